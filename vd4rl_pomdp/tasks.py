@@ -1,0 +1,40 @@
+"""The benchmark's tasks: dm_control's names, dimensions and V-D4RL's conventions, in one place."""
+
+from dataclasses import dataclass
+
+from vd4rl_pomdp.errors import UserError
+
+FRAME_SIZE = 84
+FRAME_STACK = 3
+ACTION_REPEAT = 2
+EPISODE_TRANSITIONS = 500
+"""Decisions an episode: 1000 simulator steps at action repeat 2; an episode has one row more."""
+SCORE_DIVISOR = 10.0
+"""V-D4RL's normalised score is return / 10."""
+QUALITIES = ("random", "medium_replay", "medium", "medium_expert", "expert")
+
+
+@dataclass(frozen=True)
+class Task:
+    """One dm_control task as V-D4RL uses it (camera 0, 84x84, action repeat 2)."""
+
+    name: str
+    domain: str
+    task: str
+    action_dim: int
+    state_dim: int
+    """Width of dm_control's observations, flattened and concatenated in their own order."""
+
+
+TASKS = {
+    "walker_walk": Task("walker_walk", "walker", "walk", 6, 24),
+    "cheetah_run": Task("cheetah_run", "cheetah", "run", 6, 17),
+    "humanoid_walk": Task("humanoid_walk", "humanoid", "walk", 21, 67),
+}
+
+
+def get_task(name: str) -> Task:
+    """Return the task called `name`; raises UserError listing the choices for an unknown one."""
+    if name not in TASKS:
+        raise UserError(f"unknown task {name!r}: choose one of {', '.join(TASKS)}")
+    return TASKS[name]

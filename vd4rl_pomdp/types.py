@@ -1,0 +1,89 @@
+"""The time axis and the batches every part of the harness exchanges.
+
+Rows follow dm_env: row t holds the frame o_t and the action and reward that led INTO it.
+
+    row         0        1        2      ...   T          one episode = T+1 rows, T transitions
+    frame       o_0      o_1      o_2    ...   o_T
+    action[t]   0        a_0      a_1    ...   a_{T-1}    so a_t = action[t+1]
+    reward[t]   0        r_0      r_1    ...   r_{T-1}    r_t is paid for a_t, stored on row t+1
+    step_type   FIRST    MID      MID    ...   LAST       LAST is a time limit: its discount stays 1
+
+Shape suffixes: B batch, T rows of a window, S frames of a stack, C = 3*S channels, A action dimension.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+from enum import IntEnum
+from typing import Any, Self
+
+import torch
+from torch import Tensor
+
+
+class StepType(IntEnum):
+    """dm_env's step types, as stored in V-D4RL's `step_type`."""
+
+    FIRST = 0
+    MID = 1
+    LAST = 2
+
+
+@dataclass(frozen=True)
+class Batch:
+    """A group of tensors that share their first dimension; fields can also be read as `batch["obs"]`."""
+
+    def __getitem__(self, name: str) -> Tensor:
+        if name not in self.keys():
+            raise KeyError(name)
+        return getattr(self, name)
+
+    def keys(self) -> tuple[str, ...]:
+        """Names of the tensors."""
+        return tuple(f.name for f in fields(self))
+
+    def to(self, device: torch.device | str) -> Self:
+        """Copy of the batch with every tensor on `device`."""
+        return self.replace(**{name: self[name].to(device, non_blocking=True) for name in self.keys()})
+
+    def replace(self, **changes: Any) -> Self:
+        """Copy of the batch with some tensors exchanged."""
+        return replace(self, **changes)
+
+
+@dataclass(frozen=True)
+class Transitions(Batch):
+    """n-step transitions (o_t, a_t, r, d, o_{t+n}); nothing crosses an episode's end."""
+
+    obs: Tensor
+    """(B, C, 84, 84) uint8: frames t-2..t, oldest first, the first frame repeated at an episode's start."""
+    action: Tensor
+    """(B, A) float32: a_t."""
+    reward: Tensor
+    """(B,) float32: sum of gamma^i r_{t+i} over the steps up to t+n or the episode's end."""
+    discount: Tensor
+    """(B,) float32: product of the stored discounts, times gamma for every step after the first."""
+    next_obs: Tensor
+    """(B, C, 84, 84) uint8: the stack at t+n, or at the episode's last row if that comes first."""
+    row: Tensor
+    """(B,) int64: row t in the data set, the key of `emission` corruptions."""
+    next_row: Tensor
+    """(B,) int64: the row of next_obs."""
+
+
+@dataclass(frozen=True)
+class Windows(Batch):
+    """Consecutive rows of one episode each. Row j shows o_j, a_{j-1} (`prev_action`) and a_j (`action`)."""
+
+    obs: Tensor
+    """(B, T, C, 84, 84) uint8: a frame stack a row, built within the episode (it may reach before the window)."""
+    prev_action: Tensor
+    """(B, T, A) float32: a_{j-1}; zero in the window's first row and in padding."""
+    action: Tensor
+    """(B, T, A) float32: a_j; zero where `has_action` is False."""
+    has_action: Tensor
+    """(B, T) bool: False at an episode's last row (no a_j exists there) and in padding."""
+    length: Tensor
+    """(B,) int64: real rows of each window; rows at and after it are padding."""
+    row: Tensor
+    """(B, T) int64: rows in the data set, the key of `emission` corruptions."""
