@@ -29,6 +29,11 @@ class StepType(IntEnum):
     LAST = 2
 
 
+def row_key(episode: Tensor, t: Tensor) -> Tensor:
+    """Name of row t of an episode as one int64, the same in a data set and in the environment."""
+    return (episode << 20) | t
+
+
 @dataclass(frozen=True)
 class Batch:
     """A group of tensors that share their first dimension; fields can also be read as `batch["obs"]`."""
@@ -65,10 +70,10 @@ class Transitions(Batch):
     """(B,) float32: product of the stored discounts, times gamma for every step after the first."""
     next_obs: Tensor
     """(B, C, 84, 84) uint8: the stack at t+n, or at the episode's last row if that comes first."""
-    row: Tensor
-    """(B,) int64: row t in the data set, the key of `emission` corruptions."""
-    next_row: Tensor
-    """(B,) int64: the row of next_obs."""
+    key: Tensor
+    """(B,) int64: `row_key` of row t, which keys `emission` corruptions."""
+    next_key: Tensor
+    """(B,) int64: `row_key` of next_obs."""
 
 
 @dataclass(frozen=True)
@@ -85,5 +90,5 @@ class Windows(Batch):
     """(B, T) bool: False at an episode's last row (no a_j exists there) and in padding."""
     length: Tensor
     """(B,) int64: real rows of each window; rows at and after it are padding."""
-    row: Tensor
-    """(B, T) int64: rows in the data set, the key of `emission` corruptions."""
+    key: Tensor
+    """(B, T) int64: `row_key` of every row, which keys `emission` corruptions."""
