@@ -1,0 +1,54 @@
+"""Counter-based random draws: integers that depend on a key alone, the same on every device.
+
+A key is an int64 that names one row of one batch. Hashing it (the finaliser of SplitMix64, Steele et al. 2014) gives
+independent draws without a generator's state, so a corruption can be drawn again, offline or in the environment.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_GOLDEN = 0x9E3779B97F4A7C15 - (1 << 64)
+_MIX_A = 0xBF58476D1CE4E5B9 - (1 << 64)
+_MIX_B = 0x94D049BB133111EB - (1 << 64)
+
+
+def _shift_right(x: Tensor, bits: int) -> Tensor:
+    """Logical right shift of int64."""
+    return (x >> bits) & ((1 << (64 - bits)) - 1)
+
+
+def hash_keys(key: Tensor) -> Tensor:
+    """Mix int64 keys of any shape into int64 values that look uniform."""
+    key = key + _GOLDEN
+    key = (key ^ _shift_right(key, 30)) * _MIX_A
+    key = (key ^ _shift_right(key, 27)) * _MIX_B
+    return key ^ _shift_right(key, 31)
+
+
+def derive_keys(seed: int, key: Tensor) -> Tensor:
+    """Keys of a stream of draws: one for every int64 in `key`, another set for every seed."""
+    return hash_keys(hash_keys(torch.tensor(seed, dtype=torch.int64, device=key.device)) ^ key)
+
+
+def draw_integers(key: Tensor, high: int, count: int) -> Tensor:
+    """`count` integers in [0, high) from each key: (...,) int64 -> (..., count) int64."""
+    streams = torch.arange(1, count + 1, device=key.device)
+    bits = _shift_right(hash_keys(key.unsqueeze(-1) ^ hash_keys(streams)), 33)
+    return (bits * high) >> 31
+
+
+class KeyStream:
+    """Fresh keys for every row of every batch; `position` is its whole state, so it can be saved and restored."""
+
+    def __init__(self, seed: int, position: int = 0) -> None:
+        self.seed = seed
+        self.position = position
+
+    def take(self, shape: tuple[int, ...] | torch.Size, device: torch.device | str = "cpu") -> Tensor:
+        """The next keys of the stream, shaped `shape`."""
+        count = torch.Size(shape).numel()
+        numbers = torch.arange(self.position, self.position + count, device=device)
+        self.position += count
+        return derive_keys(self.seed, numbers).view(shape)
