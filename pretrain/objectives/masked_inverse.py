@@ -1,0 +1,64 @@
+"""MIK and MIK+A: masked multi-step inverse kinematics (Wu et al. 2024, arXiv 2404.14552, section 3 and Table 1).
+
+    P(a_t | f(o_0, a_0, ..., a_{t-1}, o_t), b(o_{t+k}, a_{t+k}, o_{t+k+1}, ...)),   k in 1..K
+
+A forward GRU f summarises the past, a backward GRU b the future from row t+k on; the k steps between are masked.
+Only f is kept. "+A" (actions in both) is the field `use_actions` of the encoder.
+
+Authors' code: not published.
+
+Differences and readings:
+- Read literally, the future's first item (o_{t+k}, a_{t+k-1}) hands b the last masked action, which for k = 1 is the
+  target. Here b reads (o_j, a_j) for j >= t+k, so that it never sees a_t..a_{t+k-1}. `literal_future` restores the
+  literal reading, to measure what it does.
+- An episode's last row has no action: b reads zeros and a flag there.
+- The future reaches to the window's end (the paper's n is not stated for these experiments).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from vd4rl_pomdp.nn.action_target import ActionTarget
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.sequence import run_gru_backward
+from vd4rl_pomdp.objective import InverseConfig, InverseObjective
+from vd4rl_pomdp.types import Windows
+
+
+class MaskedInverse(InverseObjective):
+    """MIK (an encoder that reads observations only) and MIK+A (one that reads actions too)."""
+
+    def __init__(
+        self, encoder: Encoder, target: ActionTarget, config: InverseConfig, literal_future: bool = False
+    ) -> None:
+        shape = encoder.config
+        super().__init__(encoder, shape.hidden_dim, target, config)
+        self.use_actions = shape.use_actions
+        self.literal_future = literal_future
+        inputs = shape.feature_dim + (shape.action_dim + 1 if self.use_actions else 0)
+        self.backward_gru = nn.GRU(inputs, shape.hidden_dim, shape.gru_layers, batch_first=True)
+
+    def representations(self, window: Windows) -> tuple[Tensor, Tensor]:
+        """Forward states (B, T, D) and backward states (B, T, D)."""
+        features = self.encoder.frame(window.obs)
+        past = self.encoder.from_features(features, window.prev_action)
+        return past, run_gru_backward(self.backward_gru, self._future_rows(features, window), window.length)
+
+    def _future_rows(self, features: Tensor, window: Windows) -> Tensor:
+        if not self.use_actions:
+            return features
+        if self.literal_future:
+            action, known = window.prev_action, torch.ones_like(window.has_action)
+        else:
+            action, known = window.action, window.has_action
+        return torch.cat([features, action.to(features), known[..., None].to(features)], dim=-1)
+
+    def visible(self, t: int, k: int, rows: int) -> tuple[set[int], set[int]]:
+        """Past up to t and future from t+k; with actions a_j for j < t and j >= t+k."""
+        observations = set(range(t + 1)) | set(range(t + k, rows))
+        if not self.use_actions:
+            return observations, set()
+        future = range(t + k - 1, rows - 1) if self.literal_future else range(t + k, rows)
+        return observations, set(range(t)) | set(future)

@@ -1,0 +1,102 @@
+"""Four ways to predict an action, behind one interface: what a head puts out and what it is compared with."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from vd4rl_pomdp.errors import UserError
+
+
+class ActionTarget(Protocol):
+    """Turns head outputs and true actions into losses."""
+
+    outputs: int
+    """Numbers the head must put out for each prediction."""
+
+    def loss(self, logits: Tensor, action: Tensor) -> Tensor:
+        """(..., outputs) and (..., A) -> (...,) losses, in nats or squared action units."""
+
+
+class KMeansTarget(nn.Module):
+    """Cross-entropy over the nearest of `codes` K-means centres of the training actions (Islam et al.'s lineage)."""
+
+    def __init__(self, actions: np.ndarray, codes: int, seed: int) -> None:
+        super().__init__()
+        self.outputs = codes
+        self.register_buffer("centers", torch.from_numpy(_fit_centers(actions, codes, seed)))
+        self.centers: Tensor
+
+    def loss(self, logits: Tensor, action: Tensor) -> Tensor:
+        """See `ActionTarget`."""
+        code = torch.cdist(action.reshape(-1, action.shape[-1]), self.centers).argmin(-1)
+        loss = F.cross_entropy(logits.reshape(-1, self.outputs).float(), code, reduction="none")
+        return loss.view(action.shape[:-1])
+
+
+class BinsTarget(nn.Module):
+    """Cross-entropy over `bins` equal bins of [-1, 1] for each action dimension, averaged over dimensions."""
+
+    def __init__(self, action_dim: int, bins: int) -> None:
+        super().__init__()
+        self.bins = bins
+        self.outputs = action_dim * bins
+
+    def loss(self, logits: Tensor, action: Tensor) -> Tensor:
+        """See `ActionTarget`."""
+        code = ((action.clamp(-1, 1) + 1) / 2 * self.bins).long().clamp_(max=self.bins - 1)
+        loss = F.cross_entropy(logits.reshape(-1, self.bins).float(), code.reshape(-1), reduction="none")
+        return loss.view(action.shape).mean(-1)
+
+
+class MSETarget(nn.Module):
+    """Squared error on the action, or on the L2-normalised action and prediction (ACRO's published code)."""
+
+    def __init__(self, action_dim: int, normalise: bool) -> None:
+        super().__init__()
+        self.outputs = action_dim
+        self.normalise = normalise
+
+    def loss(self, logits: Tensor, action: Tensor) -> Tensor:
+        """See `ActionTarget`."""
+        if self.normalise:
+            logits, action = F.normalize(logits.float(), dim=-1), F.normalize(action, dim=-1)
+        return (logits.float() - action).square().mean(-1)
+
+
+ACTION_TARGETS = ("kmeans", "bins", "mse", "mse_l2")
+
+
+def make_action_target(name: str, actions: np.ndarray, codes: int, seed: int) -> KMeansTarget | BinsTarget | MSETarget:
+    """Build an action target.
+
+    Args:
+        name: kmeans, bins, mse or mse_l2.
+        actions: (N, A) float32 training actions, the only ones K-means is fitted on.
+        codes: K-means centres, or bins per dimension.
+        seed: seed of K-means.
+    """
+    if name not in ACTION_TARGETS:
+        raise UserError(f"unknown action target {name!r}: choose one of {', '.join(ACTION_TARGETS)}")
+    if name == "kmeans":
+        return KMeansTarget(actions, codes, seed)
+    if name == "bins":
+        return BinsTarget(actions.shape[1], codes)
+    return MSETarget(actions.shape[1], normalise=name == "mse_l2")
+
+
+def _fit_centers(actions: np.ndarray, codes: int, seed: int) -> np.ndarray:
+    """K-means centres, (codes, A) float32, of at most 50,000 of the actions."""
+    from sklearn.cluster import KMeans
+
+    distinct = len(np.unique(actions, axis=0))
+    if distinct < codes:
+        raise UserError(f"the data set has {distinct} distinct actions, fewer than --codes {codes}: lower --codes")
+    rng = np.random.default_rng(seed)
+    sample = actions if len(actions) <= 50_000 else actions[rng.choice(len(actions), 50_000, replace=False)]
+    fitted = KMeans(codes, n_init=3, random_state=seed).fit(sample.astype(np.float64))
+    return fitted.cluster_centers_.astype(np.float32)

@@ -1,0 +1,124 @@
+"""The representation that is kept: a frame encoder and, for sequence methods, a forward GRU over the past.
+
+`encode` (whole windows) and `step` (one row at a time, as the environment delivers them) agree to float tolerance.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor, nn
+
+from vd4rl_pomdp.nn.frame import make_frame_encoder
+from vd4rl_pomdp.nn.sequence import run_gru
+from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
+from vd4rl_pomdp.types import Windows
+
+
+@dataclass(frozen=True)
+class EncoderConfig:
+    """Everything needed to rebuild an encoder."""
+
+    action_dim: int
+    frame_encoder: str = "drq"
+    feature_dim: int = 256
+    history: str = "none"
+    """gru: s_t is the state of a GRU over rows 0..t; none: s_t = e(o_t)."""
+    use_actions: bool = False
+    """Whether the GRU also reads a_{t-1} in row t."""
+    hidden_dim: int = 256
+    gru_layers: int = 1
+    history_window: int = 0
+    """Rows the state is computed from, 0 for all since the episode's start."""
+    frame_stack: int = FRAME_STACK
+    frame_size: int = FRAME_SIZE
+
+
+class StreamState(NamedTuple):
+    """What an encoder remembers between rows."""
+
+    hidden: Tensor
+    """(layers, B, H); empty for memoryless encoders and under a history window."""
+    rows: Tensor
+    """(B, L', F + A): the GRU's last inputs under a history window, else empty."""
+
+
+class Encoder(nn.Module):
+    """Maps observations and past actions to the representation s_t of width `dim`."""
+
+    def __init__(self, config: EncoderConfig) -> None:
+        super().__init__()
+        self.config = config
+        self.frame = make_frame_encoder(
+            config.frame_encoder, 3 * config.frame_stack, config.frame_size, config.feature_dim
+        )
+        inputs = config.feature_dim + (config.action_dim if config.use_actions else 0)
+        self.gru = (
+            nn.GRU(inputs, config.hidden_dim, config.gru_layers, batch_first=True) if config.history == "gru" else None
+        )
+        self.dim = config.hidden_dim if self.gru is not None else config.feature_dim
+
+    def encode(self, window: Windows) -> Tensor:
+        """Representations of every row: (B, T, C, 84, 84) uint8 -> (B, T, dim)."""
+        return self.from_features(self.frame(window.obs), window.prev_action)
+
+    def from_features(self, features: Tensor, prev_action: Tensor) -> Tensor:
+        """Representations from (B, T, F) frame features and (B, T, A) previous actions."""
+        if self.gru is None:
+            return features
+        rows = self._gru_rows(features, prev_action)
+        span = self.config.history_window
+        if span == 0 or rows.shape[1] <= span:
+            return run_gru(self.gru, rows)[0]
+        return torch.cat([run_gru(self.gru, rows[:, :span])[0], self._over_last_rows(rows, span)], dim=1)
+
+    def initial_state(self, batch: int) -> StreamState:
+        """State before an episode's first row."""
+        weight = next(self.parameters())
+        hidden, rows = weight.new_zeros(0), weight.new_zeros(0)
+        if self.gru is not None:
+            hidden = weight.new_zeros(self.config.gru_layers, batch, self.config.hidden_dim)
+            rows = weight.new_zeros(batch, 0, self.gru.input_size)
+        return StreamState(hidden, rows)
+
+    def step(self, obs: Tensor, prev_action: Tensor, state: StreamState) -> tuple[Tensor, StreamState]:
+        """Advance by one row.
+
+        Args:
+            obs: (B, C, 84, 84) uint8.
+            prev_action: (B, A) float32, zeros at an episode's first row.
+            state: from `initial_state` or the previous call.
+
+        Returns:
+            (B, dim) representation, and the state for the next row.
+        """
+        features = self.frame(obs)
+        if self.gru is None:
+            return features, state
+        row = self._gru_rows(features[:, None], prev_action[:, None])
+        span = self.config.history_window
+        if span == 0:
+            out, hidden = run_gru(self.gru, row, state.hidden)
+            return out[:, 0], state._replace(hidden=hidden)
+        rows = torch.cat([state.rows, row], dim=1)[:, -span:]
+        return run_gru(self.gru, self._forget_first_action(rows))[0][:, -1], state._replace(rows=rows)
+
+    def _gru_rows(self, features: Tensor, prev_action: Tensor) -> Tensor:
+        return torch.cat([features, prev_action.to(features)], dim=-1) if self.config.use_actions else features
+
+    def _over_last_rows(self, rows: Tensor, span: int) -> Tensor:
+        """States of rows span.. of (B, T, I), each computed anew from the last `span` rows: (B, T - span, H)."""
+        assert self.gru is not None
+        recent = rows.unfold(1, span, 1)[:, 1:].transpose(2, 3)
+        states = [run_gru(self.gru, self._forget_first_action(r))[0][:, -1] for r in recent.unbind(1)]
+        return torch.stack(states, dim=1)
+
+    def _forget_first_action(self, rows: Tensor) -> Tensor:
+        """A window's first row carries no earlier action."""
+        if not self.config.use_actions:
+            return rows
+        rows = rows.clone()
+        rows[:, 0, self.config.feature_dim :] = 0
+        return rows

@@ -1,0 +1,86 @@
+"""A pretrained encoder is a folder: config.json and model.safetensors, loadable without the code that trained it."""
+
+from __future__ import annotations
+
+import json
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+
+
+@dataclass(frozen=True)
+class EncoderCard:
+    """Where an encoder comes from."""
+
+    method: str
+    task: str
+    quality: str
+    corruption: dict[str, Any]
+    """The corruption it was pretrained under, as the fields of CorruptionConfig."""
+    seed: int
+    steps: int
+    preset: str
+
+
+def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard) -> None:
+    """Write an encoder folder; whole files only, config last."""
+    folder.mkdir(parents=True, exist_ok=True)
+    weights = {name: value.contiguous().cpu() for name, value in encoder.state_dict().items()}
+    temporary = folder / ".model.safetensors.tmp"
+    save_file(weights, temporary)
+    temporary.replace(folder / "model.safetensors")
+    config = {"encoder": asdict(encoder.config), "pretrain": asdict(card)}
+    temporary = folder / ".config.json.tmp"
+    temporary.write_text(json.dumps(config, indent=2) + "\n")
+    temporary.replace(folder / "config.json")
+
+
+def load_encoder(folder: Path, task: str | None = None, action_dim: int | None = None) -> tuple[Encoder, EncoderCard]:
+    """Read an encoder folder into a frozen module in eval mode.
+
+    Args:
+        folder: written by `save_encoder`.
+        task: the task it will be used on, if that is to be checked.
+        action_dim: the action dimension it will be used with, if that is to be checked.
+
+    Raises:
+        UserError: the folder is missing, damaged, pickled, or of another task.
+    """
+    config = _read_config(folder)
+    encoder_config, card = EncoderConfig(**config["encoder"]), EncoderCard(**config["pretrain"])
+    if action_dim is not None and encoder_config.action_dim != action_dim:
+        raise UserError(
+            f"{folder}: this encoder was pretrained on {card.task} with {encoder_config.action_dim} action dimensions, "
+            f"the data set has {action_dim}; pretrain one on this task"
+        )
+    if task is not None and card.task != task:
+        raise UserError(f"{folder}: this encoder was pretrained on {card.task}, not on {task}; pretrain one on this task")
+    encoder = Encoder(encoder_config)
+    try:
+        encoder.load_state_dict(load_file(folder / "model.safetensors"))
+    except (OSError, SafetensorError, RuntimeError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"{folder}/model.safetensors: cannot be read ({reason}); pretrain the encoder again") from error
+    return encoder.eval().requires_grad_(False), card
+
+
+def _read_config(folder: Path) -> dict[str, Any]:
+    pickles = [p.name for p in folder.glob("*") if p.suffix in (".pt", ".pth", ".pkl", ".bin", ".ckpt")]
+    if pickles and not (folder / "model.safetensors").exists():
+        raise UserError(f"{folder}: {pickles[0]} is a pickle, which can run code; only model.safetensors is read")
+    try:
+        config = json.loads((folder / "config.json").read_text())
+        EncoderConfig(**config["encoder"]), EncoderCard(**config["pretrain"])
+    except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
+        raise UserError(
+            f"{folder}: not an encoder folder (config.json: {error}); `vd4rl-pomdp pretrain` writes one as RUN/encoder"
+        ) from error
+    return config
+
+

@@ -1,0 +1,61 @@
+"""Frame encoders e(o): convolutions on one stacked observation, then Linear, LayerNorm, Tanh."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from vd4rl_pomdp.errors import UserError
+
+
+class FrameEncoder(nn.Module):
+    """Encodes uint8 frame stacks.
+
+    Shapes: (..., C, 84, 84) uint8 or float in 0..255 -> (..., feature_dim) float32.
+    """
+
+    def __init__(self, convolutions: nn.Sequential, channels: int, size: int, feature_dim: int) -> None:
+        super().__init__()
+        self.convolutions = convolutions
+        with torch.no_grad():
+            flat = convolutions(torch.zeros(1, channels, size, size)).numel()
+        self.project = nn.Sequential(nn.Linear(flat, feature_dim), nn.LayerNorm(feature_dim), nn.Tanh())
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """Features of every stack."""
+        lead = obs.shape[:-3]
+        dtype = self.project[0].weight.dtype
+        image = obs.reshape(-1, *obs.shape[-3:]).contiguous(memory_format=torch.channels_last).to(dtype) / 255 - 0.5
+        return self.project(self.convolutions(image).flatten(1)).to(dtype).view(*lead, -1)
+
+
+def _drq(channels: int) -> nn.Sequential:
+    """Four 3x3 convolutions of 32 channels, the first with stride 2 (Kostrikov et al. 2020; used by V-D4RL)."""
+    layers: list[nn.Module] = [nn.Conv2d(channels, 32, 3, stride=2), nn.ReLU()]
+    for _ in range(3):
+        layers += [nn.Conv2d(32, 32, 3), nn.ReLU()]
+    return nn.Sequential(*layers)
+
+
+def _nature(channels: int) -> nn.Sequential:
+    """Three strided convolutions (Mnih et al. 2015): a fraction of DrQ's cost."""
+    return nn.Sequential(
+        nn.Conv2d(channels, 32, 8, stride=4),
+        nn.ReLU(),
+        nn.Conv2d(32, 64, 4, stride=2),
+        nn.ReLU(),
+        nn.Conv2d(64, 64, 3),
+        nn.ReLU(),
+    )
+
+
+FRAME_ENCODERS = {"drq": _drq, "nature": _nature}
+
+
+def make_frame_encoder(name: str, channels: int, size: int, feature_dim: int) -> FrameEncoder:
+    """Build a frame encoder by name; an unknown name raises UserError listing the choices."""
+    if name not in FRAME_ENCODERS:
+        raise UserError(f"unknown frame encoder {name!r}: choose one of {', '.join(FRAME_ENCODERS)}")
+    return FrameEncoder(FRAME_ENCODERS[name](channels), channels, size, feature_dim).to(
+        memory_format=torch.channels_last  # type: ignore[call-overload]
+    )

@@ -1,0 +1,52 @@
+"""Prediction heads on pairs of representations."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+class PairHead(nn.Module):
+    """An MLP of (s_t, g_{t+k}, k) for many pairs at once.
+
+    The first layer is a sum of three terms, so each row goes through it once however many pairs it is part of.
+    """
+
+    def __init__(self, past_dim: int, future_dim: int, max_k: int, outputs: int, hidden: int, k_embedding: bool) -> None:
+        super().__init__()
+        self.past = nn.Linear(past_dim, hidden)
+        self.future = nn.Linear(future_dim, hidden, bias=False)
+        self.k = nn.Embedding(max_k + 1, hidden) if k_embedding else None
+        self.rest = nn.Sequential(nn.ReLU(), nn.Linear(hidden, hidden), nn.ReLU(), nn.Linear(hidden, outputs))
+
+    def forward(self, past: Tensor, future: Tensor, pairs: Tensor) -> Tensor:
+        """Outputs for every pair.
+
+        Args:
+            past: (B, T, past_dim).
+            future: (B, T, future_dim).
+            pairs: (P, 2) int64 rows of (t, k).
+
+        Returns:
+            (B, P, outputs).
+        """
+        t, k = pairs.unbind(1)
+        hidden = self.past(past).index_select(1, t) + self.future(future).index_select(1, t + k)
+        if self.k is not None:
+            hidden = hidden + self.k(k)
+        return self.rest(hidden)
+
+
+def mlp(inputs: int, hidden: int, outputs: int, layers: int = 2) -> nn.Sequential:
+    """Rectified MLP with `layers` hidden layers."""
+    widths = [inputs] + [hidden] * layers
+    modules: list[nn.Module] = []
+    for a, b in zip(widths[:-1], widths[1:], strict=True):
+        modules += [nn.Linear(a, b), nn.ReLU()]
+    return nn.Sequential(*modules, nn.Linear(hidden, outputs))
+
+
+def all_pairs(rows: int, max_k: int) -> Tensor:
+    """Every (t, k) with 1 <= k <= max_k and t + k < rows: (P, 2) int64, ordered by k, then t."""
+    pairs = [(t, k) for k in range(1, min(max_k, rows - 1) + 1) for t in range(rows - k)]
+    return torch.tensor(pairs, dtype=torch.int64).view(-1, 2)

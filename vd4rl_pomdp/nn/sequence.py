@@ -1,0 +1,35 @@
+"""Recurrent passes over windows, forwards and backwards, that padding cannot reach."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+
+def run_gru(gru: nn.GRU, x: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Run a batch-first GRU in its own precision, also inside autocast: (B, T, I) -> (B, T, H), (layers, B, H)."""
+    with torch.autocast(x.device.type, enabled=False):
+        return gru(x.to(gru.weight_hh_l0.dtype), state)
+
+
+def run_gru_backward(gru: nn.GRU, x: Tensor, length: Tensor) -> Tensor:
+    """Run a GRU from each window's last real row to its first.
+
+    Args:
+        gru: a batch-first, one-directional GRU.
+        x: (B, T, I) inputs; rows at and after `length` are padding.
+        length: (B,) int64.
+
+    Returns:
+        (B, T, H): row j has seen rows j..length-1. Padding rows hold no information and must not be used.
+    """
+    rows = torch.arange(x.shape[1], device=x.device)
+    flip = length[:, None] - 1 - rows
+    flip = torch.where(flip >= 0, flip, rows)  # padding stays behind the real rows
+    out, _ = run_gru(gru, _take_rows(x, flip))
+    return _take_rows(out, flip)
+
+
+def _take_rows(x: Tensor, index: Tensor) -> Tensor:
+    """Rows of (B, T, I) in the order given by (B, T) indices."""
+    return x.gather(1, index[..., None].expand(-1, -1, x.shape[2]))

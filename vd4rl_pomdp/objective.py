@@ -1,0 +1,124 @@
+"""The contract of a pretraining objective, and what every inverse model shares.
+
+An objective owns an `Encoder` (the part that is kept) and whatever else it trains. Its loss is pure: no optimiser, no
+logging, no environment. A method of one's own subclasses `Objective`, or `InverseObjective` if it predicts actions.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor, nn
+
+from vd4rl_pomdp.nn.action_target import ActionTarget
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.heads import PairHead, all_pairs, mlp
+from vd4rl_pomdp.types import Windows
+
+
+class Objective(nn.Module, ABC):
+    """Trains an encoder on windows."""
+
+    encoder: Encoder
+
+    @abstractmethod
+    def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
+        """Loss of one batch.
+
+        Args:
+            window: a batch whose `obs` are already corrupted and augmented.
+            progress: share of the training that is done, 0 to 1, for schedules.
+
+        Returns:
+            A scalar to minimise, and detached scalars to log.
+        """
+
+
+@dataclass(frozen=True)
+class InverseConfig:
+    """Options that every inverse model has."""
+
+    max_k: int = 15
+    """Largest gap K between the two states of a pair; every k in 1..K is trained."""
+    k_embedding: bool = True
+    """Whether the action head is told k."""
+    head_dim: int = 256
+    """Units of the action head's two hidden layers."""
+    self_prediction: float = 0.0
+    """Weight of ||sg(s_{t+k}) - g(s_t, k)||^2, with a 3-layer MLP of 512 units."""
+    l2_states: float = 0.0
+    """Weight of the squared norm of forward states; it decays linearly to zero over the training."""
+
+
+class InverseObjective(Objective):
+    """Predicts a_t from a representation of the past at t and one of what is seen at t+k, for every k up to K."""
+
+    def __init__(self, encoder: Encoder, future_dim: int, target: ActionTarget, config: InverseConfig) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.config = config
+        self.target = target
+        self.head = PairHead(
+            encoder.dim, future_dim, config.max_k, target.outputs, config.head_dim, config.k_embedding
+        )
+        self.predictor = mlp(encoder.dim + 1, 512, encoder.dim, layers=3) if config.self_prediction else None
+
+    @abstractmethod
+    def representations(self, window: Windows) -> tuple[Tensor, Tensor]:
+        """Past (B, T, D) and future (B, T, D') representations of every row."""
+
+    @abstractmethod
+    def visible(self, t: int, k: int, rows: int) -> tuple[set[int], set[int]]:
+        """What the prediction of a_t from the pair (t, t+k) may depend on, in a window of `rows` rows.
+
+        Returns:
+            Observation rows j (of o_j) and action indices j (of a_j).
+        """
+
+    def pairs(self, rows: int) -> Tensor:
+        """The (t, k) that are scored in a window of `rows` rows: (P, 2) int64."""
+        return all_pairs(rows, self.config.max_k)
+
+    def action_logits(self, window: Windows) -> Tensor:
+        """Predictions for every pair: (B, P, target.outputs)."""
+        past, future = self.representations(window)
+        return self.head(past, future, self.pairs(window.obs.shape[1]).to(past.device))
+
+    def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean action loss over all real pairs, plus the optional terms; `loss_kNN` is the mean at each k."""
+        past, future = self.representations(window)
+        pairs = self.pairs(window.obs.shape[1]).to(past.device)
+        losses = self.target.loss(self.head(past, future, pairs), window.action[:, pairs[:, 0]])
+        real = (pairs.sum(1) < window.length[:, None]).to(losses)
+        total = (losses * real).sum() / real.sum()
+        logs = {"action_loss": total.detach()} | self._per_k(losses.detach() * real, real, pairs)
+        if self.predictor is not None:
+            term = self._self_prediction(past, pairs, real)
+            total, logs["self_prediction"] = total + self.config.self_prediction * term, term.detach()
+        if self.config.l2_states:
+            term = _masked_mean(past.square().mean(-1), window.length)
+            total, logs["l2_states"] = total + self.config.l2_states * (1 - progress) * term, term.detach()
+        logs["loss"] = total.detach()
+        return total, logs
+
+    def _per_k(self, losses: Tensor, real: Tensor, pairs: Tensor) -> dict[str, Tensor]:
+        sums = losses.new_zeros(2, self.config.max_k + 1)
+        sums.index_add_(1, pairs[:, 1], torch.stack([losses.sum(0), real.sum(0)]))
+        means = sums[0] / sums[1].clamp(min=1)
+        return {f"loss_k{k:02d}": means[k] for k in range(1, int(pairs[:, 1].max()) + 1)}
+
+    def _self_prediction(self, past: Tensor, pairs: Tensor, real: Tensor) -> Tensor:
+        assert self.predictor is not None
+        t, k = pairs.unbind(1)
+        gap = (k / self.config.max_k).to(past).expand(past.shape[0], -1)[..., None]
+        predicted = self.predictor(torch.cat([past[:, t], gap], dim=-1))
+        error = (predicted - past[:, t + k].detach()).square().mean(-1)
+        return (error * real).sum() / real.sum()
+
+
+def _masked_mean(values: Tensor, length: Tensor) -> Tensor:
+    """Mean of (B, T) values over real rows."""
+    real = (torch.arange(values.shape[1], device=values.device) < length[:, None]).to(values)
+    return (values * real).sum() / real.sum()
