@@ -1,0 +1,61 @@
+"""Endless uniform batches of windows or transitions, from a generator that is passed in."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import torch
+
+from vd4rl_pomdp.data.dataset import Dataset
+from vd4rl_pomdp.tasks import FRAME_STACK
+from vd4rl_pomdp.types import Transitions, Windows
+
+
+class WindowSampler:
+    """Windows whose starts are uniform over the set; the draws do not depend on the device."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        batch_size: int,
+        length: int,
+        generator: torch.Generator,
+        frame_stack: int = FRAME_STACK,
+    ) -> None:
+        self._dataset, self._batch_size, self._length = dataset, batch_size, length
+        self._generator, self._frame_stack = generator, frame_stack
+        self._count = dataset.num_windows(length)
+
+    def sample(self) -> Windows:
+        """The next batch."""
+        index = torch.randint(self._count, (self._batch_size,), generator=self._generator)
+        return self._dataset.windows(index, self._length, self._frame_stack)
+
+    def __iter__(self) -> Iterator[Windows]:
+        while True:
+            yield self.sample()
+
+
+class TransitionSampler:
+    """Transitions uniform over the set; the draws do not depend on the device."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        batch_size: int,
+        generator: torch.Generator,
+        n_step: int = 1,
+        frame_stack: int = FRAME_STACK,
+        gamma: float = 0.99,
+    ) -> None:
+        self._dataset, self._batch_size, self._generator = dataset, batch_size, generator
+        self._n_step, self._frame_stack, self._gamma = n_step, frame_stack, gamma
+
+    def sample(self) -> Transitions:
+        """The next batch."""
+        index = torch.randint(self._dataset.num_transitions, (self._batch_size,), generator=self._generator)
+        return self._dataset.transitions(index, self._n_step, self._frame_stack, self._gamma)
+
+    def __iter__(self) -> Iterator[Transitions]:
+        while True:
+            yield self.sample()

@@ -1,0 +1,29 @@
+"""Where tensors live and in which precision the networks run."""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import torch
+
+from vd4rl_pomdp.errors import UserError
+
+Precision = Literal["fp32", "bf16"]
+
+
+def pick_device(name: str) -> torch.device:
+    """Device called `name`; `auto` is the first GPU where there is one, else the CPU."""
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError as error:
+        raise UserError(f"unknown device {name!r}: use auto, cpu or cuda") from error
+    if device.type == "cuda" and not torch.cuda.is_available():
+        raise UserError(f"device {name!r} was asked for, but no GPU is visible: use --device cpu")
+    return device
+
+
+def autocast(device: torch.device, precision: Precision) -> torch.autocast:
+    """Context in which a forward pass runs in `precision`."""
+    return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16")

@@ -1,0 +1,89 @@
+"""A run is a folder: config.json first, then metrics.jsonl, checkpoint/ and results; the same command continues it.
+
+Everything but `timing.json` and `machine.json` is the same whether a run was interrupted or not.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs.provenance import command, git_commit, machine, versions
+
+_RUNTIME_FIELDS = {"out", "device", "workers", "wandb", "resume_every"}
+"""Config fields that do not change a result, so that a run may go on with other ones."""
+
+
+class RunFolder:
+    """Owns a run's files."""
+
+    def __init__(self, path: Path, stage: str, config: Any) -> None:
+        self.path = path
+        self._claim(stage, jsonable(asdict(config)))
+        self._started = time.monotonic()
+
+    def _claim(self, stage: str, config: dict[str, Any]) -> None:
+        file = self.path / "config.json"
+        if file.exists():
+            stored = read_json(file)
+            old = stored.get("config", {})
+            keys = (set(old) | set(config)) - _RUNTIME_FIELDS
+            differing = sorted(k for k in keys if old.get(k) != config.get(k))
+            if stored.get("stage") != stage or differing:
+                what = ", ".join(differing) or f"stage {stored.get('stage')}"
+                raise UserError(
+                    f"{self.path}: holds a run with another config ({what}); choose another --out or remove it"
+                )
+            return
+        if self.path.exists() and any(self.path.iterdir()):
+            raise UserError(f"{self.path}: is not empty and holds no run; choose another --out")
+        self.path.mkdir(parents=True, exist_ok=True)
+        record = {"stage": stage, "config": config, "versions": versions(), "git_commit": git_commit()}
+        write_json(self.path / "machine.json", machine())
+        write_json(file, record | {"command": command()})
+
+    @property
+    def checkpoint(self) -> Path:
+        """Folder of the newest checkpoint."""
+        return self.path / "checkpoint"
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has come to its end."""
+        return (self.path / "timing.json").exists()
+
+    def finish(self, seconds_before: float, **more: Any) -> None:
+        """Mark the run as done and keep its wall-clock seconds, those before an interruption included."""
+        write_json(self.path / "timing.json", {"seconds": round(self.seconds(seconds_before), 2)} | more)
+
+    def seconds(self, before: float) -> float:
+        """Wall-clock seconds of the run so far, given those spent before an interruption."""
+        return before + time.monotonic() - self._started
+
+
+def jsonable(value: Any) -> Any:
+    """Config values as JSON: paths become strings, tuples become lists."""
+    if isinstance(value, dict):
+        return {k: jsonable(v) for k, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [jsonable(v) for v in value]
+    return str(value) if isinstance(value, Path) else value
+
+
+def read_json(path: Path) -> dict[str, Any]:
+    """Read a JSON object; raises UserError if it is missing or damaged."""
+    try:
+        return json.loads(path.read_text())
+    except (OSError, json.JSONDecodeError) as error:
+        raise UserError(f"{path}: cannot be read as JSON ({error})") from error
+
+
+def write_json(path: Path, value: Any) -> None:
+    """Write a JSON file so that a reader sees it whole or not at all."""
+    temporary = path.with_name(f".{path.name}.tmp")
+    temporary.write_text(json.dumps(value, indent=2) + "\n")
+    temporary.replace(path)

@@ -1,0 +1,48 @@
+"""metrics.jsonl: one JSON object a line, appended as a run goes; wandb may mirror it and can never stop a run."""
+
+from __future__ import annotations
+
+import json
+import math
+import sys
+from pathlib import Path
+from typing import Any, Literal
+
+WandbMode = Literal["off", "offline", "online"]
+
+
+class MetricsLog:
+    """Appends rows {"step": int, name: number, ...}; opening it again at a checkpoint drops the rows after it."""
+
+    def __init__(self, path: Path, step: int, wandb: WandbMode = "off", config: dict[str, Any] | None = None) -> None:
+        self._path = path
+        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
+        path.write_text("".join(line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= step))
+        self._wandb = _start_wandb(wandb, path.parent, config or {})
+
+    def write(self, step: int, metrics: dict[str, float]) -> None:
+        """Append one row; a metric that is not a finite number raises FloatingPointError."""
+        bad = [name for name, value in metrics.items() if not math.isfinite(value)]
+        if bad:
+            raise FloatingPointError(f"{self._path.parent}: {bad[0]} is {metrics[bad[0]]} at step {step}")
+        with self._path.open("a") as file:
+            file.write(json.dumps({"step": step} | metrics) + "\n")
+        if self._wandb is not None:
+            self._wandb.log(metrics, step=step)
+
+    def close(self) -> None:
+        """End the mirror, if there is one."""
+        if self._wandb is not None:
+            self._wandb.finish()
+
+
+def _start_wandb(mode: WandbMode, folder: Path, config: dict[str, Any]) -> Any:
+    if mode == "off":
+        return None
+    import wandb
+
+    try:
+        return wandb.init(project="vd4rl-pomdp", dir=str(folder), mode=mode, config=config)
+    except wandb.errors.Error as error:
+        print(f"wandb could not start ({error}); the run goes on, metrics are in {folder}", file=sys.stderr)
+        return None
