@@ -1,0 +1,161 @@
+"""The pretraining loop. It knows no method by name: sample, corrupt, shift, step; resumable to the bit on a CPU."""
+
+from __future__ import annotations
+
+from dataclasses import asdict, fields, replace
+from typing import Any
+
+import torch
+
+from pretrain.config import PretrainConfig
+from pretrain.objectives import build_objective, get_method
+from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, make_corruption
+from vd4rl_pomdp.data import Dataset, WindowSampler, open_dataset
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.nn.action_target import make_action_target
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
+from vd4rl_pomdp.objective import Objective
+from vd4rl_pomdp.runs.checkpoint import load_checkpoint, save_checkpoint, seed_everything
+from vd4rl_pomdp.runs.device import autocast, pick_device
+from vd4rl_pomdp.runs.folder import RunFolder, jsonable
+from vd4rl_pomdp.runs.metrics import MetricsLog
+from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.tasks import get_task
+from vd4rl_pomdp.types import Windows
+
+SHIFT_STREAM, BATCH_STREAM = 1, 2
+"""Numbers that keep the seeded streams of a run apart; the corruption's stream is the seed itself."""
+
+
+def pretrain(config: PretrainConfig) -> RunFolder:
+    """Run the stage, or go on with it, and write `out/encoder`; returns the run's folder."""
+    method = get_method(config.method)
+    make_corruption(config)
+    dataset = open_dataset(config.data)
+    task = _task_of(dataset, config)
+    seed_everything(config.seed)
+    objective = _build(dataset, config)
+    device = pick_device(config.device)
+    run = RunFolder(config.out, "pretrain", replace(config, task=task))
+    if run.finished:
+        return run
+    trainer = Trainer(objective.to(device), dataset.to(device), config)
+    trainer.run(run, config.steps if method.trained else 0)
+    save_encoder(run.path / "encoder", _with_history_window(objective.encoder, config), _card(config, task, dataset))
+    run.finish(trainer.seconds, steps=trainer.step, frames=trainer.step * config.batch_size * config.window)
+    return run
+
+
+class Trainer:
+    """One objective on one data set."""
+
+    def __init__(self, objective: Objective, dataset: Dataset, config: PretrainConfig) -> None:
+        self.objective, self.dataset, self.config = objective, dataset, config
+        self.device = dataset.t.device
+        self.generator = torch.Generator().manual_seed(config.seed * 10 + BATCH_STREAM)
+        self.sampler = WindowSampler(dataset, config.batch_size, config.window, self.generator)
+        self.corruption = BatchCorruption(corruption_of(config), config.seed)
+        self.shifts = KeyStream(config.seed * 10 + SHIFT_STREAM)
+        self.optimiser = torch.optim.Adam(objective.parameters(), lr=config.learning_rate)
+        self.step = 0
+        self.seconds = 0.0
+
+    def batch(self) -> Windows:
+        """The next windows, shifted and corrupted: what the agent would see."""
+        window = self.sampler.sample()
+        obs = random_shift(window.obs, self.shifts.take((len(window.length),), self.device), self.config.shift)
+        return window.replace(obs=self.corruption(obs, window.key))
+
+    def update(self) -> dict[str, torch.Tensor]:
+        """One gradient step; returns the objective's scalars."""
+        window = self.batch()
+        with autocast(self.device, self.config.precision):
+            loss, logs = self.objective.loss(window, self.step / max(1, self.config.steps))
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimiser.step()
+        self.step += 1
+        return logs
+
+    def run(self, run: RunFolder, steps: int) -> None:
+        """Train up to `steps`, from the newest checkpoint if there is one."""
+        self._restore(load_checkpoint(run.checkpoint))
+        before = self.seconds
+        log = MetricsLog(run.path / "metrics.jsonl", self.step, self.config.wandb, jsonable(asdict(self.config)))
+        with ProgressLine(f"pretrain {self.config.method}", steps, "steps", self.step) as progress:
+            while self.step < steps:
+                logs = self.update()
+                if self.step % self.config.log_every == 0 or self.step == steps:
+                    row = {name: float(value) for name, value in logs.items()}
+                    log.write(self.step, row)
+                    progress.advance(0, loss=row["loss"])
+                progress.advance()
+                if self.step % self.config.checkpoint_every == 0 or self.step == steps:
+                    self.seconds = run.seconds(before)
+                    save_checkpoint(run.checkpoint, self._state())
+        self.seconds = run.seconds(before)
+        log.close()
+
+    def _state(self) -> dict[str, Any]:
+        return {
+            "step": self.step,
+            "seconds": self.seconds,
+            "objective": self.objective.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "batches": self.generator.get_state(),
+            "corruption": self.corruption.stream.position,
+            "shifts": self.shifts.position,
+        }
+
+    def _restore(self, state: dict[str, Any] | None) -> None:
+        if state is None:
+            return
+        self.step, self.seconds = state["step"], state["seconds"]
+        self.objective.load_state_dict(state["objective"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.generator.set_state(state["batches"])
+        self.corruption.stream.position = state["corruption"]
+        self.shifts.position = state["shifts"]
+
+
+def corruption_of(config: CorruptionConfig) -> CorruptionConfig:
+    """The corruption's fields alone."""
+    return CorruptionConfig(**{f.name: getattr(config, f.name) for f in fields(CorruptionConfig)})
+
+
+def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
+    actions = dataset.action[dataset.t > 0]
+    target = make_action_target(config.action_target, actions.numpy(), config.codes, config.seed)
+    objective = build_objective(config, actions, target)
+    dataset.num_windows(config.window)
+    return objective
+
+
+def _task_of(dataset: Dataset, config: PretrainConfig) -> str:
+    name = config.task or dataset.task
+    if name is None:
+        raise UserError(f"{config.data}: cannot tell the task of this set; pass --task")
+    task = get_task(name)
+    if task.action_dim != dataset.action_dim:
+        raise UserError(f"{config.data}: has {dataset.action_dim} action dimensions, {name} has {task.action_dim}; pass the right --task")
+    return name
+
+
+def _card(config: PretrainConfig, task: str, dataset: Dataset) -> EncoderCard:
+    return EncoderCard(
+        method=config.method,
+        task=task,
+        quality=dataset.quality or "unknown",
+        corruption=asdict(corruption_of(config)),
+        seed=config.seed,
+        steps=config.steps,
+        preset=config.preset,
+    )
+
+
+def _with_history_window(encoder: Encoder, config: PretrainConfig) -> Encoder:
+    encoder.config = replace(encoder.config, history_window=config.history_window)
+    return encoder
+

@@ -1,0 +1,209 @@
+"""Collect a set in V-D4RL's format, with simulator states, from the actors that ship with the package.
+
+Episode i depends on (seed, i) alone, whatever the number of workers. Shards are written whole, so the same command goes
+on after an interruption and ends in the same files.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import time
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+from vd4rl_pomdp.data.format import disk_error, write_shard
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.policies.actor import Actor, load_actor, read_actor
+from vd4rl_pomdp.runs.folder import jsonable, read_json, write_json
+from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.runs.provenance import command, git_commit, versions
+from vd4rl_pomdp.runs.workers import default_workers, run_jobs
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, get_task
+
+Quality = Literal["random", "medium", "expert", "medium_expert"]
+_RUNTIME_FIELDS = ("out", "workers")
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """Settings of `vd4rl-pomdp data collect`."""
+
+    task: str
+    """walker_walk, cheetah_run or humanoid_walk."""
+    quality: Quality
+    """Whose episodes: random actions, the medium or the expert actor, or half of each of the two."""
+    out: Path
+    """Folder of the set."""
+    episodes: int = 200
+    """Episodes in all, 501 rows each (V-D4RL's sets have 200)."""
+    seed: int = 0
+    """Seed of initial states and actions."""
+    workers: int = default_workers()
+    """Processes that simulate and render."""
+    render: Literal["fast", "exact"] = "fast"
+    """fast: a smaller shadow map, 0.03 of 255 away from exact; exact: dm_control's default."""
+    episodes_per_shard: int = 50
+    """Episodes in a shard."""
+    actor: Path | None = None
+    """An actor file to use instead of the shipped one (not for random or medium_expert)."""
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One episode to roll out."""
+
+    task: str
+    episode: int
+    seed: int
+    actor: Actor | None
+    render: Literal["fast", "exact"]
+    length: int
+
+
+def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Path]:
+    """Collect the set, or what is missing of it; returns its shards.
+
+    Args:
+        config: what to collect.
+        length: decisions an episode; everything but tests keeps the benchmark's.
+    """
+    get_task(config.task)
+    if config.episodes < 1 or config.episodes_per_shard < 1:
+        raise UserError("--episodes and --episodes-per-shard must be at least 1")
+    plan = list(_plan(config))
+    _claim(config, [actor for _, _, actor in plan])
+    started, frames = time.monotonic(), 0
+    with ProgressLine("collect", config.episodes, "episodes") as progress:
+        for path, episodes, actor in plan:
+            if path.exists():
+                progress.advance(len(episodes))
+                continue
+            jobs = [_Job(config.task, i, config.seed, actor, config.render, length) for i in episodes]
+            rollouts = []
+            for rollout in run_jobs(_roll_out, jobs, config.workers):
+                rollouts.append(rollout)
+                frames += len(rollout["reward"])
+                speed = frames / (time.monotonic() - started)
+                progress.advance(1, ret=float(rollout["reward"].sum()), frames_per_s=speed)
+            write_shard(path, _join(rollouts), _attributes(config, path, actor))
+    seconds = time.monotonic() - started
+    _record(config, seconds, frames)
+    return [path for path, _, _ in plan]
+
+
+def episode_seed(seed: int, episode: int) -> int:
+    """Environment seed of an episode of a set."""
+    digest = hashlib.blake2b(f"{seed}/{episode}".encode(), digest_size=4).digest()
+    return int.from_bytes(digest, "little") & 0x7FFFFFFF
+
+
+def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Actor | None]]:
+    """Shards to write: file, episode numbers, actor. medium_expert is all medium shards, then all expert ones."""
+    halves = ["medium", "expert"] if config.quality == "medium_expert" else [config.quality]
+    first = 0
+    for number, quality in enumerate(halves):
+        stop = config.episodes * (number + 1) // len(halves)
+        actor = _actor(config, quality)
+        for shard, start in enumerate(range(first, stop, config.episodes_per_shard)):
+            episodes = range(start, min(start + config.episodes_per_shard, stop))
+            # V-D4RL reads shards sorted by name: medium precedes expert there only by our own order
+            yield config.out / f"{shard}_{config.task}_{quality}.hdf5", episodes, actor
+        first = stop
+
+
+def _actor(config: CollectConfig, quality: str) -> Actor | None:
+    if quality == "random":
+        return None
+    if config.actor is None:
+        return load_actor(config.task, quality)
+    if config.quality == "medium_expert":
+        raise UserError("--actor cannot stand for two actors: collect medium and expert apart")
+    return read_actor(config.actor, get_task(config.task))
+
+
+def _roll_out(job: _Job) -> dict[str, np.ndarray]:
+    """Rows of one episode, by key."""
+    env = _environment(job.task, job.render, job.length)
+    rng = np.random.default_rng([job.seed, job.episode])
+    row = env.reset(episode_seed(job.seed, job.episode))
+    action = np.zeros(env.task.action_dim, np.float32)
+    rows = [(row, action)]
+    while not row.last:
+        if job.actor is None:
+            action = rng.uniform(-1.0, 1.0, env.task.action_dim).astype(np.float32)
+        else:
+            action = job.actor.act(row.state, rng)
+        row = env.step(action)
+        rows.append((row, action))
+    return {
+        "observation": np.stack([r.frame for r, _ in rows]),
+        "action": np.stack([a for _, a in rows]),
+        "reward": np.array([r.reward for r, _ in rows]),
+        "discount": np.array([r.discount for r, _ in rows]),
+        "step_type": np.array([int(r.step_type) for r, _ in rows]),
+        "physics": np.stack([r.physics for r, _ in rows]),
+    }
+
+
+_ENVIRONMENTS: dict[tuple, Any] = {}
+
+
+def _environment(*arguments: Any) -> Any:
+    """The process's environment for these arguments: one GL context serves all its episodes."""
+    from vd4rl_pomdp.envs.dmc import PixelEnv
+
+    if arguments not in _ENVIRONMENTS:
+        task, render, length = arguments
+        _ENVIRONMENTS[arguments] = PixelEnv(task, render, length=length)
+    return _ENVIRONMENTS[arguments]
+
+
+def _join(rollouts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    return {key: np.concatenate([rollout[key] for rollout in rollouts]) for key in rollouts[0]}
+
+
+def _attributes(config: CollectConfig, path: Path, actor: Actor | None) -> dict[str, Any]:
+    return {
+        "task": config.task,
+        "set": config.quality,
+        "policy": path.stem.split("_", 1)[1].removeprefix(f"{config.task}_"),
+        "seed": config.seed,
+        "render": config.render,
+        "actor_sha256": actor.sha256 if actor else None,
+        "versions": {k: v for k, v in versions().items() if k in ("mujoco", "dm-control", "vd4rl-pomdp")},
+    }
+
+
+def _claim(config: CollectConfig, actors: list[Actor | None]) -> None:
+    """Write collection.json, or check that the folder holds the same collection."""
+    settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS}
+    settings["actors"] = sorted({actor.sha256 for actor in actors if actor is not None})
+    path = config.out / "collection.json"
+    if path.exists():
+        stored = read_json(path)
+        differing = sorted(k for k in settings if stored.get(k) != settings[k])
+        if differing:
+            raise UserError(f"{config.out}: holds a set collected with another {', '.join(differing)}; choose another --out")
+        return
+    if config.out.exists() and any(config.out.iterdir()):
+        raise UserError(f"{config.out}: is not empty and holds no collected set; choose another --out")
+    try:
+        config.out.mkdir(parents=True, exist_ok=True)
+        write_json(path, settings)
+    except OSError as error:
+        raise disk_error(path, error) from error
+
+
+def _record(config: CollectConfig, seconds: float, frames: int) -> None:
+    """Keep what a repeated collection would not reproduce."""
+    if not frames:
+        return
+    from vd4rl_pomdp.envs.parity import render_info
+
+    facts = {"seconds": round(seconds, 1), "frames": frames, "workers": config.workers}
+    origin = {"command": command(), "git_commit": git_commit(), "versions": versions()}
+    write_json(config.out / "provenance.json", facts | origin | {"render": render_info()})

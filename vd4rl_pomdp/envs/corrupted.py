@@ -1,0 +1,61 @@
+"""The environment a policy meets: stacked frames, corrupted once a step by the class that corrupts the data."""
+
+from __future__ import annotations
+
+from collections import deque
+from dataclasses import dataclass
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys, make_corruption
+from vd4rl_pomdp.envs.dmc import PixelEnv, Row
+from vd4rl_pomdp.envs.rendering import Render
+from vd4rl_pomdp.tasks import FRAME_STACK
+from vd4rl_pomdp.types import row_key
+
+
+@dataclass(frozen=True)
+class Observation:
+    """What one step shows."""
+
+    obs: Tensor
+    """(C, 84, 84) uint8: the corrupted stack, all the agent may see."""
+    clean: Tensor
+    """(C, 84, 84) uint8: the stack before corruption."""
+    row: Row
+    """Reward, step type and simulator state."""
+
+
+class CorruptedEnv:
+    """A task with stacked, corrupted frames. Row t of an episode is corrupted by keys of (seed, episode, t)."""
+
+    def __init__(
+        self, task: str, corruption: CorruptionConfig, render: Render = "fast", length: int | None = None
+    ) -> None:
+        self.env = PixelEnv(task, render, length=length)
+        self._corruption = make_corruption(corruption)
+        self._frames: deque[np.ndarray] = deque(maxlen=FRAME_STACK)
+        self._seed, self._episode, self._t = 0, 0, 0
+
+    def reset(self, environment_seed: int, corruption_seed: int = 0, episode: int = 0) -> Observation:
+        """Begin an episode; its corruption is drawn from (corruption_seed, episode)."""
+        self._seed, self._episode, self._t = corruption_seed, episode, 0
+        row = self.env.reset(environment_seed)
+        assert row.frame is not None
+        self._frames.extend([row.frame] * FRAME_STACK)
+        return self._observe(row)
+
+    def step(self, action: np.ndarray) -> Observation:
+        """Apply an (A,) float32 action."""
+        row = self.env.step(action)
+        assert row.frame is not None
+        self._frames.append(row.frame)
+        self._t += 1
+        return self._observe(row)
+
+    def _observe(self, row: Row) -> Observation:
+        clean = torch.from_numpy(np.concatenate(self._frames))
+        key = derive_keys(self._seed, row_key(torch.tensor([self._episode]), torch.tensor([self._t])))
+        return Observation(self._corruption(clean[None], key)[0], clean, row)

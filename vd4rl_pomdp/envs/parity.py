@@ -1,0 +1,103 @@
+"""Does the environment show the pixels that the data shows? Canary frames against golden ones, and data against both."""
+
+from __future__ import annotations
+
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.envs.dmc import PixelEnv, start_from
+from vd4rl_pomdp.envs.rendering import ASSETS, Render, frame, frames_hash, gl_strings
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import TASKS
+
+MAX_MEAN_DIFFERENCE = 0.25
+"""Largest mean absolute difference (of 255) that counts as the same pixels.
+
+Measured: 0.01 between mujoco 3.1.6 and 3.11.0 with the sky restored, 0.03 with the smaller shadow map, 1.4 to 2.1
+without the sky. Rasterisers of different vendors may differ along edges, hence the room above 0.03.
+"""
+_OFF_BY = 8
+_STATIC_STD = 2.0
+
+
+def canary_frames(task: str, render: Render = "exact") -> np.ndarray:
+    """Frames of the golden file's states as this machine renders them: (F, 3, 84, 84) uint8."""
+    return _show_golden_states(PixelEnv(task, render))
+
+
+def render_info(task: str = "walker_walk") -> dict[str, Any]:
+    """What rendered: versions, GL vendor and renderer, and the hash of the canary frames."""
+    env = PixelEnv(task, "exact")  # its GL context must live while its strings are read
+    frames = _show_golden_states(env)
+    return {"mujoco": mujoco.__version__, **gl_strings(), "canary": frames_hash(frames)}
+
+
+def compare(rendered: np.ndarray, reference: np.ndarray) -> dict[str, Any]:
+    """Mean absolute difference, share of pixels off by more than 8 of 255, and whether they count as equal."""
+    difference = np.abs(rendered.astype(np.int16) - reference)
+    mean = float(difference.mean())
+    return {
+        "mean_difference": round(mean, 4),
+        "share_off_by_8": round(float((difference > _OFF_BY).mean()), 5),
+        "equal": mean <= MAX_MEAN_DIFFERENCE,
+    }
+
+
+def check_parity(path: Path | None = None) -> dict[str, Any]:
+    """Compare canary frames with golden ones, and a set's static background with the environment's.
+
+    Args:
+        path: a data set; None compares the canaries alone.
+
+    Returns:
+        `render`, `canary` (a comparison for every task), `background` (one, or None), and the verdict `equal`.
+    """
+    canary = {task: compare(canary_frames(task), _golden()[f"{task}/frames"]) for task in TASKS}
+    background = None if path is None else _compare_background(path)
+    comparisons = [*canary.values(), *([background] if background else [])]
+    equal = all(comparison["equal"] for comparison in comparisons)
+    return {"render": render_info(), "canary": canary, "background": background, "equal": equal}
+
+
+def _compare_background(path: Path) -> dict[str, Any]:
+    """Median frames of data and environment, on the pixels that are static in both."""
+    dataset = open_dataset(path)
+    if dataset.task is None:
+        raise UserError(f"{path}: cannot tell the task; put the set in a folder named after it, such as walker_walk/")
+    rows = np.linspace(0, dataset.num_rows - 1, min(dataset.num_rows, 400)).astype(int)
+    data, ours = dataset.frames.numpy()[rows], _wandering_frames(dataset.task)
+    static = (data.std(0) < _STATIC_STD) & (ours.std(0) < _STATIC_STD)
+    if not static.any():
+        raise UserError(f"{path}: no pixel is static in both the set and the environment; its frames are not this task's")
+    result = compare(np.median(ours, 0)[static], np.median(data, 0)[static])
+    return {"task": dataset.task, "static_pixels": int(static.sum()), **result}
+
+
+def _wandering_frames(task: str, count: int = 100) -> np.ndarray:
+    """Frames of a short random episode: (count, 3, 84, 84) uint8."""
+    env = PixelEnv(task)
+    rng = np.random.default_rng(0)
+    rows = [env.reset(0)]
+    while len(rows) < count:
+        rows.append(env.step(rng.uniform(-1, 1, env.task.action_dim).astype(np.float32)))
+    return np.stack([row.frame for row in rows if row.frame is not None])
+
+
+def _show_golden_states(env: PixelEnv) -> np.ndarray:
+    frames = []
+    for state in _golden()[f"{env.task.name}/physics"]:
+        start_from(env.simulator, state)
+        frames.append(frame(env.physics))
+    return np.stack(frames)
+
+
+@cache
+def _golden() -> dict[str, np.ndarray]:
+    """`<task>/physics` states and the `<task>/frames` that mujoco 3.1.6 shows for them."""
+    with np.load(ASSETS / "golden.npz") as file:
+        return dict(file)

@@ -1,0 +1,89 @@
+"""Rendering as V-D4RL's frames show it: the old skybox restored, a cheaper shadow map, headless by default.
+
+From mujoco 3.2.0 on the random stars of dm_control's sky are drawn from another seed, so an encoder pretrained on
+V-D4RL would be evaluated under another sky. The sky of mujoco 3.1.6 is written back before the first render.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import os
+from functools import cache
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+
+os.environ.setdefault("MUJOCO_GL", "egl")
+os.environ.setdefault("LP_NUM_THREADS", "1")  # software rendering scales by processes, not by threads
+
+import mujoco
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import FRAME_SIZE
+
+Render = Literal["fast", "exact"]
+ASSETS = Path(__file__).parent / "assets"
+TRIED_MUJOCO = ((3, 3), (3, 12))
+"""Lowest version and first version not supported: from 3.12 on floor textures are anchored elsewhere."""
+_FAST_SHADOW_SIZE = 512
+
+
+def check_mujoco(version: str = mujoco.__version__) -> None:
+    """Refuse a mujoco whose pixels were never compared with the data's."""
+    low, high = TRIED_MUJOCO
+    if not low <= tuple(int(part) for part in version.split(".")[:2]) < high:
+        raise UserError(
+            f"mujoco {version} renders other pixels than the data (tried: {low[0]}.{low[1]} to below "
+            f"{high[0]}.{high[1]}); install the tried pair with `pip install 'dm-control==1.0.44' 'mujoco==3.11.0'`"
+        )
+
+
+def prepare(physics: Any, render: Render) -> None:
+    """Restore the old sky and set the shadow map's size; must be called before the first render of `physics`."""
+    check_mujoco()
+    model = physics.model
+    sky = _sky()
+    number = next(i for i in range(model.ntex) if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
+    start = model.tex_adr[number]
+    size = model.tex_width[number] * model.tex_height[number] * model.tex_nchannel[number]
+    assert size == sky.size, "the skybox has another size than the one to restore"
+    model.tex_data[start : start + size] = sky
+    if render == "fast":
+        model.vis.quality.shadowsize = _FAST_SHADOW_SIZE
+
+
+def frame(physics: Any) -> np.ndarray:
+    """Camera 0 as V-D4RL stores it: (3, 84, 84) uint8."""
+    try:
+        image = physics.render(FRAME_SIZE, FRAME_SIZE, camera_id=0)
+    except (ImportError, AttributeError, RuntimeError) as error:
+        raise UserError(
+            f"cannot render without a display ({str(error).splitlines()[0]}): install Debian's libegl1 and "
+            "libgl1-mesa-dri, or libosmesa6 with MUJOCO_GL=osmesa"
+        ) from error
+    return np.ascontiguousarray(image.transpose(2, 0, 1))
+
+
+@cache
+def _sky() -> np.ndarray:
+    """Bytes of the skybox texture of mujoco 3.1.6: 11,520,000 uint8 (six faces of 800x800 RGB)."""
+    with np.load(ASSETS / "skybox.npz") as file:
+        return file["sky"]
+
+
+def gl_strings() -> dict[str, str]:
+    """Vendor and renderer of the current GL context; empty strings before anything was rendered."""
+    try:
+        from OpenGL import GL
+
+        values = [GL.glGetString(name) for name in (GL.GL_VENDOR, GL.GL_RENDERER)]
+    except (ImportError, AttributeError):
+        values = [None, None]
+    vendor, renderer = (value.decode() if value else "" for value in values)
+    return {"gl_vendor": vendor, "gl_renderer": renderer}
+
+
+def frames_hash(frames: np.ndarray) -> str:
+    """Short hash of a batch of frames."""
+    return hashlib.blake2b(np.ascontiguousarray(frames), digest_size=8).hexdigest()
