@@ -1,0 +1,1 @@
+"""Stage one: representations from pixels and actions alone."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from pathlib import Path
 
@@ -33,33 +34,45 @@ def open_dataset(path: Path | str, cache: Path | None = None) -> Dataset:
 
 
 class Dataset:
-    """Rows of a V-D4RL set with their episodes. All tensors live on one device; frames are mapped until `to` moves them."""
+    """Rows of a V-D4RL set with their episodes; made by `open_dataset`.
+
+    All tensors live on one device; frames are a read-only map shared with other processes until `to` moves them.
+    """
 
     def __init__(self, path: Path, store: Store) -> None:
         self.path = path
         self.store = store
-        self.fingerprint = store.folder.name
+        self.fingerprint = store.fingerprint
+        """Name of the set's content, the same for copies of the set."""
         self.task, self.quality = _identity(path, store)
-        step_type = _required(store, "step_type")
-        self.frames = torch.from_numpy(_writable_view(store.frames()))
-        """(N, 3, 84, 84) uint8."""
-        self.action = torch.from_numpy(_required(store, "action"))
+        """Names as in `tasks`, None where neither the shards nor the folders tell."""
+        step_type, reward = store.array("step_type"), store.array("reward")
+        self.frames = _read_only_tensor(store.frames())
+        """(N, 3, 84, 84) uint8; mapped memory: writing into it kills the process."""
+        self.action = torch.from_numpy(store.array("action"))
         """(N, A) float32: row t holds a_{t-1}."""
-        self.reward = torch.from_numpy(_required(store, "reward").astype(np.float32))
+        self.reward = torch.from_numpy(reward.astype(np.float32))
         """(N,) float32: row t holds r_{t-1}."""
-        self.discount = torch.from_numpy(_required(store, "discount").astype(np.float32))
-        self.physics = store.array("physics")
-        """(N, P) float64 simulator states, or None for published sets."""
+        self.discount = torch.from_numpy(store.array("discount").astype(np.float32))
+        """(N,) float32: row t holds the discount of the step into it."""
+        self.step_type = torch.from_numpy(step_type)
+        """(N,) uint8: `types.StepType`."""
+        self.physics = store.physics()
+        """(N, P) float64 simulator states (numpy, on the CPU), or None for published sets."""
         starts = np.flatnonzero(step_type == StepType.FIRST)
         ends = np.append(starts[1:], len(step_type))
         self.episode_start, self.episode_end = torch.from_numpy(starts), torch.from_numpy(ends)
         """(E,) int64: first row of every episode, and the row after its last."""
         self.incomplete_episodes = int((step_type[ends - 1] != StepType.LAST).sum())
+        """Episodes that end without a LAST row; they are used like the others."""
         lengths = self.episode_end - self.episode_start
         self.episode = torch.repeat_interleave(torch.arange(len(starts)), lengths)
         """(N,) int64: episode of every row."""
         self.t = torch.arange(len(step_type)) - self.episode_start[self.episode]
         """(N,) int64: row within its episode."""
+        reward[starts] = 0.0
+        self.returns = torch.from_numpy(np.add.reduceat(reward, starts))
+        """(E,) float64: undiscounted return of every episode."""
 
     @property
     def num_rows(self) -> int:
@@ -81,17 +94,11 @@ class Dataset:
         """Action dimension A."""
         return self.action.shape[1]
 
-    @property
-    def returns(self) -> Tensor:
-        """(E,) float64: undiscounted return of every episode."""
-        total = torch.zeros(self.num_episodes, dtype=torch.float64, device=self.reward.device)
-        inside = self.t > 0
-        return total.index_add_(0, self.episode[inside], self.reward[inside].double())
-
     def to(self, device: torch.device | str) -> Dataset:
-        """Move frames and rows to a device, in place."""
-        for name in ("frames", "action", "reward", "discount", "episode_start", "episode_end", "episode", "t"):
-            setattr(self, name, getattr(self, name).to(device))
+        """Move frames and rows to a device, in place; returns the data set."""
+        for name, value in vars(self).items():
+            if isinstance(value, Tensor):
+                setattr(self, name, value.to(device))
         return self
 
     def keys(self, rows: Tensor) -> Tensor:
@@ -99,12 +106,16 @@ class Dataset:
         return row_key(self.episode[rows], self.t[rows])
 
     def stacks(self, rows: Tensor, frame_stack: int = FRAME_STACK) -> Tensor:
-        """Frame stacks (..., 3 * frame_stack, 84, 84) uint8 of (...,) rows, oldest frame first, within the episode."""
+        """Frame stacks (..., 3 * frame_stack, 84, 84) uint8 of (...,) int64 rows, oldest frame first.
+
+        A stack never reaches before its episode: there the first frame is repeated.
+        """
+        _require_positive(frame_stack=frame_stack)
         back = torch.arange(frame_stack - 1, -1, -1, device=rows.device)
         first = self.episode_start[self.episode[rows]]
         index = torch.maximum(rows[..., None] - back, first[..., None])
         frames = self.frames.index_select(0, index.reshape(-1))
-        return frames.view(*rows.shape, -1, *self.frames.shape[2:])
+        return frames.view(*rows.shape, 3 * frame_stack, *self.frames.shape[2:])
 
     def transitions(
         self, index: Index, n_step: int = 1, frame_stack: int = FRAME_STACK, gamma: float = 0.99
@@ -119,10 +130,13 @@ class Dataset:
 
         Returns:
             `Transitions`. With m = min(n_step, steps left), `reward` is the sum of gamma^i r_{t+i} for i < m and
-            `discount` the product of the m stored discounts times gamma^(m-1): the learner multiplies one more gamma,
-            so that for n_step = 1 both are what the set holds.
+            `discount` the product of the m stored discounts times gamma^(m-1). The learner multiplies its own gamma
+            once more (acme's convention), also where m is cut short, so that for n_step = 1 both are as stored.
+
+        Raises:
+            IndexError: an index is out of range.
         """
-        rows = self._transition_rows(self._index(index, self.num_transitions))
+        rows = self._starts(self._index(index, self.num_transitions), self._per_episode(2))
         reward, discount, next_rows = self.n_step_returns(rows, n_step, gamma)
         return Transitions(
             obs=self.stacks(rows, frame_stack),
@@ -135,18 +149,21 @@ class Dataset:
         )
 
     def n_step_returns(self, rows: Tensor, n_step: int, gamma: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Reward, discount (see `transitions`) and successor row of the n-step transition from each row."""
-        last = self.episode_end[self.episode[rows]] - 1
-        reward, discount = torch.zeros_like(self.reward[rows]), torch.ones_like(self.reward[rows])
-        for i in range(n_step):
-            inside = rows + i < last
-            step = torch.where(inside, rows + i + 1, rows)
-            reward = reward + torch.where(inside, discount * self.reward[step] * (gamma if i else 1.0), 0.0)
-            discount = torch.where(inside, discount * self.discount[step] * (gamma if i else 1.0), discount)
-        return reward, discount, torch.minimum(rows + n_step, last)
+        """Reward and discount (B,) float32 (see `transitions`) and successor (B,) of each of (B,) int64 rows.
+
+        An episode's last row has no successor: there they are 0, 1 and the row itself.
+        """
+        _require_positive(n_step=n_step)
+        last = (self.episode_end - 1)[self.episode[rows]]
+        step = torch.arange(n_step, device=rows.device)
+        inside = rows[:, None] + step < last[:, None]
+        paid = torch.minimum(rows[:, None] + step + 1, last[:, None])
+        reward = (self.reward[paid] * gamma**step * inside).sum(1)
+        product = torch.where(inside, self.discount[paid], 1.0).prod(1)
+        return reward, product * gamma ** (inside.sum(1) - 1).clamp(min=0), torch.minimum(rows + n_step, last)
 
     def num_windows(self, length: int) -> int:
-        """Windows of `length` consecutive rows of one episode; a shorter episode raises UserError."""
+        """Number of windows of `length` consecutive rows of one episode; raises UserError as `windows` does."""
         return int(self._windows_per_episode(length).sum())
 
     def windows(self, index: Index, length: int, frame_stack: int = FRAME_STACK) -> Windows:
@@ -156,12 +173,16 @@ class Dataset:
             index: (B,) numbers in 0..num_windows(length)-1; they count all starts within episodes, in order.
             length: rows T of each window.
             frame_stack: frames in an observation; a stack may reach before its window, never before its episode.
+
+        Returns:
+            `Windows`, none of them padded. `action` of the last row is the next row's, outside the window, if any.
+
+        Raises:
+            UserError: an episode is shorter than the window.
+            IndexError: an index is out of range.
         """
         per_episode = self._windows_per_episode(length)
-        number = self._index(index, int(per_episode.sum()))
-        ends = per_episode.cumsum(0)
-        episode = torch.searchsorted(ends, number, right=True)
-        start = self.episode_start[episode] + number - (ends[episode] - per_episode[episode])
+        start = self._starts(self._index(index, int(per_episode.sum())), per_episode)
         rows = start[:, None] + torch.arange(length, device=start.device)
         has_action = rows + 1 < self.episode_end[self.episode[rows]]
         action = self.action[torch.where(has_action, rows + 1, rows)] * has_action[..., None]
@@ -176,44 +197,58 @@ class Dataset:
         )
 
     def _windows_per_episode(self, length: int) -> Tensor:
-        count = self.episode_end - self.episode_start - length + 1
-        short = torch.nonzero(count < 1)
+        _require_positive(length=length)
+        short = torch.nonzero(self.episode_end - self.episode_start < length)
         if len(short):
             episode = int(short[0, 0])
             rows = int(self.episode_end[episode] - self.episode_start[episode])
             raise UserError(
-                f"{self.path}: episode {episode} has {rows} rows, fewer than the window of {length}; "
-                "lower --window or remove the episode"
+                f"{self.path}: episode {episode} has {rows} rows, fewer than the window of {length} "
+                f"({len(short)} such episodes); choose a shorter window"
             )
-        return count
+        return self._per_episode(length)
 
-    def _transition_rows(self, number: Tensor) -> Tensor:
-        """Row of every transition: each episode has one row more than transitions."""
-        ends = (self.episode_end - self.episode_start - 1).cumsum(0)
-        return number + torch.searchsorted(ends, number, right=True)
+    def _per_episode(self, length: int) -> Tensor:
+        """(E,) rows from which `length` consecutive rows stay inside the episode: transitions for 2."""
+        return (self.episode_end - self.episode_start - (length - 1)).clamp(min=0)
+
+    def _starts(self, number: Tensor, per_episode: Tensor) -> Tensor:
+        """Row of the start called `number` when each episode has `per_episode` of them, from its first row on."""
+        ends = per_episode.cumsum(0)
+        episode = torch.searchsorted(ends, number, right=True)
+        return self.episode_start[episode] + number - (ends - per_episode)[episode]
 
     def _index(self, index: Index, size: int) -> Tensor:
-        number = torch.atleast_1d(torch.as_tensor(index, device=self.t.device)).long()
-        if len(number) and not (0 <= int(number.min()) and int(number.max()) < size):
-            raise IndexError(f"index out of range: the set has {size}")
-        return number
+        """`index` as (B,) int64 on the set's device; checked where it is, so a CPU index never waits for a GPU."""
+        number = torch.atleast_1d(torch.as_tensor(index))
+        if number.is_floating_point() or number.is_complex() or number.dtype == torch.bool or number.ndim != 1:
+            if number.numel():
+                raise IndexError(f"an index is an integer or a flat list of them, not {number.dtype} {number.ndim}-D")
+        elif len(number) and not (0 <= int(number.min()) and int(number.max()) < size):
+            raise IndexError(f"index {int(number.min())}..{int(number.max())} is outside 0..{size - 1}")
+        return number.to(self.t.device, torch.int64)
 
 
-def _required(store: Store, key: str) -> np.ndarray:
-    array = store.array(key)
-    assert array is not None, key
-    return array
+def _require_positive(**values: int) -> None:
+    for name, value in values.items():
+        if value < 1:
+            raise UserError(f"{name} is {value}; it must be at least 1")
 
 
-def _writable_view(frames: np.ndarray) -> np.ndarray:
-    """The same memory, declared writable: torch warns about read-only arrays, and nothing writes to it."""
-    return np.frombuffer(np.memmap(frames.filename, np.uint8, "c"), np.uint8).reshape(frames.shape)  # type: ignore[attr-defined]
+def _read_only_tensor(array: np.ndarray) -> Tensor:
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # meant: see `Dataset.frames`
+        return torch.from_numpy(array)
 
 
 def _identity(path: Path, store: Store) -> tuple[str | None, str | None]:
-    """Task and quality: as the shards say, else as the folders are named."""
-    attributes = store.meta["attributes"][0]
-    parts = path.resolve().parts
-    task = attributes.get("task") or next((p for p in reversed(parts) if p in TASKS), None)
-    quality = attributes.get("set") or next((p for p in reversed(parts) if p in QUALITIES), None)
-    return task, quality
+    """Task and quality of a set: as all its shards say, else as its folders are named."""
+    return _name(path, store, "task", tuple(TASKS)), _name(path, store, "set", QUALITIES)
+
+
+def _name(path: Path, store: Store, attribute: str, choices: tuple[str, ...]) -> str | None:
+    stored = {attributes.get(attribute) for attributes in store.meta["attributes"]} - {None}
+    if len(stored) > 1:
+        raise UserError(f"{path}: its shards come from {' and '.join(sorted(stored))}; keep one set in a folder")
+    named = (part for part in reversed(path.resolve().parts) if part in choices)
+    return stored.pop() if stored else next(named, None)

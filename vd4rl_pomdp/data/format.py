@@ -10,9 +10,11 @@ A set is a folder of shards. Its rows are those of all shards in order; an episo
 from __future__ import annotations
 
 import errno
+import io
 import json
 import re
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -25,15 +27,23 @@ from vd4rl_pomdp.types import StepType
 
 FRAME_SHAPE = (3, FRAME_SIZE, FRAME_SIZE)
 SUFFIXES = (".hdf5", ".h5")
-_KEYS = {"observation": 4, "action": 2, "reward": 1, "discount": 1, "step_type": 1}
+FRAMES_KEY = "observation"
+_ROW_KEYS = {"action": 2, "reward": 1, "discount": 1, "step_type": 1, "physics": 2}
+_OPTIONAL = "physics"
+_WRITTEN = {FRAMES_KEY: "uint8", "action": "float32", "step_type": "int64"}
 _ATTRIBUTE = "vd4rl_pomdp"
+_BLOCK_ROWS = 1024
+_REPAIR = "download or collect it again"
 
 
 def shard_paths(folder: Path) -> list[Path]:
-    """Shards of a set in the order of their rows.
+    """Shards of a set in the order of their rows; `folder` may also name a single shard.
 
     Sorted by name without its leading number, then by that number, digits compared as numbers: `10_mixed` follows
-    `9_mixed`, and the two halves of a medium_expert folder are not interleaved.
+    `9_mixed`, and the two halves of a medium_expert folder are not interleaved. Hidden files are no shards.
+
+    Raises:
+        UserError: there is no such folder, or no shard in it.
     """
     if folder.is_file():
         return [folder]
@@ -41,34 +51,39 @@ def shard_paths(folder: Path) -> list[Path]:
         raise UserError(f"{folder}: no such folder; collect a set there or download one with `vd4rl-pomdp data`")
     shards = [p for p in folder.iterdir() if p.suffix in SUFFIXES and not p.name.startswith(".")]
     if not shards:
-        raise UserError(f"{folder}: holds no .hdf5 shards; name the folder that contains them")
-    return sorted(shards, key=lambda path: _shard_order(path.stem))
+        inner = next((p.parent for suffix in SUFFIXES for p in sorted(folder.rglob(f"[!.]*{suffix}"))), None)
+        hint = f"name a folder of shards such as {inner}" if inner else "collect or download a set there"
+        raise UserError(f"{folder}: holds no .hdf5 shards; {hint}")
+    return sorted(shards, key=_shard_order)
 
 
-def _shard_order(stem: str) -> tuple[Any, ...]:
-    number, rest = re.fullmatch(r"(\d*)(.*)", stem, re.DOTALL).groups()  # type: ignore[union-attr]
+def shard_number(path: Path) -> tuple[str, int | None]:
+    """Name of a shard without its leading number, and that number (None if the name has none)."""
+    number, rest = re.fullmatch(r"(\d*)(.*)", path.stem, re.DOTALL).groups()  # type: ignore[union-attr]
+    return rest, int(number) if number else None
+
+
+def _shard_order(path: Path) -> tuple[list[tuple[int, str]], int]:
+    rest, number = shard_number(path)
     words = [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", rest)]
-    return words, int(number or -1)
+    return words, -1 if number is None else number
 
 
 def write_shard(path: Path, rows: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> None:
-    """Write one shard; a reader sees it whole or not at all.
+    """Write one shard; a reader sees it whole or not at all. Equal input gives equal bytes.
 
     Args:
-        path: the shard's final name.
-        rows: the arrays of the module's table, by key, of equal length.
-        attributes: JSON values to keep with the shard (task, quality, seed, versions).
+        path: the shard's final name; until it is whole it is a hidden file beside it. One writer at a time.
+        rows: the arrays of the module's table, by key, of equal length; they are stored in the table's dtypes.
+        attributes: JSON values to keep with the shard: `task`, `set` (the quality), seed, versions.
 
     Raises:
         UserError: the disk is full or the folder cannot be written; nothing is left behind.
     """
     temporary = path.with_name(f".{path.name}.tmp")
     try:
-        with h5py.File(temporary, "w", track_order=False) as file:
-            file.attrs[_ATTRIBUTE] = json.dumps(dict(attributes), sort_keys=True)
-            for key, value in rows.items():
-                chunks = (min(len(value), 50), *value.shape[1:]) if key == "observation" else True
-                file.create_dataset(key, data=value, chunks=chunks, compression="gzip", compression_opts=4)
+        # compressed in memory: HDF5 cannot close a file on a full disk
+        temporary.write_bytes(_encode(rows, attributes))
         temporary.replace(path)
     except OSError as error:
         raise disk_error(path, error) from error
@@ -76,11 +91,22 @@ def write_shard(path: Path, rows: Mapping[str, np.ndarray], attributes: Mapping[
         temporary.unlink(missing_ok=True)
 
 
+def _encode(rows: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> bytes:
+    buffer = io.BytesIO()
+    with h5py.File(buffer, "w") as file:
+        file.attrs[_ATTRIBUTE] = json.dumps(dict(attributes), sort_keys=True)
+        for key, value in rows.items():
+            data = np.asarray(value, _WRITTEN.get(key, "float64"))
+            chunks = (min(len(data), 50), *FRAME_SHAPE) if key == FRAMES_KEY else True
+            file.create_dataset(key, data=data, chunks=chunks, compression="gzip", compression_opts=4)
+    return buffer.getvalue()
+
+
 def disk_error(path: Path, error: OSError) -> UserError:
     """A sentence for a failed write."""
-    full = error.errno == errno.ENOSPC or "No space left" in str(error)
-    what = "the disk is full: free some space and start the same command again" if full else f"cannot write ({error})"
-    return UserError(f"{path}: {what}")
+    if error.errno in (errno.ENOSPC, errno.EDQUOT):
+        return UserError(f"{path}: the disk is full: free some space and start the same command again")
+    return UserError(f"{path}: cannot write ({error.strerror or error}); check the folder or choose another")
 
 
 def read_attributes(path: Path) -> dict[str, Any]:
@@ -89,53 +115,90 @@ def read_attributes(path: Path) -> dict[str, Any]:
         return json.loads(file.attrs.get(_ATTRIBUTE, "{}"))
 
 
+def read_dtypes(path: Path) -> dict[str, str]:
+    """Stored dtype of every key of a shard."""
+    with _open(path) as file:
+        return {key: str(file[key].dtype) for key in _present(path, file)}
+
+
 def read_shard(path: Path) -> dict[str, np.ndarray]:
-    """Read and validate one shard.
+    """Read and validate one shard: `read_rows` and, as `observation`, its (N, 3, 84, 84) uint8 frames."""
+    rows = read_rows(path)
+    return {FRAMES_KEY: np.concatenate(list(read_frames(path))), **rows}
+
+
+def read_rows(path: Path) -> dict[str, np.ndarray]:
+    """Read and validate all of a shard but its pixels.
 
     Returns:
-        observation uint8, action float32, reward float64, discount float64, step_type uint8, and physics float64
-        where the shard has it.
+        action (N, A) float32, reward and discount (N,) float64, step_type (N,) uint8, and where the shard has it
+        physics (N, P) float64.
 
     Raises:
         UserError: the file is truncated or no HDF5, lacks a key, or holds a wrong shape, dtype or value.
     """
     with _open(path) as file:
-        missing = [key for key in _KEYS if key not in file]
-        if missing:
-            raise UserError(f"{path}: has no {missing[0]!r}; it is not a V-D4RL shard (keys: {', '.join(file)})")
-        try:
-            rows = {key: file[key][()] for key in [*_KEYS, *(["physics"] if "physics" in file else [])]}
-        except OSError as error:
-            raise UserError(f"{path}: is damaged ({error}); download or collect it again") from error
-    _validate(path, rows)
-    dtypes = {"observation": "uint8", "action": "float32", "step_type": "uint8"}
+        keys = _present(path, file)
+        frames = file[FRAMES_KEY]
+        if frames.dtype != np.uint8 or frames.shape[1:] != FRAME_SHAPE or not len(frames):
+            raise UserError(
+                f"{path}: 'observation' is {frames.dtype} of shape {frames.shape}, expected uint8 (N, 3, 84, 84); "
+                "take a set of 84-pixel frames"
+            )
+        rows = {key: file[key][()] for key in keys if key != FRAMES_KEY}
+        count = len(frames)
+    for key, value in rows.items():
+        _validate(path, key, value, count)
+    dtypes = {"action": "float32", "step_type": "uint8"}
     return {key: value.astype(dtypes.get(key, "float64"), copy=False) for key, value in rows.items()}
 
 
-def _open(path: Path) -> h5py.File:
+def read_frames(path: Path) -> Iterator[np.ndarray]:
+    """Read the frames of a shard in order, in blocks of (M, 3, 84, 84) uint8 with M some thousand or fewer."""
+    with _open(path) as file:
+        frames = file[FRAMES_KEY]
+        chunk = frames.chunks[0] if frames.chunks else 1
+        rows = max(1, _BLOCK_ROWS // chunk) * chunk  # whole chunks: none is inflated twice
+        for start in range(0, len(frames), rows):
+            yield frames[start : start + rows]
+
+
+@contextmanager
+def _open(path: Path) -> Iterator[h5py.File]:
+    """An open shard; whatever HDF5 cannot read becomes a sentence."""
     try:
-        return h5py.File(path, "r")
-    except OSError as error:
-        raise UserError(f"{path}: is truncated or no HDF5 file ({error}); download or collect it again") from error
+        with h5py.File(path, "r") as file:
+            yield file
+    except UserError:
+        raise
+    except (OSError, RuntimeError, KeyError, ValueError) as error:
+        raise UserError(f"{path}: is truncated, damaged or no HDF5 file ({_one_line(error)}); {_REPAIR}") from error
 
 
-def _validate(path: Path, rows: dict[str, np.ndarray]) -> None:
-    count = len(rows["observation"])
-    for key, value in rows.items():
-        dimensions = _KEYS.get(key, 2)
-        if value.ndim != dimensions or len(value) != count:
-            raise UserError(f"{path}: {key!r} has shape {value.shape}, expected {dimensions} dimensions, {count} rows")
-    frames = rows["observation"]
-    if frames.dtype != np.uint8 or frames.shape[1:] != FRAME_SHAPE:
-        raise UserError(
-            f"{path}: 'observation' is {frames.dtype} of shape {frames.shape}, expected uint8 (N, 3, 84, 84); "
-            "64-pixel sets are not supported"
-        )
-    for key in ("action", "reward", "discount", *(["physics"] if "physics" in rows else [])):
-        if not np.issubdtype(rows[key].dtype, np.floating):
-            raise UserError(f"{path}: {key!r} is {rows[key].dtype}, expected floating point")
-        bad = np.flatnonzero(~np.isfinite(rows[key].reshape(count, -1)).all(1))
-        if len(bad):
-            raise UserError(f"{path}: {key!r} is not finite in row {bad[0]} ({len(bad)} such rows); repair the shard")
-    if not np.isin(rows["step_type"], [int(s) for s in StepType]).all():
-        raise UserError(f"{path}: 'step_type' holds values other than 0, 1 and 2; repair the shard")
+def _one_line(error: Exception) -> str:
+    return " ".join(str(error).split())
+
+
+def _present(path: Path, file: h5py.File) -> list[str]:
+    """The format's keys in a file; a missing one is an error, apart from physics."""
+    keys = [FRAMES_KEY, *_ROW_KEYS]
+    missing = [key for key in keys if key != _OPTIONAL and not isinstance(file.get(key), h5py.Dataset)]
+    if missing:
+        raise UserError(f"{path}: has no {missing[0]!r}, so it is no V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
+    return [key for key in keys if key in file]
+
+
+def _validate(path: Path, key: str, value: np.ndarray, count: int) -> None:
+    """Refuse a wrong shape, dtype or value of one key."""
+    if value.ndim != _ROW_KEYS[key] or len(value) != count or not value.size:
+        expected = f"({count},)" if _ROW_KEYS[key] == 1 else f"({count}, width)"
+        raise UserError(f"{path}: {key!r} has shape {value.shape}, expected {expected}; {_REPAIR}")
+    if key == "step_type":
+        if value.dtype.kind not in "iuf" or not np.isin(value, [int(s) for s in StepType]).all():
+            raise UserError(f"{path}: 'step_type' holds something else than 0, 1 and 2; {_REPAIR}")
+        return
+    if value.dtype.kind != "f":
+        raise UserError(f"{path}: {key!r} is {value.dtype}, expected floating point; {_REPAIR}")
+    bad = np.flatnonzero(~np.isfinite(value.reshape(count, -1)).all(1))
+    if len(bad):
+        raise UserError(f"{path}: {key!r} is not finite in row {bad[0]} ({len(bad)} such rows); {_REPAIR}")

@@ -7,12 +7,16 @@ from collections.abc import Iterator
 import torch
 
 from vd4rl_pomdp.data.dataset import Dataset
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_STACK
 from vd4rl_pomdp.types import Transitions, Windows
 
 
 class WindowSampler:
-    """Windows whose starts are uniform over the set; the draws do not depend on the device."""
+    """Windows whose starts are uniform over the set, drawn with replacement.
+
+    `generator` lives on the CPU, so the draws do not depend on the data set's device; its state is the sampler's state.
+    """
 
     def __init__(
         self,
@@ -27,7 +31,7 @@ class WindowSampler:
         self._count = dataset.num_windows(length)
 
     def sample(self) -> Windows:
-        """The next batch."""
+        """The next batch, on the data set's device."""
         index = torch.randint(self._count, (self._batch_size,), generator=self._generator)
         return self._dataset.windows(index, self._length, self._frame_stack)
 
@@ -37,7 +41,7 @@ class WindowSampler:
 
 
 class TransitionSampler:
-    """Transitions uniform over the set; the draws do not depend on the device."""
+    """Transitions uniform over the set, drawn with replacement; for `generator` see `WindowSampler`."""
 
     def __init__(
         self,
@@ -48,11 +52,13 @@ class TransitionSampler:
         frame_stack: int = FRAME_STACK,
         gamma: float = 0.99,
     ) -> None:
+        if not dataset.num_transitions:
+            raise UserError(f"{dataset.path}: holds no transition; every episode in it is a single row")
         self._dataset, self._batch_size, self._generator = dataset, batch_size, generator
         self._n_step, self._frame_stack, self._gamma = n_step, frame_stack, gamma
 
     def sample(self) -> Transitions:
-        """The next batch."""
+        """The next batch, on the data set's device."""
         index = torch.randint(self._dataset.num_transitions, (self._batch_size,), generator=self._generator)
         return self._dataset.transitions(index, self._n_step, self._frame_stack, self._gamma)
 

@@ -1,29 +1,36 @@
 """The store: a set decoded once into flat memory-mapped arrays that every process of the machine shares.
 
-    <cache>/<fingerprint>/  frames.u8  (N, 3, 84, 84) uint8, each frame once      action.npy ... physics.npy
-                            meta.json  shapes, checksums, attributes (written last)
+    <cache>/<key>/  frames.u8  (N, 3, 84, 84) uint8, each frame once      action.npy ... physics.npy
+                    meta.json  rows, shards, attributes, size and checksum of every file
+
+The key names the shards, their sizes and their times, so a changed set is decoded anew. Decoding happens in a hidden
+folder that is renamed when it is whole, under a lock that dies with its process. The cache may be deleted at any time.
 """
 
 from __future__ import annotations
 
+import fcntl
 import hashlib
 import json
 import os
 import shutil
-import tempfile
+import sys
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.data.format import FRAME_SHAPE, disk_error, read_attributes, read_shard, shard_paths
+from vd4rl_pomdp.data.episodes import join_shards
+from vd4rl_pomdp.data.format import FRAME_SHAPE, disk_error, read_attributes, read_frames, read_rows, shard_paths
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.progress import ProgressLine
-from vd4rl_pomdp.types import StepType
 
-_VERSION = 1
+_VERSION = 2
 _FRAMES = "frames.u8"
+_META = "meta.json"
 
 
 @dataclass(frozen=True)
@@ -32,24 +39,26 @@ class Store:
 
     folder: Path
     meta: dict[str, Any]
-    """rows, checksums by file name, attributes of the first shard, shards."""
+    """rows: N; shards: file names; attributes: of every shard; files: bytes and blake2b by file name."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Name of the set's content: equal for equal rows, wherever and whenever they were written."""
+        checksums = {name: file["blake2b"] for name, file in self.meta["files"].items()}
+        return hashlib.blake2b(json.dumps(checksums, sort_keys=True).encode(), digest_size=12).hexdigest()
 
     def frames(self) -> np.ndarray:
-        """(N, 3, 84, 84) uint8, mapped from the file."""
-        path = self.folder / _FRAMES
-        shape = (self.meta["rows"], *FRAME_SHAPE)
-        if path.stat().st_size != np.prod(shape):
-            raise UserError(f"{path}: has the wrong size; remove {self.folder} and the set is decoded again")
-        return np.memmap(path, np.uint8, "r", shape=shape)
+        """(N, 3, 84, 84) uint8, mapped read-only from the file."""
+        return np.memmap(self.folder / _FRAMES, np.uint8, "r", shape=(self.meta["rows"], *FRAME_SHAPE))
 
-    def array(self, key: str) -> np.ndarray | None:
-        """A small array by key, None if the set does not have it."""
-        path = self.folder / f"{key}.npy"
-        return np.load(path, mmap_mode="r" if key == "physics" else None) if path.exists() else None
+    def array(self, key: str) -> np.ndarray:
+        """Rows of `action` (N, A) float32, `reward` or `discount` (N,) float64, or `step_type` (N,) uint8."""
+        return np.load(self.folder / f"{key}.npy")
 
-    def verify(self) -> bool:
-        """Whether every file still has the checksum it was written with."""
-        return all(_checksum(self.folder / name) == value for name, value in self.meta["checksums"].items())
+    def physics(self) -> np.ndarray | None:
+        """(N, P) float64 simulator states, mapped read-only; None if the set has none."""
+        path = self.folder / "physics.npy"
+        return np.load(path, mmap_mode="r") if path.name in self.meta["files"] else None
 
 
 def default_cache() -> Path:
@@ -58,87 +67,101 @@ def default_cache() -> Path:
     return Path(os.environ.get("VD4RL_POMDP_CACHE") or Path(base) / "vd4rl-pomdp")
 
 
-def fingerprint(shards: list[Path]) -> str:
-    """Name of a set's decoded form; it changes with the names, sizes and times of its shards."""
+def open_store(path: Path, cache: Path | None = None) -> Store:
+    """Open the decoded form of the set at `path`, decoding it first if that was never done.
+
+    Raises:
+        UserError: the set is missing, damaged or incomplete, or the cache cannot be written.
+    """
+    shards = shard_paths(path)
+    folder = (cache or default_cache()) / _key(shards)
+    meta = _read_meta(folder)
+    if meta is None:
+        with _locked(folder):
+            meta = _read_meta(folder) or _decode(shards, folder)
+    return Store(folder, meta)
+
+
+def verify_store(store: Store) -> None:
+    """Recompute every checksum; raises UserError naming the file that has changed since it was decoded."""
+    for name, file in store.meta["files"].items():
+        if _checksum(store.folder / name) != file["blake2b"]:
+            raise UserError(f"{store.folder / name}: is damaged; delete {store.folder} and the set is decoded anew")
+
+
+def _key(shards: Sequence[Path]) -> str:
     stats = [(path.resolve().as_posix(), path.stat().st_size, path.stat().st_mtime_ns) for path in shards]
     return hashlib.blake2b(json.dumps([_VERSION, stats]).encode(), digest_size=12).hexdigest()
 
 
-def open_store(path: Path, cache: Path | None = None) -> Store:
-    """Open the decoded form of the set at `path`, decoding it first if that was never done."""
-    shards = shard_paths(path)
-    root = cache or default_cache()
-    folder = root / fingerprint(shards)
-    if not (folder / "meta.json").exists():
-        _decode(shards, folder)
-    return Store(folder, json.loads((folder / "meta.json").read_text()))
+def _read_meta(folder: Path) -> dict[str, Any] | None:
+    """The folder's meta.json; None unless every file is there in its full size."""
+    if not (folder / _META).is_file():
+        return None
+    meta = json.loads((folder / _META).read_text())
+    files = [(folder / name, file["bytes"]) for name, file in meta["files"].items()]
+    return meta if all(path.is_file() and path.stat().st_size == size for path, size in files) else None
 
 
-def _decode(shards: list[Path], folder: Path) -> None:
-    """Decode into a folder of its own and rename it; whoever of several processes comes second keeps the first's."""
+@contextmanager
+def _locked(folder: Path) -> Iterator[None]:
+    """Let one process at a time decode into a folder; the others wait and find it done."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        scratch = Path(tempfile.mkdtemp(prefix=f".{folder.name}.", dir=folder.parent))
+        file = folder.with_suffix(".lock").open("w")
     except OSError as error:
         raise disk_error(folder.parent, error) from error
+    with file:
+        fcntl.flock(file, fcntl.LOCK_EX)
+        yield
+
+
+def _decode(shards: Sequence[Path], folder: Path) -> dict[str, Any]:
+    """Decode into a hidden folder and rename it; what a killed process left there is removed first."""
+    rows = join_shards(shards, [read_rows(shard) for shard in shards])
+    scratch = folder.with_name(f".{folder.name}.tmp")
+    shutil.rmtree(scratch, ignore_errors=True)
     try:
-        meta = _write_arrays(shards, scratch)
-        meta["checksums"] = {p.name: _checksum(p) for p in sorted(scratch.iterdir())}
-        (scratch / "meta.json").write_text(json.dumps(meta, indent=1))
-        if not folder.exists():
-            scratch.rename(folder)
+        scratch.mkdir()
+        _require_space(scratch, len(rows["reward"]))
+        _write_frames(shards, scratch / _FRAMES, len(rows["reward"]))
+        for key, value in rows.items():
+            np.save(scratch / f"{key}.npy", value)
+        meta = _describe(shards, scratch, len(rows["reward"]))
+        (scratch / _META).write_text(json.dumps(meta, indent=1))
+        shutil.rmtree(folder, ignore_errors=True)  # a damaged one
+        scratch.rename(folder)
     except OSError as error:
-        if not (folder / "meta.json").exists():
-            raise disk_error(folder, error) from error
+        raise disk_error(folder.parent, error) from error
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
+    return meta
 
 
-def _write_arrays(shards: list[Path], scratch: Path) -> dict[str, Any]:
-    parts: dict[str, list[np.ndarray]] = {}
-    with (scratch / _FRAMES).open("wb") as frames, ProgressLine("decode", len(shards), "shards") as progress:
+def _require_space(folder: Path, rows: int) -> None:
+    needed, free = rows * int(np.prod(FRAME_SHAPE)), shutil.disk_usage(folder).free
+    if needed > free:
+        raise UserError(
+            f"{folder.parent}: decoding needs {needed / 1e9:.1f} GB, the disk has {free / 1e9:.1f} GB; "
+            "free some space or set VD4RL_POMDP_CACHE to a folder on another disk"
+        )
+
+
+def _write_frames(shards: Sequence[Path], path: Path, rows: int) -> None:
+    # written, not mapped: a full disk is then an error instead of a signal
+    progress = ProgressLine("decode", rows, "frames") if sys.stderr.isatty() else None
+    with path.open("wb") as file, progress or nullcontext():
         for shard in shards:
-            rows = read_shard(shard)
-            rows.pop("observation").tofile(frames)
-            for key, value in rows.items():
-                parts.setdefault(key, []).append(value)
-            progress.advance()
-    _check_agreement(shards, parts)
-    rows = {key: np.concatenate(value) for key, value in parts.items()}
-    _check_episodes(shards, [len(part) for part in parts["reward"]], rows["step_type"])
-    for key, value in rows.items():
-        np.save(scratch / f"{key}.npy", value)
-    return {
-        "rows": len(rows["reward"]),
-        "shards": [s.name for s in shards],
-        "attributes": [read_attributes(s) for s in shards],
-    }
+            for block in read_frames(shard):
+                file.write(block.data)
+                if progress:
+                    progress.advance(len(block))
 
 
-def _check_agreement(shards: list[Path], parts: dict[str, list[np.ndarray]]) -> None:
-    widths = [part.shape[1] for part in parts["action"]]
-    other = next((i for i, width in enumerate(widths) if width != widths[0]), None)
-    if other is not None:
-        raise UserError(
-            f"{shards[other]}: has {widths[other]} action dimensions, {shards[0].name} has {widths[0]}; "
-            "a folder must hold one set"
-        )
-    if "physics" in parts and len(parts["physics"]) != len(shards):
-        raise UserError(f"{shards[0].parent}: some shards have 'physics' and some have not; a folder must hold one set")
-
-
-def _check_episodes(shards: list[Path], lengths: list[int], step_type: np.ndarray) -> None:
-    """The first row must be FIRST, and FIRST must follow every LAST."""
-    wrong = np.flatnonzero((step_type[:-1] == StepType.LAST) & (step_type[1:] != StepType.FIRST)) + 1
-    if step_type[0] != StepType.FIRST:
-        wrong = np.array([0])
-    if len(wrong):
-        shard = int(np.searchsorted(np.cumsum(lengths), wrong[0], side="right"))
-        row = int(wrong[0] - sum(lengths[:shard]))
-        raise UserError(
-            f"{shards[shard]}: row {row} continues an episode whose beginning is missing; "
-            "a shard before it is missing or was renamed"
-        )
+def _describe(shards: Sequence[Path], scratch: Path, rows: int) -> dict[str, Any]:
+    files = {p.name: {"bytes": p.stat().st_size, "blake2b": _checksum(p)} for p in sorted(scratch.iterdir())}
+    attributes = [read_attributes(shard) for shard in shards]
+    return {"rows": rows, "shards": [s.name for s in shards], "attributes": attributes, "files": files}
 
 
 def _checksum(path: Path) -> str:

@@ -7,13 +7,10 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.envs import rendering  # sets the GL backend before dm_control is imported
-from vd4rl_pomdp.envs.rendering import Render
+from vd4rl_pomdp.envs import rendering
+from vd4rl_pomdp.envs.rendering import Render, suite
 from vd4rl_pomdp.tasks import ACTION_REPEAT, EPISODE_TRANSITIONS, Task, get_task
 from vd4rl_pomdp.types import StepType
-
-# isort: split
-from dm_control import suite
 
 
 @dataclass(frozen=True)
@@ -117,4 +114,5 @@ def replay_rewards(task: str, physics: np.ndarray, actions: np.ndarray) -> np.nd
 
 def _load(task: Task, random: np.random.RandomState) -> Any:
     """The dm_control environment; its own time limit never ends an episode, ours does."""
+    rendering.check_mujoco()
     return suite.load(task.domain, task.task, task_kwargs={"random": random, "time_limit": float("inf")})

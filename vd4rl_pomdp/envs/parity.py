@@ -73,7 +73,9 @@ def _compare_background(path: Path) -> dict[str, Any]:
     data, ours = dataset.frames.numpy()[rows], _wandering_frames(dataset.task)
     static = (data.std(0) < _STATIC_STD) & (ours.std(0) < _STATIC_STD)
     if not static.any():
-        raise UserError(f"{path}: no pixel is static in both the set and the environment; its frames are not this task's")
+        raise UserError(
+            f"{path}: no pixel is static in both the set and the environment; its frames are not this task's"
+        )
     result = compare(np.median(ours, 0)[static], np.median(data, 0)[static])
     return {"task": dataset.task, "static_pixels": int(static.sum()), **result}
 

@@ -17,10 +17,25 @@ import numpy as np
 os.environ.setdefault("MUJOCO_GL", "egl")
 os.environ.setdefault("LP_NUM_THREADS", "1")  # software rendering scales by processes, not by threads
 
-import mujoco
-
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_SIZE
+
+
+def gl_error(error: Exception) -> UserError:
+    """A sentence for a machine on which no OpenGL context can be made."""
+    return UserError(
+        f"cannot render with MUJOCO_GL={os.environ['MUJOCO_GL']} ({str(error).splitlines()[0]}): install Debian's "
+        "libegl1 and libgl1-mesa-dri for MUJOCO_GL=egl, or libosmesa6 for MUJOCO_GL=osmesa"
+    )
+
+
+try:  # both load the OpenGL library that MUJOCO_GL names, and fail in many ways where it is missing
+    import mujoco
+    from dm_control import suite
+except (ImportError, AttributeError, RuntimeError) as _error:
+    raise gl_error(_error) from _error
+
+__all__ = ["ASSETS", "Render", "check_mujoco", "frame", "frames_hash", "gl_error", "gl_strings", "prepare", "suite"]
 
 Render = Literal["fast", "exact"]
 ASSETS = Path(__file__).parent / "assets"
@@ -41,7 +56,6 @@ def check_mujoco(version: str = mujoco.__version__) -> None:
 
 def prepare(physics: Any, render: Render) -> None:
     """Restore the old sky and set the shadow map's size; must be called before the first render of `physics`."""
-    check_mujoco()
     model = physics.model
     sky = _sky()
     number = next(i for i in range(model.ntex) if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
@@ -57,11 +71,8 @@ def frame(physics: Any) -> np.ndarray:
     """Camera 0 as V-D4RL stores it: (3, 84, 84) uint8."""
     try:
         image = physics.render(FRAME_SIZE, FRAME_SIZE, camera_id=0)
-    except (ImportError, AttributeError, RuntimeError) as error:
-        raise UserError(
-            f"cannot render without a display ({str(error).splitlines()[0]}): install Debian's libegl1 and "
-            "libgl1-mesa-dri, or libosmesa6 with MUJOCO_GL=osmesa"
-        ) from error
+    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+        raise gl_error(error) from error
     return np.ascontiguousarray(image.transpose(2, 0, 1))
 
 

@@ -1,0 +1,1 @@
+"""Stage two: offline reinforcement learning on frozen representations."""

@@ -1,0 +1,38 @@
+"""Behaviour cloning on frozen representations: min (pi(z) - a)^2. The reference that uses no reward."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor
+
+from finetune.config import FinetuneConfig
+from finetune.features import FeatureBatch
+from vd4rl_pomdp.nn.policy import Policy
+
+
+class BC:
+    """See the module."""
+
+    def __init__(self, policy: Policy, config: FinetuneConfig, generator: torch.Generator) -> None:
+        self.policy = policy
+        self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=config.learning_rate)
+
+    def update(self, batch: FeatureBatch) -> dict[str, Tensor]:
+        """One step; returns detached scalars."""
+        loss = F.mse_loss(self.policy(batch.z), batch.action)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        self.optimiser.step()
+        return {"bc_loss": loss.detach()}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on."""
+        return {"policy": self.policy.state_dict(), "optimiser": self.optimiser.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        self.policy.load_state_dict(state["policy"])
+        self.optimiser.load_state_dict(state["optimiser"])

@@ -1,0 +1,115 @@
+"""TD3+BC: a minimalist approach to offline reinforcement learning (Fujimoto & Gu 2021, arXiv 2106.06860).
+
+    critics   y = r + gamma d min_i Q'_i(z', pi'(z') + clipped noise)
+    actor     max  lambda Q_1(z, pi(z)) - (pi(z) - a)^2,   lambda = alpha / mean |Q_1|
+
+Authors' code: github.com/sfujim/TD3_BC.
+
+Differences: states are frozen representations, standardised like the authors' states; returns are n-step.
+"""
+
+from __future__ import annotations
+
+import copy
+from typing import Any
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from finetune.config import FinetuneConfig
+from finetune.features import FeatureBatch
+from vd4rl_pomdp.nn.heads import mlp
+from vd4rl_pomdp.nn.policy import Policy
+
+TAU = 0.005
+TARGET_NOISE, NOISE_CLIP = 0.2, 0.5
+POLICY_DELAY = 2
+
+
+class TwinCritic(nn.Module):
+    """Two independent Q functions: (B, D), (B, A) -> two (B,)."""
+
+    def __init__(self, dim: int, action_dim: int, hidden: int) -> None:
+        super().__init__()
+        self.first = mlp(dim + action_dim, hidden, 1)
+        self.second = mlp(dim + action_dim, hidden, 1)
+
+    def forward(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Both values."""
+        both = torch.cat([z, action], dim=-1)
+        return self.first(both)[:, 0], self.second(both)[:, 0]
+
+
+class TD3BC:
+    """See the module."""
+
+    def __init__(self, policy: Policy, config: FinetuneConfig, generator: torch.Generator) -> None:
+        self.policy, self.config, self.generator = policy, config, generator
+        shape = policy.shape
+        device = policy.standardise.mean.device
+        self.critic = TwinCritic(shape["dim"], shape["action_dim"], shape["hidden"]).to(device)
+        self.target_policy, self.target_critic = copy.deepcopy(policy), copy.deepcopy(self.critic)
+        self.policy_optimiser = torch.optim.Adam(policy.net.parameters(), lr=config.learning_rate)
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.learning_rate)
+        self.updates = 0
+
+    def update(self, batch: FeatureBatch) -> dict[str, Tensor]:
+        """One critic step, and every other time one actor step; returns detached scalars."""
+        z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
+        metrics = self._update_critic(z, batch, next_z)
+        self.updates += 1
+        if self.updates % POLICY_DELAY == 0:
+            metrics |= self._update_policy(z, batch.action)
+            self._move_targets()
+        return metrics
+
+    def _update_critic(self, z: Tensor, batch: FeatureBatch, next_z: Tensor) -> dict[str, Tensor]:
+        with torch.no_grad():
+            noise = torch.randn(batch.action.shape, generator=self.generator).to(z.device) * TARGET_NOISE
+            action = self.target_policy.from_standardised(next_z) + noise.clamp(-NOISE_CLIP, NOISE_CLIP)
+            value = torch.minimum(*self.target_critic(next_z, action.clamp(-1, 1)))
+            target = batch.reward + self.config.gamma * batch.discount * value
+        first, second = self.critic(z, batch.action)
+        loss = F.mse_loss(first, target) + F.mse_loss(second, target)
+        self.critic_optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        self.critic_optimiser.step()
+        return {"critic_loss": loss.detach(), "q": first.detach().mean()}
+
+    def _update_policy(self, z: Tensor, action: Tensor) -> dict[str, Tensor]:
+        chosen = self.policy.from_standardised(z)
+        value = self.critic.first(torch.cat([z, chosen], dim=-1))
+        weight = self.config.alpha / value.abs().mean().detach()
+        cloning = F.mse_loss(chosen, action)
+        loss = cloning - weight * value.mean()
+        self.policy_optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        self.policy_optimiser.step()
+        return {"actor_loss": loss.detach(), "bc_loss": cloning.detach()}
+
+    @torch.no_grad()
+    def _move_targets(self) -> None:
+        for online, target in ((self.critic, self.target_critic), (self.policy.net, self.target_policy.net)):
+            for a, b in zip(online.parameters(), target.parameters(), strict=True):
+                b.lerp_(a, TAU)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on: networks, targets, optimisers, counters."""
+        return {name: part.state_dict() for name, part in self._parts().items()} | {"updates": self.updates}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        for name, part in self._parts().items():
+            part.load_state_dict(state[name])
+        self.updates = state["updates"]
+
+    def _parts(self) -> dict[str, Any]:
+        return {
+            "policy": self.policy,
+            "critic": self.critic,
+            "target_policy": self.target_policy,
+            "target_critic": self.target_critic,
+            "policy_optimiser": self.policy_optimiser,
+            "critic_optimiser": self.critic_optimiser,
+        }

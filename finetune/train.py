@@ -1,0 +1,166 @@
+"""The fine-tuning loop: frozen encoder, cached features, TD3+BC, evaluation; resumable to the bit on a CPU."""
+
+from __future__ import annotations
+
+import shutil
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from finetune.algorithms import Algorithm, get_algorithm
+from finetune.config import FinetuneConfig
+from finetune.features import BATCH_STREAM, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, rows_of
+from vd4rl_pomdp.nn.folder import EncoderCard, load_encoder
+from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.runs.checkpoint import load_checkpoint, save_checkpoint, seed_everything
+from vd4rl_pomdp.runs.device import pick_device
+from vd4rl_pomdp.runs.folder import RunFolder, jsonable, write_json
+from vd4rl_pomdp.runs.metrics import MetricsLog
+from vd4rl_pomdp.runs.progress import ProgressLine
+
+
+def finetune(config: FinetuneConfig) -> RunFolder:
+    """Run the stage, or go on with it; writes the policy and `episodes.csv` into the run's folder."""
+    build = get_algorithm(config.algorithm)
+    dataset = open_dataset(config.data)
+    encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim)
+    run = RunFolder(config.out, "finetune", config)
+    write_json(run.path / "labels.json", _labels(config, card))
+    if run.finished:
+        return run
+    _keep_encoder(config.encoder, run.path / "encoder")
+    device = pick_device(config.device)
+    dataset.to(device)
+    frozen = FrozenEncoder(
+        encoder.to(device), dataset, CorruptionConfig(**card.corruption), config.shift, config.precision, config.seed
+    )
+    seed_everything(config.seed)
+    policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(device)
+    generator = torch.Generator().manual_seed(config.seed * 10 + BATCH_STREAM)
+    algorithm = build(policy, config, generator)
+    sampler: FeatureSampler | ExactSampler
+    if config.views:
+        features = encode_views(frozen, config.views, run.path / "features.npy")
+        policy.standardise.fit(features)
+        sampler = FeatureSampler(dataset, features, config.batch_size, config.n_step, config.gamma, generator)
+    else:
+        sampler = ExactSampler(frozen, config.batch_size, config.n_step, config.gamma, generator)
+        policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(4)]))
+    Trainer(algorithm, sampler, generator, config, card).run(run)
+    return run
+
+
+class Trainer:
+    """One algorithm on one stream of batches."""
+
+    def __init__(
+        self,
+        algorithm: Algorithm,
+        sampler: FeatureSampler | ExactSampler,
+        generator: torch.Generator,
+        config: FinetuneConfig,
+        card: EncoderCard,
+    ) -> None:
+        self.algorithm, self.sampler, self.generator = algorithm, sampler, generator
+        self.config, self.card = config, card
+        self.step = 0
+        self.seconds = 0.0
+
+    def run(self, run: RunFolder) -> None:
+        """Train to the end, from the newest checkpoint if there is one."""
+        config = self.config
+        self._restore(load_checkpoint(run.checkpoint))
+        drop_rows_after(run.path / "episodes.csv", self.step)
+        before = self.seconds
+        log = MetricsLog(run.path / "metrics.jsonl", self.step, config.wandb, jsonable(asdict(config)))
+        metrics: dict[str, torch.Tensor] = {}
+        title = f"finetune {config.algorithm} on {self.card.method}"
+        with ProgressLine(title, config.updates, "updates", self.step) as progress:
+            while self.step < config.updates:
+                metrics |= self.algorithm.update(self.sampler.sample())
+                self.step += 1
+                progress.advance()
+                last = self.step == config.updates
+                if last or self.step % config.log_every == 0:
+                    row = {name: float(value) for name, value in metrics.items()}
+                    log.write(self.step, row)
+                    progress.advance(0, **row)
+                if last or self.step % config.eval_every == 0:
+                    progress.advance(0, score=self._evaluate(run))
+                if last or self.step % config.eval_every == 0 or self.step % config.checkpoint_every == 0:
+                    self.seconds = run.seconds(before)
+                    save_checkpoint(run.checkpoint, self._state())
+        log.close()
+        (run.path / "features.npy").unlink(missing_ok=True)
+        run.finish(before, updates=self.step)
+
+    def _evaluate(self, run: RunFolder) -> float:
+        """Evaluate the present policy, append its rows, keep a film of the last; returns the mean score."""
+        config = self.config
+        self.algorithm.policy.save(run.path / "policy")
+        corruption = CorruptionConfig(**self.card.corruption)
+        jobs = [
+            EpisodeJob(
+                encoder=run.path / "encoder",
+                policy=run.path / "policy",
+                version=self.step,
+                task=self.card.task,
+                corruption=corruption,
+                episode=episode,
+                film=episode == 0,
+                length=config.eval_length,
+            )
+            for episode in range(config.eval_episodes)
+        ]
+        episodes = evaluate(jobs, config.workers)
+        rows = rows_of(episodes, _labels(config, self.card) | {"step": self.step})
+        append_rows(run.path / "episodes.csv", rows)
+        if episodes[0].film is not None:
+            np.savez_compressed(run.path / "film.npz", **episodes[0].film)  # type: ignore[arg-type]
+        return float(np.mean([row["score"] for row in rows]))
+
+    def _state(self) -> dict[str, Any]:
+        state = {"step": self.step, "seconds": self.seconds, "algorithm": self.algorithm.state_dict()}
+        state["batches"] = self.generator.get_state()
+        if isinstance(self.sampler, ExactSampler):
+            state |= {"corruption": self.sampler.corruption.stream.position, "shifts": self.sampler.shifts.position}
+        return state
+
+    def _restore(self, state: dict[str, Any] | None) -> None:
+        if state is None:
+            return
+        self.step, self.seconds = state["step"], state["seconds"]
+        self.algorithm.load_state_dict(state["algorithm"])
+        self.generator.set_state(state["batches"])
+        if isinstance(self.sampler, ExactSampler):
+            self.sampler.corruption.stream.position = state["corruption"]
+            self.sampler.shifts.position = state["shifts"]
+
+
+def _labels(config: FinetuneConfig, card: EncoderCard) -> dict[str, Any]:
+    """The columns that name a run's rows."""
+    return {
+        "method": card.method,
+        "task": card.task,
+        "quality": card.quality,
+        "corruption": card.corruption["corruption"],
+        "algorithm": config.algorithm,
+        "seed": config.seed,
+    }
+
+
+def _keep_encoder(source: Path, target: Path) -> None:
+    """Copy the encoder into the run, so that the run can be evaluated wherever it is moved."""
+    if (target / "config.json").exists():
+        return
+    scratch = target.with_name(".encoder.tmp")
+    shutil.rmtree(scratch, ignore_errors=True)
+    shutil.copytree(source, scratch)
+    shutil.rmtree(target, ignore_errors=True)
+    scratch.rename(target)

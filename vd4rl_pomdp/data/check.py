@@ -1,0 +1,77 @@
+"""Is a set what it claims to be? Its counts, its statistics, and the proof that its actions lead to its rewards."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd4rl_pomdp.data.dataset import Dataset, open_dataset
+from vd4rl_pomdp.data.format import read_dtypes, shard_paths
+from vd4rl_pomdp.data.store import verify_store
+from vd4rl_pomdp.errors import UserError
+
+ReplayFn = Callable[[str, np.ndarray, np.ndarray], np.ndarray]
+"""(task, physics (P,) of an episode's first row, actions (T, A), a_0 first) -> rewards (T,), r_0 first."""
+
+
+def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn | None = None) -> dict[str, Any]:
+    """Validate a set and describe it.
+
+    Args:
+        path: folder (or file) of the shards.
+        cache: where decoded sets are kept, as in `open_dataset`.
+        replay: what simulates an episode; default `envs.dmc.replay_rewards`.
+
+    Returns:
+        JSON values: `rows`, `episodes`, `transitions`, `incomplete_episodes`, `action_dim`, `return_mean`,
+        `return_min` and `return_max` over all episodes, incomplete ones included, `replay_max_error` (largest absolute
+        difference between a stored reward and its replay; None without physics), `task`, `quality`, `shards` (names in
+        order), `dtypes` (key to the stored dtypes), `store_ok` (True: the decoded files have their checksums).
+
+    Raises:
+        UserError: the set or its decoded form is damaged.
+    """
+    path = Path(path)
+    dataset = open_dataset(path, cache)
+    verify_store(dataset.store)
+    returns = dataset.returns.numpy()
+    return {
+        "rows": dataset.num_rows,
+        "episodes": dataset.num_episodes,
+        "transitions": dataset.num_transitions,
+        "incomplete_episodes": dataset.incomplete_episodes,
+        "action_dim": dataset.action_dim,
+        "return_mean": float(returns.mean()),
+        "return_min": float(returns.min()),
+        "return_max": float(returns.max()),
+        "replay_max_error": _replay_error(dataset, replay),
+        "task": dataset.task,
+        "quality": dataset.quality,
+        "shards": dataset.store.meta["shards"],
+        "dtypes": _dtypes(shard_paths(path)),
+        "store_ok": True,
+    }
+
+
+def _replay_error(dataset: Dataset, replay: ReplayFn | None) -> float | None:
+    if dataset.physics is None:
+        return None
+    if dataset.task is None:
+        raise UserError(f"{dataset.path}: has physics but names no task; put it in a folder called like its task")
+    if replay is None:
+        from vd4rl_pomdp.envs.dmc import replay_rewards as replay
+    reward, action = dataset.store.array("reward"), dataset.store.array("action")
+    worst = 0.0
+    for start, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):
+        if end - start > 1:
+            replayed = replay(dataset.task, dataset.physics[start], action[start + 1 : end])
+            worst = max(worst, float(np.abs(replayed - reward[start + 1 : end]).max()))
+    return worst
+
+
+def _dtypes(shards: list[Path]) -> dict[str, list[str]]:
+    stored = [read_dtypes(shard) for shard in shards]
+    return {key: sorted({dtypes[key] for dtypes in stored}) for key in stored[0]}

@@ -1,0 +1,184 @@
+"""Fetch the published 84-pixel sets: resumed after an interruption, checked by SHA-256, equal files stored once."""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import os
+import shutil
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+
+import requests
+from rich.console import Console
+from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+
+from vd4rl_pomdp.data.format import disk_error
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import QUALITIES, get_task
+
+DEFAULT_ENDPOINT = "https://huggingface.co"
+_REPOSITORY = "datasets/conglu/vd4rl/resolve/main"
+_ATTEMPTS = 5
+_FIRST_WAIT_S = 1.0
+_TIMEOUT_S = (10.0, 60.0)
+_BLOCK = 1 << 20
+
+
+@dataclass(frozen=True)
+class RemoteFile:
+    """One published shard."""
+
+    path: str
+    """vd4rl/main/{task}/{quality}/84px/{file}: its place on the mirror."""
+    size: int
+    """Bytes."""
+    sha256: str
+
+    def target(self, destination: Path) -> Path:
+        """Where the file goes: destination/{task}/{quality}/84px/{file}."""
+        return destination.joinpath(*self.path.split("/")[2:])
+
+
+@cache
+def manifest() -> tuple[RemoteFile, ...]:
+    """All published 84-pixel shards."""
+    text = files("vd4rl_pomdp.data").joinpath("manifest.tsv").read_text()
+    rows = csv.DictReader(text.splitlines(), delimiter="\t")
+    return tuple(RemoteFile(row["path"], int(row["bytes"]), row["sha256"]) for row in rows)
+
+
+def download(
+    task: str, quality: str, destination: Path, endpoint: str = DEFAULT_ENDPOINT, verify: bool = False
+) -> list[Path]:
+    """Download one set into `destination/{task}/{quality}/84px`; what is there already is not fetched again.
+
+    Args:
+        task: task name.
+        quality: one of `tasks.QUALITIES`.
+        destination: folder that holds all downloaded sets; a file that another set in it has is linked, not fetched.
+        endpoint: address of the mirror, up to and without `/datasets`.
+        verify: also compute the SHA-256 of files that are there; otherwise their size is enough.
+
+    Returns:
+        The set's shards, all of them verified.
+
+    Raises:
+        UserError: unknown task or quality, no answer from the mirror, a wrong checksum, or a full disk.
+    """
+    get_task(task)
+    if quality not in QUALITIES:
+        raise UserError(f"unknown quality {quality!r}: choose one of {', '.join(QUALITIES)}")
+    if not endpoint.startswith(("http://", "https://")):
+        raise UserError(f"endpoint {endpoint!r} is no address; it starts with https:// or http://")
+    wanted = [file for file in manifest() if file.path.split("/")[2:4] == [task, quality]]
+    with _progress_bar() as bar:
+        total = bar.add_task(f"{task} {quality}", total=sum(file.size for file in wanted))
+        for file in wanted:
+            _provide(file, destination, endpoint.rstrip("/"), verify, bar)
+            bar.advance(total, file.size)
+    return [file.target(destination) for file in wanted]
+
+
+def _progress_bar() -> Progress:
+    console = Console(stderr=True)
+    columns = TextColumn("{task.description}"), BarColumn(), DownloadColumn(), TransferSpeedColumn()
+    return Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal)
+
+
+def _provide(file: RemoteFile, destination: Path, endpoint: str, verify: bool, bar: Progress) -> None:
+    """Make sure that one file is at its place: it is there, an equal one is linked, or it is fetched."""
+    target = file.target(destination)
+    if _is_complete(file, target, verify):
+        return
+    try:
+        target.parent.mkdir(parents=True, exist_ok=True)
+        twins = (other.target(destination) for other in manifest() if other.sha256 == file.sha256)
+        twin = next((path for path in twins if path != target and _is_complete(file, path, verify)), None)
+        if twin:
+            _link(twin, target)
+        else:
+            _fetch(file, target, f"{endpoint}/{_REPOSITORY}/{file.path}", bar)
+    except OSError as error:
+        raise disk_error(target, error) from error
+
+
+def _is_complete(file: RemoteFile, path: Path, verify: bool) -> bool:
+    """Only verified files get their final name, so the size suffices unless asked otherwise."""
+    if not path.is_file() or path.stat().st_size != file.size:
+        return False
+    return not verify or _sha256(path) == file.sha256
+
+
+def _link(source: Path, target: Path) -> None:
+    """Give an existing file a second name: a hard link, a symbolic one, or where neither works a copy."""
+    temporary = target.with_name(f".{target.name}.tmp")
+    temporary.unlink(missing_ok=True)
+    try:
+        os.link(source.resolve(), temporary)
+    except OSError:
+        try:
+            temporary.symlink_to(os.path.relpath(source, target.parent.resolve()))
+        except OSError:
+            shutil.copyfile(source, temporary)
+    temporary.replace(target)
+
+
+def _fetch(file: RemoteFile, target: Path, url: str, bar: Progress) -> None:
+    part = target.with_name(f"{target.name}.part")
+    row = bar.add_task(file.path.split("/")[-1], total=file.size)
+    failures, problem = 0, ""
+    while not part.exists() or part.stat().st_size < file.size:
+        before = part.stat().st_size if part.exists() else 0
+        try:
+            for done in _receive(url, part, before):
+                bar.update(row, completed=done)
+        except requests.RequestException as error:
+            problem = _describe(error)
+        if part.exists() and part.stat().st_size > before:
+            failures = 0
+            continue
+        failures += 1
+        if failures >= _ATTEMPTS:
+            reason = problem or "it sent nothing"
+            raise UserError(
+                f"{url}: cannot be fetched ({reason}); check the network or choose another --endpoint and start the "
+                "same command again: it goes on where it stopped"
+            )
+        time.sleep(_FIRST_WAIT_S * 2 ** (failures - 1))
+    bar.remove_task(row)
+    if part.stat().st_size != file.size or _sha256(part) != file.sha256:
+        part.unlink()
+        raise UserError(f"{url}: has a wrong SHA-256 and was removed; start again or choose another --endpoint")
+    part.replace(target)
+
+
+def _receive(url: str, part: Path, offset: int) -> Iterator[int]:
+    """Append to `part` from `offset`, or from the start where the server ignores ranges; yields the bytes there."""
+    headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={offset}-"} if offset else {})
+    with requests.get(url, headers=headers, stream=True, timeout=_TIMEOUT_S) as response:
+        if 400 <= response.status_code < 500 and response.status_code not in (408, 429):
+            raise UserError(f"{url}: the mirror answers {response.status_code} {response.reason}; check --endpoint")
+        response.raise_for_status()
+        resumed = response.status_code == 206
+        done = offset if resumed else 0
+        with part.open("ab" if resumed else "wb") as file:
+            for block in response.iter_content(_BLOCK):
+                file.write(block)
+                done += len(block)
+                yield done
+
+
+def _describe(error: requests.RequestException) -> str:
+    if error.response is not None:
+        return f"status {error.response.status_code}"
+    return type(error).__name__
+
+
+def _sha256(path: Path) -> str:
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()

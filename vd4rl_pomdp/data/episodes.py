@@ -1,0 +1,61 @@
+"""Do the shards of a folder form one set, and its rows whole episodes? What does not fit is named by file and row."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from vd4rl_pomdp.data.format import shard_number
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.types import StepType
+
+
+def join_shards(shards: Sequence[Path], parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Concatenate the rows of all shards (as `read_rows` gives them) into those of the set.
+
+    Raises:
+        UserError: the shards differ in width or keys, or an episode's beginning is missing.
+    """
+    for shard, part in zip(shards, parts, strict=True):
+        _agree(shards[0], parts[0], shard, part)
+    starts = np.cumsum([0, *(len(part["reward"]) for part in parts)])
+    rows = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    _check_order(shards, starts, rows["step_type"])
+    return rows
+
+
+def _agree(first: Path, expected: Mapping[str, np.ndarray], shard: Path, part: Mapping[str, np.ndarray]) -> None:
+    if expected.keys() != part.keys():
+        key = min(expected.keys() ^ part.keys())
+        having, lacking = (shard, first) if key in part else (first, shard)
+        raise UserError(f"{having}: has {key!r}, {lacking.name} has not; keep one set in a folder")
+    for key, value in part.items():
+        if value.shape[1:] != expected[key].shape[1:]:
+            widths = f"{value.shape[1]} dimensions, in {first.name} {expected[key].shape[1]}"
+            raise UserError(f"{shard}: {key!r} has {widths}; keep one set in a folder")
+
+
+def _check_order(shards: Sequence[Path], starts: np.ndarray, step_type: np.ndarray) -> None:
+    """Every row that does not begin an episode must continue the one of the row before it."""
+
+    def fail(row: int, what: str) -> None:
+        shard = int(np.searchsorted(starts, row, side="right")) - 1
+        raise UserError(f"{shards[shard]}: row {row - starts[shard]} {what}")
+
+    missing = "; is a shard before this one missing or renamed?"
+    if step_type[0] != StepType.FIRST:
+        fail(0, f"has step_type {step_type[0]}, but the first row of a set begins an episode{missing}")
+    astray = np.flatnonzero((step_type[:-1] == StepType.LAST) & (step_type[1:] != StepType.FIRST)) + 1
+    if len(astray):
+        fail(int(astray[0]), f"follows an episode's last row without beginning a new one{missing}")
+    for previous, shard, row in zip(shards[:-1], shards[1:], starts[1:-1], strict=True):
+        if step_type[row] != StepType.FIRST and not _adjacent(previous, shard):
+            fail(int(row), f"continues an episode, but not that of {previous.name}{missing}")
+
+
+def _adjacent(previous: Path, shard: Path) -> bool:
+    """Whether a shard can be the one right after another: unless both are numbered, their order is all we know."""
+    (previous_rest, before), (rest, number) = shard_number(previous), shard_number(shard)
+    return before is None or number is None or (rest == previous_rest and number == before + 1)

@@ -1,0 +1,72 @@
+"""The corrupted tasks as Gymnasium environments, for use without the rest of the harness."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
+from vd4rl_pomdp.envs.rendering import Render
+from vd4rl_pomdp.tasks import ACTION_REPEAT, FRAME_SIZE, FRAME_STACK
+
+Info = dict[str, Any]
+
+
+class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """Corrupted pixels in, actions out; the time limit truncates and nothing terminates.
+
+    Observations: (9, 84, 84) uint8, three frames, oldest first. Actions: (A,) float32 in [-1, 1]. `info` holds `clean`,
+    the observation before corruption, and `physics`, the (P,) float64 simulator state. A seed fixes the initial states
+    and corruptions of all episodes that follow it.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's own name and type)
+
+    def __init__(
+        self,
+        task: str,
+        corruption: str = "none",
+        render: Render = "fast",
+        render_mode: str | None = None,
+        length: int | None = None,
+    ) -> None:
+        self._env = CorruptedEnv(task, CorruptionConfig(corruption), render, length)
+        shape = (3 * FRAME_STACK, FRAME_SIZE, FRAME_SIZE)
+        self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._env.env.task.action_dim,), np.float32)
+        self.render_mode = render_mode
+        seconds = self._env.env.simulator.control_timestep() * ACTION_REPEAT
+        self.metadata = {**self.metadata, "render_fps": round(1 / seconds)}
+        self._corruption_seed: int | None = None
+        self._episode = 0
+        self._frame = np.zeros((FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+        """Begin the next episode; a seed begins the series anew."""
+        super().reset(seed=seed)
+        if seed is not None or self._corruption_seed is None:
+            self._corruption_seed, self._episode = self._draw(), 0
+        else:
+            self._episode += 1
+        return self._show(self._env.reset(self._draw(), self._corruption_seed, self._episode))
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
+        """Apply one action for two simulator steps; the reward is their sum."""
+        step = self._env.step(action)
+        obs, info = self._show(step)
+        return obs, step.row.reward, False, step.row.last, info
+
+    def render(self) -> np.ndarray:  # type: ignore[override]
+        """The newest frame before corruption: (84, 84, 3) uint8."""
+        return self._frame
+
+    def _draw(self) -> int:
+        return int(self.np_random.integers(2**31))
+
+    def _show(self, step: Observation) -> tuple[np.ndarray, Info]:
+        clean = step.clean.numpy()
+        self._frame = np.ascontiguousarray(clean[-3:].transpose(1, 2, 0))
+        return step.obs.numpy(), {"clean": clean, "physics": step.row.physics}

@@ -1,0 +1,159 @@
+"""Evaluate a frozen encoder and a policy in the corrupted environment, episodes in parallel, raw rows as the result."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
+from vd4rl_pomdp.envs.rendering import Render
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.folder import load_encoder
+from vd4rl_pomdp.nn.policy import Policy, load_policy
+from vd4rl_pomdp.runs.workers import run_jobs
+from vd4rl_pomdp.tasks import SCORE_DIVISOR
+
+EVALUATION_SEED = 20_000
+"""Evaluation episode i starts from environment seed EVALUATION_SEED + i, for every method and training seed."""
+FILM_EVERY = 4
+"""Rows between two pictures of a film."""
+COLUMNS = (
+    *("method", "task", "quality", "corruption", "algorithm", "seed", "step"),
+    *("episode", "episode_seed", "return", "length", "score"),
+)
+
+
+class Agent:
+    """Encoder and policy, fed one row at a time; its own past actions are part of the history."""
+
+    def __init__(self, encoder: Encoder, policy: Policy) -> None:
+        self.encoder, self.policy = encoder, policy
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: an episode begins."""
+        self._state = self.encoder.initial_state(1)
+        self._action = torch.zeros(1, self.encoder.config.action_dim)
+
+    @torch.no_grad()
+    def act(self, obs: torch.Tensor) -> np.ndarray:
+        """Mean action (A,) float32 for a (C, 84, 84) uint8 observation."""
+        z, self._state = self.encoder.step(obs[None], self._action, self._state)
+        self._action = self.policy(z)
+        return self._action[0].numpy()
+
+
+@dataclass(frozen=True)
+class EpisodeJob:
+    """One evaluation episode."""
+
+    encoder: Path
+    policy: Path
+    version: int
+    """Changes when the policy folder was written anew."""
+    task: str
+    corruption: CorruptionConfig
+    episode: int
+    film: bool
+    render: Render = "fast"
+    length: int | None = None
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What an evaluation episode gave."""
+
+    episode: int
+    total: float
+    length: int
+    film: dict[str, np.ndarray] | None
+    """`clean` (F, 3, 84, 84) and `corrupted` (F, C, 84, 84) uint8 pictures, `return` (F,) so far."""
+
+
+def evaluate(jobs: list[EpisodeJob], workers: int, on_episode: Callable[[Episode], None] | None = None) -> list[Episode]:
+    """Run evaluation episodes; their results do not depend on `workers`."""
+    episodes = []
+    for episode in run_jobs(_run_episode, jobs, workers):
+        episodes.append(episode)
+        if on_episode is not None:
+            on_episode(episode)
+    return episodes
+
+
+def rows_of(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, Any]]:
+    """Rows of `episodes.csv`: one an episode, `labels` giving the columns up to `step`."""
+    return [
+        labels
+        | {
+            "episode": e.episode,
+            "episode_seed": EVALUATION_SEED + e.episode,
+            "return": round(e.total, 4),
+            "length": e.length,
+            "score": round(e.total / SCORE_DIVISOR, 4),
+        }
+        for e in episodes
+    ]
+
+
+def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+    """Append rows to an `episodes.csv`, writing its header first."""
+    new = not path.exists() or path.stat().st_size == 0
+    with path.open("a", newline="") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        if new:
+            writer.writeheader()
+        writer.writerows(rows)
+
+
+def drop_rows_after(path: Path, step: int) -> None:
+    """Forget evaluations that a cut run made after its last checkpoint."""
+    if not path.exists():
+        return
+    with path.open(newline="") as file:
+        kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
+    path.unlink()
+    if kept:
+        append_rows(path, kept)
+
+
+_AGENTS: dict[tuple, Agent] = {}
+_ENVIRONMENTS: dict[tuple, CorruptedEnv] = {}
+
+
+def _run_episode(job: EpisodeJob) -> Episode:
+    key = (job.encoder, job.policy, job.version)
+    if key not in _AGENTS:
+        _AGENTS.clear()
+        _AGENTS[key] = Agent(load_encoder(job.encoder)[0], load_policy(job.policy))
+    place = (job.task, job.corruption, job.render, job.length)
+    if place not in _ENVIRONMENTS:
+        _ENVIRONMENTS[place] = CorruptedEnv(job.task, job.corruption, job.render, job.length)
+    return _play(_AGENTS[key], _ENVIRONMENTS[place], job)
+
+
+def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
+    agent.reset()
+    now = env.reset(EVALUATION_SEED + job.episode, EVALUATION_SEED, job.episode)
+    total, length, film = 0.0, 0, [(now, 0.0)]
+    while not now.row.last:
+        now = env.step(agent.act(now.obs))
+        total += now.row.reward
+        length += 1
+        if job.film and length % FILM_EVERY == 0:
+            film.append((now, total))
+    return Episode(job.episode, total, length, _film(film) if job.film else None)
+
+
+def _film(shots: list[tuple[Observation, float]]) -> dict[str, np.ndarray]:
+    return {
+        "clean": np.stack([shot.clean[-3:].numpy() for shot, _ in shots]),
+        "corrupted": np.stack([shot.obs.numpy() for shot, _ in shots]),
+        "return": np.array([total for _, total in shots]),
+    }

@@ -1,0 +1,77 @@
+"""The policy on frozen representations: standardise, MLP, tanh. Saved as a folder that evaluation reads on its own."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import load_file, save_file
+from torch import Tensor, nn
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.nn.heads import mlp
+from vd4rl_pomdp.runs.folder import read_json, write_json
+
+
+class Standardise(nn.Module):
+    """Subtract the mean and divide by the standard deviation of the training features, dimension by dimension."""
+
+    def __init__(self, dim: int) -> None:
+        super().__init__()
+        self.register_buffer("mean", torch.zeros(dim))
+        self.register_buffer("std", torch.ones(dim))
+        self.mean: Tensor
+        self.std: Tensor
+
+    def fit(self, features: Tensor) -> None:
+        """Take the statistics of (..., dim) features, in slices that keep memory small."""
+        flat = features.view(-1, features.shape[-1])
+        total, squares = torch.zeros_like(self.mean, dtype=torch.float64), torch.zeros_like(self.mean, dtype=torch.float64)
+        for part in flat.split(65_536):
+            values = part.double()
+            total, squares = total + values.sum(0), squares + values.square().sum(0)
+        mean = total / len(flat)
+        self.mean.copy_(mean)
+        self.std.copy_((squares / len(flat) - mean.square()).clamp(min=0).sqrt() + 1e-3)
+
+    def forward(self, z: Tensor) -> Tensor:
+        """Standardised copy of (..., dim)."""
+        return (z.float() - self.mean) / self.std
+
+
+class Policy(nn.Module):
+    """Deterministic policy: (B, D) representations -> (B, A) actions in [-1, 1]."""
+
+    def __init__(self, dim: int, action_dim: int, hidden: int) -> None:
+        super().__init__()
+        self.shape = {"dim": dim, "action_dim": action_dim, "hidden": hidden}
+        self.standardise = Standardise(dim)
+        self.net = mlp(dim, hidden, action_dim)
+
+    def forward(self, z: Tensor) -> Tensor:
+        """Mean action."""
+        return self.from_standardised(self.standardise(z))
+
+    def from_standardised(self, z: Tensor) -> Tensor:
+        """Mean action for representations that are already standardised."""
+        return torch.tanh(self.net(z))
+
+    def save(self, folder: Path) -> None:
+        """Write the policy folder."""
+        folder.mkdir(parents=True, exist_ok=True)
+        temporary = folder / ".model.safetensors.tmp"
+        save_file({k: v.contiguous().cpu() for k, v in self.state_dict().items()}, temporary)
+        temporary.replace(folder / "model.safetensors")
+        write_json(folder / "config.json", self.shape)
+
+
+def load_policy(folder: Path) -> Policy:
+    """Read a policy folder; raises UserError if it is missing or damaged."""
+    try:
+        policy = Policy(**read_json(folder / "config.json"))
+        policy.load_state_dict(load_file(folder / "model.safetensors"))
+    except (OSError, SafetensorError, RuntimeError, TypeError) as error:
+        reason = str(error).splitlines()[0]
+        raise UserError(f"{folder}: not a policy folder ({reason}); `vd4rl-pomdp finetune` writes one as RUN/policy") from error
+    return policy.eval().requires_grad_(False)
