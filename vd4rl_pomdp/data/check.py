@@ -62,7 +62,9 @@ def _replay_error(dataset: Dataset, replay: ReplayFn | None) -> float | None:
     if dataset.task is None:
         raise UserError(f"{dataset.path}: has physics but names no task; put it in a folder called like its task")
     if replay is None:
-        from vd4rl_pomdp.envs.dmc import replay_rewards as replay
+        from vd4rl_pomdp.envs.dmc import replay_rewards
+
+        replay = replay_rewards
     reward, action = dataset.store.array("reward"), dataset.store.array("action")
     worst = 0.0
     for start, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):

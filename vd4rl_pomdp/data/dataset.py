@@ -221,11 +221,13 @@ class Dataset:
     def _index(self, index: Index, size: int) -> Tensor:
         """`index` as (B,) int64 on the set's device; checked where it is, so a CPU index never waits for a GPU."""
         number = torch.atleast_1d(torch.as_tensor(index))
-        if number.is_floating_point() or number.is_complex() or number.dtype == torch.bool or number.ndim != 1:
-            if number.numel():
-                raise IndexError(f"an index is an integer or a flat list of them, not {number.dtype} {number.ndim}-D")
-        elif len(number) and not (0 <= int(number.min()) and int(number.max()) < size):
-            raise IndexError(f"index {int(number.min())}..{int(number.max())} is outside 0..{size - 1}")
+        if not number.numel():
+            return torch.zeros(0, dtype=torch.int64, device=self.t.device)
+        if number.is_floating_point() or number.dtype == torch.bool or number.ndim != 1:
+            raise IndexError(f"an index is an integer or a flat list of them, not {number.dtype} of {number.ndim} axes")
+        low, high = int(number.min()), int(number.max())
+        if low < 0 or high >= size:
+            raise IndexError(f"index {low if low < 0 else high} is outside 0..{size - 1}")
         return number.to(self.t.device, torch.int64)
 
 

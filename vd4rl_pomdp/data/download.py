@@ -131,16 +131,15 @@ def _link(source: Path, target: Path) -> None:
 def _fetch(file: RemoteFile, target: Path, url: str, bar: Progress) -> None:
     part = target.with_name(f"{target.name}.part")
     row = bar.add_task(file.path.split("/")[-1], total=file.size)
-    failures, problem = 0, ""
-    while not part.exists() or part.stat().st_size < file.size:
-        before = part.stat().st_size if part.exists() else 0
+    failures, furthest, problem = 0, _size(part), ""
+    while _size(part) < file.size:
         try:
-            for done in _receive(url, part, before):
+            for done in _receive(url, part, _size(part)):
                 bar.update(row, completed=done)
         except requests.RequestException as error:
             problem = _describe(error)
-        if part.exists() and part.stat().st_size > before:
-            failures = 0
+        if _size(part) > furthest:
+            failures, furthest = 0, _size(part)
             continue
         failures += 1
         if failures >= _ATTEMPTS:
@@ -151,7 +150,7 @@ def _fetch(file: RemoteFile, target: Path, url: str, bar: Progress) -> None:
             )
         time.sleep(_FIRST_WAIT_S * 2 ** (failures - 1))
     bar.remove_task(row)
-    if part.stat().st_size != file.size or _sha256(part) != file.sha256:
+    if _size(part) != file.size or _sha256(part) != file.sha256:
         part.unlink()
         raise UserError(f"{url}: has a wrong SHA-256 and was removed; start again or choose another --endpoint")
     part.replace(target)
@@ -171,6 +170,10 @@ def _receive(url: str, part: Path, offset: int) -> Iterator[int]:
                 file.write(block)
                 done += len(block)
                 yield done
+
+
+def _size(path: Path) -> int:
+    return path.stat().st_size if path.exists() else 0
 
 
 def _describe(error: requests.RequestException) -> str:

@@ -1,0 +1,175 @@
+import errno
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.helpers_data import fake_rows, write_fake_set
+from vd4rl_pomdp.data.format import read_attributes, read_frames, read_shard, shard_paths, write_shard
+from vd4rl_pomdp.errors import UserError
+
+
+@pytest.fixture
+def shard(tmp_path):
+    return write_fake_set(tmp_path / "set", (4, 3)) / "0_fake.hdf5"
+
+
+def alter(path, key, change):
+    """Replace one key of a shard by change(its array), dtype and all."""
+    with h5py.File(path, "a") as file:
+        value = change(file[key][()])
+        del file[key]
+        if value is not None:
+            file[key] = value
+
+
+@pytest.mark.parametrize(
+    ("names", "expected"),
+    [
+        (["10_mixed", "9_mixed", "1_mixed", "0_mixed"], ["0_mixed", "1_mixed", "9_mixed", "10_mixed"]),
+        (
+            ["0_walker_walk_expert", "0_walker_walk_medium", "1_walker_walk_expert", "1_walker_walk_medium"],
+            ["0_walker_walk_expert", "1_walker_walk_expert", "0_walker_walk_medium", "1_walker_walk_medium"],
+        ),
+        (["shard_10_reward_4", "shard_2_reward_30"], ["shard_2_reward_30", "shard_10_reward_4"]),
+    ],
+)
+def test_shards_are_ordered_by_name_then_by_number(tmp_path, names, expected):
+    for name in names:
+        (tmp_path / f"{name}.hdf5").touch()
+    assert [p.stem for p in shard_paths(tmp_path)] == expected
+
+
+def test_only_visible_shards_are_listed(tmp_path):
+    for name in (".0_a.hdf5.tmp", ".0_b.hdf5", "0_a.hdf5.part", "0_a.hdf5", "collection.json"):
+        (tmp_path / name).touch()
+    assert [p.name for p in shard_paths(tmp_path)] == ["0_a.hdf5"]
+
+
+def test_missing_and_empty_folders_are_refused_with_advice(tmp_path):
+    with pytest.raises(UserError, match=r"nothing: no such folder"):
+        shard_paths(tmp_path / "nothing")
+    with pytest.raises(UserError, match=r"holds no \.hdf5 shards; collect"):
+        shard_paths(tmp_path)
+    write_fake_set(tmp_path / "expert" / "84px")
+    with pytest.raises(UserError, match=r"holds no \.hdf5 shards; name a folder of shards such as .*84px"):
+        shard_paths(tmp_path)
+
+
+def test_a_written_shard_has_the_published_layout(tmp_path):
+    rows = fake_rows((4, 3), action_dim=2, physics_dim=5)
+    write_shard(
+        tmp_path / "0_a.hdf5", rows | {"step_type": rows["step_type"].astype(np.uint8)}, {"task": "x", "seed": 3}
+    )
+    with h5py.File(tmp_path / "0_a.hdf5") as file:
+        layout = {key: (str(file[key].dtype), file[key].shape, file[key].compression) for key in file}
+    assert layout == {
+        "observation": ("uint8", (7, 3, 84, 84), "gzip"),
+        "action": ("float32", (7, 2), "gzip"),
+        "reward": ("float64", (7,), "gzip"),
+        "discount": ("float64", (7,), "gzip"),
+        "step_type": ("int64", (7,), "gzip"),
+        "physics": ("float64", (7, 5), "gzip"),
+    }
+    assert read_attributes(tmp_path / "0_a.hdf5") == {"task": "x", "seed": 3}
+    back = read_shard(tmp_path / "0_a.hdf5")
+    assert back.keys() == rows.keys()
+    for key in rows:
+        np.testing.assert_array_equal(back[key], rows[key])
+
+
+def test_equal_rows_give_equal_bytes(tmp_path):
+    for name in ("a.hdf5", "b.hdf5"):
+        write_shard(tmp_path / name, fake_rows((3,)), {"seed": 1, "task": "x"})
+    assert (tmp_path / "a.hdf5").read_bytes() == (tmp_path / "b.hdf5").read_bytes()
+
+
+@pytest.mark.parametrize("chunks", [None, (7, 1, 84, 84), (3000, 3, 84, 84)])
+def test_frames_come_in_order_whatever_the_chunks(tmp_path, chunks):
+    frames = np.zeros((3000, 3, 84, 84), np.uint8)
+    frames[:, 0, 0, 0], frames[:, 0, 0, 1] = np.arange(3000) // 256, np.arange(3000) % 256
+    with h5py.File(tmp_path / "a.hdf5", "w") as file:
+        file.create_dataset("observation", data=frames, chunks=chunks)
+    blocks = list(read_frames(tmp_path / "a.hdf5"))
+    assert max(len(block) for block in blocks) <= (3000 if chunks == (3000, 3, 84, 84) else 1024)
+    np.testing.assert_array_equal(np.concatenate(blocks), frames)
+
+
+def test_a_full_disk_leaves_the_old_shard_and_no_temporary(shard, monkeypatch):
+    before = shard.read_bytes()
+
+    def full(path, data):
+        with path.open("wb") as file:
+            file.write(data[:10])
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    with pytest.raises(UserError, match=r"0_fake\.hdf5: the disk is full: free some space"):
+        write_shard(shard, fake_rows((9,)), {})
+    assert shard.read_bytes() == before
+    assert [p.name for p in shard.parent.iterdir()] == [shard.name]
+
+
+@pytest.mark.parametrize("dtype", [np.int64, np.float64, np.uint8])
+def test_step_types_may_have_any_number_type(shard, dtype):
+    expected = read_shard(shard)["step_type"]
+    alter(shard, "step_type", lambda value: value.astype(dtype))
+    np.testing.assert_array_equal(read_shard(shard)["step_type"], expected)
+    assert expected.tolist() == [0, 1, 1, 2, 0, 1, 2]
+
+
+def with_value(index, value):
+    def change(array):
+        array[index] = value
+        return array
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("key", "change", "message"),
+    [
+        ("reward", lambda v: None, r"has no 'reward'"),
+        ("observation", lambda v: None, r"has no 'observation'"),
+        ("action", with_value((2, 1), np.nan), r"'action' is not finite in row 2 \(1 such rows\)"),
+        ("reward", with_value(slice(3, 5), np.inf), r"'reward' is not finite in row 3 \(2 such rows\)"),
+        ("discount", with_value(0, np.nan), r"'discount' is not finite in row 0"),
+        ("action", lambda v: v.astype(int), r"'action' is int64"),
+        ("action", lambda v: v[:, 0], r"'action' has shape \(7,\)"),
+        ("reward", lambda v: v[:-1], r"'reward' has shape \(6,\), expected \(7,\)"),
+        ("reward", lambda v: v[:, None], r"'reward' has shape \(7, 1\)"),
+        ("step_type", lambda v: v + 1, r"'step_type' holds something else"),
+        ("step_type", lambda v: v + 0.5, r"'step_type' holds something else"),
+        ("observation", lambda v: v.astype(np.float32), r"'observation' is float32"),
+        ("observation", lambda v: v[:, :, :64, :64], r"'observation' is uint8 of shape \(7, 3, 64, 64\)"),
+        ("observation", lambda v: v[:0], r"'observation' is uint8 of shape \(0, "),
+    ],
+)
+def test_a_broken_key_is_named(shard, key, change, message):
+    alter(shard, key, change)
+    with pytest.raises(UserError, match=message) as caught:
+        read_shard(shard)
+    assert str(shard) in str(caught.value)
+    assert "\n" not in str(caught.value)
+
+
+def test_truncated_and_foreign_files_are_refused(shard):
+    whole = shard.read_bytes()
+    for content in (whole[: len(whole) // 2], b"no HDF5 at all" * 100, b""):
+        shard.write_bytes(content)
+        with pytest.raises(UserError, match=r"0_fake\.hdf5: is truncated, damaged or no HDF5") as caught:
+            read_shard(shard)
+        assert "\n" not in str(caught.value)
+
+
+def test_damaged_pixels_are_an_error(tmp_path):
+    write_fake_set(tmp_path, (300,))
+    path = tmp_path / "0_fake.hdf5"
+    with h5py.File(path) as file:
+        chunk = file["observation"].id.get_chunk_info(2)
+    content = bytearray(path.read_bytes())
+    content[chunk.byte_offset : chunk.byte_offset + chunk.size] = b"\xff" * chunk.size
+    path.write_bytes(content)
+    with pytest.raises(UserError, match=r"0_fake\.hdf5: is truncated, damaged"):
+        read_shard(path)
