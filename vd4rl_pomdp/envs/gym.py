@@ -59,7 +59,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         obs, info = self._show(step)
         return obs, step.row.reward, False, step.row.last, info
 
-    def render(self) -> np.ndarray:  # type: ignore[override]
+    def render(self) -> np.ndarray:
         """The newest frame before corruption: (84, 84, 3) uint8."""
         return self._frame
 

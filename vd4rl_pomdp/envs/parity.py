@@ -1,4 +1,4 @@
-"""Does the environment show the pixels that the data shows? Canary frames against golden ones, and data against both."""
+"""Does the environment show the pixels of the data? Canary frames against golden ones, and data against both."""
 
 from __future__ import annotations
 

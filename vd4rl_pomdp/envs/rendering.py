@@ -86,7 +86,7 @@ def _sky() -> np.ndarray:
 def gl_strings() -> dict[str, str]:
     """Vendor and renderer of the current GL context; empty strings before anything was rendered."""
     try:
-        from OpenGL import GL
+        from OpenGL import GL  # type: ignore[import-untyped]
 
         values = [GL.glGetString(name) for name in (GL.GL_VENDOR, GL.GL_RENDERER)]
     except (ImportError, AttributeError):
@@ -97,4 +97,4 @@ def gl_strings() -> dict[str, str]:
 
 def frames_hash(frames: np.ndarray) -> str:
     """Short hash of a batch of frames."""
-    return hashlib.blake2b(np.ascontiguousarray(frames), digest_size=8).hexdigest()
+    return hashlib.blake2b(frames.tobytes(), digest_size=8).hexdigest()

@@ -1,0 +1,94 @@
+import subprocess
+import sys
+
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.envs.dmc import PixelEnv, replay_rewards
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, TASKS
+from vd4rl_pomdp.types import StepType
+
+
+def roll(env, seed, count, action_seed=0):
+    rng = np.random.default_rng(action_seed)
+    rows, actions = [env.reset(seed)], []
+    for _ in range(count):
+        actions.append(rng.uniform(-1, 1, env.task.action_dim).astype(np.float32))
+        rows.append(env.step(actions[-1]))
+    return rows, np.stack(actions)
+
+
+@pytest.fixture(scope="module", params=TASKS)
+def blind(request):
+    return PixelEnv(request.param, pixels=False)
+
+
+def test_rewards_replay_exactly_from_the_first_stored_state(blind):
+    for seed in (3, 4):  # the second episode starts from a used simulator
+        rows, actions = roll(blind, seed, 200)
+        replayed = replay_rewards(blind.task.name, rows[0].physics, actions)
+        assert replayed.dtype == np.float64
+        np.testing.assert_array_equal(replayed, [row.reward for row in rows[1:]])
+
+
+def test_replaying_shifted_actions_does_not_give_the_rewards(blind):
+    rows, actions = roll(blind, 3, 100)
+    replayed = replay_rewards(blind.task.name, rows[0].physics, np.roll(actions, 1, axis=0))
+    assert np.abs(replayed - [row.reward for row in rows[1:]]).max() > 1e-4
+
+
+def test_the_first_state_depends_on_the_seed_alone(blind):
+    first = blind.reset(5)
+    roll(blind, 6, 10)
+    again, other = blind.reset(5), blind.reset(6)
+    np.testing.assert_array_equal(first.physics, again.physics)
+    np.testing.assert_array_equal(first.state, again.state)
+    assert not np.array_equal(first.physics, other.physics)
+
+
+def test_rows_have_the_declared_shapes(blind):
+    rows, _ = roll(blind, 0, 2)
+    assert [row.step_type for row in rows] == [StepType.FIRST, StepType.MID, StepType.MID]
+    assert rows[0].reward == 0.0
+    for row in rows:
+        assert row.frame is None
+        assert (row.state.shape, row.state.dtype) == ((blind.task.state_dim,), np.float32)
+        assert (row.physics.ndim, row.physics.dtype, row.discount) == (1, np.float64, 1.0)
+
+
+def test_an_action_is_applied_twice_and_its_rewards_summed(blind):
+    start = blind.reset(0).physics
+    action = np.full(blind.task.action_dim, 0.5, np.float32)
+    row = blind.step(action)
+    by_hand = PixelEnv(blind.task.name, pixels=False)
+    by_hand.reset(0)
+    steps = [by_hand.simulator.step(action) for _ in range(2)]
+    assert row.reward == steps[0].reward + steps[1].reward
+    np.testing.assert_array_equal(row.physics, by_hand.physics.get_state())
+    assert not np.array_equal(row.physics, start)
+
+
+def test_only_the_time_limit_ends_an_episode_and_its_discount_stays_one():
+    env = PixelEnv("walker_walk", pixels=False)
+    rows, _ = roll(env, 0, EPISODE_TRANSITIONS)
+    assert [row.last for row in rows] == [False] * EPISODE_TRANSITIONS + [True]
+    assert rows[-1].discount == 1.0
+
+
+def test_an_unknown_task_is_refused():
+    with pytest.raises(UserError, match="walker_walk, cheetah_run, humanoid_walk"):
+        PixelEnv("walker_run")
+
+
+def test_another_process_renders_the_same_bytes():
+    code = (
+        "import sys; from vd4rl_pomdp.envs.dmc import PixelEnv; env = PixelEnv('walker_walk');"
+        "env.reset(9); env.reset(1); sys.stdout.buffer.write(env.step([0.3] * 6).frame.tobytes())"
+    )
+    theirs = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout
+    env = PixelEnv("walker_walk")
+    env.reset(1)
+    frame = env.step(np.full(6, 0.3)).frame
+    assert (frame.shape, frame.dtype) == ((3, 84, 84), np.uint8)
+    assert frame.tobytes() == theirs

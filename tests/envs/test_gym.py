@@ -1,0 +1,88 @@
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+import torch
+from gymnasium.utils.env_checker import check_env
+
+from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys, make_corruption
+from vd4rl_pomdp.envs import GYM_IDS
+from vd4rl_pomdp.envs.corrupted import CorruptedEnv
+from vd4rl_pomdp.types import row_key
+
+
+def make(name, **arguments):
+    return gymnasium.make(f"vd4rl_pomdp/{name}-v0", disable_env_checker=True, **arguments)
+
+
+@pytest.mark.parametrize("name", GYM_IDS)
+def test_every_id_passes_gymnasiums_checker(name):
+    env = gymnasium.make(name, render_mode="rgb_array", length=4, disable_env_checker=True)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        check_env(env.unwrapped)
+    env.close()
+
+
+def test_ids_cover_three_tasks_and_four_corruptions():
+    assert len(GYM_IDS) == 12
+    assert GYM_IDS["vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0"] == {
+        "task": "walker_walk",
+        "corruption": "patch+zero_frames",
+    }
+
+
+def test_stacks_repeat_the_first_frame_and_put_the_oldest_first():
+    env = make("WalkerWalk")
+    obs, info = env.reset(seed=0)
+    first = obs[:3]
+    assert (obs == np.tile(first, (3, 1, 1))).all()
+    assert info["physics"].dtype == np.float64
+    second = env.step(np.ones(6, np.float32))[0]
+    third = env.step(-np.ones(6, np.float32))[0]
+    np.testing.assert_array_equal(second[:6], obs[:6])
+    assert not np.array_equal(second[6:], first)
+    np.testing.assert_array_equal(third[:6], second[3:])
+    np.testing.assert_array_equal(env.render(), third[6:].transpose(1, 2, 0))
+
+
+def test_the_time_limit_truncates():
+    env = make("WalkerWalk", length=3)
+    env.reset(seed=0)
+    ends = [env.step(np.zeros(6, np.float32))[2:4] for _ in range(3)]
+    assert ends == [(False, False), (False, False), (False, True)]
+
+
+def test_patches_cover_256_pixels_of_each_frame_and_zero_frames_leaves_one():
+    env = make("WalkerWalk-Patch16")
+    obs, info = env.reset(seed=0)
+    changed = (obs != info["clean"]).reshape(3, 3, -1).any(1).sum(1)
+    assert (changed == 256).all()
+    env = make("WalkerWalk-ZeroFrames")
+    obs, info = env.reset(seed=0)
+    blank = [not frame.any() for frame in obs.reshape(3, 3, 84, 84)]
+    assert sum(blank) == 2
+    kept = blank.index(False)
+    np.testing.assert_array_equal(obs.reshape(3, 3, 84, 84)[kept], info["clean"].reshape(3, 3, 84, 84)[kept])
+
+
+def test_a_seed_fixes_the_series_and_every_episode_has_its_own_state_and_masks():
+    env = make("WalkerWalk-Patch16")
+    series = [[env.reset(seed=7), env.reset()] for _ in range(2)]
+    for (obs, info), (same_obs, same_info) in zip(*series, strict=True):
+        np.testing.assert_array_equal(obs, same_obs)
+        np.testing.assert_array_equal(info["physics"], same_info["physics"])
+    (one, one_info), (two, two_info) = series[0]
+    assert not np.array_equal(one_info["physics"], two_info["physics"])
+    assert not np.array_equal(one != one_info["clean"], two != two_info["clean"])
+
+
+@pytest.mark.parametrize("name", ["patch", "zero_frames", "patch+zero_frames"])
+def test_the_environment_corrupts_a_row_as_a_batch_would(name):
+    env = CorruptedEnv("walker_walk", CorruptionConfig(name), length=4)
+    steps = [env.reset(1, corruption_seed=5, episode=2)] + [env.step(np.zeros(6, np.float32)) for _ in range(3)]
+    keys = derive_keys(5, row_key(torch.tensor([2]), torch.arange(4)))
+    batch = make_corruption(name)(torch.stack([step.clean for step in steps]), keys)
+    torch.testing.assert_close(torch.stack([step.obs for step in steps]), batch, rtol=0, atol=0)
+    assert not torch.equal(batch[0], steps[0].clean)
