@@ -17,7 +17,8 @@ from vd4rl_pomdp.envs.rendering import Render
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import load_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy
-from vd4rl_pomdp.runs.workers import run_jobs
+from vd4rl_pomdp.runs.folder import read_json
+from vd4rl_pomdp.runs.workers import default_workers, run_jobs
 from vd4rl_pomdp.tasks import SCORE_DIVISOR
 
 EVALUATION_SEED = 20_000
@@ -157,3 +158,27 @@ def _film(shots: list[tuple[Observation, float]]) -> dict[str, np.ndarray]:
         "corrupted": np.stack([shot.obs.numpy() for shot, _ in shots]),
         "return": np.array([total for _, total in shots]),
     }
+
+
+def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int) -> list[dict[str, Any]]:
+    """Evaluate a fine-tuning run's policy.
+
+    Args:
+        run: its folder.
+        corruption: name of another corruption (default fields), None for the run's own.
+        episodes: how many.
+        workers: processes, 0 for every core.
+
+    Returns:
+        Rows of `episodes.csv`.
+    """
+    labels = read_json(run / "labels.json")
+    card = load_encoder(run / "encoder")[1]
+    chosen = CorruptionConfig(**card.corruption) if corruption is None else CorruptionConfig(corruption)
+    jobs = [
+        EpisodeJob(run / "encoder", run / "policy", 0, card.task, chosen, episode, film=False)
+        for episode in range(episodes)
+    ]
+    step = read_json(run / "timing.json").get("updates", 0) if (run / "timing.json").exists() else 0
+    done = evaluate(jobs, workers or default_workers())
+    return rows_of(done, labels | {"corruption": chosen.corruption, "step": step})

@@ -1,0 +1,341 @@
+"""The command line: one subcommand a stage. Bad input ends with one line and exit code 2, never with a traceback."""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Annotated, Any
+
+import tyro
+
+from vd4rl_pomdp.errors import UserError
+
+Arguments = list[str]
+REPLAY_TOLERANCE = 1e-6
+"""Largest difference between a stored and a replayed reward; on the machine that collected it is 0."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of `vd4rl-pomdp`."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        _dispatch(COMMANDS, words, "vd4rl-pomdp")
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+    except FloatingPointError as error:
+        print(f"error: training diverged, {error}; lower --learning-rate or use --precision fp32", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        sys.exit(141)
+
+
+def _dispatch(table: dict[str, Command | dict[str, Command]], words: Arguments, program: str) -> None:
+    """Run the subcommand that `words` name, or print what there is."""
+    if not words or words[0] in ("-h", "--help"):
+        print(_overview(table, program))
+        return
+    if words[0] == "--version":
+        from vd4rl_pomdp import __version__
+
+        print(__version__)
+        return
+    if words[0] not in table:
+        raise UserError(f"unknown command '{program} {words[0]}': choose one of {', '.join(table)}")
+    entry = table[words[0]]
+    program = f"{program} {words[0]}"
+    if isinstance(entry, dict):
+        _dispatch(entry, words[1:], program)  # type: ignore[arg-type]
+    else:
+        entry.run(words[1:], program)
+
+
+def _overview(table: dict[str, Command | dict[str, Command]], program: str) -> str:
+    width = max(map(len, table))
+    lines = [f"usage: {program} COMMAND [--flags]   ({program} COMMAND --help says more)", ""]
+    for name, entry in table.items():
+        text = ", ".join(entry) if isinstance(entry, dict) else entry.summary
+        lines.append(f"  {name:<{width}}  {text}")
+    return "\n".join(lines)
+
+
+@dataclass(frozen=True)
+class Command:
+    """One subcommand."""
+
+    summary: str
+    run: Callable[[Arguments, str], None]
+
+
+def _parse(config: Any, words: Arguments, program: str, default: Any = None) -> Any:
+    """Arguments as an instance of a config class; `--preset`-like defaults come in as `default`."""
+    options = {} if default is None else {"default": default}
+    return tyro.cli(config, args=words, prog=program, description=config.__doc__, **options)
+
+
+def _with_presets(config: type, presets: dict[str, Any], words: Arguments, program: str) -> Any:
+    """Parse a stage's config whose `--preset` chooses the defaults of all other flags."""
+    name = next(iter(presets))
+    for word, following in zip(words, [*words[1:], ""], strict=True):
+        if word == "--preset":
+            name = following
+        elif word.startswith("--preset="):
+            name = word.partition("=")[2]
+    if name not in presets:
+        raise UserError(f"unknown preset {name!r}: choose one of {', '.join(presets)}")
+    default = presets[name]
+    required = [f for f in ("encoder", "data", "out") if getattr(default, f, None) == Path()]
+    missing = {f: tyro.MISSING for f in required}
+    from dataclasses import replace
+
+    return _parse(config, words, program, replace(default, **missing))
+
+
+def _pretrain(words: Arguments, program: str) -> None:
+    from pretrain.config import PRESETS, PretrainConfig
+    from pretrain.train import pretrain
+
+    run = pretrain(_with_presets(PretrainConfig, PRESETS, words, program))
+    print(f"encoder: {run.path / 'encoder'}")
+
+
+def _finetune(words: Arguments, program: str) -> None:
+    from finetune.config import PRESETS, FinetuneConfig
+    from finetune.train import finetune
+
+    run = finetune(_with_presets(FinetuneConfig, PRESETS, words, program))
+    print(f"episodes: {run.path / 'episodes.csv'}")
+
+
+def _collect(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.data.collect import CollectConfig, collect
+
+    config = _parse(CollectConfig, words, program)
+    shards = collect(config)
+    print(f"{len(shards)} shards in {config.out}; check them with `vd4rl-pomdp data check {config.out}`")
+
+
+@dataclass(frozen=True)
+class CheckCommand:
+    """Validate a set: format, episodes, checksums of its decoded form, and that stored actions replay to its rewards."""
+
+    path: tyro.conf.Positional[Path]
+    """Folder of shards."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def _check(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.data.check import check_dataset
+
+    command = _parse(CheckCommand, words, program)
+    result = check_dataset(command.path)
+    _show(result, command.json)
+    error = result["replay_max_error"]
+    if error is not None and error > REPLAY_TOLERANCE:
+        raise UserError(f"{command.path}: stored actions do not replay to stored rewards (largest difference {error:.3g})")
+
+
+@dataclass(frozen=True)
+class ParityCommand:
+    """Compare rendered canary frames with golden ones, and a data set's background with the environment's."""
+
+    path: tyro.conf.Positional[Path | None] = None
+    """A data set; without one only the canaries are compared."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def _parity(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.envs.parity import check_parity
+
+    command = _parse(ParityCommand, words, program)
+    result = check_parity(command.path)
+    _show(result, command.json)
+    if not result["equal"]:
+        raise UserError("the environment shows other pixels than the data: see the comparison that is not equal")
+
+
+@dataclass(frozen=True)
+class DownloadCommand:
+    """Fetch published V-D4RL 84-pixel sets: checked by SHA-256, resumable, each unique file once."""
+
+    task: str
+    """walker_walk, cheetah_run or humanoid_walk."""
+    quality: str
+    """random, medium_replay, medium, medium_expert or expert."""
+    out: Path = Path("data/vd4rl")
+    """Folder to keep sets in, as OUT/TASK/QUALITY/84px."""
+    endpoint: str = "https://huggingface.co"
+    """The mirror's address."""
+
+
+def _download(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.data.download import download
+
+    command = _parse(DownloadCommand, words, program)
+    print(download(command.task, command.quality, command.out, command.endpoint))
+
+
+@dataclass(frozen=True)
+class EvaluateCommand:
+    """Evaluate a fine-tuned run again, also under another corruption; prints the rows' summary."""
+
+    run: tyro.conf.Positional[Path]
+    """A fine-tuning run's folder."""
+    corruption: str | None = None
+    """Corruption at evaluation; default: the one it was trained under."""
+    episodes: int = 10
+    """Episodes."""
+    workers: int = 0
+    """Processes; 0 uses every core."""
+    out: Path | None = None
+    """Append the raw rows to this CSV file."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def _evaluate(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.evaluation import append_rows, evaluate_run
+
+    command = _parse(EvaluateCommand, words, program)
+    rows = evaluate_run(command.run, command.corruption, command.episodes, command.workers)
+    if command.out is not None:
+        append_rows(command.out, rows)
+    scores = [row["score"] for row in rows]
+    labels = {k: rows[0][k] for k in ("method", "task", "quality", "corruption", "algorithm", "seed", "step")}
+    summary = {"score_mean": sum(scores) / len(scores), "score_min": min(scores), "score_max": max(scores)}
+    _show(labels | summary | {"episodes": rows if command.json else len(rows)}, command.json)
+
+
+def _policy_train(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.policies.train import PolicyConfig, train_policy
+
+    for quality, path in train_policy(_parse(PolicyConfig, words, program)).items():
+        print(f"{quality}: {path}")
+
+
+@dataclass(frozen=True)
+class ReportCommand:
+    """Write an HTML page and CSV files about fine-tuning runs."""
+
+    runs: tyro.conf.Positional[list[Path]]
+    """Run folders, or folders that contain some."""
+    out: Path = Path("report")
+    """Folder of the report."""
+
+
+def _report(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.report import write_report
+
+    command = _parse(ReportCommand, words, program)
+    print(f"report: {write_report(command.runs, command.out)}")
+
+
+@dataclass(frozen=True)
+class SweepCommand:
+    """Run methods x seeds through pretraining and fine-tuning, one after the other; finished runs are skipped."""
+
+    data: Path
+    """Folder of the data set."""
+    out: Path
+    """Folder of the runs: OUT/METHOD/CORRUPTION/seedN/{pretrain,finetune-ALGORITHM}."""
+    methods: list[str] = field(default_factory=lambda: ["mik+a", "acro", "random"])
+    """Pretraining methods."""
+    corruptions: list[str] = field(default_factory=lambda: ["patch+zero_frames"])
+    """Corruptions."""
+    algorithms: list[str] = field(default_factory=lambda: ["td3_bc"])
+    """Fine-tuning algorithms."""
+    seeds: list[int] = field(default_factory=lambda: [0])
+    """Training seeds."""
+    preset: str = "paper"
+    """paper, cpu or smoke."""
+    pretrain: str = ""
+    """More flags for every pretraining, as one string."""
+    finetune: str = ""
+    """More flags for every fine-tuning, as one string."""
+
+
+def _sweep(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.runs.sweep import sweep_commands
+
+    command = _parse(SweepCommand, words, program)
+    for stage in sweep_commands(command):
+        print(f"$ vd4rl-pomdp {' '.join(stage)}", file=sys.stderr)
+        _dispatch(COMMANDS, stage, "vd4rl-pomdp")
+
+
+@dataclass(frozen=True)
+class DemoCommand:
+    """Every stage on a small walker_walk set with real rendering, in minutes, ending with a table and a report."""
+
+    out: Path = Path("runs/demo")
+    """Folder of the demo's data and runs; the same command continues where it was cut."""
+    workers: Annotated[int, tyro.conf.arg(help="Processes; 0 uses every core.")] = 0
+
+
+def _demo(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.experiments.demo import demo
+
+    command = _parse(DemoCommand, words, program)
+    demo(command.out, command.workers, lambda stage: _dispatch(COMMANDS, stage, "vd4rl-pomdp"))
+
+
+@dataclass(frozen=True)
+class BenchCommand:
+    """Measure speed and memory of every stage on this machine, as ratios within one run."""
+
+    json: bool = False
+    """Print one JSON object instead of a table."""
+    quick: bool = False
+    """Fewer repetitions: numbers are rougher."""
+
+
+def _bench(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.experiments.bench import bench
+
+    command = _parse(BenchCommand, words, program)
+    _show(bench(command.quick), command.json)
+
+
+def _show(result: dict[str, Any], as_json: bool) -> None:
+    """Print a result as one JSON object, or as an aligned list."""
+    if as_json:
+        print(json.dumps(result))
+        return
+    for name, value in _flatten(result).items():
+        print(f"{name:<40} {value:.6g}" if isinstance(value, float) else f"{name:<40} {value}")
+
+
+def _flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, item in value.items():
+        flat |= _flatten(item, f"{prefix}{key}.") if isinstance(item, dict) else {f"{prefix}{key}": item}
+    return flat
+
+
+COMMANDS: dict[str, Command | dict[str, Command]] = {
+    "demo": Command("every stage on a small set, in minutes", _demo),
+    "data": {
+        "collect": Command("render a set in V-D4RL's format from the shipped actors", _collect),
+        "download": Command("fetch a published V-D4RL set", _download),
+        "check": Command("validate a set and replay its actions", _check),
+        "parity": Command("compare rendered pixels with the data's", _parity),
+    },
+    "policy": {"train": Command("train the state-based actors that collect data", _policy_train)},
+    "pretrain": Command("train an encoder", _pretrain),
+    "finetune": Command("TD3+BC on a frozen encoder", _finetune),
+    "evaluate": Command("evaluate a fine-tuned run again", _evaluate),
+    "sweep": Command("methods x corruptions x seeds", _sweep),
+    "report": Command("an HTML page and CSV files about runs", _report),
+    "bench": Command("speed and memory on this machine", _bench),
+}
+
+if __name__ == "__main__":
+    main()
