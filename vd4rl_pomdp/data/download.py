@@ -26,7 +26,8 @@ _REPOSITORY = "datasets/conglu/vd4rl/resolve/main"
 _ATTEMPTS = 5
 _FIRST_WAIT_S = 1.0
 _TIMEOUT_S = (10.0, 60.0)
-_BLOCK = 1 << 20
+_BLOCK = 1 << 16
+"""Bytes read at once: what a cut connection loses at most."""
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,74 @@
+import json
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.helpers_data import fake_reward, write_fake_set
+from vd4rl_pomdp.data.check import check_dataset
+from vd4rl_pomdp.errors import UserError
+
+
+def true_replay(task, physics, actions):
+    """Rewards of the fake sets, told from their fake simulator state and actions."""
+    assert task == "walker_walk"
+    episode, t = int(physics[0]), int(physics[1])
+    assert t == 0, "a replay starts at an episode's first row"
+    np.testing.assert_allclose(actions[:, 0], (episode * 1000 + np.arange(len(actions))) / 1e4, rtol=1e-6)
+    return np.array([fake_reward(episode, i) for i in range(len(actions))])
+
+
+@pytest.fixture
+def folder(tmp_path):
+    lengths = (5, 1, 4)
+    return write_fake_set(tmp_path / "walker_walk" / "expert", lengths, physics_dim=3, cuts=(3, 7), complete_last=False)
+
+
+def test_the_report_holds_every_number(folder, tmp_path):
+    report = check_dataset(folder, tmp_path / "cache", true_replay)
+    shards = [f"{i}_fake.hdf5" for i in range(3)]
+    dtypes = {"observation": ["uint8"], "action": ["float32"], "reward": ["float64"], "discount": ["float64"]}
+    dtypes |= {"step_type": ["int64"], "physics": ["float64"]}
+    returns = [0.006, 0.0, 6.003]
+    assert json.loads(json.dumps(report)) == {
+        "rows": 10,
+        "episodes": 3,
+        "transitions": 7,
+        "incomplete_episodes": 2,  # an episode of a single row has no LAST either
+        "action_dim": 6,
+        "return_mean": pytest.approx(np.mean(returns)),
+        "return_min": 0.0,
+        "return_max": pytest.approx(6.003),
+        "replay_max_error": 0.0,
+        "task": "walker_walk",
+        "quality": "expert",
+        "shards": shards,
+        "dtypes": dtypes,
+        "store_ok": True,
+    }
+
+
+def test_the_largest_replay_error_counts(folder, tmp_path):
+    with h5py.File(folder / "2_fake.hdf5", "a") as file:
+        file["reward"][1] += 0.25
+    assert check_dataset(folder, tmp_path / "cache", true_replay)["replay_max_error"] == pytest.approx(0.25)
+
+
+def test_without_physics_nothing_is_replayed(tmp_path):
+    report = check_dataset(write_fake_set(tmp_path / "set", (4,)), tmp_path / "cache", replay=None)
+    assert report["replay_max_error"] is None
+    assert report["dtypes"].keys() == {"observation", "action", "reward", "discount", "step_type"}
+
+
+def test_differing_dtypes_are_all_listed(tmp_path):
+    folder = write_fake_set(tmp_path / "set", (4, 4), cuts=(4,))
+    with h5py.File(folder / "1_fake.hdf5", "a") as file:
+        step_type = file["step_type"][()].astype(float)
+        del file["step_type"]
+        file["step_type"] = step_type
+    assert check_dataset(folder, tmp_path / "cache")["dtypes"]["step_type"] == ["float64", "int64"]
+
+
+def test_physics_without_a_task_is_refused(tmp_path):
+    with pytest.raises(UserError, match="has physics but names no task"):
+        check_dataset(write_fake_set(tmp_path / "set", (4,), physics_dim=2), tmp_path / "cache", true_replay)

@@ -1,0 +1,235 @@
+import h5py
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers_data import fake_action, fake_reward, fake_rows, frame_identity, write_fake_set
+from vd4rl_pomdp.data import TransitionSampler, WindowSampler, open_dataset
+from vd4rl_pomdp.data.format import shard_paths, write_shard
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.types import row_key
+
+LENGTHS = (5, 3, 260)
+ROWS = [(e, t) for e, length in enumerate(LENGTHS) for t in range(length)]
+STARTS = [(e, t) for e, t in ROWS if t + 1 < LENGTHS[e]]
+"""(episode, t) of every transition, in order."""
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory):
+    base = tmp_path_factory.mktemp("dataset")
+    folder = write_fake_set(base / "walker_walk" / "expert" / "84px", LENGTHS, cuts=(2, 6, 30), complete_last=False)
+    return open_dataset(folder, cache=base / "cache")
+
+
+def stack_identity(episode, t, frames=3):
+    return [[episode, max(t - back, 0)] for back in reversed(range(frames))]
+
+
+def test_counts_and_names(dataset):
+    assert (dataset.num_rows, dataset.num_episodes, dataset.num_transitions) == (268, 3, 265)
+    assert (dataset.action_dim, dataset.incomplete_episodes) == (6, 1)
+    assert (dataset.task, dataset.quality, dataset.physics) == ("walker_walk", "expert", None)
+    assert dataset.episode_start.tolist() == [0, 5, 8]
+    assert dataset.episode_end.tolist() == [5, 8, 268]
+    assert list(zip(dataset.episode.tolist(), dataset.t.tolist(), strict=True)) == ROWS
+    expected = [sum(fake_reward(e, t) for t in range(length - 1)) for e, length in enumerate(LENGTHS)]
+    np.testing.assert_allclose(dataset.returns, expected, rtol=1e-12)
+
+
+def test_row_tensors_have_the_documented_types(dataset):
+    kinds = {"frames": torch.uint8, "action": torch.float32, "reward": torch.float32, "discount": torch.float32}
+    kinds |= {"step_type": torch.uint8, "episode": torch.int64, "t": torch.int64, "returns": torch.float64}
+    assert {name: getattr(dataset, name).dtype for name in kinds} == kinds
+    assert dataset.frames.shape == (268, 3, 84, 84)
+
+
+def test_every_field_of_every_transition_is_aligned(dataset):
+    batch = dataset.transitions(range(dataset.num_transitions))
+    assert batch.obs.shape == batch.next_obs.shape == (265, 9, 84, 84)
+    assert batch.obs.dtype == torch.uint8
+    assert frame_identity(batch.obs).tolist() == [stack_identity(e, t) for e, t in STARTS]
+    assert frame_identity(batch.next_obs).tolist() == [stack_identity(e, t + 1) for e, t in STARTS]
+    np.testing.assert_array_equal(batch.action, np.stack([fake_action(e, t) for e, t in STARTS]))
+    np.testing.assert_array_equal(batch.reward, np.float32([fake_reward(e, t) for e, t in STARTS]))
+    assert batch.discount.tolist() == [1.0] * 265
+    assert batch.key.tolist() == [(e << 20) + t for e, t in STARTS]
+    assert batch.next_key.tolist() == [(e << 20) + t + 1 for e, t in STARTS]
+
+
+@pytest.mark.parametrize("n", [2, 3, 10])
+def test_n_step_returns_stop_at_the_episodes_end(dataset, n):
+    gamma = 0.5
+    batch = dataset.transitions(range(dataset.num_transitions), n_step=n, gamma=gamma)
+    taken = [min(n, LENGTHS[e] - 1 - t) for e, t in STARTS]
+    rewards = [sum(gamma**i * fake_reward(e, t + i) for i in range(m)) for (e, t), m in zip(STARTS, taken, strict=True)]
+    np.testing.assert_allclose(batch.reward, rewards, rtol=1e-6)
+    np.testing.assert_allclose(batch.discount, [gamma ** (m - 1) for m in taken], rtol=1e-6)
+    ends = [(e, t + m) for (e, t), m in zip(STARTS, taken, strict=True)]
+    assert frame_identity(batch.next_obs).tolist() == [stack_identity(e, t) for e, t in ends]
+    assert batch.next_key.tolist() == [(e << 20) + t for e, t in ends]
+    np.testing.assert_array_equal(batch.action, np.stack([fake_action(e, t) for e, t in STARTS]))
+
+
+def test_stored_discounts_are_multiplied_and_may_be_zero(tmp_path):
+    rows = fake_rows((5,))
+    rows["discount"] = np.array([9.0, 0.5, 0.25, 1.0, 0.0])
+    (tmp_path / "set").mkdir()
+    write_shard(tmp_path / "set" / "0_a.hdf5", rows, {})
+    dataset = open_dataset(tmp_path / "set", tmp_path / "cache")
+    np.testing.assert_allclose(dataset.transitions(range(4)).discount, [0.5, 0.25, 1.0, 0.0])
+    batch = dataset.transitions(range(4), n_step=2, gamma=0.1)
+    np.testing.assert_allclose(batch.discount, [0.0125, 0.025, 0.0, 0.0])
+    np.testing.assert_allclose(batch.reward, [0.0001, 0.0012, 0.0023, 0.003], rtol=1e-5)
+
+
+def test_an_episodes_last_row_has_no_return(dataset):
+    reward, discount, successor = dataset.n_step_returns(torch.tensor([4, 3]), n_step=3, gamma=0.9)
+    assert reward.tolist() == [0.0, pytest.approx(0.003)]
+    assert discount.tolist() == [1.0, 1.0]
+    assert successor.tolist() == [4, 4]
+
+
+@pytest.mark.parametrize("frames", [1, 2, 5])
+def test_stacks_of_any_depth_and_shape(dataset, frames):
+    rows = torch.tensor([[0, 1, 5], [6, 8, 267]])
+    stacks = dataset.stacks(rows, frames)
+    assert stacks.shape == (2, 3, 3 * frames, 84, 84)
+    expected = [[stack_identity(*ROWS[row], frames) for row in line] for line in rows.tolist()]
+    assert frame_identity(stacks).tolist() == expected
+
+
+def test_every_field_of_every_window_is_aligned(dataset):
+    length = 3
+    starts = [(e, t) for e, t in ROWS if t + length <= LENGTHS[e]]
+    assert dataset.num_windows(length) == len(starts) == 3 + 1 + 258
+    batch = dataset.windows(np.arange(len(starts)), length)
+    assert batch.obs.shape == (len(starts), 3, 9, 84, 84)
+    assert frame_identity(batch.obs).tolist() == [[stack_identity(e, t + j) for j in range(3)] for e, t in starts]
+    zero = np.zeros(6, np.float32)
+    for i, (e, t) in enumerate(starts):
+        following = [t + j + 1 < LENGTHS[e] for j in range(3)]
+        assert batch.has_action[i].tolist() == following
+        actions = [fake_action(e, t + j) if there else zero for j, there in enumerate(following)]
+        np.testing.assert_array_equal(batch.action[i], actions)
+        np.testing.assert_array_equal(batch.prev_action[i], [zero, fake_action(e, t), fake_action(e, t + 1)])
+        assert batch.key[i].tolist() == [(e << 20) + t + j for j in range(3)]
+    assert batch.length.tolist() == [3] * len(starts)
+    assert (batch.length.dtype, batch.has_action.dtype, batch.key.dtype) == (torch.int64, torch.bool, torch.int64)
+
+
+def test_an_episode_shorter_than_the_window_is_named(dataset):
+    for call in (lambda: dataset.num_windows(6), lambda: dataset.windows([0], 6)):
+        with pytest.raises(UserError, match=r"episode 0 has 5 rows, fewer than the window of 6 \(2 such episodes\)"):
+            call()
+
+
+@pytest.mark.parametrize("index", [7, [7], (7,), np.int64(7), np.array([7]), torch.tensor(7), torch.tensor([7])])
+def test_an_index_may_be_any_integers(dataset, index):
+    assert dataset.transitions(index).key.tolist() == [row_key(torch.tensor(2), torch.tensor(1)).item()]
+    assert dataset.windows(index, 2).key[:, 0].tolist() == dataset.transitions(index).key.tolist()
+
+
+@pytest.mark.parametrize("index", [-1, 265, [0, 265], [[0]], 1.0, [True]])
+def test_an_index_out_of_range_or_of_another_kind_is_refused(dataset, index):
+    with pytest.raises(IndexError):
+        dataset.transitions(index)
+    with pytest.raises(IndexError):
+        dataset.windows(index, 2)
+
+
+def test_an_empty_index_gives_an_empty_batch(dataset):
+    assert dataset.transitions([]).obs.shape == (0, 9, 84, 84)
+    assert dataset.windows([], 2).obs.shape == (0, 2, 9, 84, 84)
+
+
+@pytest.mark.parametrize("arguments", [{"n_step": 0}, {"frame_stack": 0}])
+def test_counts_below_one_are_refused(dataset, arguments):
+    with pytest.raises(UserError, match=f"{next(iter(arguments))} is 0"):
+        dataset.transitions(0, **arguments)
+
+
+def test_gathered_frames_do_not_share_the_map(dataset):
+    dataset.stacks(torch.tensor([0]), 1).fill_(255)
+    assert dataset.frames[0].max() == 0
+
+
+def test_an_episode_of_one_row_has_no_transition(tmp_path):
+    folder = write_fake_set(tmp_path / "set", (1, 3, 1), cuts=(1,))
+    dataset = open_dataset(folder, tmp_path / "cache")
+    assert (dataset.num_rows, dataset.num_episodes, dataset.num_transitions) == (5, 3, 2)
+    assert dataset.transitions([0, 1]).key.tolist() == [(1 << 20), (1 << 20) + 1]
+    lonely = open_dataset(write_fake_set(tmp_path / "lonely", (1,)), tmp_path / "cache")
+    with pytest.raises(UserError, match="holds no transition"):
+        TransitionSampler(lonely, 4, torch.Generator())
+
+
+def test_names_come_from_the_shards_before_the_folders(tmp_path):
+    folder = tmp_path / "cheetah_run" / "random"
+    write_fake_set(folder, attributes={"task": "walker_walk", "set": "medium"})
+    dataset = open_dataset(folder, tmp_path / "cache")
+    assert (dataset.task, dataset.quality) == ("walker_walk", "medium")
+    plain = open_dataset(write_fake_set(tmp_path / "elsewhere"), tmp_path / "cache")
+    assert (plain.task, plain.quality) == (None, None)
+    write_fake_set(folder, names=["1_fake.hdf5"], attributes={"task": "cheetah_run"})
+    with pytest.raises(UserError, match="its shards come from cheetah_run and walker_walk"):
+        open_dataset(folder, tmp_path / "cache")
+
+
+def test_samplers_repeat_with_their_generator_and_cover_the_set(dataset):
+    def draws(sampler, count):
+        return [next(batches).key.tolist() for batches in [iter(sampler)] for _ in range(count)]
+
+    def transitions(seed):
+        return TransitionSampler(dataset, 64, torch.Generator().manual_seed(seed), n_step=2, frame_stack=1)
+
+    def windows(seed):
+        return WindowSampler(dataset, 64, 2, torch.Generator().manual_seed(seed), frame_stack=1)
+
+    for make in (transitions, windows):
+        first = draws(make(0), 30)
+        assert first == draws(make(0), 30)
+        assert first != draws(make(1), 30)
+        keys = {tuple(np.atleast_1d(key)) for batch in first for key in batch}
+        assert {key[0] for key in keys} == {(e << 20) + t for e, t in STARTS}
+
+
+def test_samplers_draw_uniformly_over_transitions(dataset):
+    sampler = TransitionSampler(dataset, 2000, torch.Generator().manual_seed(0), frame_stack=1)
+    short = np.mean([key < (2 << 20) for key in sampler.sample().key.tolist()])
+    assert short == pytest.approx(6 / 265, abs=0.012)
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_device_changes_nothing(tmp_path):
+    folder = write_fake_set(tmp_path / "set", (9, 5))
+    for make in (
+        lambda d: TransitionSampler(d, 32, torch.Generator().manual_seed(0), n_step=3),
+        lambda d: WindowSampler(d, 8, 4, torch.Generator().manual_seed(0)),
+    ):
+        here, there = (make(open_dataset(folder, tmp_path / "cache").to(device)).sample() for device in ("cpu", "cuda"))
+        assert there.obs.is_cuda
+        for name in here.keys():  # noqa: SIM118
+            torch.testing.assert_close(there[name].cpu(), here[name])
+
+
+def test_every_trap_of_the_published_files_at_once(tmp_path):
+    """Cut inside episodes, a float step_type, `10_` after `9_`, two halves in one folder, no last row at the end."""
+    folder = tmp_path / "humanoid_walk" / "medium_expert"
+    lengths = (9, 4, 9, 2)
+    cuts = (1, 2, 3, 5, 6, 8, 9, 11, 12, 13, 22)  # the medium half begins with episode 3
+    names = [f"{i}_walker_expert.hdf5" for i in range(11)] + ["0_walker_medium.hdf5"]
+    write_fake_set(folder, lengths, 21, complete_last=False, cuts=cuts, names=names)
+    for path in shard_paths(folder)[::2]:
+        with h5py.File(path, "a") as file:
+            step_type = file["step_type"][()].astype(np.float64)
+            del file["step_type"]
+            file["step_type"] = step_type
+    dataset = open_dataset(folder, tmp_path / "cache")
+    assert (dataset.num_rows, dataset.num_episodes, dataset.incomplete_episodes) == (24, 4, 1)
+    assert (dataset.task, dataset.quality, dataset.action_dim) == ("humanoid_walk", "medium_expert", 21)
+    expected = [(e, t) for e, length in enumerate(lengths) for t in range(length)]
+    assert [tuple(pair) for pair in frame_identity(dataset.frames)[:, 0].tolist()] == expected
+    starts = [(e, t) for e, t in expected if t + 1 < lengths[e]]
+    batch = dataset.transitions(range(dataset.num_transitions))
+    np.testing.assert_array_equal(batch.action, np.stack([fake_action(e, t, 21) for e, t in starts]))

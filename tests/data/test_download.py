@@ -1,0 +1,207 @@
+import hashlib
+import re
+import threading
+from collections import Counter
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
+
+import pytest
+
+from vd4rl_pomdp.data import download as module
+from vd4rl_pomdp.data.download import RemoteFile, download, manifest
+from vd4rl_pomdp.errors import UserError
+
+CONTENT = {"0_a_expert.hdf5": bytes(range(256)) * 40, "1_a_expert.hdf5": b"second" * 999, "0_a_medium.hdf5": b"m" * 500}
+EXPERT = "walker_walk/expert/84px"
+BOTH = "walker_walk/medium_expert/84px"
+PREFIX = "/datasets/conglu/vd4rl/resolve/main/vd4rl/main/"
+
+
+class Mirror:
+    """A mirror on this machine with the faults that a test asks for."""
+
+    def __init__(self):
+        self.files = {
+            f"{folder}/{name}": CONTENT[name]
+            for folder, names in {EXPERT: list(CONTENT)[:2], BOTH: list(CONTENT)}.items()
+            for name in names
+        }
+        self.manifest = tuple(
+            RemoteFile(f"vd4rl/main/{path}", len(content), hashlib.sha256(content).hexdigest())
+            for path, content in self.files.items()
+        )
+        self.requests = []
+        """(path, Range header or None) of every request."""
+        self.ranges = True
+        self.cuts = Counter()
+        """How often a path's answer breaks off after 1000 bytes."""
+        self.status = []
+        """Statuses of the next answers that fail."""
+
+    def answer(self, handler):
+        path, wanted = handler.path.removeprefix(PREFIX), handler.headers["Range"]
+        self.requests.append((path, wanted))
+        if self.status or path not in self.files:
+            return handler.send_error(self.status.pop(0) if self.status else 404)
+        body = self.files[path]
+        offset = int(re.fullmatch(r"bytes=(\d+)-", wanted)[1]) if wanted and self.ranges else 0
+        handler.send_response(206 if offset else 200)
+        if offset:
+            handler.send_header("Content-Range", f"bytes {offset}-{len(body) - 1}/{len(body)}")
+        handler.send_header("Content-Length", str(len(body) - offset))
+        handler.end_headers()
+        cut = self.cuts[path] > 0
+        self.cuts[path] -= cut
+        handler.wfile.write(body[offset : offset + 1000] if cut else body[offset:])
+        return None
+
+
+@pytest.fixture
+def mirror(monkeypatch):
+    mirror = Mirror()
+
+    class Handler(BaseHTTPRequestHandler):
+        def do_GET(self):
+            mirror.answer(self)
+
+        def log_message(self, *_):
+            pass
+
+    server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
+    mirror.endpoint = f"http://127.0.0.1:{server.server_port}"
+    threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
+    monkeypatch.setattr(module, "manifest", lambda: mirror.manifest)
+    monkeypatch.setattr(module, "_FIRST_WAIT_S", 0.001)
+    monkeypatch.setattr(module, "_BLOCK", 500)
+    monkeypatch.setenv("NO_PROXY", "127.0.0.1")
+    yield mirror
+    server.shutdown()
+    server.server_close()
+
+
+def fetch(mirror, destination, quality="expert", **options):
+    return download("walker_walk", quality, destination, endpoint=mirror.endpoint, **options)
+
+
+def names(folder):
+    return sorted(p.name for p in folder.iterdir())
+
+
+def test_the_manifest_lists_the_published_sets():
+    listed = manifest()
+    assert len(listed) == 86
+    assert len({file.sha256 for file in listed}) == 62
+    assert sum({file.sha256: file.size for file in listed}.values()) == pytest.approx(10.5e9, rel=0.01)
+    sets = {tuple(file.path.split("/")[2:4]) for file in listed}
+    assert len(sets) == 15
+
+
+def test_a_set_arrives_whole_and_is_not_fetched_twice(mirror, tmp_path):
+    shards = fetch(mirror, tmp_path)
+    assert [shard.relative_to(tmp_path).as_posix() for shard in shards] == list(mirror.files)[:2]
+    assert [shard.read_bytes() for shard in shards] == list(CONTENT.values())[:2]
+    assert names(tmp_path / EXPERT) == ["0_a_expert.hdf5", "1_a_expert.hdf5"]
+    mirror.requests.clear()
+    assert fetch(mirror, tmp_path) == shards
+    assert mirror.requests == []
+
+
+def test_a_cut_connection_is_resumed(mirror, tmp_path):
+    path = f"{EXPERT}/0_a_expert.hdf5"
+    mirror.cuts[path] = 2
+    fetch(mirror, tmp_path)
+    assert [r for p, r in mirror.requests if p == path] == [None, "bytes=1000-", "bytes=2000-"]
+    assert (tmp_path / path).read_bytes() == CONTENT["0_a_expert.hdf5"]
+
+
+def test_a_partial_file_of_an_earlier_run_is_continued(mirror, tmp_path):
+    path = f"{EXPERT}/0_a_expert.hdf5"
+    (tmp_path / EXPERT).mkdir(parents=True)
+    (tmp_path / f"{path}.part").write_bytes(CONTENT["0_a_expert.hdf5"][:77])
+    fetch(mirror, tmp_path)
+    assert mirror.requests[0] == (path, "bytes=77-")
+    assert (tmp_path / path).read_bytes() == CONTENT["0_a_expert.hdf5"]
+
+
+def test_a_server_without_ranges_starts_over(mirror, tmp_path):
+    path = f"{EXPERT}/0_a_expert.hdf5"
+    mirror.ranges, mirror.cuts[path] = False, 2
+    fetch(mirror, tmp_path)
+    assert [r for p, r in mirror.requests if p == path] == [None, "bytes=1000-", "bytes=1000-"]
+    assert (tmp_path / path).read_bytes() == CONTENT["0_a_expert.hdf5"]
+
+
+def test_passing_failures_of_the_server_are_survived(mirror, tmp_path):
+    mirror.status = [503, 429, 500]
+    assert len(fetch(mirror, tmp_path)) == 2
+
+
+def test_a_wrong_hash_removes_the_file(mirror, tmp_path):
+    path = f"{EXPERT}/1_a_expert.hdf5"
+    mirror.files[path] = b"SECOND" * 999
+    with pytest.raises(UserError, match=r"1_a_expert\.hdf5: has a wrong SHA-256 and was removed"):
+        fetch(mirror, tmp_path)
+    assert names(tmp_path / EXPERT) == ["0_a_expert.hdf5"]
+
+
+def test_equal_files_are_fetched_and_stored_once(mirror, tmp_path):
+    expert = fetch(mirror, tmp_path)
+    mirror.requests.clear()
+    both = fetch(mirror, tmp_path, "medium_expert")
+    assert [path for path, _ in mirror.requests] == [f"{BOTH}/0_a_medium.hdf5"]
+    assert [shard.read_bytes() for shard in both] == list(CONTENT.values())
+    assert both[0].samefile(expert[0])
+
+
+@pytest.mark.parametrize("broken", [["link"], ["link", "symlink"]])
+def test_where_links_do_not_work_the_next_best_is_used(mirror, tmp_path, monkeypatch, broken):
+    def refuse(*_, **__):
+        raise OSError("links are not supported here")
+
+    expert = fetch(mirror, tmp_path)
+    for name in broken:
+        monkeypatch.setattr(module.os, name, refuse)
+    both = fetch(mirror, tmp_path, "medium_expert")
+    assert both[0].read_bytes() == expert[0].read_bytes()
+    assert both[0].is_symlink() == (broken == ["link"])
+    assert both[0].samefile(expert[0]) == (broken == ["link"])
+
+
+def test_damage_is_found_by_size_and_on_request_by_hash(mirror, tmp_path):
+    first, second = fetch(mirror, tmp_path)
+    first.write_bytes(b"short")
+    second.write_bytes(b"SECOND" * 999)
+    fetch(mirror, tmp_path)
+    assert (first.read_bytes(), second.read_bytes()) == (CONTENT["0_a_expert.hdf5"], b"SECOND" * 999)
+    fetch(mirror, tmp_path, verify=True)
+    assert second.read_bytes() == CONTENT["1_a_expert.hdf5"]
+
+
+def test_a_dead_mirror_is_told_with_advice(mirror, tmp_path):
+    mirror.status = [503] * 5
+    with pytest.raises(UserError, match=r"cannot be fetched \(status 503\); check the network .*--endpoint"):
+        fetch(mirror, tmp_path)
+    assert len(mirror.requests) == 5
+    with pytest.raises(UserError, match=r"cannot be fetched \(ConnectionError\)"):
+        download("walker_walk", "expert", tmp_path, endpoint="http://127.0.0.1:9")
+
+
+def test_a_missing_file_is_told_at_once(mirror, tmp_path):
+    mirror.files.clear()
+    with pytest.raises(UserError, match=r"the mirror answers 404 .*--endpoint"):
+        fetch(mirror, tmp_path)
+    assert len(mirror.requests) == 1
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        (("walker_run", "expert"), "unknown task 'walker_run'"),
+        (("walker_walk", "best"), "unknown quality 'best': choose one of random"),
+        (("walker_walk", "expert", "hf.co"), "endpoint 'hf.co' is no address"),
+    ],
+)
+def test_what_is_not_published_is_refused(tmp_path, arguments, message):
+    task, quality, *endpoint = arguments
+    with pytest.raises(UserError, match=message):
+        download(task, quality, tmp_path, *endpoint)
+    assert names(tmp_path) == []

@@ -1,0 +1,195 @@
+import errno
+import multiprocessing
+import os
+import signal
+import time
+
+import h5py
+import numpy as np
+import pytest
+
+from tests.helpers_data import fake_rows, frame_identity, write_fake_set
+from vd4rl_pomdp.data import store as store_module
+from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.data.store import default_cache, open_store, verify_store
+from vd4rl_pomdp.errors import UserError
+
+fork = multiprocessing.get_context("fork")
+
+
+@pytest.fixture
+def cache(tmp_path):
+    return tmp_path / "cache"
+
+
+def slow_frames(log, seconds):
+    """`read_frames` that notes every call in a file and takes its time after every block."""
+
+    def read(path, original=store_module.read_frames):
+        with log.open("a") as file:
+            file.write(f"{path.name}\n")
+        for block in original(path):
+            yield block
+            time.sleep(seconds)
+
+    return read
+
+
+def visible(cache):
+    return sorted(p.name for p in cache.iterdir() if p.suffix != ".lock")
+
+
+def test_decoded_arrays_are_the_concatenated_rows(tmp_path, cache):
+    rows = fake_rows((5, 4, 6), physics_dim=3)
+    store = open_store(write_fake_set(tmp_path / "set", (5, 4, 6), physics_dim=3, cuts=(3, 11)), cache)
+    np.testing.assert_array_equal(store.frames(), rows["observation"])
+    for key in ("action", "reward", "discount", "step_type"):
+        np.testing.assert_array_equal(store.array(key), rows[key])
+    np.testing.assert_array_equal(store.physics(), rows["physics"])
+    assert not store.frames().flags.writeable
+    assert store.meta["shards"] == ["0_fake.hdf5", "1_fake.hdf5", "2_fake.hdf5"]
+
+
+def test_a_set_is_decoded_once(tmp_path, cache, monkeypatch):
+    folder = write_fake_set(tmp_path / "set")
+    log = tmp_path / "log"
+    monkeypatch.setattr(store_module, "read_frames", slow_frames(log, 0))
+    first, second = open_store(folder, cache), open_store(folder, cache)
+    assert first == second
+    assert log.read_text() == "0_fake.hdf5\n"
+
+
+def test_a_changed_set_is_decoded_anew(tmp_path, cache):
+    folder = write_fake_set(tmp_path / "set", (4,))
+    before = open_store(folder, cache)
+    write_shard(folder / "1_fake.hdf5", fake_rows((3,)), {})
+    after = open_store(folder, cache)
+    assert (before.meta["rows"], after.meta["rows"]) == (4, 7)
+    assert before.fingerprint != after.fingerprint
+
+
+def test_the_fingerprint_names_the_content(tmp_path, cache):
+    one, two, other = (write_fake_set(tmp_path / n, (4,), action_dim=d) for n, d in (("a", 2), ("b", 2), ("c", 3)))
+    assert open_store(one, cache).fingerprint == open_store(two, cache).fingerprint
+    assert open_store(one, cache).fingerprint != open_store(other, cache).fingerprint
+
+
+def test_the_cache_folder_follows_the_environment(tmp_path, monkeypatch):
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
+    monkeypatch.delenv("VD4RL_POMDP_CACHE", raising=False)
+    assert default_cache() == tmp_path / "xdg" / "vd4rl-pomdp"
+    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "own"))
+    assert default_cache() == tmp_path / "own"
+
+
+@pytest.mark.parametrize("name", ["frames.u8", "reward.npy"])
+def test_verify_finds_a_flipped_byte_and_open_a_short_file(tmp_path, cache, name):
+    folder = write_fake_set(tmp_path / "set")
+    store = open_store(folder, cache)
+    verify_store(store)
+    content = bytearray((store.folder / name).read_bytes())
+    content[-1] ^= 1
+    (store.folder / name).write_bytes(content)
+    with pytest.raises(UserError, match=rf"{name}: is damaged; delete"):
+        verify_store(store)
+    (store.folder / name).write_bytes(content[:-1])
+    verify_store(open_store(folder, cache))  # decoded anew
+
+
+def test_two_processes_decode_once_and_agree(tmp_path, cache, monkeypatch):
+    folder = write_fake_set(tmp_path / "set", (5, 4), cuts=(3,))
+    log = tmp_path / "log"
+    monkeypatch.setattr(store_module, "read_frames", slow_frames(log, 0.2))
+    with fork.Pool(2) as pool:
+        stores = pool.starmap(open_store, [(folder, cache)] * 2, chunksize=1)
+    assert stores[0] == stores[1]
+    assert log.read_text() == "0_fake.hdf5\n1_fake.hdf5\n"
+    np.testing.assert_array_equal(stores[0].frames(), fake_rows((5, 4))["observation"])
+    assert visible(cache) == [stores[0].folder.name]
+
+
+def test_a_killed_decode_leaves_nothing_that_counts(tmp_path, cache, monkeypatch):
+    folder = write_fake_set(tmp_path / "set", (5, 4), cuts=(3,))
+    log = tmp_path / "log"
+    with monkeypatch.context() as patch:
+        patch.setattr(store_module, "read_frames", slow_frames(log, 60))
+        process = fork.Process(target=open_store, args=(folder, cache))
+        process.start()
+    while not log.exists():
+        time.sleep(0.01)
+    assert process.pid
+    os.kill(process.pid, signal.SIGKILL)
+    process.join()
+    assert [name[0] for name in visible(cache)] == ["."], "only the hidden folder may be there"
+    store = open_store(folder, cache)
+    verify_store(store)
+    assert visible(cache) == [store.folder.name]
+
+
+@pytest.mark.parametrize("stage", ["_write_frames", "_describe"])
+def test_a_full_disk_removes_what_was_written(tmp_path, cache, monkeypatch, stage):
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(store_module, stage, full)
+    with pytest.raises(UserError, match=r"cache: the disk is full: free some space"):
+        open_store(write_fake_set(tmp_path / "set"), cache)
+    assert visible(cache) == []
+
+
+def test_too_little_space_is_told_before_decoding(tmp_path, cache, monkeypatch):
+    monkeypatch.setattr(store_module.shutil, "disk_usage", lambda _: type("usage", (), {"free": 8 * 21168 - 1}))
+    with pytest.raises(UserError, match=r"decoding needs 0\.0 GB, .*VD4RL_POMDP_CACHE"):
+        open_store(write_fake_set(tmp_path / "set", (4, 4)), cache)
+    assert visible(cache) == []
+
+
+def test_an_unusable_cache_is_told(tmp_path):
+    (tmp_path / "file").write_text("")
+    with pytest.raises(UserError, match=r"file: cannot write"):
+        open_store(write_fake_set(tmp_path / "set"), tmp_path / "file")
+
+
+def set_step_type(path, row, value):
+    with h5py.File(path, "a") as file:
+        file["step_type"][row] = value
+
+
+def test_rows_that_belong_to_no_episode_are_named(tmp_path, cache):
+    folder = write_fake_set(tmp_path / "set", (4, 4, 4), cuts=(6,))
+    set_step_type(folder / "1_fake.hdf5", 2, 1)  # row 8, the third episode's first
+    with pytest.raises(UserError, match=r"1_fake\.hdf5: row 2 follows an episode's last row without beginning"):
+        open_store(folder, cache)
+    (folder / "0_fake.hdf5").unlink()
+    with pytest.raises(UserError, match=r"1_fake\.hdf5: row 0 has step_type 1, but the first row .*missing"):
+        open_store(folder, cache)
+    assert not cache.exists() or visible(cache) == []
+
+
+def test_a_shard_missing_in_the_middle_is_found(tmp_path, cache):
+    folder = write_fake_set(tmp_path / "set", (9, 9), cuts=(3, 6, 9, 12))
+    (folder / "1_fake.hdf5").unlink()
+    with pytest.raises(UserError, match=r"2_fake\.hdf5: row 0 continues an episode, but not that of 0_fake\.hdf5"):
+        open_store(folder, cache)
+
+
+def test_a_subset_of_whole_episodes_may_be_used(tmp_path, cache):
+    folder = write_fake_set(tmp_path / "set", (3, 3, 3), cuts=(3, 6))
+    (folder / "1_fake.hdf5").unlink()
+    frames = open_store(folder, cache).frames()
+    assert frame_identity(frames)[:, 0].tolist() == [[0, 0], [0, 1], [0, 2], [2, 0], [2, 1], [2, 2]]
+
+
+@pytest.mark.parametrize(
+    ("second", "message"),
+    [
+        ({"action_dim": 5, "physics_dim": 3}, r"1_b\.hdf5: 'action' has 5 dimensions, in 0_a\.hdf5 6"),
+        ({"physics_dim": 4}, r"1_b\.hdf5: 'physics' has 4 dimensions, in 0_a\.hdf5 3"),
+        ({}, r"0_a\.hdf5: has 'physics', 1_b\.hdf5 has not"),
+    ],
+)
+def test_shards_of_different_sets_are_refused(tmp_path, cache, second, message):
+    write_fake_set(tmp_path / "set", (4,), physics_dim=3, names=["0_a.hdf5"])
+    write_fake_set(tmp_path / "set", (4,), names=["1_b.hdf5"], **second)
+    with pytest.raises(UserError, match=message):
+        open_store(tmp_path / "set", cache)
