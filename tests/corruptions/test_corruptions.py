@@ -1,0 +1,117 @@
+import pytest
+import torch
+
+from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.corruptions import (
+    CORRUPTIONS,
+    BatchCorruption,
+    CorruptionConfig,
+    KeyStream,
+    derive_keys,
+    draw_integers,
+    make_corruption,
+)
+from vd4rl_pomdp.errors import UserError
+
+
+def stacks(n: int = 64) -> torch.Tensor:
+    return torch.randint(1, 256, (n, 9, 84, 84), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+
+
+def test_draws_are_uniform_and_depend_on_every_key():
+    draws = draw_integers(torch.arange(20_000), 69, 3)
+    counts = torch.stack([draws[:, i].bincount(minlength=69) for i in range(3)])
+    expected = 20_000 / 69
+    chi_square = ((counts - expected) ** 2 / expected).sum(1)
+    assert (chi_square < 125).all()  # 68 degrees of freedom: 99.99% quantile is 119
+    correlation = torch.corrcoef(draws.T.double())
+    assert (correlation - torch.eye(3)).abs().max() < 0.03
+
+
+def test_patch_zeroes_one_square_of_the_stated_size_in_every_frame():
+    obs = stacks()
+    out = make_corruption("patch")(obs, torch.arange(64))
+    frames = out.view(64 * 3, 3, 84, 84)
+    hidden = (frames == 0).all(1)
+    assert (hidden.sum((1, 2)) == 16 * 16).all()
+    rows, columns = hidden.any(2).sum(1), hidden.any(1).sum(1)
+    assert (rows == 16).all()
+    assert (columns == 16).all()
+    assert torch.equal(out[out != 0], obs[out != 0])
+    assert len(torch.unique(hidden.view(64 * 3, -1).int().argmax(1))) > 100
+
+
+def test_shared_patches_are_at_the_same_place_in_all_frames_of_a_stack():
+    out = make_corruption(CorruptionConfig("patch", patch_shared=True))(stacks(), torch.arange(64))
+    hidden = (out.view(64, 3, 3, 84, 84) == 0).all(2)
+    assert torch.equal(hidden[:, 0], hidden[:, 1])
+    apart = make_corruption("patch")(stacks(), torch.arange(64))
+    hidden = (apart.view(64, 3, 3, 84, 84) == 0).all(2)
+    assert not torch.equal(hidden[:, 0], hidden[:, 1])
+
+
+def test_zero_frames_blanks_two_of_three_each_equally_often():
+    out = make_corruption("zero_frames")(stacks(1).expand(3000, -1, -1, -1), torch.arange(3000))
+    blank = (out.view(3000, 3, -1) == 0).all(2)
+    assert (blank.sum(1) == 2).all()
+    assert ((blank.float().mean(0) - 2 / 3).abs() < 0.03).all()
+
+
+@pytest.mark.parametrize("name", CORRUPTIONS)
+def test_equal_keys_give_equal_masks_whatever_the_batch(name: str):
+    obs, corruption = stacks(8), make_corruption(name)
+    key = torch.arange(100, 108)
+    whole = corruption(obs, key)
+    alone = torch.cat([corruption(obs[i : i + 1], key[i : i + 1]) for i in range(8)])
+    assert torch.equal(whole, alone)
+    windows = corruption(obs.view(2, 4, 9, 84, 84), key.view(2, 4))
+    assert torch.equal(windows.view_as(whole), whole)
+    assert torch.equal(obs, stacks(8)), "the input was changed"
+
+
+def test_resample_draws_anew_and_emission_never_does():
+    obs, row_key = stacks(4), torch.arange(4)
+    for mode, same in (("resample", False), ("emission", True)):
+        corruption = BatchCorruption(CorruptionConfig("patch", mode), seed=0)
+        assert torch.equal(corruption(obs, row_key), corruption(obs, row_key)) == same
+    a, b = (BatchCorruption(CorruptionConfig("patch"), seed=3) for _ in range(2))
+    assert torch.equal(a(obs, row_key), b(obs, row_key))
+
+
+def test_emission_of_a_batch_equals_the_environments_draw():
+    obs, row_key = stacks(4), torch.tensor([5, 6, 1 << 20, (1 << 20) + 1])
+    batch = BatchCorruption(CorruptionConfig("patch+zero_frames", "emission"), seed=7)(obs, row_key)
+    environment = make_corruption("patch+zero_frames")
+    single = torch.cat([environment(obs[i : i + 1], derive_keys(7, row_key[i : i + 1])) for i in range(4)])
+    assert torch.equal(batch, single)
+
+
+def test_a_key_stream_goes_on_from_its_position():
+    whole = KeyStream(1).take((10,))
+    stream = KeyStream(1, position=4)
+    assert torch.equal(stream.take((6,)), whole[4:])
+    assert stream.position == 10
+    assert not torch.equal(KeyStream(2).take((10,)), whole)
+
+
+def test_unknown_and_impossible_corruptions_are_refused():
+    with pytest.raises(UserError, match=r"unknown corruption 'fog'.*patch\+zero_frames"):
+        make_corruption("fog")
+    with pytest.raises(UserError, match="--patch-size"):
+        make_corruption(CorruptionConfig("patch", patch_size=85))(stacks(1), torch.zeros(1, dtype=torch.int64))
+    with pytest.raises(UserError, match="--zeroed-frames"):
+        make_corruption(CorruptionConfig("zero_frames", zeroed_frames=4))(stacks(1), torch.zeros(1, dtype=torch.int64))
+
+
+def test_random_shift_equals_padding_and_cropping():
+    obs, key = stacks(32), torch.arange(32)
+    shifted = random_shift(obs, key, pad=4)
+    padded = torch.nn.functional.pad(obs.float(), (4, 4, 4, 4), mode="replicate").to(torch.uint8)
+    offset = draw_integers(key, 9, 2)
+    for i in range(32):
+        y, x = offset[i].tolist()
+        assert torch.equal(shifted[i], padded[i, :, y : y + 84, x : x + 84])
+    assert len(torch.unique(offset, dim=0)) > 15
+    windows = random_shift(obs.view(4, 8, 9, 84, 84), key[:4])
+    assert torch.equal(windows[0, 3], random_shift(obs[3:4], key[:1])[0])
+    assert random_shift(obs, key, pad=0) is obs

@@ -1,0 +1,98 @@
+import json
+
+import pytest
+import torch
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.nn import Encoder, EncoderCard, EncoderConfig, load_encoder, save_encoder
+from vd4rl_pomdp.nn.sequence import run_gru_backward
+from vd4rl_pomdp.types import Windows
+
+CARD = EncoderCard("mik+a", "walker_walk", "expert", {"corruption": "none"}, 0, 10, "smoke")
+
+
+def make(history: str, use_actions: bool, span: int = 0, layers: int = 1) -> Encoder:
+    torch.manual_seed(0)
+    config = EncoderConfig(
+        2, "nature", 16, history, use_actions, hidden_dim=12, gru_layers=layers, history_window=span
+    )
+    return Encoder(config).eval()
+
+
+def window(rows: int = 9, batch: int = 2) -> Windows:
+    g = torch.Generator().manual_seed(1)
+    action = torch.rand(batch, rows, 2, generator=g)
+    return Windows(
+        obs=torch.randint(0, 256, (batch, rows, 9, 84, 84), generator=g, dtype=torch.uint8),
+        prev_action=torch.cat([torch.zeros(batch, 1, 2), action[:, :-1]], 1),
+        action=action,
+        has_action=torch.ones(batch, rows, dtype=torch.bool),
+        length=torch.full((batch,), rows),
+        key=torch.zeros(batch, rows, dtype=torch.int64),
+    )
+
+
+@pytest.mark.parametrize(
+    ("history", "use_actions", "span", "layers"),
+    [("none", False, 0, 1), ("gru", False, 0, 1), ("gru", True, 0, 2), ("gru", True, 4, 1), ("gru", False, 3, 2)],
+)
+def test_streaming_and_batch_encodings_agree(history: str, use_actions: bool, span: int, layers: int):
+    encoder, batch = make(history, use_actions, span, layers), window()
+    with torch.no_grad():
+        whole = encoder.encode(batch)
+        state = encoder.initial_state(2)
+        for t in range(9):
+            z, state = encoder.step(batch.obs[:, t], batch.prev_action[:, t], state)
+            torch.testing.assert_close(z, whole[:, t], atol=1e-5, rtol=1e-4)
+
+
+def test_a_history_window_forgets_what_is_before_it_and_only_that():
+    encoder, batch = make("gru", True, span=3), window()
+    changed = batch.replace(obs=batch.obs.clone(), prev_action=batch.prev_action.clone())
+    changed.obs[:, 4], changed.prev_action[:, 5] = 0, 9.0
+    with torch.no_grad():
+        moved = (encoder.encode(batch) - encoder.encode(changed)).abs().amax((0, 2)) > 1e-6
+    # row 4's frame reaches rows 4..6; a_4 (row 5) reaches rows 5 and 6: in row 7 it would come from the first row
+    assert moved.tolist() == [False] * 4 + [True, True, True] + [False] * 2
+
+
+def test_the_backward_gru_starts_at_each_windows_last_real_row():
+    torch.manual_seed(0)
+    gru = torch.nn.GRU(3, 4, batch_first=True)
+    x, length = torch.randn(2, 6, 3), torch.tensor([6, 4])
+    out = run_gru_backward(gru, x, length)
+    for b in range(2):
+        alone, _ = gru(x[b : b + 1, : length[b]].flip(1))
+        torch.testing.assert_close(out[b, : length[b]], alone[0].flip(0))
+
+
+def test_an_encoder_folder_gives_back_the_same_encoder(tmp_path):
+    encoder, batch = make("gru", True), window()
+    save_encoder(tmp_path, encoder, CARD)
+    loaded, card = load_encoder(tmp_path, "walker_walk", 2)
+    assert card == CARD
+    with torch.no_grad():
+        torch.testing.assert_close(loaded.encode(batch), encoder.encode(batch))
+    assert not any(p.requires_grad for p in loaded.parameters())
+
+
+def test_bad_encoder_folders_are_refused_in_one_line(tmp_path):
+    with pytest.raises(UserError, match="not an encoder folder"):
+        load_encoder(tmp_path)
+    save_encoder(tmp_path, make("none", False), CARD)
+    with pytest.raises(UserError, match="2 action dimensions"):
+        load_encoder(tmp_path, action_dim=6)
+    with pytest.raises(UserError, match="pretrained on walker_walk, not on cheetah_run"):
+        load_encoder(tmp_path, task="cheetah_run")
+    (tmp_path / "model.safetensors").write_bytes(b"damaged")
+    with pytest.raises(UserError, match="cannot be read"):
+        load_encoder(tmp_path)
+    (tmp_path / "model.safetensors").rename(tmp_path / "model.pt")
+    with pytest.raises(UserError, match="pickle"):
+        load_encoder(tmp_path)
+    config = json.loads((tmp_path / "config.json").read_text())
+    config["encoder"]["unknown"] = 1
+    (tmp_path / "model.pt").unlink()
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match="unknown"):
+        load_encoder(tmp_path)
