@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -74,6 +74,10 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
     get_task(config.task)
     if config.episodes < 1 or config.episodes_per_shard < 1:
         raise UserError("--episodes and --episodes-per-shard must be at least 1")
+    if config.quality not in get_args(Quality):
+        raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(get_args(Quality))}")
+    if config.actor is not None and config.quality not in ("medium", "expert"):
+        raise UserError(f"--actor is for medium or expert sets, not {config.quality}: leave it out or change --quality")
     plan = list(_plan(config))
     _claim(config, [actor for _, _, actor in plan])
     started, frames = time.monotonic(), 0
@@ -110,7 +114,6 @@ def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Actor | None]]:
         actor = _actor(config, quality)
         for shard, start in enumerate(range(first, stop, config.episodes_per_shard)):
             episodes = range(start, min(start + config.episodes_per_shard, stop))
-            # V-D4RL reads shards sorted by name: medium precedes expert there only by our own order
             yield config.out / f"{shard}_{config.task}_{quality}.hdf5", episodes, actor
         first = stop
 
@@ -120,8 +123,6 @@ def _actor(config: CollectConfig, quality: str) -> Actor | None:
         return None
     if config.actor is None:
         return load_actor(config.task, quality)
-    if config.quality == "medium_expert":
-        raise UserError("--actor cannot stand for two actors: collect medium and expert apart")
     return read_actor(config.actor, get_task(config.task))
 
 
@@ -187,23 +188,33 @@ def _claim(config: CollectConfig, actors: list[Actor | None]) -> None:
         stored = read_json(path)
         differing = sorted(k for k in settings if stored.get(k) != settings[k])
         if differing:
-            raise UserError(f"{config.out}: holds a set collected with another {', '.join(differing)}; choose another --out")
+            raise UserError(
+                f"{config.out}: holds a set collected with another {', '.join(differing)}; choose another --out"
+            )
         return
-    if config.out.exists() and any(config.out.iterdir()):
+    if config.out.exists() and any(not file.name.startswith(".") for file in config.out.iterdir()):
         raise UserError(f"{config.out}: is not empty and holds no collected set; choose another --out")
     try:
         config.out.mkdir(parents=True, exist_ok=True)
-        write_json(path, settings)
     except OSError as error:
-        raise disk_error(path, error) from error
+        raise disk_error(config.out, error) from error
+    _write_json(path, settings)
 
 
 def _record(config: CollectConfig, seconds: float, frames: int) -> None:
     """Keep what a repeated collection would not reproduce."""
-    if not frames:
+    path = config.out / "provenance.json"
+    if not frames and path.exists():
         return
     from vd4rl_pomdp.envs.parity import render_info
 
     facts = {"seconds": round(seconds, 1), "frames": frames, "workers": config.workers}
     origin = {"command": command(), "git_commit": git_commit(), "versions": versions()}
-    write_json(config.out / "provenance.json", facts | origin | {"render": render_info()})
+    _write_json(path, facts | origin | {"render": render_info()})
+
+
+def _write_json(path: Path, value: dict[str, Any]) -> None:
+    try:
+        write_json(path, value)
+    except OSError as error:
+        raise disk_error(path, error) from error

@@ -1,0 +1,195 @@
+import errno
+import json
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.data import collect as module
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data.collect import CollectConfig, collect
+from vd4rl_pomdp.data.format import read_attributes, read_shard
+from vd4rl_pomdp.envs.dmc import replay_rewards
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.policies import Actor
+
+LENGTH = 5
+
+
+def config(out, **changes):
+    settings = {"task": "walker_walk", "quality": "random", "episodes": 3, "workers": 1, "episodes_per_shard": 2}
+    return CollectConfig(out=out, **(settings | changes))
+
+
+def contents(folder):
+    """Bytes of everything that a repeated collection must reproduce."""
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.name != "provenance.json"}
+
+
+def actor(seed):
+    rng = np.random.default_rng(seed)
+    sizes = {"hidden.0": (24, 256), "hidden.1": (256, 256), "mean": (256, 6), "log_std": (256, 6)}
+    weights = {f"{n}.weight": 0.1 * rng.standard_normal(s, dtype=np.float32) for n, s in sizes.items()}
+    weights |= {f"{n}.bias": np.zeros(s[1], np.float32) for n, s in sizes.items()}
+    return Actor(weights, {"task": "walker_walk"}, sha256=f"{seed}" * 64)
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """An uninterrupted collection."""
+    out = tmp_path_factory.mktemp("collect") / "set"
+    collect(config(out), LENGTH)
+    return out
+
+
+def test_shards_hold_v_d4rls_keys_and_the_simulator_state(whole):
+    assert sorted(p.name for p in whole.glob("*.hdf5")) == ["0_walker_walk_random.hdf5", "1_walker_walk_random.hdf5"]
+    with h5py.File(whole / "0_walker_walk_random.hdf5") as file:
+        found = {key: (file[key].shape, str(file[key].dtype)) for key in file}
+    rows = 2 * (LENGTH + 1)
+    assert found.pop("step_type")[0] == (rows,)
+    assert found == {
+        "observation": ((rows, 3, 84, 84), "uint8"),
+        "action": ((rows, 6), "float32"),
+        "reward": ((rows,), "float64"),
+        "discount": ((rows,), "float64"),
+        "physics": ((rows, 18), "float64"),
+    }
+
+
+def test_stored_actions_replay_to_stored_rewards(whole):
+    shard = read_shard(whole / "0_walker_walk_random.hdf5")
+    for episode in range(2):
+        rows = slice(episode * (LENGTH + 1), (episode + 1) * (LENGTH + 1))
+        step_type, action, reward = (shard[key][rows] for key in ("step_type", "action", "reward"))
+        assert step_type.tolist() == [0] + [1] * (LENGTH - 1) + [2]
+        assert not action[0].any()
+        assert reward[0] == 0
+        np.testing.assert_array_equal(replay_rewards("walker_walk", shard["physics"][rows][0], action[1:]), reward[1:])
+
+
+def test_the_set_opens_with_its_task_and_quality(whole, tmp_path):
+    dataset = open_dataset(whole, cache=tmp_path)
+    assert (dataset.task, dataset.quality) == ("walker_walk", "random")
+    assert (dataset.num_episodes, dataset.num_rows) == (3, 3 * (LENGTH + 1))
+    assert dataset.incomplete_episodes == 0
+
+
+def test_an_episode_does_not_depend_on_how_the_set_is_cut(whole, tmp_path):
+    collect(config(tmp_path / "set", episodes=2, episodes_per_shard=1), LENGTH)
+    second = read_shard(tmp_path / "set" / "1_walker_walk_random.hdf5")
+    both = read_shard(whole / "0_walker_walk_random.hdf5")
+    for key, value in second.items():
+        np.testing.assert_array_equal(value, both[key][LENGTH + 1 :])
+    assert not np.array_equal(both["physics"][0], second["physics"][0])
+
+
+@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("killed")])
+def test_an_interrupted_collection_ends_in_the_same_files(whole, tmp_path, monkeypatch, error):
+    out = tmp_path / "set"
+    roll_out = module._roll_out
+
+    def fail_in_the_second_shard(job):
+        if job.episode == 2:
+            raise error
+        return roll_out(job)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(module, "_roll_out", fail_in_the_second_shard)
+        with pytest.raises(type(error)):
+            collect(config(out), LENGTH)
+    assert sorted(p.name for p in out.iterdir()) == ["0_walker_walk_random.hdf5", "collection.json"]
+    (out / ".1_walker_walk_random.hdf5.tmp").write_bytes(b"half")
+    first = (out / "0_walker_walk_random.hdf5").stat().st_mtime_ns
+    collect(config(out), LENGTH)
+    assert contents(out) == contents(whole)
+    assert (out / "0_walker_walk_random.hdf5").stat().st_mtime_ns == first
+
+
+def test_an_interrupt_before_the_config_was_written_does_not_block_the_folder(whole, tmp_path):
+    (tmp_path / ".collection.json.tmp").write_text("{")
+    collect(config(tmp_path), LENGTH)
+    assert contents(tmp_path) == contents(whole)
+
+
+def test_the_number_of_workers_changes_nothing(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "load_actor", lambda task, quality: actor(1))
+    for workers in (1, 2):
+        collect(config(tmp_path / str(workers), quality="expert", episodes=2, workers=workers), LENGTH)
+    assert contents(tmp_path / "1") == contents(tmp_path / "2")
+
+
+def test_medium_expert_is_half_medium_then_half_expert(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "load_actor", lambda task, quality: actor({"medium": 1, "expert": 2}[quality]))
+    paths = collect(config(tmp_path, quality="medium_expert", episodes=4, episodes_per_shard=1), LENGTH)
+    names = [path.name for path in paths]
+    assert names == [f"{i}_walker_walk_{quality}.hdf5" for quality in ("medium", "expert") for i in range(2)]
+    attributes = [read_attributes(path) for path in paths]
+    assert [a["policy"] for a in attributes] == ["medium"] * 2 + ["expert"] * 2
+    assert [a["actor_sha256"][0] for a in attributes] == ["1"] * 2 + ["2"] * 2
+    assert {a["set"] for a in attributes} == {"medium_expert"}
+    assert not np.array_equal(read_shard(paths[0])["physics"][0], read_shard(paths[2])["physics"][0])
+
+
+def test_provenance_is_kept_apart_from_the_config(whole):
+    provenance = json.loads((whole / "provenance.json").read_text())
+    assert provenance["frames"] == 3 * (LENGTH + 1)
+    assert provenance["render"]["canary"]
+    assert "mujoco" in provenance["versions"]
+    stored = json.loads((whole / "collection.json").read_text())
+    assert {"workers", "out"}.isdisjoint(stored)
+
+
+@pytest.mark.parametrize("change", [{"seed": 1}, {"episodes": 4}, {"render": "exact"}, {"task": "cheetah_run"}])
+def test_a_folder_of_another_config_is_refused_untouched(whole, change):
+    before = contents(whole)
+    with pytest.raises(UserError, match=f"another {next(iter(change))}"):
+        collect(config(whole, **change), LENGTH)
+    assert contents(whole) == before
+
+
+def test_a_folder_with_something_else_is_refused(tmp_path):
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match="holds no collected set"):
+        collect(config(tmp_path), LENGTH)
+    assert [p.name for p in tmp_path.iterdir()] == ["notes.txt"]
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"task": "walker_run"}, "unknown task"),
+        ({"quality": "medium_replay"}, "cannot collect quality"),
+        ({"episodes": 0}, "at least 1"),
+        ({"actor": Path("a.safetensors")}, "--actor is for medium or expert"),
+        ({"actor": Path("a.safetensors"), "quality": "medium_expert"}, "--actor is for medium or expert"),
+        ({"actor": Path("a.safetensors"), "quality": "expert"}, "a.safetensors"),
+    ],
+)
+def test_bad_settings_are_refused_before_anything_is_written(tmp_path, change, message):
+    with pytest.raises(UserError, match=message):
+        collect(config(tmp_path / "set", **change), LENGTH)
+    assert not (tmp_path / "set").exists()
+
+
+def test_a_full_disk_leaves_nothing_half_written_and_the_collection_goes_on(whole, tmp_path, monkeypatch):
+    def full(path, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_bytes", full)
+        with pytest.raises(UserError, match="disk is full"):
+            collect(config(tmp_path), LENGTH)
+    assert [p.name for p in tmp_path.iterdir()] == ["collection.json"]
+    collect(config(tmp_path), LENGTH)
+    assert contents(tmp_path) == contents(whole)
+
+
+def test_a_full_disk_at_the_start_is_a_sentence(tmp_path, monkeypatch):
+    def full(path, data):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_text", full)
+    with pytest.raises(UserError, match="disk is full"):
+        collect(config(tmp_path / "set"), LENGTH)
