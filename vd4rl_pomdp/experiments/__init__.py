@@ -1,0 +1,1 @@
+"""Experiments as data: lists of stage commands and what to measure."""

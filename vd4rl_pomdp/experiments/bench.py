@@ -1,0 +1,212 @@
+"""Speed and memory of every stage as ratios measured in one run, so that a noisy machine cannot bend them much."""
+
+from __future__ import annotations
+
+import statistics
+import tempfile
+import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig
+from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.envs.dmc import PixelEnv
+from vd4rl_pomdp.envs.parity import canary_frames, compare
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.runs.device import Precision, autocast, pick_device
+from vd4rl_pomdp.runs.provenance import machine, versions
+from vd4rl_pomdp.runs.workers import run_jobs
+from vd4rl_pomdp.tasks import FRAME_SIZE
+from vd4rl_pomdp.types import StepType
+
+BATCH = 256
+EPISODE_ROWS = 501
+
+
+def bench(quick: bool = False) -> dict[str, Any]:
+    """Run every measurement.
+
+    Args:
+        quick: a smaller set and fewer repetitions.
+
+    Returns:
+        Nested ratios and rates, with the machine and the versions they were measured on.
+    """
+    torch.manual_seed(0)
+    repeats = 5 if quick else 15
+    with tempfile.TemporaryDirectory() as folder:
+        dataset, opening = _synthetic_set(Path(folder), 20 if quick else 200)
+        results = {
+            "opening": opening,
+            "sampling": _sampling(dataset, repeats),
+            "pretraining": _pretraining(dataset, Path(folder), repeats),
+            "finetuning": _finetuning(dataset, repeats),
+        }
+    results["collection"] = _collection(60 if quick else 200)
+    return results | {"machine": machine(), "versions": versions()}
+
+
+def _seconds(function: Callable[[], Any], repeats: int) -> float:
+    """Median seconds of a call, after one that is not counted."""
+    times = []
+    for _ in range(repeats + 1):
+        start = time.perf_counter()
+        function()
+        if torch.cuda.is_available():
+            torch.cuda.synchronize()
+        times.append(time.perf_counter() - start)
+    return statistics.median(times[1:])
+
+
+def _synthetic_set(folder: Path, episodes: int) -> tuple[Dataset, dict[str, Any]]:
+    """Write, decode and open a set of `episodes` full episodes; random stripes compress fast and cost like pixels."""
+    rng = np.random.default_rng(0)
+    (folder / "set").mkdir()
+    for shard in range(0, episodes, 20):
+        count = min(20, episodes - shard)
+        rows = count * EPISODE_ROWS
+        step_type = np.full(rows, int(StepType.MID))
+        step_type[::EPISODE_ROWS], step_type[EPISODE_ROWS - 1 :: EPISODE_ROWS] = StepType.FIRST, StepType.LAST
+        stripes = rng.integers(0, 256, (rows, 3, FRAME_SIZE, 1), dtype=np.uint8)
+        arrays = {
+            "observation": np.broadcast_to(stripes, (rows, 3, FRAME_SIZE, FRAME_SIZE)),
+            "action": rng.uniform(-1, 1, (rows, 6)).astype(np.float32),
+            "reward": rng.uniform(0, 2, rows),
+            "discount": np.ones(rows),
+            "step_type": step_type,
+        }
+        write_shard(folder / "set" / f"{shard // 20}_bench.hdf5", arrays, {})
+    start = time.perf_counter()
+    open_dataset(folder / "set", folder / "cache")
+    decoding = time.perf_counter() - start
+    opening = _seconds(lambda: open_dataset(folder / "set", folder / "cache"), 3)
+    dataset = open_dataset(folder / "set", folder / "cache")
+    return dataset, {"rows": dataset.num_rows, "decode_seconds": decoding, "open_seconds": opening}
+
+
+def _sampling(dataset: Dataset, repeats: int) -> dict[str, float]:
+    """Gathering against copying the same bytes, corruption and shift against gathering."""
+    index = torch.randint(dataset.num_transitions, (BATCH,))
+    dataset.frames[: min(len(dataset.frames), 20_000)].sum(dtype=torch.int64)  # warm the page cache
+    rows = torch.randint(3, min(dataset.num_rows, 20_000) - 1, (2 * BATCH,))
+    obs = dataset.stacks(rows)
+    target = torch.empty_like(obs)
+    corruption = BatchCorruption(CorruptionConfig("patch+zero_frames"), 0)
+    keys = dataset.keys(rows)
+    copying = _seconds(lambda: target.copy_(obs), repeats)
+    gathering = _seconds(lambda: dataset.stacks(rows), repeats)
+    changing = _seconds(lambda: corruption(random_shift(obs, keys), keys), repeats)
+    return {
+        "copy_ms": copying * 1e3,
+        "gather_ms": gathering * 1e3,
+        "gather_speed_over_copy": copying / gathering,
+        "corrupt_and_shift_over_gather": changing / gathering,
+        "transitions_ms": _seconds(lambda: dataset.transitions(index, 3), repeats) * 1e3,
+    }
+
+
+def _pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
+    """Share of a step that is not the network's forward and backward pass, and bf16 against fp32."""
+    from pretrain.config import PRESETS
+    from pretrain.objectives import build_objective
+    from pretrain.train import Trainer
+    from vd4rl_pomdp.nn.action_target import make_action_target
+
+    device = pick_device("auto")
+    results: dict[str, Any] = {"device": str(device)}
+    steps: dict[str, float] = {}
+    for precision in ("fp32", "bf16"):
+        config = replace(
+            PRESETS["paper"], data=folder, out=folder, batch_size=8, corruption="patch+zero_frames", precision=precision
+        )
+        target = make_action_target("kmeans", dataset.action[:2000].numpy(), config.codes, 0)
+        trainer = Trainer(build_objective(config, dataset.action, target).to(device), dataset, config)
+        steps[precision] = _seconds(lambda t=trainer: t.update(), max(3, repeats // 3))  # type: ignore[misc]
+        passes = _seconds(lambda t=trainer: _forward_backward(t, device), max(3, repeats // 3))  # type: ignore[misc]
+        results[f"{precision}_frames_per_s"] = config.batch_size * config.window / steps[precision]
+        results[f"{precision}_overhead_share"] = max(0.0, 1 - passes / steps[precision])
+    return results | {"bf16_over_fp32": steps["fp32"] / steps["bf16"]}
+
+
+def _forward_backward(trainer: Any, device: torch.device) -> None:
+    """The network's part of a step, on a batch that is kept."""
+    if not hasattr(trainer, "kept"):
+        trainer.kept = trainer.batch()
+    with autocast(device, trainer.config.precision):
+        loss, _ = trainer.objective.loss(trainer.kept, 0.0)
+    loss.backward()
+
+
+def _finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
+    """Updates on cached features against updates that encode every batch, with the same frame encoder."""
+    from finetune.algorithms import TD3BC
+    from finetune.config import PRESETS
+    from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder
+    from vd4rl_pomdp.nn.policy import Policy
+
+    config = PRESETS["cpu"]
+    device = dataset.t.device
+    precision: Precision = config.precision
+    encoder = Encoder(EncoderConfig(dataset.action_dim)).eval().to(device)
+    frozen = FrozenEncoder(encoder, dataset, CorruptionConfig("patch+zero_frames"), config.shift, precision, 0)
+    features = torch.randn(1, dataset.num_rows, encoder.dim, dtype=torch.float16, device=device)
+    generator = torch.Generator().manual_seed(0)
+    algorithm = TD3BC(Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(device), config, generator)
+    cached = FeatureSampler(dataset, features, BATCH, 3, 0.99, generator)
+    exact = ExactSampler(frozen, BATCH, 3, 0.99, generator)
+    fast = _seconds(lambda: algorithm.update(cached.sample()), 20 * repeats)
+    slow = _seconds(lambda: algorithm.update(exact.sample()), 3)
+    return {"cached_updates_per_s": 1 / fast, "exact_updates_per_s": 1 / slow, "cached_over_exact": slow / fast}
+
+
+def _collection(frames: int) -> dict[str, float]:
+    """Frames per CPU-second of the fast rendering against dm_control's default, and two workers against one."""
+    speed = {render: _render_speed((render, frames)) for render in ("exact", "fast")}
+    difference = compare(canary_frames("walker_walk", "fast"), canary_frames("walker_walk", "exact"))
+    wall = {}
+    for workers in (1, 2):
+        jobs = [("fast", frames)] * 4
+        list(run_jobs(_render_speed, [("fast", 1)] * workers, workers))
+        start = time.perf_counter()
+        inside = list(run_jobs(_render_wall, jobs, workers))
+        wall[workers] = sum(inside) / workers if workers > 1 else time.perf_counter() - start
+    return {
+        "exact_frames_per_cpu_s": speed["exact"],
+        "fast_frames_per_cpu_s": speed["fast"],
+        "fast_over_exact": speed["fast"] / speed["exact"],
+        "fast_mean_difference_of_255": difference["mean_difference"],
+        "two_workers_over_one": wall[1] / wall[2],
+    }
+
+
+def _render_speed(job: tuple[Any, int]) -> float:
+    """Frames per CPU-second of one process."""
+    env, action = _warm_environment(job[0])
+    start = time.process_time()
+    for _ in range(job[1]):
+        env.step(action)
+    return job[1] / (time.process_time() - start)
+
+
+def _render_wall(job: tuple[Any, int]) -> float:
+    """Wall-clock seconds of one job, without the process's start."""
+    env, action = _warm_environment(job[0])
+    start = time.perf_counter()
+    for _ in range(job[1]):
+        env.step(action)
+    return time.perf_counter() - start
+
+
+def _warm_environment(render: Any) -> tuple[PixelEnv, np.ndarray]:
+    env = PixelEnv("walker_walk", render)
+    env.reset(0)
+    action = np.zeros(env.task.action_dim, np.float32)
+    env.step(action)
+    return env, action

@@ -1,0 +1,45 @@
+"""The demo: every stage on a small set with real rendering. It shows that all works, not which method is best."""
+
+from __future__ import annotations
+
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from vd4rl_pomdp.runs.workers import default_workers
+
+METHODS = ("mik+a", "acro", "random")
+CORRUPTION = "patch+zero_frames"
+EPISODES = 8
+PRETRAIN = ["--preset", "cpu", "--steps", "300", "--log-every", "25", "--checkpoint-every", "100"]
+FINETUNE = ["--preset", "cpu", "--updates", "5000", "--views", "2", "--eval-every", "5000", "--eval-episodes", "2"]
+
+
+def demo_commands(out: Path, workers: int) -> Iterator[list[str]]:
+    """Words of every stage's command line, in order."""
+    data = str(out / "data" / "walker_walk" / "medium_expert")
+    collect = ["--task", "walker_walk", "--quality", "medium_expert", "--episodes", str(EPISODES), "--out", data]
+    yield ["data", "collect", *collect, "--workers", str(workers)]
+    for method in METHODS:
+        folder = out / "runs" / method
+        place = ["--data", data, "--out", str(folder / "pretrain")]
+        yield ["pretrain", "--method", method, "--corruption", CORRUPTION, *place, *PRETRAIN]
+        place = ["--encoder", str(folder / "pretrain" / "encoder"), "--data", data, "--out", str(folder / "finetune")]
+        yield ["finetune", *place, *FINETUNE, "--workers", str(workers)]
+    yield ["report", str(out / "runs"), "--out", str(out / "report")]
+
+
+def demo(out: Path, workers: int, run: Callable[[list[str]], None]) -> None:
+    """Run every command of the demo, printing each so that it can be run by hand.
+
+    Args:
+        out: folder of data, runs and report.
+        workers: processes, 0 for every core.
+        run: what carries out one command line.
+    """
+    started = time.monotonic()
+    for words in demo_commands(out, workers or default_workers()):
+        print(f"\n$ vd4rl-pomdp {' '.join(words)}", file=sys.stderr)
+        run(words)
+    print(f"demo finished in {(time.monotonic() - started) / 60:.1f} minutes")
