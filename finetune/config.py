@@ -93,4 +93,4 @@ PRESETS = {
         checkpoint_every=20,
     ),
 }
-"""Defaults by preset: `paper` is the full setting, `cpu` fits two cores, `smoke` shows within seconds that a stage works."""
+"""Defaults by preset: `paper` is the full setting, `cpu` fits two cores, `smoke` shows in seconds that all works."""

@@ -43,7 +43,13 @@ class FrozenEncoder:
     """A frozen encoder with the corruption and shift under which it sees a data set."""
 
     def __init__(
-        self, encoder: Encoder, dataset: Dataset, corruption: CorruptionConfig, shift: int, precision: Precision, seed: int
+        self,
+        encoder: Encoder,
+        dataset: Dataset,
+        corruption: CorruptionConfig,
+        shift: int,
+        precision: Precision,
+        seed: int,
     ) -> None:
         self.encoder, self.dataset, self.shift, self.precision, self.seed = encoder, dataset, shift, precision, seed
         self.device = dataset.t.device

@@ -91,7 +91,7 @@ PRESETS = {
         checkpoint_every=10,
     ),
 }
-"""Defaults by preset: `paper` is the full setting, `cpu` fits two cores, `smoke` shows within seconds that a stage works."""
+"""Defaults by preset: `paper` is the full setting, `cpu` fits two cores, `smoke` shows in seconds that all works."""
 
 
 def with_preset(name: str, **changes: object) -> PretrainConfig:

@@ -139,7 +139,10 @@ def _task_of(dataset: Dataset, config: PretrainConfig) -> str:
         raise UserError(f"{config.data}: cannot tell the task of this set; pass --task")
     task = get_task(name)
     if task.action_dim != dataset.action_dim:
-        raise UserError(f"{config.data}: has {dataset.action_dim} action dimensions, {name} has {task.action_dim}; pass the right --task")
+        raise UserError(
+            f"{config.data}: has {dataset.action_dim} action dimensions, {name} has {task.action_dim}; "
+            "pass the right --task"
+        )
     return name
 
 
@@ -158,4 +161,3 @@ def _card(config: PretrainConfig, task: str, dataset: Dataset) -> EncoderCard:
 def _with_history_window(encoder: Encoder, config: PretrainConfig) -> Encoder:
     encoder.config = replace(encoder.config, history_window=config.history_window)
     return encoder
-

@@ -148,7 +148,7 @@ def test_another_config_in_the_same_folder_is_refused_and_nothing_is_lost(data, 
 def test_user_slips_are_one_line(data, encoder, tmp_path):
     with pytest.raises(UserError, match=r"unknown method 'mikado'.*mik\+a"):
         run_pretrain(smoke_pretrain(data, tmp_path / "a", method="mikado"))
-    with pytest.raises(UserError, match="episode 0 has 20 rows.*--window|20"):
+    with pytest.raises(UserError, match=r"episode 0 .*20 rows"):
         run_pretrain(smoke_pretrain(data, tmp_path / "b", window=21))
     with pytest.raises(UserError, match="unknown algorithm"):
         run_finetune(smoke_finetune(encoder, data, tmp_path / "c", algorithm="ppo"))
@@ -171,7 +171,9 @@ def test_td3_bc_finds_the_better_action_and_bc_the_common_one():
         policy = Policy(2, 1, 32)
         algorithm = build(policy, config, torch.Generator().manual_seed(0))
         action = torch.where(torch.arange(64) % 4 == 0, 0.5, -0.5)[:, None]
-        batch = FeatureBatch(torch.zeros(64, 2), action, (action[:, 0] > 0).float(), torch.zeros(64), torch.zeros(64, 2))
+        batch = FeatureBatch(
+            torch.zeros(64, 2), action, (action[:, 0] > 0).float(), torch.zeros(64), torch.zeros(64, 2)
+        )
         for _ in range(300):
             algorithm.update(batch)
         chosen[name] = policy(torch.zeros(1, 2)).item()

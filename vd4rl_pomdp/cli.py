@@ -123,7 +123,7 @@ def _collect(words: Arguments, program: str) -> None:
 
 @dataclass(frozen=True)
 class CheckCommand:
-    """Validate a set: format, episodes, checksums of its decoded form, and that stored actions replay to its rewards."""
+    """Validate a set: format, episodes, checksums, and that its actions replay to its rewards."""
 
     path: tyro.conf.Positional[Path]
     """Folder of shards."""
@@ -139,7 +139,9 @@ def _check(words: Arguments, program: str) -> None:
     _show(result, command.json)
     error = result["replay_max_error"]
     if error is not None and error > REPLAY_TOLERANCE:
-        raise UserError(f"{command.path}: stored actions do not replay to stored rewards (largest difference {error:.3g})")
+        raise UserError(
+            f"{command.path}: stored actions do not replay to stored rewards (largest difference {error:.3g})"
+        )
 
 
 @dataclass(frozen=True)
@@ -232,10 +234,12 @@ class ReportCommand:
 
 
 def _report(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.report import write_report
+    from vd4rl_pomdp.report import print_summary, write_report
 
     command = _parse(ReportCommand, words, program)
-    print(f"report: {write_report(command.runs, command.out)}")
+    page, summary = write_report(command.runs, command.out)
+    print_summary(summary)
+    print(f"report: {page}")
 
 
 @dataclass(frozen=True)

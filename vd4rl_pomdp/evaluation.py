@@ -78,7 +78,9 @@ class Episode:
     """`clean` (F, 3, 84, 84) and `corrupted` (F, C, 84, 84) uint8 pictures, `return` (F,) so far."""
 
 
-def evaluate(jobs: list[EpisodeJob], workers: int, on_episode: Callable[[Episode], None] | None = None) -> list[Episode]:
+def evaluate(
+    jobs: list[EpisodeJob], workers: int, on_episode: Callable[[Episode], None] | None = None
+) -> list[Episode]:
     """Run evaluation episodes; their results do not depend on `workers`."""
     episodes = []
     for episode in run_jobs(_run_episode, jobs, workers):

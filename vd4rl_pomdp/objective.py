@@ -60,9 +60,7 @@ class InverseObjective(Objective):
         self.encoder = encoder
         self.config = config
         self.target = target
-        self.head = PairHead(
-            encoder.dim, future_dim, config.max_k, target.outputs, config.head_dim, config.k_embedding
-        )
+        self.head = PairHead(encoder.dim, future_dim, config.max_k, target.outputs, config.head_dim, config.k_embedding)
         self.predictor = mlp(encoder.dim + 1, 512, encoder.dim, layers=3) if config.self_prediction else None
 
     @abstractmethod

@@ -51,8 +51,12 @@ def dependence(objective: InverseObjective, lengths: list[int]) -> dict[tuple[in
         for b, length in enumerate(lengths):
             if t + k >= length:
                 continue
-            grads = torch.autograd.grad((logits[b, p] * weights).sum(), (obs, actions), retain_graph=True, allow_unused=True)
-            seen = [set() if g is None else set(torch.nonzero(g[b].flatten(1).abs().amax(1))[:, 0].tolist()) for g in grads]
+            grads = torch.autograd.grad(
+                (logits[b, p] * weights).sum(), (obs, actions), retain_graph=True, allow_unused=True
+            )
+            seen = [
+                set() if g is None else set(torch.nonzero(g[b].flatten(1).abs().amax(1))[:, 0].tolist()) for g in grads
+            ]
             others = [g is not None and bool(g[torch.arange(len(lengths)) != b].any()) for g in grads]
             assert not any(others), "one window's logits depend on another window"
             found[b, t, k] = (seen[0], seen[1])

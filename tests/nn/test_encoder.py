@@ -13,9 +13,7 @@ CARD = EncoderCard("mik+a", "walker_walk", "expert", {"corruption": "none"}, 0, 
 
 def make(history: str, use_actions: bool, span: int = 0, layers: int = 1) -> Encoder:
     torch.manual_seed(0)
-    config = EncoderConfig(
-        2, "nature", 16, history, use_actions, hidden_dim=12, gru_layers=layers, history_window=span
-    )
+    config = EncoderConfig(2, "nature", 16, history, use_actions, hidden_dim=12, gru_layers=layers, history_window=span)
     return Encoder(config).eval()
 
 

@@ -43,7 +43,9 @@ class Patch:
         """See `Stage`."""
         n, s, _, height, width = obs.shape
         if self.size > min(height, width):
-            raise UserError(f"patch size {self.size} exceeds the image ({height}x{width}): choose a smaller --patch-size")
+            raise UserError(
+                f"patch size {self.size} exceeds the image ({height}x{width}): choose a smaller --patch-size"
+            )
         places = self.count * (1 if self.shared else s)
         shape = (n, 1 if self.shared else s, self.count)
         top = draw_integers(key, height - self.size + 1, places).view(shape).expand(n, s, self.count)
@@ -78,7 +80,7 @@ class CorruptionConfig:
     corruption: str = "none"
     """none, patch, zero_frames or patch+zero_frames."""
     corruption_mode: Mode = "resample"
-    """resample: drawn anew whenever a row enters a batch (the paper's way); emission: each row always looks the same."""
+    """resample: drawn anew whenever a row enters a batch, as in the paper; emission: a row always looks the same."""
     patch_size: int = 16
     """Side of a patch in pixels."""
     patch_count: int = 1

@@ -75,7 +75,7 @@ def _synthetic_set(folder: Path, episodes: int) -> tuple[Dataset, dict[str, Any]
         step_type = np.full(rows, int(StepType.MID))
         step_type[::EPISODE_ROWS], step_type[EPISODE_ROWS - 1 :: EPISODE_ROWS] = StepType.FIRST, StepType.LAST
         stripes = rng.integers(0, 256, (rows, 3, FRAME_SIZE, 1), dtype=np.uint8)
-        arrays = {
+        arrays: dict[str, np.ndarray] = {
             "observation": np.broadcast_to(stripes, (rows, 3, FRAME_SIZE, FRAME_SIZE)),
             "action": rng.uniform(-1, 1, (rows, 6)).astype(np.float32),
             "reward": rng.uniform(0, 2, rows),

@@ -60,7 +60,9 @@ def load_encoder(folder: Path, task: str | None = None, action_dim: int | None =
             f"the data set has {action_dim}; pretrain one on this task"
         )
     if task is not None and card.task != task:
-        raise UserError(f"{folder}: this encoder was pretrained on {card.task}, not on {task}; pretrain one on this task")
+        raise UserError(
+            f"{folder}: this encoder was pretrained on {card.task}, not on {task}; pretrain one on this task"
+        )
     encoder = Encoder(encoder_config)
     try:
         encoder.load_state_dict(load_file(folder / "model.safetensors"))
@@ -82,5 +84,3 @@ def _read_config(folder: Path) -> dict[str, Any]:
             f"{folder}: not an encoder folder (config.json: {error}); `vd4rl-pomdp pretrain` writes one as RUN/encoder"
         ) from error
     return config
-
-

@@ -24,7 +24,7 @@ class FrameEncoder(nn.Module):
     def forward(self, obs: Tensor) -> Tensor:
         """Features of every stack."""
         lead = obs.shape[:-3]
-        dtype = self.project[0].weight.dtype
+        dtype = next(self.project.parameters()).dtype
         image = obs.reshape(-1, *obs.shape[-3:]).contiguous(memory_format=torch.channels_last).to(dtype) / 255 - 0.5
         return self.project(self.convolutions(image).flatten(1)).to(dtype).view(*lead, -1)
 

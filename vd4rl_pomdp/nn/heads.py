@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from itertools import pairwise
+
 import torch
 from torch import Tensor, nn
 
@@ -12,7 +14,9 @@ class PairHead(nn.Module):
     The first layer is a sum of three terms, so each row goes through it once however many pairs it is part of.
     """
 
-    def __init__(self, past_dim: int, future_dim: int, max_k: int, outputs: int, hidden: int, k_embedding: bool) -> None:
+    def __init__(
+        self, past_dim: int, future_dim: int, max_k: int, outputs: int, hidden: int, k_embedding: bool
+    ) -> None:
         super().__init__()
         self.past = nn.Linear(past_dim, hidden)
         self.future = nn.Linear(future_dim, hidden, bias=False)
@@ -41,7 +45,7 @@ def mlp(inputs: int, hidden: int, outputs: int, layers: int = 2) -> nn.Sequentia
     """Rectified MLP with `layers` hidden layers."""
     widths = [inputs] + [hidden] * layers
     modules: list[nn.Module] = []
-    for a, b in zip(widths[:-1], widths[1:], strict=True):
+    for a, b in pairwise(widths):
         modules += [nn.Linear(a, b), nn.ReLU()]
     return nn.Sequential(*modules, nn.Linear(hidden, outputs))
 

@@ -27,7 +27,10 @@ class Standardise(nn.Module):
     def fit(self, features: Tensor) -> None:
         """Take the statistics of (..., dim) features, in slices that keep memory small."""
         flat = features.view(-1, features.shape[-1])
-        total, squares = torch.zeros_like(self.mean, dtype=torch.float64), torch.zeros_like(self.mean, dtype=torch.float64)
+        total, squares = (
+            torch.zeros_like(self.mean, dtype=torch.float64),
+            torch.zeros_like(self.mean, dtype=torch.float64),
+        )
         for part in flat.split(65_536):
             values = part.double()
             total, squares = total + values.sum(0), squares + values.square().sum(0)
@@ -73,5 +76,7 @@ def load_policy(folder: Path) -> Policy:
         policy.load_state_dict(load_file(folder / "model.safetensors"))
     except (OSError, SafetensorError, RuntimeError, TypeError) as error:
         reason = str(error).splitlines()[0]
-        raise UserError(f"{folder}: not a policy folder ({reason}); `vd4rl-pomdp finetune` writes one as RUN/policy") from error
+        raise UserError(
+            f"{folder}: not a policy folder ({reason}); `vd4rl-pomdp finetune` writes one as RUN/policy"
+        ) from error
     return policy.eval().requires_grad_(False)

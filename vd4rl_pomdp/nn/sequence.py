@@ -9,7 +9,7 @@ from torch import Tensor, nn
 def run_gru(gru: nn.GRU, x: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
     """Run a batch-first GRU in its own precision, also inside autocast: (B, T, I) -> (B, T, H), (layers, B, H)."""
     with torch.autocast(x.device.type, enabled=False):
-        return gru(x.to(gru.weight_hh_l0.dtype), state)
+        return gru(x.to(next(gru.parameters()).dtype), state)
 
 
 def run_gru_backward(gru: nn.GRU, x: Tensor, length: Tensor) -> Tensor:

@@ -178,7 +178,7 @@ def _save(model: SAC, run: Path) -> None:
     fresh.mkdir()
     leaves, _ = _leaves(model)
     save_file({f"{i:04d}": np.array(leaf) for i, leaf in enumerate(leaves)}, fresh / "model.safetensors")
-    buffer = model.replay_buffer
+    buffer: Any = model.replay_buffer
     stop = buffer.buffer_size if buffer.full else buffer.pos
     save_file({k: np.ascontiguousarray(getattr(buffer, k)[:stop]) for k in REPLAY_ARRAYS}, fresh / "replay.safetensors")
     counters = {"decisions": model.num_timesteps, "updates": model._n_updates, "position": buffer.pos}
@@ -205,10 +205,11 @@ def _restore(model: SAC, run: Path) -> int:
     counters = json.loads((folder / "counters.json").read_text())
     replay = load_file(folder / "replay.safetensors")
     stop = len(replay["rewards"])
+    buffer: Any = model.replay_buffer
     for name in REPLAY_ARRAYS:
-        getattr(model.replay_buffer, name)[:stop] = replay[name]
-    model.replay_buffer.pos = counters["position"]
-    model.replay_buffer.full = stop == model.replay_buffer.buffer_size
+        getattr(buffer, name)[:stop] = replay[name]
+    buffer.pos = counters["position"]
+    buffer.full = stop == buffer.buffer_size
     model.num_timesteps, model._n_updates = counters["decisions"], counters["updates"]
     _forget_newer(run, counters["decisions"])
     return int(counters["decisions"])

@@ -44,12 +44,16 @@ class ProgressLine:
             self._bar.update(self._task, speed=f"{speed:.3g} {self._unit}/s")
         if not self._console.is_terminal and self._done >= self._next_plain:
             note = "  ".join(f"{k} {v:.4g}" for k, v in numbers.items())
-            print(f"{self._title}: {self._done}/{self._total} {self._unit}  {note}", file=self._console.file, flush=True)
+            print(
+                f"{self._title}: {self._done}/{self._total} {self._unit}  {note}", file=self._console.file, flush=True
+            )
             self._next_plain += max(1, self._total // self._PLAIN_LINES)
 
     def __enter__(self) -> Self:
         self._bar.start()
         return self
 
-    def __exit__(self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None) -> None:
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
         self._bar.stop()

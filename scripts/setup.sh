@@ -1,0 +1,60 @@
+#!/usr/bin/env bash
+# Set up what `make demo` and `make test` need: a virtual environment with the package, and software rendering.
+# A second run finds its stamp and does nothing. PYTHON=python3.12 chooses the interpreter.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+PYTHON="${PYTHON:-python3}"
+VENV=.venv
+STAMP="$VENV/.installed"
+RENDER_PACKAGES="libegl1 libgl1-mesa-dri"
+
+say() { printf '%s\n' "$*" >&2; }
+
+# Install Debian packages as root or with passwordless sudo; otherwise name them in one line and stop.
+install_debian() {
+    local as_root=""
+    if [ "$(id -u)" -ne 0 ]; then
+        if ! sudo -n true 2>/dev/null; then
+            say "setup: please install $* (for example: sudo apt-get install $*), then run the same command again"
+            exit 2
+        fi
+        as_root="sudo -n"
+    fi
+    say "setup: installing $*"
+    $as_root apt-get update -qq >/dev/null
+    # word splitting is wanted: a list of packages
+    # shellcheck disable=SC2086
+    DEBIAN_FRONTEND=noninteractive $as_root apt-get install -y -qq $* >/dev/null
+}
+
+wanted="$(cat pyproject.toml scripts/setup.sh | sha256sum | cut -d' ' -f1) $PYTHON"
+if [ -f "$STAMP" ] && [ "$(cat "$STAMP")" = "$wanted" ]; then
+    exit 0
+fi
+
+if ! command -v "$PYTHON" >/dev/null; then
+    install_debian python3 python3-venv
+fi
+if ! "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
+    say "setup: $PYTHON is $("$PYTHON" -V), 3.11 or newer is needed; name one with PYTHON=python3.12"
+    exit 2
+fi
+if [ ! -x "$VENV/bin/python" ]; then
+    "$PYTHON" -c 'import ensurepip, venv' 2>/dev/null || install_debian python3-venv
+    "$PYTHON" -m venv "$VENV"
+fi
+say "setup: installing Python packages (a few minutes the first time)"
+"$VENV/bin/python" -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+
+can_render() {
+    MUJOCO_GL="${MUJOCO_GL:-egl}" "$VENV/bin/python" scripts/can_render.py >/dev/null 2>&1
+}
+if ! can_render; then
+    install_debian "$RENDER_PACKAGES"
+    if ! can_render; then
+        say "setup: rendering still fails with MUJOCO_GL=${MUJOCO_GL:-egl}; try MUJOCO_GL=osmesa with the package libosmesa6"
+        exit 2
+    fi
+fi
+printf '%s' "$wanted" >"$STAMP"

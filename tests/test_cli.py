@@ -1,0 +1,56 @@
+import pytest
+
+from vd4rl_pomdp.cli import COMMANDS, main
+from vd4rl_pomdp.experiments.demo import demo_commands
+
+NAMES = [
+    [name, *([inner] if inner else [])]
+    for name, entry in COMMANDS.items()
+    for inner in (entry if isinstance(entry, dict) else [None])
+]
+
+
+@pytest.mark.parametrize("words", NAMES, ids=" ".join)
+def test_every_command_has_help(words, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([*words, "--help"])
+    assert end.value.code in (0, None)
+    assert words[-1] in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["pretrian"], "unknown command 'vd4rl-pomdp pretrian': choose one of demo, data"),
+        (["data", "chekc"], "choose one of collect"),
+        (["data", "check", "nowhere"], "nowhere"),
+        (["pretrain", "--data", "nowhere", "--out", "x"], "nowhere: no such folder"),
+        (["pretrain", "--preset", "huge"], "unknown preset 'huge': choose one of paper, cpu, smoke"),
+        (["pretrain", "--data", "x", "--out", "y", "--corruption", "fog"], "unknown corruption 'fog'"),
+        (["pretrain", "--data", "x", "--out", "y", "--method", "m"], "unknown method 'm'"),
+        (["data", "collect", "--task", "ant", "--quality", "random", "--out", "x"], "unknown task 'ant'"),
+        (["finetune", "--encoder", "nowhere", "--data", "nowhere", "--out", "x"], "nowhere"),
+        (["report", "nowhere"], "nowhere: no such folder"),
+    ],
+)
+def test_a_slip_is_one_line_and_exit_code_2(words, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        main(words)
+    assert end.value.code == 2
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1
+    assert error.startswith("error: ")
+    assert message in error
+    assert not list(tmp_path.iterdir()), "nothing may be left behind"
+
+
+def test_without_words_the_commands_are_listed(capsys):
+    main([])
+    shown = capsys.readouterr().out
+    assert all(name in shown for name in COMMANDS)
+
+
+def test_the_demo_uses_every_stage(tmp_path):
+    stages = [words[0] for words in demo_commands(tmp_path, 1)]
+    assert stages == ["data", *["pretrain", "finetune"] * 3, "report"]

@@ -1,0 +1,85 @@
+"""Figures as bytes that an HTML page can carry: curves as SVG, pictures as PNG, an episode as an animated WebP."""
+
+from __future__ import annotations
+
+import io
+from typing import Any
+
+import matplotlib as mpl
+import numpy as np
+from matplotlib.figure import Figure
+from PIL import Image
+
+mpl.rcParams["svg.hashsalt"] = "vd4rl-pomdp"
+COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
+"""Okabe and Ito's palette, which colour-blind readers can tell apart."""
+Film = dict[str, np.ndarray]
+
+
+def curve_figure(rows: list[dict[str, Any]], methods: list[str]) -> str:
+    """Score against updates, one line a method, a band from the lowest to the highest seed."""
+    figure = Figure(figsize=(6.4, 3.2), layout="constrained")
+    axes = figure.subplots()
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = [row for row in rows if row["method"] == method]
+        colour = COLOURS[methods.index(method) % len(COLOURS)]
+        steps = [row["step"] for row in mine]
+        axes.plot(steps, [row["score"] for row in mine], "o-", color=colour, label=method, markersize=4)
+        axes.fill_between(steps, [r["low"] for r in mine], [r["high"] for r in mine], color=colour, alpha=0.15, lw=0)
+    axes.set(xlabel="gradient updates", ylabel="score (return / 10)")
+    axes.set_xlim(left=0)
+    axes.set_ylim(bottom=0)
+    return _svg(figure, axes)
+
+
+def loss_figure(series: dict[str, list[dict[str, float]]]) -> str:
+    """Pretraining action loss against steps, for every run by name."""
+    figure = Figure(figsize=(6.4, 3.2), layout="constrained")
+    axes = figure.subplots()
+    for number, (name, metrics) in enumerate(series.items()):
+        steps = [row["step"] for row in metrics if "action_loss" in row]
+        values = [row["action_loss"] for row in metrics if "action_loss" in row]
+        axes.plot(steps, values, color=COLOURS[number % len(COLOURS)], label=name, lw=1.2)
+    axes.set(xlabel="gradient steps", ylabel="action loss")
+    return _svg(figure, axes)
+
+
+def _svg(figure: Figure, axes: Any) -> str:
+    axes.grid(alpha=0.25)
+    axes.spines[["top", "right"]].set_visible(False)
+    axes.legend(frameon=False, fontsize=9)
+    buffer = io.StringIO()
+    figure.savefig(buffer, format="svg", metadata={"Date": None})
+    text = buffer.getvalue()
+    return text[text.index("<svg") :]
+
+
+def strip(film: Film, columns: int = 8) -> bytes:
+    """PNG film strip: clean frames above, the frames of the corrupted stacks (oldest to newest) below."""
+    chosen = np.linspace(0, len(film["clean"]) - 1, columns).astype(int)
+    stacks = film["corrupted"][chosen].reshape(columns, -1, 3, *film["corrupted"].shape[-2:])
+    rows = [film["clean"][chosen], *stacks.swapaxes(0, 1)]
+    return _png(np.concatenate([np.concatenate(list(_spaced(row)), axis=1) for row in rows], axis=0))
+
+
+def _spaced(images: np.ndarray) -> Any:
+    """(N, 3, H, W) -> images (H + 2, W + 2, 3) with a white border."""
+    for image in images:
+        yield np.pad(image.transpose(1, 2, 0), ((1, 1), (1, 1), (0, 0)), constant_values=255)
+
+
+def movie(film: Film, scale: int = 2) -> bytes:
+    """Animated WebP of an episode: clean at the left, the newest corrupted frame at the right."""
+    newest = film["corrupted"][:, -3:]
+    pairs = np.concatenate([film["clean"], newest], axis=3).transpose(0, 2, 3, 1)
+    size = (pairs.shape[2] * scale, pairs.shape[1] * scale)
+    frames = [Image.fromarray(pair).resize(size, Image.Resampling.NEAREST) for pair in pairs]
+    buffer = io.BytesIO()
+    frames[0].save(buffer, "WEBP", save_all=True, append_images=frames[1:], duration=80, loop=0, quality=60)
+    return buffer.getvalue()
+
+
+def _png(image: np.ndarray) -> bytes:
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()

@@ -1,0 +1,113 @@
+"""Read run folders: configs, metrics, evaluation rows and films."""
+
+from __future__ import annotations
+
+import csv
+import json
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.evaluation import COLUMNS
+from vd4rl_pomdp.runs.folder import read_json
+
+IDENTITY = ("task", "quality", "corruption", "algorithm", "method", "seed")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One run's files, in memory."""
+
+    path: Path
+    stage: str
+    record: dict[str, Any]
+    """config.json: stage, config, versions, git_commit, command."""
+    rows: list[dict[str, Any]]
+    """Evaluation rows, numbers parsed."""
+    metrics: list[dict[str, float]]
+    seconds: float | None
+    """Wall-clock time; None while the run is unfinished."""
+
+    @property
+    def identity(self) -> tuple[str, ...]:
+        """Values of IDENTITY, from the first row."""
+        return tuple(str(self.rows[0][name]) for name in IDENTITY)
+
+    def film(self) -> dict[str, np.ndarray] | None:
+        """Pictures of an evaluation episode, if the run kept them."""
+        path = self.path / "film.npz"
+        if not path.exists():
+            return None
+        with np.load(path) as file:
+            return dict(file)
+
+
+def load_runs(paths: list[Path]) -> list[Run]:
+    """Every run at or below the paths; none, or two with the same identity, raises UserError."""
+    if not paths:
+        raise UserError("name at least one run folder, or a folder that contains some")
+    folders: list[Path] = []
+    for path in paths:
+        if not path.exists():
+            raise UserError(f"{path}: no such folder")
+        folders += sorted(p.parent for p in path.rglob("config.json") if _is_run(p))
+    runs = [_load(folder) for folder in dict.fromkeys(folders)]
+    if not runs:
+        raise UserError(f"{paths[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl)")
+    _refuse_twins(runs)
+    return runs
+
+
+def _is_run(config: Path) -> bool:
+    return "stage" in read_json(config)
+
+
+def _load(folder: Path) -> Run:
+    record = read_json(folder / "config.json")
+    timing = folder / "timing.json"
+    return Run(
+        path=folder,
+        stage=record["stage"],
+        record=record,
+        rows=_rows(folder / "episodes.csv"),
+        metrics=_metrics(folder / "metrics.jsonl"),
+        seconds=read_json(timing)["seconds"] if timing.exists() else None,
+    )
+
+
+def _rows(path: Path) -> list[dict[str, Any]]:
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        reader = csv.DictReader(file)
+        missing = [name for name in COLUMNS if name not in (reader.fieldnames or [])]
+        if missing:
+            raise UserError(f"{path}: has no column {missing[0]!r}; it was not written by this package")
+        whole = ("seed", "step", "episode", "episode_seed", "length")
+        return [
+            row | {k: int(row[k]) for k in whole} | {k: float(row[k]) for k in ("return", "score")} for row in reader
+        ]
+
+
+def _metrics(path: Path) -> list[dict[str, float]]:
+    if not path.exists():
+        return []
+    try:
+        return [json.loads(line) for line in path.read_text().splitlines()]
+    except json.JSONDecodeError as error:
+        raise UserError(f"{path}: a line is not JSON ({error})") from error
+
+
+def _refuse_twins(runs: list[Run]) -> None:
+    seen: dict[tuple[str, ...], Path] = {}
+    for run in runs:
+        if not run.rows:
+            continue
+        if run.identity in seen:
+            raise UserError(
+                f"{run.path} and {seen[run.identity]}: two runs of one method, setting and seed; report one of them"
+            )
+        seen[run.identity] = run.path

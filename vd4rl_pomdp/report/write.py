@@ -1,0 +1,133 @@
+"""Write a report: one HTML page that opens from disk, and the CSV files its tables and figures are made of."""
+
+from __future__ import annotations
+
+import base64
+import csv
+import json
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import jinja2
+from rich.console import Console
+from rich.table import Table
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.evaluation import COLUMNS
+from vd4rl_pomdp.report import figures, tables
+from vd4rl_pomdp.report.load import Run, load_runs
+from vd4rl_pomdp.report.stats import FEW_SEEDS
+
+Row = dict[str, Any]
+
+
+def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
+    """Write the report of all runs at or below `paths` into `out`; returns the page and the table of final scores."""
+    runs = load_runs(paths)
+    rows = [row for run in runs for row in run.rows]
+    if not rows:
+        raise UserError(f"{paths[0]}: holds no evaluated run yet; `vd4rl-pomdp finetune` evaluates")
+    summary, curves, aggregate = tables.summary(rows), tables.curves(rows), tables.aggregate(rows)
+    out.mkdir(parents=True, exist_ok=True)
+    for name, table in (("summary", summary), ("curves", curves), ("aggregate", aggregate)):
+        _write_csv(out / f"{name}.csv", table, list(table[0]))
+    _write_csv(out / "episodes.csv", rows, list(COLUMNS))
+    page = _render(runs, rows, summary, curves, aggregate)
+    (out / "index.html").write_text(page)
+    return out / "index.html", summary
+
+
+def print_summary(summary: list[Row], console: Console | None = None) -> None:
+    """The table of final scores on the terminal."""
+    table = Table(title="score = return / 10, mean over seeds [95% interval]")
+    for name in ("setting", "method"):
+        table.add_column(name)
+    for name in ("score", "interval", "seeds", "episodes"):
+        table.add_column(name, justify="right")
+    for row in summary:
+        interval = f"{row['low']:.1f} - {row['high']:.1f}" if row["low"] is not None else "-"
+        cells = (f"{row['score']:.1f}", interval, str(row["seeds"]), str(row["episodes"]))
+        table.add_row(_setting(row), row["method"], *cells)
+    (console or Console()).print(table)
+
+
+def _render(runs: list[Run], rows: list[Row], summary: list[Row], curves: list[Row], aggregate: list[Row]) -> str:
+    template = files("vd4rl_pomdp.report").joinpath("page.html").read_text()
+    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
+    methods = list(dict.fromkeys(row["method"] for row in summary))
+    pretraining = {_title(run): run.metrics for run in runs if run.stage == "pretrain" and run.metrics}
+    return environment.from_string(template).render(
+        finished=sum(run.seconds is not None for run in runs),
+        rows=len(rows),
+        few=FEW_SEEDS,
+        tables=_by_setting(summary),
+        aggregate=aggregate,
+        curves=[(name, figures.curve_figure(part, methods)) for name, part in _by_setting(curves)],
+        losses=figures.loss_figure(pretraining) if pretraining else "",
+        films=_films(runs),
+        published=_published(rows),
+        runs=[_facts(run) for run in runs],
+    )
+
+
+def _setting(row: Row) -> str:
+    return f"{row['task']} {row['quality']}, {row['corruption']}, {row['algorithm']}"
+
+
+def _by_setting(rows: list[Row]) -> list[tuple[str, list[Row]]]:
+    groups: dict[str, list[Row]] = {}
+    for row in rows:
+        groups.setdefault(_setting(row), []).append(row)
+    return list(groups.items())
+
+
+def _title(run: Run) -> str:
+    config = run.record["config"]
+    if run.rows:
+        return f"{run.stage} {run.rows[0]['method']}, {_setting(run.rows[0])}, seed {config['seed']}"
+    return f"{run.stage} {config.get('method', run.path.name)}, {config.get('corruption', '')}, seed {config['seed']}"
+
+
+def _films(runs: list[Run]) -> list[Row]:
+    """The film of the first seed of every method and setting."""
+    chosen: dict[tuple[str, ...], Run] = {}
+    for run in runs:
+        if run.rows and (run.path / "film.npz").exists():
+            chosen.setdefault(run.identity[:-1], run)
+    shown = []
+    for run in chosen.values():
+        film = run.film()
+        assert film is not None
+        strip, movie = figures.strip(film), figures.movie(film)
+        shown.append(
+            {"title": _title(run), "strip": _base64(strip), "movie": _base64(movie), "total": film["return"][-1]}
+        )
+    return shown
+
+
+def _base64(data: bytes) -> str:
+    return base64.b64encode(data).decode()
+
+
+def _published(rows: list[Row]) -> list[dict[str, str]]:
+    wanted = {(row["task"], row["quality"]) for row in rows}
+    with files("vd4rl_pomdp.report").joinpath("published_scores.csv").open() as file:
+        return [row for row in csv.DictReader(file) if (row["env"], row["dataset"]) in wanted]
+
+
+def _facts(run: Run) -> dict[str, str]:
+    return {
+        "title": _title(run),
+        "commit": run.record.get("git_commit", ""),
+        "time": f"{run.seconds:.0f} s" if run.seconds is not None else "unfinished",
+        "command": run.record.get("command", ""),
+        "config": json.dumps({k: run.record.get(k) for k in ("config", "versions")}, indent=1),
+    }
+
+
+def _write_csv(path: Path, rows: list[Row], columns: list[str]) -> None:
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
