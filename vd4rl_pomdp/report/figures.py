@@ -56,8 +56,8 @@ def _svg(figure: Figure, axes: Any) -> str:
 
 def strip(film: Film, columns: int = 8) -> bytes:
     """PNG film strip: clean frames above, the frames of the corrupted stacks (oldest to newest) below."""
-    chosen = np.linspace(0, len(film["clean"]) - 1, columns).astype(int)
-    stacks = film["corrupted"][chosen].reshape(columns, -1, 3, *film["corrupted"].shape[-2:])
+    chosen = np.unique(np.linspace(0, len(film["clean"]) - 1, columns).astype(int))
+    stacks = film["corrupted"][chosen].reshape(len(chosen), -1, 3, *film["corrupted"].shape[-2:])
     rows = [film["clean"][chosen], *stacks.swapaxes(0, 1)]
     return _png(np.concatenate([np.concatenate(list(_spaced(row)), axis=1) for row in rows], axis=0))
 

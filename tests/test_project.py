@@ -1,0 +1,102 @@
+"""What documentation and layout promise, checked on the tracked files."""
+
+import ast
+import re
+import subprocess
+import tomllib
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("vd4rl_pomdp", "pretrain", "finetune", "baselines")
+SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+MAY_IMPORT = {
+    "vd4rl_pomdp": {"vd4rl_pomdp"},
+    "baselines": {"baselines", "vd4rl_pomdp"},
+    "pretrain": {"pretrain", "baselines", "vd4rl_pomdp"},
+    "finetune": {"finetune", "vd4rl_pomdp"},
+}
+DISPATCHERS = ("vd4rl_pomdp/cli.py", "vd4rl_pomdp/experiments/bench.py")
+"""Files that call the stages, and import them inside functions only."""
+
+
+def imports(tree: ast.AST) -> set[str]:
+    names = set()
+    for node in ast.walk(tree):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            names.add(node.module.split(".")[0])
+        elif isinstance(node, ast.Import):
+            names |= {alias.name.split(".")[0] for alias in node.names}
+    return names
+
+
+def test_layers_import_only_what_is_below_them():
+    wrong = []
+    for path in SOURCES:
+        name = path.relative_to(ROOT).as_posix()
+        tree = ast.parse(path.read_text())
+        if name in DISPATCHERS:
+            tree = ast.Module([n for n in tree.body if isinstance(n, ast.Import | ast.ImportFrom)], [])
+        outside = (imports(tree) & set(PACKAGES)) - MAY_IMPORT[name.split("/")[0]]
+        wrong += [f"{name} imports {other}" for other in sorted(outside)]
+    assert wrong == []
+
+
+def test_every_module_says_what_it_is():
+    assert [p for p in SOURCES if not ast.get_docstring(ast.parse(p.read_text()))] == []
+
+
+def test_nothing_is_read_by_pickle_or_eval():
+    forbidden = re.compile(r"\bimport pickle|torch\.load\(|allow_pickle=True|(?<!\.)\beval\(|\bexec\(")
+    assert [p for p in SOURCES if forbidden.search(p.read_text())] == []
+
+
+def test_dependencies_are_bounded_above():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = [entry for group in project["optional-dependencies"].values() for entry in group]
+    unbounded = [entry for entry in project["dependencies"] + extras if "<" not in entry]
+    assert unbounded == []
+
+
+def test_the_readmes_two_commands_exist_and_ci_runs_the_test_command():
+    readme, makefile = (ROOT / "README.md").read_text(), (ROOT / "Makefile").read_text()
+    for command in ("demo", "test"):
+        assert f"make {command}" in readme
+        assert re.search(rf"^{command}:", makefile, re.MULTILINE)
+    assert "make test" in (ROOT / ".ci" / "run").read_text()
+
+
+def test_every_registered_name_is_in_the_readme():
+    from finetune.algorithms import ALGORITHMS
+    from pretrain.objectives import METHODS
+
+    readme = (ROOT / "README.md").read_text()
+    assert [name for name in [*METHODS, *ALGORITHMS] if f"`{name}`" not in readme] == []
+
+
+def test_every_flag_of_the_table_of_choices_exists():
+    from dataclasses import fields
+
+    from finetune.config import FinetuneConfig
+    from pretrain.config import PretrainConfig
+
+    flags = {f.name.replace("_", "-") for config in (PretrainConfig, FinetuneConfig) for f in fields(config)}
+    named = re.findall(r"`--([a-z0-9-]+)", (ROOT / "docs" / "choices.md").read_text())
+    assert len(named) > 30
+    assert set(named) - flags == set()
+
+
+def test_no_machine_paths_in_tracked_files():
+    if not (ROOT / ".git").exists():
+        pytest.skip("not a git checkout")
+    pattern = r"(/home/[a-z]+|/root/|/tmp/[a-z])"
+    found = subprocess.run(
+        ["git", "grep", "-nIE", pattern, "--", ".", ":!tests/test_project.py"], cwd=ROOT, capture_output=True, text=True
+    )
+    assert found.stdout == ""
+
+
+def test_the_changelog_tells_of_the_present_version():
+    version = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]["version"]
+    assert re.search(r"^## (\S+)", (ROOT / "CHANGELOG.md").read_text(), re.MULTILINE).group(1) == version
