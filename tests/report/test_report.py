@@ -94,7 +94,7 @@ def test_bad_input_is_one_line(tmp_path):
         write_report([tmp_path / "empty"], tmp_path / "out")
     write_run(tmp_path / "a", "acro", 0, {10: [1.0]})
     write_run(tmp_path / "b", "acro", 0, {10: [2.0]})
-    with pytest.raises(UserError, match="two runs of the same method"):
+    with pytest.raises(UserError, match="two runs of one method"):
         write_report([tmp_path / "a", tmp_path / "b"], tmp_path / "out")
     (tmp_path / "a" / "metrics.jsonl").write_text("{")
     with pytest.raises(UserError, match="not JSON"):
