@@ -98,7 +98,7 @@ class Trainer:
                     save_checkpoint(run.checkpoint, self._state())
         log.close()
         (run.path / "features.npy").unlink(missing_ok=True)
-        run.finish(before, updates=self.step)
+        run.finish(run.seconds(before), updates=self.step)
 
     def _evaluate(self, run: RunFolder) -> float:
         """Evaluate the present policy, append its rows, keep a film of the last; returns the mean score."""

@@ -56,9 +56,9 @@ class RunFolder:
         """Whether the run has come to its end."""
         return (self.path / "timing.json").exists()
 
-    def finish(self, seconds_before: float, **more: Any) -> None:
+    def finish(self, seconds: float, **more: Any) -> None:
         """Mark the run as done and keep its wall-clock seconds, those before an interruption included."""
-        write_json(self.path / "timing.json", {"seconds": round(self.seconds(seconds_before), 2)} | more)
+        write_json(self.path / "timing.json", {"seconds": round(seconds, 2)} | more)
 
     def seconds(self, before: float) -> float:
         """Wall-clock seconds of the run so far, given those spent before an interruption."""
