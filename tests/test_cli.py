@@ -31,6 +31,9 @@ def test_every_command_has_help(words, capsys):
         (["data", "collect", "--task", "ant", "--quality", "random", "--out", "x"], "unknown task 'ant'"),
         (["finetune", "--encoder", "nowhere", "--data", "nowhere", "--out", "x"], "nowhere"),
         (["report", "nowhere"], "nowhere: no such folder"),
+        (["pretrain", "--data", "x"], "Missing from vd4rl-pomdp pretrain: --out"),
+        (["pretrain", "--data", "x", "--out", "y", "--steps", "many"], "--steps: invalid literal"),
+        (["finetune", "--encoder", "a", "--data", "b", "--out", "c", "--veiws", "3"], "Perhaps you meant: --views"),
     ],
 )
 def test_a_slip_is_one_line_and_exit_code_2(words, message, capsys, tmp_path, monkeypatch):

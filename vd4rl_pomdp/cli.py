@@ -2,7 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
+import io
 import json
+import re
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -76,7 +79,21 @@ class Command:
 def _parse(config: Any, words: Arguments, program: str, default: Any = None) -> Any:
     """Arguments as an instance of a config class; `--preset`-like defaults come in as `default`."""
     options = {} if default is None else {"default": default}
-    return tyro.cli(config, args=words, prog=program, description=config.__doc__, **options)
+    shown = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(shown):
+            return tyro.cli(config, args=words, prog=program, description=config.__doc__, **options)
+    except SystemExit as end:
+        if end.code in (0, None):
+            raise
+        raise UserError(_one_line(shown.getvalue(), program)) from None
+
+
+def _one_line(box: str, program: str) -> str:
+    """tyro's boxed message, without its title and frame, as one sentence."""
+    text = " ".join(line for line in box.splitlines() if not line.startswith(("╭", "╰")))
+    text = re.sub(r"[\u2500-\u257f]+", " ", text.partition("For full helptext")[0])
+    return f"{' '.join(text.split())} (see `{program} --help`)"
 
 
 def _with_presets(config: type, presets: dict[str, Any], words: Arguments, program: str) -> Any:
