@@ -98,7 +98,7 @@ def smoke_finetune(encoder: Path, data: Path, out: Path, **changes: object) -> f
     return replace(finetune.config.PRESETS["smoke"], encoder=encoder, data=data, out=out, workers=1, **changes)
 
 
-@pytest.mark.parametrize(("algorithm", "views"), [("td3_bc", 2), ("bc", 1), ("td3_bc", 0)])
+@pytest.mark.parametrize(("algorithm", "views"), [("td3_bc", 2), ("drqv2_bc", 1), ("bc", 1), ("td3_bc", 0)])
 def test_finetuning_resumes_to_the_bit(encoder, data, tmp_path, monkeypatch, algorithm, views):
     changes = {"algorithm": algorithm, "views": views, "eval_length": 2, "updates": 30, "eval_every": 15}
     changes |= {"checkpoint_every": 10, "batch_size": 4}
@@ -179,6 +179,7 @@ def test_td3_bc_finds_the_better_action_and_bc_the_common_one():
         chosen[name] = policy(torch.zeros(1, 2)).item()
     assert chosen["bc"] == pytest.approx(-0.25, abs=0.02)
     assert chosen["td3_bc"] > 0.2
+    assert chosen["drqv2_bc"] > 0.2
 
 
 def test_policy_statistics_are_those_of_the_features():

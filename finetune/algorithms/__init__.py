@@ -7,6 +7,7 @@ from typing import Any, Protocol
 from torch import Tensor
 
 from finetune.algorithms.bc import BC
+from finetune.algorithms.drqv2_bc import DrQv2BC
 from finetune.algorithms.td3_bc import TD3BC
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.errors import UserError
@@ -28,7 +29,7 @@ class Algorithm(Protocol):
         """Continue from `state_dict`."""
 
 
-ALGORITHMS = {"td3_bc": TD3BC, "bc": BC}
+ALGORITHMS = {"td3_bc": TD3BC, "drqv2_bc": DrQv2BC, "bc": BC}
 
 
 def get_algorithm(name: str) -> type[TD3BC] | type[BC]:

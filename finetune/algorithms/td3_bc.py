@@ -22,9 +22,7 @@ from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.heads import mlp
 from vd4rl_pomdp.nn.policy import Policy
 
-TAU = 0.005
 TARGET_NOISE, NOISE_CLIP = 0.2, 0.5
-POLICY_DELAY = 2
 
 
 class TwinCritic(nn.Module):
@@ -44,6 +42,9 @@ class TwinCritic(nn.Module):
 class TD3BC:
     """See the module."""
 
+    tau = 0.005
+    policy_delay = 2
+
     def __init__(self, policy: Policy, config: FinetuneConfig, generator: torch.Generator) -> None:
         self.policy, self.config, self.generator = policy, config, generator
         shape = policy.shape
@@ -59,16 +60,14 @@ class TD3BC:
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         metrics = self._update_critic(z, batch, next_z)
         self.updates += 1
-        if self.updates % POLICY_DELAY == 0:
+        if self.updates % self.policy_delay == 0:
             metrics |= self._update_policy(z, batch.action)
             self._move_targets()
         return metrics
 
     def _update_critic(self, z: Tensor, batch: FeatureBatch, next_z: Tensor) -> dict[str, Tensor]:
         with torch.no_grad():
-            noise = torch.randn(batch.action.shape, generator=self.generator).to(z.device) * TARGET_NOISE
-            action = self.target_policy.from_standardised(next_z) + noise.clamp(-NOISE_CLIP, NOISE_CLIP)
-            value = torch.minimum(*self.target_critic(next_z, action.clamp(-1, 1)))
+            value = torch.minimum(*self.target_critic(next_z, self._next_action(next_z)))
             target = batch.reward + self.config.gamma * batch.discount * value
         first, second = self.critic(z, batch.action)
         loss = F.mse_loss(first, target) + F.mse_loss(second, target)
@@ -77,9 +76,25 @@ class TD3BC:
         self.critic_optimiser.step()
         return {"critic_loss": loss.detach(), "q": first.detach().mean()}
 
+    def _next_action(self, next_z: Tensor) -> Tensor:
+        """Action of the target policy, smoothed by clipped noise."""
+        return self._noisy(self.target_policy.from_standardised(next_z), TARGET_NOISE, NOISE_CLIP)
+
+    def _noisy(self, action: Tensor, std: float, clip: float) -> Tensor:
+        noise = torch.randn(action.shape, generator=self.generator).to(action.device) * std
+        return (action + noise.clamp(-clip, clip)).clamp(-1, 1)
+
+    def _policy_value(self, z: Tensor, action: Tensor) -> Tensor:
+        """What the actor maximises."""
+        return self.critic.first(torch.cat([z, action], dim=-1))
+
+    def _policy_action(self, z: Tensor) -> Tensor:
+        """The action that the actor's loss is about."""
+        return self.policy.from_standardised(z)
+
     def _update_policy(self, z: Tensor, action: Tensor) -> dict[str, Tensor]:
-        chosen = self.policy.from_standardised(z)
-        value = self.critic.first(torch.cat([z, chosen], dim=-1))
+        chosen = self._policy_action(z)
+        value = self._policy_value(z, chosen)
         weight = self.config.alpha / value.abs().mean().detach()
         cloning = F.mse_loss(chosen, action)
         loss = cloning - weight * value.mean()
@@ -92,7 +107,7 @@ class TD3BC:
     def _move_targets(self) -> None:
         for online, target in ((self.critic, self.target_critic), (self.policy.net, self.target_policy.net)):
             for a, b in zip(online.parameters(), target.parameters(), strict=True):
-                b.lerp_(a, TAU)
+                b.lerp_(a, self.tau)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on: networks, targets, optimisers, counters."""
