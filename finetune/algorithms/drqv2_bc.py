@@ -6,7 +6,7 @@
 Authors' code: github.com/conglu1997/v-d4rl (drqbc).
 
 Differences to TD3+BC here: no target actor, an actor step with every critic step, noise that decays linearly from 1.0
-to 0.1 over 250k updates, tau 0.01. Differences to the authors' loop: the encoder is frozen, so there is no 50-unit trunk
+to 0.1 over 250k updates, tau 0.01. Differences to the authors' loop: the encoder is frozen, so there is no trunk
 and no encoder update; V-D4RL's learning rate is 1e-4 (`--learning-rate`).
 """
 
