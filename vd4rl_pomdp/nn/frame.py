@@ -25,8 +25,16 @@ class FrameEncoder(nn.Module):
         """Features of every stack."""
         lead = obs.shape[:-3]
         dtype = next(self.project.parameters()).dtype
-        image = obs.reshape(-1, *obs.shape[-3:]).contiguous(memory_format=torch.channels_last).to(dtype) / 255 - 0.5
+        image = _as_image(obs.reshape(-1, *obs.shape[-3:]), dtype)
         return self.project(self.convolutions(image).flatten(1)).to(dtype).view(*lead, -1)
+
+
+def _as_image(obs: Tensor, dtype: torch.dtype) -> Tensor:
+    """Pixels 0..255 as channels-last numbers in [-0.5, 0.5], straight in the precision that the convolutions use."""
+    if torch.is_autocast_enabled(obs.device.type):
+        dtype = torch.get_autocast_dtype(obs.device.type)
+    pixels = obs.contiguous(memory_format=torch.channels_last).to(dtype, copy=True)
+    return pixels.mul_(1 / 255).sub_(0.5)
 
 
 def _drq(channels: int) -> nn.Sequential:
