@@ -15,6 +15,7 @@ from finetune.config import FinetuneConfig
 from finetune.features import BATCH_STREAM, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.envs.parity import render_info
 from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, rows_of
 from vd4rl_pomdp.nn.folder import EncoderCard, load_encoder
 from vd4rl_pomdp.nn.policy import Policy
@@ -98,6 +99,7 @@ class Trainer:
                     save_checkpoint(run.checkpoint, self._state())
         log.close()
         (run.path / "features.npy").unlink(missing_ok=True)
+        write_json(run.path / "render.json", render_info(self.card.task))
         run.finish(run.seconds(before), updates=self.step)
 
     def _evaluate(self, run: RunFolder) -> float:

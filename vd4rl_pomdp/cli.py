@@ -234,9 +234,14 @@ def _evaluate(words: Arguments, program: str) -> None:
 
 
 def _policy_train(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.policies.train import PolicyConfig, train_policy
+    from vd4rl_pomdp.policies.train import PolicyConfig, decisions_made, train_policy
+    from vd4rl_pomdp.runs.progress import ProgressLine
 
-    for quality, path in train_policy(_parse(PolicyConfig, words, program)).items():
+    config = _parse(PolicyConfig, words, program)
+    done = decisions_made(config.out)
+    with ProgressLine(f"train {config.task}", config.decisions, "decisions", done) as progress:
+        files = train_policy(config, lambda decisions, mean: progress.reach(decisions, ret=mean))
+    for quality, path in files.items():
         print(f"{quality}: {path}")
 
 

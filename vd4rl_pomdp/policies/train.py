@@ -107,6 +107,12 @@ def read_curve(run: Path) -> list[tuple[int, float]]:
         return [(int(row["decisions"]), float(row["return_mean"])) for row in csv.DictReader(file)]
 
 
+def decisions_made(run: Path) -> int:
+    """Decisions behind a run's newest checkpoint, 0 for a new run."""
+    counters = run / "checkpoint" / "counters.json"
+    return int(json.loads(counters.read_text())["decisions"]) if counters.exists() else 0
+
+
 def _claim(config: PolicyConfig) -> None:
     """Write the run's config, or check that the folder holds the same one (its length may grow)."""
     settings = {k: v for k, v in asdict(config).items() if k not in ("out", "decisions", "stop_at")}

@@ -49,6 +49,10 @@ class ProgressLine:
             )
             self._next_plain += max(1, self._total // self._PLAIN_LINES)
 
+    def reach(self, done: int, **numbers: float) -> None:
+        """Move on to `done`, showing `numbers`."""
+        self.advance(done - self._done, **numbers)
+
     def __enter__(self) -> Self:
         self._bar.start()
         return self
