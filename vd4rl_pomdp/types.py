@@ -81,7 +81,7 @@ class Windows(Batch):
     """Consecutive rows of one episode each. Row j shows o_j, a_{j-1} (`prev_action`) and a_j (`action`)."""
 
     obs: Tensor
-    """(B, T, C, 84, 84) uint8: a frame stack a row, built within the episode (it may reach before the window)."""
+    """(B, T, C, H, W) uint8: a frame stack a row, built within the episode (it may reach before the window)."""
     prev_action: Tensor
     """(B, T, A) float32: a_{j-1}; zero in the window's first row and in padding."""
     action: Tensor

@@ -69,8 +69,8 @@ class ZeroFrames:
         if self.frames > s:
             raise UserError(f"cannot zero {self.frames} of {s} stacked frames: choose a smaller --zeroed-frames")
         order = draw_integers(hash_keys(key ^ 1), 1 << 31, s).argsort(dim=1)
-        chosen = order[:, : self.frames] + torch.arange(n, device=obs.device)[:, None] * s
-        obs.view(n * s, -1).index_fill_(0, chosen.reshape(-1), 0)
+        keep = torch.ones(n, s, dtype=torch.uint8, device=obs.device).scatter_(1, order[:, : self.frames], 0)
+        obs.mul_(keep[:, :, None, None, None])
 
 
 @dataclass(frozen=True)

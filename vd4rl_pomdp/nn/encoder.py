@@ -32,8 +32,10 @@ class EncoderConfig:
     gru_layers: int = 1
     history_window: int = 0
     """Rows the state is computed from, 0 for all since the episode's start."""
-    frame_stack: int = FRAME_STACK
-    frame_size: int = FRAME_SIZE
+    channels: int = 3 * FRAME_STACK
+    """Channels of an observation."""
+    size: int = FRAME_SIZE
+    """Height and width of an observation."""
 
 
 class StreamState(NamedTuple):
@@ -51,9 +53,7 @@ class Encoder(nn.Module):
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        self.frame = make_frame_encoder(
-            config.frame_encoder, 3 * config.frame_stack, config.frame_size, config.feature_dim
-        )
+        self.frame = make_frame_encoder(config.frame_encoder, config.channels, config.size, config.feature_dim)
         inputs = config.feature_dim + (config.action_dim if config.use_actions else 0)
         self.gru = (
             nn.GRU(inputs, config.hidden_dim, config.gru_layers, batch_first=True) if config.history == "gru" else None

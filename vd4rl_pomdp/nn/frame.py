@@ -11,7 +11,7 @@ from vd4rl_pomdp.errors import UserError
 class FrameEncoder(nn.Module):
     """Encodes uint8 frame stacks.
 
-    Shapes: (..., C, 84, 84) uint8 or float in 0..255 -> (..., feature_dim) float32.
+    Shapes: (..., C, size, size) uint8 or float in 0..255 -> (..., feature_dim) float32.
     """
 
     def __init__(self, convolutions: nn.Sequential, channels: int, size: int, feature_dim: int) -> None:
@@ -57,7 +57,12 @@ def _nature(channels: int) -> nn.Sequential:
     )
 
 
-FRAME_ENCODERS = {"drq": _drq, "nature": _nature}
+def _flat(channels: int) -> nn.Sequential:
+    """No convolution: for observations that are a handful of numbers, as in finite worlds."""
+    return nn.Sequential()
+
+
+FRAME_ENCODERS = {"drq": _drq, "nature": _nature, "flat": _flat}
 
 
 def make_frame_encoder(name: str, channels: int, size: int, feature_dim: int) -> FrameEncoder:
