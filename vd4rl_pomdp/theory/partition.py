@@ -76,8 +76,8 @@ class Relation:
     def coarsest(self) -> dict[Hashable, int]:
         """A coarsest partition, block by history: the smallest of those that the orders lead to."""
         groupings: tuple[Callable[[Hashable], tuple], ...] = (
-            lambda h: (_text(self.facts[h].states),),
             lambda h: (_text(self.facts[h].actions[::-1]),),
+            lambda h: (_text(self.facts[h].states),),
         )
         found = [self._first_fit(group) for group in groupings]
         return min(found, key=lambda blocks: len(set(blocks.values())))
@@ -151,9 +151,8 @@ def relation(world: World, view: View, memory: Memory, ks: Iterable[int]) -> Rel
     within the rows m..m+K is taken, because one late history must serve all earlier t.
     """
     ks, first = list(ks), first_row(view, memory)
-    starts = range(first, first + max(ks)) if view.past == "all" else [first]
     found = Relation(shared=not view.masked)
-    for t in starts:
+    for t in range(first, first + (max(ks) if view.past == "all" else 1)):
         for k in (k for k in ks if view.past != "all" or t + k <= first + max(ks)):
             rows = t + k + memory.n + 1
             start, end = view.start(t, memory.m), view.end(t, k, memory.m, memory.n, rows)
