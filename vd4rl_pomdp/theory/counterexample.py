@@ -81,7 +81,11 @@ def differences(appendix: dict[str, Any], main_text: dict[str, Any]) -> list[str
             f"The text needs k = 2 and k = 3 to tell states apart; the first action is uniform at k = {_list(early)} as "
             f"well, so only k = {_list(appendix['informative_k'])} say anything."
         )
-    for name, claimed in (("examples", CLAIMED_EXAMPLES), ("diameter", CLAIMED_DIAMETER), ("m_with_actions", CLAIMED_M)):
+    for name, claimed in (
+        ("examples", CLAIMED_EXAMPLES),
+        ("diameter", CLAIMED_DIAMETER),
+        ("m_with_actions", CLAIMED_M),
+    ):
         if appendix[name] != claimed:
             found.append(f"The paper has {name} = {claimed}; enumeration gives {appendix[name]}.")
     late = [k for k in CLAIMED_UNIFORM if k not in main_text["uniform_k"]]

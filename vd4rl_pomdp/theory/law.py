@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from functools import cached_property
 from math import lcm, log
 from typing import Any
 
@@ -20,6 +21,8 @@ from vd4rl_pomdp.theory.world import Pair, World, uniform
 
 Variable = tuple[str, int]
 """("o", j), ("a", j), ("s", j) or ("xi", j): observation, action, agent-centric or exogenous state of row j."""
+Prediction = tuple[Fraction, ...]
+"""Probability of every action, in the world's order."""
 KINDS = ("s", "xi", "o", "a")
 """Order of the variables of one row."""
 LARGEST = 2**62
@@ -72,36 +75,44 @@ class Conditional:
     counts: np.ndarray
     """(views, actions) integers."""
 
+    @cached_property
+    def _kinds(self) -> tuple[np.ndarray, list[Prediction]]:
+        """The distinct predictions, and which of them belongs to each view."""
+        rows = [np.unique(column, return_inverse=True)[1] for column in self.counts.T]
+        kinds = _number(rows, len(self.counts))
+        first = np.unique(kinds, return_index=True)[1]
+        distinct = [tuple(Fraction(n, sum(row)) for n in row) for row in self.counts[first].astype(object).tolist()]
+        return kinds, distinct
+
     def agrees(self, other: Conditional) -> bool:
-        """Whether two classifiers say the same wherever their views occur together (compared as fractions)."""
-        mine, theirs = np.unique(np.stack([self.ids, other.ids]), axis=1)
-        one, two = self.counts[mine].astype(object), other.counts[theirs].astype(object)
-        return bool((one * two.sum(1, keepdims=True) == two * one.sum(1, keepdims=True)).all())
+        """Whether two classifiers say the same wherever their views occur together."""
+        (mine, one), (theirs, two) = self._kinds, other._kinds
+        met = np.unique(np.stack([mine[self.ids], theirs[other.ids]]), axis=1)
+        return all(one[i] == two[j] for i, j in met.T)
 
     def certain(self) -> bool:
         """Whether the action is known, whatever the view."""
-        return bool(((self.counts > 0).sum(1) == 1).all())
+        return all(max(p) == 1 for p in self._kinds[1])
 
     def uniform(self) -> bool:
         """Whether no action is more likely than another, whatever the view."""
-        return bool((self.counts == self.counts[:, :1]).all())
+        return all(len(set(p)) == 1 for p in self._kinds[1])
 
     def entropy(self) -> float:
         """H(a | view) in nats; the only number here that is rounded."""
-        total = int(self.counts.sum())
-        terms = [
-            n * log(Fraction(sum(row), n)) for row in self.counts.astype(object).tolist() for n in row if 0 < n < sum(row)
-        ]
-        return sum(terms) / total
+        kinds, distinct = self._kinds
+        weights = np.zeros(len(distinct), object)
+        np.add.at(weights, kinds, self.counts.astype(object).sum(1))
+        bits = [-sum(float(q) * log(q) for q in p if q) for p in distinct]
+        return sum(float(Fraction(w, sum(weights))) * bit for w, bit in zip(weights, bits, strict=True))
 
-    def predictions(self) -> list[tuple[Fraction, ...]]:
+    def predictions(self) -> list[Prediction]:
         """P(a | view) for every view."""
-        return [tuple(Fraction(n, sum(row)) for n in row) for row in self.counts.astype(object).tolist()]
+        kinds, distinct = self._kinds
+        return [distinct[i] for i in kinds]
 
 
-def joint_law(
-    world: World, variables: Iterable[Variable], initial: Mapping[Pair, Fraction] | None = None
-) -> Law:
+def joint_law(world: World, variables: Iterable[Variable], initial: Mapping[Pair, Fraction] | None = None) -> Law:
     """Exact joint law of some variables of a sequence that starts in the world's initial law, or in another."""
     wanted = sorted(set(variables), key=_place)
     rows = 1 + max(row for _, row in wanted)

@@ -11,15 +11,16 @@ the future and has an encoder of its own). Every refinement of such a phi is eno
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Hashable, Iterable, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from itertools import combinations
+from itertools import combinations, product
 
 import numpy as np
 
 from vd4rl_pomdp.theory.classifiers import Memory, first_row
-from vd4rl_pomdp.theory.law import Variable, joint_law
+from vd4rl_pomdp.theory.law import Prediction, Variable, joint_law
 from vd4rl_pomdp.theory.views import View
 from vd4rl_pomdp.theory.world import World
 
@@ -49,9 +50,9 @@ class Relation:
         self.facts: dict[Hashable, Facts] = {}
         self.rows: dict[Hashable, dict[tuple, int]] = {}
         """History -> {(role, k, other side) -> prediction}; role is start or end."""
-        self._predictions: dict[tuple[Fraction, ...], int] = {}
+        self._predictions: dict[Prediction, int] = {}
 
-    def add(self, past: Hashable, later: Hashable, k: int, prediction: tuple[Fraction, ...]) -> None:
+    def add(self, past: Hashable, later: Hashable, k: int, prediction: Prediction) -> None:
         """Record one value of F."""
         value = self._predictions.setdefault(prediction, len(self._predictions))
         self.rows.setdefault(past, {})["start", k, later if self.shared else ("future", later)] = value
@@ -61,6 +62,18 @@ class Relation:
     def must_differ(self, one: Hashable, other: Hashable) -> bool:
         """Whether no representation that is enough can put two histories together."""
         return not _fits(self.rows[one], self.rows[other], one, other)
+
+    def conflicts(self) -> set[frozenset]:
+        """Every pair of histories that must differ."""
+        meeting: dict[tuple, list] = {}
+        for history, row in self.rows.items():
+            for key in row:
+                meeting.setdefault(key, []).append(history)
+        pairs = {frozenset(pair) for met in meeting.values() for pair in combinations(met, 2)}
+        direct = [(h, other) for h, row in self.rows.items() for _, _, other in row if other in self.rows]
+        loops = dict.fromkeys(h for h, other in direct if h == other)
+        pairs |= {frozenset(pair) for pair in [*direct, *combinations(loops, 2)]}
+        return {pair for pair in pairs if len(pair) == 2 and self.must_differ(*pair)}
 
     def factors(self, code: Callable[[Hashable], Hashable]) -> bool:
         """Whether F is a function of the codes of both sides."""
@@ -99,12 +112,17 @@ def _text(value: object) -> str:
 
 def _fits(mine: dict[tuple, int], theirs: dict[tuple, int], me: Hashable, them: Hashable) -> bool:
     """Whether two rows of F agree once the two sides have one name."""
-    merged: dict[tuple, int] = {}
-    for row in (mine, theirs):
-        for (role, k, other), value in row.items():
-            if merged.setdefault((role, k, me if other == them else other), value) != value:
-                return False
-    return True
+    common = mine.keys() & theirs.keys()
+    if any(mine[key] != theirs[key] for key in common):
+        return False
+    both = [
+        (role, k, row[role, k, name])
+        for row in (mine, theirs)
+        for role, k, other in row
+        for name in (me, them)
+        if other == name
+    ]
+    return len({(role, k) for role, k, _ in both}) == len(set(both))
 
 
 class _Blocks:
@@ -195,23 +213,24 @@ def state_relation(world: World, ks: Iterable[int]) -> Relation:
     return found
 
 
-def forced_pairs(found: Relation, states: Sequence[Hashable]) -> set[frozenset]:
-    """Pairs of states that every optimal representation separates.
+def forced_shares(found: Relation, states: Sequence[Hashable]) -> dict[frozenset, Fraction]:
+    """For every pair of states, the share of pairs of their histories that every optimal representation separates.
 
-    Such are pairs whose histories must differ, each of one from each of the other, wherever their exogenous parts can be
-    the same (else a code could lean on what the future shows of the exogenous part).
+    Only histories whose exogenous parts can be the same are paired: else a code could lean on what the future shows of
+    the exogenous part.
     """
-    members = {s: [h for h, facts in found.facts.items() if s in facts.states] for s in states}
-    return {
-        frozenset((one, other))
-        for one, other in combinations(states, 2)
-        if all(
-            found.must_differ(a, b)
-            for a in members[one]
-            for b in members[other]
-            if found.facts[a].noises & found.facts[b].noises
-        )
-    }
+    eligible: Counter = Counter()
+    groups = Counter((facts.states, facts.noises) for facts in found.facts.values())
+    for (mine, here), (theirs, there) in product(groups, repeat=2):
+        if here & there:
+            count = groups[mine, here] * groups[theirs, there]
+            eligible.update({(s, other): count for s in mine for other in theirs})
+    forced: Counter = Counter()
+    for pair in found.conflicts():
+        one, other = (found.facts[h] for h in pair)
+        if one.noises & other.noises:
+            forced.update(frozenset(ends) for ends in product(one.states, other.states))
+    return {frozenset(pair): Fraction(forced[frozenset(pair)], eligible[pair]) for pair in combinations(states, 2)}
 
 
 def discards_noise(found: Relation) -> bool:
@@ -231,11 +250,13 @@ def discards_noise(found: Relation) -> bool:
 
 
 def state_classes(found: Relation, blocks: dict[Hashable, int], states: Sequence[Hashable]) -> dict[Hashable, int]:
-    """Classes of states that share a block, directly or through others: what a partition of histories cannot tell."""
+    """Classes of states that a partition of histories cannot tell: they share a block at an equal exogenous state,
+    directly or through others."""
     label = {s: s for s in states}
-    members: dict[int, set] = {}
+    members: dict[tuple, set] = {}
     for history, block in blocks.items():
-        members.setdefault(block, set()).update(found.facts[history].states)
+        for noise in found.facts[history].noises:
+            members.setdefault((block, noise), set()).update(found.facts[history].states)
     for together in members.values():
         joined = {label[s] for s in together}
         target = min(joined, key=states.index)

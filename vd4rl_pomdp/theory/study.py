@@ -6,7 +6,7 @@ from typing import Any
 
 from vd4rl_pomdp.theory import counterexample, table
 from vd4rl_pomdp.theory.gallery import WORLDS
-from vd4rl_pomdp.theory.partition import Relation, forced_pairs, relation, state_classes, state_relation
+from vd4rl_pomdp.theory.partition import Relation, forced_shares, relation, state_classes, state_relation
 from vd4rl_pomdp.theory.views import VIEWS
 from vd4rl_pomdp.theory.world import World
 
@@ -61,12 +61,12 @@ def diagrams(place: table.Setting) -> list[dict[str, Any]]:
 
 def _diagram(title: str, wanted: Relation, world: World) -> dict[str, Any]:
     blocks = wanted.coarsest()
-    forced = forced_pairs(wanted, world.states)
+    shares = forced_shares(wanted, world.states)
     return {
         "title": title,
         "blocks": len(set(blocks.values())),
         "histories": len(blocks),
         "states": [list(s) for s in world.states],  # type: ignore[call-overload]
         "classes": list(state_classes(wanted, blocks, world.states).values()),
-        "forced": sorted(sorted(world.states.index(s) for s in pair) for pair in forced),
+        "forced": sorted([*sorted(world.states.index(s) for s in pair), float(x)] for pair, x in shares.items() if x),
     }

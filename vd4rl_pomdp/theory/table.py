@@ -6,10 +6,10 @@ from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from vd4rl_pomdp.theory.classifiers import Comparison, Memory, compare
+from vd4rl_pomdp.theory.classifiers import Memory, compare
 from vd4rl_pomdp.theory.gallery import WORLDS, variants
 from vd4rl_pomdp.theory.law import future_memory, past_memory
-from vd4rl_pomdp.theory.partition import discards_noise, forced_pairs, relation
+from vd4rl_pomdp.theory.partition import discards_noise, forced_shares, relation
 from vd4rl_pomdp.theory.views import VIEWS
 from vd4rl_pomdp.theory.world import World, diameter, period
 
@@ -105,12 +105,13 @@ def representations(place: Setting) -> list[dict[str, Any]]:
             noisy = relation(place.worlds[True, biased], VIEWS[method], place.memory, range(1, place.diameter + 1))
             for max_k in sorted({place.diameter, place.diameter if whole else place.max_k}):
                 found = relation(world, VIEWS[method], place.memory, range(1, max_k + 1))
-                forced = forced_pairs(found, world.states)
+                shares = forced_shares(found, world.states).values()
+                forced = sum(share == 1 for share in shares)
                 label = {"world": place.name, "state_dependent": biased, "method": method, "max_k": max_k}
-                label |= {"blocks": len(set(found.coarsest().values())), "histories": len(found.rows)}
                 rows.append(
                     label
-                    | {"forced": len(forced), "pairs": pairs, "complete": len(forced) == pairs}
+                    | {"forced": forced, "sometimes_forced": sum(share > 0 for share in shares), "pairs": pairs}
+                    | {"complete": forced == pairs}
                     | {"discards": discards_noise(found) and discards_noise(noisy)}
                 )
     return rows
@@ -128,6 +129,8 @@ def cells(rows: list[dict[str, Any]], needs: list[dict[str, Any]], method: str) 
         "correct": all(row["multi_step"] for row in mine),
         "wrong_k": sorted({row["k"] for row in mine if not row["multi_step"]}),
         "complete": all(row["complete"] for row in kept if row["max_k"] == largest),
+        "forced": min(row["forced"] for row in kept if row["max_k"] == largest),
+        "pairs": kept[0]["pairs"],
         "discards": all(row["discards"] for row in kept if row["max_k"] == largest),
     }
 
@@ -193,12 +196,15 @@ def check_equations(rows: list[dict[str, Any]], memories: dict[str, Memory]) -> 
 
 
 def disagreements(tables: dict[str, list[dict[str, Any]]], equations: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Every printed cell and equation that some world contradicts, with the k and whether the assumptions hold there."""
+    """Every printed yes and every equation that some world contradicts, and whether the assumptions hold there.
+
+    A printed no says that a property is not guaranteed, which a world that has it does not contradict.
+    """
     found = []
     for world, table in tables.items():
         for row in table:
             for column in COLUMNS:
-                if row[column] != printed(row["method"])[column]:
+                if printed(row["method"])[column] and not row[column]:
                     found.append(_cell_difference(world, row, column))
     for entry in equations:
         if entry["fails_k"]:
@@ -208,9 +214,12 @@ def disagreements(tables: dict[str, list[dict[str, Any]]], equations: list[dict[
 
 
 def _cell_difference(world: str, row: dict[str, Any], column: str) -> dict[str, Any]:
-    says = {True: "yes", False: "no"}
-    text = f"'{TITLES[column]}' is printed {says[printed(row['method'])[column]]}, computed {says[row[column]]}"
-    detail = f"wrong at k = {_list(row['wrong_k'])}" if column == "correct" and row["wrong_k"] else ""
+    text = f"'{TITLES[column]}' is printed yes, computed no"
+    detail = {
+        "correct": f"wrong at k = {_list(row['wrong_k'])}",
+        "complete": f"{row['forced']} of {row['pairs']} pairs of states are always told apart",
+        "discards": "the past's code must carry part of the exogenous state",
+    }[column]
     return _difference(world, row["method"], text, row["decodes_past"] and row["decodes_end"], detail)
 
 
@@ -220,6 +229,3 @@ def _difference(world: str, method: str, text: str, decodes: bool, detail: str) 
 
 def _list(ks: Iterable[int]) -> str:
     return ", ".join(map(str, ks))
-
-
-__all__ = ["Comparison", "Setting", "cells", "check_equations", "comparisons", "describe", "disagreements", "setting"]

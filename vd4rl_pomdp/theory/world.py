@@ -128,7 +128,9 @@ def with_noise(world: World, name: str, noise: Mapping[Exogenous, Row]) -> World
         exogenous=tuple((xi, e) for xi in world.exogenous for e in noise),
         initial={(s, (xi, e)): p * share for (s, xi), p in world.initial.items() for e in noise},
         drift={(xi, e): _product(row, noise[e]) for xi, row in world.drift.items() for e in noise},
-        emission={(s, (xi, e)): _product(row, {e: Fraction(1)}) for (s, xi), row in world.emission.items() for e in noise},
+        emission={
+            (s, (xi, e)): _product(row, {e: Fraction(1)}) for (s, xi), row in world.emission.items() for e in noise
+        },
     )
 
 
@@ -152,7 +154,9 @@ def _law(name: str, where: str, row: Mapping[Any, Any], allowed: Iterable[Any] |
 def _fraction(name: str, where: str, value: Any) -> Fraction:
     if isinstance(value, int | Fraction | str):
         return Fraction(value)
-    raise UserError(f"world {name!r}: {where} holds {value!r}: write probabilities as Fraction, int or '1/3', not float")
+    raise UserError(
+        f"world {name!r}: {where} holds {value!r}: write probabilities as Fraction, int or '1/3', not float"
+    )
 
 
 def _known(name: str, where: str, value: Any, allowed: Iterable[Any]) -> Any:
