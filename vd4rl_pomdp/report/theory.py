@@ -61,8 +61,8 @@ def print_theory(study: Row, console: Console | None = None) -> None:
     console = console or Console()
     appendix = study["counterexample"]["appendix"]
     console.print(
-        f"Forward-Jump counterexample: {appendix['examples']} inverse examples for k = 1..10; first action uniform at k = "
-        f"{_list(appendix['uniform_k'])}; diameter {appendix['diameter']}, m = {appendix['m_with_actions']} with actions"
+        f"Forward-Jump counterexample: {appendix['examples']} inverse examples for k = 1..10; first action uniform at "
+        f"k = {_list(appendix['uniform_k'])}; diameter {appendix['diameter']}, m = {appendix['m_with_actions']}"
     )
     for sentence in study["counterexample_differences"]:
         console.print(f"  - {sentence}", markup=False)
@@ -117,7 +117,7 @@ def _draw(axes: Axes, diagram: Row) -> None:
         axes.scatter([x], [y], s=620, color=COLOURS[group % len(COLOURS)], zorder=2)
         axes.text(x, y, f"{state[0]},{state[1]:+d}", color="white", ha="center", va="center", fontsize=9, zorder=3)
     axes.set_title(
-        f"{diagram['title']}\n{len(set(diagram['classes']))} classes of states, {diagram['blocks']} codes", fontsize=10
+        f"{diagram['title']}\nstates in {len(set(diagram['classes']))} classes, {diagram['blocks']} codes", fontsize=10
     )
     axes.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal")
     axes.axis("off")

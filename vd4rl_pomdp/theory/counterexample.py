@@ -78,8 +78,8 @@ def differences(appendix: dict[str, Any], main_text: dict[str, Any]) -> list[str
     early = [k for k in appendix["uniform_k"] if k not in CLAIMED_UNIFORM]
     if early:
         found.append(
-            f"The text needs k = 2 and k = 3 to tell states apart; the first action is uniform at k = {_list(early)} as "
-            f"well, so only k = {_list(appendix['informative_k'])} say anything."
+            "The text needs k = 2 and k = 3 to tell states apart; the first action is uniform at "
+            f"k = {_list(early)} as well, so only k = {_list(appendix['informative_k'])} say anything."
         )
     for name, claimed in (
         ("examples", CLAIMED_EXAMPLES),
@@ -91,15 +91,15 @@ def differences(appendix: dict[str, Any], main_text: dict[str, Any]) -> list[str
     late = [k for k in CLAIMED_UNIFORM if k not in main_text["uniform_k"]]
     if late:
         found.append(
-            f"With the main text's actions {{0, 1}} the number of examples is {main_text['examples']}, too, but the first "
-            f"action is not uniform at k = {_list(late)}, and the diameter is {main_text['diameter']}: the claims are about "
-            "the appendix's {-1, +1}."
+            f"With the main text's actions {{0, 1}} the number of examples is {main_text['examples']}, too, but the "
+            f"first action is not uniform at k = {_list(late)}, and the diameter is {main_text['diameter']}: the "
+            "claims are about the appendix's {-1, +1}."
         )
     if appendix["n_with_actions"] is None:
         found.append(
-            "Future decodability, which MIK+A assumes, fails: no later observation or action shows s^B, the last action. It "
-            f"holds (n = {appendix['n_with_actions_literal']}) only if the future's first item carries a_{{t+k-1}}, the "
-            "formula read literally, which at k = 1 is the action to be predicted."
+            "Future decodability, which MIK+A assumes, fails: no later observation or action shows s^B, the last "
+            f"action. It holds (n = {appendix['n_with_actions_literal']}) only if the future's first item carries "
+            "a_{t+k-1}, the formula read literally, which at k = 1 is the action to be predicted."
         )
     if appendix["period"] > 1:
         found.append(

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from fractions import Fraction
 
-from vd4rl_pomdp.theory.world import State, World, finite_world, with_noise, with_policy
+from vd4rl_pomdp.theory.world import Exogenous, Row, State, World, finite_world, with_noise, with_policy
 
 BLANK = "blank"
 """Observation that shows nothing."""
 HALF = Fraction(1, 2)
-NOISE = {"dark": {"dark": HALF, "light": HALF}, "light": {"light": Fraction(1)}}
+NOISE: dict[Exogenous, Row] = {"dark": {"dark": HALF, "light": HALF}, "light": {"light": Fraction(1)}}
 """A lamp, shown beside the observation, that goes on at a random time."""
 
 
@@ -36,8 +36,8 @@ def counterexample(actions: tuple[int, int] = (-1, 1)) -> World:
 def echo() -> World:
     """A world that observations alone decode, before and after: an action moves by one at once, by two a step later.
 
-    s = (x, b): x in Z_4, b the last action in {0, 1}, x' = x + 2b + a, and o = x. Two observations in a row tell b and a,
-    whether they are the last two (m = 1) or the next two (n = 1).
+    s = (x, b): x in Z_4, b the last action in {0, 1}, x' = x + 2b + a, and o = x. Two observations in a row tell b and
+    a, whether they are the last two (m = 1) or the next two (n = 1).
     """
     return finite_world(
         "echo",

@@ -208,7 +208,7 @@ def state_relation(world: World, ks: Iterable[int]) -> Relation:
     found = Relation(shared=True)
     for k in ks:
         _add_predictions(found, world, frozenset([("s", 0)]), frozenset([("s", k)]), 0, k)
-    for (state,) in found.rows:
+    for state in world.states:
         found.facts[state,] = Facts(frozenset([state]), frozenset(world.exogenous), frozenset([state]), ())
     return found
 

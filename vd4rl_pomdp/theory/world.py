@@ -1,7 +1,7 @@
 """A small language for finite agent-centric FM-POMDPs (Wu et al., arXiv 2404.14552, section 2), in exact arithmetic.
 
-A world has agent-centric states s with deterministic dynamics, an exogenous chain xi that no action touches, an emission
-of the pair, and a policy that reads s alone:
+A world has agent-centric states s with deterministic dynamics, an exogenous chain xi that no action touches, an
+emission of the pair, and a policy that reads s alone:
 
     row      0                1                2
     pair     (s_0, xi_0) ---> (s_1, xi_1) ---> (s_2, xi_2)       s_{t+1} = step(s_t, a_t),  xi_{t+1} ~ drift(xi_t)
