@@ -88,7 +88,7 @@ def test_one_encoder_on_true_states_recovers_aperiodic_worlds():
 
 
 def test_the_past_encoder_alone_may_merge_states_that_act_alike():
-    """echo: (0, 1) and (2, 0) have the same successors, so that f can merge them under a policy that treats them alike."""
+    """echo: (0, 1) and (2, 0) have the same successors; f can merge them under a policy that treats them alike."""
     world, ks = echo(), range(1, 5)
     even = forced_shares(relation(world, VIEWS["mik+a"], Memory(1, 1), ks), world.states)
     assert {pair for pair, share in even.items() if share == 0} == {

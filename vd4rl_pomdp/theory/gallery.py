@@ -13,22 +13,23 @@ NOISE: dict[Exogenous, Row] = {"dark": {"dark": HALF, "light": HALF}, "light": {
 """A lamp, shown beside the observation, that goes on at a random time."""
 
 
-def counterexample(actions: tuple[int, int] = (-1, 1)) -> World:
+def counterexample(actions: tuple[int, int] = (-1, 1), every: int = 4) -> World:
     """The paper's Forward-Jump counterexample (section 3.2 and appendix).
 
-    s = (s^A, s^B): s^A in Z_4 moves by the action, s^B is the last action. A counter c in Z_4 runs by itself and the
-    state is shown when c = 0 alone.
+    s = (s^A, s^B): s^A in Z_4 moves by the action, s^B is the last action. A counter c runs by itself and the state
+    is shown when c = 0 alone.
 
     Args:
         actions: (-1, 1) as in the appendix, or (0, 1) as in the main text.
+        every: the counter's period: the state is shown every so many rows.
     """
     return finite_world(
         "counterexample",
         states=[(x, b) for x in range(4) for b in actions],
-        exogenous=range(4),
+        exogenous=range(every),
         actions=actions,
         step=lambda s, a: ((s[0] + a) % 4, a),
-        drift=lambda c: {(c + 1) % 4: 1},
+        drift=lambda c: {(c + 1) % every: 1},
         emit=lambda s, c: {s if c == 0 else BLANK: 1},
     )
 

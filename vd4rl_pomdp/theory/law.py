@@ -76,8 +76,8 @@ class Conditional:
     """(views, actions) integers."""
 
     @cached_property
-    def _kinds(self) -> tuple[np.ndarray, list[Prediction]]:
-        """The distinct predictions, and which of them belongs to each view."""
+    def kinds(self) -> tuple[np.ndarray, list[Prediction]]:
+        """Which of the distinct predictions belongs to each view, and those predictions."""
         rows = [np.unique(column, return_inverse=True)[1] for column in self.counts.T]
         kinds = _number(rows, len(self.counts))
         first = np.unique(kinds, return_index=True)[1]
@@ -86,30 +86,25 @@ class Conditional:
 
     def agrees(self, other: Conditional) -> bool:
         """Whether two classifiers say the same wherever their views occur together."""
-        (mine, one), (theirs, two) = self._kinds, other._kinds
+        (mine, one), (theirs, two) = self.kinds, other.kinds
         met = np.unique(np.stack([mine[self.ids], theirs[other.ids]]), axis=1)
         return all(one[i] == two[j] for i, j in met.T)
 
     def certain(self) -> bool:
         """Whether the action is known, whatever the view."""
-        return all(max(p) == 1 for p in self._kinds[1])
+        return all(max(p) == 1 for p in self.kinds[1])
 
     def uniform(self) -> bool:
         """Whether no action is more likely than another, whatever the view."""
-        return all(len(set(p)) == 1 for p in self._kinds[1])
+        return all(len(set(p)) == 1 for p in self.kinds[1])
 
     def entropy(self) -> float:
         """H(a | view) in nats; the only number here that is rounded."""
-        kinds, distinct = self._kinds
+        kinds, distinct = self.kinds
         weights = np.zeros(len(distinct), object)
         np.add.at(weights, kinds, self.counts.astype(object).sum(1))
         bits = [-sum(float(q) * log(q) for q in p if q) for p in distinct]
         return sum(float(Fraction(w, sum(weights))) * bit for w, bit in zip(weights, bits, strict=True))
-
-    def predictions(self) -> list[Prediction]:
-        """P(a | view) for every view."""
-        kinds, distinct = self._kinds
-        return [distinct[i] for i in kinds]
 
 
 def joint_law(world: World, variables: Iterable[Variable], initial: Mapping[Pair, Fraction] | None = None) -> Law:

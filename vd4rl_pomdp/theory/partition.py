@@ -50,18 +50,23 @@ class Relation:
         self.facts: dict[Hashable, Facts] = {}
         self.rows: dict[Hashable, dict[tuple, int]] = {}
         """History -> {(role, k, other side) -> prediction}; role is start or end."""
+        self.ks: set[int] = set()
         self._predictions: dict[Prediction, int] = {}
 
-    def add(self, past: Hashable, later: Hashable, k: int, prediction: Prediction) -> None:
-        """Record one value of F."""
-        value = self._predictions.setdefault(prediction, len(self._predictions))
+    def number(self, prediction: Prediction) -> int:
+        """The number by which `rows` know a prediction."""
+        return self._predictions.setdefault(prediction, len(self._predictions))
+
+    def add(self, past: Hashable, later: Hashable, k: int, value: int) -> None:
+        """Record one value of F, a prediction's number."""
+        self.ks.add(k)
         self.rows.setdefault(past, {})["start", k, later if self.shared else ("future", later)] = value
         if self.shared:
             self.rows.setdefault(later, {})["end", k, past] = value
 
     def must_differ(self, one: Hashable, other: Hashable) -> bool:
         """Whether no representation that is enough can put two histories together."""
-        return not _fits(self.rows[one], self.rows[other], one, other)
+        return not _fits(self.rows[one], self.rows[other], one, other, self.ks)
 
     def conflicts(self) -> set[frozenset]:
         """Every pair of histories that must differ."""
@@ -97,7 +102,7 @@ class Relation:
 
     def _first_fit(self, group: Callable[[Hashable], tuple]) -> dict[Hashable, int]:
         """Blocks by first fit: at first within groups (of equal states, or of equal actions), then across them."""
-        blocks = _Blocks(self.rows)
+        blocks = _Blocks(self.rows, self.ks)
         order = sorted(self.rows, key=lambda h: (group(h), _text(self.facts[h].states), _text(h)))
         blocks.join(order, lambda a, b: group(a) == group(b))
         blocks.join([h for h in order if h in blocks.rows], lambda a, b: True)
@@ -110,25 +115,22 @@ def _text(value: object) -> str:
     return repr(sorted(value, key=repr)) if isinstance(value, frozenset) else repr(value)
 
 
-def _fits(mine: dict[tuple, int], theirs: dict[tuple, int], me: Hashable, them: Hashable) -> bool:
+def _fits(mine: dict[tuple, int], theirs: dict[tuple, int], me: Hashable, them: Hashable, ks: set[int]) -> bool:
     """Whether two rows of F agree once the two sides have one name."""
-    common = mine.keys() & theirs.keys()
-    if any(mine[key] != theirs[key] for key in common):
+    if any(mine[key] != theirs[key] for key in mine.keys() & theirs.keys()):
         return False
-    both = [
-        (role, k, row[role, k, name])
-        for row in (mine, theirs)
-        for role, k, other in row
-        for name in (me, them)
-        if other == name
-    ]
-    return len({(role, k) for role, k, _ in both}) == len(set(both))
+    for role, k in product(("start", "end"), ks):
+        between = {row[role, k, name] for row in (mine, theirs) for name in (me, them) if (role, k, name) in row}
+        if len(between) > 1:
+            return False
+    return True
 
 
 class _Blocks:
     """Blocks of histories, each named by its first member, with the rows of F between blocks."""
 
-    def __init__(self, rows: dict[Hashable, dict[tuple, int]]) -> None:
+    def __init__(self, rows: dict[Hashable, dict[tuple, int]], ks: set[int]) -> None:
+        self.ks = ks
         self.rows = {name: dict(row) for name, row in rows.items()}
         self.parent: dict[Hashable, Hashable] = {name: name for name in rows}
 
@@ -142,7 +144,7 @@ class _Blocks:
         """Put every block, in order, into the first earlier one that is allowed and contradicts nothing."""
         heads: list[Hashable] = []
         for name in order:
-            fitting = (h for h in heads if allowed(h, name) and _fits(self.rows[h], self.rows[name], h, name))
+            fitting = (h for h in heads if allowed(h, name) and _fits(self.rows[h], self.rows[name], h, name, self.ks))
             head = next(fitting, None)
             if head is None:
                 heads.append(name)
@@ -186,10 +188,11 @@ def _add_predictions(
 ) -> None:
     law = joint_law(world, start | end | {("a", t)})
     seen = law.given(start | end, ("a", t))
-    views, rows = np.unique(seen.ids, return_index=True)
-    predictions = seen.predictions()
-    for view, past, later in zip(views, law.values(start, rows), law.values(end, rows), strict=True):
-        found.add(past, later, k, predictions[view])
+    rows = np.unique(seen.ids, return_index=True)[1]
+    kinds, distinct = seen.kinds
+    numbers = [found.number(prediction) for prediction in distinct]
+    for kind, past, later in zip(kinds, law.values(start, rows), law.values(end, rows), strict=True):
+        found.add(past, later, k, numbers[kind])
 
 
 def _add_facts(found: Relation, world: World, past: frozenset[Variable], row: int) -> None:
