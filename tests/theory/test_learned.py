@@ -16,6 +16,7 @@ from pretrain.config import PRESETS
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.nn.heads import all_pairs
 from vd4rl_pomdp.objective import InverseObjective
 from vd4rl_pomdp.theory.gallery import counterexample
 from vd4rl_pomdp.theory.law import joint_law
@@ -89,7 +90,7 @@ def exact_loss(world: World, method: str, max_k: int) -> float:
     view = VIEWS[method]
     m = ROWS if view.masked else M
     entropies = []
-    for t, k in ((t, k) for k in range(1, max_k + 1) for t in range(ROWS - k)):
+    for t, k in all_pairs(ROWS, max_k).tolist():
         visible = view.visible(t, k, m, ROWS, ROWS)
         entropies.append(joint_law(world, visible | {("a", t)}).given(visible, ("a", t)).entropy())
     return sum(entropies) / len(entropies)

@@ -1,9 +1,11 @@
 import json
 import re
+from pathlib import Path
 
 import pytest
 
 from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.report.theory import MARKS, table_rows
 from vd4rl_pomdp.theory import table
 
 OUT = "page"
@@ -103,3 +105,23 @@ def test_out_that_is_a_file_is_one_line(tmp_path, capsys):
         main(["theory", "--out", str(tmp_path / "x")])
     assert end.value.code == 2
     assert "--out names a folder" in capsys.readouterr().err
+
+
+def test_the_documentation_shows_the_computed_numbers(shown):
+    study, _ = shown
+    text = (Path(__file__).parents[2] / "docs" / "theory.md").read_text()
+    for entry in table_rows(study):
+        cells = []
+        for column in table.COLUMNS:
+            computed = [
+                MARKS[row[column]] if row["decodes_past"] and row["decodes_end"] else f"({MARKS[row[column]]})"
+                for row in entry["worlds"].values()
+            ]
+            cells.append(f"{MARKS[entry['printed'][column]]} / {' '.join(computed)}")
+        assert f"| `{entry['method']}` | {' | '.join(cells)} |" in text
+    held = sum(row["assumptions_hold"] for row in study["disagreements"])
+    assert f"All {len(study['disagreements'])} disagreements, {held} of them where the assumptions hold" in text
+    code = re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]
+    names: dict = {}
+    exec(code.replace("print(", "found = ("), names)
+    assert names["found"].decodes_past is False
