@@ -338,6 +338,32 @@ def _bench(words: Arguments, program: str) -> None:
         print_table(results)
 
 
+@dataclass(frozen=True)
+class TheoryCommand:
+    """Compute the paper's claims on finite worlds by enumeration, and list where its text differs."""
+
+    json: bool = False
+    """Print one JSON object."""
+    out: Path | None = None
+    """Also write an HTML page with figures, and the JSON, into this folder."""
+
+
+def _theory(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.report.theory import print_theory, write_theory
+    from vd4rl_pomdp.theory import theory_study
+
+    command = _parse(TheoryCommand, words, program)
+    if command.out is not None and command.out.is_file():
+        raise UserError(f"{command.out}: is a file; --out names a folder")
+    study = theory_study()
+    if command.json:
+        print(json.dumps(study))
+    else:
+        print_theory(study)
+    if command.out is not None:
+        print(f"page: {write_theory(study, command.out)}", file=sys.stderr if command.json else sys.stdout)
+
+
 def _show(result: dict[str, Any], as_json: bool) -> None:
     """Print a result as one JSON object, or as an aligned list."""
     if as_json:
@@ -361,6 +387,7 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     "evaluate": Command("evaluate a fine-tuned run again", _evaluate),
     "sweep": Command("methods x corruptions x seeds", _sweep),
     "report": Command("an HTML page and CSV files about runs", _report),
+    "theory": Command("the paper's claims on finite worlds, by enumeration", _theory),
     "bench": Command("speed and memory on this machine", _bench),
 }
 

@@ -2,7 +2,8 @@
 
 Importing this package registers every task and corruption with Gymnasium, as `vd4rl_pomdp/WalkerWalk-v0`,
 `vd4rl_pomdp/WalkerWalk-Patch16-v0`, `vd4rl_pomdp/WalkerWalk-ZeroFrames-v0`,
-`vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0`, and likewise for `CheetahRun` and `HumanoidWalk`.
+`vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0`, and likewise for `CheetahRun` and `HumanoidWalk`;
+also the paper's finite counterexample, `vd4rl_pomdp/ForwardJumpCounterexample-v0`.
 """
 
 import gymnasium
@@ -20,3 +21,9 @@ GYM_IDS = {
 
 for _id, _arguments in GYM_IDS.items():
     gymnasium.register(_id, entry_point="vd4rl_pomdp.envs.gym:GymEnv", kwargs=_arguments)
+
+FINITE_IDS = {"vd4rl_pomdp/ForwardJumpCounterexample-v0": "counterexample"}
+"""Finite worlds by Gymnasium id."""
+
+for _id, _world in FINITE_IDS.items():
+    gymnasium.register(_id, entry_point="vd4rl_pomdp.envs.finite:FiniteEnv", kwargs={"world": _world})

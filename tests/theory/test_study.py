@@ -1,0 +1,127 @@
+import json
+import re
+from pathlib import Path
+
+import pytest
+
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.report.theory import MARKS, table_rows
+from vd4rl_pomdp.theory import table
+
+OUT = "page"
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory):
+    """What the command prints as JSON, and the folder it writes."""
+    import contextlib
+    import io
+
+    out, text = tmp_path_factory.mktemp("theory") / OUT, io.StringIO()
+    with contextlib.redirect_stdout(text):
+        main(["theory", "--json", "--out", str(out)])
+    return json.loads(text.getvalue()), out
+
+
+def cell(study, world, method):
+    return next(row for row in study["tables"][world] if row["method"] == method)
+
+
+def test_the_computed_table(shown):
+    study, _ = shown
+    correct = {w: [row["method"] for row in rows if row["correct"]] for w, rows in study["tables"].items()}
+    assert correct == {
+        "counterexample": ["mik+a literal"],
+        "echo": ["mik", "mik+a", "mik+a literal"],
+        "momentum": ["fj", "mik+a"],
+    }
+    complete = {w: [row["method"] for row in rows if row["complete"]] for w, rows in study["tables"].items()}
+    assert complete["counterexample"] == []
+    assert complete["echo"] == ["fj", "fj+a", "fj+a literal"]
+    assert "mik+a" in complete["momentum"]
+    assert not {"ah", "ah+a"} & set(complete["momentum"])
+    assert cell(study, "momentum", "mik+a")["discards"]
+    assert not cell(study, "counterexample", "fj")["discards"]
+
+
+def test_the_papers_equations_where_their_assumptions_hold(shown):
+    study, _ = shown
+    broken = {(row["method"], row["where"]) for row in study["equations"] if row["decodes"] and row["fails_k"]}
+    assert broken == {
+        ("fj", "k > m"),
+        ("fj+a", "k > m"),
+        ("fj+a literal", "k > m"),
+        ("mik+a literal", "every k"),
+    }
+    early = [r for r in study["equations"] if r["method"] == "fj+a" and r["where"] == "k <= m"]
+    assert all(row["holds_k"] and not row["fails_k"] for row in early)
+
+
+def test_disagreements_name_only_printed_claims_that_fail(shown):
+    study, _ = shown
+    for row in study["disagreements"]:
+        title = re.match(r"'(.*)' is printed yes", row["difference"])
+        if title:
+            column = next(c for c, t in table.TITLES.items() if t == title[1])
+            assert table.printed(row["method"])[column]
+            assert not cell(study, row["world"], row["method"])[column]
+    assert any(row["assumptions_hold"] and row["method"] == "fj+a" for row in study["disagreements"])
+    assert not [r for r in study["disagreements"] if r["world"] == "momentum" and r["method"] == "mik+a"]
+
+
+def test_noise_changes_no_entropy(shown):
+    study, _ = shown
+    keys = ("world", "state_dependent", "method", "k")
+    plain = {tuple(r[k] for k in keys): r["entropy"] for r in study["comparisons"] if not r["noise"]}
+    noisy = [r for r in study["comparisons"] if r["noise"]]
+    assert len(noisy) > 100
+    for row in noisy:
+        assert row["entropy"] == pytest.approx(plain[tuple(row[k] for k in keys)], abs=1e-12)
+
+
+def test_the_page_stands_alone(shown):
+    study, out = shown
+    assert json.loads((out / "theory.json").read_text()) == study
+    text = (out / "index.html").read_text()
+    assert "16368" in text
+    assert text.count("<svg") == 2
+    assert not re.search(r'(src|href)="?(https?:)?//', text), "the page must not need a network"
+
+
+def test_the_terminal_tables_say_the_same(shown, monkeypatch, capsys):
+    study, _ = shown
+    monkeypatch.setattr("vd4rl_pomdp.theory.theory_study", lambda: study)
+    main(["theory"])
+    text = capsys.readouterr().out
+    assert "16368 inverse examples" in text
+    assert f"{len(study['disagreements'])} disagreements" in text
+    for method in table.METHODS:
+        assert method in text
+
+
+def test_out_that_is_a_file_is_one_line(tmp_path, capsys):
+    (tmp_path / "x").write_text("")
+    with pytest.raises(SystemExit) as end:
+        main(["theory", "--out", str(tmp_path / "x")])
+    assert end.value.code == 2
+    assert "--out names a folder" in capsys.readouterr().err
+
+
+def test_the_documentation_shows_the_computed_numbers(shown):
+    study, _ = shown
+    text = (Path(__file__).parents[2] / "docs" / "theory.md").read_text()
+    for entry in table_rows(study):
+        cells = []
+        for column in table.COLUMNS:
+            computed = [
+                MARKS[row[column]] if row["decodes_past"] and row["decodes_end"] else f"({MARKS[row[column]]})"
+                for row in entry["worlds"].values()
+            ]
+            cells.append(f"{MARKS[entry['printed'][column]]} / {' '.join(computed)}")
+        assert f"| `{entry['method']}` | {' | '.join(cells)} |" in text
+    held = sum(row["assumptions_hold"] for row in study["disagreements"])
+    assert f"All {len(study['disagreements'])} disagreements, {held} of them where the assumptions hold" in text
+    code = re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]
+    names: dict = {}
+    exec(code.replace("print(", "found = ("), names)
+    assert names["found"].decodes_past is False

@@ -1,0 +1,72 @@
+"""Everything that `vd4rl-pomdp theory` computes, as one JSON-ready dict."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from vd4rl_pomdp.theory import counterexample, table
+from vd4rl_pomdp.theory.gallery import WORLDS
+from vd4rl_pomdp.theory.partition import Relation, forced_shares, relation, state_classes, state_relation
+from vd4rl_pomdp.theory.views import VIEWS
+from vd4rl_pomdp.theory.world import World
+
+DIAGRAMS = (
+    ("fj", 3),
+    ("fj+a", 3),
+    ("fj+a", 5),
+    ("mik+a", 3),
+    ("mik+a literal", 3),
+)
+"""Method and largest k of each diagram of merged states; the counterexample's diameter and m are 3."""
+
+
+def theory_study() -> dict[str, Any]:
+    """Compute the counterexample's numbers, Table 1, the equations, all disagreements and the merged states."""
+    places = {name: table.setting(name) for name in WORLDS}
+    rows = [row for place in places.values() for row in table.comparisons(place)]
+    needs = [row for place in places.values() for row in table.representations(place)]
+    tables = {
+        name: [table.cells(_of(rows, name), _of(needs, name), method) for method in table.METHODS] for name in places
+    }
+    equations = table.check_equations(rows, {name: place.memory for name, place in places.items()})
+    appendix, main_text = counterexample.study((-1, 1)), counterexample.study((0, 1))
+    return {
+        "counterexample": {"appendix": appendix, "main_text": main_text},
+        "counterexample_differences": counterexample.differences(appendix, main_text),
+        "worlds": {name: table.describe(place) for name, place in places.items()},
+        "printed": table.PRINTED,
+        "tables": tables,
+        "equations": equations,
+        "disagreements": table.disagreements(tables, equations),
+        "comparisons": rows,
+        "representations": needs,
+        "diagrams": diagrams(places["counterexample"]),
+    }
+
+
+def _of(rows: list[dict[str, Any]], world: str) -> list[dict[str, Any]]:
+    return [row for row in rows if row["world"] == world]
+
+
+def diagrams(place: table.Setting) -> list[dict[str, Any]]:
+    """For some objectives, the counterexample's states in classes that a coarsest partition cannot tell apart."""
+    world = place.worlds[False, False]
+    found = []
+    for method, max_k in DIAGRAMS:
+        wanted = relation(world, VIEWS[method], place.memory, range(1, max_k + 1))
+        found.append(_diagram(f"{method}, k <= {max_k}", wanted, world))
+    states = state_relation(world, range(1, place.max_k + 1))
+    return [*found, _diagram(f"one encoder on true states, k <= {place.max_k}", states, world)]
+
+
+def _diagram(title: str, wanted: Relation, world: World) -> dict[str, Any]:
+    blocks = wanted.coarsest()
+    shares = forced_shares(wanted, world.states)
+    return {
+        "title": title,
+        "blocks": len(set(blocks.values())),
+        "histories": len(blocks),
+        "states": [list(s) for s in world.states],  # type: ignore[call-overload]
+        "classes": list(state_classes(wanted, blocks, world.states).values()),
+        "forced": sorted([*sorted(world.states.index(s) for s in pair), float(x)] for pair, x in shares.items() if x),
+    }

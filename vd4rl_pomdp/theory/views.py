@@ -1,0 +1,71 @@
+"""What each inverse objective of the paper's Table 1 may see when it predicts a_t for the pair (t, t+k).
+
+The learned objectives declare the same in `InverseObjective.visible`; a test holds the two together. Here the view is
+kept in its two halves, because a representation is a function of one of them.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+Variable = tuple[str, int]
+"""("o", j) or ("a", j): observation or action of row j."""
+
+
+@dataclass(frozen=True)
+class View:
+    """One objective's view of a sequence."""
+
+    name: str
+    past: Literal["none", "all", "window"]
+    """Rows before t (and before t+k, where the later state is one of the past, too): none, all, or m."""
+    actions: bool = False
+    """Whether actions are seen."""
+    masked: bool = False
+    """Whether the later state is one of the future from t+k on, computed by an encoder of its own."""
+    literal: bool = False
+    """Whether rows carry the action before them even at a window's first row, as the paper's formulas read."""
+
+    def start(self, t: int, m: int) -> frozenset[Variable]:
+        """What the representation of row t is computed from."""
+        return self._before(t, m)
+
+    def end(self, t: int, k: int, m: int, n: int, rows: int) -> frozenset[Variable]:
+        """What the representation of row t+k is computed from, in a window of `rows` rows."""
+        if not self.masked:
+            return self._before(t + k, m)
+        last = min(rows, t + k + n + 1)
+        shift = 1 if self.literal else 0
+        actions = range(t + k - shift, last - shift) if self.actions else ()
+        return _variables(range(t + k, last), actions)
+
+    def visible(self, t: int, k: int, m: int, n: int, rows: int) -> frozenset[Variable]:
+        """Everything a prediction may depend on."""
+        return self.start(t, m) | self.end(t, k, m, n, rows)
+
+    def _before(self, row: int, m: int) -> frozenset[Variable]:
+        first = {"none": row, "all": 0, "window": max(0, row - m)}[self.past]
+        earlier = first - 1 if self.literal and not self.masked else first
+        return _variables(range(first, row + 1), range(max(0, earlier), row) if self.actions else ())
+
+
+def _variables(rows: range, actions: range | tuple) -> frozenset[Variable]:
+    return frozenset([("o", j) for j in rows] + [("a", j) for j in actions])
+
+
+VIEWS = {
+    view.name: view
+    for view in (
+        View("no_history", "none"),
+        View("ah", "all"),
+        View("ah+a", "all", actions=True),
+        View("fj", "window"),
+        View("fj+a", "window", actions=True),
+        View("fj+a literal", "window", actions=True, literal=True),
+        View("mik", "window", masked=True),
+        View("mik+a", "window", actions=True, masked=True),
+        View("mik+a literal", "window", actions=True, masked=True, literal=True),
+    )
+}
+"""Every view by the name of its method; `literal` variants read the paper's formulas word for word."""
