@@ -8,8 +8,10 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.buffers import FrameBuffers
 from vd4rl_pomdp.corruptions.keys import draw_integers
 
+_BUFFERS = FrameBuffers()
 _ENDS = 2
 """Samples that have a neighbour on one side only."""
 
@@ -51,7 +53,7 @@ def _shift_by_copying(obs: Tensor, offset: Tensor, pad: int) -> Tensor:
     """
     n, height, width = len(obs), obs.shape[-2], obs.shape[-1]
     size = obs[0].numel()
-    out = torch.empty_like(obs)
+    out = _BUFFERS.take_like(obs)
     starts = torch.arange(1, n - 1) * size + offset[1:-1, 0] * width + offset[1:-1, 1]
     windows = obs.view(-1).as_strided(((n - 1) * size + 1, size), (1, 1))
     torch.index_select(windows, 0, starts, out=out.view(n, size)[1:-1])

@@ -15,6 +15,7 @@ from typing import Annotated, Any
 import tyro
 
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs.folder import flatten
 
 Arguments = list[str]
 REPLAY_TOLERANCE = 1e-6
@@ -193,13 +194,16 @@ class DownloadCommand:
     """Folder to keep sets in, as OUT/TASK/QUALITY/84px."""
     endpoint: str = "https://huggingface.co"
     """The mirror's address."""
+    verify: bool = False
+    """Compute the SHA-256 of files that are already there, too."""
 
 
 def _download(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.data.download import download
 
     command = _parse(DownloadCommand, words, program)
-    print(download(command.task, command.quality, command.out, command.endpoint))
+    shards = download(command.task, command.quality, command.out, command.endpoint, command.verify)
+    print(f"{len(shards)} shards in {shards[0].parent}; check them with `vd4rl-pomdp data check {shards[0].parent}`")
 
 
 @dataclass(frozen=True)
@@ -324,10 +328,14 @@ class BenchCommand:
 
 
 def _bench(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.experiments.bench import bench
+    from vd4rl_pomdp.experiments.bench import bench, print_table
 
     command = _parse(BenchCommand, words, program)
-    _show(bench(command.quick), command.json)
+    results = bench(command.quick)
+    if command.json:
+        _show(results, as_json=True)
+    else:
+        print_table(results)
 
 
 def _show(result: dict[str, Any], as_json: bool) -> None:
@@ -335,15 +343,8 @@ def _show(result: dict[str, Any], as_json: bool) -> None:
     if as_json:
         print(json.dumps(result))
         return
-    for name, value in _flatten(result).items():
+    for name, value in flatten(result).items():
         print(f"{name:<40} {value:.6g}" if isinstance(value, float) else f"{name:<40} {value}")
-
-
-def _flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
-    for key, item in value.items():
-        flat |= _flatten(item, f"{prefix}{key}.") if isinstance(item, dict) else {f"{prefix}{key}": item}
-    return flat
 
 
 COMMANDS: dict[str, Command | dict[str, Command]] = {

@@ -18,7 +18,7 @@ class BC:
 
     def __init__(self, policy: Policy, config: FinetuneConfig, generator: torch.Generator) -> None:
         self.policy = policy
-        self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=config.learning_rate)
+        self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=config.learning_rate, fused=True)
 
     def update(self, batch: FeatureBatch) -> dict[str, Tensor]:
         """One step; returns detached scalars."""

@@ -51,8 +51,8 @@ class TD3BC:
         device = policy.standardise.mean.device
         self.critic = TwinCritic(shape["dim"], shape["action_dim"], shape["hidden"]).to(device)
         self.target_policy, self.target_critic = copy.deepcopy(policy), copy.deepcopy(self.critic)
-        self.policy_optimiser = torch.optim.Adam(policy.net.parameters(), lr=config.learning_rate)
-        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.learning_rate)
+        self.policy_optimiser = torch.optim.Adam(policy.net.parameters(), lr=config.learning_rate, fused=True)
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.learning_rate, fused=True)
         self.updates = 0
 
     def update(self, batch: FeatureBatch) -> dict[str, Tensor]:

@@ -12,6 +12,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.buffers import FrameBuffers
 from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_integers, hash_keys
 from vd4rl_pomdp.errors import UserError
 
@@ -113,6 +114,7 @@ class Corruption:
     def __init__(self, name: str, stages: list[Stage]) -> None:
         self.name = name
         self._stages = stages
+        self._buffers = FrameBuffers()
 
     def __call__(self, obs: Tensor, key: Tensor) -> Tensor:
         """Corrupted copy of a batch.
@@ -126,7 +128,7 @@ class Corruption:
         """
         if not self._stages:
             return obs
-        out = obs.clone(memory_format=torch.contiguous_format)
+        out = self._buffers.take_like(obs).copy_(obs)
         stacks = out.view(-1, obs.shape[-3] // _CHANNELS, _CHANNELS, *obs.shape[-2:])
         for number, stage in enumerate(self._stages):
             stage(stacks, derive_keys(number, key.reshape(-1)))

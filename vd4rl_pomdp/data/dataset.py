@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.data.buffers import FrameBuffers
+from vd4rl_pomdp.buffers import FrameBuffers
 from vd4rl_pomdp.data.store import Store, open_store
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_STACK, QUALITIES, TASKS
@@ -116,7 +116,7 @@ class Dataset:
         back = torch.arange(frame_stack - 1, -1, -1, device=rows.device)
         first = self.episode_start[self.episode[rows]]
         index = torch.maximum(rows[..., None] - back, first[..., None])
-        out = self._buffers.take(index.numel()) if self.frames.device.type == "cpu" else None
+        out = self._buffers.take((index.numel(), *self.frames.shape[1:])) if self.frames.device.type == "cpu" else None
         frames = torch.index_select(self.frames, 0, index.reshape(-1), out=out)
         return frames.view(*rows.shape, 3 * frame_stack, *self.frames.shape[2:])
 

@@ -12,6 +12,8 @@ from typing import Any
 
 import numpy as np
 import torch
+from rich.console import Console
+from rich.table import Table
 
 from vd4rl_pomdp.augmentation import random_shift
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig
@@ -21,6 +23,7 @@ from vd4rl_pomdp.envs.dmc import PixelEnv
 from vd4rl_pomdp.envs.parity import canary_frames, compare
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.runs.device import Precision, autocast, pick_device
+from vd4rl_pomdp.runs.folder import flatten
 from vd4rl_pomdp.runs.provenance import machine, versions
 from vd4rl_pomdp.runs.workers import run_jobs
 from vd4rl_pomdp.tasks import FRAME_SIZE
@@ -28,6 +31,20 @@ from vd4rl_pomdp.types import StepType
 
 BATCH = 256
 EPISODE_ROWS = 501
+GOALS: dict[str, tuple[str, float]] = {
+    "opening.open_seconds": ("<=", 1.0),
+    "memory.peak_over_frames": ("<=", 1.3),
+    "sampling.gather_speed_over_copy": (">=", 0.5),
+    "sampling.corrupt_and_shift_over_gather": ("<=", 2.0),
+    "pretraining.fp32_overhead_share": ("<=", 0.2),
+    "pretraining.bf16_overhead_share": ("<=", 0.2),
+    "pretraining.bf16_over_fp32": (">=", 1.4),
+    "finetuning.cached_over_exact": (">=", 20.0),
+    "collection.fast_over_exact": (">=", 1.4),
+    "collection.fast_mean_difference_of_255": ("<=", 0.05),
+    "collection.two_workers_over_one": (">=", 1.8),
+}
+"""What this package promises on two cores without a GPU."""
 
 
 def bench(quick: bool = False) -> dict[str, Any]:
@@ -48,9 +65,25 @@ def bench(quick: bool = False) -> dict[str, Any]:
             "sampling": _sampling(dataset, repeats),
             "pretraining": _pretraining(dataset, Path(folder), repeats),
             "finetuning": _finetuning(dataset, repeats),
+            "memory": _memory(Path(folder), dataset.frames.numel()),
         }
     results["collection"] = _collection(60 if quick else 200)
     return results | {"machine": machine(), "versions": versions()}
+
+
+def print_table(results: dict[str, Any]) -> None:
+    """All measurements on the terminal, those that have a goal with it and a verdict."""
+    table = Table(title="speed and memory, ratios within one run")
+    table.add_column("measurement")
+    for name in ("value", "goal", ""):
+        table.add_column(name, justify="right")
+    for name, value in flatten(results).items():
+        shown = f"{value:.4g}" if isinstance(value, float) else str(value)
+        relation, goal = GOALS.get(name, ("", 0.0))
+        reached = value <= goal if relation == "<=" else value >= goal if relation else None
+        verdict = {True: "[green]reached[/]", False: "[red]missed[/]", None: ""}[reached]
+        table.add_row(name, shown, f"{relation} {goal:g}" if relation else "", verdict)
+    Console().print(table)
 
 
 def _seconds(function: Callable[[], Any], repeats: int) -> float:
@@ -91,24 +124,36 @@ def _synthetic_set(folder: Path, episodes: int) -> tuple[Dataset, dict[str, Any]
     return dataset, {"rows": dataset.num_rows, "decode_seconds": decoding, "open_seconds": opening}
 
 
+def _read(frames: torch.Tensor) -> None:
+    """Touch every page, so that it is in the page cache and mapped."""
+    frames.view(-1)[::4096].max()
+
+
 def _sampling(dataset: Dataset, repeats: int) -> dict[str, float]:
-    """Gathering against copying the same bytes, corruption and shift against gathering."""
-    index = torch.randint(dataset.num_transitions, (BATCH,))
-    dataset.frames[: min(len(dataset.frames), 20_000)].sum(dtype=torch.int64)  # warm the page cache
-    rows = torch.randint(3, min(dataset.num_rows, 20_000) - 1, (2 * BATCH,))
-    obs = dataset.stacks(rows)
-    target = torch.empty_like(obs)
+    """Gathering against copying the same bytes, corruption and shift against gathering; new rows every time."""
+    some = min(dataset.num_rows, 20_000)
+    _read(dataset.frames[:some])
+    generator = torch.Generator().manual_seed(0)
     corruption = BatchCorruption(CorruptionConfig("patch+zero_frames"), 0)
-    keys = dataset.keys(rows)
-    copying = _seconds(lambda: target.copy_(obs), repeats)
-    gathering = _seconds(lambda: dataset.stacks(rows), repeats)
+
+    def rows() -> torch.Tensor:
+        return torch.randint(3, some - 1, (2 * BATCH,), generator=generator)
+
+    def copy() -> None:
+        start = int(rows()[0]) * (some - 3 * len(obs)) // some
+        target.copy_(dataset.frames[start : start + len(target)])
+
+    obs, keys = dataset.stacks(rows()), dataset.keys(rows())
+    target = torch.empty_like(obs).view(-1, *dataset.frames.shape[1:])
+    copying = _seconds(copy, repeats)
+    gathering = _seconds(lambda: dataset.stacks(rows()), repeats)
     changing = _seconds(lambda: corruption(random_shift(obs, keys), keys), repeats)
     return {
         "copy_ms": copying * 1e3,
         "gather_ms": gathering * 1e3,
         "gather_speed_over_copy": copying / gathering,
         "corrupt_and_shift_over_gather": changing / gathering,
-        "transitions_ms": _seconds(lambda: dataset.transitions(index, 3), repeats) * 1e3,
+        "transitions_ms": _seconds(lambda: dataset.transitions(rows(), 3), repeats) * 1e3,
     }
 
 
@@ -166,23 +211,48 @@ def _finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
     return {"cached_updates_per_s": 1 / fast, "exact_updates_per_s": 1 / slow, "cached_over_exact": slow / fast}
 
 
+def _memory(folder: Path, frame_bytes: int) -> dict[str, float]:
+    """Peak memory of a pretraining process on the set, and what a second one adds: all but the mapped frames."""
+    (peak, private) = next(iter(run_jobs(_train_a_little, [(folder, 3), (folder, 3)], 2)))
+    return {
+        "frames_gib": frame_bytes / 2**30,
+        "peak_over_frames": peak / frame_bytes,
+        "second_process_over_frames": private / frame_bytes,
+    }
+
+
+def _train_a_little(job: tuple[Path, int]) -> tuple[int, int]:
+    """Peak resident bytes of a process that reads the whole set and trains, and how many of them it does not share."""
+    from pretrain.config import PRESETS
+    from pretrain.objectives import build_objective
+    from pretrain.train import Trainer
+    from vd4rl_pomdp.nn.action_target import make_action_target
+
+    folder, steps = job
+    dataset = open_dataset(folder / "set", folder / "cache")
+    config = replace(PRESETS["cpu"], data=folder, out=folder, corruption="patch+zero_frames")
+    target = make_action_target("kmeans", dataset.action[:2000].numpy(), config.codes, 0)
+    trainer = Trainer(build_objective(config, dataset.action, target), dataset, config)
+    for _ in range(steps):
+        trainer.update()
+    _read(dataset.frames)
+    fields = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
+    kibibytes = {name: int(fields[name].split()[0]) for name in ("VmHWM", "RssAnon")}
+    return kibibytes["VmHWM"] * 1024, kibibytes["RssAnon"] * 1024
+
+
 def _collection(frames: int) -> dict[str, float]:
     """Frames per CPU-second of the fast rendering against dm_control's default, and two workers against one."""
     speed = {render: _render_speed((render, frames)) for render in ("exact", "fast")}
     difference = compare(canary_frames("walker_walk", "fast"), canary_frames("walker_walk", "exact"))
-    wall = {}
-    for workers in (1, 2):
-        jobs = [("fast", frames)] * 4
-        list(run_jobs(_render_speed, [("fast", 1)] * workers, workers))
-        start = time.perf_counter()
-        inside = list(run_jobs(_render_wall, jobs, workers))
-        wall[workers] = sum(inside) / workers if workers > 1 else time.perf_counter() - start
+    alone = frames / next(iter(run_jobs(_render_wall, [("fast", frames)], 1)))
+    together = sum(frames / seconds for seconds in run_jobs(_render_wall, [("fast", 4 * frames)] * 2, 2)) * 4
     return {
         "exact_frames_per_cpu_s": speed["exact"],
         "fast_frames_per_cpu_s": speed["fast"],
         "fast_over_exact": speed["fast"] / speed["exact"],
         "fast_mean_difference_of_255": difference["mean_difference"],
-        "two_workers_over_one": wall[1] / wall[2],
+        "two_workers_over_one": together / alone,
     }
 
 

@@ -1,4 +1,4 @@
-"""Memory for gathered frames that is used again: fresh pages for every batch cost more time than the copy into them."""
+"""Memory for batches of frames that is used again: fresh pages for every batch cost more time than filling them."""
 
 from __future__ import annotations
 
@@ -8,8 +8,6 @@ import weakref
 import numpy as np
 import torch
 from torch import Tensor
-
-from vd4rl_pomdp.data.format import FRAME_SHAPE
 
 _KEPT = 4
 """Blocks kept at most: two for a batch of transitions, twice."""
@@ -23,9 +21,9 @@ class FrameBuffers:
         """Each block with the view that its borrower holds, gone when the last tensor on it is gone."""
         self._lock = threading.Lock()
 
-    def take(self, count: int) -> Tensor:
-        """Uninitialised (count, 3, 84, 84) uint8 that shares memory with no other living tensor."""
-        shape = (count, *FRAME_SHAPE)
+    def take(self, shape: tuple[int, ...] | torch.Size) -> Tensor:
+        """Uninitialised uint8 tensor of a shape that shares memory with no other living tensor."""
+        shape = tuple(shape)
         with self._lock:
             idle = [i for i, (_, view) in enumerate(self._blocks) if view() is None]
             fitting = next((i for i in idle if self._blocks[i][0].shape == shape), None)
@@ -38,3 +36,9 @@ class FrameBuffers:
             elif idle:
                 self._blocks[idle[0]] = block, weakref.ref(view)
         return torch.from_numpy(view)
+
+    def take_like(self, obs: Tensor) -> Tensor:
+        """Uninitialised contiguous tensor of the shape and dtype of `obs`, on its device; lent if it is CPU frames."""
+        if obs.device.type == "cpu" and obs.dtype == torch.uint8:
+            return self.take(obs.shape)
+        return torch.empty_like(obs, memory_format=torch.contiguous_format)
