@@ -18,7 +18,7 @@ GOAL_RADIUS = 0.2
 ACTION_REPEAT = 5
 """Simulator steps of 0.01 s for one action: enough to see what an action does."""
 ACCELERATION, ANGULAR_VELOCITY = 10.0, 4.0
-"""first_person: units/s^2 along the heading and radians/s for an action of 1. (A top-view action of 1 is 23.9 units/s^2.)"""
+"""first_person: units/s^2 along the heading and radians/s for an action of 1 (from the top it is 23.9 units/s^2)."""
 
 
 class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -113,9 +113,14 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             if self.is_free(place):
                 return place
 
+    def draw(self) -> np.ndarray:
+        """Picture of the present state: (3, 100, 100) uint8."""
+        assert self._view is not None, "this environment was made without pixels"
+        return self._view(self._point.data)
+
     def _observe(self) -> tuple[np.ndarray, Info]:
         if self._view is not None:
-            self._picture = self._view(self._point.data)
+            self._picture = self.draw()
         state = self.state
         info = {"state": state, "goal": self.goal.copy(), "hidden": bool(self.maze_spec.hidden(state))}
         return self._picture, info
