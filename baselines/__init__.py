@@ -1,5 +1,9 @@
 """Baselines, one file each, on the library's contracts."""
 
 from baselines.acro import ACRO
+from baselines.curl import CURL
+from baselines.driml import DRIML
+from baselines.homer import HOMER
+from baselines.one_step_inverse import OneStepInverse
 
-__all__ = ["ACRO"]
+__all__ = ["ACRO", "CURL", "DRIML", "HOMER", "OneStepInverse"]

@@ -13,27 +13,8 @@ Differences:
 
 from __future__ import annotations
 
-from torch import Tensor
-
-from vd4rl_pomdp.nn.action_target import ActionTarget
-from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.objective import InverseConfig, InverseObjective
-from vd4rl_pomdp.types import Windows
+from vd4rl_pomdp.objective import StateInverse
 
 
-class ACRO(InverseObjective):
-    """Multi-step inverse model on the encoder's own representations of rows t and t+k."""
-
-    def __init__(self, encoder: Encoder, target: ActionTarget, config: InverseConfig) -> None:
-        super().__init__(encoder, encoder.dim, target, config)
-
-    def representations(self, window: Windows) -> tuple[Tensor, Tensor]:
-        """The same representations (B, T, D) for both ends of a pair."""
-        states = self.encoder.encode(window)
-        return states, states
-
-    def visible(self, t: int, k: int, rows: int) -> tuple[set[int], set[int]]:
-        """Rows t and t+k alone; with a GRU everything up to t+k, and its actions if it reads them."""
-        if self.encoder.config.history == "none":
-            return {t, t + k}, set()
-        return set(range(t + k + 1)), set(range(t + k)) if self.encoder.config.use_actions else set()
+class ACRO(StateInverse):
+    """Multi-step inverse model on states of an encoder without memory."""

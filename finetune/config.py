@@ -21,7 +21,7 @@ class FinetuneConfig:
     out: Path
     """Run folder; the same command continues a run that was cut."""
     algorithm: str = "td3_bc"
-    """td3_bc, drqv2_bc or bc."""
+    """td3_bc, drqv2_bc or bc; the references bc and drq_bc bring their own."""
     preset: str = "paper"
     """paper, cpu or smoke: the defaults of all other settings."""
     seed: int = 0

@@ -54,6 +54,7 @@ class FrozenEncoder:
         self.encoder, self.dataset, self.shift, self.precision, self.seed = encoder, dataset, shift, precision, seed
         self.device = dataset.t.device
         self._corruption_config = corruption
+        self.states = dataset.states() if encoder.reads_state else torch.empty(0)
 
     def corruption(self, view: int) -> BatchCorruption:
         """The corruption of a view; under `emission` all views look the same."""
@@ -63,6 +64,8 @@ class FrozenEncoder:
     @torch.no_grad()
     def rows(self, rows: Tensor, shift_key: Tensor, corruption: BatchCorruption) -> Tensor:
         """Frame features (N, F) of (N,) rows, shifted by (N,) keys, in chunks."""
+        if self.encoder.reads_state:
+            return self.encoder.frame(self.states[rows, :, None, None])
         parts = []
         for part, key in zip(rows.split(CHUNK), shift_key.split(CHUNK), strict=True):
             obs = random_shift(self.dataset.stacks(part), key, self.shift)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import shutil
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -12,49 +12,73 @@ import torch
 
 from finetune.algorithms import Algorithm, get_algorithm
 from finetune.config import FinetuneConfig
+from finetune.end_to_end import EndToEnd, PixelSampler
 from finetune.features import BATCH_STREAM, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.envs.parity import render_info
 from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, rows_of
-from vd4rl_pomdp.nn.folder import EncoderCard, load_encoder
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.folder import EncoderCard, load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.probes import probe_state
 from vd4rl_pomdp.runs.checkpoint import load_checkpoint, save_checkpoint, seed_everything
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.folder import RunFolder, jsonable, write_json
 from vd4rl_pomdp.runs.metrics import MetricsLog
 from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.tasks import get_task
 
 
 def finetune(config: FinetuneConfig) -> RunFolder:
     """Run the stage, or go on with it; writes the policy and `episodes.csv` into the run's folder."""
-    build = get_algorithm(config.algorithm)
+    get_algorithm(config.algorithm)
     dataset = open_dataset(config.data)
     encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim)
+    if card.end_to_end:
+        config = replace(config, algorithm=card.end_to_end, views=0)
+    if encoder.reads_state:
+        dataset.states()
     run = RunFolder(config.out, "finetune", config)
     write_json(run.path / "labels.json", _labels(config, card))
     if run.finished:
         return run
-    _keep_encoder(config.encoder, run.path / "encoder")
-    device = pick_device(config.device)
-    dataset.to(device)
-    frozen = FrozenEncoder(
-        encoder.to(device), dataset, CorruptionConfig(**card.corruption), config.shift, config.precision, config.seed
-    )
+    _keep_encoder(config.encoder, run.path)
+    dataset.to(pick_device(config.device))
+    _trainer(config, dataset, encoder.to(dataset.t.device), card, run).run(run)
+    return run
+
+
+def _trainer(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: EncoderCard, run: RunFolder) -> Trainer:
+    """What a run trains and on which batches: cached features, features encoded anew, or pixels."""
     seed_everything(config.seed)
-    policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(device)
+    policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(dataset.t.device)
     generator = torch.Generator().manual_seed(config.seed * 10 + BATCH_STREAM)
-    algorithm = build(policy, config, generator)
-    sampler: FeatureSampler | ExactSampler
-    if config.views:
+    corruption = CorruptionConfig(**card.corruption)
+    frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed)
+    sampler: FeatureSampler | ExactSampler | PixelSampler
+    if card.end_to_end:
+        sampler = PixelSampler(dataset, corruption, config, generator)
+    elif config.views:
         features = encode_views(frozen, config.views, run.path / "features.npy")
         policy.standardise.fit(features)
+        _probe(features, dataset, run)
         sampler = FeatureSampler(dataset, features, config.batch_size, config.n_step, config.gamma, generator)
     else:
         sampler = ExactSampler(frozen, config.batch_size, config.n_step, config.gamma, generator)
         policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(4)]))
-    Trainer(algorithm, sampler, generator, config, card).run(run)
-    return run
+    algorithm = get_algorithm(config.algorithm)(policy, config, generator)
+    return Trainer(
+        EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, generator, config, card
+    )
+
+
+def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
+    """Write how well the first view tells the simulator state, where the set stores it."""
+    if dataset.physics is None or dataset.task is None or (run.path / "probe.json").exists():
+        return
+    arrays = features[0].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
+    write_json(run.path / "probe.json", probe_state(*arrays, get_task(dataset.task)))
 
 
 class Trainer:
@@ -62,8 +86,8 @@ class Trainer:
 
     def __init__(
         self,
-        algorithm: Algorithm,
-        sampler: FeatureSampler | ExactSampler,
+        algorithm: Algorithm | EndToEnd,
+        sampler: FeatureSampler | ExactSampler | PixelSampler,
         generator: torch.Generator,
         config: FinetuneConfig,
         card: EncoderCard,
@@ -84,7 +108,7 @@ class Trainer:
         title = f"finetune {config.algorithm} on {self.card.method}"
         with ProgressLine(title, config.updates, "updates", self.step) as progress:
             while self.step < config.updates:
-                metrics |= self.algorithm.update(self.sampler.sample())
+                metrics |= self.algorithm.update(self.sampler.sample())  # type: ignore[arg-type]
                 self.step += 1
                 progress.advance()
                 last = self.step == config.updates
@@ -106,6 +130,8 @@ class Trainer:
         """Evaluate the present policy, append its rows, keep a film of the last; returns the mean score."""
         config = self.config
         self.algorithm.policy.save(run.path / "policy")
+        if isinstance(self.algorithm, EndToEnd):
+            save_encoder(run.path / "encoder", self.algorithm.encoder, self.card)
         corruption = CorruptionConfig(**self.card.corruption)
         jobs = [
             EpisodeJob(
@@ -130,7 +156,7 @@ class Trainer:
     def _state(self) -> dict[str, Any]:
         state = {"step": self.step, "seconds": self.seconds, "algorithm": self.algorithm.state_dict()}
         state["batches"] = self.generator.get_state()
-        if isinstance(self.sampler, ExactSampler):
+        if isinstance(self.sampler, ExactSampler | PixelSampler):
             state |= {"corruption": self.sampler.corruption.stream.position, "shifts": self.sampler.shifts.position}
         return state
 
@@ -140,7 +166,7 @@ class Trainer:
         self.step, self.seconds = state["step"], state["seconds"]
         self.algorithm.load_state_dict(state["algorithm"])
         self.generator.set_state(state["batches"])
-        if isinstance(self.sampler, ExactSampler):
+        if isinstance(self.sampler, ExactSampler | PixelSampler):
             self.sampler.corruption.stream.position = state["corruption"]
             self.sampler.shifts.position = state["shifts"]
 
@@ -157,10 +183,14 @@ def _labels(config: FinetuneConfig, card: EncoderCard) -> dict[str, Any]:
     }
 
 
-def _keep_encoder(source: Path, target: Path) -> None:
-    """Copy the encoder into the run, so that the run can be evaluated wherever it is moved."""
+def _keep_encoder(source: Path, run: Path) -> None:
+    """Copy the encoder into the run, so that the run can be evaluated wherever it is moved; its timing, too."""
+    target = run / "encoder"
     if (target / "config.json").exists():
         return
+    timing = source.parent / "timing.json"
+    if timing.exists():
+        shutil.copyfile(timing, run / "pretrain_timing.json")
     scratch = target.with_name(".encoder.tmp")
     shutil.rmtree(scratch, ignore_errors=True)
     shutil.copytree(source, scratch)

@@ -48,14 +48,20 @@ class PretrainConfig(CorruptionConfig, InverseConfig):
     """Units of the GRU."""
     gru_layers: int = 1
     """Layers of the GRU."""
+    m: int | None = None
+    """Rows before t that a state is computed from; None: what the method has (fj and fj+a 8, the others all)."""
+    n: int | None = None
+    """mik and mik+a: rows after t+k that the future encoder reads; None: all to the window's end."""
     history_window: int = 0
-    """After pretraining, compute states from the last this many rows; 0 for all since the episode's start."""
+    """After pretraining, compute states from the last this many rows; 0: as in training."""
     literal_future: bool = False
     """mik+a only: give the future encoder a_{t+k-1}, as the paper's formula reads literally (a leak at k = 1)."""
     action_target: str = "kmeans"
     """What the action head predicts: kmeans, bins, mse or mse_l2."""
     codes: int = 20
     """K-means codes, or bins for each action dimension."""
+    homer_codes: int = 0
+    """homer only: codes of its discrete bottleneck; 0 for none."""
     precision: Precision = "fp32"
     """fp32, or bf16 autocast."""
     device: str = "auto"

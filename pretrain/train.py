@@ -20,7 +20,7 @@ from vd4rl_pomdp.objective import Objective
 from vd4rl_pomdp.runs.checkpoint import load_checkpoint, save_checkpoint, seed_everything
 from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.folder import RunFolder, jsonable
-from vd4rl_pomdp.runs.metrics import MetricsLog
+from vd4rl_pomdp.runs.metrics import MetricsLog, read_metrics
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.tasks import get_task
 from vd4rl_pomdp.types import Windows
@@ -43,7 +43,9 @@ def pretrain(config: PretrainConfig) -> RunFolder:
         return run
     trainer = Trainer(objective.to(device), dataset.to(device), config)
     trainer.run(run, config.steps if method.trained else 0)
-    save_encoder(run.path / "encoder", _with_history_window(objective.encoder, config), _card(config, task, dataset))
+    save_encoder(
+        run.path / "encoder", _with_history_window(objective.encoder, config), _card(config, task, dataset, run)
+    )
     run.finish(trainer.seconds, steps=trainer.step, frames=trainer.step * config.batch_size * config.window)
     return run
 
@@ -76,6 +78,7 @@ class Trainer:
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         self.optimiser.step()
+        self.objective.after_step()
         self.step += 1
         return logs
 
@@ -126,11 +129,20 @@ def corruption_of(config: CorruptionConfig) -> CorruptionConfig:
 
 
 def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
+    _refuse_below({"max_k": 1, "batch_size": 1, "window": 2, "codes": 1, "m": 0, "n": 0, "homer_codes": 0}, config)
     actions = dataset.action[dataset.t > 0]
     target = make_action_target(config.action_target, actions.numpy(), config.codes, config.seed)
-    objective = build_objective(config, actions, target)
+    state_dim = dataset.states().shape[1] if get_method(config.method).reads_state else 0
+    objective = build_objective(config, actions, target, state_dim)
     dataset.num_windows(config.window)
     return objective
+
+
+def _refuse_below(lowest: dict[str, int], config: PretrainConfig) -> None:
+    for name, low in lowest.items():
+        value = getattr(config, name)
+        if value is not None and value < low:
+            raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {low}")
 
 
 def _task_of(dataset: Dataset, config: PretrainConfig) -> str:
@@ -146,7 +158,7 @@ def _task_of(dataset: Dataset, config: PretrainConfig) -> str:
     return name
 
 
-def _card(config: PretrainConfig, task: str, dataset: Dataset) -> EncoderCard:
+def _card(config: PretrainConfig, task: str, dataset: Dataset, run: RunFolder) -> EncoderCard:
     return EncoderCard(
         method=config.method,
         task=task,
@@ -155,9 +167,18 @@ def _card(config: PretrainConfig, task: str, dataset: Dataset) -> EncoderCard:
         seed=config.seed,
         steps=config.steps,
         preset=config.preset,
+        end_to_end=get_method(config.method).end_to_end,
+        action_loss=_last_action_loss(run),
     )
 
 
+def _last_action_loss(run: RunFolder) -> float | None:
+    rows = read_metrics(run.path / "metrics.jsonl")
+    losses = [row["action_loss"] for row in rows if "action_loss" in row]
+    return sum(last) / len(last) if (last := losses[-max(1, len(losses) // 10) :]) else None
+
+
 def _with_history_window(encoder: Encoder, config: PretrainConfig) -> Encoder:
-    encoder.config = replace(encoder.config, history_window=config.history_window)
+    if config.history_window:
+        encoder.config = replace(encoder.config, history_window=config.history_window)
     return encoder

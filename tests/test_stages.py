@@ -21,7 +21,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.runs import checkpoint
 
-VARYING = ("timing.json", "machine.json")
+VARYING = ("timing.json", "pretrain_timing.json", "machine.json")
 
 
 @pytest.fixture(autouse=True)

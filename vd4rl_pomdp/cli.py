@@ -287,9 +287,9 @@ class SweepCommand:
     preset: str = "paper"
     """paper, cpu or smoke."""
     pretrain: str = ""
-    """More flags for every pretraining, as one string."""
+    """More flags for every pretraining, with an equals sign: --pretrain="--steps 1000 --shift 0"."""
     finetune: str = ""
-    """More flags for every fine-tuning, as one string."""
+    """More flags for every fine-tuning, likewise."""
 
 
 def _sweep(words: Arguments, program: str) -> None:

@@ -19,7 +19,7 @@ from vd4rl_pomdp.nn.folder import load_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy
 from vd4rl_pomdp.runs.folder import read_json
 from vd4rl_pomdp.runs.workers import default_workers, run_jobs
-from vd4rl_pomdp.tasks import SCORE_DIVISOR
+from vd4rl_pomdp.tasks import SCORE_DIVISOR, get_task
 
 EVALUATION_SEED = 20_000
 """Evaluation episode i starts from environment seed EVALUATION_SEED + i, for every method and training seed."""
@@ -42,6 +42,12 @@ class Agent:
         """Forget everything: an episode begins."""
         self._state = self.encoder.initial_state(1)
         self._action = torch.zeros(1, self.encoder.config.action_dim)
+
+    def observe(self, now: Observation, task: str) -> torch.Tensor:
+        """What the encoder reads: the corrupted stack, or the simulator state for the `state` reference."""
+        if not self.encoder.reads_state:
+            return now.obs
+        return torch.from_numpy(get_task(task).visible_state(now.row.physics))[:, None, None]
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> np.ndarray:
@@ -146,7 +152,7 @@ def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
     now = env.reset(EVALUATION_SEED + job.episode, EVALUATION_SEED, job.episode)
     total, length, film = 0.0, 0, [(now, 0.0)]
     while not now.row.last:
-        now = env.step(agent.act(now.obs))
+        now = env.step(agent.act(agent.observe(now, job.task)))
         total += now.row.reward
         length += 1
         if job.film and length % FILM_EVERY == 0:

@@ -35,6 +35,9 @@ class Objective(nn.Module, ABC):
             A scalar to minimise, and detached scalars to log.
         """
 
+    def after_step(self) -> None:
+        """Called after every optimiser step: the place for what no gradient moves, such as momentum encoders."""
+
 
 @dataclass(frozen=True)
 class InverseConfig:
@@ -75,6 +78,14 @@ class InverseObjective(Objective):
             Observation rows j (of o_j) and action indices j (of a_j).
         """
 
+    def past_visible(self, t: int) -> tuple[set[int], set[int]]:
+        """Observation rows and action indices that the encoder's state of row t depends on."""
+        shape = self.encoder.config
+        if shape.history == "none":
+            return {t}, set()
+        first = max(0, t + 1 - shape.history_window) if shape.history_window else 0
+        return set(range(first, t + 1)), set(range(first, t)) if shape.use_actions else set()
+
     def pairs(self, rows: int) -> Tensor:
         """The (t, k) that are scored in a window of `rows` rows: (P, 2) int64."""
         return all_pairs(rows, self.config.max_k)
@@ -114,6 +125,26 @@ class InverseObjective(Objective):
         predicted = self.predictor(torch.cat([past[:, t], gap], dim=-1))
         error = (predicted - past[:, t + k].detach()).square().mean(-1)
         return (error * real).sum() / real.sum()
+
+
+class StateInverse(InverseObjective):
+    """Predicts a_t from the encoder's own states of rows t and t+k; what differs is the encoder's memory.
+
+    P(a_t | s_t, s_{t+k}): memoryless states give ACRO, states of a GRU over the whole past AH, over m rows FJ.
+    """
+
+    def __init__(self, encoder: Encoder, target: ActionTarget, config: InverseConfig) -> None:
+        super().__init__(encoder, encoder.dim, target, config)
+
+    def representations(self, window: Windows) -> tuple[Tensor, Tensor]:
+        """The same states (B, T, D) for both ends of a pair."""
+        states = self.encoder.encode(window)
+        return states, states
+
+    def visible(self, t: int, k: int, rows: int) -> tuple[set[int], set[int]]:
+        """What the states of rows t and t+k depend on."""
+        (observations, actions), (later, later_actions) = self.past_visible(t), self.past_visible(t + k)
+        return observations | later, actions | later_actions
 
 
 def _masked_mean(values: Tensor, length: Tensor) -> Tensor:

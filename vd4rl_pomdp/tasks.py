@@ -2,6 +2,8 @@
 
 from dataclasses import dataclass
 
+import numpy as np
+
 from vd4rl_pomdp.errors import UserError
 
 FRAME_SIZE = 84
@@ -24,12 +26,28 @@ class Task:
     action_dim: int
     state_dim: int
     """Width of dm_control's observations, flattened and concatenated in their own order."""
+    positions: int
+    """Generalised positions: the first columns of the simulator state, velocities the others."""
+    travel: tuple[int, ...]
+    """Positions along the ground, which the tracking camera does not show."""
+
+    def pose(self, physics: np.ndarray) -> np.ndarray:
+        """Positions of (..., P) simulator states, without the place on the ground."""
+        return np.delete(physics[..., : self.positions], self.travel, axis=-1)
+
+    def velocity(self, physics: np.ndarray) -> np.ndarray:
+        """Velocities of (..., P) simulator states."""
+        return physics[..., self.positions :]
+
+    def visible_state(self, physics: np.ndarray) -> np.ndarray:
+        """(..., P') float32: pose and velocity."""
+        return np.concatenate([self.pose(physics), self.velocity(physics)], axis=-1).astype(np.float32)
 
 
 TASKS = {
-    "walker_walk": Task("walker_walk", "walker", "walk", 6, 24),
-    "cheetah_run": Task("cheetah_run", "cheetah", "run", 6, 17),
-    "humanoid_walk": Task("humanoid_walk", "humanoid", "walk", 21, 67),
+    "walker_walk": Task("walker_walk", "walker", "walk", 6, 24, positions=9, travel=(1,)),
+    "cheetah_run": Task("cheetah_run", "cheetah", "run", 6, 17, positions=9, travel=(0,)),
+    "humanoid_walk": Task("humanoid_walk", "humanoid", "walk", 21, 67, positions=28, travel=(0, 1)),
 }
 
 

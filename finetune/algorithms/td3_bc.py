@@ -61,7 +61,7 @@ class TD3BC:
         metrics = self._update_critic(z, batch, next_z)
         self.updates += 1
         if self.updates % self.policy_delay == 0:
-            metrics |= self._update_policy(z, batch.action)
+            metrics |= self._update_policy(z.detach(), batch.action)
             self._move_targets()
         return metrics
 

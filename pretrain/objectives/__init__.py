@@ -1,20 +1,28 @@
-"""Every pretraining method by name. A method is one file and one entry here."""
+"""Every pretraining method by name. A method is one file and one entry here, or `register_method` from anywhere."""
 
 from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from importlib.metadata import entry_points
+from typing import Any
 
 from torch import Tensor
 
-from baselines import ACRO
+from baselines import ACRO, CURL, DRIML, HOMER, OneStepInverse
 from pretrain.config import PretrainConfig
+from pretrain.objectives.all_history import AllHistory
+from pretrain.objectives.forward_jump import ForwardJump
 from pretrain.objectives.masked_inverse import MaskedInverse
 from pretrain.objectives.untrained import Untrained
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.nn.frame import STATE
 from vd4rl_pomdp.objective import Objective
+
+ENTRY_POINTS = "vd4rl_pomdp.methods"
+"""Group of entry points under which a package offers methods; each names a `Method`."""
 
 
 @dataclass(frozen=True)
@@ -22,51 +30,105 @@ class Method:
     """How to build an objective, and the encoder it trains."""
 
     build: Callable[[Encoder, ActionTarget, PretrainConfig], Objective]
-    history: str
+    history: str = "none"
     """Memory of its encoder unless the user chooses: gru or none."""
     use_actions: bool = False
     """Whether the GRU reads past actions."""
+    past: int | None = None
+    """Rows before t that a state is computed from unless the user chooses m; None: all."""
     trained: bool = True
     """False for references that take no gradient step."""
+    end_to_end: str = ""
+    """Fine-tuning algorithm that trains the encoder, too; empty for frozen encoders."""
+    reads_state: bool = False
+    """Whether it is given the simulator state in place of pixels."""
 
 
-def _mik(encoder: Encoder, target: ActionTarget, config: PretrainConfig) -> Objective:
-    return MaskedInverse(encoder, target, config, config.literal_future)
+def _masked(encoder: Encoder, target: ActionTarget, config: PretrainConfig) -> Objective:
+    return MaskedInverse(encoder, target, config, config.literal_future, config.n)
+
+
+def _curl(encoder: Encoder, target: ActionTarget, config: PretrainConfig) -> Objective:
+    return CURL(encoder, config.seed)
+
+
+def _driml(encoder: Encoder, target: ActionTarget, config: PretrainConfig) -> Objective:
+    return DRIML(encoder, config.max_k, config.seed)
+
+
+def _homer(encoder: Encoder, target: ActionTarget, config: PretrainConfig) -> Objective:
+    return HOMER(encoder, config.homer_codes, config.seed)
 
 
 METHODS: dict[str, Method] = {
-    "mik+a": Method(_mik, "gru", use_actions=True),
-    "acro": Method(ACRO, "none"),
-    "random": Method(Untrained, "none", trained=False),
+    "no_history": Method(AllHistory),
+    "ah": Method(AllHistory, "gru"),
+    "ah+a": Method(AllHistory, "gru", use_actions=True),
+    "fj": Method(ForwardJump, "gru", past=8),
+    "fj+a": Method(ForwardJump, "gru", use_actions=True, past=8),
+    "mik": Method(_masked, "gru"),
+    "mik+a": Method(_masked, "gru", use_actions=True),
+    "acro": Method(ACRO),
+    "one_step_inverse": Method(OneStepInverse),
+    "curl": Method(_curl),
+    "driml": Method(_driml),
+    "homer": Method(_homer),
+    "random": Method(Untrained, trained=False),
+    "bc": Method(Untrained, trained=False, end_to_end="bc"),
+    "drq_bc": Method(Untrained, trained=False, end_to_end="drqv2_bc"),
+    "state": Method(Untrained, trained=False, reads_state=True),
 }
+
+
+def register_method(name: str, method: Method) -> None:
+    """Add a method of one's own; a name that is taken raises UserError."""
+    if name in METHODS:
+        raise UserError(f"a method called {name!r} exists already: choose another name")
+    METHODS[name] = method
+
+
+def _load_plugins() -> None:
+    """Register the methods that installed packages offer."""
+    for entry in entry_points(group=ENTRY_POINTS):
+        if entry.name not in METHODS:
+            register_method(entry.name, entry.load())
 
 
 def get_method(name: str) -> Method:
     """The method called `name`; raises UserError listing the choices."""
+    _load_plugins()
     if name not in METHODS:
         raise UserError(f"unknown method {name!r}: choose one of {', '.join(METHODS)}")
     return METHODS[name]
 
 
-def build_objective(config: PretrainConfig, action: Tensor, target: ActionTarget) -> Objective:
+def build_objective(config: PretrainConfig, action: Tensor, target: ActionTarget, state_dim: int = 0) -> Objective:
     """Build the objective of a config.
 
     Args:
         config: the run's settings.
         action: (N, A) float32, for its width alone.
         target: what an action head predicts.
+        state_dim: width of the simulator state, for methods that read it.
     """
     method = get_method(config.method)
+    history = method.history if config.history == "method" else config.history
+    past = method.past if config.m is None else config.m
+    if history != "none" and (method.end_to_end or method.reads_state):
+        raise UserError(f"{config.method} has no memory: --history {history} is for pretrained methods")
+    shape: dict[str, Any] = {"frame_encoder": config.frame_encoder}
+    if method.reads_state:
+        shape = {"frame_encoder": STATE, "channels": state_dim, "size": 1}
     encoder = Encoder(
         EncoderConfig(
             action_dim=action.shape[1],
-            frame_encoder=config.frame_encoder,
             feature_dim=config.feature_dim,
-            history=method.history if config.history == "method" else config.history,
+            history=history,
             use_actions=method.use_actions,
             hidden_dim=config.hidden_dim,
             gru_layers=config.gru_layers,
-            history_window=0,
+            history_window=0 if past is None else past + 1,
+            **shape,
         )
     )
     return method.build(encoder, target, config)

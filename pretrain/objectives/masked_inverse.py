@@ -12,7 +12,8 @@ Differences and readings:
   target. Here b reads (o_j, a_j) for j >= t+k, so that it never sees a_t..a_{t+k-1}. `literal_future` restores the
   literal reading, to measure what it does.
 - An episode's last row has no action: b reads zeros and a flag there.
-- The future reaches to the window's end (the paper's n is not stated for these experiments).
+- The future reaches to the window's end, or n rows beyond t+k (the paper's n is not stated for these experiments);
+  the past to the window's start, or m rows before t.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from torch import Tensor, nn
 
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.sequence import run_gru_backward
+from vd4rl_pomdp.nn.sequence import run_gru_backward, run_gru_over_next
 from vd4rl_pomdp.objective import InverseConfig, InverseObjective
 from vd4rl_pomdp.types import Windows
 
@@ -31,12 +32,18 @@ class MaskedInverse(InverseObjective):
     """MIK (an encoder that reads observations only) and MIK+A (one that reads actions too)."""
 
     def __init__(
-        self, encoder: Encoder, target: ActionTarget, config: InverseConfig, literal_future: bool = False
+        self,
+        encoder: Encoder,
+        target: ActionTarget,
+        config: InverseConfig,
+        literal_future: bool = False,
+        n: int | None = None,
     ) -> None:
         shape = encoder.config
         super().__init__(encoder, shape.hidden_dim, target, config)
         self.use_actions = shape.use_actions
         self.literal_future = literal_future
+        self.n = n
         inputs = shape.feature_dim + (shape.action_dim + 1 if self.use_actions else 0)
         self.backward_gru = nn.GRU(inputs, shape.hidden_dim, shape.gru_layers, batch_first=True)
 
@@ -44,7 +51,10 @@ class MaskedInverse(InverseObjective):
         """Forward states (B, T, D) and backward states (B, T, D)."""
         features = self.encoder.frame(window.obs)
         past = self.encoder.from_features(features, window.prev_action)
-        return past, run_gru_backward(self.backward_gru, self._future_rows(features, window), window.length)
+        rows = self._future_rows(features, window)
+        if self.n is None:
+            return past, run_gru_backward(self.backward_gru, rows, window.length)
+        return past, run_gru_over_next(self.backward_gru, rows, window.length, self.n + 1)
 
     def _future_rows(self, features: Tensor, window: Windows) -> Tensor:
         if not self.use_actions:
@@ -56,9 +66,10 @@ class MaskedInverse(InverseObjective):
         return torch.cat([features, action.to(features), known[..., None].to(features)], dim=-1)
 
     def visible(self, t: int, k: int, rows: int) -> tuple[set[int], set[int]]:
-        """Past up to t and future from t+k; with actions a_j for j < t and j >= t+k."""
-        observations = set(range(t + 1)) | set(range(t + k, rows))
-        if not self.use_actions:
-            return observations, set()
-        future = range(t + k - 1, rows - 1) if self.literal_future else range(t + k, rows)
-        return observations, set(range(t)) | set(future)
+        """Past up to t and future from t+k on; with actions a_j for j < t and j >= t+k."""
+        observations, actions = self.past_visible(t)
+        end = rows if self.n is None else min(rows, t + k + self.n + 1)
+        observations |= set(range(t + k, end))
+        if self.use_actions:
+            actions |= set(range(t + k - 1, end - 1) if self.literal_future else range(t + k, end))
+        return observations, actions

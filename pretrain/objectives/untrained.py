@@ -1,4 +1,10 @@
-"""`random`: the encoder as it is initialised, the floor that makes a table honest."""
+"""References that make a table honest; no pretraining step is taken, their encoders are written as initialised.
+
+random   stays as it is: the floor
+bc       is trained by fine-tuning, end to end, by behaviour cloning
+drq_bc   is trained by fine-tuning, end to end, by the critic's loss (DrQ-v2+BC of V-D4RL)
+state    is no network: the simulator state itself, the ceiling on sets that store it
+"""
 
 from __future__ import annotations
 

@@ -97,6 +97,12 @@ class Dataset:
         """Action dimension A."""
         return self.action.shape[1]
 
+    def states(self) -> Tensor:
+        """(N, P') float32 poses and velocities on the set's device; raises UserError if the set has no states."""
+        if self.physics is None or self.task is None:
+            raise UserError(f"{self.path}: stores no simulator states; collect a set with `vd4rl-pomdp data collect`")
+        return torch.from_numpy(TASKS[self.task].visible_state(self.physics)).to(self.t.device)
+
     def to(self, device: torch.device | str) -> Dataset:
         """Move frames and rows to a device, in place; returns the data set."""
         for name, value in vars(self).items():

@@ -5,13 +5,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.nn.frame import make_frame_encoder
+from vd4rl_pomdp.nn.frame import STATE, FrameEncoder, StateFrame, make_frame_encoder
 from vd4rl_pomdp.nn.sequence import run_gru
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.types import Windows
@@ -53,12 +53,21 @@ class Encoder(nn.Module):
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        self.frame = make_frame_encoder(config.frame_encoder, config.channels, config.size, config.feature_dim)
+        if config.frame_encoder == STATE:
+            config = self.config = replace(config, feature_dim=config.channels)
+            self.frame: FrameEncoder | StateFrame = StateFrame()
+        else:
+            self.frame = make_frame_encoder(config.frame_encoder, config.channels, config.size, config.feature_dim)
         inputs = config.feature_dim + (config.action_dim if config.use_actions else 0)
         self.gru = (
             nn.GRU(inputs, config.hidden_dim, config.gru_layers, batch_first=True) if config.history == "gru" else None
         )
         self.dim = config.hidden_dim if self.gru is not None else config.feature_dim
+
+    @property
+    def reads_state(self) -> bool:
+        """Whether observations are simulator states (B, P, 1, 1) in place of pixels."""
+        return self.config.frame_encoder == STATE
 
     def encode(self, window: Windows) -> Tensor:
         """Representations of every row: (B, T, C, 84, 84) uint8 -> (B, T, dim)."""
@@ -112,8 +121,8 @@ class Encoder(nn.Module):
         """States of rows span.. of (B, T, I), each computed anew from the last `span` rows: (B, T - span, H)."""
         assert self.gru is not None
         recent = rows.unfold(1, span, 1)[:, 1:].transpose(2, 3)
-        states = [run_gru(self.gru, self._forget_first_action(r))[0][:, -1] for r in recent.unbind(1)]
-        return torch.stack(states, dim=1)
+        states, _ = run_gru(self.gru, self._forget_first_action(recent.flatten(0, 1)))
+        return states[:, -1].view(*recent.shape[:2], -1)
 
     def _forget_first_action(self, rows: Tensor) -> Tensor:
         """A window's first row carries no earlier action."""

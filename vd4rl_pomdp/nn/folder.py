@@ -26,6 +26,10 @@ class EncoderCard:
     seed: int
     steps: int
     preset: str
+    end_to_end: str = ""
+    """Fine-tuning algorithm that trains the encoder, too; empty for a frozen encoder."""
+    action_loss: float | None = None
+    """Mean over the last tenth of the pretraining's logged steps, for methods that predict actions."""
 
 
 def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard) -> None:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 from torch import Tensor, nn
 
@@ -18,15 +20,25 @@ class FrameEncoder(nn.Module):
         super().__init__()
         self.convolutions = convolutions
         with torch.no_grad():
-            flat = convolutions(torch.zeros(1, channels, size, size)).numel()
+            self.map_shape = tuple(convolutions(torch.zeros(1, channels, size, size)).shape[1:])
+            """(C', H', W') of the feature maps."""
+        flat = math.prod(self.map_shape)
         self.project = nn.Sequential(nn.Linear(flat, feature_dim), nn.LayerNorm(feature_dim), nn.Tanh())
 
     def forward(self, obs: Tensor) -> Tensor:
         """Features of every stack."""
-        lead = obs.shape[:-3]
+        return self.from_maps(self.maps(obs))
+
+    def maps(self, obs: Tensor) -> Tensor:
+        """Feature maps (..., C', H', W') of every stack, the layer before `from_maps`."""
         dtype = next(self.project.parameters()).dtype
         image = _as_image(obs.reshape(-1, *obs.shape[-3:]), dtype)
-        return self.project(self.convolutions(image).flatten(1)).to(dtype).view(*lead, -1)
+        return self.convolutions(image).view(*obs.shape[:-3], *self.map_shape)
+
+    def from_maps(self, maps: Tensor) -> Tensor:
+        """Features (..., feature_dim) float32 of feature maps."""
+        dtype = next(self.project.parameters()).dtype
+        return self.project(maps.flatten(-3).flatten(0, -2)).to(dtype).view(*maps.shape[:-3], -1)
 
 
 def _as_image(obs: Tensor, dtype: torch.dtype) -> Tensor:
@@ -63,6 +75,23 @@ def _flat(channels: int) -> nn.Sequential:
 
 
 FRAME_ENCODERS = {"drq": _drq, "nature": _nature, "flat": _flat}
+
+
+class StateFrame(nn.Module):
+    """Hands the simulator state through, in place of pixels: (..., P, 1, 1) -> (..., P) float32."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.nothing = nn.Parameter(torch.zeros(0))
+        """Optimisers and files want one."""
+
+    def forward(self, obs: Tensor) -> Tensor:
+        """The state itself."""
+        return obs.flatten(-3).float()
+
+
+STATE = "state"
+"""Frame encoder of the `state` reference."""
 
 
 def make_frame_encoder(name: str, channels: int, size: int, feature_dim: int) -> FrameEncoder:

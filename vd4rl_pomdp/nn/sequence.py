@@ -30,6 +30,18 @@ def run_gru_backward(gru: nn.GRU, x: Tensor, length: Tensor) -> Tensor:
     return _take_rows(out, flip)
 
 
+def run_gru_over_next(gru: nn.GRU, x: Tensor, length: Tensor, span: int) -> Tensor:
+    """Like `run_gru_backward`, but row j has seen rows j..j+span-1 alone: each state is computed anew from zero."""
+    batch, rows, width = x.shape
+    j = torch.arange(rows, device=x.device)
+    count = (length[:, None] - j).clamp(1, span)  # padding rows read themselves
+    index = (j[:, None] + count[..., None] - 1 - torch.arange(span, device=x.device)).maximum(j[:, None])
+    windows = _take_rows(x, index.view(batch, -1)).view(batch * rows, span, width)
+    out, _ = run_gru(gru, windows)
+    last = (count - 1).reshape(-1, 1)
+    return _take_rows(out, last).view(batch, rows, -1)
+
+
 def _take_rows(x: Tensor, index: Tensor) -> Tensor:
     """Rows of (B, T, I) in the order given by (B, T) indices."""
     return x.gather(1, index[..., None].expand(-1, -1, x.shape[2]))

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import json
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -13,6 +12,7 @@ import numpy as np
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import COLUMNS
 from vd4rl_pomdp.runs.folder import read_json
+from vd4rl_pomdp.runs.metrics import read_metrics
 
 IDENTITY = ("task", "quality", "corruption", "algorithm", "method", "seed")
 
@@ -73,7 +73,7 @@ def _load(folder: Path) -> Run:
         stage=record["stage"],
         record=record,
         rows=_rows(folder / "episodes.csv"),
-        metrics=_metrics(folder / "metrics.jsonl"),
+        metrics=read_metrics(folder / "metrics.jsonl"),
         seconds=read_json(timing)["seconds"] if timing.exists() else None,
     )
 
@@ -90,15 +90,6 @@ def _rows(path: Path) -> list[dict[str, Any]]:
         return [
             row | {k: int(row[k]) for k in whole} | {k: float(row[k]) for k in ("return", "score")} for row in reader
         ]
-
-
-def _metrics(path: Path) -> list[dict[str, float]]:
-    if not path.exists():
-        return []
-    try:
-        return [json.loads(line) for line in path.read_text().splitlines()]
-    except json.JSONDecodeError as error:
-        raise UserError(f"{path}: a line is not JSON ({error})") from error
 
 
 def _refuse_twins(runs: list[Run]) -> None:

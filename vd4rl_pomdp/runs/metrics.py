@@ -8,6 +8,8 @@ import sys
 from pathlib import Path
 from typing import Any, Literal
 
+from vd4rl_pomdp.errors import UserError
+
 WandbMode = Literal["off", "offline", "online"]
 
 
@@ -34,6 +36,16 @@ class MetricsLog:
         """End the mirror, if there is one."""
         if self._wandb is not None:
             self._wandb.finish()
+
+
+def read_metrics(path: Path) -> list[dict[str, float]]:
+    """Rows of a metrics.jsonl, none if there is no file; a damaged line raises UserError."""
+    if not path.exists():
+        return []
+    try:
+        return [json.loads(line) for line in path.read_text().splitlines()]
+    except json.JSONDecodeError as error:
+        raise UserError(f"{path}: a line is not JSON ({error})") from error
 
 
 def _start_wandb(mode: WandbMode, folder: Path, config: dict[str, Any]) -> Any:

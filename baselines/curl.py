@@ -1,0 +1,69 @@
+"""CURL: contrastive unsupervised representations (Laskin et al. 2020, arXiv 2004.04136).
+
+    L = -log exp(q^T W k+) / sum_i exp(q^T W k_i),   q = e(aug(o)), k = e'(aug'(o)),   e' <- 0.95 e' + 0.05 e
+
+Two augmentations of one observation are a positive pair, other observations of the batch the negatives; W is a learned
+bilinear form, e' a momentum copy of the encoder that takes no gradient.
+
+Authors' code: github.com/MishaLaskin/curl.
+
+Differences:
+- The contrastive loss alone: the paper trains it together with SAC on the same encoder.
+- Augmentation is a random shift by up to 4 pixels, as everywhere in this benchmark, not a random crop of a larger
+  frame; both copies are shifted anew from one corrupted observation: hiding is the world's doing, no augmentation.
+- The paper subtracts each row's largest logit before the softmax; here log-softmax does it.
+- Observations of the anchor's own window are no negatives (see `info_nce`).
+- With `--history gru` the GRU is part of e and e', and one shift serves a whole window.
+"""
+
+from __future__ import annotations
+
+import copy
+
+import torch
+from torch import Tensor, nn
+
+from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.nn.contrastive import info_nce
+from vd4rl_pomdp.nn.draws import Draws
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.objective import Objective
+from vd4rl_pomdp.types import Windows
+
+MOMENTUM = 0.05
+"""Share of the encoder that its momentum copy takes over after every step."""
+
+
+class CURL(Objective):
+    """Instance discrimination with a momentum encoder."""
+
+    def __init__(self, encoder: Encoder, seed: int) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.momentum_encoder = copy.deepcopy(encoder).requires_grad_(False)
+        self.bilinear = nn.Parameter(torch.rand(encoder.dim, encoder.dim))
+        self.draws = Draws(seed)
+
+    def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
+        """InfoNCE over all real rows of the batch."""
+        query = self.encoder.encode(self._shifted(window))
+        with torch.no_grad():
+            positive = self.momentum_encoder.encode(self._shifted(window))
+        batch, rows = query.shape[:2]
+        real = torch.arange(rows, device=query.device) < window.length[:, None]
+        group = torch.arange(batch, device=query.device)[:, None].expand(-1, rows)[real]
+        scores = query[real] @ self.bilinear @ positive[real].T
+        loss = info_nce(scores, group)
+        right = (scores.argmax(1) == torch.arange(len(scores), device=scores.device)).float().mean()
+        return loss, {"loss": loss.detach(), "accuracy": right}
+
+    @torch.no_grad()
+    def after_step(self) -> None:
+        """Move the momentum encoder."""
+        for slow, fast in zip(self.momentum_encoder.parameters(), self.encoder.parameters(), strict=True):
+            slow.lerp_(fast, MOMENTUM)
+
+    def _shifted(self, window: Windows) -> Windows:
+        """The window, shifted anew: each row by itself, or all alike if the encoder has a memory."""
+        obs = window.obs if self.encoder.gru is not None else window.obs.flatten(0, 1)
+        return window.replace(obs=random_shift(obs, self.draws.keys(len(obs))).view_as(window.obs))

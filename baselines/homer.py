@@ -1,0 +1,74 @@
+"""HOMER: kinematic inseparability by telling real from imposter transitions (Misra et al. 2019, arXiv 1911.05815).
+
+    P(real | e(o_t), a_t, c(e(o_{t+1}))),   imposters: o_{t+1} drawn independently of (o_t, a_t)
+
+The Bayes-optimal classifier is p(o'|o,a) / (p(o'|o,a) + p(o')): observations that no (o, a) can tell apart may share a
+code. c is a discrete bottleneck, Gumbel-softmax over a few codes, or the identity.
+
+Authors' code: github.com/cereb-rl (Homer).
+
+Differences:
+- The abstraction alone: no exploration policies, no tabular planning on the codes.
+- One encoder for o_t and o_{t+1}; the paper has one for each direction and keeps the second.
+- Imposters come from the batch, each a uniformly drawn next observation of it.
+- The bottleneck is an option (`--homer-codes`), since TD3+BC needs a continuous state; the kept z is before it.
+- With `--history gru` the state of row t+1 remembers row t, which makes imposters easy: use it knowing that.
+"""
+
+from __future__ import annotations
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from vd4rl_pomdp.nn.draws import Draws
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.heads import mlp
+from vd4rl_pomdp.objective import Objective
+from vd4rl_pomdp.types import Windows
+
+
+class Bottleneck(nn.Module):
+    """Straight-through Gumbel-softmax (Jang et al. 2016, arXiv 1611.01144) over `codes` codes: (N, D) -> (N, D)."""
+
+    def __init__(self, dim: int, codes: int, seed: int) -> None:
+        super().__init__()
+        self.logits = nn.Linear(dim, codes)
+        self.embedding = nn.Linear(codes, dim, bias=False)
+        self.draws = Draws(seed)
+
+    def forward(self, z: Tensor) -> Tensor:
+        """Embedding of each row's code; noise in training alone."""
+        logits = self.logits(z)
+        if self.training:
+            logits = logits - (-self.draws.uniform(*logits.shape).log()).log()
+        soft = logits.softmax(-1)
+        hard = F.one_hot(logits.argmax(-1), soft.shape[-1]).to(soft)
+        return self.embedding(hard + soft - soft.detach())
+
+
+class HOMER(Objective):
+    """Real or imposter (o_t, a_t, o_{t+1})."""
+
+    def __init__(self, encoder: Encoder, codes: int, seed: int) -> None:
+        super().__init__()
+        self.encoder = encoder
+        self.bottleneck = Bottleneck(encoder.dim, codes, seed + 1) if codes else nn.Identity()
+        self.classifier = mlp(2 * encoder.dim + encoder.config.action_dim, 256, 1)
+        self.draws = Draws(seed)
+
+    def logits(self, state: Tensor, action: Tensor, following: Tensor) -> Tensor:
+        """Log-odds (N,) that transitions of (N, D), (N, A), (N, D) are real."""
+        return self.classifier(torch.cat([state, action.to(state), self.bottleneck(following)], dim=-1))[:, 0]
+
+    def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
+        """Mean binary cross-entropy of every real transition of the batch and one imposter for each."""
+        states = self.encoder.encode(window)
+        real = torch.arange(1, states.shape[1], device=states.device) < window.length[:, None]
+        state, action, following = states[:, :-1][real], window.action[:, :-1][real], states[:, 1:][real]
+        imposter = following[self.draws.integers(len(following), len(following))]
+        logits = torch.stack([self.logits(state, action, following), self.logits(state, action, imposter)])
+        truth = torch.tensor([[1.0], [0.0]], device=logits.device).expand_as(logits)
+        loss = F.binary_cross_entropy_with_logits(logits, truth)
+        right = ((logits > 0) == (truth > 0)).float().mean()
+        return loss, {"loss": loss.detach(), "accuracy": right}

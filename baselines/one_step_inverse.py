@@ -1,0 +1,25 @@
+"""One-step inverse model (Pathak et al. 2017, arXiv 1705.05363): the action between two consecutive observations.
+
+    P(a_t | e(o_t), e(o_{t+1}))
+
+Authors' code: github.com/pathak22/noreward-rl (the inverse model of the intrinsic curiosity module).
+
+Differences:
+- The inverse model alone: no forward model, no curiosity reward, no policy trained with it.
+- It is ACRO with K = 1, so that nothing but K differs between the two; the action target is a choice.
+"""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+from vd4rl_pomdp.nn.action_target import ActionTarget
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.objective import InverseConfig, StateInverse
+
+
+class OneStepInverse(StateInverse):
+    """Inverse model on consecutive states, whatever `max_k` is configured."""
+
+    def __init__(self, encoder: Encoder, target: ActionTarget, config: InverseConfig) -> None:
+        super().__init__(encoder, target, replace(config, max_k=1))

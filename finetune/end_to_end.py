@@ -1,0 +1,81 @@
+"""References without a frozen stage: the encoder is trained by the algorithm's own loss, in V-D4RL's manner.
+
+`bc` trains it by behaviour cloning, `drq_bc` by the critic's loss (Lu et al. 2022, arXiv 2206.04779): the actor's
+gradient stops at the representation.
+
+Authors' code: github.com/conglu1997/v-d4rl (drqbc).
+
+Differences: actor and critic share the encoder's Linear-LayerNorm-Tanh layer, where V-D4RL has one for each; the target
+critic reads the present encoder's representations, as there.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from finetune.config import FinetuneConfig
+from finetune.features import SHIFT_STREAM, FeatureBatch
+from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream
+from vd4rl_pomdp.data import Dataset, TransitionSampler
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.runs.device import autocast
+from vd4rl_pomdp.types import Transitions
+
+
+class PixelSampler:
+    """Uniform n-step transitions of pixels, both observations shifted and corrupted on their own."""
+
+    def __init__(
+        self, dataset: Dataset, corruption: CorruptionConfig, config: FinetuneConfig, generator: torch.Generator
+    ) -> None:
+        self._sampler = TransitionSampler(dataset, config.batch_size, generator, config.n_step, gamma=config.gamma)
+        self._shift = config.shift
+        self.corruption = BatchCorruption(corruption, config.seed)
+        self.shifts = KeyStream(config.seed * 10 + SHIFT_STREAM)
+
+    def sample(self) -> Transitions:
+        """The next batch."""
+        batch = self._sampler.sample()
+        return batch.replace(
+            obs=self._observed(batch.obs, batch.key), next_obs=self._observed(batch.next_obs, batch.next_key)
+        )
+
+    def _observed(self, obs: Tensor, key: Tensor) -> Tensor:
+        shifted = random_shift(obs, self.shifts.take((len(obs),), obs.device), self._shift)
+        return self.corruption(shifted, key)
+
+
+class EndToEnd:
+    """An algorithm together with the encoder that its first loss trains."""
+
+    def __init__(self, algorithm: Any, encoder: Encoder, config: FinetuneConfig) -> None:
+        self.algorithm, self.encoder, self.config = algorithm, encoder.train().requires_grad_(True), config
+        self.policy = algorithm.policy
+        self.optimiser = torch.optim.Adam(encoder.parameters(), lr=config.learning_rate)
+
+    def update(self, batch: Transitions) -> dict[str, Tensor]:
+        """One update of encoder, critic and actor; returns detached scalars."""
+        device = batch.obs.device
+        with autocast(device, self.config.precision):
+            z = self.encoder.frame(batch.obs).float()
+            with torch.no_grad():
+                next_z = self.encoder.frame(batch.next_obs).float()
+        self.optimiser.zero_grad(set_to_none=True)
+        metrics = self.algorithm.update(FeatureBatch(z, batch.action, batch.reward, batch.discount, next_z))
+        self.optimiser.step()
+        return metrics
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on."""
+        parts = {"algorithm": self.algorithm, "encoder": self.encoder, "optimiser": self.optimiser}
+        return {name: part.state_dict() for name, part in parts.items()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        self.algorithm.load_state_dict(state["algorithm"])
+        self.encoder.load_state_dict(state["encoder"])
+        self.optimiser.load_state_dict(state["optimiser"])

@@ -1,0 +1,30 @@
+"""FJ and FJ+A: forward-jump inverse models on states of a bounded past (Wu et al. 2024, section 3.2, Table 1).
+
+    FJ     P(a_t | f(o_{t-m}..o_t), f(o_{t+k-m}..o_{t+k})),   k in 1..K
+    FJ+A   the same with the actions inside each window: a_{t-m}..a_{t-1} and a_{t+k-m}..a_{t+k-1}
+
+Each state is computed anew, from zero, over its own m+1 rows. A window's first row carries no earlier action. For
+k <= m the later window of FJ+A contains a_t; for k > m + 1 neither window sees the steps between, and what they miss
+is the paper's counterexample.
+
+Authors' code: not published.
+
+Differences and readings:
+- Frames are encoded once; windows are gathered from the features (m+1 GRU steps for each row, no convolutions).
+- Windows are cut short at the first row of a batch's window, where nothing earlier is known.
+- The kept encoder reads its last m+1 rows in evaluation, too: it never saw a longer past.
+"""
+
+from __future__ import annotations
+
+from vd4rl_pomdp.nn.action_target import ActionTarget
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.objective import InverseConfig, StateInverse
+
+
+class ForwardJump(StateInverse):
+    """FJ (a GRU over m+1 observations) and FJ+A (that reads actions, too)."""
+
+    def __init__(self, encoder: Encoder, target: ActionTarget, config: InverseConfig) -> None:
+        super().__init__(encoder, target, config)
+        assert encoder.config.history_window > 0, "a forward jump needs a bounded past"

@@ -1,0 +1,33 @@
+"""Random draws of an objective, as state: saved with it, so that a resumed training goes on with the same draws."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from vd4rl_pomdp.corruptions.keys import KeyStream
+
+
+class Draws(nn.Module):
+    """A stream of keys and numbers whose position is a buffer."""
+
+    def __init__(self, seed: int) -> None:
+        super().__init__()
+        self.seed = seed
+        self.register_buffer("position", torch.zeros((), dtype=torch.int64))
+        self.position: Tensor
+
+    def keys(self, *shape: int) -> Tensor:
+        """Fresh int64 keys."""
+        stream = KeyStream(self.seed, int(self.position))
+        keys = stream.take(shape, self.position.device)
+        self.position.fill_(stream.position)
+        return keys
+
+    def integers(self, high: int, *shape: int) -> Tensor:
+        """Uniform int64 in [0, high)."""
+        return ((self.keys(*shape) >> 33 & 0x3FFFFFFF) * high) >> 30
+
+    def uniform(self, *shape: int) -> Tensor:
+        """Uniform float32 in (0, 1)."""
+        return ((self.keys(*shape) >> 33 & 0x3FFFFF).float() + 0.5) / 0x400000
