@@ -108,7 +108,7 @@ def _with_presets(config: type, presets: dict[str, Any], words: Arguments, progr
     if name not in presets:
         raise UserError(f"unknown preset {name!r}: choose one of {', '.join(presets)}")
     default = presets[name]
-    required = [f for f in ("encoder", "data", "out") if getattr(default, f, None) == Path()]
+    required = [f for f in ("encoder", "data", "out", "maze") if getattr(default, f, None) in (Path(), "")]
     missing = {f: tyro.MISSING for f in required}
     from dataclasses import replace
 
@@ -301,6 +301,13 @@ def _sweep(words: Arguments, program: str) -> None:
         _dispatch(COMMANDS, stage, "vd4rl-pomdp")
 
 
+def _navigation_collect(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.experiments.navigation.collect import PRESETS, CollectConfig, collect
+
+    config = _with_presets(CollectConfig, PRESETS, words, program)
+    print(f"{len(collect(config))} shards in {config.out}")
+
+
 @dataclass(frozen=True)
 class DemoCommand:
     """Every stage on a small walker_walk set with real rendering, in minutes, ending with a table and a report."""
@@ -359,6 +366,9 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     "pretrain": Command("train an encoder", _pretrain),
     "finetune": Command("TD3+BC on a frozen encoder", _finetune),
     "evaluate": Command("evaluate a fine-tuned run again", _evaluate),
+    "navigation": {
+        "collect": Command("a maze's data, with true states", _navigation_collect),
+    },
     "sweep": Command("methods x corruptions x seeds", _sweep),
     "report": Command("an HTML page and CSV files about runs", _report),
     "bench": Command("speed and memory on this machine", _bench),

@@ -42,7 +42,8 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     ) -> None:
         self.maze_spec = get_maze(maze)
         self._repeat = action_repeat
-        self._point, self._maze = build_simulator(self.maze_spec)
+        self._point, self.maze = build_simulator(self.maze_spec)
+        """The library's description of the cells."""
         self._view = make_view(self.maze_spec, self._point.model, render) if pixels else None
         self.observation_space = gymnasium.spaces.Box(0, 255, (3, PICTURE_SIZE, PICTURE_SIZE), np.uint8)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
@@ -91,8 +92,8 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def is_free(self, place: np.ndarray) -> bool:
         """Whether the mass fits at a (2,) position."""
         corners = place + COLLISION_RADIUS * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
-        cells = [self._maze.cell_xy_to_rowcol(corner) for corner in corners]
-        return all(self._maze.maze_map[row][column] != 1 for row, column in cells)
+        cells = [self.maze.cell_xy_to_rowcol(corner) for corner in corners]
+        return all(self.maze.maze_map[row][column] != 1 for row, column in cells)
 
     def _simulate(self, action: np.ndarray) -> None:
         """PointMaze's own steps; in first person the velocities are changed first, and no motor runs."""

@@ -11,7 +11,18 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("vd4rl-pomdp", "torch", "numpy", "mujoco", "dm-control", "h5py", "gymnasium", "scikit-learn", "safetensors")
+PACKAGES = (
+    "vd4rl-pomdp",
+    "torch",
+    "numpy",
+    "mujoco",
+    "dm-control",
+    "h5py",
+    "gymnasium",
+    "gymnasium-robotics",
+    "scikit-learn",
+    "safetensors",
+)
 
 
 def versions() -> dict[str, str]:
