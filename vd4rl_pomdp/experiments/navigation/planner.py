@@ -1,4 +1,4 @@
-"""The planner that collects top-view data: shortest path over the maze's cells, a PD controller towards its next cell."""
+"""The planner that collects top-view data: a shortest path over the cells, a PD controller towards its next one."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class Planner:
         return [(i, j) for i, row in rows for j, kind in enumerate(row) if kind != 1]
 
     def _towards(self, goal: Cell) -> dict[Cell, Cell]:
-        """Breadth-first search from a goal: the next cell to enter, from every cell (the goal's own leads to itself)."""
+        """Breadth-first search from a goal: the next cell to enter from every cell; the goal leads to itself."""
         free, following, queue = set(self._free_cells()), {goal: goal}, deque([goal])
         while queue:
             i, j = queue.popleft()
