@@ -308,6 +308,14 @@ def _navigation_collect(words: Arguments, program: str) -> None:
     print(f"{len(collect(config))} shards in {config.out}")
 
 
+def _navigation_train(words: Arguments, program: str) -> None:
+    from pretrain.navigation.config import PRESETS, NavigationConfig
+    from pretrain.navigation.train import train
+
+    run = train(_with_presets(NavigationConfig, PRESETS, words, program))
+    print(f"results: {run.path / 'results.json'}")
+
+
 @dataclass(frozen=True)
 class DemoCommand:
     """Every stage on a small walker_walk set with real rendering, in minutes, ending with a table and a report."""
@@ -368,6 +376,7 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     "evaluate": Command("evaluate a fine-tuned run again", _evaluate),
     "navigation": {
         "collect": Command("a maze's data, with true states", _navigation_collect),
+        "train": Command("an objective on a maze, beside a state probe", _navigation_train),
     },
     "sweep": Command("methods x corruptions x seeds", _sweep),
     "report": Command("an HTML page and CSV files about runs", _report),
