@@ -14,6 +14,10 @@ from vd4rl_pomdp.errors import UserError
 
 PICTURE_SIZE = 100
 """Height and width of a picture."""
+FREE_CELLS = ((1, 1), (1, 2), (1, 3), (2, 3), (3, 3), (3, 2), (3, 1))
+"""Rows and columns of the 5x5 map's free cells, along the U."""
+HALF_SIZE = 2.5
+"""The maze's outer walls are at -2.5 and 2.5, its upper left cell is row 0 and column 0."""
 BALL_RADIUS = 0.2
 """Radius of the ball that is drawn (PointMaze's site); the one that collides has a radius of 0.1."""
 _PARALLAX = 0.03

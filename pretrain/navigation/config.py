@@ -105,6 +105,7 @@ _CPU: dict[str, Any] = {
     "feature_dim": 128,
     "hidden_dim": 128,
     "gru_layers": 1,
+    "precision": "bf16",
     "log_every": 50,
     "checkpoint_every": 250,
 }

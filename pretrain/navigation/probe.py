@@ -85,7 +85,7 @@ class ErrorSums:
 
     def percent(self) -> dict[str, float]:
         """`state`, `position`, `velocity`, and the same with `_hidden` where any counted row was hidden."""
-        named = {}
+        named: dict[str, float] = {}
         for number, suffix in enumerate(("", "_hidden")):
             if self._counts[number]:
                 means = 100 * self._sums[number] / self._counts[number]

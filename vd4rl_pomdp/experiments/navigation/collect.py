@@ -96,6 +96,12 @@ def collect(config: CollectConfig) -> list[Path]:
     return shards
 
 
+def drive(maze: str, rows: int, action_repeat: int = 5, noise: float = 0.5, seed: int = 0) -> dict[str, np.ndarray]:
+    """Rows of one trajectory, by key, without writing anything."""
+    get_maze(maze)
+    return _roll_out(_Job(maze, 0, seed, rows, action_repeat, noise))
+
+
 def _check(config: CollectConfig) -> None:
     get_maze(config.maze)
     for name in ("trajectories", "action_repeat", "trajectories_per_shard", "workers"):
@@ -124,7 +130,7 @@ def _roll_out(job: _Job) -> dict[str, np.ndarray]:
     env, policy = _environment(job.maze, job.action_repeat)
     rng = np.random.default_rng([job.seed, job.trajectory])
     frame, info = env.reset(seed=episode_seed(job.seed, job.trajectory))
-    rows = [(frame, np.zeros(2, np.float32), 0.0, info["state"])]
+    rows: list[tuple[Any, ...]] = [(frame, np.zeros(2, np.float32), 0.0, info["state"])]
     while len(rows) < job.rows:
         action = policy(info["state"], info["goal"]) + rng.normal(0, job.noise, 2)
         action = np.clip(action, -1, 1).astype(np.float32)
