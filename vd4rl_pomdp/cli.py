@@ -317,6 +317,14 @@ def _navigation_train(words: Arguments, program: str) -> None:
     print(f"results: {run.path / 'results.json'}")
 
 
+def _navigation_policy(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.experiments.navigation.policy import MazePolicyConfig, train_policy
+
+    config = _parse(MazePolicyConfig, words, program)
+    card = train_policy(config).card
+    print(f"{config.out}: {card['goals_in_20_episodes']} goals in 20 episodes")
+
+
 @dataclass(frozen=True)
 class NavigationReportCommand:
     """Write the paper's navigation tables and figures about finished runs."""
@@ -428,6 +436,7 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     "navigation": {
         "collect": Command("a maze's data, with true states", _navigation_collect),
         "train": Command("an objective on a maze, beside a state probe", _navigation_train),
+        "policy": Command("train the first-person policy (PPO) that ships", _navigation_policy),
         "grid": Command("the runs behind the tables, one after the other", _navigation_grid),
         "report": Command("the paper's tables and figures about runs", _navigation_report),
     },

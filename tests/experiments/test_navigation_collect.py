@@ -103,3 +103,38 @@ def test_wrong_settings_are_named(changes, message, tmp_path):
 def test_another_collection_is_refused(maze_set):
     with pytest.raises(UserError, match="collected with another noise"):
         collect(small(maze_set, noise=0.2))
+
+
+def test_the_shipped_first_person_policy_reaches_goals_and_an_idle_one_does_not():
+    from vd4rl_pomdp.experiments.navigation.policy import SHIPPED, goals_reached
+    from vd4rl_pomdp.policies.actor import read_actor
+
+    actor = read_actor(SHIPPED)
+    assert actor.card["algorithm"] == "PPO"
+    reached = goals_reached(actor, actor.card["action_repeat"], 3)
+    idle = replace(actor, weights={name: value * 0 for name, value in actor.weights.items()})
+    assert reached >= 12
+    assert goals_reached(idle, actor.card["action_repeat"], 3) < reached / 3
+
+
+def test_first_person_data_holds_headings_and_moves(tmp_path):
+    collect(small(tmp_path / "set", maze="first_person", trajectories=1, trajectory_rows=120))
+    dataset = open_dataset(tmp_path / "set", tmp_path / "cache", frame_size=100)
+    assert dataset.physics.shape == (120, 6)
+    assert np.ptp(dataset.physics[:, 2]) > 1
+    assert np.ptp(dataset.physics[:, :2], axis=0).max() > 1
+    assert len({frame.numpy().tobytes() for frame in dataset.frames}) > 100
+
+
+def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    from vd4rl_pomdp.experiments.navigation.policy import MazePolicyConfig, train_policy
+    from vd4rl_pomdp.policies.actor import read_actor
+
+    trained = train_policy(MazePolicyConfig(tmp_path / "actor.safetensors", decisions=2048))
+    stored = read_actor(tmp_path / "actor.safetensors")
+    seen = np.array([0.3, -0.2, 1.0, 0.1], np.float32)
+    np.testing.assert_array_equal(stored.act(seen), trained.act(seen))
+    assert stored.card["decisions"] == 2048
+    spread = [stored.act(seen, np.random.default_rng(i)) for i in range(50)]
+    assert np.std(spread, axis=0).min() > 0.1

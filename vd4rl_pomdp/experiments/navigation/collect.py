@@ -156,10 +156,12 @@ def _environment(maze: str, action_repeat: int) -> tuple[Any, Callable[[np.ndarr
     """The process's environment and policy for these arguments: one GL context serves all its trajectories."""
     from vd4rl_pomdp.envs.maze import MazeEnv
     from vd4rl_pomdp.experiments.navigation.planner import Planner
+    from vd4rl_pomdp.experiments.navigation.policy import FirstPersonPilot
 
     if (maze, action_repeat) not in _ENVIRONMENTS:
         env = MazeEnv(maze, action_repeat)
-        _ENVIRONMENTS[maze, action_repeat] = env, Planner(env).act
+        pilot = FirstPersonPilot(env) if env.maze_spec.first_person else Planner(env)
+        _ENVIRONMENTS[maze, action_repeat] = env, pilot.act
     return _ENVIRONMENTS[maze, action_repeat]
 
 
@@ -167,7 +169,7 @@ def _attributes(config: CollectConfig) -> dict[str, Any]:
     packages = ("mujoco", "gymnasium-robotics", "vd4rl-pomdp")
     return {
         "task": config.maze,
-        "policy": "planner",
+        "policy": "ppo" if get_maze(config.maze).first_person else "planner",
         "seed": config.seed,
         "action_repeat": config.action_repeat,
         "noise": config.noise,

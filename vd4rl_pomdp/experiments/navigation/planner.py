@@ -24,10 +24,22 @@ class Planner:
 
     def act(self, state: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Action (2,) float64 for a (4,) state and a (2,) goal."""
-        here, there = self._cell(state[:2]), self._cell(goal)
-        following = self._next[there][here]
-        target = goal if following == there else self._maze.cell_rowcol_to_xy(np.array(following))
-        return POSITION_GAIN * (target - state[:2]) - VELOCITY_GAIN * state[2:]
+        return POSITION_GAIN * (self.waypoint(state[:2], goal) - state[:2]) - VELOCITY_GAIN * state[2:]
+
+    def waypoint(self, place: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Where to go straight from a (2,) place: to the goal if it is at most one cell away, else to the next cell."""
+        following, there = self._next[self._cell(goal)][self._cell(place)], self._cell(goal)
+        return goal if following == there else self._maze.cell_rowcol_to_xy(np.array(following))
+
+    def distance(self, place: np.ndarray, goal: np.ndarray) -> float:
+        """Length of the way from a (2,) place to a goal over the waypoints."""
+        length, here = 0.0, place
+        while True:
+            target = self.waypoint(here, goal)
+            length += float(np.linalg.norm(target - here))
+            if target is goal:
+                return length
+            here = target
 
     def _cell(self, place: np.ndarray) -> Cell:
         row, column = self._maze.cell_xy_to_rowcol(place)
