@@ -54,9 +54,9 @@ def train(config: NavigationConfig) -> RunFolder:
     noise = None
     if config.exogenous != "none":
         noise = ExogenousNoise(config.exogenous, config.exogenous_weight, config.seed * 10 + _NOISE_STREAM)
-    data = MazeData(*open_maze_set(str(config.data)), config, noise)
+    data = MazeData(*open_maze_set(config.data), config, noise)
     seed_everything(config.seed)
-    objective = _build(data, config)
+    objective = make_objective(data, config)
     run = RunFolder(config.out, STAGE, config)
     if run.finished:
         return run
@@ -332,7 +332,8 @@ def _window_at(dataset: Dataset, row: int, length: int) -> int:
     return int(per_episode[:episode].sum()) + int(dataset.t[row])
 
 
-def _build(data: MazeData, config: NavigationConfig) -> InverseObjective:
+def make_objective(data: MazeData, config: NavigationConfig) -> InverseObjective:
+    """The objective of a config on a maze's data, on the CPU."""
     method = _UNTRAINED_IS if config.method == UNTRAINED else config.method
     target = make_action_target(config.action_target, data.training_actions.numpy(), config.codes, config.seed)
     objective = build_objective(

@@ -109,6 +109,17 @@ def test_the_fast_picture_is_mujocos(maze):
         assert np.abs(ours - theirs).max() <= 24
 
 
+def test_the_fast_first_person_picture_is_mujocos_but_for_its_highlights():
+    rng = np.random.default_rng(1)
+    fast, exact = MazeEnv("first_person"), MazeEnv("first_person", render="exact")
+    fast.reset(seed=0), exact.reset(seed=0)
+    for _ in range(20):
+        state = np.array([*fast._free_place(), rng.uniform(-np.pi, np.pi), 0, 0, 0])
+        ours, theirs = (env.reset(options={"state": state})[0].astype(int) for env in (fast, exact))
+        assert np.abs(ours - theirs).mean() < 4
+        assert (np.abs(ours - theirs) > 20).mean() < 0.02
+
+
 def test_curtains_do_not_collide_and_goals_are_not_drawn():
     env = MazeEnv("three_curtains")
     env.reset(seed=0, options={"state": np.array([-1.2, 1.0, 3.0, 0.0])})

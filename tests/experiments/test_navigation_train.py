@@ -32,8 +32,8 @@ def smoke(data: Path, out: Path, **changes: object) -> NavigationConfig:
 
 def trainer_of(config: NavigationConfig) -> Trainer:
     torch.manual_seed(0)
-    data = MazeData(*open_maze_set(str(config.data)), config, None)
-    return Trainer(module._build(data, config), data.on(torch.device("cpu")), config)
+    data = MazeData(*open_maze_set(config.data), config, None)
+    return Trainer(module.make_objective(data, config), data.on(torch.device("cpu")), config)
 
 
 def results(out: Path) -> dict[tuple, float]:
@@ -180,9 +180,7 @@ def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
     noise = ExogenousNoise("photographs", 0.5, 0)
     for picture, size in (("grey50", 50), ("rgb100", 100)):
         config = smoke(maze_set, tmp_path / "run", picture=picture, frame_encoder="nature")
-        clean, noisy = (
-            MazeData(*open_maze_set(str(maze_set)), config, n).on(torch.device("cpu")) for n in (None, noise)
-        )
+        clean, noisy = (MazeData(*open_maze_set(maze_set), config, n).on(torch.device("cpu")) for n in (None, noise))
         number = torch.tensor([0, 40])
         first, second = clean.windows(number), noisy.windows(number)
         assert first.obs.shape[-2:] == (size, size)

@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from vd4rl_pomdp.envs.maze_model import COLLISION_RADIUS, TIMESTEP, build_simulator
-from vd4rl_pomdp.envs.maze_view import make_view
+from vd4rl_pomdp.envs.maze_view import ExactView, make_view
 from vd4rl_pomdp.envs.rendering import Render, mujoco
 from vd4rl_pomdp.mazes import PICTURE_SIZE, get_maze
 
@@ -88,6 +88,11 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def render(self) -> np.ndarray:
         """The newest picture: (100, 100, 3) uint8."""
         return np.ascontiguousarray(self._picture.transpose(1, 2, 0))
+
+    def close(self) -> None:
+        """Free the GL context, if there is one."""
+        if isinstance(self._view, ExactView):
+            self._view.close()
 
     def is_free(self, place: np.ndarray) -> bool:
         """Whether the mass fits at a (2,) position."""

@@ -69,6 +69,7 @@ def _change(spec: MazeSpec, model: mujoco.MjSpec) -> mujoco.MjSpec:
     if not spec.first_person:
         model.worldbody.add_camera(name="view", pos=[0, 0, CAMERA_HEIGHT], fovy=TOP_FOVY)
         return model
+    model.visual.map.znear = 0.001  # walls are as near as 0.1
     body = model.body("particle")
     body.add_joint(name="heading", type=mujoco.mjtJoint.mjJNT_HINGE, axis=[0, 0, 1], damping=0.0)
     body.add_camera(name="view", pos=[0, 0, EYE_HEIGHT], quat=_AHEAD, fovy=EYE_FOVY)

@@ -4,20 +4,27 @@ Seen from the top only the ball moves. So MuJoCo draws the maze and its depth on
 the ball is then a sphere cut by 40x40 rays of the same camera, shaded like MuJoCo's headlight shades, and put where it
 is nearer than what MuJoCo drew. A ball that is wholly behind a curtain therefore changes no pixel.
 
-In first person everything moves, and MuJoCo draws it all, without the finer rays when it should be fast.
+In first person a ray for each column finds the nearest wall. The light shines where the camera looks, so a wall's face
+has one shade, the floor none but the ambient one, and the picture is made of five colours, averaged over 2x2 rays.
 """
 
 from __future__ import annotations
 
+import atexit
+import weakref
+
 import numpy as np
 
-from vd4rl_pomdp.envs.maze_model import CAMERA_HEIGHT, TOP_FOVY
+from vd4rl_pomdp.envs.maze_model import CAMERA_HEIGHT, EYE_FOVY, EYE_HEIGHT, TOP_FOVY, WALL_HEIGHT
 from vd4rl_pomdp.envs.rendering import Render, gl_error, mujoco
-from vd4rl_pomdp.mazes import BALL_RADIUS, PICTURE_SIZE, MazeSpec
+from vd4rl_pomdp.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, PICTURE_SIZE, MazeSpec
 
 _FINE = 4
 """Rays for each pixel, in each direction."""
 _BALL_COLOR = np.array([0.3, 0.6, 0.3])
+_WALL_COLOR = np.array([0.7, 0.5, 0.3])
+_FLOOR_LIGHT, _FLOOR_DARK, _SQUARE = np.array([0.2, 0.3, 0.4]), np.array([0.1, 0.2, 0.3]), 2.0
+_GROUND = -0.1
 _AMBIENT, _DIFFUSE, _SPECULAR, _SHININESS = 0.4, 0.8, 0.045, 64
 """MuJoCo's headlight on PointMaze's materials."""
 
@@ -34,6 +41,7 @@ class ExactView:
         except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
             raise gl_error(error) from error
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0
+        atexit.register(_close, weakref.ref(self._renderer))  # before OpenGL itself ends
 
     def __call__(self, data: mujoco.MjData) -> np.ndarray:
         """Picture of a state that `mj_forward` has seen."""
@@ -52,6 +60,12 @@ class ExactView:
     def close(self) -> None:
         """Free the GL context."""
         self._renderer.close()
+
+
+def _close(renderer: weakref.ref[mujoco.Renderer]) -> None:
+    alive = renderer()
+    if alive is not None:
+        alive.close()
 
 
 def average(fine: np.ndarray, by: int) -> np.ndarray:
@@ -127,11 +141,72 @@ def _hit_sphere(right: np.ndarray, up: np.ndarray, x: float, y: float) -> tuple[
     return depth, np.sqrt(np.maximum(inside, 0) / squared) / BALL_RADIUS
 
 
-View = ExactView | TopView
+class FirstPersonView:
+    """The fast picture from the ball. It leaves out the faint highlight on walls that are faced squarely."""
+
+    _FINE = 2
+    _SKY, _LIGHT, _DARK, _SHADED, _WALL_X, _WALL_Y = range(6)
+    _OFFSET = 64
+    """An even number of floor squares that makes all places positive."""
+
+    def __init__(self) -> None:
+        side = PICTURE_SIZE * self._FINE
+        steps = ((np.arange(side) + 0.5) / side * 2 - 1) * np.tan(np.radians(EYE_FOVY) / 2)
+        self._left, self._up = -steps, -steps[:, None]
+        """(side,) and (side, 1) slopes of the rays, by column and by row."""
+        self._to_floor = (EYE_HEIGHT - _GROUND) / steps[side // 2 :, None]
+        """(side / 2, 1) distance ahead at which the rays of the lower half meet the floor."""
+        cells = [(row, column) for row in range(5) for column in range(5) if (row, column) not in FREE_CELLS]
+        self._walls = np.array([(c + 0.5 - HALF_SIZE, HALF_SIZE - r - 0.5) for r, c in cells])[:, None]
+        """(walls, 1, 2) centres of the wall cells."""
+
+    def __call__(self, data: mujoco.MjData) -> np.ndarray:
+        """Picture of a state."""
+        place, heading = data.qpos[:2], float(data.qpos[2])
+        ahead = np.array([np.cos(heading), np.sin(heading)])
+        rays = ahead + self._left[:, None] * np.array([-ahead[1], ahead[0]])
+        distance, axis = self._nearest_wall(place, rays)
+        lit = rays[np.arange(len(rays)), axis] * ahead[axis] > 0
+        faces = np.where(lit, self._WALL_X + axis, self._SHADED).astype(np.uint8)
+        height = EYE_HEIGHT + self._up * distance
+        kinds = np.where(height <= WALL_HEIGHT, faces, np.uint8(self._SKY))
+        lower = len(kinds) // 2
+        np.copyto(kinds[lower:], self._floor(place, rays), where=height[lower:] < 0)
+        return self._color(kinds, ahead)
+
+    def _floor(self, place: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        """Kinds (rows of the lower half, columns) of the floor's squares."""
+        x, y = (
+            (self._to_floor * (rays[:, i] / _SQUARE) + (place[i] / _SQUARE + self._OFFSET)).astype(np.int32)
+            for i in (0, 1)
+        )
+        return np.where((x ^ y) & 1, np.uint8(self._LIGHT), np.uint8(self._DARK))
+
+    def _nearest_wall(self, place: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distance ahead (columns,) of the first wall on each (columns, 2) ray, and the axis of its face."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            one, other = ((self._walls + half - place) / rays for half in (-0.5, 0.5))
+        enter, leave = np.minimum(one, other), np.maximum(one, other)
+        first, last = np.maximum(*np.moveaxis(enter, -1, 0)), np.minimum(*np.moveaxis(leave, -1, 0))
+        hit = np.where((first < last) & (first > 0), first, np.inf)
+        wall, columns = hit.argmin(0), np.arange(len(rays))
+        return hit[wall, columns], enter[wall, columns].argmax(-1)
+
+    def _color(self, kinds: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+        """The picture of (side, side) kinds, averaged over the rays of each pixel."""
+        walls = [_WALL_COLOR * (_AMBIENT + _DIFFUSE * light) for light in (0.0, *np.abs(ahead))]
+        colors = np.array([np.zeros(3), _FLOOR_LIGHT * _AMBIENT, _FLOOR_DARK * _AMBIENT, *walls])
+        palette = (np.minimum(colors, 1) * 255 + 0.5).astype(np.uint16)
+        parts = [kinds[i :: self._FINE, j :: self._FINE] for i in range(self._FINE) for j in range(self._FINE)]
+        sums = [sum(shade[part] for part in parts) for shade in palette.T]
+        return ((np.stack(sums) + self._FINE) // self._FINE**2).astype(np.uint8)
+
+
+View = ExactView | TopView | FirstPersonView
 
 
 def make_view(spec: MazeSpec, model: mujoco.MjModel, render: Render) -> View:
-    """What draws a maze: `exact` is MuJoCo alone with smooth edges, `fast` as the module says."""
-    if spec.first_person:
-        return ExactView(model, _FINE if render == "exact" else 1)
-    return TopView(model) if render == "fast" else ExactView(model)
+    """What draws a maze: `exact` is MuJoCo alone with smooth edges, `fast` the rays."""
+    if render == "exact":
+        return ExactView(model)
+    return FirstPersonView() if spec.first_person else TopView(model)

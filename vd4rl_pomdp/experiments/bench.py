@@ -45,6 +45,8 @@ GOALS: dict[str, tuple[str, float]] = {
     "collection.fast_mean_difference_of_255": ("<=", 0.05),
     "collection.two_workers_over_one": (">=", 1.8),
     "mazes.fast_over_default": (">=", 5.0),
+    "mazes.first_person_over_default": (">=", 5.0),
+    "mazes.training_overhead_share": ("<=", 0.2),
 }
 """What this package promises on two cores without a GPU."""
 
@@ -305,7 +307,33 @@ def _mazes(frames: int) -> dict[str, float]:
     default.close()
     for name in ("fast", "first_person"):
         speeds[f"{name}_over_default"] = speeds[f"{name}_frames_per_cpu_s"] / speeds["default_frames_per_cpu_s"]
-    return speeds
+    return speeds | _maze_training()
+
+
+def _maze_training() -> dict[str, float]:
+    """Steps/s of `navigation train --preset cpu`, and the share that is neither forward nor backward pass."""
+    from pretrain.navigation.config import PRESETS
+    from pretrain.navigation.train import MazeData, Trainer, make_objective
+    from vd4rl_pomdp.experiments.navigation import collect
+    from vd4rl_pomdp.experiments.navigation.observations import open_maze_set
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shape = {"maze": "no_curtain", "out": folder / "set", "workers": 1}
+        collect.collect(replace(collect.PRESETS["smoke"], **shape))  # type: ignore[arg-type]
+        config = replace(PRESETS["cpu"], data=folder / "set", out=folder)
+        data = MazeData(*open_maze_set(folder / "set", folder / "cache"), config, None)
+        device = pick_device("auto")
+        trainer = Trainer(make_objective(data, config).to(device), data.on(device), config)
+    step = _seconds(trainer.update, 5)
+    kept = trainer.batch()
+
+    def passes() -> None:
+        with autocast(device, config.precision):
+            loss, *_ = trainer.losses(kept)
+        loss.backward()
+
+    return {"training_steps_per_s": 1 / step, "training_overhead_share": max(0.0, 1 - _seconds(passes, 5) / step)}
 
 
 def _rate(function: Callable[[], Any], count: int) -> float:

@@ -6,9 +6,9 @@ photographs that scikit-learn ships, or images from a folder: CIFAR-10's python 
 
 from __future__ import annotations
 
-import pickletools
 from collections.abc import Iterator
 from pathlib import Path
+from pickletools import genops
 
 import numpy as np
 import torch
@@ -110,7 +110,7 @@ def _binary_records(path: Path) -> np.ndarray:
 def _python_records(path: Path) -> np.ndarray:
     """The pixels inside a pickled batch, found without running the pickle: its one long run of bytes."""
     try:
-        runs = [a for _, a, _ in pickletools.genops(path.read_bytes()) if isinstance(a, str | bytes)]
+        runs = [a for _, a, _ in genops(path.read_bytes()) if isinstance(a, str | bytes)]
         longest = max(runs, key=len, default=b"")
         raw = longest.encode("latin-1") if isinstance(longest, str) else longest
     except (ValueError, OSError) as error:

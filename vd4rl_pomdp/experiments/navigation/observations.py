@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Literal
 
 import torch
@@ -19,9 +20,9 @@ _LUMA = (0.299, 0.587, 0.114)
 _BLOCK = 1000
 
 
-def open_maze_set(path: str) -> tuple[Dataset, MazeSpec]:
+def open_maze_set(path: Path, cache: Path | None = None) -> tuple[Dataset, MazeSpec]:
     """A set of maze data and its maze; raises UserError if it is of something else or holds no true states."""
-    dataset = open_dataset(path, frame_size=PICTURE_SIZE)
+    dataset = open_dataset(path, cache, PICTURE_SIZE)
     attributes = dataset.store.meta["attributes"]
     names = {stored.get("task") for stored in attributes}
     if len(names) != 1 or not names <= set(MAZES):
