@@ -13,6 +13,7 @@ import finetune.config
 import pretrain.config
 from finetune.features import FrozenEncoder
 from finetune.train import finetune as run_finetune
+from pretrain.objectives import METHODS
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.corruptions import CorruptionConfig
@@ -74,7 +75,7 @@ def smoke_pretrain(data: Path, out: Path, **changes: object) -> pretrain.config.
     return replace(pretrain.config.PRESETS["smoke"], data=data, out=out, corruption="patch+zero_frames", **changes)
 
 
-@pytest.mark.parametrize("method", ["mik+a", "acro"])
+@pytest.mark.parametrize("method", [name for name, method in METHODS.items() if method.trained])
 def test_pretraining_resumes_to_the_bit(data, tmp_path, monkeypatch, method):
     whole = run_pretrain(smoke_pretrain(data, tmp_path / "whole", method=method))
     cut = smoke_pretrain(data, tmp_path / "cut", method=method)
@@ -116,6 +117,45 @@ def test_finetuning_resumes_to_the_bit(encoder, data, tmp_path, monkeypatch, alg
     assert not (whole.path / "features.npy").exists()
 
 
+@pytest.fixture
+def with_states(tmp_path) -> Path:
+    return write_fake_set(tmp_path / "own" / "walker_walk" / "expert", [20, 25, 30], physics_dim=18)
+
+
+@pytest.mark.parametrize("method", ["bc", "drq_bc", "state"])
+def test_references_resume_to_the_bit(with_states, tmp_path, monkeypatch, method):
+    made = run_pretrain(smoke_pretrain(with_states, tmp_path / "made", method=method)).path / "encoder"
+    changes = {"updates": 12, "eval_every": 6, "checkpoint_every": 4, "batch_size": 4, "eval_length": 2}
+    whole = run_finetune(smoke_finetune(made, with_states, tmp_path / "whole", **changes))
+    cut = smoke_finetune(made, with_states, tmp_path / "cut", **changes)
+    with monkeypatch.context() as patch:
+        cut_at(patch, "finetune.train", 2)
+        with pytest.raises(CutError):
+            run_finetune(cut)
+    run_finetune(cut)
+    assert contents(tmp_path / "cut") == contents(whole.path)
+    trained = (whole.path / "encoder" / "model.safetensors").read_bytes()
+    assert (trained != (made / "model.safetensors").read_bytes()) == (method != "state")
+    rows = list(csv.DictReader((whole.path / "episodes.csv").open()))
+    assert {row["algorithm"] for row in rows} == {{"bc": "bc", "drq_bc": "drqv2_bc", "state": "td3_bc"}[method]}
+
+
+def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_them(with_states, data, tmp_path):
+    encoder, _ = load_encoder(
+        run_pretrain(smoke_pretrain(with_states, tmp_path / "s", method="state")).path / "encoder"
+    )
+    dataset = open_dataset(with_states)
+    frozen = FrozenEncoder(encoder, dataset, CorruptionConfig("patch"), 4, "fp32", 0)
+    z = frozen.episode(1, 0, frozen.corruption(0)).numpy()
+    rows = slice(int(dataset.episode_start[1]), int(dataset.episode_end[1]))
+    assert z.shape == (25, 17)
+    assert np.allclose(z, np.delete(dataset.physics[rows], 1, axis=1))
+    with pytest.raises(UserError, match="stores no simulator states"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "none", method="state"))
+    with pytest.raises(UserError, match="drq_bc has no memory"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "gru", method="drq_bc", history="gru"))
+
+
 def test_exact_batches_agree_with_cached_features(encoder, data):
     """Without corruption and shift both modes must give the same representation for the same row."""
     from finetune.features import ExactSampler
@@ -155,7 +195,10 @@ def test_user_slips_are_one_line(data, encoder, tmp_path):
     other = write_fake_set(tmp_path / "humanoid_walk" / "expert", [20, 20], action_dim=21)
     with pytest.raises(UserError, match="6 action dimensions"):
         run_finetune(smoke_finetune(encoder, other, tmp_path / "d"))
-    assert not any((tmp_path / name).exists() for name in "abcd")
+    for wrong in ({"m": -1}, {"n": -1}, {"max_k": 0}, {"homer_codes": -1}):
+        with pytest.raises(UserError, match="must be at least"):
+            run_pretrain(smoke_pretrain(data, tmp_path / "e", **wrong))
+    assert not any((tmp_path / name).exists() for name in "abcde")
 
 
 def test_td3_bc_finds_the_better_action_and_bc_the_common_one():

@@ -30,7 +30,8 @@ def random_shift(obs: Tensor, key: Tensor, pad: int = 4) -> Tensor:
     if pad == 0:
         return obs
     offset = draw_integers(key, 2 * pad + 1, 2) - pad
-    if obs.device.type == "cpu" and obs.is_contiguous() and len(obs) > _ENDS:
+    large = len(obs) > _ENDS and min(obs.shape[-2:]) > pad
+    if large and obs.device.type == "cpu" and obs.is_contiguous():
         return _shift_by_copying(obs, offset, pad)
     return _shift_by_index(obs, offset)
 

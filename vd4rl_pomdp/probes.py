@@ -19,16 +19,19 @@ def probe_error(features: np.ndarray, targets: np.ndarray, episode: np.ndarray) 
 
     Args:
         features: (N, D) representations.
-        targets: (N, P) state variables; constant ones are left out.
+        targets: (N, P) state variables; constant ones are left out (all constant: the error is 0).
         episode: (N,) episode of every row. Every fifth episode is held out, the others are fitted.
     """
     held_out = episode % HELD_OUT == HELD_OUT - 1 if episode.max() >= HELD_OUT - 1 else episode == episode.max()
     scale = StandardScaler().fit(targets[~held_out])
     varying = scale.var_ > 1e-10
+    if not varying.any():
+        return 0.0
     targets = scale.transform(targets)[:, varying]
     inputs = StandardScaler().fit(features[~held_out])
     fitted = Ridge(alpha=1.0).fit(inputs.transform(features[~held_out]), targets[~held_out])
-    return float(np.abs(fitted.predict(inputs.transform(features[held_out])) - targets[held_out]).mean() * 100)
+    error = fitted.predict(inputs.transform(features[held_out])).reshape(-1, varying.sum()) - targets[held_out]
+    return float(np.abs(error).mean() * 100)
 
 
 def probe_state(features: np.ndarray, physics: np.ndarray, episode: np.ndarray, task: Task) -> dict[str, float]:

@@ -1,0 +1,58 @@
+"""Objectives that must be equal are, to 1e-6: methods differ in what they claim to differ in, in nothing else."""
+
+import pytest
+import torch
+
+from tests.conformance.test_methods import ROWS, batch, build
+
+
+def assert_same_logits(first: torch.nn.Module, second: torch.nn.Module) -> None:
+    second.load_state_dict(first.state_dict())
+    window = batch()
+    real = first.pairs(ROWS).sum(1) < window.length[:, None]
+    found = first.action_logits(window)[real]
+    torch.testing.assert_close(found, second.action_logits(window)[real], atol=1e-6, rtol=1e-6)
+
+
+def test_acro_with_k_1_is_one_step_inverse():
+    assert_same_logits(build("acro", max_k=1), build("one_step_inverse"))
+
+
+@pytest.mark.parametrize("actions", ["", "+a"])
+def test_fj_whose_past_covers_the_window_is_ah(actions: str):
+    assert_same_logits(build(f"fj{actions}", m=ROWS), build(f"ah{actions}"))
+
+
+@pytest.mark.parametrize("actions", ["", "+a"])
+def test_mik_with_a_past_of_m_rows_has_the_past_of_fj(actions: str):
+    mik, fj = build(f"mik{actions}", m=2), build(f"fj{actions}", m=2)
+    fj.encoder.load_state_dict(mik.encoder.state_dict())
+    window = batch()
+    torch.testing.assert_close(mik.representations(window)[0], fj.representations(window)[0], atol=1e-6, rtol=1e-6)
+
+
+def test_mik_with_a_long_future_is_mik():
+    assert_same_logits(build("mik+a", n=ROWS), build("mik+a"))
+
+
+def test_mik_with_a_future_of_one_row_sees_that_row_alone():
+    objective, window = build("mik", n=0), batch()
+    future = objective.representations(window)[1]
+    features = objective.encoder.frame(window.obs)
+    alone = torch.stack([objective.backward_gru(features[:, j : j + 1])[0][:, 0] for j in range(4)], 1)
+    torch.testing.assert_close(future[:, :4], alone, atol=1e-6, rtol=1e-6)
+
+
+def test_no_history_is_acro():
+    assert_same_logits(build("acro"), build("no_history"))
+
+
+def test_padding_a_window_leaves_its_logits():
+    for method in ("mik+a", "mik", "fj+a", "ah", "acro"):
+        objective = build(method, **({"m": 2, "n": 1} if method == "mik" else {}))
+        whole, padded = batch((4, 4)), batch((4, 4))
+        short = whole.replace(**{n: whole[n][:, :4] for n in ("obs", "prev_action", "action", "has_action", "key")})
+        pairs = objective.pairs(ROWS)
+        inside = pairs.sum(1) < 4
+        logits = objective.action_logits(padded)[:, inside]
+        torch.testing.assert_close(logits, objective.action_logits(short), atol=1e-6, rtol=1e-6)

@@ -1,0 +1,45 @@
+import numpy as np
+import pytest
+from dm_control import suite
+
+from vd4rl_pomdp.probes import probe_error, probe_state
+from vd4rl_pomdp.tasks import TASKS, get_task
+
+RNG = np.random.default_rng(0)
+
+
+def test_a_linear_function_of_the_state_is_found_and_noise_is_not():
+    episode = np.arange(2000) // 100
+    states = RNG.normal(size=(2000, 4)) * [1, 2, 0.5, 3] + 5
+    features = states @ RNG.normal(size=(4, 8)) + 2
+    assert probe_error(features, states, episode) < 1
+    assert probe_error(RNG.normal(size=(2000, 8)), states, episode) == pytest.approx(80, abs=3)
+    assert probe_error(np.where(episode[:, None] % 5 == 4, 0, features), states, episode) > 60, (
+        "tested on unseen episodes"
+    )
+
+
+def test_constant_states_are_left_out_and_one_episode_is_enough_to_test():
+    states = np.column_stack([np.sin(np.arange(60.0)), np.full(60, 3.0)])
+    assert probe_error(states[:, :1], states, np.arange(60) // 20) < 10
+    assert probe_error(states[:, :1], states, np.arange(60) // 30) < 10
+
+
+def test_pose_and_velocity_are_apart():
+    task = get_task("walker_walk")
+    physics = RNG.normal(size=(1000, 18))
+    episode = np.arange(1000) // 50
+    found = probe_state(task.velocity(physics), physics, episode, task)
+    assert found["probe_velocity"] < 1
+    assert found["probe_pose"] > 70
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_tasks_name_the_columns_of_their_simulators(name: str):
+    task = TASKS[name]
+    physics = suite.load(task.domain, task.task).physics
+    assert task.positions == physics.model.nq
+    joints = [physics.model.id2name(i, "joint") for i in range(physics.model.njnt)]
+    travel = (0, 1) if joints[0] == "root" else (joints.index("rootx"),)
+    assert task.travel == travel
+    assert task.visible_state(physics.get_state()[None]).shape == (1, physics.get_state().size - len(travel))
