@@ -304,8 +304,11 @@ def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]
     """Means of the logged intervals that end in the last `average_last` steps."""
     logged = [json.loads(line) for line in path.read_text().splitlines()]
     last = [row for row in logged if row["step"] > config.steps - config.average_last]
-    names = {name for row in last for name in row} - {"step"}
-    return {name: sum(row[name] for row in last if name in row) / len([r for r in last if name in r]) for name in names}
+    values: dict[str, list[float]] = defaultdict(list)
+    for row in last:
+        for name, value in row.items():
+            values[name].append(value)
+    return {name: sum(numbers) / len(numbers) for name, numbers in values.items()}
 
 
 def _write_trajectory(path: Path, trainer: Trainer, probe: StateProbe) -> None:

@@ -189,8 +189,8 @@ def _page(runs: list[Run], tables: list[Table], drawn: bool, pictures: bool) -> 
     lines = ["# Navigation: what the objectives know of the state", ""]
     lines += [
         f"{len(runs)} runs, preset `{preset}`, {' or '.join(map(str, steps))} gradient steps, seeds "
-        f"{', '.join(map(str, seeds))}. A cell reads: **mean over seeds** [95% bootstrap interval] n=seeds "
-        "(the paper's number). The paper's budget is 200,000 steps on 500k samples. Intervals of few seeds are too narrow.",
+        f"{', '.join(map(str, seeds))}. A cell reads: **mean over seeds** [95% bootstrap interval] n=seeds (the paper's",
+        "number). The paper's budget is 200,000 steps on 500k samples. Intervals of few seeds are too narrow.",
         "",
         "![Accuracy of every objective](figures/accuracy.png)",
         "",
