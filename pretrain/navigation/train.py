@@ -158,16 +158,16 @@ class Trainer:
         with ProgressLine(f"{self.data.maze.name} {self.config.method}", steps, "steps", self.step) as progress:
             while self.step < steps:
                 count = min(self.config.log_every, steps - self.step)
-                row = self._interval(count, progress)
+                row = self._interval(count)
                 log.write(self.step, row)
-                progress.advance(0, loss=row["loss"], state=row["state"])
+                progress.advance(count, loss=row["loss"], state_error=row["state"])
                 if self.step % self.config.checkpoint_every == 0 or self.step == steps:
                     self.seconds = run.seconds(before)
                     save_checkpoint(run.checkpoint, self._state())
         self.seconds = run.seconds(before)
         log.close()
 
-    def _interval(self, count: int, progress: ProgressLine) -> dict[str, float]:
+    def _interval(self, count: int) -> dict[str, float]:
         """Means over the next `count` steps."""
         sums: dict[str, Tensor | float] = defaultdict(float)
         errors = ErrorSums()
@@ -176,7 +176,6 @@ class Trainer:
             errors.add(*states, self.config.burn_in)
             for name, value in logs.items():
                 sums[name] = sums[name] + value
-            progress.advance()
         return {name: float(value) / count for name, value in sums.items()} | errors.percent()
 
     def _state(self) -> dict[str, Any]:

@@ -42,8 +42,9 @@ class ExogenousNoise:
 
     def __call__(self, pictures: Tensor, key: Tensor) -> Tensor:
         """Noisy copies of (N, 3, 100, 100) uint8 pictures, drawn by (N,) int64 row keys."""
+        self.pool = self.pool.to(pictures.device)
         chosen = draw_integers(derive_keys(self._seed, key), len(self.pool), 1)[:, 0]
-        added = self.pool.to(pictures.device)[chosen].float().mul_(self._weight)
+        added = self.pool[chosen].float().mul_(self._weight)
         return added.add_(pictures).round_().clamp_(max=255).to(torch.uint8)
 
 

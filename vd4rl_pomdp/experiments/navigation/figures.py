@@ -57,6 +57,7 @@ def trajectories(runs: list[Run], path: Path, methods: tuple[str, ...] = ("mik+a
     if not found:
         return False
     mazes = [maze for maze in MAZES if any(run.cell.maze == maze for run in found)]
+    methods = tuple(method for method in methods if any(run.cell.method == method for run in found))
     figure = Figure(figsize=(3.2 * len(methods), 3.3 * len(mazes)), layout="constrained")
     panels = figure.subplots(len(mazes), len(methods), squeeze=False)
     for axes in panels.flat:

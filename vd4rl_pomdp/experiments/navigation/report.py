@@ -1,6 +1,6 @@
 """The navigation report: the paper's tables from raw rows, each number beside the paper's, and what they say.
 
-OUT/report.md     tables, verdicts, figures, and the command of every cell
+OUT/README.md     tables, verdicts, figures, and the command of every cell
 OUT/rows.csv, runs.csv, trajectories/     raw numbers; `navigation report OUT` makes everything again from them
 OUT/tables.csv    every cell: mean, interval, seeds, the paper's number
 OUT/figures/      accuracy.png, trajectories.png, observations.png
@@ -103,7 +103,7 @@ def write_report(sources: Sequence[Path], out: Path, pictures: bool = True) -> P
         figures.sample_observations(out / "figures" / "observations.png")
     tables = make_tables(runs)
     _write_tables(tables, out / "tables.csv")
-    page = out / "report.md"
+    page = out / "README.md"
     page.write_text("\n".join(_page(runs, tables, drawn, pictures)) + "\n")
     return page
 
@@ -189,8 +189,8 @@ def _page(runs: list[Run], tables: list[Table], drawn: bool, pictures: bool) -> 
     lines = ["# Navigation: what the objectives know of the state", ""]
     lines += [
         f"{len(runs)} runs, preset `{preset}`, {' or '.join(map(str, steps))} gradient steps, seeds "
-        f"{', '.join(map(str, seeds))}. A cell reads: **mean over seeds** [95% bootstrap interval] n=seeds (the paper's",
-        "number). The paper's budget is 200,000 steps on 500k samples. Intervals of few seeds are too narrow.",
+        f"{', '.join(map(str, seeds))}. A cell reads: **mean over seeds** [95% bootstrap interval] n=seeds (the",
+        "paper's number). The paper's budget is 200,000 steps on 500k samples. Intervals of few seeds are too narrow.",
         "",
         "![Accuracy of every objective](figures/accuracy.png)",
         "",
