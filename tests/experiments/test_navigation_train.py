@@ -252,3 +252,14 @@ def test_the_mixer_has_the_papers_shape():
     assert (paper.gru_layers, paper.hidden_dim, paper.batch_size, paper.window) == (2, 256, 16, 64)
     assert (paper.steps, paper.average_last, paper.learning_rate, paper.codes) == (200_000, 10_000, 1e-4, 20)
     assert re.fullmatch("mixer", paper.frame_encoder)
+
+
+@pytest.mark.parametrize(("frame_encoder", "picture"), [("mixer", "rgb100"), ("small", "grey50")])
+def test_streaming_and_windows_agree_for_the_mazes_encoders(maze_set, tmp_path, frame_encoder, picture):
+    trainer = trainer_of(smoke(maze_set, tmp_path / "run", frame_encoder=frame_encoder, picture=picture, batch_size=1))
+    window, encoder = trainer.batch(), trainer.objective.encoder.eval()
+    with torch.no_grad():
+        whole, state = encoder.encode(window), encoder.initial_state(1)
+        for t in range(6):
+            z, state = encoder.step(window.obs[:, t], window.prev_action[:, t], state)
+            torch.testing.assert_close(z, whole[:, t], atol=1e-5, rtol=1e-4)
