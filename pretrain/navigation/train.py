@@ -359,6 +359,8 @@ def _check(config: NavigationConfig) -> None:
             raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {low}")
     if config.picture not in SHAPES:
         raise UserError(f"unknown picture {config.picture!r}: choose one of {', '.join(SHAPES)}")
+    if config.literal_future and config.method != "mik+a":
+        raise UserError(f"--literal-future is for mik+a, not for {config.method}: leave it out or change --method")
     if config.burn_in >= config.window:
         raise UserError(f"--burn-in {config.burn_in} leaves no row of a window of {config.window}: lower it")
     if config.checkpoint_every % config.log_every:
