@@ -8,7 +8,7 @@ import time
 from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
@@ -30,6 +30,10 @@ from vd4rl_pomdp.runs.workers import run_jobs
 from vd4rl_pomdp.tasks import FRAME_SIZE
 from vd4rl_pomdp.types import StepType
 
+if TYPE_CHECKING:
+    from pretrain.config import PretrainConfig
+    from pretrain.train import Trainer
+
 BATCH = 256
 EPISODE_ROWS = 501
 GOALS: dict[str, tuple[str, float]] = {
@@ -40,6 +44,7 @@ GOALS: dict[str, tuple[str, float]] = {
     "pretraining.fp32_overhead_share": ("<=", 0.2),
     "pretraining.bf16_overhead_share": ("<=", 0.2),
     "pretraining.bf16_over_fp32": (">=", 1.4),
+    "methods.k_30_over_k_15": ("<=", 1.25),
     "finetuning.cached_over_exact": (">=", 20.0),
     "collection.fast_over_exact": (">=", 1.4),
     "collection.fast_mean_difference_of_255": ("<=", 0.05),
@@ -69,6 +74,7 @@ def bench(quick: bool = False) -> dict[str, Any]:
             "sampling": _sampling(dataset, repeats),
             "pretraining": _pretraining(dataset, Path(folder), repeats),
             "finetuning": _finetuning(dataset, repeats),
+            "methods": _methods(dataset, Path(folder), repeats),
             "memory": _memory(Path(folder), dataset.frames.numel()),
         }
     results["collection"] = _collection(60 if quick else 200)
@@ -165,9 +171,6 @@ def _sampling(dataset: Dataset, repeats: int) -> dict[str, float]:
 def _pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
     """Share of a step that is not the network's forward and backward pass, and bf16 against fp32."""
     from pretrain.config import PRESETS
-    from pretrain.objectives import build_objective
-    from pretrain.train import Trainer
-    from vd4rl_pomdp.nn.action_target import make_action_target
 
     device = pick_device("auto")
     results: dict[str, Any] = {"device": str(device)}
@@ -176,13 +179,43 @@ def _pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]
         config = replace(
             PRESETS["paper"], data=folder, out=folder, batch_size=8, corruption="patch+zero_frames", precision=precision
         )
-        target = make_action_target("kmeans", dataset.action[:2000].numpy(), config.codes, 0)
-        trainer = Trainer(build_objective(config, dataset.action, target).to(device), dataset, config)
+        trainer = _trainer(dataset, config)
         steps[precision] = _seconds(lambda t=trainer: t.update(), max(3, repeats // 3))  # type: ignore[misc]
         passes = _seconds(lambda t=trainer: _forward_backward(t, device), max(3, repeats // 3))  # type: ignore[misc]
         results[f"{precision}_frames_per_s"] = config.batch_size * config.window / steps[precision]
         results[f"{precision}_overhead_share"] = max(0.0, 1 - passes / steps[precision])
     return results | {"bf16_over_fp32": steps["fp32"] / steps["bf16"]}
+
+
+def _methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
+    """Step time and frames/s of every method in the cpu preset, and what doubling K costs MIK+A."""
+    from pretrain.config import PRESETS
+    from pretrain.objectives import METHODS
+
+    trained = [name for name, method in METHODS.items() if method.trained]
+    config = replace(PRESETS["cpu"], data=folder, out=folder, corruption="patch+zero_frames")
+    results: dict[str, Any] = {}
+    for name in trained:
+        seconds = _step_seconds(dataset, replace(config, method=name), repeats)
+        frames = config.batch_size * config.window / seconds
+        results[name] = {"step_ms": seconds * 1e3, "frames_per_s": frames}
+    wide = [_step_seconds(dataset, replace(config, max_k=k), repeats) for k in (15, 30)]
+    return results | {"k_30_over_k_15": wide[1] / wide[0]}
+
+
+def _step_seconds(dataset: Dataset, config: PretrainConfig, repeats: int) -> float:
+    trainer = _trainer(dataset, config)
+    return _seconds(lambda: trainer.update(), max(3, repeats // 3))
+
+
+def _trainer(dataset: Dataset, config: PretrainConfig) -> Trainer:
+    from pretrain.objectives import build_objective
+    from pretrain.train import Trainer
+    from vd4rl_pomdp.nn.action_target import make_action_target
+
+    target = make_action_target("kmeans", dataset.action[:2000].numpy(), config.codes, 0)
+    objective = build_objective(config, dataset.action, target)
+    return Trainer(objective.to(dataset.t.device), dataset, config)
 
 
 def _forward_backward(trainer: Any, device: torch.device) -> None:
@@ -229,15 +262,11 @@ def _memory(folder: Path, frame_bytes: int) -> dict[str, float]:
 def _train_a_little(job: tuple[Path, int]) -> tuple[int, int]:
     """Peak resident bytes of a process that reads the whole set and trains, and how many of them it does not share."""
     from pretrain.config import PRESETS
-    from pretrain.objectives import build_objective
-    from pretrain.train import Trainer
-    from vd4rl_pomdp.nn.action_target import make_action_target
 
     folder, steps = job
     dataset = open_dataset(folder / "set", folder / "cache")
     config = replace(PRESETS["cpu"], data=folder, out=folder, corruption="patch+zero_frames")
-    target = make_action_target("kmeans", dataset.action[:2000].numpy(), config.codes, 0)
-    trainer = Trainer(build_objective(config, dataset.action, target), dataset, config)
+    trainer = _trainer(dataset, config)
     for _ in range(steps):
         trainer.update()
     _read(dataset.frames)

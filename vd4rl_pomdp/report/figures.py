@@ -10,6 +10,8 @@ import numpy as np
 from matplotlib.figure import Figure
 from PIL import Image
 
+from vd4rl_pomdp.report.tables import label
+
 mpl.rcParams["svg.hashsalt"] = "vd4rl-pomdp"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
 """Okabe and Ito's palette, which colour-blind readers can tell apart."""
@@ -20,16 +22,36 @@ def curve_figure(rows: list[dict[str, Any]], methods: list[str]) -> str:
     """Score against updates, one line a method, a band from the lowest to the highest seed."""
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     axes = figure.subplots()
-    for method in dict.fromkeys(row["method"] for row in rows):
-        mine = [row for row in rows if row["method"] == method]
-        colour = COLOURS[methods.index(method) % len(COLOURS)]
+    for method in dict.fromkeys(map(label, rows)):
+        mine = [row for row in rows if label(row) == method]
+        style = _style(methods.index(method))
         steps = [row["step"] for row in mine]
-        axes.plot(steps, [row["score"] for row in mine], "o-", color=colour, label=method, markersize=4)
-        axes.fill_between(steps, [r["low"] for r in mine], [r["high"] for r in mine], color=colour, alpha=0.15, lw=0)
+        axes.plot(steps, [row["score"] for row in mine], marker="o", label=method, markersize=4, **style)
+        axes.fill_between(
+            steps, [r["low"] for r in mine], [r["high"] for r in mine], color=style["color"], alpha=0.15, lw=0
+        )
     axes.set(xlabel="gradient updates", ylabel="score (return / 10)")
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=0)
     return _svg(figure, axes)
+
+
+def profile_figure(rows: list[dict[str, Any]], methods: list[str]) -> str:
+    """Share of runs above a score, one line a method."""
+    figure = Figure(figsize=(6.4, 3.2), layout="constrained")
+    axes = figure.subplots()
+    for method in dict.fromkeys(row["method"] for row in rows):
+        mine = [row for row in rows if row["method"] == method]
+        style = _style(methods.index(method))
+        axes.step([r["threshold"] for r in mine], [r["share"] for r in mine], where="post", label=method, **style)
+    axes.set(xlabel="score", ylabel="share of runs above it", xlim=(0, None), ylim=(0, 1.02))
+    return _svg(figure, axes)
+
+
+def _style(number: int) -> dict[str, Any]:
+    """Colour and dashes of the line of this number: more lines than colours stay distinct."""
+    dashes = ("-", "--", ":")[number // len(COLOURS) % 3]
+    return {"color": COLOURS[number % len(COLOURS)], "linestyle": dashes}
 
 
 def loss_figure(series: dict[str, list[dict[str, float]]]) -> str:
@@ -39,7 +61,7 @@ def loss_figure(series: dict[str, list[dict[str, float]]]) -> str:
     for number, (name, metrics) in enumerate(series.items()):
         steps = [row["step"] for row in metrics if "action_loss" in row]
         values = [row["action_loss"] for row in metrics if "action_loss" in row]
-        axes.plot(steps, values, color=COLOURS[number % len(COLOURS)], label=name, lw=1.2)
+        axes.plot(steps, values, label=name, lw=1.2, **_style(number))
     axes.set(xlabel="gradient steps", ylabel="action loss")
     return _svg(figure, axes)
 
@@ -47,7 +69,7 @@ def loss_figure(series: dict[str, list[dict[str, float]]]) -> str:
 def _svg(figure: Figure, axes: Any) -> str:
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=9)
+    axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
     text = buffer.getvalue()

@@ -30,6 +30,8 @@ class Run:
     metrics: list[dict[str, float]]
     seconds: float | None
     """Wall-clock time; None while the run is unfinished."""
+    representation: dict[str, float | None]
+    """What is known of its encoder: action_loss, probe_pose, probe_velocity, pretrain_seconds."""
 
     @property
     def identity(self) -> tuple[str, ...]:
@@ -75,7 +77,21 @@ def _load(folder: Path) -> Run:
         rows=_rows(folder / "episodes.csv"),
         metrics=read_metrics(folder / "metrics.jsonl"),
         seconds=read_json(timing)["seconds"] if timing.exists() else None,
+        representation=_representation(folder),
     )
+
+
+def _representation(folder: Path) -> dict[str, float | None]:
+    card, probe, timing = (
+        read_json(path) if path.exists() else {}
+        for path in (folder / "encoder" / "config.json", folder / "probe.json", folder / "pretrain_timing.json")
+    )
+    return {
+        "action_loss": card.get("pretrain", {}).get("action_loss"),
+        "probe_pose": probe.get("probe_pose"),
+        "probe_velocity": probe.get("probe_velocity"),
+        "pretrain_seconds": timing.get("seconds"),
+    }
 
 
 def _rows(path: Path) -> list[dict[str, Any]]:

@@ -8,12 +8,69 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.report import stats
+from vd4rl_pomdp.report.load import IDENTITY, Run
+from vd4rl_pomdp.tasks import SCORE_DIVISOR
 
 Row = dict[str, Any]
 SETTING = ("corruption", "algorithm")
 GROUP = ("task", "quality", "corruption", "algorithm", "method")
 REFERENCES = ("random", "bc", "drq_bc", "state")
 """Methods that are references: last in a table."""
+
+
+END_TO_END = ("bc", "drq_bc")
+"""References that bring their own algorithm."""
+
+
+def label(row: Row) -> str:
+    """A method's name in tables and figures, with the algorithm where it is not TD3+BC."""
+    own = row["algorithm"] == "td3_bc" or row["method"] in END_TO_END
+    return row["method"] if own else f"{row['method']}, {row['algorithm']}"
+
+
+def representations(runs: list[Run]) -> list[Row]:
+    """One row for every evaluated run: what its encoder knows, what its policy reached, what both cost."""
+    table = []
+    for run in runs:
+        if run.rows:
+            final = max(row["step"] for row in run.rows)
+            score = float(np.mean([row["score"] for row in run.rows if row["step"] == final]))
+            identity = dict(zip(IDENTITY, run.identity, strict=True))
+            costs = {"finetune_seconds": run.seconds, "git_commit": run.record.get("git_commit", "")}
+            table.append(identity | run.representation | {"score": score, "return": score * SCORE_DIVISOR} | costs)
+    return sorted(table, key=_table_order)
+
+
+def improvement(rows: list[Row]) -> list[Row]:
+    """Probability that a run of one method beats one of another on the same task, averaged over common tasks."""
+    table = []
+    for setting, members in _grouped(rows, ("corruption",)):
+        final: dict[str, dict[tuple, np.ndarray]] = {}
+        for (task, quality, *_), group in _grouped(members, (*GROUP,)):
+            curve = _by_step(group)
+            final.setdefault(label(group[0]), {})[task, quality] = _per_seed(curve[max(curve)])
+        for name, scores in final.items():
+            for other, others in final.items():
+                common = [task for task in scores if task in others]
+                if name != other and common:
+                    chances = [stats.probability_of_improvement(scores[t], others[t]) for t in common]
+                    place = {"corruption": setting[0], "method": name, "other": other}
+                    table.append(place | {"probability": float(np.mean(chances)), "tasks": len(common)})
+    return table
+
+
+def profiles(rows: list[Row], thresholds: np.ndarray) -> list[Row]:
+    """Share of runs (all tasks and seeds of a method) whose final score is above each threshold."""
+    table = []
+    for (corruption, *_), members in _grouped(rows, (*SETTING, "method")):
+        strata = []
+        for _, task_rows in _grouped(members, ("task", "quality")):
+            curve = _by_step(task_rows)
+            strata.append(_per_seed(curve[max(curve)]))
+        share = stats.performance_profile(np.concatenate(strata), thresholds)
+        place = {"corruption": corruption, "method": label(members[0])}
+        table += [place | {"threshold": float(t), "share": float(v)} for t, v in zip(thresholds, share, strict=True)]
+    return table
 
 
 def summary(rows: list[Row]) -> list[Row]:
@@ -69,7 +126,7 @@ def aggregate(rows: list[Row]) -> list[Row]:
 
 
 def _table_order(row: Row) -> tuple:
-    place = tuple(row.get(name, "") for name in ("task", "quality", *SETTING))
+    place = tuple(row.get(name, "") for name in ("task", "quality", "corruption"))
     return *place, row["method"] in REFERENCES, -float(row["score"] if "score" in row else row["iqm"])
 
 

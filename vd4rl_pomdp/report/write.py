@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import Any
 
 import jinja2
+import numpy as np
 from rich.console import Console
 from rich.table import Table
 
@@ -28,14 +29,21 @@ def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
     rows = [row for run in runs for row in run.rows]
     if not rows:
         raise UserError(f"{paths[0]}: holds no evaluated run yet; `vd4rl-pomdp finetune` evaluates")
-    summary, curves, aggregate = tables.summary(rows), tables.curves(rows), tables.aggregate(rows)
+    made = {
+        "summary": tables.summary(rows),
+        "curves": tables.curves(rows),
+        "aggregate": tables.aggregate(rows),
+        "runs": tables.representations(runs),
+        "improvement": tables.improvement(rows),
+        "profiles": tables.profiles(rows, np.linspace(0, 100, 101)),
+    }
     out.mkdir(parents=True, exist_ok=True)
-    for name, table in (("summary", summary), ("curves", curves), ("aggregate", aggregate)):
-        _write_csv(out / f"{name}.csv", table, list(table[0]))
+    for name, table in made.items():
+        if table:
+            _write_csv(out / f"{name}.csv", table, list(table[0]))
     _write_csv(out / "episodes.csv", rows, list(COLUMNS))
-    page = _render(runs, rows, summary, curves, aggregate)
-    (out / "index.html").write_text(page)
-    return out / "index.html", summary
+    (out / "index.html").write_text(_render(runs, rows, made))
+    return out / "index.html", made["summary"]
 
 
 def print_summary(summary: list[Row], console: Console | None = None) -> None:
@@ -48,22 +56,26 @@ def print_summary(summary: list[Row], console: Console | None = None) -> None:
     for row in summary:
         interval = f"{row['low']:.1f} - {row['high']:.1f}" if row["low"] is not None else "-"
         cells = (f"{row['score']:.1f}", interval, str(row["seeds"]), str(row["episodes"]))
-        table.add_row(_setting(row), row["method"], *cells)
+        table.add_row(_setting(row), tables.label(row), *cells)
     (console or Console()).print(table)
 
 
-def _render(runs: list[Run], rows: list[Row], summary: list[Row], curves: list[Row], aggregate: list[Row]) -> str:
+def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]]) -> str:
     template = files("vd4rl_pomdp.report").joinpath("page.html").read_text()
     environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    methods = list(dict.fromkeys(row["method"] for row in summary))
-    pretraining = {_title(run): run.metrics for run in runs if run.stage == "pretrain" and run.metrics}
+    environment.filters |= {"label": tables.label, "number": _number}
+    names = list(dict.fromkeys(map(tables.label, made["summary"])))
+    pretraining = {_title(run): run.metrics for run in runs if run.stage == "pretrain" and _has_losses(run)}
     return environment.from_string(template).render(
         finished=sum(run.seconds is not None for run in runs),
         rows=len(rows),
         few=FEW_SEEDS,
-        tables=_by_setting(summary),
-        aggregate=aggregate,
-        curves=[(name, figures.curve_figure(part, methods)) for name, part in _by_setting(curves)],
+        tables=_by_setting(made["summary"]),
+        aggregate=made["aggregate"],
+        representations=made["runs"],
+        improvement=_matrices(made["improvement"]),
+        curves=[(name, figures.curve_figure(part, names)) for name, part in _by_setting(made["curves"])],
+        profiles=[(name, figures.profile_figure(part, names)) for name, part in _by(made["profiles"], "corruption")],
         losses=figures.loss_figure(pretraining) if pretraining else "",
         films=_films(runs),
         published=_published(rows),
@@ -71,8 +83,30 @@ def _render(runs: list[Run], rows: list[Row], summary: list[Row], curves: list[R
     )
 
 
+def _has_losses(run: Run) -> bool:
+    return any("action_loss" in row for row in run.metrics)
+
+
+def _number(value: float | None, digits: int = 1) -> str:
+    return "–" if value is None else f"{value:.{digits}f}"
+
+
+def _by(rows: list[Row], name: str) -> list[tuple[str, list[Row]]]:
+    return [(key, [row for row in rows if row[name] == key]) for key in dict.fromkeys(row[name] for row in rows)]
+
+
+def _matrices(rows: list[Row]) -> list[Row]:
+    """Improvement tables by corruption: names, and the probability for every pair of them."""
+    matrices = []
+    for corruption, members in _by(rows, "corruption"):
+        names = list(dict.fromkeys(row["method"] for row in members))
+        values = {(row["method"], row["other"]): row["probability"] for row in members}
+        matrices.append({"corruption": corruption, "names": names, "values": values})
+    return matrices
+
+
 def _setting(row: Row) -> str:
-    return f"{row['task']} {row['quality']}, {row['corruption']}, {row['algorithm']}"
+    return f"{row['task']} {row['quality']}, {row['corruption']}"
 
 
 def _by_setting(rows: list[Row]) -> list[tuple[str, list[Row]]]:
@@ -85,7 +119,7 @@ def _by_setting(rows: list[Row]) -> list[tuple[str, list[Row]]]:
 def _title(run: Run) -> str:
     config = run.record["config"]
     if run.rows:
-        return f"{run.stage} {run.rows[0]['method']}, {_setting(run.rows[0])}, seed {config['seed']}"
+        return f"{run.stage} {tables.label(run.rows[0])}, {_setting(run.rows[0])}, seed {config['seed']}"
     return f"{run.stage} {config.get('method', run.path.name)}, {config.get('corruption', '')}, seed {config['seed']}"
 
 
