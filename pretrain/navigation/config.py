@@ -133,3 +133,15 @@ PRESETS = {
     "smoke": NavigationConfig(**(_CPU | _SMOKE), preset="smoke"),
 }
 """Defaults by preset: the paper's setting for a GPU, one for two cores, and one that takes seconds."""
+
+
+def command_of(config: NavigationConfig) -> list[str]:
+    """Words of the command that trains with a config: the preset, and every flag that differs from it."""
+    words = ["vd4rl-pomdp", "navigation", "train", "--preset", config.preset]
+    for field in fields(config):
+        value, default = getattr(config, field.name), getattr(PRESETS[config.preset], field.name)
+        flag = field.name.replace("_", "-")
+        if value == default or field.name in ("preset", "device", "wandb"):
+            continue
+        words += [f"--{'' if value else 'no-'}{flag}"] if isinstance(value, bool) else [f"--{flag}", str(value)]
+    return words

@@ -9,6 +9,7 @@ from __future__ import annotations
 import csv
 import json
 import math
+import shlex
 from collections import defaultdict
 from dataclasses import asdict
 from pathlib import Path
@@ -17,7 +18,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from pretrain.navigation.config import NavigationConfig
+from pretrain.navigation.config import NavigationConfig, command_of
 from pretrain.navigation.probe import ErrorSums, StateProbe, TrueStates, refit
 from pretrain.objectives import build_objective, get_method
 from vd4rl_pomdp.corruptions import CorruptionConfig
@@ -272,7 +273,8 @@ def _conclude(run: RunFolder, trainer: Trainer, data: MazeData) -> None:
         preset=config.preset,
     )
     save_encoder(run.path / "encoder", trainer.objective.encoder, card)
-    write_json(run.path / "results.json", {"maze": data.maze.name, "set": data.dataset.fingerprint, "rows": rows})
+    record = {"maze": data.maze.name, "set": data.dataset.fingerprint, "command": shlex.join(command_of(config))}
+    write_json(run.path / "results.json", record | {"rows": rows})
     frames = trainer.step * config.batch_size * config.window
     run.finish(trainer.seconds, steps=trainer.step, frames=frames, total_seconds=round(run.seconds(0.0), 2))
 

@@ -30,7 +30,8 @@ def write_run(base: Path, cell: Cell, seed: int, level: float) -> Path:
         "preset": "cpu",
         "seed": seed,
     }
-    record = {"stage": "navigation", "config": config, "git_commit": "abc", "command": "vd4rl-pomdp navigation train"}
+    words = ["vd4rl-pomdp", *cell.words("cpu", Path("data"), Path("runs"), seed)]
+    record = {"stage": "navigation", "config": config, "git_commit": "abc", "command": " ".join(words)}
     common = {"rows": "all", "k": 0, "value": level}
     rows = [
         common | {"measure": f"{name}_error", "split": split, "probe": probe, "rows": shown}
@@ -87,7 +88,7 @@ def test_the_report_shows_means_seeds_and_the_papers_numbers(runs, tmp_path):
     assert (best["mean"], best["seeds"], best["paper"]) == ("21", "3", "6.0")
     assert float(best["low"]) < 21 < float(best["high"])
     assert "**21.0** [20.0, 22.0] n=3 (6.0)" in page
-    assert page.count("--seed 1 ") == 10, "one command for every run of seed 1"
+    assert page.count("--seed 1 --out runs/") == 10, "one command for every run of seed 1"
     for name in ("accuracy.png", "trajectories.png"):
         assert (tmp_path / "out" / "figures" / name).stat().st_size > 5_000
 

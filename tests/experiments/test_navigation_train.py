@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pretrain.navigation import train as module
-from pretrain.navigation.config import PRESETS, NavigationConfig
+from pretrain.navigation.config import PRESETS, NavigationConfig, command_of
 from pretrain.navigation.probe import ErrorSums, StateProbe, TrueStates, refit
 from pretrain.navigation.train import METHOD_NAMES, MazeData, Trainer, learning_rate, train
 from tests.helpers_data import write_fake_set
@@ -264,3 +264,16 @@ def test_streaming_and_windows_agree_for_the_mazes_encoders(maze_set, tmp_path, 
         for t in range(6):
             z, state = encoder.step(window.obs[:, t], window.prev_action[:, t], state)
             torch.testing.assert_close(z, whole[:, t], atol=1e-5, rtol=1e-4)
+
+
+def test_the_command_that_a_run_names_has_its_config(maze_set, tmp_path):
+    from vd4rl_pomdp.cli import _with_presets
+
+    for config in (
+        smoke(maze_set, tmp_path / "a run", method="fj+a", m=3, self_prediction=0.5, k_embedding=False),
+        replace(PRESETS["cpu"], data=maze_set, out=tmp_path, literal_future=True, seed=4, max_k=1),
+        replace(PRESETS["paper"], data=maze_set, out=tmp_path),
+    ):
+        words = command_of(config)
+        assert words[:3] == ["vd4rl-pomdp", "navigation", "train"]
+        assert _with_presets(NavigationConfig, PRESETS, words[3:], "x") == config

@@ -9,7 +9,6 @@ OUT/figures/      accuracy.png, trajectories.png, observations.png
 from __future__ import annotations
 
 import csv
-import shlex
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -243,8 +242,7 @@ def _commands(runs: list[Run]) -> list[str]:
         collect = f"vd4rl-pomdp navigation collect --preset {runs[0].preset} --maze {maze} --out data/{maze}"
         lines.append(collect)
     for run in runs:
-        words = run.cell.words(run.preset, Path("data"), Path("runs/navigation"), run.seed)
-        lines.append(f"{shlex.join(['vd4rl-pomdp', *words])}  # {float(run.facts['seconds']):.0f} s")
+        lines.append(f"{run.facts['command']}  # {float(run.facts['seconds']):.0f} s")
     return [*lines, "```"]
 
 

@@ -127,7 +127,7 @@ def _read_run(folder: Path) -> Run:
         "git_commit": record["git_commit"],
         "processor": machine["processor"],
         "gpu": machine["gpu"] or "",
-        "command": record["command"],
+        "command": results.get("command", record["command"]),
     }
     values = {_value(row): float(f"{row['value']:.6g}") for row in results["rows"]}
     trajectory = folder / "trajectory.csv"
