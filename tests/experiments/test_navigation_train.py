@@ -87,8 +87,9 @@ def test_an_interrupted_run_ends_like_an_uninterrupted_one(maze_set, tmp_path, m
         train(smoke(maze_set, tmp_path / "cut"))
     monkeypatch.setattr(Trainer, "update", update)
     train(smoke(maze_set, tmp_path / "cut"))
-    for name in ("metrics.jsonl", "results.json", "trajectory.csv", "encoder/model.safetensors"):
+    for name in ("metrics.jsonl", "trajectory.csv", "encoder/model.safetensors"):
         assert (whole.path / name).read_bytes() == (tmp_path / "cut" / name).read_bytes(), name
+    assert results(whole.path) == results(tmp_path / "cut")
     with pytest.raises(UserError, match=r"another config \(seed\)"):
         train(smoke(maze_set, tmp_path / "cut", seed=1))
 
