@@ -7,7 +7,7 @@ cd "$(dirname "$0")/.."
 PYTHON="${PYTHON:-python3}"
 VENV=.venv
 STAMP="$VENV/.installed"
-RENDER_PACKAGES="libegl1 libgl1-mesa-dri"
+RENDER_PACKAGES=(libegl1 libgl1-mesa-dri)
 
 say() { printf '%s\n' "$*" >&2; }
 
@@ -23,9 +23,7 @@ install_debian() {
     fi
     say "setup: installing $*"
     $as_root apt-get update -qq >/dev/null
-    # word splitting is wanted: a list of packages
-    # shellcheck disable=SC2086
-    DEBIAN_FRONTEND=noninteractive $as_root apt-get install -y -qq $* >/dev/null
+    $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq "$@" >/dev/null
 }
 
 wanted="$(cat pyproject.toml scripts/setup.sh | sha256sum | cut -d' ' -f1) $PYTHON"
@@ -51,7 +49,7 @@ can_render() {
     MUJOCO_GL="${MUJOCO_GL:-egl}" "$VENV/bin/python" scripts/can_render.py >/dev/null 2>&1
 }
 if ! can_render; then
-    install_debian "$RENDER_PACKAGES"
+    install_debian "${RENDER_PACKAGES[@]}"
     if ! can_render; then
         say "setup: rendering still fails with MUJOCO_GL=${MUJOCO_GL:-egl}; try MUJOCO_GL=osmesa with the package libosmesa6"
         exit 2

@@ -86,6 +86,26 @@ def test_a_report_counts_seeds_not_episodes(tmp_path):
     assert not re.search(r'(src|href)="?(https?:)?//', text), "the page must not need a network"
 
 
+def test_references_with_their_own_algorithm_stand_in_the_same_table(tmp_path):
+    write_run(tmp_path / "runs/acro", "acro", 0, {10: [50.0]})
+    end_to_end = write_run(tmp_path / "runs/bc", "bc", 0, {10: [20.0]})
+    rows = (end_to_end / "episodes.csv").read_text()
+    (end_to_end / "episodes.csv").write_text(rows.replace("td3_bc", "bc"))
+    (end_to_end / "probe.json").write_text('{"probe_pose": 12.5, "probe_velocity": 34.5}')
+    (end_to_end / "pretrain_timing.json").write_text('{"seconds": 7.0}')
+    page, _ = write_report([tmp_path / "runs"], tmp_path / "out")
+    text = page.read_text()
+    assert text.count("<h3>walker_walk expert, patch</h3>") == 1
+    with (tmp_path / "out" / "runs.csv").open() as file:
+        acro, bc = csv.DictReader(file)
+    assert (acro["method"], acro["return"], acro["probe_pose"]) == ("acro", "500.0", "")
+    assert (bc["method"], bc["probe_pose"], bc["probe_velocity"]) == ("bc", "12.5", "34.5")
+    assert (bc["pretrain_seconds"], bc["finetune_seconds"]) == ("7.0", "3.0")
+    with (tmp_path / "out" / "improvement.csv").open() as file:
+        chances = {(row["method"], row["other"]): float(row["probability"]) for row in csv.DictReader(file)}
+    assert chances == {("acro", "bc"): 1.0, ("bc", "acro"): 0.0}
+
+
 def test_bad_input_is_one_line(tmp_path):
     with pytest.raises(UserError, match="no such folder"):
         write_report([tmp_path / "nowhere"], tmp_path / "out")

@@ -41,9 +41,11 @@ def _start_worker() -> None:
     """One thread a worker; Ctrl-C is the parent's business; a worker never outlives its parent."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    import threadpoolctl
     import torch
 
     torch.set_num_threads(1)
+    threadpoolctl.threadpool_limits(1)
 
 
 def _end_with_parent() -> None:
