@@ -87,6 +87,20 @@ def test_every_flag_of_the_table_of_choices_exists():
     assert set(named) - flags == set()
 
 
+def test_every_flag_of_the_navigation_page_exists():
+    from dataclasses import fields
+
+    from pretrain.navigation.config import NavigationConfig
+    from vd4rl_pomdp.cli import NavigationGridCommand
+    from vd4rl_pomdp.experiments.navigation.collect import CollectConfig
+
+    configs = (NavigationConfig, CollectConfig, NavigationGridCommand)
+    flags = {f.name.replace("_", "-") for config in configs for f in fields(config)}
+    named = re.findall(r"`--([a-z0-9-]+)", (ROOT / "docs" / "navigation.md").read_text())
+    assert len(named) > 20
+    assert set(named) - flags == set()
+
+
 def test_no_machine_paths_in_tracked_files():
     if not (ROOT / ".git").exists():
         pytest.skip("not a git checkout")

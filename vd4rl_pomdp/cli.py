@@ -6,6 +6,7 @@ import contextlib
 import io
 import json
 import re
+import shlex
 import sys
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -108,7 +109,7 @@ def _with_presets(config: type, presets: dict[str, Any], words: Arguments, progr
     if name not in presets:
         raise UserError(f"unknown preset {name!r}: choose one of {', '.join(presets)}")
     default = presets[name]
-    required = [f for f in ("encoder", "data", "out") if getattr(default, f, None) == Path()]
+    required = [f for f in ("encoder", "data", "out", "maze") if getattr(default, f, None) in (Path(), "")]
     missing = {f: tyro.MISSING for f in required}
     from dataclasses import replace
 
@@ -301,6 +302,79 @@ def _sweep(words: Arguments, program: str) -> None:
         _dispatch(COMMANDS, stage, "vd4rl-pomdp")
 
 
+def _navigation_collect(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.experiments.navigation.collect import PRESETS, CollectConfig, collect
+
+    config = _with_presets(CollectConfig, PRESETS, words, program)
+    print(f"{len(collect(config))} shards in {config.out}")
+
+
+def _navigation_train(words: Arguments, program: str) -> None:
+    from pretrain.navigation.config import PRESETS, NavigationConfig
+    from pretrain.navigation.train import train
+
+    run = train(_with_presets(NavigationConfig, PRESETS, words, program))
+    print(f"results: {run.path / 'results.json'}")
+
+
+def _navigation_policy(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.experiments.navigation.policy import MazePolicyConfig, train_policy
+
+    config = _parse(MazePolicyConfig, words, program)
+    card = train_policy(config).card
+    print(f"{config.out}: {card['goals_in_20_episodes']} goals in 20 episodes")
+
+
+@dataclass(frozen=True)
+class NavigationReportCommand:
+    """Write the paper's navigation tables and figures about finished runs."""
+
+    runs: tyro.conf.Positional[list[Path]]
+    """Run folders, folders that contain some, or a folder that holds an earlier report's rows.csv."""
+    out: Path = Path("navigation-report")
+    """Folder of the report."""
+    pictures: bool = True
+    """Also draw sample observations, which needs OpenGL."""
+
+
+def _navigation_report(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.experiments.navigation.report import write_report
+
+    command = _parse(NavigationReportCommand, words, program)
+    print(f"report: {write_report(command.runs, command.out, command.pictures)}")
+
+
+@dataclass(frozen=True)
+class NavigationGridCommand:
+    """Train all runs of a grid, seed by seed; finished runs are skipped, a cut one goes on."""
+
+    grid: str = "evidence"
+    """evidence: all objectives at K=15 and the K=1 comparisons; options: self-prediction and exogenous noise."""
+    mazes: list[str] = field(default_factory=lambda: ["no_curtain", "three_curtains"])
+    """Mazes."""
+    seeds: list[int] = field(default_factory=lambda: [0, 1, 2])
+    """Training seeds."""
+    preset: str = "cpu"
+    """paper, cpu or smoke."""
+    data: Path = Path("data")
+    """Folder of the mazes' sets, DATA/MAZE."""
+    out: Path = Path("runs/navigation")
+    """Folder of the runs."""
+    dry_run: bool = False
+    """Print the commands only."""
+
+
+def _navigation_grid(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.experiments.navigation.grid import grid_commands
+
+    command = _parse(NavigationGridCommand, words, program)
+    where = (tuple(command.mazes), tuple(command.seeds), command.preset, command.data, command.out)
+    for stage in grid_commands(command.grid, *where):
+        print(f"vd4rl-pomdp {shlex.join(stage)}", file=sys.stdout if command.dry_run else sys.stderr)
+        if not command.dry_run:
+            _dispatch(COMMANDS, stage, "vd4rl-pomdp")
+
+
 @dataclass(frozen=True)
 class DemoCommand:
     """Every stage on a small walker_walk set with real rendering, in minutes, ending with a table and a report."""
@@ -385,6 +459,13 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     "pretrain": Command("train an encoder", _pretrain),
     "finetune": Command("TD3+BC on a frozen encoder", _finetune),
     "evaluate": Command("evaluate a fine-tuned run again", _evaluate),
+    "navigation": {
+        "collect": Command("a maze's data, with true states", _navigation_collect),
+        "train": Command("an objective on a maze, beside a state probe", _navigation_train),
+        "policy": Command("train the first-person policy (PPO) that ships", _navigation_policy),
+        "grid": Command("the runs behind the tables, one after the other", _navigation_grid),
+        "report": Command("the paper's tables and figures about runs", _navigation_report),
+    },
     "sweep": Command("methods x corruptions x seeds", _sweep),
     "report": Command("an HTML page and CSV files about runs", _report),
     "theory": Command("the paper's claims on finite worlds, by enumeration", _theory),

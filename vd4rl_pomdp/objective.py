@@ -98,6 +98,12 @@ class InverseObjective(Objective):
     def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean action loss over all real pairs, plus the optional terms; `loss_kNN` is the mean at each k."""
         past, future = self.representations(window)
+        return self.loss_of(past, future, window, progress)
+
+    def loss_of(
+        self, past: Tensor, future: Tensor, window: Windows, progress: float
+    ) -> tuple[Tensor, dict[str, Tensor]]:
+        """`loss`, given the `representations` of the window."""
         pairs = self.pairs(window.obs.shape[1]).to(past.device)
         losses = self.target.loss(self.head(past, future, pairs), window.action[:, pairs[:, 0]])
         real = (pairs.sum(1) < window.length[:, None]).to(losses)

@@ -20,6 +20,7 @@ from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE
 from vd4rl_pomdp.objective import Objective
+from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 
 ENTRY_POINTS = "vd4rl_pomdp.methods"
 """Group of entry points under which a package offers methods; each names a `Method`."""
@@ -102,7 +103,13 @@ def get_method(name: str) -> Method:
     return METHODS[name]
 
 
-def build_objective(config: PretrainConfig, action: Tensor, target: ActionTarget, state_dim: int = 0) -> Objective:
+def build_objective(
+    config: PretrainConfig,
+    action: Tensor,
+    target: ActionTarget,
+    state_dim: int = 0,
+    observation: tuple[int, int] = (3 * FRAME_STACK, FRAME_SIZE),
+) -> Objective:
     """Build the objective of a config.
 
     Args:
@@ -110,13 +117,15 @@ def build_objective(config: PretrainConfig, action: Tensor, target: ActionTarget
         action: (N, A) float32, for its width alone.
         target: what an action head predicts.
         state_dim: width of the simulator state, for methods that read it.
+        observation: channels and size of an observation, for methods that read pixels.
     """
     method = get_method(config.method)
     history = method.history if config.history == "method" else config.history
     past = method.past if config.m is None else config.m
     if history != "none" and (method.end_to_end or method.reads_state):
         raise UserError(f"{config.method} has no memory: --history {history} is for pretrained methods")
-    shape: dict[str, Any] = {"frame_encoder": config.frame_encoder}
+    channels, size = observation
+    shape: dict[str, Any] = {"frame_encoder": config.frame_encoder, "channels": channels, "size": size}
     if method.reads_state:
         shape = {"frame_encoder": STATE, "channels": state_dim, "size": 1}
     encoder = Encoder(

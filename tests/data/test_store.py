@@ -193,3 +193,16 @@ def test_shards_of_different_sets_are_refused(tmp_path, cache, second, message):
     write_fake_set(tmp_path / "set", (4,), names=["1_b.hdf5"], **second)
     with pytest.raises(UserError, match=message):
         open_store(tmp_path / "set", cache)
+
+
+def test_a_set_of_another_frame_size_is_refused_before_and_after_it_was_decoded(tmp_path):
+    rows = fake_rows([6])
+    rows["observation"] = np.zeros((6, 3, 100, 100), np.uint8)
+    (tmp_path / "maze").mkdir()
+    write_shard(tmp_path / "maze" / "0_maze.hdf5", rows, {})
+    with pytest.raises(UserError, match="take a set of 84-pixel frames"):
+        open_store(tmp_path / "maze", tmp_path / "cache")
+    store = open_store(tmp_path / "maze", tmp_path / "cache", frame_size=100)
+    assert store.frames().shape == (6, 3, 100, 100)
+    with pytest.raises(UserError, match=r"has frames of 100x100 pixels, expected 84x84"):
+        open_store(tmp_path / "maze", tmp_path / "cache")

@@ -93,9 +93,9 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
                 frames += len(rollout["reward"])
                 speed = frames / (time.monotonic() - started)
                 progress.advance(1, ret=float(rollout["reward"].sum()), frames_per_s=speed)
-            write_shard(path, _join(rollouts), _attributes(config, path, actor))
+            write_shard(path, join_rollouts(rollouts), _attributes(config, path, actor))
     seconds = time.monotonic() - started
-    _record(config, seconds, frames)
+    record_set(config.out, seconds, frames, config.workers)
     return [path for path, _, _ in plan]
 
 
@@ -163,7 +163,8 @@ def _environment(*arguments: Any) -> Any:
     return _ENVIRONMENTS[arguments]
 
 
-def _join(rollouts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def join_rollouts(rollouts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Rows of several episodes, in order."""
     return {key: np.concatenate([rollout[key] for rollout in rollouts]) for key in rollouts[0]}
 
 
@@ -180,35 +181,37 @@ def _attributes(config: CollectConfig, path: Path, actor: Actor | None) -> dict[
 
 
 def _claim(config: CollectConfig, actors: list[Actor | None]) -> None:
-    """Write collection.json, or check that the folder holds the same collection."""
     settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS}
     settings["actors"] = sorted({actor.sha256 for actor in actors if actor is not None})
-    path = config.out / "collection.json"
+    claim_set(config.out, settings)
+
+
+def claim_set(out: Path, settings: dict[str, Any]) -> None:
+    """Write collection.json, or check that the folder holds the same collection."""
+    path = out / "collection.json"
     if path.exists():
         stored = read_json(path)
         differing = sorted(k for k in settings if stored.get(k) != settings[k])
         if differing:
-            raise UserError(
-                f"{config.out}: holds a set collected with another {', '.join(differing)}; choose another --out"
-            )
+            raise UserError(f"{out}: holds a set collected with another {', '.join(differing)}; choose another --out")
         return
-    if config.out.exists() and any(not file.name.startswith(".") for file in config.out.iterdir()):
-        raise UserError(f"{config.out}: is not empty and holds no collected set; choose another --out")
+    if out.exists() and any(not file.name.startswith(".") for file in out.iterdir()):
+        raise UserError(f"{out}: is not empty and holds no collected set; choose another --out")
     try:
-        config.out.mkdir(parents=True, exist_ok=True)
+        out.mkdir(parents=True, exist_ok=True)
     except OSError as error:
-        raise disk_error(config.out, error) from error
+        raise disk_error(out, error) from error
     _write_json(path, settings)
 
 
-def _record(config: CollectConfig, seconds: float, frames: int) -> None:
+def record_set(out: Path, seconds: float, frames: int, workers: int) -> None:
     """Keep what a repeated collection would not reproduce."""
-    path = config.out / "provenance.json"
+    path = out / "provenance.json"
     if not frames and path.exists():
         return
     from vd4rl_pomdp.envs.parity import render_info
 
-    facts = {"seconds": round(seconds, 1), "frames": frames, "workers": config.workers}
+    facts = {"seconds": round(seconds, 1), "frames": frames, "workers": workers}
     origin = {"command": command(), "git_commit": git_commit(), "versions": versions()}
     _write_json(path, facts | origin | {"render": render_info()})
 

@@ -13,13 +13,13 @@ from torch import Tensor
 from vd4rl_pomdp.buffers import FrameBuffers
 from vd4rl_pomdp.data.store import Store, open_store
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import FRAME_STACK, QUALITIES, TASKS
+from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, QUALITIES, TASKS
 from vd4rl_pomdp.types import StepType, Transitions, Windows, row_key
 
 Index = int | Sequence[int] | np.ndarray | Tensor
 
 
-def open_dataset(path: Path | str, cache: Path | None = None) -> Dataset:
+def open_dataset(path: Path | str, cache: Path | None = None, frame_size: int = FRAME_SIZE) -> Dataset:
     """Open a V-D4RL set: a folder of shards, or one shard.
 
     The first opening decodes the set into the store; later ones map it and take well under a second.
@@ -27,11 +27,12 @@ def open_dataset(path: Path | str, cache: Path | None = None) -> Dataset:
     Args:
         path: folder (or file) of the shards.
         cache: where decoded sets are kept; default `$VD4RL_POMDP_CACHE`, else the user's cache folder.
+        frame_size: height and width S that its frames must have.
 
     Raises:
-        UserError: the set is missing, empty, damaged or incomplete.
+        UserError: the set is missing, empty, damaged, incomplete or of another frame size.
     """
-    return Dataset(Path(path), open_store(Path(path), cache))
+    return Dataset(Path(path), open_store(Path(path), cache, frame_size))
 
 
 class Dataset:
@@ -50,7 +51,7 @@ class Dataset:
         """Names as in `tasks`, None where neither the shards nor the folders tell."""
         step_type, reward = store.array("step_type"), store.array("reward")
         self.frames = _read_only_tensor(store.frames())
-        """(N, 3, 84, 84) uint8; mapped memory: writing into it kills the process."""
+        """(N, 3, S, S) uint8, S = 84; mapped memory: writing into it kills the process."""
         self.action = torch.from_numpy(store.array("action"))
         """(N, A) float32: row t holds a_{t-1}."""
         self.reward = torch.from_numpy(reward.astype(np.float32))
@@ -114,7 +115,7 @@ class Dataset:
         return row_key(self.episode[rows], self.t[rows])
 
     def stacks(self, rows: Tensor, frame_stack: int = FRAME_STACK) -> Tensor:
-        """Frame stacks (..., 3 * frame_stack, 84, 84) uint8 of (...,) int64 rows, oldest frame first.
+        """Frame stacks (..., 3 * frame_stack, S, S) uint8 of (...,) int64 rows, oldest frame first.
 
         A stack never reaches before its episode: there the first frame is repeated.
         """
@@ -124,7 +125,7 @@ class Dataset:
         index = torch.maximum(rows[..., None] - back, first[..., None])
         out = self._buffers.take((index.numel(), *self.frames.shape[1:])) if self.frames.device.type == "cpu" else None
         frames = torch.index_select(self.frames, 0, index.reshape(-1), out=out)
-        return frames.view(*rows.shape, 3 * frame_stack, *self.frames.shape[2:])
+        return frames.view(*rows.shape, self.frames.shape[1] * frame_stack, *self.frames.shape[2:])
 
     def transitions(
         self, index: Index, n_step: int = 1, frame_stack: int = FRAME_STACK, gamma: float = 0.99

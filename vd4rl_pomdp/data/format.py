@@ -4,7 +4,8 @@
     step_type   (N,) 0 first, 1 mid, 2 last (int64 in some published files, float64 in others)
     physics     (N, P) float64, simulator state of every row: only in sets collected by this package
 
-A set is a folder of shards. Its rows are those of all shards in order; an episode may continue in the next shard.
+Mazes are stored likewise, in frames of 100x100. A set is a folder of shards. Its rows are those of all shards in order;
+an episode may continue in the next shard.
 """
 
 from __future__ import annotations
@@ -25,7 +26,6 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_SIZE
 from vd4rl_pomdp.types import StepType
 
-FRAME_SHAPE = (3, FRAME_SIZE, FRAME_SIZE)
 SUFFIXES = (".hdf5", ".h5")
 FRAMES_KEY = "observation"
 _ROW_KEYS = {"action": 2, "reward": 1, "discount": 1, "step_type": 1, "physics": 2}
@@ -97,7 +97,7 @@ def _encode(rows: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> by
         file.attrs[_ATTRIBUTE] = json.dumps(dict(attributes), sort_keys=True)
         for key, value in rows.items():
             data = np.asarray(value, _WRITTEN.get(key, "float64"))
-            chunks = (min(len(data), 50), *FRAME_SHAPE) if key == FRAMES_KEY else True
+            chunks = (min(len(data), 50), *data.shape[1:]) if key == FRAMES_KEY else True
             file.create_dataset(key, data=data, chunks=chunks, compression="gzip", compression_opts=4)
     return buffer.getvalue()
 
@@ -121,14 +121,18 @@ def read_dtypes(path: Path) -> dict[str, str]:
         return {key: str(file[key].dtype) for key in _present(path, file)}
 
 
-def read_shard(path: Path) -> dict[str, np.ndarray]:
-    """Read and validate one shard: `read_rows` and, as `observation`, its (N, 3, 84, 84) uint8 frames."""
-    rows = read_rows(path)
+def read_shard(path: Path, frame_size: int = FRAME_SIZE) -> dict[str, np.ndarray]:
+    """Read and validate one shard: `read_rows` and, as `observation`, its (N, 3, S, S) uint8 frames."""
+    rows = read_rows(path, frame_size)
     return {FRAMES_KEY: np.concatenate(list(read_frames(path))), **rows}
 
 
-def read_rows(path: Path) -> dict[str, np.ndarray]:
+def read_rows(path: Path, frame_size: int = FRAME_SIZE) -> dict[str, np.ndarray]:
     """Read and validate all of a shard but its pixels.
+
+    Args:
+        path: the shard.
+        frame_size: height and width that its frames must have.
 
     Returns:
         action (N, A) float32, reward and discount (N,) float64, step_type (N,) uint8, and where the shard has it
@@ -140,10 +144,10 @@ def read_rows(path: Path) -> dict[str, np.ndarray]:
     with _open(path) as file:
         keys = _present(path, file)
         frames = file[FRAMES_KEY]
-        if frames.dtype != np.uint8 or frames.shape[1:] != FRAME_SHAPE or not len(frames):
+        if frames.dtype != np.uint8 or frames.shape[1:] != (3, frame_size, frame_size) or not len(frames):
             raise UserError(
-                f"{path}: 'observation' is {frames.dtype} of shape {frames.shape}, expected uint8 (N, 3, 84, 84); "
-                "take a set of 84-pixel frames"
+                f"{path}: 'observation' is {frames.dtype} of shape {frames.shape}, expected uint8 (N, 3, {frame_size}, "
+                f"{frame_size}); take a set of {frame_size}-pixel frames"
             )
         rows = {key: file[key][()] for key in keys if key != FRAMES_KEY}
         count = len(frames)
@@ -154,7 +158,7 @@ def read_rows(path: Path) -> dict[str, np.ndarray]:
 
 
 def read_frames(path: Path) -> Iterator[np.ndarray]:
-    """Read the frames of a shard in order, in blocks of (M, 3, 84, 84) uint8 with M some thousand or fewer."""
+    """Read the frames of a shard in order, in blocks of (M, 3, S, S) uint8 with M some thousand or fewer."""
     with _open(path) as file:
         frames = file[FRAMES_KEY]
         chunk = frames.chunks[0] if frames.chunks else 1

@@ -1,6 +1,6 @@
 """The store: a set decoded once into flat memory-mapped arrays that every process of the machine shares.
 
-    <cache>/<key>/  frames.u8  (N, 3, 84, 84) uint8, each frame once      action.npy ... physics.npy
+    <cache>/<key>/  frames.u8  (N, 3, S, S) uint8, each frame once      action.npy ... physics.npy
                     meta.json  rows, shards, attributes, size and checksum of every file
 
 The key names the shards, their sizes and their times, so a changed set is decoded anew. Decoding happens in a hidden
@@ -12,6 +12,7 @@ from __future__ import annotations
 import fcntl
 import hashlib
 import json
+import math
 import os
 import shutil
 import sys
@@ -24,9 +25,10 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.data.episodes import join_shards
-from vd4rl_pomdp.data.format import FRAME_SHAPE, disk_error, read_attributes, read_frames, read_rows, shard_paths
+from vd4rl_pomdp.data.format import disk_error, read_attributes, read_frames, read_rows, shard_paths
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.tasks import FRAME_SIZE
 
 _VERSION = 2
 _FRAMES = "frames.u8"
@@ -47,9 +49,15 @@ class Store:
         checksums = {name: file["blake2b"] for name, file in self.meta["files"].items()}
         return hashlib.blake2b(json.dumps(checksums, sort_keys=True).encode(), digest_size=12).hexdigest()
 
+    @property
+    def frame_size(self) -> int:
+        """Height and width S of a frame."""
+        return math.isqrt(self.meta["files"][_FRAMES]["bytes"] // (3 * self.meta["rows"]))
+
     def frames(self) -> np.ndarray:
-        """(N, 3, 84, 84) uint8, mapped read-only from the file."""
-        return np.memmap(self.folder / _FRAMES, np.uint8, "r", shape=(self.meta["rows"], *FRAME_SHAPE))
+        """(N, 3, S, S) uint8, mapped read-only from the file."""
+        shape = (self.meta["rows"], 3, self.frame_size, self.frame_size)
+        return np.memmap(self.folder / _FRAMES, np.uint8, "r", shape=shape)
 
     def array(self, key: str) -> np.ndarray:
         """Rows of `action` (N, A) float32, `reward` or `discount` (N,) float64, or `step_type` (N,) uint8."""
@@ -67,19 +75,25 @@ def default_cache() -> Path:
     return Path(os.environ.get("VD4RL_POMDP_CACHE") or Path(base) / "vd4rl-pomdp")
 
 
-def open_store(path: Path, cache: Path | None = None) -> Store:
+def open_store(path: Path, cache: Path | None = None, frame_size: int = FRAME_SIZE) -> Store:
     """Open the decoded form of the set at `path`, decoding it first if that was never done.
 
     Raises:
-        UserError: the set is missing, damaged or incomplete, or the cache cannot be written.
+        UserError: the set is missing, damaged, incomplete or of another frame size, or the cache cannot be written.
     """
     shards = shard_paths(path)
     folder = (cache or default_cache()) / _key(shards)
     meta = _read_meta(folder)
     if meta is None:
         with _locked(folder):
-            meta = _read_meta(folder) or _decode(shards, folder)
-    return Store(folder, meta)
+            meta = _read_meta(folder) or _decode(shards, folder, frame_size)
+    store = Store(folder, meta)
+    if store.frame_size != frame_size:
+        raise UserError(
+            f"{path}: has frames of {store.frame_size}x{store.frame_size} pixels, expected {frame_size}x{frame_size}; "
+            f"take a set of {frame_size}-pixel frames"
+        )
+    return store
 
 
 def verify_store(store: Store) -> None:
@@ -116,14 +130,14 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
 
 
-def _decode(shards: Sequence[Path], folder: Path) -> dict[str, Any]:
+def _decode(shards: Sequence[Path], folder: Path, frame_size: int) -> dict[str, Any]:
     """Decode into a hidden folder and rename it; what a killed process left there is removed first."""
-    rows = join_shards(shards, [read_rows(shard) for shard in shards])
+    rows = join_shards(shards, [read_rows(shard, frame_size) for shard in shards])
     scratch = folder.with_name(f".{folder.name}.tmp")
     shutil.rmtree(scratch, ignore_errors=True)
     try:
         scratch.mkdir()
-        _require_space(scratch, len(rows["reward"]))
+        _require_space(scratch, len(rows["reward"]) * 3 * frame_size**2)
         _write_frames(shards, scratch / _FRAMES, len(rows["reward"]))
         for key, value in rows.items():
             np.save(scratch / f"{key}.npy", value)
@@ -138,8 +152,8 @@ def _decode(shards: Sequence[Path], folder: Path) -> dict[str, Any]:
     return meta
 
 
-def _require_space(folder: Path, rows: int) -> None:
-    needed, free = rows * int(np.prod(FRAME_SHAPE)), shutil.disk_usage(folder).free
+def _require_space(folder: Path, needed: int) -> None:
+    free = shutil.disk_usage(folder).free
     if needed > free:
         raise UserError(
             f"{folder.parent}: decoding needs {needed / 1e9:.1f} GB, the disk has {free / 1e9:.1f} GB; "

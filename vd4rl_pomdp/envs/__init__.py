@@ -1,13 +1,15 @@
-"""Environments: dm_control pixels as the data shows them, with the corruptions of the benchmark.
+"""Environments: dm_control pixels as the data shows them, with the corruptions of the benchmark; and four mazes.
 
 Importing this package registers every task and corruption with Gymnasium, as `vd4rl_pomdp/WalkerWalk-v0`,
 `vd4rl_pomdp/WalkerWalk-Patch16-v0`, `vd4rl_pomdp/WalkerWalk-ZeroFrames-v0`,
-`vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0`, and likewise for `CheetahRun` and `HumanoidWalk`;
-also the paper's finite counterexample, `vd4rl_pomdp/ForwardJumpCounterexample-v0`.
+`vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0`, and likewise for `CheetahRun` and `HumanoidWalk`; the mazes as
+`vd4rl_pomdp/MazeNoCurtain-v0`, `MazeOneCurtain`, `MazeThreeCurtains` and `MazeFirstPerson`; and the paper's finite
+counterexample, `vd4rl_pomdp/ForwardJumpCounterexample-v0`.
 """
 
 import gymnasium
 
+from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.tasks import TASKS
 
 _SUFFIXES = {"": "none", "-Patch16": "patch", "-ZeroFrames": "zero_frames", "-Patch16-ZeroFrames": "patch+zero_frames"}
@@ -27,3 +29,14 @@ FINITE_IDS = {"vd4rl_pomdp/ForwardJumpCounterexample-v0": "counterexample"}
 
 for _id, _world in FINITE_IDS.items():
     gymnasium.register(_id, entry_point="vd4rl_pomdp.envs.finite:FiniteEnv", kwargs={"world": _world})
+
+MAZE_STEPS = 500
+"""Actions after which a registered maze truncates its episode."""
+
+for _maze in MAZES.values():
+    gymnasium.register(
+        _maze.gym_id,
+        entry_point="vd4rl_pomdp.envs.maze:MazeEnv",
+        kwargs={"maze": _maze.name},
+        max_episode_steps=MAZE_STEPS,
+    )

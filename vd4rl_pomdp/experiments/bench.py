@@ -21,6 +21,7 @@ from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.envs.dmc import PixelEnv
 from vd4rl_pomdp.envs.parity import canary_frames, compare
+from vd4rl_pomdp.mazes import PICTURE_SIZE
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.runs.device import Precision, autocast, pick_device
 from vd4rl_pomdp.runs.folder import flatten
@@ -48,6 +49,9 @@ GOALS: dict[str, tuple[str, float]] = {
     "collection.fast_over_exact": (">=", 1.4),
     "collection.fast_mean_difference_of_255": ("<=", 0.05),
     "collection.two_workers_over_one": (">=", 1.8),
+    "mazes.fast_over_default": (">=", 5.0),
+    "mazes.first_person_over_default": (">=", 5.0),
+    "mazes.training_overhead_share": ("<=", 0.2),
 }
 """What this package promises on two cores without a GPU."""
 
@@ -74,6 +78,7 @@ def bench(quick: bool = False) -> dict[str, Any]:
             "memory": _memory(Path(folder), dataset.frames.numel()),
         }
     results["collection"] = _collection(60 if quick else 200)
+    results["mazes"] = _mazes(60 if quick else 200)
     return results | {"machine": machine(), "versions": versions()}
 
 
@@ -309,3 +314,62 @@ def _warm_environment(render: Any) -> tuple[PixelEnv, np.ndarray]:
     action = np.zeros(env.task.action_dim, np.float32)
     env.step(action)
     return env, action
+
+
+def _mazes(frames: int) -> dict[str, float]:
+    """Pictures per CPU-second of the mazes, against PointMaze's own `render()` at the same size."""
+    import gymnasium
+
+    from vd4rl_pomdp.envs.maze import MazeEnv
+    from vd4rl_pomdp.envs.maze_model import gymnasium_robotics
+
+    gymnasium.register_envs(gymnasium_robotics)
+    default: Any = gymnasium.make(
+        "PointMaze_UMaze-v3", render_mode="rgb_array", width=PICTURE_SIZE, height=PICTURE_SIZE
+    )
+    default.reset(seed=0)
+    speeds = {"default_frames_per_cpu_s": _rate(default.render, frames)}
+    for name, maze, render in (("fast", "no_curtain", "fast"), ("first_person", "first_person", "fast")):
+        env = MazeEnv(maze, render=render)  # type: ignore[arg-type]
+        env.reset(seed=0, options={"state": np.array([1.0, 1.0] + [0.0] * (4 if maze == "first_person" else 2))})
+        speeds[f"{name}_frames_per_cpu_s"] = _rate(env.draw, frames)
+    default.close()
+    for name in ("fast", "first_person"):
+        speeds[f"{name}_over_default"] = speeds[f"{name}_frames_per_cpu_s"] / speeds["default_frames_per_cpu_s"]
+    return speeds | _maze_training()
+
+
+def _maze_training() -> dict[str, float]:
+    """Steps/s of `navigation train --preset cpu`, and the share that is neither forward nor backward pass."""
+    from pretrain.navigation.config import PRESETS
+    from pretrain.navigation.train import MazeData, Trainer, make_objective
+    from vd4rl_pomdp.experiments.navigation import collect
+    from vd4rl_pomdp.experiments.navigation.observations import open_maze_set
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shape = {"maze": "no_curtain", "out": folder / "set", "workers": 1}
+        collect.collect(replace(collect.PRESETS["smoke"], **shape))  # type: ignore[arg-type]
+        config = replace(PRESETS["cpu"], data=folder / "set", out=folder)
+        data = MazeData(*open_maze_set(folder / "set", folder / "cache"), config, None)
+        device = pick_device("auto")
+        trainer = Trainer(make_objective(data, config).to(device), data.on(device), config)
+    step = _seconds(trainer.update, 5)
+    kept = trainer.batch()
+
+    def passes() -> None:
+        with autocast(device, config.precision):
+            loss, *_ = trainer.losses(kept)
+        loss.backward()
+
+    return {"training_steps_per_s": 1 / step, "training_overhead_share": max(0.0, 1 - _seconds(passes, 5) / step)}
+
+
+def _rate(function: Callable[[], Any], count: int) -> float:
+    """Calls per CPU-second, after some that are not counted."""
+    for _ in range(5):
+        function()
+    start = time.process_time()
+    for _ in range(count):
+        function()
+    return count / (time.process_time() - start)

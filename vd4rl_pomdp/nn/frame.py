@@ -49,7 +49,7 @@ def _as_image(obs: Tensor, dtype: torch.dtype) -> Tensor:
     return pixels.mul_(1 / 255).sub_(0.5)
 
 
-def _drq(channels: int) -> nn.Sequential:
+def _drq(channels: int, size: int) -> nn.Sequential:
     """Four 3x3 convolutions of 32 channels, the first with stride 2 (Kostrikov et al. 2020; used by V-D4RL)."""
     layers: list[nn.Module] = [nn.Conv2d(channels, 32, 3, stride=2), nn.ReLU()]
     for _ in range(3):
@@ -57,7 +57,7 @@ def _drq(channels: int) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-def _nature(channels: int) -> nn.Sequential:
+def _nature(channels: int, size: int) -> nn.Sequential:
     """Three strided convolutions (Mnih et al. 2015): a fraction of DrQ's cost."""
     return nn.Sequential(
         nn.Conv2d(channels, 32, 8, stride=4),
@@ -69,12 +69,68 @@ def _nature(channels: int) -> nn.Sequential:
     )
 
 
-def _flat(channels: int) -> nn.Sequential:
+def _small(channels: int, size: int) -> nn.Sequential:
+    """Three strided convolutions of 16 to 32 channels, for grey 50x50 pictures on a CPU."""
+    return nn.Sequential(
+        nn.Conv2d(channels, 16, 5, stride=2),
+        nn.ReLU(),
+        nn.Conv2d(16, 32, 3, stride=2),
+        nn.ReLU(),
+        nn.Conv2d(32, 32, 3, stride=2),
+        nn.ReLU(),
+    )
+
+
+_PATCH, _MIXER_DIM, _MIXER_LAYERS = 10, 256, 8
+
+
+class MixerLayer(nn.Module):
+    """Mixes (N, patches, dim) over the patches, then over the features (Tolstikhin et al. 2021, arXiv 2105.01601)."""
+
+    def __init__(self, patches: int, dim: int) -> None:
+        super().__init__()
+        self.norms = nn.ModuleList([nn.LayerNorm(dim), nn.LayerNorm(dim)])
+        self.over_patches = nn.Sequential(nn.Linear(patches, dim // 2), nn.GELU(), nn.Linear(dim // 2, patches))
+        self.over_features = nn.Sequential(nn.Linear(dim, 4 * dim), nn.GELU(), nn.Linear(4 * dim, dim))
+
+    def forward(self, x: Tensor) -> Tensor:
+        """Same shape."""
+        x = x + self.over_patches(self.norms[0](x).transpose(1, 2)).transpose(1, 2)
+        return x + self.over_features(self.norms[1](x))
+
+
+class _Pool(nn.Module):
+    """Mean over patches: (N, patches, dim) -> (N, dim, 1, 1)."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.mean(1)[..., None, None]
+
+
+class _Patches(nn.Module):
+    """Feature maps as a sequence: (N, dim, h, w) -> (N, h * w, dim)."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        return x.flatten(2).transpose(1, 2)
+
+
+def _mixer(channels: int, size: int) -> nn.Sequential:
+    """MLP-Mixer of 8 layers on patches of 10x10 pixels (the paper's navigation encoder)."""
+    if size % _PATCH:
+        raise UserError(
+            f"frame encoder 'mixer' cuts pictures into patches of {_PATCH} pixels, and {size} is no multiple of it: "
+            "choose another --frame-encoder"
+        )
+    layers = [MixerLayer((size // _PATCH) ** 2, _MIXER_DIM) for _ in range(_MIXER_LAYERS)]
+    patches = nn.Conv2d(channels, _MIXER_DIM, _PATCH, stride=_PATCH)
+    return nn.Sequential(patches, _Patches(), *layers, nn.LayerNorm(_MIXER_DIM), _Pool())
+
+
+def _flat(channels: int, size: int) -> nn.Sequential:
     """No convolution: for observations that are a handful of numbers, as in finite worlds."""
     return nn.Sequential()
 
 
-FRAME_ENCODERS = {"drq": _drq, "nature": _nature, "flat": _flat}
+FRAME_ENCODERS = {"drq": _drq, "nature": _nature, "small": _small, "mixer": _mixer, "flat": _flat}
 
 
 class StateFrame(nn.Module):
@@ -98,6 +154,6 @@ def make_frame_encoder(name: str, channels: int, size: int, feature_dim: int) ->
     """Build a frame encoder by name; an unknown name raises UserError listing the choices."""
     if name not in FRAME_ENCODERS:
         raise UserError(f"unknown frame encoder {name!r}: choose one of {', '.join(FRAME_ENCODERS)}")
-    return FrameEncoder(FRAME_ENCODERS[name](channels), channels, size, feature_dim).to(
+    return FrameEncoder(FRAME_ENCODERS[name](channels, size), channels, size, feature_dim).to(
         memory_format=torch.channels_last  # type: ignore[call-overload]
     )

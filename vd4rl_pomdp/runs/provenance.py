@@ -11,7 +11,18 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-PACKAGES = ("vd4rl-pomdp", "torch", "numpy", "mujoco", "dm-control", "h5py", "gymnasium", "scikit-learn", "safetensors")
+PACKAGES = (
+    "vd4rl-pomdp",
+    "torch",
+    "numpy",
+    "mujoco",
+    "dm-control",
+    "h5py",
+    "gymnasium",
+    "gymnasium-robotics",
+    "scikit-learn",
+    "safetensors",
+)
 
 
 def versions() -> dict[str, str]:
@@ -54,7 +65,9 @@ def machine() -> dict[str, Any]:
 def command() -> str:
     """The command line, the program named as a user would type it."""
     program = (
-        "vd4rl-pomdp" if Path(sys.argv[0]).name in ("vd4rl-pomdp", "__main__.py", "-c") else Path(sys.argv[0]).name
+        "vd4rl-pomdp"
+        if Path(sys.argv[0]).name in ("vd4rl-pomdp", "__main__.py", "cli.py", "-c")
+        else Path(sys.argv[0]).name
     )
     return shlex.join([program, *sys.argv[1:]])
 

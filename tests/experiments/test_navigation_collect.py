@@ -1,0 +1,140 @@
+import hashlib
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.envs.maze import MazeEnv
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.experiments.navigation import collect as module
+from vd4rl_pomdp.experiments.navigation.collect import PRESETS, CollectConfig, collect
+
+
+def small(out: Path, **changes: object) -> CollectConfig:
+    given = {"maze": "three_curtains", "out": out, "trajectories": 4, "trajectory_rows": 30, "workers": 1}
+    return replace(PRESETS["cpu"], **(given | {"trajectories_per_shard": 2} | changes))
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.glob("*.hdf5"))}
+
+
+@pytest.fixture(scope="module")
+def maze_set(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("maze") / "set"
+    collect(small(out))
+    return out
+
+
+def test_stored_actions_lead_through_the_stored_states_and_pictures(maze_set, tmp_path):
+    dataset = open_dataset(maze_set, tmp_path, frame_size=100)
+    assert (dataset.num_rows, dataset.num_episodes, dataset.task) == (120, 4, "three_curtains")
+    env = MazeEnv("three_curtains", 5)
+    for start, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):
+        frame, _ = env.reset(seed=0, options={"state": dataset.physics[start]})
+        assert not dataset.action[start].any()
+        for row in range(start, end):
+            np.testing.assert_allclose(env.state, dataset.physics[row], atol=1e-9)
+            np.testing.assert_array_equal(frame, dataset.frames[row].numpy())
+            if row + 1 < end:
+                frame, *_ = env.step(dataset.action[row + 1].numpy())
+
+
+def test_an_interrupted_collection_ends_in_the_same_files(maze_set, tmp_path, monkeypatch):
+    whole, written = module.write_shard, []
+
+    def cut(path, rows, attributes):
+        if written:
+            raise KeyboardInterrupt
+        whole(path, rows, attributes)
+        written.append(path)
+
+    monkeypatch.setattr(module, "write_shard", cut)
+    with pytest.raises(KeyboardInterrupt):
+        collect(small(tmp_path / "set"))
+    assert len(hashes(tmp_path / "set")) == 1
+    monkeypatch.setattr(module, "write_shard", whole)
+    collect(small(tmp_path / "set", workers=2))
+    assert hashes(tmp_path / "set") == hashes(maze_set)
+
+
+def test_noise_repeat_and_seed_change_the_set(maze_set, tmp_path):
+    found = [hashes(maze_set)]
+    for i, changes in enumerate([{"noise": 0.1}, {"action_repeat": 2}, {"seed": 1}]):
+        collect(small(tmp_path / str(i), trajectories=2, **changes))
+        found.append(hashes(tmp_path / str(i)))
+    firsts = [files["0_three_curtains.hdf5"] for files in found]
+    assert len(set(firsts)) == 4
+
+
+def test_the_planner_reaches_goals_everywhere():
+    from vd4rl_pomdp.experiments.navigation.planner import Planner
+
+    env = MazeEnv("no_curtain", 5, pixels=False)
+    planner = Planner(env)
+    _, info = env.reset(seed=0)
+    reached, places = 0, []
+    for _ in range(600):
+        _, reward, _, _, info = env.step(planner.act(info["state"], info["goal"]))
+        reached += int(reward)
+        places.append(info["state"][:2])
+    assert reached > 20
+    cells = {tuple(env.maze.cell_xy_to_rowcol(place)) for place in places}
+    assert len(cells) == 7, "all cells of the U were visited"
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"maze": "spiral"}, "unknown maze 'spiral'"),
+        ({"noise": -1.0}, "--noise is -1.0"),
+        ({"trajectory_rows": 1}, "--trajectory-rows is 1"),
+        ({"action_repeat": 0}, "--action-repeat is 0"),
+    ],
+)
+def test_wrong_settings_are_named(changes, message, tmp_path):
+    with pytest.raises(UserError, match=message):
+        collect(small(tmp_path / "set", **changes))
+    assert not (tmp_path / "set").exists()
+
+
+def test_another_collection_is_refused(maze_set):
+    with pytest.raises(UserError, match="collected with another noise"):
+        collect(small(maze_set, noise=0.2))
+
+
+def test_the_shipped_first_person_policy_reaches_goals_and_an_idle_one_does_not():
+    from vd4rl_pomdp.experiments.navigation.policy import SHIPPED, goals_reached
+    from vd4rl_pomdp.policies.actor import read_actor
+
+    actor = read_actor(SHIPPED)
+    assert actor.card["algorithm"] == "PPO"
+    reached = goals_reached(actor, actor.card["action_repeat"], 3)
+    idle = replace(actor, weights={name: value * 0 for name, value in actor.weights.items()})
+    assert reached >= 12
+    assert goals_reached(idle, actor.card["action_repeat"], 3) < reached / 3
+
+
+def test_first_person_data_holds_headings_and_moves(tmp_path):
+    collect(small(tmp_path / "set", maze="first_person", trajectories=1, trajectory_rows=120))
+    dataset = open_dataset(tmp_path / "set", tmp_path / "cache", frame_size=100)
+    assert dataset.physics.shape == (120, 6)
+    assert np.ptp(dataset.physics[:, 2]) > 1
+    assert np.ptp(dataset.physics[:, :2], axis=0).max() > 1
+    assert len({frame.numpy().tobytes() for frame in dataset.frames}) > 100
+
+
+def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
+    pytest.importorskip("stable_baselines3")
+    from vd4rl_pomdp.experiments.navigation.policy import MazePolicyConfig, train_policy
+    from vd4rl_pomdp.policies.actor import read_actor
+
+    trained = train_policy(MazePolicyConfig(tmp_path / "actor.safetensors", decisions=2048))
+    stored = read_actor(tmp_path / "actor.safetensors")
+    seen = np.array([0.3, -0.2, 1.0, 0.1], np.float32)
+    np.testing.assert_array_equal(stored.act(seen), trained.act(seen))
+    assert stored.card["decisions"] == 2048
+    spread = [stored.act(seen, np.random.default_rng(i)) for i in range(50)]
+    assert np.std(spread, axis=0).min() > 0.1

@@ -1,0 +1,109 @@
+import struct
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.experiments.navigation.exogenous import POOL, ExogenousNoise, load_pool
+from vd4rl_pomdp.experiments.navigation.observations import to_grey50
+
+
+@pytest.fixture(scope="module")
+def noise() -> ExogenousNoise:
+    return ExogenousNoise("photographs", 0.5, 0)
+
+
+def test_the_shipped_pool_is_many_different_natural_images(noise):
+    assert noise.pool.shape == (POOL, 3, 100, 100)
+    assert len({picture.numpy().tobytes() for picture in noise.pool}) == POOL
+    neighbours = (noise.pool[..., 1:].float() - noise.pool[..., :-1].float()).abs().mean()
+    strangers = (noise.pool[1:].float() - noise.pool[:-1].float()).abs().mean()
+    assert neighbours < strangers / 3, "pixels of natural images resemble their neighbours"
+
+
+def test_a_row_shows_the_same_image_always_and_rows_differ(noise):
+    pictures = torch.full((200, 3, 100, 100), 50, dtype=torch.uint8)
+    key = torch.arange(200)
+    first = noise(pictures, key)
+    assert torch.equal(first, noise(pictures, key))
+    assert torch.equal(first[7:9], noise(pictures[7:9], key[7:9]))
+    assert len({picture.numpy().tobytes() for picture in first}) > 150
+    assert not torch.equal(first, ExogenousNoise("photographs", 0.5, 1)(pictures, key))
+
+
+def test_noise_is_added_and_clipped(noise):
+    dark, bright = (torch.full((50, 3, 100, 100), v, dtype=torch.uint8) for v in (0, 240))
+    key = torch.arange(50)
+    added = noise(dark, key)
+    expected = (noise(dark, key).int() + 240).clamp(max=255)
+    assert added.max() <= 128
+    assert (noise(bright, key).int() - expected).abs().max() <= 1
+    assert noise.pool.shape[1:] == added.shape[1:]
+
+
+def cifar_binary(folder, count: int = 4) -> np.ndarray:
+    images = np.random.default_rng(0).integers(0, 256, (count, 3072), dtype=np.uint8)
+    records = np.concatenate([np.arange(count, dtype=np.uint8)[:, None], images], 1)
+    (folder / "data_batch_1.bin").write_bytes(records.tobytes())
+    return images
+
+
+def python_batch(pixels: bytes) -> bytes:
+    """A protocol-2 pickle of {"data": pixels}, as Python 2 wrote strings."""
+    return b"\x80\x02}q\x01U\x04dataq\x02T" + struct.pack("<i", len(pixels)) + pixels + b"q\x03s."
+
+
+def test_cifar_files_of_both_kinds_give_the_same_images(tmp_path):
+    for name in ("binary", "python"):
+        (tmp_path / name).mkdir()
+    images = cifar_binary(tmp_path / "binary")
+    (tmp_path / "python" / "data_batch_1").write_bytes(python_batch(images.tobytes()))
+    pools = [load_pool(str(tmp_path / name), 0) for name in ("binary", "python")]
+    assert torch.equal(*pools)
+    assert pools[0].shape == (4, 3, 100, 100)
+    planes = images.reshape(4, 3, 32, 32).mean((2, 3))
+    ours = pools[0].float().mean((2, 3)).numpy()
+    assert np.abs(np.sort(planes, 0) - np.sort(ours, 0)).max() < 2
+
+
+def test_a_pickle_is_never_run(tmp_path):
+    """A batch that would write a file, were it unpickled, yields its pixels and nothing else."""
+    pixels = bytes(range(256)) * 12
+    call = b"cos\nsystem\nU" + bytes([len(f"touch {tmp_path}/harm")]) + f"touch {tmp_path}/harm".encode() + b"\x85R0"
+    (tmp_path / "data_batch_1").write_bytes(b"\x80\x02" + call + python_batch(pixels)[2:])
+    assert load_pool(str(tmp_path), 0).shape == (1, 3, 100, 100)
+    assert not (tmp_path / "harm").exists()
+
+
+def test_other_images_are_read_too(tmp_path):
+    Image.fromarray(np.full((40, 60, 3), 99, np.uint8)).save(tmp_path / "a.png")
+    Image.fromarray(np.full((30, 30), 10, np.uint8)).save(tmp_path / "b.JPG", "JPEG")
+    pool = load_pool(str(tmp_path), 0)
+    assert sorted(pool.float().mean((1, 2, 3)).tolist()) == pytest.approx([10, 99], abs=2)
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("notes.txt", b"no image", "no readable image"),
+        ("data_batch_1.bin", b"\x00" * 3000, "no multiple of 3073"),
+        ("data_batch_1.bin", b"\xff" * 3073, "labels above 9"),
+        ("data_batch_1", python_batch(b"\x00" * 100), "holds no pixels"),
+        ("data_batch_1", b"\xfe\xfe\xfe", "is damaged"),
+        ("a.png", b"not a picture", "cannot be read as an image"),
+    ],
+)
+def test_folders_without_usable_images_are_named(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError, match=message) as caught:
+        load_pool(str(tmp_path), 0)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_grey_quarters_are_area_averages_of_the_luminance():
+    pictures = torch.randint(0, 256, (3, 3, 100, 100), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+    luma = (pictures.double() * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(1)
+    expected = luma.view(3, 50, 2, 50, 2).mean((2, 4))
+    assert (to_grey50(pictures)[:, 0].double() - expected).abs().max() <= 0.51

@@ -1,0 +1,201 @@
+import csv
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.experiments.navigation.claims import claims, judge, paper_number
+from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, Cell, cell_of, evidence, grid_commands, paper_rows
+from vd4rl_pomdp.experiments.navigation.report import write_report
+from vd4rl_pomdp.experiments.navigation.rows import load_runs
+from vd4rl_pomdp.mazes import FREE_CELLS, MAZES
+
+STATE = ("state_error", "held_out", "refit", "all", 0)
+
+
+def write_run(base: Path, cell: Cell, seed: int, level: float) -> Path:
+    """A finished run whose every error is `level` and whose losses grow with k."""
+    folder = base / cell.name / f"seed{seed}"
+    folder.mkdir(parents=True)
+    config = {
+        "method": cell.method,
+        "max_k": cell.max_k,
+        "self_prediction": float(cell.self_prediction),
+        "exogenous": "photographs" if cell.exogenous else "none",
+        "literal_future": cell.literal_future,
+        "preset": "cpu",
+        "seed": seed,
+    }
+    words = ["vd4rl-pomdp", *cell.words("cpu", Path("data"), Path("runs"), seed)]
+    record = {"stage": "navigation", "config": config, "git_commit": "abc", "command": " ".join(words)}
+    common = {"rows": "all", "k": 0, "value": level}
+    rows = [
+        common | {"measure": f"{name}_error", "split": split, "probe": probe, "rows": shown}
+        for name in ("state", "position", "velocity")
+        for split, probe in (("held_out", "refit"), ("training", "online"))
+        for shown in ("all", "hidden")
+    ]
+    rows += [
+        common | {"measure": "action_loss", "split": split, "probe": "", "k": k, "value": level + k}
+        for split in ("held_out", "training")
+        for k in range(cell.max_k + 1)
+    ]
+    points = "".join(f"{t},{t / 50},1,0,0,{t / 50},1.1,0,0,0\n" for t in range(60))
+    header = "t,x,y,vx,vy,estimated_x,estimated_y,estimated_vx,estimated_vy,hidden\n"
+    for name, value in (
+        ("config.json", record),
+        ("results.json", {"maze": cell.maze, "set": "f00", "rows": rows}),
+        ("timing.json", {"steps": 2500, "seconds": 300.0}),
+        ("machine.json", {"processor": "some", "gpu": None}),
+    ):
+        (folder / name).write_text(json.dumps(value))
+    (folder / "trajectory.csv").write_text(header + points)
+    return folder
+
+
+@pytest.fixture
+def runs(tmp_path) -> Path:
+    for seed in (0, 1, 2):
+        for i, method in enumerate((*OBJECTIVES, "random")):
+            write_run(tmp_path / "runs", Cell("three_curtains", method), seed, 10.0 * (8 - i) + seed)
+        write_run(tmp_path / "runs", Cell("three_curtains", "ah+a", 1), seed, 44.0)
+        write_run(tmp_path / "runs", Cell("three_curtains", "mik+a", 1), seed, 12.5 + 20 * (seed == 2))
+    return tmp_path / "runs"
+
+
+def test_every_line_of_the_papers_tables_is_a_cell_with_its_own_number():
+    for line in paper_rows():
+        component = line["component"]
+        value = (component if component == "action_loss" else f"{component}_error", "training", "online", "all", 0)
+        for maze in MAZES:
+            assert paper_number(cell_of(line, maze), value) == float(line[maze])
+    assert paper_number(Cell("no_curtain", "mik+a"), STATE) == 3.4
+    assert paper_number(Cell("no_curtain", "mik+a", literal_future=True), STATE) is None
+    assert paper_number(Cell("no_curtain", "random"), STATE) is None
+
+
+def test_the_report_shows_means_seeds_and_the_papers_numbers(runs, tmp_path):
+    page = write_report([runs], tmp_path / "out", pictures=False).read_text()
+    numbers = {
+        (row["table"], row["view"][:8], row["row"], row["maze"]): row
+        for row in csv.DictReader((tmp_path / "out" / "tables.csv").open())
+    }
+    best = numbers["state_error", "held-out", "MIK+A, K=15", "three_curtains"]
+    assert (best["mean"], best["seeds"], best["paper"]) == ("21", "3", "6.0")
+    assert float(best["low"]) < 21 < float(best["high"])
+    assert "**21.0** [20.0, 22.0] n=3 (6.0)" in page
+    assert page.count("--seed 1 --out runs/") == 10, "one command for every run of seed 1"
+    for name in ("accuracy.png", "trajectories.png"):
+        assert (tmp_path / "out" / "figures" / name).stat().st_size > 5_000
+
+
+def test_the_report_made_from_its_own_rows_is_the_same(runs, tmp_path):
+    first = write_report([runs], tmp_path / "first", pictures=False)
+    again = write_report([tmp_path / "first"], tmp_path / "again", pictures=False)
+    assert first.read_text() == again.read_text()
+    for name in ("rows.csv", "runs.csv", "tables.csv"):
+        assert (first.parent / name).read_bytes() == (again.parent / name).read_bytes()
+    assert load_runs([tmp_path / "first", runs]) != []
+
+
+def test_claims_are_judged_by_means_and_seed_by_seed(runs):
+    found = load_runs([runs])
+    verdicts = {claim.text: judge(claim, found) for claim in claims("three_curtains")}
+    k1 = verdicts["K=1: ah+a's state error, of mik+a's"]
+    assert (k1.seeds_holding, k1.seeds, k1.holds, k1.paper) == (2, 3, True, True)
+    assert k1.left == pytest.approx(44)
+    gate = verdicts["gate: mik+a's action loss at k=1, of that at k=15"]
+    assert gate.holds == ((21 + 1) <= 0.85 * (21 + 15))
+    assert gate.paper is None
+    assert verdicts["K=1: ah+a's action loss is near zero"].holds is False
+    assert verdicts["K=1: mik+a's state error with the literal future, of the default's"] is None
+
+
+def test_which_way_round_a_relation_is():
+    claim = next(c for c in claims("no_curtain") if c.text.startswith("no_history's velocity"))
+    assert claim.holds(90.0, 30.0)
+    assert not claim.holds(89.0, 30.0)
+
+
+def test_the_grid_is_the_issues_and_its_commands_parse(capsys):
+    cells = evidence()
+    assert len(cells) == len(set(cells)) == 2 * (8 + 3)
+    assert {c.method for c in cells if c.max_k == 15} == {*OBJECTIVES, "random"}
+    commands = list(grid_commands("evidence", ("no_curtain",), (0, 1, 2), "cpu", Path("d"), Path("r")))
+    assert len(commands) == 33
+    assert len({tuple(words) for words in commands}) == 33
+    from pretrain.navigation.config import PRESETS, NavigationConfig
+    from vd4rl_pomdp.cli import _with_presets
+
+    literal = next(words for words in commands if "--literal-future" in words)
+    config = _with_presets(NavigationConfig, PRESETS, literal[2:], "x")
+    assert (config.literal_future, config.max_k, config.preset) == (True, 1, "cpu")
+    options = Cell("no_curtain", "ah", self_prediction=True, exogenous=True)
+    config = _with_presets(NavigationConfig, PRESETS, options.words("cpu", Path("d"), Path("r"), 4)[2:], "x")
+    assert (config.self_prediction, config.exogenous, config.seed) == (1.0, "photographs", 4)
+    main(["navigation", "grid", "--dry-run", "--seeds", "0", "--mazes", "no_curtain"])
+    assert len(capsys.readouterr().out.splitlines()) == 11
+
+
+def test_free_cells_are_the_librarys():
+    from gymnasium_robotics.envs.maze.maps import U_MAZE
+
+    library = {(i, j) for i, row in enumerate(U_MAZE) for j, kind in enumerate(row) if kind != 1}
+    assert set(FREE_CELLS) == library
+
+
+def test_what_cannot_be_reported_is_named(runs, tmp_path):
+    (tmp_path / "empty").mkdir()
+    for source, message in (("nowhere", "no such folder"), ("empty", "holds no finished run")):
+        with pytest.raises(UserError, match=message):
+            write_report([tmp_path / source], tmp_path / "out", pictures=False)
+    write_run(tmp_path / "other", Cell("three_curtains", "mik"), 0, 99.0)
+    with pytest.raises(UserError, match="twice with other results"):
+        write_report([runs, tmp_path / "other"], tmp_path / "out", pictures=False)
+    config = next((tmp_path / "other").rglob("config.json"))
+    record = json.loads(config.read_text())
+    record["config"] |= {"preset": "paper", "seed": 7}
+    config.write_text(json.dumps(record))
+    with pytest.raises(UserError, match="different presets"):
+        write_report([runs, tmp_path / "other"], tmp_path / "out", pictures=False)
+
+
+def test_sample_observations_are_of_different_moments_and_mazes(tmp_path):
+    from vd4rl_pomdp.experiments.navigation.figures import _drive, sample_observations
+
+    drives = [_drive(maze) for maze in MAZES]
+    assert all(len({picture.tobytes() for picture in drive}) > 1 for drive in drives)
+    assert len({np.stack(drive).tobytes() for drive in drives}) == 4
+    sample_observations(tmp_path / "observations.png")
+    assert (tmp_path / "observations.png").stat().st_size > 20_000
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["collect", "--maze", "spiral", "--out", "x"], "unknown maze 'spiral'"),
+        (["collect", "--out", "x"], "--maze"),
+        (["train", "--data", "nowhere", "--out", "x"], "nowhere: no such folder"),
+        (["train", "--preset", "huge"], "unknown preset 'huge'"),
+        (["report", "nowhere"], "nowhere: no such folder"),
+        (["grid", "--grid", "all"], "unknown grid 'all'"),
+        (["grid", "--mazes", "spiral"], "unknown maze 'spiral'"),
+    ],
+)
+def test_slips_are_one_line_and_exit_code_2(words, message, capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        main(["navigation", *words])
+    assert end.value.code == 2
+    error = capsys.readouterr().err.strip()
+    assert len(error.splitlines()) == 1
+    assert message in error
+    assert not list(tmp_path.iterdir())
+
+
+def test_runs_are_frozen_values():
+    assert replace(Cell("no_curtain", "ah"), max_k=1).name == "no_curtain/ah-K1"

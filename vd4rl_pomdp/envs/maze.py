@@ -1,0 +1,132 @@
+"""The four mazes as Gymnasium environments: pixels in, accelerations out, goals that move when they are reached."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from vd4rl_pomdp.envs.maze_model import COLLISION_RADIUS, TIMESTEP, build_simulator
+from vd4rl_pomdp.envs.maze_view import ExactView, make_view
+from vd4rl_pomdp.envs.rendering import Render, mujoco
+from vd4rl_pomdp.mazes import PICTURE_SIZE, get_maze
+
+Info = dict[str, Any]
+GOAL_RADIUS = 0.2
+"""A goal is reached, and another drawn, within this distance."""
+ACTION_REPEAT = 5
+"""Simulator steps of 0.01 s for one action: enough to see what an action does."""
+ACCELERATION, ANGULAR_VELOCITY = 10.0, 4.0
+"""first_person: units/s^2 along the heading and radians/s for an action of 1 (from the top it is 23.9 units/s^2)."""
+
+
+class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """A point mass in a U-shaped maze, seen from the top (with curtains or not) or in first person.
+
+    Observations: (3, 100, 100) uint8. Actions: (2,) float32 in [-1, 1]: accelerations in x and y, or along the heading
+    and the angular velocity. The reward is 1 whenever a goal is reached; nothing terminates. `info` holds `state`
+    (qpos, then qvel: x, y, vx, vy; in first person x, y, heading, vx, vy, angular velocity), `goal` (2,) and `hidden`,
+    whether a curtain covers the whole mass. A seed fixes all starts and goals that follow it.
+    """
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's own name and type)
+
+    def __init__(
+        self,
+        maze: str,
+        action_repeat: int = ACTION_REPEAT,
+        render: Render = "fast",
+        pixels: bool = True,
+        render_mode: str | None = None,
+    ) -> None:
+        self.maze_spec = get_maze(maze)
+        self._repeat = action_repeat
+        self._point, self.maze = build_simulator(self.maze_spec)
+        """The library's description of the cells."""
+        self._view = make_view(self.maze_spec, self._point.model, render) if pixels else None
+        self.observation_space = gymnasium.spaces.Box(0, 255, (3, PICTURE_SIZE, PICTURE_SIZE), np.uint8)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+        self.render_mode = render_mode
+        self.metadata = {**self.metadata, "render_fps": round(1 / (TIMESTEP * action_repeat))}
+        self._picture = np.zeros((3, PICTURE_SIZE, PICTURE_SIZE), np.uint8)
+        self.goal = np.zeros(2)
+        """(2,) position to go to."""
+
+    @property
+    def state(self) -> np.ndarray:
+        """(P,) float64: qpos, then qvel."""
+        return np.concatenate([self._point.data.qpos, self._point.data.qvel])
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
+        """Put the mass somewhere, at rest, and draw a goal; `options={"state": (P,)}` chooses the state."""
+        super().reset(seed=seed)
+        mujoco.mj_resetData(self._point.model, self._point.data)
+        qpos = np.zeros(self._point.model.nq)
+        qpos[:2] = self._free_place()
+        if self.maze_spec.first_person:
+            qpos[2] = self.np_random.uniform(-np.pi, np.pi)
+        state = np.concatenate([qpos, np.zeros(self._point.model.nv)])
+        self.set_state((options or {}).get("state", state))
+        self.goal = self._free_place()
+        return self._observe()
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
+        """Apply one action for the action repeat."""
+        self._simulate(np.clip(np.asarray(action, np.float64), -1, 1))
+        reached = bool(np.linalg.norm(self.state[:2] - self.goal) <= GOAL_RADIUS)
+        if reached:
+            self.goal = self._free_place()
+        observation, info = self._observe()
+        return observation, float(reached), False, False, info
+
+    def set_state(self, state: np.ndarray) -> None:
+        """Put the simulator into a (P,) state."""
+        count = self._point.model.nq
+        self._point.set_state(np.asarray(state[:count], np.float64), np.asarray(state[count:], np.float64))
+
+    def render(self) -> np.ndarray:
+        """The newest picture: (100, 100, 3) uint8."""
+        return np.ascontiguousarray(self._picture.transpose(1, 2, 0))
+
+    def close(self) -> None:
+        """Free the GL context, if there is one."""
+        if isinstance(self._view, ExactView):
+            self._view.close()
+
+    def is_free(self, place: np.ndarray) -> bool:
+        """Whether the mass fits at a (2,) position."""
+        corners = place + COLLISION_RADIUS * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+        cells = [self.maze.cell_xy_to_rowcol(corner) for corner in corners]
+        return all(self.maze.maze_map[row][column] != 1 for row, column in cells)
+
+    def _simulate(self, action: np.ndarray) -> None:
+        """PointMaze's own steps; in first person the velocities are changed first, and no motor runs."""
+        if self.maze_spec.first_person:
+            qpos, qvel = self._point.data.qpos.copy(), self._point.data.qvel.copy()
+            gain = action[0] * ACCELERATION * TIMESTEP * self._repeat
+            qvel[:2] += gain * np.array([np.cos(qpos[2]), np.sin(qpos[2])])
+            qvel[2] = action[1] * ANGULAR_VELOCITY
+            self._point.set_state(qpos, qvel)
+            action = np.zeros(2)
+        for _ in range(self._repeat):
+            self._point.step(action)
+
+    def _free_place(self) -> np.ndarray:
+        """A position drawn uniformly from where the mass fits."""
+        while True:
+            place = self.np_random.uniform(-1.5, 1.5, 2)
+            if self.is_free(place):
+                return place
+
+    def draw(self) -> np.ndarray:
+        """Picture of the present state: (3, 100, 100) uint8."""
+        assert self._view is not None, "this environment was made without pixels"
+        return self._view(self._point.data)
+
+    def _observe(self) -> tuple[np.ndarray, Info]:
+        if self._view is not None:
+            self._picture = self.draw()
+        state = self.state
+        info = {"state": state, "goal": self.goal.copy(), "hidden": bool(self.maze_spec.hidden(state))}
+        return self._picture, info

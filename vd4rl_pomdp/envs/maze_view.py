@@ -1,0 +1,212 @@
+"""Pictures of the mazes, (3, 100, 100) uint8: MuJoCo's own, and the same much faster.
+
+Seen from the top only the ball moves. So MuJoCo draws the maze and its depth once, four times finer than the picture;
+the ball is then a sphere cut by 40x40 rays of the same camera, shaded like MuJoCo's headlight shades, and put where it
+is nearer than what MuJoCo drew. A ball that is wholly behind a curtain therefore changes no pixel.
+
+In first person a ray for each column finds the nearest wall. The light shines where the camera looks, so a wall's face
+has one shade, the floor none but the ambient one, and the picture is made of five colours, averaged over 2x2 rays.
+"""
+
+from __future__ import annotations
+
+import atexit
+import weakref
+
+import numpy as np
+
+from vd4rl_pomdp.envs.maze_model import CAMERA_HEIGHT, EYE_FOVY, EYE_HEIGHT, TOP_FOVY, WALL_HEIGHT
+from vd4rl_pomdp.envs.rendering import Render, gl_error, mujoco
+from vd4rl_pomdp.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, PICTURE_SIZE, MazeSpec
+
+_FINE = 4
+"""Rays for each pixel, in each direction."""
+_BALL_COLOR = np.array([0.3, 0.6, 0.3])
+_WALL_COLOR = np.array([0.7, 0.5, 0.3])
+_FLOOR_LIGHT, _FLOOR_DARK, _SQUARE = np.array([0.2, 0.3, 0.4]), np.array([0.1, 0.2, 0.3]), 2.0
+_GROUND = -0.1
+_AMBIENT, _DIFFUSE, _SPECULAR, _SHININESS = 0.4, 0.8, 0.045, 64
+"""MuJoCo's headlight on PointMaze's materials."""
+
+
+class ExactView:
+    """MuJoCo's picture from the camera `view`, drawn finer and averaged, so that edges are smooth."""
+
+    def __init__(self, model: mujoco.MjModel, fine: int = _FINE) -> None:
+        self._fine = fine
+        model.vis.quality.offsamples = 0
+        model.vis.global_.offwidth = model.vis.global_.offheight = PICTURE_SIZE * fine
+        try:
+            self._renderer = mujoco.Renderer(model, PICTURE_SIZE * fine, PICTURE_SIZE * fine)
+        except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+            raise gl_error(error) from error
+        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0
+        atexit.register(_close, weakref.ref(self._renderer))  # before OpenGL itself ends
+
+    def __call__(self, data: mujoco.MjData) -> np.ndarray:
+        """Picture of a state that `mj_forward` has seen."""
+        self._renderer.update_scene(data, camera="view")
+        return average(self._renderer.render(), self._fine)
+
+    def fine_picture(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
+        """Colours (H, H, 3) uint8 and depths (H, H) float32 before averaging, H = 100 * fine."""
+        self._renderer.update_scene(data, camera="view")
+        colors = self._renderer.render().copy()
+        self._renderer.enable_depth_rendering()
+        depths = self._renderer.render().copy()
+        self._renderer.disable_depth_rendering()
+        return colors, depths
+
+    def close(self) -> None:
+        """Free the GL context."""
+        self._renderer.close()
+
+
+def _close(renderer: weakref.ref[mujoco.Renderer]) -> None:
+    alive = renderer()
+    if alive is not None:
+        alive.close()
+
+
+def average(fine: np.ndarray, by: int) -> np.ndarray:
+    """(H, W, 3) uint8 -> (3, H / by, W / by) uint8, rounded area averages."""
+    height, width = fine.shape[0] // by, fine.shape[1] // by
+    sums = fine.reshape(height, by, width, by, 3).sum((1, 3), dtype=np.uint32)
+    return np.ascontiguousarray(((sums + by * by // 2) // (by * by)).astype(np.uint8).transpose(2, 0, 1))
+
+
+class TopView:
+    """The fast picture from the top."""
+
+    _WINDOW = 48
+    """Rays across the square in which the ball is drawn: a multiple of _FINE with room for the whole ball."""
+
+    def __init__(self, model: mujoco.MjModel) -> None:
+        self._colors, self._depths = _static_picture(model)
+        self._picture = average(self._colors, _FINE)
+        side = PICTURE_SIZE * _FINE
+        self._slope = ((np.arange(side) + 0.5) / side * 2 - 1) * np.tan(np.radians(TOP_FOVY) / 2)
+        """(side,) sideways travel of a ray for each unit of depth, by column."""
+
+    def __call__(self, data: mujoco.MjData) -> np.ndarray:
+        """Picture of a state."""
+        picture = self._picture.copy()
+        x, y = float(data.qpos[0]), float(data.qpos[1])
+        left, top = self._corner(x), self._corner(-y)
+        cells = slice(top, top + self._WINDOW), slice(left, left + self._WINDOW)
+        right, down = self._slope[cells[1]][None, :], self._slope[cells[0]][:, None]
+        depth, facing = _hit_sphere(right, -down, x, y)
+        drawn = depth < self._depths[cells]
+        if not drawn.any():
+            return picture
+        shade = np.where(facing > 0, _AMBIENT + _DIFFUSE * facing, 0)[..., None]
+        colors = _BALL_COLOR * shade + (_SPECULAR * facing**_SHININESS)[..., None]
+        patch = self._colors[cells].copy()
+        patch[drawn] = np.minimum(colors[drawn] * 255 + 0.5, 255).astype(np.uint8)
+        size = self._WINDOW // _FINE
+        row, column = top // _FINE, left // _FINE
+        picture[:, row : row + size, column : column + size] = average(patch, _FINE)
+        return picture
+
+    def _corner(self, sideways: float) -> int:
+        """First ray, a multiple of _FINE, of a window around a coordinate."""
+        center = np.searchsorted(self._slope, sideways / CAMERA_HEIGHT)
+        first = (int(center) - self._WINDOW // 2) // _FINE * _FINE
+        return min(max(first, 0), PICTURE_SIZE * _FINE - self._WINDOW)
+
+
+def _static_picture(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
+    """Colours and depths of the maze without the ball."""
+    color = model.site("particle_site").rgba.copy()
+    model.site("particle_site").rgba[3] = 0
+    view = ExactView(model)
+    data = mujoco.MjData(model)
+    mujoco.mj_forward(model, data)
+    picture = view.fine_picture(data)
+    view.close()
+    model.site("particle_site").rgba[:] = color
+    return picture
+
+
+def _hit_sphere(right: np.ndarray, up: np.ndarray, x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays (right, up, -1) from the camera first meet the ball at (x, y, 0).
+
+    Returns:
+        Depths (inf where a ray misses), and cosines between the ball's surface and the direction to the camera.
+    """
+    squared = right**2 + up**2 + 1
+    along = right * x + up * y + CAMERA_HEIGHT
+    inside = along**2 - squared * (x**2 + y**2 + CAMERA_HEIGHT**2 - BALL_RADIUS**2)
+    depth = np.where(inside > 0, (along - np.sqrt(np.maximum(inside, 0))) / squared, np.inf)
+    return depth, np.sqrt(np.maximum(inside, 0) / squared) / BALL_RADIUS
+
+
+class FirstPersonView:
+    """The fast picture from the ball. It leaves out the faint highlight on walls that are faced squarely."""
+
+    _FINE = 2
+    _SKY, _LIGHT, _DARK, _SHADED, _WALL_X, _WALL_Y = range(6)
+    _OFFSET = 64
+    """An even number of floor squares that makes all places positive."""
+
+    def __init__(self) -> None:
+        side = PICTURE_SIZE * self._FINE
+        steps = ((np.arange(side) + 0.5) / side * 2 - 1) * np.tan(np.radians(EYE_FOVY) / 2)
+        self._left, self._up = -steps, -steps[:, None]
+        """(side,) and (side, 1) slopes of the rays, by column and by row."""
+        self._to_floor = (EYE_HEIGHT - _GROUND) / steps[side // 2 :, None]
+        """(side / 2, 1) distance ahead at which the rays of the lower half meet the floor."""
+        cells = [(row, column) for row in range(5) for column in range(5) if (row, column) not in FREE_CELLS]
+        self._walls = np.array([(c + 0.5 - HALF_SIZE, HALF_SIZE - r - 0.5) for r, c in cells])[:, None]
+        """(walls, 1, 2) centres of the wall cells."""
+
+    def __call__(self, data: mujoco.MjData) -> np.ndarray:
+        """Picture of a state."""
+        place, heading = data.qpos[:2], float(data.qpos[2])
+        ahead = np.array([np.cos(heading), np.sin(heading)])
+        rays = ahead + self._left[:, None] * np.array([-ahead[1], ahead[0]])
+        distance, axis = self._nearest_wall(place, rays)
+        lit = rays[np.arange(len(rays)), axis] * ahead[axis] > 0
+        faces = np.where(lit, self._WALL_X + axis, self._SHADED).astype(np.uint8)
+        height = EYE_HEIGHT + self._up * distance
+        kinds = np.where(height <= WALL_HEIGHT, faces, np.uint8(self._SKY))
+        lower = len(kinds) // 2
+        np.copyto(kinds[lower:], self._floor(place, rays), where=height[lower:] < 0)
+        return self._color(kinds, ahead)
+
+    def _floor(self, place: np.ndarray, rays: np.ndarray) -> np.ndarray:
+        """Kinds (rows of the lower half, columns) of the floor's squares."""
+        x, y = (
+            (self._to_floor * (rays[:, i] / _SQUARE) + (place[i] / _SQUARE + self._OFFSET)).astype(np.int32)
+            for i in (0, 1)
+        )
+        return np.where((x ^ y) & 1, np.uint8(self._LIGHT), np.uint8(self._DARK))
+
+    def _nearest_wall(self, place: np.ndarray, rays: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Distance ahead (columns,) of the first wall on each (columns, 2) ray, and the axis of its face."""
+        with np.errstate(divide="ignore", invalid="ignore"):
+            one, other = ((self._walls + half - place) / rays for half in (-0.5, 0.5))
+        enter, leave = np.minimum(one, other), np.maximum(one, other)
+        first, last = np.maximum(*np.moveaxis(enter, -1, 0)), np.minimum(*np.moveaxis(leave, -1, 0))
+        hit = np.where((first < last) & (first > 0), first, np.inf)
+        wall, columns = hit.argmin(0), np.arange(len(rays))
+        return hit[wall, columns], enter[wall, columns].argmax(-1)
+
+    def _color(self, kinds: np.ndarray, ahead: np.ndarray) -> np.ndarray:
+        """The picture of (side, side) kinds, averaged over the rays of each pixel."""
+        walls = [_WALL_COLOR * (_AMBIENT + _DIFFUSE * light) for light in (0.0, *np.abs(ahead))]
+        colors = np.array([np.zeros(3), _FLOOR_LIGHT * _AMBIENT, _FLOOR_DARK * _AMBIENT, *walls])
+        palette = (np.minimum(colors, 1) * 255 + 0.5).astype(np.uint16)
+        parts = [kinds[i :: self._FINE, j :: self._FINE] for i in range(self._FINE) for j in range(self._FINE)]
+        sums = [sum(shade[part] for part in parts) for shade in palette.T]
+        return ((np.stack(sums) + self._FINE) // self._FINE**2).astype(np.uint8)
+
+
+View = ExactView | TopView | FirstPersonView
+
+
+def make_view(spec: MazeSpec, model: mujoco.MjModel, render: Render) -> View:
+    """What draws a maze: `exact` is MuJoCo alone with smooth edges, `fast` the rays."""
+    if render == "exact":
+        return ExactView(model)
+    return FirstPersonView() if spec.first_person else TopView(model)

@@ -1,0 +1,133 @@
+"""What the paper's tables say about the objectives, as statements that runs confirm or not, seed by seed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from vd4rl_pomdp.experiments.navigation.grid import Cell, paper_rows
+from vd4rl_pomdp.experiments.navigation.rows import Run, Value
+
+RECURRENT = ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
+NEAR_ZERO = 5.0
+"""Action loss (nats x 100) that counts as near zero; guessing among 20 codes is 300."""
+Test = Callable[[float, float], bool]
+
+
+@dataclass(frozen=True)
+class Claim:
+    """`left` compared with `factor` times `right`; without a right side, with `factor` itself."""
+
+    text: str
+    left: tuple[Cell, Value]
+    relation: str
+    factor: float
+    right: tuple[Cell, Value] | None = None
+
+    def holds(self, left: float, right: float) -> bool:
+        """Whether two numbers are in the relation."""
+        bound = self.factor * right
+        return {">=": left >= bound, "<=": left <= bound, "<": left < bound, ">": left > bound}[self.relation]
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """A claim and what the runs say."""
+
+    claim: Claim
+    left: float
+    right: float
+    seeds: int
+    """Seeds for which both numbers exist."""
+    seeds_holding: int
+    paper: bool | None
+    """Whether the paper's own numbers hold it; None where it has none."""
+
+    @property
+    def holds(self) -> bool:
+        """Whether it holds for the means over seeds."""
+        return self.claim.holds(self.left, self.right)
+
+
+def claims(maze: str) -> list[Claim]:
+    """The maturity gate, then the statements, of one maze."""
+
+    def error(component: str) -> Value:
+        return f"{component}_error", "held_out", "refit", "all", 0
+
+    def loss(k: int) -> Value:
+        return "action_loss", "held_out", "", "all", k
+
+    best, best_1 = Cell(maze, "mik+a"), Cell(maze, "mik+a", 1)
+    recorder, recorder_1 = Cell(maze, "ah+a"), Cell(maze, "ah+a", 1)
+    literal = Cell(maze, "mik+a", 1, literal_future=True)
+    state, position, velocity = error("state"), error("position"), error("velocity")
+    found = [
+        Claim("gate: mik+a's action loss at k=1, of that at k=15", (best, loss(1)), "<=", 0.85, (best, loss(15))),
+        Claim(
+            "no_history's velocity error, of mik+a's", (Cell(maze, "no_history"), velocity), ">=", 3, (best, velocity)
+        ),
+        Claim("K=1: ah+a's state error, of mik+a's", (recorder_1, state), ">=", 2, (best_1, state)),
+        Claim("K=1: ah+a's action loss is near zero", (recorder_1, loss(0)), "<=", NEAR_ZERO),
+        Claim(
+            "K=1: mik+a's state error with the literal future, of the default's",
+            (literal, state),
+            ">=",
+            2,
+            (best_1, state),
+        ),
+        Claim("ah+a's position error, of mik+a's", (recorder, position), ">=", 1.5, (best, position)),
+    ]
+    if maze == "three_curtains":
+        found += [
+            Claim("mik's velocity error, of mik+a's", (Cell(maze, "mik"), velocity), ">=", 1.5, (best, velocity)),
+            Claim("ah's state error, of mik+a's", (Cell(maze, "ah"), state), ">", 1, (best, state)),
+        ]
+    untrained = Cell(maze, "random"), position
+    for method in RECURRENT:
+        found.append(
+            Claim(
+                f"{method}'s position error, of the untrained one's",
+                (Cell(maze, method), position),
+                "<",
+                0.5,
+                untrained,
+            )
+        )
+    return found
+
+
+def judge(claim: Claim, runs: Sequence[Run]) -> Verdict | None:
+    """What the runs say of a claim, seeds paired; None while a side has no run."""
+    left = _by_seed(claim.left, runs)
+    right = dict.fromkeys(left, 1.0) if claim.right is None else _by_seed(claim.right, runs)
+    seeds = sorted(left.keys() & right.keys())
+    if not seeds:
+        return None
+    holding = sum(claim.holds(left[seed], right[seed]) for seed in seeds)
+    means = [sum(side[seed] for seed in seeds) / len(seeds) for side in (left, right)]
+    return Verdict(claim, means[0], means[1], len(seeds), holding, _paper_says(claim))
+
+
+def _by_seed(side: tuple[Cell, Value], runs: Sequence[Run]) -> dict[int, float]:
+    cell, value = side
+    return {run.seed: run.values[value] for run in runs if run.cell == cell and value in run.values}
+
+
+def _paper_says(claim: Claim) -> bool | None:
+    left = paper_number(*claim.left)
+    right = 1.0 if claim.right is None else paper_number(*claim.right)
+    return None if left is None or right is None else claim.holds(left, right)
+
+
+def paper_number(cell: Cell, value: Value) -> float | None:
+    """The paper's number for a cell and a measure, where it has one."""
+    if cell.literal_future or value[4] != 0 or value[3] != "all":
+        return None
+    component = value[0].removesuffix("_error")
+    for row in paper_rows():
+        name = row["objective"].lower().replace(" ", "_"), int(row["k_max"]), row["component"]
+        options = row["self_prediction"] == "Y", row["exogenous"] == "Y"
+        if name == (cell.method, cell.max_k, component) and options == (cell.self_prediction, cell.exogenous):
+            return float(row[cell.maze])
+    return None

@@ -1,0 +1,177 @@
+"""Collect a maze's data: shards in V-D4RL's format with frames of 100x100 and the true state of every row.
+
+Trajectory i depends on (seed, i) alone, whatever the number of workers. Within a trajectory nothing is reset; goals
+are uniform in the free space and move when they are reached. Shards are written whole, so the same command goes on
+after an interruption and ends in the same files.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd4rl_pomdp.data.collect import claim_set, episode_seed, join_rollouts, record_set
+from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.mazes import get_maze
+from vd4rl_pomdp.runs.folder import jsonable
+from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.runs.provenance import versions
+from vd4rl_pomdp.runs.workers import default_workers, run_jobs
+from vd4rl_pomdp.types import StepType
+
+_RUNTIME_FIELDS = ("out", "workers", "preset")
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """Settings of `vd4rl-pomdp navigation collect`."""
+
+    maze: str
+    """no_curtain, one_curtain, three_curtains or first_person."""
+    out: Path
+    """Folder of the set."""
+    preset: str = "paper"
+    """paper, cpu or smoke: the defaults of all other settings."""
+    trajectories: int = 500
+    """Trajectories in all; the last tenth is held out from training."""
+    trajectory_rows: int = 1000
+    """Rows of each trajectory."""
+    action_repeat: int = 1
+    """Simulator steps of 0.01 s for one action (D4RL's is 1)."""
+    noise: float = 0.5
+    """Standard deviation of the Gaussian noise on actions in [-1, 1]."""
+    seed: int = 0
+    """Seed of starts, goals and noise."""
+    workers: int = default_workers()
+    """Processes that simulate and draw."""
+    trajectories_per_shard: int = 5
+    """Trajectories in a shard."""
+
+
+_CPU = CollectConfig("", Path(), preset="cpu", trajectories=100, action_repeat=5)
+PRESETS = {
+    "paper": CollectConfig("", Path()),
+    "cpu": _CPU,
+    "smoke": replace(_CPU, preset="smoke", trajectories=10, trajectory_rows=120),
+}
+"""Defaults by preset: 500k rows as in the paper, 100k rows whose actions move the mass visibly, and 1,200 rows."""
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One trajectory to roll out."""
+
+    maze: str
+    trajectory: int
+    seed: int
+    rows: int
+    action_repeat: int
+    noise: float
+
+
+def collect(config: CollectConfig) -> list[Path]:
+    """Collect the set, or what is missing of it; returns its shards."""
+    _check(config)
+    claim_set(config.out, {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS})
+    started, frames, shards = time.monotonic(), 0, []
+    with ProgressLine(f"collect {config.maze}", config.trajectories, "trajectories") as progress:
+        for path, trajectories in _plan(config):
+            shards.append(path)
+            if path.exists():
+                progress.advance(len(trajectories))
+                continue
+            rollouts = []
+            for rollout in run_jobs(_roll_out, [_job(config, i) for i in trajectories], config.workers):
+                rollouts.append(rollout)
+                frames += len(rollout["reward"])
+                progress.advance(1, frames_per_s=frames / (time.monotonic() - started))
+            write_shard(path, join_rollouts(rollouts), _attributes(config))
+    record_set(config.out, time.monotonic() - started, frames, config.workers)
+    return shards
+
+
+def drive(maze: str, rows: int, action_repeat: int = 5, noise: float = 0.5, seed: int = 0) -> dict[str, np.ndarray]:
+    """Rows of one trajectory, by key, without writing anything."""
+    get_maze(maze)
+    return _roll_out(_Job(maze, 0, seed, rows, action_repeat, noise))
+
+
+def _check(config: CollectConfig) -> None:
+    get_maze(config.maze)
+    for name in ("trajectories", "action_repeat", "trajectories_per_shard", "workers"):
+        if getattr(config, name) < 1:
+            raise UserError(f"--{name.replace('_', '-')} is {getattr(config, name)}; it must be at least 1")
+    if config.trajectory_rows < 2:
+        raise UserError(f"--trajectory-rows is {config.trajectory_rows}; a trajectory needs at least 2")
+    if not config.noise >= 0:
+        raise UserError(f"--noise is {config.noise}; a standard deviation cannot be negative")
+
+
+def _plan(config: CollectConfig) -> Iterator[tuple[Path, range]]:
+    """Shards to write: file and trajectory numbers."""
+    for number, start in enumerate(range(0, config.trajectories, config.trajectories_per_shard)):
+        stop = min(start + config.trajectories_per_shard, config.trajectories)
+        yield config.out / f"{number}_{config.maze}.hdf5", range(start, stop)
+
+
+def _job(config: CollectConfig, trajectory: int) -> _Job:
+    rows, repeat = config.trajectory_rows, config.action_repeat
+    return _Job(config.maze, trajectory, config.seed, rows, repeat, config.noise)
+
+
+def _roll_out(job: _Job) -> dict[str, np.ndarray]:
+    """Rows of one trajectory, by key."""
+    env, policy = _environment(job.maze, job.action_repeat)
+    rng = np.random.default_rng([job.seed, job.trajectory])
+    frame, info = env.reset(seed=episode_seed(job.seed, job.trajectory))
+    rows: list[tuple[Any, ...]] = [(frame, np.zeros(2, np.float32), 0.0, info["state"])]
+    while len(rows) < job.rows:
+        action = policy(info["state"], info["goal"]) + rng.normal(0, job.noise, 2)
+        action = np.clip(action, -1, 1).astype(np.float32)
+        frame, reward, _, _, info = env.step(action)
+        rows.append((frame, action, reward, info["state"]))
+    frames, actions, rewards, states = zip(*rows, strict=True)
+    step_type = np.full(len(rows), StepType.MID)
+    step_type[0], step_type[-1] = StepType.FIRST, StepType.LAST
+    return {
+        "observation": np.stack(frames),
+        "action": np.stack(actions),
+        "reward": np.array(rewards),
+        "discount": np.ones(len(rows)),
+        "step_type": step_type,
+        "physics": np.stack(states),
+    }
+
+
+_ENVIRONMENTS: dict[tuple[str, int], Any] = {}
+
+
+def _environment(maze: str, action_repeat: int) -> tuple[Any, Callable[[np.ndarray, np.ndarray], np.ndarray]]:
+    """The process's environment and policy for these arguments: one GL context serves all its trajectories."""
+    from vd4rl_pomdp.envs.maze import MazeEnv
+    from vd4rl_pomdp.experiments.navigation.planner import Planner
+    from vd4rl_pomdp.experiments.navigation.policy import FirstPersonPilot
+
+    if (maze, action_repeat) not in _ENVIRONMENTS:
+        env = MazeEnv(maze, action_repeat)
+        pilot = FirstPersonPilot(env) if env.maze_spec.first_person else Planner(env)
+        _ENVIRONMENTS[maze, action_repeat] = env, pilot.act
+    return _ENVIRONMENTS[maze, action_repeat]
+
+
+def _attributes(config: CollectConfig) -> dict[str, Any]:
+    packages = ("mujoco", "gymnasium-robotics", "vd4rl-pomdp")
+    return {
+        "task": config.maze,
+        "policy": "ppo" if get_maze(config.maze).first_person else "planner",
+        "seed": config.seed,
+        "action_repeat": config.action_repeat,
+        "noise": config.noise,
+        "versions": {k: v for k, v in versions().items() if k in packages},
+    }

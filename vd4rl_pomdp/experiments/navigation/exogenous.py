@@ -1,0 +1,128 @@
+"""Exogenous noise: an image from a pool is added to each observation, and has nothing to do with the agent.
+
+A row always shows the same image (it is drawn by the row's key), as in a real environment; the pool is crops of the
+photographs that scikit-learn ships, or images from a folder: CIFAR-10's python or binary files, or PNG and JPEG files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from pathlib import Path
+from pickletools import genops
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image
+from torch import Tensor
+
+from vd4rl_pomdp.corruptions.keys import derive_keys, draw_integers
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.mazes import PICTURE_SIZE
+
+PHOTOGRAPHS = "photographs"
+"""Name of the pool that needs no files."""
+POOL = 1024
+"""Images in a pool at most."""
+_CIFAR_SIDE, _CIFAR_CLASSES = 32, 10
+_CIFAR_BYTES = 3 * _CIFAR_SIDE**2
+_CROPS = (120, 400)
+"""Least and greatest side of a photograph's crop, in its pixels."""
+
+
+class ExogenousNoise:
+    """Adds `weight` times an image of the pool to each picture and clips."""
+
+    def __init__(self, source: str, weight: float, seed: int) -> None:
+        if not 0 < weight <= 1:
+            raise UserError(f"--exogenous-weight is {weight}; it must be above 0 and at most 1")
+        self._seed, self._weight = seed, weight
+        self.pool = load_pool(source, seed)
+        """(P, 3, 100, 100) uint8."""
+
+    def __call__(self, pictures: Tensor, key: Tensor) -> Tensor:
+        """Noisy copies of (N, 3, 100, 100) uint8 pictures, drawn by (N,) int64 row keys."""
+        self.pool = self.pool.to(pictures.device)
+        chosen = draw_integers(derive_keys(self._seed, key), len(self.pool), 1)[:, 0]
+        added = self.pool[chosen].float().mul_(self._weight)
+        return added.add_(pictures).round_().clamp_(max=255).to(torch.uint8)
+
+
+def load_pool(source: str, seed: int) -> Tensor:
+    """Images to add: (P, 3, 100, 100) uint8; raises UserError if there is none."""
+    rng = np.random.default_rng(seed)
+    if source == PHOTOGRAPHS:
+        return _photographs(rng)
+    images = list(_resized(Path(source)))
+    if not images:
+        raise UserError(
+            f"{source}: no readable image; name a folder with CIFAR-10's data_batch files (python or binary), with PNG "
+            f"or JPEG files, or use --exogenous {PHOTOGRAPHS}"
+        )
+    pool = torch.cat(images)
+    return pool[torch.from_numpy(rng.permutation(len(pool))[:POOL])]
+
+
+def _photographs(rng: np.random.Generator) -> Tensor:
+    """Random square crops, mirrored half of the time."""
+    from sklearn.datasets import load_sample_images
+
+    photographs = load_sample_images().images
+    crops = []
+    for number in range(POOL):
+        photograph = photographs[number % len(photographs)]
+        side = int(rng.integers(*_CROPS))
+        top, left = (int(rng.integers(length - side + 1)) for length in photograph.shape[:2])
+        crop = photograph[top : top + side, left : left + side]
+        crops.append(_to_size(np.ascontiguousarray(crop[:, ::-1] if rng.random() < 0.5 else crop)[None]))
+    return torch.cat(crops)
+
+
+def _resized(folder: Path) -> Iterator[Tensor]:
+    """Batches of a folder's images, at most POOL of each file."""
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such folder; name one with images or use --exogenous {PHOTOGRAPHS}")
+    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
+        if path.name.startswith(("data_batch", "test_batch")):
+            yield _to_size(_read_cifar(path)[:POOL])
+        elif path.suffix.lower() in (".png", ".jpg", ".jpeg"):
+            try:
+                yield _to_size(np.asarray(Image.open(path).convert("RGB"))[None])
+            except OSError as error:
+                raise UserError(f"{path}: cannot be read as an image ({error}); remove or replace it") from error
+
+
+def _read_cifar(path: Path) -> np.ndarray:
+    """(N, 32, 32, 3) uint8 of one CIFAR-10 file."""
+    data = _binary_records(path) if path.suffix == ".bin" else _python_records(path)
+    return data.reshape(-1, 3, _CIFAR_SIDE, _CIFAR_SIDE).transpose(0, 2, 3, 1)
+
+
+def _binary_records(path: Path) -> np.ndarray:
+    raw = np.fromfile(path, np.uint8)
+    if not raw.size or raw.size % (_CIFAR_BYTES + 1):
+        raise UserError(f"{path}: its size is no multiple of {_CIFAR_BYTES + 1} bytes; download CIFAR-10 again")
+    records = raw.reshape(-1, _CIFAR_BYTES + 1)
+    if records[:, 0].max() >= _CIFAR_CLASSES:
+        raise UserError(f"{path}: holds labels above 9, so it is no CIFAR-10 file; download CIFAR-10 again")
+    return records[:, 1:]
+
+
+def _python_records(path: Path) -> np.ndarray:
+    """The pixels inside a pickled batch, found without running the pickle: its one long run of bytes."""
+    try:
+        runs = [a for _, a, _ in genops(path.read_bytes()) if isinstance(a, str | bytes)]
+        longest = max(runs, key=len, default=b"")
+        raw = longest.encode("latin-1") if isinstance(longest, str) else longest
+    except (ValueError, OSError) as error:
+        raise UserError(f"{path}: is damaged ({error}); download CIFAR-10 again") from error
+    if not raw or len(raw) % _CIFAR_BYTES:
+        raise UserError(f"{path}: holds no pixels of 32x32 images; download CIFAR-10 again")
+    return np.frombuffer(raw, np.uint8)
+
+
+def _to_size(images: np.ndarray) -> Tensor:
+    """(N, H, W, 3) uint8 -> (N, 3, 100, 100) uint8."""
+    planes = torch.from_numpy(np.array(images)).permute(0, 3, 1, 2).float()
+    resized = F.interpolate(planes, (PICTURE_SIZE, PICTURE_SIZE), mode="bilinear", antialias=True)
+    return resized.round_().clamp_(0, 255).to(torch.uint8)

@@ -1,0 +1,127 @@
+"""Pictures of the navigation report: accuracy bars, trajectories over the maze, and what a model is shown."""
+
+from __future__ import annotations
+
+import csv
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from matplotlib.figure import Figure
+from matplotlib.patches import Rectangle
+
+from vd4rl_pomdp.experiments.navigation.claims import paper_number
+from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, Cell
+from vd4rl_pomdp.experiments.navigation.rows import Run, Value
+from vd4rl_pomdp.mazes import FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
+
+_OURS, _PAPER, _ESTIMATE = "#0072b2", "#e69f00", "#d55e00"
+_SAMPLES = 6
+_FIRST_ROW, _ROW_STEP = 20, 12
+
+
+def accuracy_bars(runs: list[Run], value: Value, path: Path) -> None:
+    """State prediction accuracy, 100 - error, of every objective and maze at K = 15, beside the paper's."""
+    mazes = [maze for maze in MAZES if any(run.cell.maze == maze for run in runs)]
+    figure = Figure(figsize=(1.2 + 3.6 * len(mazes), 3.4), layout="constrained")
+    panels = np.atleast_1d(figure.subplots(1, len(mazes), sharey=True))
+    methods = [*OBJECTIVES, "random"]
+    for axes, maze in zip(panels, mazes, strict=True):
+        for place, method in enumerate(methods):
+            _bar(axes, place, Cell(maze, method), runs, value)
+        axes.set_title(maze, fontsize=10)
+        axes.set_xticks(range(len(methods)), methods, rotation=40, ha="right", fontsize=8)
+        axes.spines[["top", "right"]].set_visible(False)
+        axes.set_ylim(0, 100)
+    panels[0].set_ylabel("accuracy: 100 - state error (%)")
+    handles = [Rectangle((0, 0), 1, 1, color=colour) for colour in (_OURS, _PAPER)]
+    figure.legend(handles, ["here (points are seeds)", "paper"], loc="outside upper right", ncols=2, frameon=False)
+    figure.savefig(path, dpi=130, metadata={"Software": None})
+
+
+def _bar(axes: Any, place: int, cell: Cell, runs: list[Run], value: Value) -> None:
+    accuracy = [100 - run.values[value] for run in runs if run.cell == cell and value in run.values]
+    if accuracy:
+        axes.bar(place - 0.2, np.mean(accuracy), 0.38, color=_OURS)
+        axes.plot([place - 0.2] * len(accuracy), accuracy, "k.", markersize=3)
+    paper = paper_number(cell, ("state_error", "training", "online", "all", 0))
+    if paper is not None:
+        axes.bar(place + 0.2, 100 - paper, 0.38, color=_PAPER)
+
+
+def trajectories(runs: list[Run], path: Path, methods: tuple[str, ...] = ("mik+a", "ah+a", "no_history")) -> bool:
+    """A held-out trajectory over the maze with the refitted probe's estimates; False if no run has one."""
+    chosen = [_first(runs, Cell(maze, method)) for maze in MAZES for method in methods]
+    found = [run for run in chosen if run is not None]
+    if not found:
+        return False
+    mazes = [maze for maze in MAZES if any(run.cell.maze == maze for run in found)]
+    methods = tuple(method for method in methods if any(run.cell.method == method for run in found))
+    figure = Figure(figsize=(3.2 * len(methods), 3.3 * len(mazes)), layout="constrained")
+    panels = figure.subplots(len(mazes), len(methods), squeeze=False)
+    for axes in panels.flat:
+        axes.set_axis_off()
+    for run in found:
+        axes = panels[mazes.index(run.cell.maze)][methods.index(run.cell.method)]
+        _draw_trajectory(axes, run)
+    figure.savefig(path, dpi=120, metadata={"Software": None})
+    return True
+
+
+def _first(runs: list[Run], cell: Cell) -> Run | None:
+    return next((run for run in runs if run.cell == cell and run.trajectory is not None), None)
+
+
+def _draw_trajectory(axes: Any, run: Run, rows: int = 100) -> None:
+    assert run.trajectory is not None
+    with run.trajectory.open(newline="") as file:
+        table = list(csv.DictReader(file))[:rows]
+    draw_maze(axes, MAZES[run.cell.maze])
+    for names, colour, label in ((("x", "y"), "black", "true"), (("estimated_x", "estimated_y"), _ESTIMATE, "probe")):
+        points = np.array([[float(row[name]) for name in names] for row in table])
+        axes.plot(*points.T, color=colour, lw=1, marker=".", markersize=2.5, label=label)
+    axes.set_title(f"{run.cell.maze}: {run.cell.method}", fontsize=9)
+    axes.legend(fontsize=7, loc="center left", framealpha=0.9)
+
+
+def draw_maze(axes: Any, maze: MazeSpec) -> None:
+    """Walls, free cells and curtains, seen from the top."""
+    axes.add_patch(Rectangle((-HALF_SIZE, -HALF_SIZE), 2 * HALF_SIZE, 2 * HALF_SIZE, color="#e4c9a8", zorder=0))
+    for row, column in FREE_CELLS:
+        corner = column - HALF_SIZE, HALF_SIZE - row - 1
+        axes.add_patch(Rectangle(corner, 1, 1, color="#f7f7f7", zorder=0))
+    for curtain in maze.curtains:
+        corner = curtain.center[0] - curtain.half[0], curtain.center[1] - curtain.half[1]
+        axes.add_patch(
+            Rectangle(corner, 2 * curtain.half[0], 2 * curtain.half[1], color="#5b5b78", alpha=0.25, zorder=1)
+        )
+    axes.set(xlim=(-HALF_SIZE, HALF_SIZE), ylim=(-HALF_SIZE, HALF_SIZE), aspect="equal")
+
+
+def sample_observations(path: Path) -> None:
+    """Pictures along a drive through each maze; below them grey ones and ones with exogenous noise."""
+    from vd4rl_pomdp.experiments.navigation.exogenous import PHOTOGRAPHS, ExogenousNoise
+    from vd4rl_pomdp.experiments.navigation.observations import to_grey50
+
+    drives = {maze: _drive(maze) for maze in MAZES}
+    pictures = torch.from_numpy(drives["three_curtains"])
+    noise = ExogenousNoise(PHOTOGRAPHS, 0.5, 0)
+    drives["three_curtains, grey50"] = to_grey50(pictures).expand(-1, 3, -1, -1).numpy()
+    drives["three_curtains, exogenous"] = noise(pictures, torch.arange(len(pictures))).numpy()
+    figure = Figure(figsize=(1.5 * _SAMPLES + 1.6, 1.55 * len(drives)), layout="constrained")
+    panels = figure.subplots(len(drives), _SAMPLES)
+    for row, (name, drive) in zip(panels, drives.items(), strict=True):
+        for axes, picture in zip(row, drive, strict=True):
+            axes.imshow(picture.transpose(1, 2, 0), interpolation="nearest")
+            axes.set(xticks=[], yticks=[])
+        row[0].set_ylabel(name.replace(", ", "\n"), fontsize=8)
+    figure.savefig(path, dpi=100, metadata={"Software": None})
+
+
+def _drive(maze: str) -> np.ndarray:
+    """Some pictures of a drive: (_SAMPLES, 3, 100, 100) uint8."""
+    from vd4rl_pomdp.experiments.navigation.collect import drive
+
+    count = _FIRST_ROW + _ROW_STEP * (_SAMPLES - 1) + 1
+    return drive(maze, rows=count)["observation"][_FIRST_ROW::_ROW_STEP]

@@ -1,0 +1,87 @@
+"""Which runs make the paper's tables: cells as data, each with the command that computes it."""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.mazes import get_maze
+
+PAPER = Path(__file__).parent / "paper.csv"
+"""The paper's numbers: one line a table row, one column a maze."""
+OBJECTIVES = ("no_history", "ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
+EVIDENCE_MAZES = ("no_curtain", "three_curtains")
+
+
+@dataclass(frozen=True)
+class Cell:
+    """What one run trains, but for its seed and budget."""
+
+    maze: str
+    method: str
+    max_k: int = 15
+    self_prediction: bool = False
+    exogenous: bool = False
+    literal_future: bool = False
+
+    @property
+    def name(self) -> str:
+        """Folder of the cell's runs."""
+        parts = [self.method, f"K{self.max_k}"]
+        for flag, short in (("self_prediction", "sp"), ("exogenous", "exo"), ("literal_future", "literal")):
+            parts += [short] if getattr(self, flag) else []
+        return f"{self.maze}/{'-'.join(parts)}"
+
+    def words(self, preset: str, data: Path, runs: Path, seed: int) -> list[str]:
+        """Words of the command that trains it, after `vd4rl-pomdp`."""
+        words = ["navigation", "train", "--preset", preset, "--data", str(data / self.maze), "--method", self.method]
+        words += ["--max-k", str(self.max_k), "--seed", str(seed)]
+        words += ["--self-prediction", "1.0"] if self.self_prediction else []
+        words += ["--exogenous", "photographs"] if self.exogenous else []
+        words += ["--literal-future"] if self.literal_future else []
+        return [*words, "--out", str(runs / self.name / f"seed{seed}")]
+
+
+def evidence(mazes: tuple[str, ...] = EVIDENCE_MAZES) -> list[Cell]:
+    """The first evidence: all objectives and the floor at K = 15, and what K = 1 does to those that read actions."""
+    cells = [Cell(maze, method) for maze in mazes for method in ("mik+a", "ah+a", "no_history", "random")]
+    cells += [Cell(maze, method, 1) for maze in mazes for method in ("ah+a", "mik+a")]
+    cells += [Cell(maze, "mik+a", 1, literal_future=True) for maze in mazes]
+    return cells + [Cell(maze, method) for maze in mazes for method in ("mik", "ah", "fj+a", "fj")]
+
+
+def options(mazes: tuple[str, ...] = EVIDENCE_MAZES) -> list[Cell]:
+    """Self-prediction and exogenous noise, for all objectives."""
+    cells = [Cell(maze, method, self_prediction=True) for maze in mazes for method in reversed(OBJECTIVES)]
+    return cells + [Cell(maze, method, exogenous=True) for maze in mazes for method in reversed(OBJECTIVES)]
+
+
+GRIDS = {"evidence": evidence, "options": options}
+
+
+def grid_commands(
+    grid: str, mazes: tuple[str, ...], seeds: tuple[int, ...], preset: str, data: Path, runs: Path
+) -> Iterator[list[str]]:
+    """Words of all runs of a grid, seed by seed, so that every cell has its first seed early."""
+    if grid not in GRIDS:
+        raise UserError(f"unknown grid {grid!r}: choose one of {', '.join(GRIDS)}")
+    for maze in mazes:
+        get_maze(maze)
+    for seed in seeds:
+        for cell in GRIDS[grid](mazes):
+            yield cell.words(preset, data, runs, seed)
+
+
+def paper_rows() -> list[dict[str, str]]:
+    """The paper's tables, line by line."""
+    with PAPER.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def cell_of(row: dict[str, str], maze: str) -> Cell:
+    """The cell that a line of the paper's tables is about."""
+    method = row["objective"].lower().replace(" ", "_")
+    return Cell(maze, method, int(row["k_max"]), row["self_prediction"] == "Y", row["exogenous"] == "Y")

@@ -1,0 +1,173 @@
+"""The policy that collects first-person data: PPO (stable-baselines3) on states, exported as a small file and shipped.
+
+It is told the way: the next waypoint and its own velocity, both seen from its heading. The reward is the way it covers
+and 1 for a goal. PPO's Gaussian acts before a tanh, so that the exported actor (see `policies.actor`) is the policy.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.experiments.navigation.planner import Planner
+from vd4rl_pomdp.policies.actor import Actor, read_actor
+from vd4rl_pomdp.runs.progress import ProgressLine
+
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
+
+    from vd4rl_pomdp.envs.maze import MazeEnv
+
+SHIPPED = Path(__file__).parent / "assets" / "first_person.safetensors"
+FEATURES = 4
+_EPISODE = 200
+_LARGEST = 4.0
+"""Bound of PPO's actions before the tanh."""
+_PARALLEL = 8
+
+
+@dataclass(frozen=True)
+class MazePolicyConfig:
+    """Settings of `vd4rl-pomdp navigation policy`."""
+
+    out: Path
+    """File of the actor."""
+    decisions: int = 200_000
+    """Environment decisions in all."""
+    action_repeat: int = 5
+    """Simulator steps of 0.01 s for one action."""
+    seed: int = 0
+    """Seed of the networks and the episodes."""
+
+
+def features(state: np.ndarray, waypoint: np.ndarray) -> np.ndarray:
+    """What the policy sees of a (6,) state: (4,) float32, waypoint and velocity in the frame of its heading."""
+    ahead = np.array([np.cos(state[2]), np.sin(state[2])])
+    left = np.array([-ahead[1], ahead[0]])
+    way = waypoint - state[:2]
+    return np.array([way @ ahead, way @ left, state[3:5] @ ahead, state[3:5] @ left], np.float32)
+
+
+class FirstPersonPilot:
+    """The shipped policy's mean action for a state and a goal."""
+
+    def __init__(self, env: MazeEnv, actor: Actor | None = None) -> None:
+        self._planner = Planner(env)
+        self._actor = actor or read_actor(SHIPPED)
+
+    def act(self, state: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Action (2,) for a (6,) state and a (2,) goal."""
+        return self._actor.act(features(state, self._planner.waypoint(state[:2], goal)))
+
+
+class PilotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """The first-person maze as PPO sees it."""
+
+    def __init__(self, action_repeat: int) -> None:
+        from vd4rl_pomdp.envs.maze import MazeEnv
+
+        self._env = MazeEnv("first_person", action_repeat, pixels=False)
+        self._planner = Planner(self._env)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (FEATURES,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-_LARGEST, _LARGEST, (2,), np.float32)
+        self._steps = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Another start and goal."""
+        super().reset(seed=seed)
+        self._env.reset(seed=seed)
+        self._steps = 0
+        return self._see(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Apply tanh(action); the reward is the way covered, and 1 for a goal."""
+        goal = self._env.goal
+        before = self._planner.distance(self._env.state[:2], goal)
+        _, reached, *_ = self._env.step(np.tanh(action))
+        covered = before - self._planner.distance(self._env.state[:2], goal)
+        self._steps += 1
+        return self._see(), covered + reached, False, self._steps == _EPISODE, {}
+
+    def _see(self) -> np.ndarray:
+        return features(self._env.state, self._planner.waypoint(self._env.state[:2], self._env.goal))
+
+
+def train_policy(config: MazePolicyConfig) -> Actor:
+    """Train and write the actor; its card says how many goals it reaches in 20 episodes."""
+    try:
+        from stable_baselines3 import PPO
+        from stable_baselines3.common.callbacks import BaseCallback
+        from stable_baselines3.common.vec_env import DummyVecEnv
+        from torch import nn
+    except ImportError as error:
+        raise UserError(
+            f"training a policy needs stable-baselines3 ({error}): pip install 'vd4rl-pomdp[policy]'"
+        ) from None
+
+    class Report(BaseCallback):
+        """Moves the progress line."""
+
+        def _on_step(self) -> bool:
+            progress.advance(_PARALLEL)
+            return True
+
+    environments = DummyVecEnv([lambda: PilotEnv(config.action_repeat) for _ in range(_PARALLEL)])
+    model = PPO(
+        "MlpPolicy",
+        environments,
+        n_steps=256,
+        batch_size=512,
+        gamma=0.98,
+        ent_coef=1e-3,
+        seed=config.seed,
+        device="cpu",
+        policy_kwargs={"net_arch": [64, 64], "activation_fn": nn.ReLU},
+    )
+    with ProgressLine("PPO first_person", config.decisions, "decisions") as progress:
+        model.learn(config.decisions, callback=Report())
+    actor = _export(model, config)
+    actor.card["goals_in_20_episodes"] = goals_reached(actor, config.action_repeat, 20)
+    actor.save(config.out)
+    return actor
+
+
+def goals_reached(actor: Actor, action_repeat: int, episodes: int) -> int:
+    """Goals that the mean action reaches in episodes of 200 decisions from fixed seeds."""
+    from vd4rl_pomdp.envs.maze import MazeEnv
+
+    env = MazeEnv("first_person", action_repeat, pixels=False)
+    pilot, reached = FirstPersonPilot(env, actor), 0
+    for episode in range(episodes):
+        _, info = env.reset(seed=10_000 + episode)
+        for _ in range(_EPISODE):
+            _, reward, _, _, info = env.step(pilot.act(info["state"], info["goal"]))
+            reached += int(reward)
+    return reached
+
+
+def _export(model: PPO, config: MazePolicyConfig) -> Actor:
+    """PPO's actor as plain matrices; its spread does not depend on the state."""
+    policy: Any = model.policy
+    layers = [module for module in policy.mlp_extractor.policy_net if hasattr(module, "weight")]
+    weights = {f"hidden.{i}": layer for i, layer in enumerate(layers)} | {"mean": policy.action_net}
+    arrays = {f"{name}.weight": layer.weight.detach().numpy().T.copy() for name, layer in weights.items()}
+    arrays |= {f"{name}.bias": layer.bias.detach().numpy().copy() for name, layer in weights.items()}
+    log_std = policy.log_std.detach().numpy().copy()
+    arrays |= {"log_std.weight": np.zeros((layers[-1].out_features, len(log_std)), np.float32), "log_std.bias": log_std}
+    card = {
+        "task": "first_person",
+        "algorithm": "PPO",
+        "decisions": config.decisions,
+        "action_repeat": config.action_repeat,
+        "seed": config.seed,
+        "stable_baselines3": version("stable-baselines3"),
+    }
+    return Actor(arrays, card)

@@ -1,0 +1,273 @@
+"""The navigation report: the paper's tables from raw rows, each number beside the paper's, and what they say.
+
+OUT/README.md     tables, verdicts, figures, and the command of every cell
+OUT/rows.csv, runs.csv, trajectories/     raw numbers; `navigation report OUT` makes everything again from them
+OUT/tables.csv    every cell: mean, interval, seeds, the paper's number
+OUT/figures/      accuracy.png, trajectories.png, observations.png
+"""
+
+from __future__ import annotations
+
+import csv
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.experiments.navigation import figures
+from vd4rl_pomdp.experiments.navigation.claims import claims, judge, paper_number
+from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, Cell, cell_of, paper_rows
+from vd4rl_pomdp.experiments.navigation.rows import Run, Value, load_runs, save_runs
+from vd4rl_pomdp.mazes import MAZES
+from vd4rl_pomdp.report.stats import bootstrap_interval, mean
+
+VIEWS = {
+    "training averages, probe trained beside the model (the paper's way)": ("training", "online"),
+    "held-out trajectories, probe refitted on frozen states": ("held_out", "refit"),
+}
+"""Where an error is measured, and by which probe."""
+_TITLES = {
+    "state_error": "State estimation errors (%), K = 1 and 15",
+    "position_error": "Position errors (%), K = 15",
+    "velocity_error": "Velocity errors (%), K = 15",
+    "action_loss": "Action prediction losses (nats x 100), K = 15",
+    "self_prediction": "State estimation errors (%) without and with self-prediction, K = 15",
+    "exogenous": "State estimation errors (%) with exogenous noise, K = 15",
+    "exogenous_main": "State estimation errors (%) with exogenous noise, two mazes (the main text's table)",
+}
+_MAIN_TEXT = ("no_curtain", "three_curtains")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """One number of a table."""
+
+    cell: Cell
+    value: Value
+    numbers: np.ndarray
+    """(n,) one for each seed."""
+
+    @property
+    def paper(self) -> float | None:
+        """The paper's number."""
+        return paper_number(self.cell, self.value)
+
+    def text(self) -> str:
+        """Mean, interval, seeds, and the paper's number in brackets."""
+        paper = "-" if self.paper is None else f"{self.paper:.1f}"
+        if not len(self.numbers):
+            return f"({paper})"
+        interval = self.interval()
+        spread = "" if interval is None else f" [{interval[0]:.1f}, {interval[1]:.1f}]"
+        return f"**{self.numbers.mean():.1f}**{spread} n={len(self.numbers)} ({paper})"
+
+    def interval(self) -> tuple[float, float] | None:
+        """Bootstrap interval over seeds."""
+        if not len(self.numbers):
+            return None
+        return bootstrap_interval([self.numbers], mean, np.random.default_rng(0))
+
+
+@dataclass(frozen=True)
+class Table:
+    """Rows of entries, one column a maze."""
+
+    name: str
+    view: str
+    mazes: tuple[str, ...]
+    rows: list[tuple[str, list[Entry]]]
+
+
+def write_report(sources: Sequence[Path], out: Path, pictures: bool = True) -> Path:
+    """Write the report of all runs in `sources` to `out`; returns the page.
+
+    Args:
+        sources: run folders, folders of them, or a folder that this function wrote.
+        out: where to.
+        pictures: whether to draw sample observations, which needs OpenGL.
+    """
+    runs = load_runs(sources)
+    try:
+        save_runs(runs, out)
+        (out / "figures").mkdir(exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{out}: cannot write ({error.strerror}); choose another --out") from error
+    value = ("state_error", "held_out", "refit", "all", 0)
+    figures.accuracy_bars(runs, value, out / "figures" / "accuracy.png")
+    drawn = figures.trajectories(runs, out / "figures" / "trajectories.png")
+    if pictures:
+        figures.sample_observations(out / "figures" / "observations.png")
+    tables = make_tables(runs)
+    _write_tables(tables, out / "tables.csv")
+    page = out / "README.md"
+    page.write_text("\n".join(_page(runs, tables, drawn, pictures)) + "\n")
+    return page
+
+
+def make_tables(runs: list[Run]) -> list[Table]:
+    """The paper's six tables (position and velocity are one of them), then three of our own."""
+    tables = []
+    for name in _TITLES:
+        for view, (split, probe) in VIEWS.items():
+            tables.append(_paper_table(name, view, split, probe, runs))
+    return [*tables, _floor_table(runs), _hidden_table(runs), _by_k_table(runs)]
+
+
+def _paper_table(name: str, view: str, split: str, probe: str, runs: list[Run]) -> Table:
+    mazes = _MAIN_TEXT if name == "exogenous_main" else tuple(MAZES)
+    rows = []
+    for line in paper_rows():
+        if line["table"] != name.removesuffix("_main"):
+            continue
+        loss = line["component"] == "action_loss"
+        value: Value = (
+            ("action_loss", split, "", "all", 0) if loss else (f"{line['component']}_error", split, probe, "all", 0)
+        )
+        options = "".join(f", {o}" for o in ("self-prediction",) if line["self_prediction"] == "Y")
+        label = f"{line['objective']}, K={line['k_max']}{options}"
+        rows.append((label, [_entry(cell_of(line, maze), value, runs) for maze in mazes]))
+    return Table(name, view, mazes, rows)
+
+
+def _floor_table(runs: list[Run]) -> Table:
+    """What the paper does not show: the untrained encoder, and the literal future."""
+    mazes = tuple(MAZES)
+    rows = []
+    for component in ("state", "position", "velocity"):
+        value: Value = (f"{component}_error", "held_out", "refit", "all", 0)
+        rows.append((f"untrained, {component}", [_entry(Cell(m, "random"), value, runs) for m in mazes]))
+    literal = [Cell(maze, "mik+a", 1, literal_future=True) for maze in mazes]
+    measures: dict[str, Value] = {
+        "state error": ("state_error", "held_out", "refit", "all", 0),
+        "action loss": ("action_loss", "held_out", "", "all", 0),
+    }
+    for name, value in measures.items():
+        rows.append((f"MIK+A, literal future, K=1, {name}", [_entry(cell, value, runs) for cell in literal]))
+    return Table("references", "held-out trajectories, probe refitted on frozen states", mazes, rows)
+
+
+def _hidden_table(runs: list[Run]) -> Table:
+    """Errors on hidden steps alone."""
+    mazes = tuple(maze for maze, spec in MAZES.items() if spec.curtains)
+    rows = []
+    for method in (*OBJECTIVES, "random"):
+        for component in ("position", "velocity"):
+            value: Value = (f"{component}_error", "held_out", "refit", "hidden", 0)
+            rows.append((f"{method}, {component}", [_entry(Cell(maze, method), value, runs) for maze in mazes]))
+    return Table("hidden", "held-out trajectories, probe refitted on frozen states", mazes, rows)
+
+
+def _by_k_table(runs: list[Run]) -> Table:
+    """Action losses at the least and the greatest k."""
+    rows = []
+    for method in OBJECTIVES:
+        for k in (1, 5, 15):
+            value: Value = ("action_loss", "held_out", "", "all", k)
+            rows.append((f"{method}, k={k}", [_entry(Cell(maze, method), value, runs) for maze in MAZES]))
+    return Table("by_k", "held-out trajectories", tuple(MAZES), rows)
+
+
+def _entry(cell: Cell, value: Value, runs: list[Run]) -> Entry:
+    numbers = [run.values[value] for run in runs if run.cell == cell and value in run.values]
+    return Entry(cell, value, np.array(numbers))
+
+
+_OWN_TITLES = {
+    "references": "References: the untrained encoder, and MIK+A whose future holds a_{t+k-1}",
+    "hidden": "Errors (%) on steps that a curtain hides, K = 15",
+    "by_k": "Action losses (nats x 100) by k, K = 15",
+}
+
+
+def _page(runs: list[Run], tables: list[Table], drawn: bool, pictures: bool) -> list[str]:
+    preset, seeds = runs[0].preset, sorted({run.seed for run in runs})
+    steps = sorted({int(run.facts["steps"]) for run in runs if run.cell.method != "random"})
+    lines = ["# Navigation: what the objectives know of the state", ""]
+    lines += [
+        f"{len(runs)} runs, preset `{preset}`, {' or '.join(map(str, steps))} gradient steps, seeds "
+        f"{', '.join(map(str, seeds))}. A cell reads: **mean over seeds** [95% bootstrap interval] n=seeds (the",
+        "paper's number). The paper's budget is 200,000 steps on 500k samples. Intervals of few seeds are too narrow.",
+        "",
+        "![Accuracy of every objective](figures/accuracy.png)",
+        "",
+        *_verdicts(runs),
+    ]
+    lines += ["![True and estimated trajectories](figures/trajectories.png)", ""] if drawn else []
+    lines += ["![Sample observations](figures/observations.png)", ""] if pictures else []
+    for table in tables:
+        lines += _markdown(table)
+    return lines + _commands(runs)
+
+
+def _verdicts(runs: list[Run]) -> list[str]:
+    lines = ["## Which statements hold", "", "Held-out trajectories, probe refitted on frozen states.", ""]
+    lines += ["| maze | statement | here | holds | seeds | paper's numbers |", "|---|---|---|---|---|---|"]
+    for maze in MAZES:
+        for claim in claims(maze):
+            verdict = judge(claim, runs)
+            if verdict is None:
+                continue
+            bound = f"{claim.relation} {claim.factor:g}" + (" x" if claim.right else "")
+            ratio = f"{verdict.left:.1f} / {verdict.right:.1f}" if claim.right else f"{verdict.left:.1f}"
+            paper = {True: "hold it", False: "do not", None: "none"}[verdict.paper]
+            answer = "**yes**" if verdict.holds else "**no**"
+            cells = [maze, f"{claim.text} {bound}", ratio, answer, f"{verdict.seeds_holding} of {verdict.seeds}", paper]
+            lines.append(f"| {' | '.join(cells)} |")
+    return [*lines, ""]
+
+
+def _markdown(table: Table) -> list[str]:
+    title = _TITLES.get(table.name) or _OWN_TITLES[table.name]
+    shown = [(label, entries) for label, entries in table.rows if any(len(entry.numbers) for entry in entries)]
+    if not shown:
+        return [f"## {title}", "", f"*{table.view}*: no run yet.", ""]
+    lines = [f"## {title}", "", f"*{table.view}*", "", "| | " + " | ".join(table.mazes) + " |"]
+    lines += ["|---|" + "---|" * len(table.mazes)]
+    lines += [f"| {label} | " + " | ".join(entry.text() for entry in entries) + " |" for label, entries in table.rows]
+    return [*lines, ""]
+
+
+def _commands(runs: list[Run]) -> list[str]:
+    """The command of every run behind the tables."""
+    lines = [
+        "## Commands",
+        "",
+        "Each line computes one run; `navigation collect` makes its data. Seconds are wall-clock.",
+    ]
+    lines += ["", "```bash"]
+    for maze in dict.fromkeys(run.cell.maze for run in runs):
+        collect = f"vd4rl-pomdp navigation collect --preset {runs[0].preset} --maze {maze} --out data/{maze}"
+        lines.append(collect)
+    for run in runs:
+        lines.append(f"{run.facts['command']}  # {float(run.facts['seconds']):.0f} s")
+    return [*lines, "```"]
+
+
+def _write_tables(tables: list[Table], path: Path) -> None:
+    names = ["table", "view", "row", "maze", "mean", "low", "high", "seeds", "paper"]
+    with path.open("w", newline="") as file:
+        writer = csv.DictWriter(file, names, lineterminator="\n")
+        writer.writeheader()
+        for table in tables:
+            for label, entries in table.rows:
+                for maze, entry in zip(table.mazes, entries, strict=True):
+                    if len(entry.numbers):
+                        writer.writerow(_csv_row(table, label, maze, entry))
+
+
+def _csv_row(table: Table, label: str, maze: str, entry: Entry) -> dict[str, Any]:
+    low, high = entry.interval() or ("", "")
+    return {
+        "table": table.name,
+        "view": table.view,
+        "row": label,
+        "maze": maze,
+        "mean": f"{entry.numbers.mean():.4g}",
+        "low": low if low == "" else f"{low:.4g}",
+        "high": high if high == "" else f"{high:.4g}",
+        "seeds": len(entry.numbers),
+        "paper": "" if entry.paper is None else entry.paper,
+    }

@@ -1,0 +1,165 @@
+"""Raw numbers of navigation runs: read from run folders or from CSV files written before, kept as CSV files."""
+
+from __future__ import annotations
+
+import csv
+import shutil
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.experiments.navigation.grid import Cell
+from vd4rl_pomdp.runs.folder import read_json
+
+ROWS, RUNS, TRAJECTORIES = "rows.csv", "runs.csv", "trajectories"
+Value = tuple[str, str, str, str, int]
+"""(measure, split, probe, rows, k), for instance ("state_error", "held_out", "refit", "all", 0)."""
+_IDENTITY = ("maze", "method", "max_k", "self_prediction", "exogenous", "literal_future", "preset", "seed")
+_MEASURED = ("measure", "split", "probe", "rows", "k", "value")
+_FACTS = ("steps", "seconds", "set", "git_commit", "processor", "gpu", "command")
+
+
+@dataclass(frozen=True)
+class Run:
+    """One finished run."""
+
+    cell: Cell
+    preset: str
+    seed: int
+    values: dict[Value, float]
+    facts: dict[str, str]
+    """How it came about: steps, seconds, data, commit, machine, command."""
+    trajectory: Path | None
+    """A held-out trajectory with estimated states."""
+
+    @property
+    def identity(self) -> dict[str, Any]:
+        """What tells this run from others."""
+        shape = {name: getattr(self.cell, name) for name in _IDENTITY[:6]}
+        return {k: int(v) if isinstance(v, bool) else v for k, v in shape.items()} | {
+            "preset": self.preset,
+            "seed": self.seed,
+        }
+
+    @property
+    def file_name(self) -> str:
+        """Name of its trajectory beside the CSV files."""
+        return f"{self.cell.name.replace('/', '-')}-seed{self.seed}.csv"
+
+
+def load_runs(sources: Iterable[Path]) -> list[Run]:
+    """Finished runs of all sources: run folders, folders that hold some, or folders with `rows.csv` and `runs.csv`.
+
+    Raises:
+        UserError: a source is missing or holds nothing, or the same run comes with two results.
+    """
+    runs: dict[tuple[Any, ...], Run] = {}
+    for source in sources:
+        if not source.exists():
+            raise UserError(f"{source}: no such folder; name runs of `vd4rl-pomdp navigation train`")
+        found = _from_csv(source) if (source / ROWS).exists() else _from_folders(source)
+        if not found:
+            raise UserError(f"{source}: holds no finished run of `vd4rl-pomdp navigation train`")
+        for run in found:
+            key = tuple(run.identity.values())
+            if key in runs and runs[key].values != run.values:
+                raise UserError(
+                    f"{source}: {run.cell.name} seed {run.seed} is there twice with other results; keep one"
+                )
+            runs.setdefault(key, run)
+    presets = sorted({run.preset for run in runs.values()})
+    if len(presets) > 1:
+        raise UserError(f"runs of different presets ({', '.join(presets)}) do not make one table; report them apart")
+    return sorted(runs.values(), key=lambda run: tuple(run.identity.values()))
+
+
+def save_runs(runs: list[Run], out: Path) -> None:
+    """Write `rows.csv`, `runs.csv` and `trajectories/`, from which the report can be made again."""
+    out.mkdir(parents=True, exist_ok=True)
+    rows = [
+        run.identity | dict(zip(_MEASURED, (*value, f"{number:.6g}"), strict=True))
+        for run in runs
+        for value, number in run.values.items()
+    ]
+    _write(out / ROWS, (*_IDENTITY, *_MEASURED), rows)
+    _write(out / RUNS, (*_IDENTITY, *_FACTS), [run.identity | run.facts for run in runs])
+    (out / TRAJECTORIES).mkdir(exist_ok=True)
+    for run in runs:
+        target = out / TRAJECTORIES / run.file_name
+        if run.trajectory is not None and run.trajectory.resolve() != target.resolve():
+            shutil.copyfile(run.trajectory, target)
+
+
+def _write(path: Path, names: tuple[str, ...], rows: list[dict[str, Any]]) -> None:
+    temporary = path.with_name(f".{path.name}.tmp")
+    with temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, names, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    temporary.replace(path)
+
+
+def _from_folders(source: Path) -> list[Run]:
+    return [_read_run(path.parent) for path in sorted(source.rglob("timing.json")) if _is_navigation(path.parent)]
+
+
+def _is_navigation(folder: Path) -> bool:
+    return (folder / "results.json").exists() and read_json(folder / "config.json").get("stage") == "navigation"
+
+
+def _read_run(folder: Path) -> Run:
+    record, results = read_json(folder / "config.json"), read_json(folder / "results.json")
+    config, timing, machine = record["config"], read_json(folder / "timing.json"), read_json(folder / "machine.json")
+    cell = Cell(
+        maze=results["maze"],
+        method=config["method"],
+        max_k=config["max_k"],
+        self_prediction=config["self_prediction"] > 0,
+        exogenous=config["exogenous"] != "none",
+        literal_future=config["literal_future"],
+    )
+    facts = {
+        "steps": timing["steps"],
+        "seconds": timing["seconds"],
+        "set": results["set"],
+        "git_commit": record["git_commit"],
+        "processor": machine["processor"],
+        "gpu": machine["gpu"] or "",
+        "command": results.get("command", record["command"]),
+    }
+    values = {_value(row): float(f"{row['value']:.6g}") for row in results["rows"]}
+    trajectory = folder / "trajectory.csv"
+    return Run(cell, config["preset"], config["seed"], values, {k: str(v) for k, v in facts.items()}, trajectory)
+
+
+def _value(row: dict[str, Any]) -> Value:
+    return row["measure"], row["split"], row["probe"], row["rows"], int(row["k"])
+
+
+def _from_csv(source: Path) -> list[Run]:
+    values: dict[tuple[str, ...], dict[Value, float]] = {}
+    for row in _read(source / ROWS):
+        values.setdefault(_identity(row), {})[_value(row)] = float(row["value"])
+    runs = []
+    for row in _read(source / RUNS):
+        flags = {name: row[name] == "1" for name in ("self_prediction", "exogenous", "literal_future")}
+        cell = Cell(row["maze"], row["method"], int(row["max_k"]), **flags)
+        facts = {name: row[name] for name in _FACTS}
+        run = Run(cell, row["preset"], int(row["seed"]), values[_identity(row)], facts, None)
+        trajectory = source / TRAJECTORIES / run.file_name
+        runs.append(Run(cell, run.preset, run.seed, run.values, facts, trajectory if trajectory.exists() else None))
+    return runs
+
+
+def _identity(row: dict[str, str]) -> tuple[str, ...]:
+    return tuple(row[name] for name in _IDENTITY)
+
+
+def _read(path: Path) -> list[dict[str, str]]:
+    try:
+        with path.open(newline="") as file:
+            return list(csv.DictReader(file))
+    except OSError as error:
+        raise UserError(f"{path}: cannot be read ({error.strerror}); it is written by the report") from error
