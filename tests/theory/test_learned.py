@@ -47,7 +47,7 @@ def random_world() -> World:
 
 
 WORLDS = {"counterexample": lambda: counterexample(every=2), "random": random_world}
-"""The counterexample with a shorter counter: with the paper's, five moves must be added up modulo 4 at once."""
+"""The counterexample with a shorter counter: with the paper's, several moves must be added up modulo 4 at once."""
 
 
 def build(world: World, method: str, max_k: int) -> InverseObjective:

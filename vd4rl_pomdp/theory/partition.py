@@ -171,15 +171,17 @@ def relation(world: World, view: View, memory: Memory, ks: Iterable[int]) -> Rel
     within the rows m..m+K is taken, because one late history must serve all earlier t.
     """
     ks, first = list(ks), first_row(view, memory)
-    found = Relation(shared=not view.masked)
+    found, histories = Relation(shared=not view.masked), {}
     for t in range(first, first + (max(ks) if view.past == "all" else 1)):
         for k in (k for k in ks if view.past != "all" or t + k <= first + max(ks)):
             rows = t + k + memory.n + 1
             start, end = view.start(t, memory.m), view.end(t, k, memory.m, memory.n, rows)
             _add_predictions(found, world, start, end, t, k)
-            _add_facts(found, world, start, t)
+            histories[t] = start
             if found.shared:
-                _add_facts(found, world, end, t + k)
+                histories[t + k] = end
+    for row, seen in histories.items():
+        _add_facts(found, world, seen, row)
     return found
 
 
