@@ -7,7 +7,11 @@ cd "$(dirname "$0")/.."
 PYTHON="${PYTHON:-python3}"
 VENV=.venv
 STAMP="$VENV/.installed"
+export MUJOCO_GL="${MUJOCO_GL:-egl}"
 RENDER_PACKAGES=(libegl1 libgl1-mesa-dri)
+if [ "$MUJOCO_GL" = osmesa ]; then
+    RENDER_PACKAGES=(libosmesa6)
+fi
 
 say() { printf '%s\n' "$*" >&2; }
 
@@ -46,12 +50,12 @@ say "setup: installing Python packages (a few minutes the first time)"
 "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check -e ".[dev]"
 
 can_render() {
-    MUJOCO_GL="${MUJOCO_GL:-egl}" "$VENV/bin/python" scripts/can_render.py >/dev/null 2>&1
+    "$VENV/bin/python" scripts/can_render.py >/dev/null 2>&1
 }
 if ! can_render; then
     install_debian "${RENDER_PACKAGES[@]}"
     if ! can_render; then
-        say "setup: rendering still fails with MUJOCO_GL=${MUJOCO_GL:-egl}; try MUJOCO_GL=osmesa with the package libosmesa6"
+        say "setup: rendering still fails with MUJOCO_GL=$MUJOCO_GL; try MUJOCO_GL=osmesa"
         exit 2
     fi
 fi
