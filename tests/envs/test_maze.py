@@ -1,3 +1,6 @@
+import subprocess
+import sys
+
 import gymnasium
 import numpy as np
 import pytest
@@ -169,3 +172,14 @@ def test_an_unknown_maze_is_named_with_the_choices():
         get_maze("spiral")
     assert "vd4rl_pomdp/MazeThreeCurtains-v0" in gymnasium.registry
     assert gymnasium.spec("vd4rl_pomdp/MazeNoCurtain-v0").max_episode_steps == vd4rl_pomdp.envs.MAZE_STEPS
+
+
+def test_mazes_and_dm_control_end_quietly_in_one_process():
+    code = """
+import gymnasium, numpy as np, vd4rl_pomdp.envs
+for name in ("WalkerWalk", "MazeThreeCurtains", "CheetahRun"):
+    env = gymnasium.make(f"vd4rl_pomdp/{name}-v0")
+    env.reset(seed=0)
+"""
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert "Traceback" not in done.stderr, done.stderr

@@ -11,6 +11,7 @@ has one shade, the floor none but the ambient one, and the picture is made of fi
 from __future__ import annotations
 
 import atexit
+import os
 import weakref
 
 import numpy as np
@@ -41,6 +42,7 @@ class ExactView:
         except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
             raise gl_error(error) from error
         self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0
+        _keep_display()
         atexit.register(_close, weakref.ref(self._renderer))  # before OpenGL itself ends
 
     def __call__(self, data: mujoco.MjData) -> np.ndarray:
@@ -60,6 +62,17 @@ class ExactView:
     def close(self) -> None:
         """Free the GL context."""
         self._renderer.close()
+
+
+def _keep_display() -> None:
+    """Leave closing the EGL display to the process's end.
+
+    mujoco and dm_control share it; mujoco's exit handler would close it while dm_control still frees its contexts.
+    """
+    if os.environ["MUJOCO_GL"] == "egl":
+        from mujoco.egl import egl_ext
+
+        atexit.unregister(egl_ext.eglTerminate)
 
 
 def _close(renderer: weakref.ref[mujoco.Renderer]) -> None:
