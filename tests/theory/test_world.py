@@ -6,9 +6,9 @@ from hypothesis import given, settings
 
 from tests.theory.random_worlds import worlds
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.theory.gallery import NOISE, biased, counterexample, echo, momentum
-from vd4rl_pomdp.theory.law import future_memory, joint_law, past_memory
-from vd4rl_pomdp.theory.world import diameter, distances, finite_world, period, uniform, with_noise, with_policy
+from vd4rl_pomdp.theory.gallery import counterexample
+from vd4rl_pomdp.theory.law import joint_law
+from vd4rl_pomdp.theory.world import diameter, distances, finite_world, period, uniform, with_policy
 
 HALF = Fraction(1, 2)
 
@@ -102,23 +102,6 @@ def test_large_denominators_stay_exact():
     law = joint_law(world, ALL)
     assert law.counts.dtype == object
     assert as_fractions(law) == brute_force(world, 3)
-
-
-def test_decodability_of_the_gallery():
-    assert [past_memory(w(), actions=True) for w in (counterexample, echo, momentum)] == [3, 1, 1]
-    assert [past_memory(w(), actions=False) for w in (counterexample, echo, momentum)] == [None, 1, 1]
-    assert [future_memory(w(), actions=True) for w in (counterexample, echo, momentum)] == [None, 1, 1]
-    assert [future_memory(w(), actions=False) for w in (counterexample, echo, momentum)] == [None, 1, None]
-    assert future_memory(counterexample(), actions=True, literal=True) == 3
-
-
-def test_noise_and_policies_change_neither_dynamics_nor_decodability():
-    noisy = with_noise(biased(momentum()), "noise", NOISE)
-    assert (past_memory(noisy, True), future_memory(noisy, True)) == (1, 1)
-    assert diameter(noisy) == diameter(momentum()) == 4
-    assert len(noisy.symbols) == 2 * len(momentum().symbols)
-    with pytest.raises(UserError, match="noise"):
-        with_noise(momentum(), "noise", {0: {0: HALF}})
 
 
 def test_distances_diameter_and_period():
