@@ -255,7 +255,7 @@ class ReportCommand:
     """Write an HTML page and CSV files about fine-tuning runs."""
 
     runs: tyro.conf.Positional[list[Path]]
-    """Run folders, or folders that contain some."""
+    """Run folders, or folders that contain some; a folder that `theory --out` wrote adds its section."""
     out: Path = Path("report")
     """Folder of the report."""
 

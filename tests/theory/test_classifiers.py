@@ -9,8 +9,8 @@ from pretrain.objectives import METHODS, build_objective
 from tests.theory.random_worlds import worlds
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.theory.classifiers import Memory, compare
-from vd4rl_pomdp.theory.gallery import WORLDS, biased, counterexample, echo, momentum
 from vd4rl_pomdp.theory.decodability import future_memory, past_memory
+from vd4rl_pomdp.theory.gallery import WORLDS, biased, counterexample, echo, momentum
 from vd4rl_pomdp.theory.views import VIEWS
 
 MANY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])

@@ -80,10 +80,8 @@ def train(objective: InverseObjective, data: ExactWindows, steps: int, exactly: 
     optimiser = torch.optim.Adam(objective.parameters(), 1e-3)
     schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, 1e-2 if exactly else 8e-3, steps)
     for step in range(steps):
-        if exactly:
-            loss = expected_loss(objective, data)
-        else:
-            loss = objective.loss(data.draw(128, generator), step / steps)[0]
+        drawn = None if exactly else data.draw(128, generator)
+        loss = expected_loss(objective, data) if drawn is None else objective.loss(drawn, step / steps)[0]
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()

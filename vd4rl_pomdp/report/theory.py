@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from itertools import chain
 from math import cos, hypot, pi, sin
 from pathlib import Path
@@ -22,7 +21,7 @@ from vd4rl_pomdp.runs.folder import read_json, write_json
 Row = dict[str, Any]
 FILE = "theory.json"
 COLUMNS = {"correct": "correct classifier", "complete": "complete state", "discards": "discards noise"}
-LABEL = {"fontsize": 7, "ha": "center", "va": "center", "zorder": 3}
+LABEL: dict[str, Any] = {"fontsize": 7, "ha": "center", "va": "center", "zorder": 3}
 KEYS = ("counterexample", "tables", "disagreements", "comparisons", "worlds", "states", "transitions", "diagrams")
 
 
@@ -61,7 +60,10 @@ def section(study: Row) -> Row:
 
 
 def table_rows(study: Row) -> list[Row]:
-    """Table 1 by method: for each column what is printed, then each world's entry, bracketed where the paper claims none."""
+    """Table 1 by method: for each column what is printed, then each world's entry.
+
+    Entries are bracketed where the method's assumptions fail, so that the paper claims none.
+    """
     rows = []
     for entries in zip(*study["tables"].values(), strict=True):
         method = entries[0]["method"]

@@ -16,9 +16,9 @@ from rich.table import Table
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import COLUMNS
 from vd4rl_pomdp.report import figures, tables
-from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.report.load import Run, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
+from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.report.theory import load_study, section
 
 Row = dict[str, Any]

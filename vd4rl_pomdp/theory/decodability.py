@@ -28,9 +28,10 @@ def future_memory(world: World, actions: bool, literal: bool = False) -> int | N
     """
     couples = _alike(world)
     if literal:
-        led = {after for c in product(world.reachable(), repeat=2) for after in _next(world, c, actions)}
+        pairs = world.reachable()
+        led = {after for c in product(pairs, pairs) for after in _next(world, c, actions)}
         return _rows_needed(couples, lambda left: _that_go_on(world, left, left, actions), led)
-    going = _that_go_on(world, couples, set(product(world.reachable(), repeat=2)), actions)
+    going = {c for c in couples if any(_next(world, c, actions))}
     return _rows_needed(going, lambda left: _that_go_on(world, left, left, actions))
 
 

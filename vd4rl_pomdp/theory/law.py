@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import lcm, log
 from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.theory.world import Pair, World
+from vd4rl_pomdp.theory.world import World
 
 Variable = tuple[str, int]
 """("o", j), ("a", j), ("s", j) or ("xi", j): observation, action, agent-centric or exogenous state of row j."""
@@ -89,8 +89,9 @@ class Conditional:
     def agrees(self, other: Conditional) -> bool:
         """Whether two classifiers say the same wherever their views occur together."""
         (mine, one), (theirs, two) = self.kinds, other.kinds
-        met = np.unique(np.stack([mine[self.ids], theirs[other.ids]]), axis=1)
-        return all(one[i] == two[j] for i, j in met.T)
+        mine, theirs = mine[self.ids], theirs[other.ids]
+        first = number_rows([mine, theirs])[1]
+        return all(one[i] == two[j] for i, j in zip(mine[first], theirs[first], strict=True))
 
     def certain(self) -> bool:
         """Whether the action is known, whatever the view."""
@@ -140,23 +141,28 @@ class _Table:
         self.total = int(self.weights[0].sum())
 
 
+@lru_cache(maxsize=16)
+def _tables(world: World) -> tuple[np.ndarray, _Table, _Table, _Table, _Table]:
+    """A world as numbers: next states (S, A), and the laws of the first pair, the action, the drift and the symbol."""
+    states, noises, actions = world.states, world.exogenous, world.actions
+    pairs = [(s, xi) for s in states for xi in noises]
+    return (
+        np.array([[states.index(world.step[s, a]) for a in actions] for s in states], np.int32),
+        _Table([world.initial], pairs),
+        _Table([world.policy[s] for s in states], actions),
+        _Table([world.drift[xi] for xi in noises], noises),
+        _Table([world.emission[pair] for pair in pairs], world.symbols),
+    )
+
+
 class _Walk:
     """All sequences so far: kept columns, the present pair, and a count."""
 
     def __init__(self, world: World, rows: int) -> None:
-        states, noises = world.states, world.exogenous
-        pairs = [(s, xi) for s in states for xi in noises]
-        self.noises = len(noises)
-        self.step = np.array([[states.index(world.step[s, a]) for a in world.actions] for s in states], np.int32)
-        self.policy = _Table([world.policy[s] for s in states], world.actions)
-        self.drift = _Table([world.drift[xi] for xi in noises], noises)
-        self.emission = _Table([world.emission[pair] for pair in pairs], world.symbols)
-        initial = _Table([world.initial], pairs)
+        self.step, initial, self.policy, self.drift, self.emission = _tables(world)
         total = initial.total * (self.policy.total * self.drift.total * self.emission.total) ** rows
-        dtype = np.int64 if total < LARGEST else object
-        for table in (self.policy, self.drift, self.emission):
-            table.weights = table.weights.astype(dtype)
-        self.counts = initial.weights[0].astype(dtype)
+        self.counts = initial.weights[0].astype(np.int64 if total < LARGEST else object)
+        self.noises = len(world.exogenous)
         self.s, self.xi = np.divmod(initial.entries[0], self.noises)
         self.columns: list[np.ndarray] = []
 
@@ -181,10 +187,11 @@ class _Walk:
 
     def _branch(self, table: _Table, row: np.ndarray) -> np.ndarray:
         """Split every sequence by what may come next, by its row of a table; returns each branch's entry."""
-        parent, nth = np.nonzero(table.weights[row])
+        weights = table.weights.astype(self.counts.dtype)
+        parent, nth = np.nonzero(weights[row])
         self.columns = [column[parent] for column in self.columns]
         self.s, self.xi, row = self.s[parent], self.xi[parent], row[parent]
-        self.counts = self.counts[parent] * table.weights[row, nth]
+        self.counts = self.counts[parent] * weights[row, nth]
         return table.entries[row, nth]
 
     def _merge(self, keys: list[np.ndarray]) -> None:

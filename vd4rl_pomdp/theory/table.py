@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from vd4rl_pomdp.theory.classifiers import Memory, compare
-from vd4rl_pomdp.theory.gallery import WORLDS, variants
 from vd4rl_pomdp.theory.decodability import future_memory, past_memory
+from vd4rl_pomdp.theory.gallery import WORLDS, variants
 from vd4rl_pomdp.theory.partition import discards_noise, forced_shares, relation
 from vd4rl_pomdp.theory.views import VIEWS
 from vd4rl_pomdp.theory.world import World, diameter, period
