@@ -427,8 +427,8 @@ def _theory(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.theory import theory_study
 
     command = _parse(TheoryCommand, words, program)
-    if command.out is not None and command.out.is_file():
-        raise UserError(f"{command.out}: is a file; --out names a folder")
+    if command.out is not None:
+        _make_folder(command.out)
     study = theory_study()
     if command.json:
         print(json.dumps(study))
@@ -436,6 +436,14 @@ def _theory(words: Arguments, program: str) -> None:
         print_theory(study)
     if command.out is not None:
         print(f"page: {write_theory(study, command.out)}", file=sys.stderr if command.json else sys.stdout)
+
+
+def _make_folder(out: Path) -> None:
+    """Make --out's folder before anything is computed."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{out}: cannot be a folder ({error.strerror}); --out names a folder") from error
 
 
 def _show(result: dict[str, Any], as_json: bool) -> None:

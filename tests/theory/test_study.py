@@ -142,10 +142,11 @@ def test_the_terminal_tables_say_the_same(shown, monkeypatch, capsys):
         assert method in text
 
 
-def test_out_that_is_a_file_is_one_line(tmp_path, capsys):
+@pytest.mark.parametrize("out", ["x", "x/below"])
+def test_out_that_cannot_be_a_folder_is_one_line(out, tmp_path, capsys):
     (tmp_path / "x").write_text("")
     with pytest.raises(SystemExit) as end:
-        main(["theory", "--out", str(tmp_path / "x")])
+        main(["theory", "--out", str(tmp_path / out)])
     assert end.value.code == 2
     assert "--out names a folder" in capsys.readouterr().err
 

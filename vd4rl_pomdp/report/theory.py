@@ -26,8 +26,7 @@ KEYS = ("counterexample", "tables", "disagreements", "comparisons", "worlds", "s
 
 
 def write_theory(study: Row, out: Path) -> Path:
-    """Write the study as a page and as JSON into a folder; returns the page."""
-    out.mkdir(parents=True, exist_ok=True)
+    """Write the study as a page and as JSON into a folder that exists; returns the page."""
     write_json(out / FILE, study)
     (out / "index.html").write_text(render("theory.html", theory=section(study)))
     return out / "index.html"
