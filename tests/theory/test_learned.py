@@ -138,7 +138,7 @@ def papers_world():
     world = counterexample()
     data = exact_windows(world, 5)
     objective = build(world, "mik+a", 1, hidden=64)
-    train(objective, data, 800, exactly=True)
+    train(objective, data, 1000, exactly=True)
     return world, data, objective
 
 
