@@ -98,16 +98,18 @@ def _one_line(box: str, program: str) -> str:
     return f"{' '.join(text.split())} (see `{program} --help`)"
 
 
-def _with_presets(config: type, presets: dict[str, Any], words: Arguments, program: str) -> Any:
-    """Parse a stage's config whose `--preset` chooses the defaults of all other flags."""
+def _with_presets(
+    config: type, presets: dict[str, Any], words: Arguments, program: str, flag: str = "--preset"
+) -> Any:
+    """Parse a stage's config one of whose flags, `--preset`, chooses the defaults of all others."""
     name = next(iter(presets))
     for word, following in zip(words, [*words[1:], ""], strict=True):
-        if word == "--preset":
+        if word == flag:
             name = following
-        elif word.startswith("--preset="):
+        elif word.startswith(f"{flag}="):
             name = word.partition("=")[2]
     if name not in presets:
-        raise UserError(f"unknown preset {name!r}: choose one of {', '.join(presets)}")
+        raise UserError(f"unknown {flag.removeprefix('--')} {name!r}: choose one of {', '.join(presets)}")
     default = presets[name]
     required = [f for f in ("encoder", "data", "out", "maze") if getattr(default, f, None) in (Path(), "")]
     missing = {f: tyro.MISSING for f in required}
@@ -239,14 +241,33 @@ def _evaluate(words: Arguments, program: str) -> None:
 
 
 def _policy_train(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.policies.train import PolicyConfig, decisions_made, train_policy
+    from vd4rl_pomdp.policies.config import RECIPES, PolicyConfig
+    from vd4rl_pomdp.policies.train import decisions_made, train_policy
     from vd4rl_pomdp.runs.progress import ProgressLine
 
-    config = _parse(PolicyConfig, words, program)
+    config = _with_presets(PolicyConfig, RECIPES, words, program, flag="--task")
     done = decisions_made(config.out)
     with ProgressLine(f"train {config.task}", config.decisions, "decisions", done) as progress:
         files = train_policy(config, lambda decisions, mean: progress.reach(decisions, ret=mean))
     for quality, path in files.items():
+        print(f"{quality}: {path}")
+
+
+@dataclass(frozen=True)
+class PolicyExportCommand:
+    """Choose a run's expert, medium and medium_replay actors and write them with their cards; it may be still going on."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of a policy training run."""
+    out: Path
+    """Folder for the files."""
+
+
+def _policy_export(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.policies.export import export_run
+
+    command = _parse(PolicyExportCommand, words, program)
+    for quality, path in export_run(command.run, command.out).items():
         print(f"{quality}: {path}")
 
 
@@ -455,7 +476,10 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
         "check": Command("validate a set and replay its actions", _check),
         "parity": Command("compare rendered pixels with the data's", _parity),
     },
-    "policy": {"train": Command("train the state-based actors that collect data", _policy_train)},
+    "policy": {
+        "train": Command("train the state-based actors that collect data", _policy_train),
+        "export": Command("choose a run's actors and write them with their cards", _policy_export),
+    },
     "pretrain": Command("train an encoder", _pretrain),
     "finetune": Command("TD3+BC on a frozen encoder", _finetune),
     "evaluate": Command("evaluate a fine-tuned run again", _evaluate),
