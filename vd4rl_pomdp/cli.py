@@ -98,9 +98,7 @@ def _one_line(box: str, program: str) -> str:
     return f"{' '.join(text.split())} (see `{program} --help`)"
 
 
-def _with_presets(
-    config: type, presets: dict[str, Any], words: Arguments, program: str, flag: str = "--preset"
-) -> Any:
+def _with_presets(config: type, presets: dict[str, Any], words: Arguments, program: str, flag: str = "--preset") -> Any:
     """Parse a stage's config one of whose flags, `--preset`, chooses the defaults of all others."""
     name = next(iter(presets))
     for word, following in zip(words, [*words[1:], ""], strict=True):
@@ -139,7 +137,22 @@ def _collect(words: Arguments, program: str) -> None:
 
     config = _parse(CollectConfig, words, program)
     shards = collect(config)
-    print(f"{len(shards)} shards in {config.out}; check them with `vd4rl-pomdp data check {config.out}`")
+    print(f"{len(shards)} shards in {config.out}, described in {config.out / 'card.md'}")
+    print(f"check them with `vd4rl-pomdp data check {config.out}`")
+
+
+@dataclass(frozen=True)
+class CardCommand:
+    """Write a set's data card, card.md and card.png, into its folder; `data collect` does so itself."""
+
+    path: tyro.conf.Positional[Path]
+    """Folder of shards."""
+
+
+def _card(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.data.card import write_card
+
+    print(f"card: {write_card(_parse(CardCommand, words, program).path)}")
 
 
 @dataclass(frozen=True)
@@ -255,7 +268,7 @@ def _policy_train(words: Arguments, program: str) -> None:
 
 @dataclass(frozen=True)
 class PolicyExportCommand:
-    """Choose a run's expert, medium and medium_replay actors and write them with their cards; it may be still going on."""
+    """Choose a run's expert, medium and medium_replay actors and write them with their cards; it may still go on."""
 
     run: tyro.conf.Positional[Path]
     """Folder of a policy training run."""
@@ -473,6 +486,7 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     "data": {
         "collect": Command("render a set in V-D4RL's format from the shipped actors", _collect),
         "download": Command("fetch a published V-D4RL set", _download),
+        "card": Command("describe a set: returns, origin, film strip", _card),
         "check": Command("validate a set and replay its actions", _check),
         "parity": Command("compare rendered pixels with the data's", _parity),
     },

@@ -34,8 +34,8 @@ class Actor:
     """A stochastic policy on simulator states."""
 
     weights: dict[str, np.ndarray]
-    """float32: matrices (in, out) with their `.bias`: `mean.weight`, `log_std.weight`, and either `hidden.{i}.weight` or
-    `embed.weight`, `block.{i}.up.weight`, `block.{i}.down.weight`, with the layer norms `block.{i}.norm.scale` and
+    """float32: matrices (in, out) with their `.bias`: `mean.weight`, `log_std.weight`, and either `hidden.{i}.weight`
+    or `embed.weight`, `block.{i}.up.weight`, `block.{i}.down.weight`, with the layer norms `block.{i}.norm.scale` and
     `norm.scale`; optionally `observation.mean` and `observation.std` (D,)."""
     card: dict[str, Any]
     """Where the actor comes from: task, quality, training step, mean return of 20 episodes, config, versions."""

@@ -75,8 +75,8 @@ RECIPES: dict[str, PolicyConfig] = {
         temperature=0.01,
         temperature_rate=1e-4,
         target_entropy=-0.5,
-        eval_every=48_000,
+        eval_every=24_000,
     ),
 }
-"""Defaults by task. Plain SAC is enough for two of them; humanoid_walk needs standardised observations, layer norms in the
-critics, three-step returns, and more fresh decisions for each update (physics is far cheaper than gradients)."""
+"""Defaults by task. Plain SAC is enough for two of them. humanoid_walk gets standardised observations, layer norms in
+the critics, three-step returns, and more fresh decisions for each update: physics is far cheaper than gradients."""

@@ -1,7 +1,7 @@
-"""SBX's soft actor-critic behind four verbs: build, learn, export an actor, keep and restore everything it has learned.
+"""SBX's soft actor-critic: build it, export its actor, keep and restore everything it has learned.
 
-A checkpoint holds networks, optimisers and the replay buffer; `networks.safetensors` beside it holds the networks and the
-observation statistics alone, small enough for a repository, and is what another machine can start from.
+A checkpoint holds networks, optimisers and the replay buffer; `networks.safetensors` beside it holds the networks and
+the observation statistics alone, small enough for a repository, and is what another machine can start from.
 """
 
 from __future__ import annotations
@@ -75,9 +75,9 @@ def export_actor(model: SAC, config: PolicyConfig, decisions: int) -> Actor:
     params = model.policy.actor_state.params["params"]
     weights = _simba_weights(params) if config.network == "simba" else _mlp_weights(params)
     if config.normalise:
-        statistics = model.get_vec_normalize_env()
-        weights["observation.mean"] = statistics.obs_rms.mean
-        weights["observation.std"] = np.sqrt(statistics.obs_rms.var + statistics.epsilon)
+        envs = _envs(model)
+        weights["observation.mean"] = envs.obs_rms.mean
+        weights["observation.std"] = np.sqrt(envs.obs_rms.var + envs.epsilon)
     card = {"task": config.task, "decisions": decisions, "algorithm": "SAC", "seed": config.seed}
     return Actor({name: np.asarray(value, np.float32) for name, value in weights.items()}, card)
 
@@ -214,8 +214,13 @@ def _networks(model: SAC) -> tuple[Any, ...]:
     return model.policy.actor_state.params, model.policy.qf_state.params, model.ent_coef_state.params
 
 
+def _envs(model: SAC) -> Any:
+    """The environments behind their running statistics, SB3's VecNormalize."""
+    return model.get_vec_normalize_env()
+
+
 def _statistics(model: SAC) -> dict[str, np.ndarray]:
-    envs = model.get_vec_normalize_env()
+    envs = _envs(model)
     if not envs.norm_obs:
         return {}
     running = envs.obs_rms
@@ -223,7 +228,7 @@ def _statistics(model: SAC) -> dict[str, np.ndarray]:
 
 
 def _set_statistics(model: SAC, stored: dict[str, np.ndarray]) -> None:
-    envs = model.get_vec_normalize_env()
+    envs = _envs(model)
     if envs.norm_obs:
         for name in STATISTICS:
             setattr(envs.obs_rms, name, stored[f"observation.{name}"])

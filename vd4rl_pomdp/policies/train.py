@@ -1,9 +1,9 @@
 """Train the data-collecting policies: soft actor-critic on simulator states (SBX), resumable, exported as small files.
 
-A run keeps `snapshots/` (an actor and its mean return every `eval_every` decisions), `curve.csv`, `networks.safetensors`
-(what another machine can start from) and `checkpoint/` (networks, optimisers, replay buffer). At its end, or with
-`policy export` at any time, the best snapshot becomes the expert, the one whose return is nearest to half of the expert's
-the medium actor, and a ladder of snapshots up to the medium one stands for the replay buffer (see `export`).
+A run keeps `snapshots/` (an actor and its mean return every `eval_every` decisions), `curve.csv`,
+`networks.safetensors` (what another machine can start from) and `checkpoint/` (networks, optimisers, replay buffer). At
+its end, or with `policy export` at any time, the best snapshot becomes the expert, the one whose return is nearest to
+half of the expert's the medium actor, and a ladder of snapshots up to the medium one stands for the replay buffer.
 """
 
 from __future__ import annotations
