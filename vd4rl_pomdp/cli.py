@@ -156,6 +156,34 @@ def _card(words: Arguments, program: str) -> None:
 
 
 @dataclass(frozen=True)
+class TableCommand:
+    """Tabulate all sets: returns of their 200 episodes, played by physics alone, and what collecting them costs."""
+
+    out: Path = Path("results/datasets")
+    """Folder of the table; sets that are in it already are not played again."""
+    tasks: list[str] = field(default_factory=lambda: ["walker_walk", "cheetah_run", "humanoid_walk"])
+    """Tasks."""
+    qualities: list[str] = field(
+        default_factory=lambda: ["random", "medium_replay", "medium", "medium_expert", "expert"]
+    )
+    """Qualities; one whose actor does not ship is left out."""
+    timed_episodes: int = 4
+    """Episodes of the short rendered collection that is timed for each task."""
+    workers: int = 1
+    """Processes that play."""
+
+
+def _table(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.experiments.datasets import tabulate
+
+    command = _parse(TableCommand, words, program)
+    rows = tabulate(command.out, command.tasks, command.qualities, command.timed_episodes, command.workers)
+    for row in rows:
+        print("  ".join(f"{value!s:<14}" for value in row.values()).rstrip())
+    print(f"table: {command.out / 'sets.csv'}")
+
+
+@dataclass(frozen=True)
 class CheckCommand:
     """Validate a set: format, episodes, checksums, and that its actions replay to its rewards."""
 
@@ -258,6 +286,8 @@ def _policy_train(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.policies.train import decisions_made, train_policy
     from vd4rl_pomdp.runs.progress import ProgressLine
 
+    if not any(word.split("=")[0] in ("--task", "--help", "-h") for word in words):
+        raise UserError(f"--task is missing: choose one of {', '.join(RECIPES)}")
     config = _with_presets(PolicyConfig, RECIPES, words, program, flag="--task")
     done = decisions_made(config.out)
     with ProgressLine(f"train {config.task}", config.decisions, "decisions", done) as progress:
@@ -487,6 +517,7 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
         "collect": Command("render a set in V-D4RL's format from the shipped actors", _collect),
         "download": Command("fetch a published V-D4RL set", _download),
         "card": Command("describe a set: returns, origin, film strip", _card),
+        "table": Command("tabulate the returns and the cost of all sets", _table),
         "check": Command("validate a set and replay its actions", _check),
         "parity": Command("compare rendered pixels with the data's", _parity),
     },

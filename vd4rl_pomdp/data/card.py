@@ -93,14 +93,14 @@ def _picture(
     figure = Figure(figsize=(8.4, 4.0), layout="constrained", dpi=110)
     above, below = figure.subplots(2, 1, height_ratios=(2.4, 1))
     top = max(returns.max(), published or 0.0)
-    above.hist(returns, bins=np.linspace(0, max(top, 1.0) * 1.02, 41), color="#56b4e9")
+    counts, _, _ = above.hist(returns, bins=np.linspace(0, max(top, 1.0) * 1.02, 41), color="#56b4e9")
     above.axvline(returns.mean(), color="#0072b2", label=f"mean of this set, {returns.mean():.1f}")
     if published is not None:
         label = f"published: plain BC on V-D4RL's set of this name, {published:.0f}"
         above.axvline(published, color="#d55e00", ls="--", label=label)
-    above.set(xlabel="episode return", ylabel="episodes", title=_title(names))
+    above.set(xlabel="episode return", ylabel="episodes", title=_title(names), ylim=(0, counts.max() * 1.25))
     above.spines[["top", "right"]].set_visible(False)
-    above.legend(frameon=False, fontsize=8)
+    above.legend(frameon=False, fontsize=8, ncols=2, loc="upper center")
     below.imshow(np.concatenate(list(film.transpose(0, 2, 3, 1)), axis=1), interpolation="nearest")
     below.set_title("the episode of median return", fontsize=9)
     below.axis("off")

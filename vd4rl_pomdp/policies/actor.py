@@ -177,8 +177,18 @@ def load_ladder(task: str) -> Ladder:
     return Ladder(*_read(_shipped(task, "replay"), get_task(task)))
 
 
+def ships(task: str, quality: str) -> bool:
+    """Whether the actors of a set ship: random needs none, medium_expert needs two."""
+    needed = {"random": (), "medium_replay": ("replay",), "medium_expert": ("medium", "expert")}
+    return all(_asset(task, name).exists() for name in needed.get(quality, (quality,)))
+
+
+def _asset(task: str, name: str) -> Path:
+    return ASSETS / f"{get_task(task).name}_{name}.safetensors"
+
+
 def _shipped(task: str, quality: str) -> Path:
-    path = ASSETS / f"{get_task(task).name}_{quality}.safetensors"
+    path = _asset(task, quality)
     if not path.exists():
         have = ", ".join(sorted(p.stem for p in ASSETS.glob("*.safetensors"))) or "none"
         raise UserError(
