@@ -15,7 +15,6 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.data.format import disk_error, write_shard
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
@@ -101,6 +100,8 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
             write_shard(path, join_rollouts(rollouts), _attributes(config, path, policy))
     seconds = time.monotonic() - started
     record_set(config.out, seconds, frames, config.workers)
+    from vd4rl_pomdp.data.card import write_card  # draws; the processes that render need it not
+
     write_card(config.out)
     return [path for path, _, _ in plan]
 

@@ -155,6 +155,11 @@ def read_actor(path: Path, task: Task | None = None) -> Actor:
     return Actor(*_read(path, task))
 
 
+def read_ladder(path: Path, task: Task | None = None) -> Ladder:
+    """Read a ladder's file; raises UserError as `read_actor` does."""
+    return Ladder(*_read(path, task))
+
+
 def _read(path: Path, task: Task | None) -> tuple[dict[str, np.ndarray], dict[str, Any], str]:
     try:
         with safe_open(path, framework="np") as file:
@@ -174,7 +179,7 @@ def load_actor(task: str, quality: str) -> Actor:
 
 def load_ladder(task: str) -> Ladder:
     """Load the ladder of actors that ships for a task's medium_replay set."""
-    return Ladder(*_read(_shipped(task, "replay"), get_task(task)))
+    return read_ladder(_shipped(task, "replay"), get_task(task))
 
 
 def ships(task: str, quality: str) -> bool:

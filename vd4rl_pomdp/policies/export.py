@@ -1,9 +1,15 @@
-"""From a training run to the files that ship: expert, medium, and the ladder of snapshots behind medium_replay."""
+"""From a training run to the files that ship: expert, medium, and the ladder of snapshots behind medium_replay.
+
+The folder that `export_run` writes also holds the run's config, curve and networks: small enough for a repository, and
+all that another machine needs to go on.
+"""
 
 from __future__ import annotations
 
 import csv
 import json
+import shutil
+from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -11,13 +17,16 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.policies.actor import Actor, Ladder, read_actor
+from vd4rl_pomdp.policies.actor import Actor, Ladder, read_actor, read_ladder
 from vd4rl_pomdp.policies.state_env import StateEnv
 from vd4rl_pomdp.tasks import Task, get_task
 
 CARD_EPISODES = 20
 CARD_SEED = 10_000
 """Episode i of an actor's card starts from environment seed CARD_SEED + i."""
+NETWORKS = "networks.safetensors"
+PROGRESS = ("config.json", "curve.csv", NETWORKS)
+"""Files of a run from which another one can start."""
 LADDER_RUNGS = 15
 """Snapshots in a ladder, at most: the actors of all tasks together stay under 10 MB."""
 
@@ -48,7 +57,7 @@ def snapshot_path(run: Path, decisions: int) -> Path:
 
 
 def export_run(run: Path, out: Path) -> dict[str, Path]:
-    """Choose and write a run's expert, medium and ladder, each with its card; the run may still be going on.
+    """Choose and write a run's expert, medium and ladder, and copy its progress; the run may still be going on.
 
     The expert is the best of the three best snapshots, the medium actor the one of the three snapshots before it whose
     return is nearest to half of the expert's; all are judged on the same 20 episodes.
@@ -73,6 +82,9 @@ def export_run(run: Path, out: Path) -> dict[str, Path]:
     judged |= _judge(run, task, [step for step, _ in near])
     medium = min((step for step, _ in near), key=lambda step: abs(float(np.mean(judged[step])) - half), default=expert)
     out.mkdir(parents=True, exist_ok=True)
+    for name in PROGRESS:
+        if (run / name).exists() and out.resolve() != run.resolve():
+            shutil.copy(run / name, out / name)
     files = {
         quality: _publish(run, out / f"{task.name}_{quality}.safetensors", config, quality, step, judged[step], curve)
         for quality, step in (("expert", expert), ("medium", medium))
@@ -119,3 +131,16 @@ def _publish_ladder(run: Path, out: Path, task: Task, rows: list[tuple[int, floa
     path = out / f"{task.name}_replay.safetensors"
     Ladder.of(actors, {"task": task.name, "decisions": steps, "curve": [rows[i][1] for i in chosen]}).save(path)
     return path
+
+
+def exported_actors(folder: Path, task: Task) -> Iterator[tuple[int, Actor]]:
+    """Actors that `export_run` wrote into a folder, with their decisions; a ladder's first, rounded as they are."""
+    ladder = folder / f"{task.name}_replay.safetensors"
+    if ladder.exists():
+        read = read_ladder(ladder, task)
+        yield from zip(read.card["decisions"], read.rungs, strict=True)
+    for quality in ("medium", "expert"):
+        path = folder / f"{task.name}_{quality}.safetensors"
+        if path.exists():
+            actor = read_actor(path, task)
+            yield actor.card["decisions"], actor

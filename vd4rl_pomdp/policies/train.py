@@ -22,13 +22,20 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies import learner
 from vd4rl_pomdp.policies.actor import Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
-from vd4rl_pomdp.policies.export import CARD_SEED, episode_returns, export_run, read_curve, snapshot_path
+from vd4rl_pomdp.policies.export import (
+    CARD_SEED,
+    NETWORKS,
+    PROGRESS,
+    episode_returns,
+    export_run,
+    exported_actors,
+    read_curve,
+    snapshot_path,
+)
 from vd4rl_pomdp.tasks import get_task
 
 if TYPE_CHECKING:
     from sbx import SAC
-
-NETWORKS = "networks.safetensors"
 
 
 def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None] | None = None) -> dict[str, Path]:
@@ -87,7 +94,7 @@ def _claim(config: PolicyConfig) -> None:
 
 
 def _check_start(config: PolicyConfig, start: Path) -> None:
-    missing = [name for name in ("config.json", "curve.csv", NETWORKS) if not (start / name).exists()]
+    missing = [name for name in PROGRESS if not (start / name).exists()]
     if missing:
         raise UserError(f"{start}: has no {' and no '.join(missing)}; --start-from takes the folder of a policy run")
     task = json.loads((start / "config.json").read_text())["task"]
@@ -99,6 +106,8 @@ def _start_from(model: SAC, config: PolicyConfig, start: Path) -> int:
     """Take over another run's networks, curve and snapshots; its replay is made anew. Returns the decisions so far."""
     learner.start_from_networks(model, start / NETWORKS)
     curve = read_curve(start)
+    for step, actor in exported_actors(start, get_task(config.task)):
+        actor.save(snapshot_path(config.out, step))
     for step, _ in curve:
         if snapshot_path(start, step).exists():
             shutil.copy(snapshot_path(start, step), snapshot_path(config.out, step))
