@@ -5,6 +5,7 @@ Shifts are whole pixels, so gathering by index gives exactly what DrQ's interpol
 
 from __future__ import annotations
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -12,8 +13,6 @@ from vd4rl_pomdp.buffers import FrameBuffers
 from vd4rl_pomdp.corruptions.keys import draw_integers
 
 _BUFFERS = FrameBuffers()
-_ENDS = 2
-"""Samples that have a neighbour on one side only."""
 
 
 def random_shift(obs: Tensor, key: Tensor, pad: int = 4) -> Tensor:
@@ -30,9 +29,8 @@ def random_shift(obs: Tensor, key: Tensor, pad: int = 4) -> Tensor:
     if pad == 0:
         return obs
     offset = draw_integers(key, 2 * pad + 1, 2) - pad
-    large = len(obs) > _ENDS and min(obs.shape[-2:]) > pad
-    if large and obs.device.type == "cpu" and obs.is_contiguous():
-        return _shift_by_copying(obs, offset, pad)
+    if obs.device.type == "cpu" and obs.is_contiguous() and min(obs.shape[-2:]) > pad:
+        return _shift_by_copying(obs, offset)
     return _shift_by_index(obs, offset)
 
 
@@ -46,25 +44,24 @@ def _shift_by_index(obs: Tensor, offset: Tensor) -> Tensor:
     return images.gather(2, pixel.expand_as(images)).view(obs.shape)
 
 
-def _shift_by_copying(obs: Tensor, offset: Tensor, pad: int) -> Tensor:
-    """The same, some ten times as fast on a CPU: a shift moves all bytes alike, but for the border that came in.
-
-    Every sample but the first and the last is copied whole from its shifted start in memory, neighbours included; then
-    the rows and columns that belong to a neighbour are overwritten by the border they repeat.
-    """
-    n, height, width = len(obs), obs.shape[-2], obs.shape[-1]
-    size = obs[0].numel()
+def _shift_by_copying(obs: Tensor, offset: Tensor) -> Tensor:
+    """The same, some twenty times as fast on a CPU: a shift moves all bytes alike, but for the border that comes in."""
     out = _BUFFERS.take_like(obs)
-    starts = torch.arange(1, n - 1) * size + offset[1:-1, 0] * width + offset[1:-1, 1]
-    windows = obs.view(-1).as_strided(((n - 1) * size + 1, size), (1, 1))
-    torch.index_select(windows, 0, starts, out=out.view(n, size)[1:-1])
-    images = out.view(n, -1, height, width)
-    for axis in (0, 1):
-        planes = images if axis == 0 else images.transpose(2, 3)
-        for d in range(1, pad + 1):
-            low, high = (torch.nonzero(offset[:, axis] == sign * d)[:, 0] for sign in (-1, 1))
-            planes[low, :, :d] = planes[low, :, d : d + 1]
-            planes[high, :, -d:] = planes[high, :, -d - 1 : -d]
-    ends = [0, n - 1]
-    out[ends] = _shift_by_index(obs[ends], offset[ends])
+    height, width = obs.shape[-2:]
+    size = obs[0].numel()
+    old, new = (images.numpy().reshape(len(obs), size) for images in (obs, out))
+    for before, after, (dy, dx) in zip(old, new, offset.tolist(), strict=True):
+        step = dy * width + dx
+        after[max(-step, 0) : size - max(step, 0)] = before[max(step, 0) : size - max(-step, 0)]
+        planes = after.reshape(-1, height, width)
+        _repeat_border(planes.transpose(2, 0, 1), dx)
+        _repeat_border(planes.transpose(1, 0, 2), dy)
     return out
+
+
+def _repeat_border(lines: np.ndarray, shift: int) -> None:
+    """Overwrite the lines that a shift brought in, at the end if it is positive, by the outermost true one."""
+    count = len(lines)
+    edge = count - 1 - shift if shift > 0 else -shift
+    for line in range(edge + 1, count) if shift > 0 else range(edge):
+        lines[line] = lines[edge]

@@ -202,7 +202,7 @@ def _check(words: Arguments, program: str) -> None:
     error = result["replay_max_error"]
     if error is not None and error > REPLAY_TOLERANCE:
         raise UserError(
-            f"{command.path}: stored actions do not replay to stored rewards (largest difference {error:.3g})"
+            f"{command.path}: stored actions do not replay to what is stored (largest difference {error:.3g})"
         )
 
 

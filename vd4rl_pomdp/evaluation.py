@@ -56,6 +56,10 @@ class Agent:
         self._action = self.policy(z)
         return self._action[0].numpy()
 
+    def acted(self, action: np.ndarray) -> None:
+        """Tell that another (A,) action than the last answer was executed."""
+        self._action = torch.from_numpy(action)[None]
+
 
 @dataclass(frozen=True)
 class EpisodeJob:

@@ -99,7 +99,7 @@ class TD3BC:
         cloning = F.mse_loss(chosen, action)
         loss = cloning - weight * value.mean()
         self.policy_optimiser.zero_grad(set_to_none=True)
-        loss.backward()
+        loss.backward(inputs=list(self.policy.net.parameters()))
         self.policy_optimiser.step()
         return {"actor_loss": loss.detach(), "bc_loss": cloning.detach()}
 

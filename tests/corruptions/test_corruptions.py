@@ -73,9 +73,9 @@ def test_resample_draws_anew_and_emission_never_does():
     obs, row_key = stacks(4), torch.arange(4)
     for mode, same in (("resample", False), ("emission", True)):
         corruption = BatchCorruption(CorruptionConfig("patch", mode), seed=0)
-        assert torch.equal(corruption(obs, row_key), corruption(obs, row_key)) == same
+        assert torch.equal(corruption(obs.clone(), row_key), corruption(obs.clone(), row_key)) == same
     a, b = (BatchCorruption(CorruptionConfig("patch"), seed=3) for _ in range(2))
-    assert torch.equal(a(obs, row_key), b(obs, row_key))
+    assert torch.equal(a(obs.clone(), row_key), b(obs.clone(), row_key))
 
 
 def test_emission_of_a_batch_equals_the_environments_draw():
@@ -117,9 +117,9 @@ def test_random_shift_equals_padding_and_cropping():
     assert random_shift(obs, key, pad=0) is obs
 
 
-@pytest.mark.parametrize("shape", [(3, 3, 20, 30), (7, 2, 3, 12, 12), (64, 9, 84, 84)])
+@pytest.mark.parametrize("shape", [(1, 3, 20, 30), (7, 2, 3, 12, 12), (64, 9, 84, 84)])
 @pytest.mark.parametrize("pad", [1, 4])
 def test_both_ways_to_shift_agree(shape, pad):
     obs = torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     offset = draw_integers(torch.arange(shape[0]), 2 * pad + 1, 2) - pad
-    assert torch.equal(_shift_by_copying(obs, offset, pad), _shift_by_index(obs, offset))
+    assert torch.equal(_shift_by_copying(obs, offset), _shift_by_index(obs, offset))

@@ -1,11 +1,14 @@
 import hashlib
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import numpy as np
 import pytest
 
 from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.envs.maze import MazeEnv
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation import collect as module
@@ -40,6 +43,21 @@ def test_stored_actions_lead_through_the_stored_states_and_pictures(maze_set, tm
             np.testing.assert_array_equal(frame, dataset.frames[row].numpy())
             if row + 1 < end:
                 frame, *_ = env.step(dataset.action[row + 1].numpy())
+
+
+def test_a_check_replays_the_states(maze_set, tmp_path):
+    report = check_dataset(maze_set, tmp_path / "cache")
+    assert (report["task"], report["rows"], report["episodes"], report["replay_max_error"]) == (
+        "three_curtains",
+        120,
+        4,
+        0,
+    )
+    damaged = tmp_path / "damaged"
+    shutil.copytree(maze_set, damaged)
+    with h5py.File(damaged / "1_three_curtains.hdf5", "a") as file:
+        file["physics"][20, 2] += 0.5
+    assert check_dataset(damaged, tmp_path / "cache")["replay_max_error"] == pytest.approx(0.5)
 
 
 def test_an_interrupted_collection_ends_in_the_same_files(maze_set, tmp_path, monkeypatch):

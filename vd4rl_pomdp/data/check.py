@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.data.dataset import Dataset, open_dataset
-from vd4rl_pomdp.data.format import read_dtypes, shard_paths
+from vd4rl_pomdp.data.format import read_attributes, read_dtypes, shard_paths
 from vd4rl_pomdp.data.store import verify_store
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.mazes import MAZES, PICTURE_SIZE
+from vd4rl_pomdp.tasks import FRAME_SIZE
 
 ReplayFn = Callable[[str, np.ndarray, np.ndarray], np.ndarray]
 """(task, physics (P,) of an episode's first row, actions (T, A), a_0 first) -> rewards (T,), r_0 first."""
@@ -21,21 +23,24 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
     """Validate a set and describe it.
 
     Args:
-        path: folder (or file) of the shards.
+        path: folder (or file) of the shards, of V-D4RL's tasks or of a maze.
         cache: where decoded sets are kept, as in `open_dataset`.
         replay: what simulates an episode; default `envs.dmc.replay_rewards`.
 
     Returns:
         JSON values: `rows`, `episodes`, `transitions`, `incomplete_episodes`, `action_dim`, `return_mean`,
         `return_min` and `return_max` over all episodes, incomplete ones included, `replay_max_error` (largest absolute
-        difference between a stored reward and its replay; None without physics), `task`, `quality`, `shards` (names in
-        order), `dtypes` (key to the stored dtypes), `store_ok` (True: the decoded files have their checksums).
+        difference between a stored reward, in a maze a true state, and its replay; None without physics), `task`,
+        `quality`, `shards` (names in order), `dtypes` (key to the stored dtypes), `store_ok` (True: the decoded files
+        have their checksums).
 
     Raises:
         UserError: the set or its decoded form is damaged.
     """
     path = Path(path)
-    dataset = open_dataset(path, cache)
+    attributes = read_attributes(shard_paths(path)[0])
+    is_maze = attributes.get("task") in MAZES
+    dataset = open_dataset(path, cache, PICTURE_SIZE if is_maze else FRAME_SIZE)
     verify_store(dataset.store)
     returns = dataset.returns.numpy()
     return {
@@ -47,7 +52,7 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
         "return_mean": float(returns.mean()),
         "return_min": float(returns.min()),
         "return_max": float(returns.max()),
-        "replay_max_error": _replay_error(dataset, replay),
+        "replay_max_error": _maze_error(dataset, attributes) if is_maze else _replay_error(dataset, replay),
         "task": dataset.task,
         "quality": dataset.quality,
         "shards": dataset.store.meta["shards"],
@@ -71,6 +76,21 @@ def _replay_error(dataset: Dataset, replay: ReplayFn | None) -> float | None:
         if end - start > 1:
             replayed = replay(dataset.task, dataset.physics[start], action[start + 1 : end])
             worst = max(worst, float(np.abs(replayed - reward[start + 1 : end]).max()))
+    return worst
+
+
+def _maze_error(dataset: Dataset, attributes: dict[str, Any]) -> float | None:
+    if dataset.physics is None:
+        return None
+    from vd4rl_pomdp.envs.maze import replay_states
+
+    states, action = dataset.physics, dataset.store.array("action")
+    worst = 0.0
+    for start, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):
+        replayed = replay_states(
+            attributes["task"], states[start], action[start + 1 : end], attributes["action_repeat"]
+        )
+        worst = max(worst, float(np.abs(replayed - states[start + 1 : end]).max(initial=0.0)))
     return worst
 
 

@@ -130,3 +130,10 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         state = self.state
         info = {"state": state, "goal": self.goal.copy(), "hidden": bool(self.maze_spec.hidden(state))}
         return self._picture, info
+
+
+def replay_states(maze: str, state: np.ndarray, actions: np.ndarray, action_repeat: int = ACTION_REPEAT) -> np.ndarray:
+    """True states (T, P) float64 after each of (T, 2) actions from a (P,) state."""
+    env = MazeEnv(maze, action_repeat, pixels=False)
+    env.reset(options={"state": state})
+    return np.array([env.step(action)[-1]["state"] for action in actions]).reshape(-1, len(state))

@@ -21,6 +21,7 @@ from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.envs.dmc import PixelEnv
 from vd4rl_pomdp.envs.parity import canary_frames, compare
+from vd4rl_pomdp.experiments.bench_memory import make_trainer, memory, touch
 from vd4rl_pomdp.mazes import PICTURE_SIZE
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.runs.device import Precision, autocast, pick_device
@@ -32,7 +33,6 @@ from vd4rl_pomdp.types import StepType
 
 if TYPE_CHECKING:
     from pretrain.config import PretrainConfig
-    from pretrain.train import Trainer
 
 BATCH = 256
 EPISODE_ROWS = 501
@@ -75,7 +75,7 @@ def bench(quick: bool = False) -> dict[str, Any]:
             "pretraining": _pretraining(dataset, Path(folder), repeats),
             "finetuning": _finetuning(dataset, repeats),
             "methods": _methods(dataset, Path(folder), repeats),
-            "memory": _memory(Path(folder), dataset.frames.numel()),
+            "memory": memory(Path(folder), dataset.frames.numel()),
         }
     results["collection"] = _collection(60 if quick else 200)
     results["mazes"] = _mazes(60 if quick else 200)
@@ -135,15 +135,10 @@ def _synthetic_set(folder: Path, episodes: int) -> tuple[Dataset, dict[str, Any]
     return dataset, {"rows": dataset.num_rows, "decode_seconds": decoding, "open_seconds": opening}
 
 
-def _read(frames: torch.Tensor) -> None:
-    """Touch every page, so that it is in the page cache and mapped."""
-    frames.view(-1)[::4096].max()
-
-
 def _sampling(dataset: Dataset, repeats: int) -> dict[str, float]:
     """Gathering against copying the same bytes, corruption and shift against gathering; new rows every time."""
     some = min(dataset.num_rows, 20_000)
-    _read(dataset.frames[:some])
+    touch(dataset.frames[:some])
     generator = torch.Generator().manual_seed(0)
     corruption = BatchCorruption(CorruptionConfig("patch+zero_frames"), 0)
 
@@ -179,7 +174,7 @@ def _pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]
         config = replace(
             PRESETS["paper"], data=folder, out=folder, batch_size=8, corruption="patch+zero_frames", precision=precision
         )
-        trainer = _trainer(dataset, config)
+        trainer = make_trainer(dataset, config)
         steps[precision] = _seconds(lambda t=trainer: t.update(), max(3, repeats // 3))  # type: ignore[misc]
         passes = _seconds(lambda t=trainer: _forward_backward(t, device), max(3, repeats // 3))  # type: ignore[misc]
         results[f"{precision}_frames_per_s"] = config.batch_size * config.window / steps[precision]
@@ -204,18 +199,8 @@ def _methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
 
 
 def _step_seconds(dataset: Dataset, config: PretrainConfig, repeats: int) -> float:
-    trainer = _trainer(dataset, config)
+    trainer = make_trainer(dataset, config)
     return _seconds(lambda: trainer.update(), max(3, repeats // 3))
-
-
-def _trainer(dataset: Dataset, config: PretrainConfig) -> Trainer:
-    from pretrain.objectives import build_objective
-    from pretrain.train import Trainer
-    from vd4rl_pomdp.nn.action_target import make_action_target
-
-    target = make_action_target("kmeans", dataset.action[:2000].numpy(), config.codes, 0)
-    objective = build_objective(config, dataset.action, target)
-    return Trainer(objective.to(dataset.t.device), dataset, config)
 
 
 def _forward_backward(trainer: Any, device: torch.device) -> None:
@@ -247,32 +232,6 @@ def _finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
     fast = _seconds(lambda: algorithm.update(cached.sample()), 20 * repeats)
     slow = _seconds(lambda: algorithm.update(exact.sample()), 3)
     return {"cached_updates_per_s": 1 / fast, "exact_updates_per_s": 1 / slow, "cached_over_exact": slow / fast}
-
-
-def _memory(folder: Path, frame_bytes: int) -> dict[str, float]:
-    """Peak memory of a pretraining process on the set, and what a second one adds: all but the mapped frames."""
-    (peak, private) = next(iter(run_jobs(_train_a_little, [(folder, 3), (folder, 3)], 2)))
-    return {
-        "frames_gib": frame_bytes / 2**30,
-        "peak_over_frames": peak / frame_bytes,
-        "second_process_over_frames": private / frame_bytes,
-    }
-
-
-def _train_a_little(job: tuple[Path, int]) -> tuple[int, int]:
-    """Peak resident bytes of a process that reads the whole set and trains, and how many of them it does not share."""
-    from pretrain.config import PRESETS
-
-    folder, steps = job
-    dataset = open_dataset(folder / "set", folder / "cache")
-    config = replace(PRESETS["cpu"], data=folder, out=folder, corruption="patch+zero_frames")
-    trainer = _trainer(dataset, config)
-    for _ in range(steps):
-        trainer.update()
-    _read(dataset.frames)
-    fields = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
-    kibibytes = {name: int(fields[name].split()[0]) for name in ("VmHWM", "RssAnon")}
-    return kibibytes["VmHWM"] * 1024, kibibytes["RssAnon"] * 1024
 
 
 def _collection(frames: int) -> dict[str, float]:

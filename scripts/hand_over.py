@@ -1,0 +1,91 @@
+"""Where does a policy fail: on the expert's path, or on the way there? The data's expert acts first, then hands over.
+
+    python scripts/hand_over.py RUN... --after 0 60 --episodes 5 --out hand_over.csv
+
+For every fine-tuning run and hand-over time it plays evaluation episodes in which the shipped expert acts on the true
+state for the first rows while the run's policy watches; then the policy acts. Columns: `reward` is the mean reward of
+a decision after the hand-over (2 at most), `error_0_10`, `error_10_50` and `error_50_end` the mean squared difference
+between the policy's action and the expert's at these rows, whoever acts.
+"""
+
+from __future__ import annotations
+
+import csv
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import tyro
+
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.envs.corrupted import CorruptedEnv
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.evaluation import EVALUATION_SEED, Agent
+from vd4rl_pomdp.nn.folder import load_encoder
+from vd4rl_pomdp.nn.policy import load_policy
+from vd4rl_pomdp.policies.actor import Actor, load_actor
+from vd4rl_pomdp.runs.folder import read_json
+
+SPANS = ((0, 10), (10, 50), (50, None))
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the comparison."""
+
+    runs: tyro.conf.Positional[tuple[Path, ...]]
+    """Fine-tuning run folders."""
+    after: tuple[int, ...] = (0, 60)
+    """Rows that the expert acts in before it hands over."""
+    episodes: int = 5
+    """Episodes for each run and hand-over time."""
+    out: Path = Path("hand_over.csv")
+    """CSV file to write."""
+
+
+def play(agent: Agent, expert: Actor, env: CorruptedEnv, task: str, after: int, episode: int) -> dict[str, float]:
+    """Measurements of one episode."""
+    agent.reset()
+    now = env.reset(EVALUATION_SEED + episode, EVALUATION_SEED, episode)
+    rewards, errors = [], []
+    while not now.row.last:
+        action, shown = agent.act(agent.observe(now, task)), expert.act(now.row.state)
+        errors.append(float(np.square(action - shown).mean()))
+        if len(errors) <= after:
+            action = shown
+            agent.acted(action)
+        now = env.step(action)
+        rewards.append(now.row.reward)
+    spans = {f"error_{a}_{b or 'end'}": round(float(np.mean(errors[a:b])), 4) for a, b in SPANS}
+    return {"reward": round(float(np.mean(rewards[after:])), 4)} | spans
+
+
+def main(config: Config) -> None:
+    """Play all episodes and write the table."""
+    if not config.runs:
+        raise UserError("no runs given; name fine-tuning run folders")
+    rows: list[dict[str, Any]] = []
+    for run in config.runs:
+        labels = read_json(run / "labels.json")
+        encoder, card = load_encoder(run / "encoder")
+        agent, expert = Agent(encoder, load_policy(run / "policy")), load_actor(card.task, "expert")
+        env = CorruptedEnv(card.task, CorruptionConfig(**card.corruption))
+        for after in config.after:
+            for episode in range(config.episodes):
+                row = labels | {"after": after, "episode": episode}
+                rows.append(row | play(agent, expert, env, card.task, after, episode))
+                print(" ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
+    with config.out.open("w", newline="") as file:
+        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Config))
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)

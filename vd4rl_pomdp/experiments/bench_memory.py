@@ -1,0 +1,59 @@
+"""Peak memory of pretraining, a module of its own: its workers import what training imports and no more."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+import torch
+
+from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.runs.workers import run_jobs
+
+if TYPE_CHECKING:
+    from pretrain.config import PretrainConfig
+    from pretrain.train import Trainer
+
+STEPS = 3
+
+
+def memory(folder: Path, frame_bytes: int) -> dict[str, float]:
+    """Peak memory of a process that trains on the set in `folder`, and what a second one adds: all but the frames."""
+    (peak, private) = next(iter(run_jobs(_train_a_little, [folder, folder], 2)))
+    return {
+        "frames_gib": frame_bytes / 2**30,
+        "peak_over_frames": peak / frame_bytes,
+        "second_process_over_frames": private / frame_bytes,
+    }
+
+
+def make_trainer(dataset: Dataset, config: PretrainConfig) -> Trainer:
+    """A trainer of the config's objective, its codebook fitted on a few actions."""
+    from pretrain.objectives import build_objective
+    from pretrain.train import Trainer
+    from vd4rl_pomdp.nn.action_target import make_action_target
+
+    target = make_action_target("kmeans", dataset.action[:2000].numpy(), config.codes, 0)
+    objective = build_objective(config, dataset.action, target)
+    return Trainer(objective.to(dataset.t.device), dataset, config)
+
+
+def touch(frames: torch.Tensor) -> None:
+    """Read every page, so that it is in the page cache and mapped."""
+    frames.view(-1)[::4096].max()
+
+
+def _train_a_little(folder: Path) -> tuple[int, int]:
+    """Peak resident bytes of a process that reads the whole set and trains, and how many of them it does not share."""
+    from pretrain.config import PRESETS
+
+    dataset = open_dataset(folder / "set", folder / "cache")
+    config = replace(PRESETS["cpu"], data=folder, out=folder, corruption="patch+zero_frames")
+    trainer = make_trainer(dataset, config)
+    for _ in range(STEPS):
+        trainer.update()
+    touch(dataset.frames)
+    fields = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
+    kibibytes = {name: int(fields[name].split()[0]) for name in ("VmHWM", "RssAnon")}
+    return kibibytes["VmHWM"] * 1024, kibibytes["RssAnon"] * 1024
