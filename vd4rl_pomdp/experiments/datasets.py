@@ -50,15 +50,17 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
     returns, costs = _read(out / "returns.csv"), _read(out / "costs.csv")
     for task in tasks:
         get_task(task)
-        if not any(row["task"] == task for row in costs):
-            costs.append(_cost(task, timed_episodes))
-            _write(out / "costs.csv", COSTS, costs)
         for quality in qualities:
             if ships(task, quality) and not any((r["task"], r["quality"]) == (task, quality) for r in returns):
                 config = CollectConfig(task, quality, Path(), EPISODES, workers=workers)  # type: ignore[arg-type]
                 played = enumerate(replay_returns(config))
                 returns += [{"task": task, "quality": quality, "episode": i, "return": repr(v)} for i, v in played]
                 _write(out / "returns.csv", RETURNS, returns)
+                _write(out / "sets.csv", SETS, summarise(returns, costs))
+    for task in tasks:
+        if not any(row["task"] == task for row in costs):
+            costs.append(_cost(task, timed_episodes))
+            _write(out / "costs.csv", COSTS, costs)
     table = summarise(returns, costs)
     _write(out / "sets.csv", SETS, table)
     write_json(out / "provenance.json", {"git_commit": git_commit(), "versions": versions(), "machine": machine()})
@@ -66,7 +68,7 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
 
 
 def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:
-    """The table from the raw rows."""
+    """The table from the raw rows; no seconds for a task that was not timed yet."""
     seconds = {r["task"]: float(r["cpu_seconds"]) / float(r["rows"]) * 1e5 / CORES for r in costs}
     table = []
     for task in dict.fromkeys(row["task"] for row in returns):
@@ -76,7 +78,7 @@ def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:
                 statistics = {"mean": np.mean(mine), "min": min(mine), "max": max(mine)}
                 row = {"task": task, "quality": quality, "episodes": len(mine)}
                 row |= {name: f"{value:.1f}" for name, value in statistics.items()}
-                table.append(row | {"seconds_100k": round(seconds[task])})
+                table.append(row | {"seconds_100k": round(seconds[task]) if task in seconds else ""})
     return table
 
 
