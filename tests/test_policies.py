@@ -154,12 +154,14 @@ def test_a_checkpoint_brings_everything_back(configure, tmp_path):
     assert second.replay_buffer.timeouts[second.replay_buffer.pos - 1].all(), "a cut episode must not be continued"
 
 
-def test_a_run_goes_on_and_forgets_what_it_wrote_after_its_checkpoint(configure, tmp_path):
+def test_a_run_goes_on_and_forgets_what_it_wrote_after_its_checkpoint(configure, tmp_path, monkeypatch):
     from dataclasses import replace
 
+    from vd4rl_pomdp.policies import learner
     from vd4rl_pomdp.policies.export import read_curve
     from vd4rl_pomdp.policies.train import decisions_made, train_policy
 
+    monkeypatch.setattr(learner, "RANDOM_DECISIONS", 1_000)  # no update is compiled
     config = configure(tmp_path, decisions=80)
     train_policy(config)
     with (tmp_path / "curve.csv").open("a") as file:
@@ -214,7 +216,7 @@ def test_a_start_that_does_not_fit_is_one_sentence(configure, tmp_path):
     with pytest.raises(UserError, match=r"has no config.json and no curve.csv and no networks.safetensors"):
         train_policy(configure(tmp_path / "new", start_from=tmp_path))
     assert not (tmp_path / "new").exists()
-    train_policy(configure(tmp_path / "old", decisions=40))
+    train_policy(configure(tmp_path / "old", decisions=20))
     with pytest.raises(UserError, match="networks of another shape"):
         train_policy(configure(tmp_path / "new", start_from=tmp_path / "old", hidden=8))
 

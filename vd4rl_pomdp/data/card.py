@@ -21,6 +21,8 @@ from vd4rl_pomdp.tasks import SCORE_DIVISOR
 from vd4rl_pomdp.types import StepType
 
 FILM_FRAMES = 10
+LINES = 0.82
+"""Height of bars and lines; above is the legend's place."""
 HOW = {
     "random": "Uniformly random actions.",
     "medium": "The medium actor's sampled actions; the one that ships has about half of the expert's return.",
@@ -94,11 +96,12 @@ def _picture(
     above, below = figure.subplots(2, 1, height_ratios=(2.4, 1))
     top = max(returns.max(), published or 0.0)
     counts, _, _ = above.hist(returns, bins=np.linspace(0, max(top, 1.0) * 1.02, 41), color="#56b4e9")
-    above.axvline(returns.mean(), color="#0072b2", label=f"mean of this set, {returns.mean():.1f}")
+    above.axvline(returns.mean(), ymax=LINES, color="#0072b2", label=f"mean of this set, {returns.mean():.1f}")
     if published is not None:
         label = f"published: plain BC on V-D4RL's set of this name, {published:.0f}"
-        above.axvline(published, color="#d55e00", ls="--", label=label)
-    above.set(xlabel="episode return", ylabel="episodes", title=_title(names), ylim=(0, counts.max() * 1.25))
+        above.axvline(published, ymax=LINES, color="#d55e00", ls="--", label=label)
+    above.set(xlabel="episode return", ylabel="episodes", title=_title(names), ylim=(0, counts.max() / LINES))
+    above.yaxis.get_major_locator().set_params(integer=True)
     above.spines[["top", "right"]].set_visible(False)
     above.legend(frameon=False, fontsize=8, ncols=2, loc="upper center")
     below.imshow(np.concatenate(list(film.transpose(0, 2, 3, 1)), axis=1), interpolation="nearest")
