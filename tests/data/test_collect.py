@@ -25,7 +25,8 @@ def config(out, **changes):
 
 def contents(folder):
     """Bytes of everything that a repeated collection must reproduce."""
-    return {p.name: p.read_bytes() for p in folder.iterdir() if p.name != "provenance.json"}
+    quoting = ("provenance.json", "card.md")  # they name command and commit
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.name not in quoting}
 
 
 def actor(seed):
