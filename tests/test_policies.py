@@ -1,42 +1,81 @@
+import json
+from importlib.metadata import version
+from pathlib import Path
+
 import numpy as np
 import pytest
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.policies import load_actor, read_actor
-from vd4rl_pomdp.policies.train import episode_returns
+from vd4rl_pomdp.policies import Actor, Ladder, actor, load_actor, load_ladder, read_actor
+from vd4rl_pomdp.policies.export import CARD_EPISODES, LADDER_RUNGS, episode_returns
 from vd4rl_pomdp.tasks import get_task
 
-SHIPPED = {
-    ("walker_walk", "expert"): 900,
-    ("walker_walk", "medium"): 400,
-    ("cheetah_run", "expert"): 750,
-    ("cheetah_run", "medium"): 300,
+ACTORS = sorted(p.stem for p in actor.ASSETS.glob("*.json"))
+LADDERS = sorted(p.stem.removesuffix("_replay") for p in actor.ASSETS.glob("*_replay.safetensors"))
+AT_LEAST = {
+    "walker_walk_expert": 900,
+    "walker_walk_medium": 400,
+    "cheetah_run_expert": 750,
+    "cheetah_run_medium": 300,
 }
 
 
-@pytest.mark.parametrize(("task", "quality"), SHIPPED)
-def test_shipped_actors_are_what_their_cards_say(task, quality):
-    actor = load_actor(task, quality)
-    assert actor.card["return_mean"] >= SHIPPED[task, quality]
-    returns = episode_returns(actor, get_task(task), 2)
-    assert actor.card["return_min"] - 1 <= min(returns)
-    assert max(returns) <= actor.card["return_max"] + 1
+@pytest.mark.parametrize("name", ACTORS)
+def test_twenty_episodes_return_what_the_card_says_to_the_digit(name):
+    task, quality = name.rsplit("_", 1)
+    shipped = load_actor(task, quality)
+    card = json.loads((actor.ASSETS / f"{name}.json").read_text())
+    assert {k: card[k] for k in shipped.card} == shipped.card
+    assert len(card["returns"]) == CARD_EPISODES
+    assert card["return_mean"] == round(float(np.mean(card["returns"])), 3) >= AT_LEAST.get(name, 0)
+    differing = [k for k in ("mujoco", "dm-control") if version(k) != card["versions"][k]]
+    if differing:
+        pytest.skip(f"the card was written with another {' and '.join(differing)}")
+    assert episode_returns(shipped, get_task(task), CARD_EPISODES) == card["returns"]
+
+
+def test_the_required_actors_ship_and_all_stay_small():
+    assert set(AT_LEAST) <= set(ACTORS)
+    assert {"walker_walk", "cheetah_run"} <= set(LADDERS)
+    assert sum(p.stat().st_size for p in actor.ASSETS.iterdir()) < 10e6
+
+
+@pytest.mark.parametrize("task", LADDERS)
+def test_a_ladder_leads_to_the_medium_actor(task):
+    ladder, medium = load_ladder(task), load_actor(task, "medium")
+    steps = ladder.card["decisions"]
+    assert steps == sorted(set(steps))
+    assert steps[-1] == medium.card["decisions"]
+    assert 10 <= len(steps) <= LADDER_RUNGS
+    top = ladder.rungs[-1]
+    for name, value in medium.weights.items():
+        np.testing.assert_array_equal(top.weights[name], value.astype(np.float16).astype(np.float32))
+    state = np.linspace(-1, 1, get_task(task).state_dim, dtype=np.float32)
+    np.testing.assert_allclose(top.act(state), medium.act(state), atol=0.02)
+
+
+def numbered(value):
+    return Actor({"mean.weight": np.full((2, 1), value, np.float32), "mean.bias": np.zeros(1, np.float32)}, {})
+
+
+def test_a_ladder_gives_each_moment_the_nearest_rung_in_proportion():
+    ladder = Ladder.of([numbered(1), numbered(2), numbered(3)], {"decisions": [20, 60, 100]})
+    acting = [ladder.actor_at((episode + 0.5) / 10) for episode in range(10)]
+    assert [a and a.weights["mean.weight"][0, 0] for a in acting] == [None, 1, 1, 1, 2, 2, 2, 2, 3, 3]
 
 
 def test_sampled_actions_scatter_around_the_mean_action():
-    actor = load_actor("walker_walk", "expert")
+    shipped = load_actor("walker_walk", "expert")
     state, rng = np.zeros(24, np.float32), np.random.default_rng(0)
-    sampled = np.stack([actor.act(state, rng) for _ in range(500)])
+    sampled = np.stack([shipped.act(state, rng) for _ in range(500)])
     assert sampled.dtype == np.float32
     assert (np.abs(sampled) <= 1).all()
     assert sampled.std(0).min() > 0.01
-    below = (sampled < actor.act(state)).mean(0)  # tanh keeps the median
+    below = (sampled < shipped.act(state)).mean(0)  # tanh keeps the median
     assert np.allclose(below, 0.5, atol=0.08)
 
 
-def test_bad_actors_are_refused(tmp_path):
-    with pytest.raises(UserError, match="no expert actor ships for humanoid_walk"):
-        load_actor("humanoid_walk", "expert")
+def test_bad_actors_are_refused(tmp_path, monkeypatch):
     path = tmp_path / "actor.safetensors"
     path.write_bytes(b"\x80\x04 a pickle")
     with pytest.raises(UserError, match="not an actor file"):
@@ -44,3 +83,147 @@ def test_bad_actors_are_refused(tmp_path):
     load_actor("walker_walk", "medium").save(path)
     with pytest.raises(UserError, match="trained on walker_walk, not on cheetah_run"):
         read_actor(path, get_task("cheetah_run"))
+    monkeypatch.setattr(actor, "ASSETS", tmp_path)
+    with pytest.raises(UserError, match="no expert actor ships for humanoid_walk"):
+        load_actor("humanoid_walk", "expert")
+    with pytest.raises(UserError, match="no replay actor ships for humanoid_walk"):
+        load_ladder("humanoid_walk")
+
+
+SETTINGS = {
+    "mlp": {"critic_norm": True, "n_step": 3, "envs": 2, "updates_per_decision": 0.5},
+    "simba": {"network": "simba", "learning_rate": 1e-3},
+}
+
+
+@pytest.fixture
+def configure(monkeypatch):
+    """Settings of a run that trains after 40 decisions and lasts seconds."""
+    pytest.importorskip("sbx")
+    from vd4rl_pomdp.policies import learner
+    from vd4rl_pomdp.policies.config import PolicyConfig
+
+    monkeypatch.setattr(learner, "RANDOM_DECISIONS", 20)
+    small = {"hidden": 16, "batch_size": 32, "replay_size": 2_000, "eval_every": 40, "eval_episodes": 1}
+    small |= {"normalise": True, "refill": 20, "critic_warmup": 8}
+    return lambda out, **more: PolicyConfig("walker_walk", Path(out), **(small | more))
+
+
+@pytest.mark.parametrize("kind", SETTINGS)
+def test_an_exported_actor_acts_like_the_learners_network(configure, kind, tmp_path):
+    from vd4rl_pomdp.policies import learner
+
+    config = configure(tmp_path, **SETTINGS[kind])
+    model = learner.build(config, get_task("walker_walk"))
+    model.learn(120)
+    assert model._n_updates > 0
+    states = 3 * np.random.default_rng(0).standard_normal((6, 24)).astype(np.float32)
+    wanted = model.policy._predict(learner._envs(model).normalize_obs(states), deterministic=True)
+    exported = learner.export_actor(model, config, 120)
+    exported.save(tmp_path / "actor.safetensors")
+    read = read_actor(tmp_path / "actor.safetensors")
+    np.testing.assert_allclose(np.stack([read.act(state) for state in states]), np.asarray(wanted), atol=1e-5)
+
+
+def leaves(model):
+    import jax
+
+    from vd4rl_pomdp.policies import learner
+
+    return [np.asarray(leaf) for leaf in jax.tree_util.tree_leaves(learner._states(model))]
+
+
+def test_a_checkpoint_brings_everything_back(configure, tmp_path):
+    from vd4rl_pomdp.policies import learner
+    from vd4rl_pomdp.policies.train import train_policy
+
+    config = configure(tmp_path, decisions=120, **SETTINGS["mlp"])
+    files = train_policy(config)
+    assert {path.name for path in files.values()} == {
+        f"walker_walk_{q}.safetensors" for q in ("expert", "medium", "replay")
+    }
+    first, second = (learner.build(config, get_task("walker_walk")) for _ in range(2))
+    assert learner.restore_checkpoint(first, tmp_path) == 120
+    learner.save_checkpoint(first, tmp_path)
+    learner.restore_checkpoint(second, tmp_path)
+    for one, other in zip(leaves(first), leaves(second), strict=True):
+        np.testing.assert_array_equal(one, other)
+    for name in learner.REPLAY_ARRAYS:
+        np.testing.assert_array_equal(getattr(first.replay_buffer, name), getattr(second.replay_buffer, name))
+    np.testing.assert_array_equal(learner._envs(first).obs_rms.var, learner._envs(second).obs_rms.var)
+    assert second.replay_buffer.timeouts[second.replay_buffer.pos - 1].all(), "a cut episode must not be continued"
+
+
+def test_a_run_goes_on_and_forgets_what_it_wrote_after_its_checkpoint(configure, tmp_path, monkeypatch):
+    from dataclasses import replace
+
+    from vd4rl_pomdp.policies import learner
+    from vd4rl_pomdp.policies.export import read_curve
+    from vd4rl_pomdp.policies.train import decisions_made, train_policy
+
+    monkeypatch.setattr(learner, "RANDOM_DECISIONS", 1_000)  # no update is compiled
+    config = configure(tmp_path, decisions=80)
+    train_policy(config)
+    with (tmp_path / "curve.csv").open("a") as file:
+        file.write("999,1.0\n")
+    train_policy(replace(config, decisions=160))
+    assert [step for step, _ in read_curve(tmp_path)] == [40, 80, 120, 160]
+    assert decisions_made(tmp_path) == 160
+    with pytest.raises(UserError, match="another n_step"):
+        train_policy(replace(config, n_step=3))
+
+
+def test_a_new_run_starts_where_committed_networks_stood(configure, tmp_path):
+    from vd4rl_pomdp.policies import learner
+    from vd4rl_pomdp.policies.export import NETWORKS, export_run, read_curve, snapshot_path
+    from vd4rl_pomdp.policies.train import train_policy
+
+    old, new = tmp_path / "old", tmp_path / "new"
+    config = configure(old, decisions=80, **SETTINGS["mlp"])
+    train_policy(config)
+    model = learner.build(config, get_task("walker_walk"))
+    learner.start_from_networks(model, old / NETWORKS)
+    before, trained = learner.export_actor(model, config, 0), read_actor(snapshot_path(old, 80))
+    for name, value in trained.weights.items():
+        np.testing.assert_array_equal(before.weights[name], value)
+    critics = [np.asarray(x) for x in leaves_of(model.policy.qf_state.params)]
+    model.num_timesteps = 80
+    learner.refill(model, 20, 8)
+    assert (model.num_timesteps, model._n_updates) == (100, 8)
+    after = learner.export_actor(model, config, 0)
+    assert all(
+        np.array_equal(after.weights[n], v) for n, v in before.weights.items() if not n.startswith("observation")
+    )
+    assert any(not np.array_equal(x, y) for x, y in zip(critics, leaves_of(model.policy.qf_state.params), strict=True))
+    kept = tmp_path / "kept"
+    export_run(old, kept)  # what a repository would hold
+    train_policy(configure(new, decisions=180, start_from=kept, **SETTINGS["mlp"]))
+    assert [step for step, _ in read_curve(new)] == [40, 80, 140, 180]
+    for step in (40, 80):
+        taken, original = (read_actor(snapshot_path(run, step)) for run in (new, old))
+        np.testing.assert_allclose(taken.weights["mean.weight"], original.weights["mean.weight"], atol=1e-3)
+
+
+def leaves_of(tree):
+    import jax
+
+    return jax.tree_util.tree_leaves(tree)
+
+
+def test_a_start_that_does_not_fit_is_one_sentence(configure, tmp_path):
+    from vd4rl_pomdp.policies.train import train_policy
+
+    with pytest.raises(UserError, match=r"has no config.json and no curve.csv and no networks.safetensors"):
+        train_policy(configure(tmp_path / "new", start_from=tmp_path))
+    assert not (tmp_path / "new").exists()
+    train_policy(configure(tmp_path / "old", decisions=20))
+    with pytest.raises(UserError, match="networks of another shape"):
+        train_policy(configure(tmp_path / "new", start_from=tmp_path / "old", hidden=8))
+
+
+def test_what_is_no_run_cannot_be_exported(tmp_path):
+    from vd4rl_pomdp.policies.export import export_run
+
+    with pytest.raises(UserError, match="not the folder of a policy run"):
+        export_run(tmp_path, tmp_path / "out")
+    assert not (tmp_path / "out").exists()

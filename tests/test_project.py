@@ -17,7 +17,7 @@ MAY_IMPORT = {
     "pretrain": {"pretrain", "baselines", "vd4rl_pomdp"},
     "finetune": {"finetune", "vd4rl_pomdp"},
 }
-DISPATCHERS = ("vd4rl_pomdp/cli.py", "vd4rl_pomdp/experiments/bench.py")
+DISPATCHERS = ("vd4rl_pomdp/cli.py", "vd4rl_pomdp/experiments/bench.py", "vd4rl_pomdp/experiments/bench_memory.py")
 """Files that call the stages, and import them inside functions only."""
 
 

@@ -98,16 +98,16 @@ def _one_line(box: str, program: str) -> str:
     return f"{' '.join(text.split())} (see `{program} --help`)"
 
 
-def _with_presets(config: type, presets: dict[str, Any], words: Arguments, program: str) -> Any:
-    """Parse a stage's config whose `--preset` chooses the defaults of all other flags."""
+def _with_presets(config: type, presets: dict[str, Any], words: Arguments, program: str, flag: str = "--preset") -> Any:
+    """Parse a stage's config one of whose flags, `--preset`, chooses the defaults of all others."""
     name = next(iter(presets))
     for word, following in zip(words, [*words[1:], ""], strict=True):
-        if word == "--preset":
+        if word == flag:
             name = following
-        elif word.startswith("--preset="):
+        elif word.startswith(f"{flag}="):
             name = word.partition("=")[2]
     if name not in presets:
-        raise UserError(f"unknown preset {name!r}: choose one of {', '.join(presets)}")
+        raise UserError(f"unknown {flag.removeprefix('--')} {name!r}: choose one of {', '.join(presets)}")
     default = presets[name]
     required = [f for f in ("encoder", "data", "out", "maze") if getattr(default, f, None) in (Path(), "")]
     missing = {f: tyro.MISSING for f in required}
@@ -137,7 +137,50 @@ def _collect(words: Arguments, program: str) -> None:
 
     config = _parse(CollectConfig, words, program)
     shards = collect(config)
-    print(f"{len(shards)} shards in {config.out}; check them with `vd4rl-pomdp data check {config.out}`")
+    print(f"{len(shards)} shards in {config.out}, described in {config.out / 'card.md'}")
+    print(f"check them with `vd4rl-pomdp data check {config.out}`")
+
+
+@dataclass(frozen=True)
+class CardCommand:
+    """Write a set's data card, card.md and card.png, into its folder; `data collect` does so itself."""
+
+    path: tyro.conf.Positional[Path]
+    """Folder of shards."""
+
+
+def _card(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.data.card import write_card
+
+    print(f"card: {write_card(_parse(CardCommand, words, program).path)}")
+
+
+@dataclass(frozen=True)
+class TableCommand:
+    """Tabulate all sets: returns of their 200 episodes, played by physics alone, and what collecting them costs."""
+
+    out: Path = Path("results/datasets")
+    """Folder of the table; sets that are in it already are not played again."""
+    tasks: list[str] = field(default_factory=lambda: ["walker_walk", "cheetah_run", "humanoid_walk"])
+    """Tasks."""
+    qualities: list[str] = field(
+        default_factory=lambda: ["random", "medium_replay", "medium", "medium_expert", "expert"]
+    )
+    """Qualities; one whose actor does not ship is left out."""
+    timed_episodes: int = 4
+    """Episodes of the short rendered collection that is timed for each task."""
+    workers: int = 1
+    """Processes that play."""
+
+
+def _table(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.experiments.datasets import tabulate
+
+    command = _parse(TableCommand, words, program)
+    rows = tabulate(command.out, command.tasks, command.qualities, command.timed_episodes, command.workers)
+    for row in rows:
+        print("  ".join(f"{value!s:<14}" for value in row.values()).rstrip())
+    print(f"table: {command.out / 'sets.csv'}")
 
 
 @dataclass(frozen=True)
@@ -239,14 +282,35 @@ def _evaluate(words: Arguments, program: str) -> None:
 
 
 def _policy_train(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.policies.train import PolicyConfig, decisions_made, train_policy
+    from vd4rl_pomdp.policies.config import RECIPES, PolicyConfig
+    from vd4rl_pomdp.policies.train import decisions_made, train_policy
     from vd4rl_pomdp.runs.progress import ProgressLine
 
-    config = _parse(PolicyConfig, words, program)
+    if not any(word.split("=")[0] in ("--task", "--help", "-h") for word in words):
+        raise UserError(f"--task is missing: choose one of {', '.join(RECIPES)}")
+    config = _with_presets(PolicyConfig, RECIPES, words, program, flag="--task")
     done = decisions_made(config.out)
     with ProgressLine(f"train {config.task}", config.decisions, "decisions", done) as progress:
         files = train_policy(config, lambda decisions, mean: progress.reach(decisions, ret=mean))
     for quality, path in files.items():
+        print(f"{quality}: {path}")
+
+
+@dataclass(frozen=True)
+class PolicyExportCommand:
+    """Choose a run's expert, medium and medium_replay actors and write them with their cards; it may still go on."""
+
+    run: tyro.conf.Positional[Path]
+    """Folder of a policy training run."""
+    out: Path
+    """Folder for the files."""
+
+
+def _policy_export(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.policies.export import export_run
+
+    command = _parse(PolicyExportCommand, words, program)
+    for quality, path in export_run(command.run, command.out).items():
         print(f"{quality}: {path}")
 
 
@@ -460,10 +524,15 @@ COMMANDS: dict[str, Command | dict[str, Command]] = {
     "data": {
         "collect": Command("render a set in V-D4RL's format from the shipped actors", _collect),
         "download": Command("fetch a published V-D4RL set", _download),
+        "card": Command("describe a set: returns, origin, film strip", _card),
+        "table": Command("tabulate the returns and the cost of all sets", _table),
         "check": Command("validate a set and replay its actions", _check),
         "parity": Command("compare rendered pixels with the data's", _parity),
     },
-    "policy": {"train": Command("train the state-based actors that collect data", _policy_train)},
+    "policy": {
+        "train": Command("train the state-based actors that collect data", _policy_train),
+        "export": Command("choose a run's actors and write them with their cards", _policy_export),
+    },
     "pretrain": Command("train an encoder", _pretrain),
     "finetune": Command("TD3+BC on a frozen encoder", _finetune),
     "evaluate": Command("evaluate a fine-tuned run again", _evaluate),

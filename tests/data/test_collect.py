@@ -1,5 +1,6 @@
 import errno
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import h5py
@@ -12,7 +13,7 @@ from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import read_attributes, read_shard
 from vd4rl_pomdp.envs.dmc import replay_rewards
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.policies import Actor
+from vd4rl_pomdp.policies import Actor, Ladder
 
 LENGTH = 5
 
@@ -24,7 +25,8 @@ def config(out, **changes):
 
 def contents(folder):
     """Bytes of everything that a repeated collection must reproduce."""
-    return {p.name: p.read_bytes() for p in folder.iterdir() if p.name != "provenance.json"}
+    quoting = ("provenance.json", "card.md")  # they name command and commit
+    return {p.name: p.read_bytes() for p in folder.iterdir() if p.name not in quoting}
 
 
 def actor(seed):
@@ -132,6 +134,34 @@ def test_medium_expert_is_half_medium_then_half_expert(tmp_path, monkeypatch):
     assert not np.array_equal(read_shard(paths[0])["physics"][0], read_shard(paths[2])["physics"][0])
 
 
+def test_medium_replay_follows_the_run_from_random_actions_to_the_medium_actor(tmp_path, monkeypatch):
+    ladder = Ladder.of([actor(1), actor(2), actor(3)], {"task": "walker_walk", "decisions": [20, 60, 100]})
+    monkeypatch.setattr(module, "load_ladder", lambda task: replace(ladder, sha256="c" * 64))
+    acting = []
+    roll_out = module._roll_out
+
+    def note(job):
+        acting.append(job.actor and float(job.actor.weights["mean.weight"][0, 0]))
+        return roll_out(job)
+
+    monkeypatch.setattr(module, "_roll_out", note)
+    paths = collect(config(tmp_path, quality="medium_replay", episodes=5, episodes_per_shard=5), LENGTH)
+    tops = [float(rung.weights["mean.weight"][0, 0]) for rung in ladder.rungs]
+    assert acting == [None, tops[0], tops[1], tops[1], tops[2]]
+    assert read_attributes(paths[0])["actor_sha256"] == "c" * 64
+    assert "regenerated from actors saved along the training run" in (tmp_path / "card.md").read_text()
+
+
+@pytest.mark.parametrize("quality", ["medium_replay", "medium", "medium_expert", "expert"])
+def test_a_quality_without_an_actor_is_one_sentence(tmp_path, monkeypatch, quality):
+    from vd4rl_pomdp.policies import actor as actors
+
+    monkeypatch.setattr(actors, "ASSETS", tmp_path / "none")
+    with pytest.raises(UserError, match=r"actor ships for humanoid_walk .* policy train --task humanoid_walk"):
+        collect(config(tmp_path / "set", task="humanoid_walk", quality=quality), LENGTH)
+    assert not (tmp_path / "set").exists()
+
+
 def test_provenance_is_kept_apart_from_the_config(whole):
     provenance = json.loads((whole / "provenance.json").read_text())
     assert provenance["frames"] == 3 * (LENGTH + 1)
@@ -160,7 +190,8 @@ def test_a_folder_with_something_else_is_refused(tmp_path):
     ("change", "message"),
     [
         ({"task": "walker_run"}, "unknown task"),
-        ({"quality": "medium_replay"}, "cannot collect quality"),
+        ({"quality": "mixed"}, "cannot collect quality"),
+        ({"actor": Path("a.safetensors"), "quality": "medium_replay"}, "--actor is for medium or expert"),
         ({"episodes": 0}, "at least 1"),
         ({"actor": Path("a.safetensors")}, "--actor is for medium or expert"),
         ({"actor": Path("a.safetensors"), "quality": "medium_expert"}, "--actor is for medium or expert"),

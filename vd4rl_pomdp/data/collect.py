@@ -1,4 +1,4 @@
-"""Collect a set in V-D4RL's format, with simulator states, from the actors that ship with the package.
+"""Collect a set in V-D4RL's format, with simulator states and a data card, from the actors that ship with the package.
 
 Episode i depends on (seed, i) alone, whatever the number of workers. Shards are written whole, so the same command goes
 on after an interruption and ends in the same files.
@@ -9,7 +9,7 @@ from __future__ import annotations
 import hashlib
 import time
 from collections.abc import Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -17,14 +17,16 @@ import numpy as np
 
 from vd4rl_pomdp.data.format import disk_error, write_shard
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.policies.actor import Actor, load_actor, read_actor
+from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.folder import jsonable, read_json, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
 from vd4rl_pomdp.runs.workers import default_workers, run_jobs
 from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, get_task
 
-Quality = Literal["random", "medium", "expert", "medium_expert"]
+Quality = Literal["random", "medium_replay", "medium", "medium_expert", "expert"]
+Policy = Actor | Ladder | None
+"""Who acts in a shard: an actor, a ladder of them, or nobody (random actions)."""
 _RUNTIME_FIELDS = ("out", "workers")
 
 
@@ -35,7 +37,8 @@ class CollectConfig:
     task: str
     """walker_walk, cheetah_run or humanoid_walk."""
     quality: Quality
-    """Whose episodes: random actions, the medium or the expert actor, or half of each of the two."""
+    """Whose episodes: random actions, actors saved on the way to the medium one, the medium actor, half of medium and
+    expert each, or the expert actor."""
     out: Path
     """Folder of the set."""
     episodes: int = 200
@@ -49,7 +52,7 @@ class CollectConfig:
     episodes_per_shard: int = 50
     """Episodes in a shard."""
     actor: Path | None = None
-    """An actor file to use instead of the shipped one (not for random or medium_expert)."""
+    """An actor file to use instead of the shipped one (for medium or expert)."""
 
 
 @dataclass(frozen=True)
@@ -60,7 +63,8 @@ class _Job:
     episode: int
     seed: int
     actor: Actor | None
-    render: Literal["fast", "exact"]
+    render: Literal["fast", "exact"] | None
+    """None: physics alone, no frames."""
     length: int
 
 
@@ -79,24 +83,42 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
     if config.actor is not None and config.quality not in ("medium", "expert"):
         raise UserError(f"--actor is for medium or expert sets, not {config.quality}: leave it out or change --quality")
     plan = list(_plan(config))
-    _claim(config, [actor for _, _, actor in plan])
+    _claim(config, [policy for _, _, policy in plan])
     started, frames = time.monotonic(), 0
     with ProgressLine("collect", config.episodes, "episodes") as progress:
-        for path, episodes, actor in plan:
+        for path, episodes, policy in plan:
             if path.exists():
                 progress.advance(len(episodes))
                 continue
-            jobs = [_Job(config.task, i, config.seed, actor, config.render, length) for i in episodes]
+            jobs = [_job(config, policy, episode, length) for episode in episodes]
             rollouts = []
             for rollout in run_jobs(_roll_out, jobs, config.workers):
                 rollouts.append(rollout)
                 frames += len(rollout["reward"])
                 speed = frames / (time.monotonic() - started)
                 progress.advance(1, ret=float(rollout["reward"].sum()), frames_per_s=speed)
-            write_shard(path, join_rollouts(rollouts), _attributes(config, path, actor))
+            write_shard(path, join_rollouts(rollouts), _attributes(config, path, policy))
     seconds = time.monotonic() - started
     record_set(config.out, seconds, frames, config.workers)
+    from vd4rl_pomdp.data.card import write_card  # draws; the processes that render need it not
+
+    write_card(config.out)
     return [path for path, _, _ in plan]
+
+
+def replay_returns(config: CollectConfig) -> list[float]:
+    """Returns of all episodes that `collect` would render, by physics alone: the same seeds, actions and rewards."""
+    jobs = [
+        replace(_job(config, policy, episode, EPISODE_TRANSITIONS), render=None)
+        for _, episodes, policy in _plan(config)
+        for episode in episodes
+    ]
+    with ProgressLine(f"play {config.task} {config.quality}", config.episodes, "episodes") as progress:
+        returns = []
+        for rollout in run_jobs(_roll_out, jobs, config.workers):
+            returns.append(float(rollout["reward"].sum()))
+            progress.advance(1, ret=returns[-1])
+    return returns
 
 
 def episode_seed(seed: int, episode: int) -> int:
@@ -105,25 +127,33 @@ def episode_seed(seed: int, episode: int) -> int:
     return int.from_bytes(digest, "little") & 0x7FFFFFFF
 
 
-def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Actor | None]]:
-    """Shards to write: file, episode numbers, actor. medium_expert is all medium shards, then all expert ones."""
+def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Policy]]:
+    """Shards to write: file, episode numbers, policy. medium_expert is all medium shards, then all expert ones."""
     halves = ["medium", "expert"] if config.quality == "medium_expert" else [config.quality]
     first = 0
     for number, quality in enumerate(halves):
         stop = config.episodes * (number + 1) // len(halves)
-        actor = _actor(config, quality)
+        policy = _policy(config, quality)
         for shard, start in enumerate(range(first, stop, config.episodes_per_shard)):
             episodes = range(start, min(start + config.episodes_per_shard, stop))
-            yield config.out / f"{shard}_{config.task}_{quality}.hdf5", episodes, actor
+            yield config.out / f"{shard}_{config.task}_{quality}.hdf5", episodes, policy
         first = stop
 
 
-def _actor(config: CollectConfig, quality: str) -> Actor | None:
+def _policy(config: CollectConfig, quality: str) -> Policy:
     if quality == "random":
         return None
+    if quality == "medium_replay":
+        return load_ladder(config.task)
     if config.actor is None:
         return load_actor(config.task, quality)
     return read_actor(config.actor, get_task(config.task))
+
+
+def _job(config: CollectConfig, policy: Policy, episode: int, length: int) -> _Job:
+    """One episode; with a ladder, by who acted at the moment of training that the episode stands for."""
+    actor = policy.actor_at((episode + 0.5) / config.episodes) if isinstance(policy, Ladder) else policy
+    return _Job(config.task, episode, config.seed, actor, config.render, length)
 
 
 def _roll_out(job: _Job) -> dict[str, np.ndarray]:
@@ -140,8 +170,8 @@ def _roll_out(job: _Job) -> dict[str, np.ndarray]:
             action = job.actor.act(row.state, rng)
         row = env.step(action)
         rows.append((row, action))
-    return {
-        "observation": np.stack([r.frame for r, _ in rows]),
+    frames = {} if job.render is None else {"observation": np.stack([r.frame for r, _ in rows])}
+    return frames | {
         "action": np.stack([a for _, a in rows]),
         "reward": np.array([r.reward for r, _ in rows]),
         "discount": np.array([r.discount for r, _ in rows]),
@@ -159,7 +189,8 @@ def _environment(*arguments: Any) -> Any:
 
     if arguments not in _ENVIRONMENTS:
         task, render, length = arguments
-        _ENVIRONMENTS[arguments] = PixelEnv(task, render, length=length)
+        pixels = render is not None
+        _ENVIRONMENTS[arguments] = PixelEnv(task, render or "fast", pixels, length)
     return _ENVIRONMENTS[arguments]
 
 
@@ -168,21 +199,21 @@ def join_rollouts(rollouts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray
     return {key: np.concatenate([rollout[key] for rollout in rollouts]) for key in rollouts[0]}
 
 
-def _attributes(config: CollectConfig, path: Path, actor: Actor | None) -> dict[str, Any]:
+def _attributes(config: CollectConfig, path: Path, policy: Policy) -> dict[str, Any]:
     return {
         "task": config.task,
         "set": config.quality,
         "policy": path.stem.split("_", 1)[1].removeprefix(f"{config.task}_"),
         "seed": config.seed,
         "render": config.render,
-        "actor_sha256": actor.sha256 if actor else None,
+        "actor_sha256": policy.sha256 if policy else None,
         "versions": {k: v for k, v in versions().items() if k in ("mujoco", "dm-control", "vd4rl-pomdp")},
     }
 
 
-def _claim(config: CollectConfig, actors: list[Actor | None]) -> None:
+def _claim(config: CollectConfig, policies: list[Policy]) -> None:
     settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS}
-    settings["actors"] = sorted({actor.sha256 for actor in actors if actor is not None})
+    settings["actors"] = sorted({policy.sha256 for policy in policies if policy is not None})
     claim_set(config.out, settings)
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import warnings
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -47,7 +48,7 @@ class Dataset:
         self._buffers = FrameBuffers()
         self.fingerprint = store.fingerprint
         """Name of the set's content, the same for copies of the set."""
-        self.task, self.quality = _identity(path, store)
+        self.task, self.quality = identity(path, store.meta["attributes"])
         """Names as in `tasks`, None where neither the shards nor the folders tell."""
         step_type, reward = store.array("step_type"), store.array("reward")
         self.frames = _read_only_tensor(store.frames())
@@ -253,13 +254,13 @@ def _read_only_tensor(array: np.ndarray) -> Tensor:
         return torch.from_numpy(array)
 
 
-def _identity(path: Path, store: Store) -> tuple[str | None, str | None]:
-    """Task and quality of a set: as all its shards say, else as its folders are named."""
-    return _name(path, store, "task", tuple(TASKS)), _name(path, store, "set", QUALITIES)
+def identity(path: Path, attributes: list[dict[str, Any]]) -> tuple[str | None, str | None]:
+    """Task and quality of a set: as the attributes of all its shards say, else as its folders are named."""
+    return _name(path, attributes, "task", tuple(TASKS)), _name(path, attributes, "set", QUALITIES)
 
 
-def _name(path: Path, store: Store, attribute: str, choices: tuple[str, ...]) -> str | None:
-    stored = {attributes.get(attribute) for attributes in store.meta["attributes"]} - {None}
+def _name(path: Path, attributes: list[dict[str, Any]], attribute: str, choices: tuple[str, ...]) -> str | None:
+    stored = {str(one[attribute]) for one in attributes if one.get(attribute)}
     if len(stored) > 1:
         raise UserError(f"{path}: its shards come from {' and '.join(sorted(stored))}; keep one set in a folder")
     named = (part for part in reversed(path.resolve().parts) if part in choices)

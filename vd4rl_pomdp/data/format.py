@@ -167,6 +167,12 @@ def read_frames(path: Path) -> Iterator[np.ndarray]:
             yield frames[start : start + rows]
 
 
+def read_some_frames(path: Path, rows: np.ndarray) -> np.ndarray:
+    """Frames of a shard's rows, (R, 3, S, S) uint8, given increasing row numbers (R,)."""
+    with _open(path) as file:
+        return file[FRAMES_KEY][rows]
+
+
 @contextmanager
 def _open(path: Path) -> Iterator[h5py.File]:
     """An open shard; whatever HDF5 cannot read becomes a sentence."""

@@ -1,5 +1,5 @@
 """State-based policies that collect the data."""
 
-from vd4rl_pomdp.policies.actor import Actor, load_actor, read_actor
+from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 
-__all__ = ["Actor", "load_actor", "read_actor"]
+__all__ = ["Actor", "Ladder", "load_actor", "load_ladder", "read_actor"]

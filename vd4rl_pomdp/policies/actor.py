@@ -1,7 +1,9 @@
 """State-based SAC actors as small files: safetensors weights, numpy inference, no learning library needed.
 
 An actor maps dm_control's flattened observations to a squashed Gaussian over actions (Haarnoja et al. 2018,
-arXiv 1801.01290): two hidden layers of rectified units, then a mean and a log standard deviation, tanh at the end.
+arXiv 1801.01290): hidden layers of rectified units, or SimBa's residual blocks (Lee et al. 2024, arXiv 2410.09754),
+then a mean and a log standard deviation, tanh at the end. Observations may be standardised first. Weights are float32;
+an action is computed in double precision and rounded to float32 once, so that it does not depend on the processor.
 """
 
 from __future__ import annotations
@@ -9,6 +11,7 @@ from __future__ import annotations
 import hashlib
 import json
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
@@ -20,8 +23,10 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import Task, get_task
 
 LOG_STD_RANGE = (-20.0, 2.0)
+OBSERVATION_CLIP = 10.0
+"""Standardised observations are cut off here."""
+LAYER_NORM_EPSILON = 1e-6
 ASSETS = Path(__file__).parent / "assets"
-SHIPPED = ("medium", "expert")
 
 
 @dataclass(frozen=True)
@@ -29,7 +34,9 @@ class Actor:
     """A stochastic policy on simulator states."""
 
     weights: dict[str, np.ndarray]
-    """float32 matrices `hidden.{i}.weight` (in, out), `mean.weight`, `log_std.weight`, and their `.bias`."""
+    """float32: matrices (in, out) with their `.bias`: `mean.weight`, `log_std.weight`, and either `hidden.{i}.weight`
+    or `embed.weight`, `block.{i}.up.weight`, `block.{i}.down.weight`, with the layer norms `block.{i}.norm.scale` and
+    `norm.scale`; optionally `observation.mean` and `observation.std` (D,)."""
     card: dict[str, Any]
     """Where the actor comes from: task, quality, training step, mean return of 20 episodes, config, versions."""
     sha256: str = ""
@@ -45,32 +52,115 @@ class Actor:
         Returns:
             (A,) float32 in [-1, 1].
         """
-        hidden = state.astype(np.float32)
-        layer = 0
-        while f"hidden.{layer}.weight" in self.weights:
-            hidden = np.maximum(self._linear(f"hidden.{layer}", hidden), 0.0)
-            layer += 1
+        hidden = self._features(self._standardised(state.astype(np.float64)))
         action = self._linear("mean", hidden)
         if rng is not None:
             log_std = np.clip(self._linear("log_std", hidden), *LOG_STD_RANGE)
             action = action + np.exp(log_std) * rng.standard_normal(action.shape, dtype=np.float32)
-        return np.tanh(action)
+        return np.tanh(action).astype(np.float32)
+
+    @cached_property
+    def _double(self) -> dict[str, np.ndarray]:
+        """The weights in double precision."""
+        return {name: value.astype(np.float64) for name, value in self.weights.items()}
+
+    def _standardised(self, state: np.ndarray) -> np.ndarray:
+        if "observation.mean" not in self.weights:
+            return state
+        scaled = (state - self._double["observation.mean"]) / self._double["observation.std"]
+        return np.clip(scaled, -OBSERVATION_CLIP, OBSERVATION_CLIP)
+
+    def _features(self, x: np.ndarray) -> np.ndarray:
+        """What the mean and the standard deviation are read from."""
+        if "embed.weight" not in self.weights:
+            for layer in range(self._count("hidden.{}.weight")):
+                x = np.maximum(self._linear(f"hidden.{layer}", x), 0.0)
+            return x
+        x = self._linear("embed", x)
+        for block in range(self._count("block.{}.up.weight")):
+            up = self._linear(f"block.{block}.up", self._normed(f"block.{block}.norm", x))
+            x = x + self._linear(f"block.{block}.down", np.maximum(up, 0.0))
+        return self._normed("norm", x)
+
+    def _count(self, pattern: str) -> int:
+        count = 0
+        while pattern.format(count) in self.weights:
+            count += 1
+        return count
+
+    def _normed(self, name: str, x: np.ndarray) -> np.ndarray:
+        centred = x - x.mean()
+        scale = self._double[f"{name}.scale"] / np.sqrt(centred.var() + LAYER_NORM_EPSILON)
+        return centred * scale + self._double[f"{name}.bias"]
 
     def _linear(self, name: str, x: np.ndarray) -> np.ndarray:
-        return x @ self.weights[f"{name}.weight"] + self.weights[f"{name}.bias"]
+        return x @ self._double[f"{name}.weight"] + self._double[f"{name}.bias"]
 
     def save(self, path: Path) -> None:
         """Write the actor to one safetensors file, its card as JSON in the header."""
-        path.parent.mkdir(parents=True, exist_ok=True)
-        temporary = path.with_name(f".{path.name}.tmp")
-        save_file(
-            {k: np.ascontiguousarray(v) for k, v in self.weights.items()}, temporary, {"card": json.dumps(self.card)}
-        )
-        temporary.replace(path)
+        _save(self.weights, self.card, path)
+
+
+@dataclass(frozen=True)
+class Ladder:
+    """Actors saved along one training run, standing for its replay buffer."""
+
+    weights: dict[str, np.ndarray]
+    """As an actor's, float16, the rungs along a new first axis."""
+    card: dict[str, Any]
+    """Task, `decisions` of each rung, and its return on the learning curve, `curve`."""
+    sha256: str = ""
+    """Hash of the file the ladder was read from."""
+
+    @classmethod
+    def of(cls, actors: list[Actor], card: dict[str, Any]) -> Ladder:
+        """Stack actors of one architecture; their weights are rounded to half precision."""
+        names = actors[0].weights
+        return cls({name: np.stack([a.weights[name] for a in actors]).astype(np.float16) for name in names}, card)
+
+    @cached_property
+    def rungs(self) -> list[Actor]:
+        """The actors, first to last."""
+        count = len(self.card["decisions"])
+        stacked = {name: value.astype(np.float32) for name, value in self.weights.items()}
+        return [Actor({name: value[i] for name, value in stacked.items()}, self.card) for i in range(count)]
+
+    def actor_at(self, progress: float) -> Actor | None:
+        """Who acted at a moment of the run up to the last rung.
+
+        Args:
+            progress: moment as a share of the run, in [0, 1].
+
+        Returns:
+            The rung nearest in decisions, None for uniformly random actions when the untrained start is nearer.
+        """
+        steps = np.array([0, *self.card["decisions"]])
+        nearest = int(np.abs(steps - progress * steps[-1]).argmin())
+        return self.rungs[nearest - 1] if nearest else None
+
+    def save(self, path: Path) -> None:
+        """Write the ladder to one safetensors file, its card as JSON in the header."""
+        _save(self.weights, self.card, path)
+
+
+def _save(weights: dict[str, np.ndarray], card: dict[str, Any], path: Path) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    save_file({k: np.ascontiguousarray(v) for k, v in weights.items()}, temporary, {"card": json.dumps(card)})
+    temporary.replace(path)
 
 
 def read_actor(path: Path, task: Task | None = None) -> Actor:
     """Read an actor file; raises UserError if it is missing, damaged, or made for another task than `task`."""
+    return Actor(*_read(path, task))
+
+
+def read_ladder(path: Path, task: Task | None = None) -> Ladder:
+    """Read a ladder's file; raises UserError as `read_actor` does."""
+    return Ladder(*_read(path, task))
+
+
+def _read(path: Path, task: Task | None) -> tuple[dict[str, np.ndarray], dict[str, Any], str]:
     try:
         with safe_open(path, framework="np") as file:
             card = json.loads((file.metadata() or {})["card"])
@@ -79,16 +169,35 @@ def read_actor(path: Path, task: Task | None = None) -> Actor:
         raise UserError(f"{path}: not an actor file ({error}); make one with `vd4rl-pomdp policy train`") from error
     if task is not None and card.get("task") != task.name:
         raise UserError(f"{path}: this actor was trained on {card.get('task')}, not on {task.name}")
-    return Actor(weights, card, hashlib.sha256(path.read_bytes()).hexdigest())
+    return weights, card, hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def load_actor(task: str, quality: str) -> Actor:
     """Load the actor that ships for a task and a quality (`medium` or `expert`)."""
-    path = ASSETS / f"{get_task(task).name}_{quality}.safetensors"
+    return read_actor(_shipped(task, quality), get_task(task))
+
+
+def load_ladder(task: str) -> Ladder:
+    """Load the ladder of actors that ships for a task's medium_replay set."""
+    return read_ladder(_shipped(task, "replay"), get_task(task))
+
+
+def ships(task: str, quality: str) -> bool:
+    """Whether the actors of a set ship: random needs none, medium_expert needs two."""
+    needed = {"random": (), "medium_replay": ("replay",), "medium_expert": ("medium", "expert")}
+    return all(_asset(task, name).exists() for name in needed.get(quality, (quality,)))
+
+
+def _asset(task: str, name: str) -> Path:
+    return ASSETS / f"{get_task(task).name}_{name}.safetensors"
+
+
+def _shipped(task: str, quality: str) -> Path:
+    path = _asset(task, quality)
     if not path.exists():
         have = ", ".join(sorted(p.stem for p in ASSETS.glob("*.safetensors"))) or "none"
         raise UserError(
             f"no {quality} actor ships for {task} (shipped: {have}); "
-            f"train one with `vd4rl-pomdp policy train --task {task}` and pass it as --actor"
+            f"train one with `vd4rl-pomdp policy train --task {task}`"
         )
-    return read_actor(path, get_task(task))
+    return path

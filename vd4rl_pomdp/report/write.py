@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import csv
 import json
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ import numpy as np
 from rich.console import Console
 from rich.table import Table
 
+from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import COLUMNS
 from vd4rl_pomdp.report import figures, tables
@@ -151,8 +151,7 @@ def _base64(data: bytes) -> str:
 
 def _published(rows: list[Row]) -> list[dict[str, str]]:
     wanted = {(row["task"], row["quality"]) for row in rows}
-    with files("vd4rl_pomdp.report").joinpath("published_scores.csv").open() as file:
-        return [row for row in csv.DictReader(file) if (row["env"], row["dataset"]) in wanted]
+    return [row for row in published_scores() if (row["env"], row["dataset"]) in wanted]
 
 
 def _facts(run: Run) -> dict[str, str]:

@@ -1,0 +1,62 @@
+import numpy as np
+import pytest
+from PIL import Image
+
+from tests.helpers_data import fake_reward, write_fake_set
+from vd4rl_pomdp.data import card as module
+from vd4rl_pomdp.data.card import write_card
+from vd4rl_pomdp.data.published import published_scores
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import QUALITIES, TASKS
+
+MADE = {"task": "cheetah_run", "set": "medium_replay", "policy": "medium_replay", "seed": 7, "render": "fast"}
+
+
+def fields(path):
+    lines = [line.strip("| ").split(" | ") for line in path.read_text().splitlines() if line.startswith("| ")]
+    return {line[0]: line[1] for line in lines if len(line) == 2}
+
+
+def test_a_card_says_what_the_set_holds_and_how_it_was_made(tmp_path):
+    folder = write_fake_set(tmp_path / "set", (12, 30, 12), attributes=MADE | {"actor_sha256": "ab" * 32})
+    path = write_card(folder)
+    returns = [sum(fake_reward(episode, t) for t in range(n - 1)) for episode, n in enumerate((12, 30, 12))]
+    found = fields(path)
+    assert (found["episodes"], found["rows"], found["rows an episode"]) == ("3", "54", "12 to 30")
+    assert found["return, mean"] == f"{np.mean(returns):.3f}"
+    assert found["return, lowest to highest"] == f"{min(returns):.3f} to {max(returns):.3f}"
+    assert found["published return of plain BC on V-D4RL's set"] == "250"
+    assert (found["seed"], found["render"]) == ("7", "fast")
+    assert found["actor medium_replay, SHA-256"] == "ab" * 32
+    assert "in proportion" in path.read_text()
+    with Image.open(folder / "card.png") as picture:
+        assert picture.width > 600
+
+
+def test_the_film_shows_the_episode_of_median_return_across_shards(tmp_path):
+    folder = write_fake_set(tmp_path / "set", (12, 30, 20), cuts=(40, 50), attributes=MADE)
+    shards = module.shard_paths(folder)
+    counts = [40, 10, 12]
+    film = module._film(shards, counts, np.array([0, 12, 42]), np.array([12, 30, 20]), np.array([0.0, 9.0, 5.0]))
+    assert film.shape == (module.FILM_FRAMES, 3, 84, 84)
+    assert film[:, 0, 0, 0].tolist() == [2] * module.FILM_FRAMES  # the episode
+    assert film[:, 2, 0, 0].tolist() == np.linspace(0, 19, module.FILM_FRAMES).astype(int).tolist()
+
+
+def test_a_published_set_gets_a_card_without_an_origin(tmp_path):
+    folder = write_fake_set(tmp_path / "walker_walk" / "expert" / "84px")
+    text = write_card(folder).read_text()
+    assert text.startswith("# walker_walk, expert")
+    assert "915" in text
+    assert "seed" not in text
+
+
+def test_what_is_no_set_gets_no_card(tmp_path):
+    with pytest.raises(UserError, match=r"holds no \.hdf5 shards"):
+        write_card(tmp_path)
+    assert not list(tmp_path.iterdir())
+
+
+def test_every_set_has_a_published_score():
+    assert {(row["env"], row["dataset"]) for row in published_scores()} == {(t, q) for t in TASKS for q in QUALITIES}
+    assert set(module.HOW) == set(QUALITIES)

@@ -1,0 +1,67 @@
+import csv
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.data.collect import CollectConfig, _job, _plan, _roll_out, replay_returns
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.experiments import datasets as module
+
+
+@pytest.fixture
+def played(monkeypatch):
+    """Episodes are not played here: each returns its number; returns what was asked for."""
+    asked = []
+
+    def fake(config):
+        asked.append((config.task, config.quality))
+        return [float(i) for i in range(config.episodes)]
+
+    monkeypatch.setattr(module, "replay_returns", fake)
+    monkeypatch.setattr(module, "EPISODES", 3)
+    cost = {"episodes": 2, "rows": 1000, "cpu_seconds": "20.0", "commit": ""}
+    monkeypatch.setattr(module, "_cost", lambda task, episodes: {"task": task} | cost)
+    return asked
+
+
+def test_the_table_holds_every_set_that_can_be_made(played, tmp_path):
+    rows = module.tabulate(tmp_path, ["walker_walk"], ["random", "expert"], 2, 1)
+    expected = {"episodes": 3, "mean": "1.0", "min": "0.0", "max": "2.0", "seconds_100k": 1000}
+    assert rows == [{"task": "walker_walk", "quality": quality} | expected for quality in ("random", "expert")]
+    with (tmp_path / "returns.csv").open() as file:
+        assert [row["return"] for row in csv.DictReader(file)] == ["0.0", "1.0", "2.0"] * 2
+
+
+def test_what_is_in_the_table_is_not_played_again(played, tmp_path, monkeypatch):
+    module.tabulate(tmp_path, ["walker_walk"], ["random"], 2, 1)
+    monkeypatch.setattr(module, "ships", lambda task, quality: quality != "expert")
+    rows = module.tabulate(tmp_path, ["walker_walk"], ["random", "medium", "expert"], 2, 1)
+    assert played == [("walker_walk", "random"), ("walker_walk", "medium")]
+    assert [row["quality"] for row in rows] == ["random", "medium"]
+
+
+def test_a_slip_is_a_sentence(played, tmp_path):
+    with pytest.raises(UserError, match="unknown quality 'good'"):
+        module.tabulate(tmp_path, ["walker_walk"], ["good"], 2, 1)
+    with pytest.raises(UserError, match="unknown task"):
+        module.tabulate(tmp_path, ["ant"], ["random"], 2, 1)
+
+
+def test_physics_alone_gives_the_rewards_of_the_rendered_episodes(tmp_path):
+    config = CollectConfig("walker_walk", "medium_replay", tmp_path, episodes=2, workers=1)
+    _, episodes, policy = next(iter(_plan(config)))
+    for episode in episodes:
+        job = _job(config, policy, episode, 6)
+        rendered, played = _roll_out(job), _roll_out(replace(job, render=None))
+        assert "observation" in rendered
+        assert "observation" not in played
+        for key, value in played.items():
+            np.testing.assert_array_equal(value, rendered[key])
+
+
+def test_all_episodes_of_a_set_are_played(tmp_path):
+    config = CollectConfig("walker_walk", "random", tmp_path / "set", episodes=2, workers=1)
+    returns = replay_returns(config)
+    assert len(set(returns)) == 2
+    assert not (tmp_path / "set").exists()

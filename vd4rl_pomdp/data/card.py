@@ -1,0 +1,163 @@
+"""A set's data card: `card.md` and `card.png` beside its shards, all from what the set itself records.
+
+V-D4RL's files are not needed to make one; its published figures are those in `published`.
+"""
+
+from __future__ import annotations
+
+import io
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from vd4rl_pomdp.data.dataset import identity
+from vd4rl_pomdp.data.episodes import join_shards
+from vd4rl_pomdp.data.format import disk_error, read_attributes, read_rows, read_some_frames, shard_paths
+from vd4rl_pomdp.data.published import published_scores
+from vd4rl_pomdp.runs.folder import read_json
+from vd4rl_pomdp.tasks import SCORE_DIVISOR
+from vd4rl_pomdp.types import StepType
+
+FILM_FRAMES = 10
+LINES = 0.82
+"""Height of bars and lines; above is the legend's place."""
+HOW = {
+    "random": "Uniformly random actions.",
+    "medium": "The medium actor's sampled actions; the one that ships has about half of the expert's return.",
+    "expert": "The expert actor's sampled actions; the one that ships is the best snapshot of its training run.",
+    "medium_expert": "The first half of the episodes by the medium actor, the second half by the expert actor.",
+    "medium_replay": (
+        "Not a replay buffer itself, but regenerated from actors saved along the training run up to its medium level: "
+        "each episode is played anew, with the run's exploration noise, by the actor saved nearest to the moment of "
+        "the run that the episode stands for, in proportion and in order; the earliest by uniformly random actions."
+    ),
+}
+
+
+def write_card(path: Path) -> Path:
+    """Describe a set in `card.md` and `card.png`, in its folder.
+
+    Args:
+        path: folder of the shards, collected here or published.
+
+    Returns:
+        The card's file.
+
+    Raises:
+        UserError: the set is damaged, or the folder cannot be written.
+    """
+    shards = shard_paths(path)
+    parts = [read_rows(shard) for shard in shards]
+    rows = join_shards(shards, parts)
+    attributes = [read_attributes(shard) for shard in shards]
+    names = identity(path, attributes)
+    starts = np.flatnonzero(rows["step_type"] == StepType.FIRST)
+    returns = np.add.reduceat(rows["reward"], starts)
+    lengths = np.diff([*starts, len(rows["reward"])])
+    published = _published(*names)
+    film = _film(shards, [len(part["reward"]) for part in parts], starts, lengths, returns)
+    text = _text(path, names, attributes, returns, lengths, published)
+    folder = path if path.is_dir() else path.parent
+    try:
+        (folder / "card.png").write_bytes(_picture(names, returns, published, film))
+        (folder / "card.md").write_text(text)
+    except OSError as error:
+        raise disk_error(folder / "card.md", error) from error
+    return folder / "card.md"
+
+
+def _published(task: str | None, quality: str | None) -> float | None:
+    """Return of plain behaviour cloning on the published set of this name, the figure nearest to its average."""
+    scores = [row["bc"] for row in published_scores() if (row["env"], row["dataset"]) == (task, quality)]
+    return float(scores[0]) * SCORE_DIVISOR if scores else None
+
+
+def _film(
+    shards: list[Path], counts: list[int], starts: np.ndarray, lengths: np.ndarray, returns: np.ndarray
+) -> np.ndarray:
+    """(FILM_FRAMES, 3, 84, 84) frames, evenly spaced, of the episode with the median return."""
+    episode = int(np.argsort(returns)[len(returns) // 2])
+    wanted = starts[episode] + np.linspace(0, lengths[episode] - 1, FILM_FRAMES).astype(int)
+    offsets = np.cumsum([0, *counts])
+    frames = []
+    for shard, first, stop in zip(shards, offsets, offsets[1:], strict=False):
+        inside = np.unique(wanted[(wanted >= first) & (wanted < stop)])
+        if len(inside):
+            frames.append(read_some_frames(shard, inside - first))
+    return np.concatenate(frames)
+
+
+def _picture(
+    names: tuple[str | None, str | None], returns: np.ndarray, published: float | None, film: np.ndarray
+) -> bytes:
+    figure = Figure(figsize=(8.4, 4.0), layout="constrained", dpi=110)
+    above, below = figure.subplots(2, 1, height_ratios=(2.4, 1))
+    top = max(returns.max(), published or 0.0)
+    counts, _, _ = above.hist(returns, bins=np.linspace(0, max(top, 1.0) * 1.02, 41), color="#56b4e9")
+    above.axvline(returns.mean(), ymax=LINES, color="#0072b2", label=f"mean of this set, {returns.mean():.1f}")
+    if published is not None:
+        label = f"published: plain BC on V-D4RL's set of this name, {published:.0f}"
+        above.axvline(published, ymax=LINES, color="#d55e00", ls="--", label=label)
+    above.set(xlabel="episode return", ylabel="episodes", title=_title(names), ylim=(0, counts.max() / LINES))
+    above.yaxis.get_major_locator().set_params(integer=True)
+    above.spines[["top", "right"]].set_visible(False)
+    above.legend(frameon=False, fontsize=8, ncols=2, loc="upper center")
+    below.imshow(np.concatenate(list(film.transpose(0, 2, 3, 1)), axis=1), interpolation="nearest")
+    below.set_title("the episode of median return", fontsize=9)
+    below.axis("off")
+    buffer = io.BytesIO()
+    figure.savefig(buffer, format="png", metadata={"Software": None})
+    return buffer.getvalue()
+
+
+def _title(names: tuple[str | None, str | None]) -> str:
+    return ", ".join(name for name in names if name) or "data set"
+
+
+def _text(
+    path: Path,
+    names: tuple[str | None, str | None],
+    attributes: list[dict[str, Any]],
+    returns: np.ndarray,
+    lengths: np.ndarray,
+    published: float | None,
+) -> str:
+    rows = {
+        "episodes": len(returns),
+        "rows": int(lengths.sum()),
+        "rows an episode": _span(lengths.min(), lengths.max()),
+        "return, mean": f"{returns.mean():.3f}",
+        "return, standard deviation": f"{returns.std():.3f}",
+        "return, lowest to highest": f"{returns.min():.3f} to {returns.max():.3f}",
+        "return, quartiles": ", ".join(f"{q:.1f}" for q in np.quantile(returns, (0.25, 0.5, 0.75))),
+        "published return of plain BC on V-D4RL's set": "none" if published is None else f"{published:.0f}",
+    } | _origin(path, attributes)
+    table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
+    how = HOW.get(names[1] or "", "") if attributes[0] else "A published set, or one that records no origin."
+    return f"# {_title(names)}\n\n{how}\n\n| | |\n|---|---|\n{table}\n\n![Returns and a film strip](card.png)\n"
+
+
+def _span(low: Any, high: Any) -> str:
+    return f"{low}" if low == high else f"{low} to {high}"
+
+
+def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, Any]:
+    """Seed, actors, rendering, versions and commit, as the shards and provenance.json record them."""
+    if not attributes[0]:
+        return {}
+    first = attributes[0]
+    actors = {a["policy"]: a.get("actor_sha256") for a in attributes if a.get("actor_sha256")}
+    facts = {"seed": first.get("seed"), "render": first.get("render")}
+    facts |= {f"actor {name}, SHA-256": sha for name, sha in actors.items()}
+    record = path / "provenance.json"
+    if record.exists():
+        provenance = read_json(record)
+        rendered = provenance.get("render", {})
+        facts["rendered by"] = ", ".join(str(rendered[k]) for k in ("gl_vendor", "gl_renderer") if k in rendered)
+        facts["canary frames"] = rendered.get("canary")
+        facts["versions"] = ", ".join(f"{k} {v}" for k, v in provenance.get("versions", {}).items())
+        facts["commit"] = provenance.get("git_commit")
+        facts["command"] = f"`{provenance.get('command')}`"
+    return {name: value for name, value in facts.items() if value not in (None, "")}

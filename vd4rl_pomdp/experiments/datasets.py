@@ -1,0 +1,109 @@
+"""A table of all sets that `data collect` makes: what their episodes return, and what collecting them costs.
+
+Returns are those of a full collection with the default seed: every episode is played by physics alone, from the same
+seed and with the same actions, so its rewards are the same to the digit. Cost is measured on a short collection with
+rendering.
+"""
+
+from __future__ import annotations
+
+import csv
+import tempfile
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd4rl_pomdp.data.collect import CollectConfig, collect, replay_returns
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.policies.actor import ships
+from vd4rl_pomdp.runs.folder import write_json
+from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, QUALITIES, get_task
+
+EPISODES = 200
+CORES = 2
+Row = dict[str, Any]
+RETURNS = ("task", "quality", "episode", "return")
+COSTS = ("task", "episodes", "rows", "cpu_seconds", "commit")
+SETS = ("task", "quality", "episodes", "mean", "min", "max", "seconds_100k")
+
+
+def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_episodes: int, workers: int) -> list[Row]:
+    """Play and time the sets that are not in the table yet, and write it anew.
+
+    Args:
+        out: folder of `returns.csv` (one row an episode), `costs.csv` (one row a task) and `sets.csv`, the table.
+        tasks: tasks to add.
+        qualities: qualities to add; one whose actor does not ship yet is left out.
+        timed_episodes: episodes of the short collection that is timed, on one core.
+        workers: processes that play.
+
+    Returns:
+        Rows of the table, in the order of `tasks` and `QUALITIES`.
+    """
+    unknown = sorted(set(qualities) - set(QUALITIES))
+    if unknown:
+        raise UserError(f"unknown quality {unknown[0]!r}: choose from {', '.join(QUALITIES)}")
+    returns, costs = _read(out / "returns.csv"), _read(out / "costs.csv")
+    for task in tasks:
+        get_task(task)
+        for quality in qualities:
+            if ships(task, quality) and not any((r["task"], r["quality"]) == (task, quality) for r in returns):
+                config = CollectConfig(task, quality, Path(), EPISODES, workers=workers)  # type: ignore[arg-type]
+                played = enumerate(replay_returns(config))
+                returns += [{"task": task, "quality": quality, "episode": i, "return": repr(v)} for i, v in played]
+                _write(out / "returns.csv", RETURNS, returns)
+                _write(out / "sets.csv", SETS, summarise(returns, costs))
+    for task in tasks:
+        if not any(row["task"] == task for row in costs):
+            costs.append(_cost(task, timed_episodes))
+            _write(out / "costs.csv", COSTS, costs)
+    table = summarise(returns, costs)
+    _write(out / "sets.csv", SETS, table)
+    write_json(out / "provenance.json", {"git_commit": git_commit(), "versions": versions(), "machine": machine()})
+    return table
+
+
+def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:
+    """The table from the raw rows; no seconds for a task that was not timed yet."""
+    seconds = {r["task"]: float(r["cpu_seconds"]) / float(r["rows"]) * 1e5 / CORES for r in costs}
+    table = []
+    for task in dict.fromkeys(row["task"] for row in returns):
+        for quality in QUALITIES:
+            mine = [float(r["return"]) for r in returns if (r["task"], r["quality"]) == (task, quality)]
+            if mine:
+                statistics = {"mean": np.mean(mine), "min": min(mine), "max": max(mine)}
+                row = {"task": task, "quality": quality, "episodes": len(mine)}
+                row |= {name: f"{value:.1f}" for name, value in statistics.items()}
+                table.append(row | {"seconds_100k": round(seconds[task]) if task in seconds else ""})
+    return table
+
+
+def _cost(task: str, episodes: int) -> Row:
+    """Processor time of a short collection of random episodes, rendering and writing included, in this process."""
+    with tempfile.TemporaryDirectory() as folder:
+        started = time.process_time()
+        collect(CollectConfig(task, "random", Path(folder) / task, episodes, workers=1))
+        spent = time.process_time() - started
+    rows = episodes * (EPISODE_TRANSITIONS + 1)
+    return {"task": task, "episodes": episodes, "rows": rows, "cpu_seconds": f"{spent:.1f}", "commit": git_commit()}
+
+
+def _read(path: Path) -> list[Row]:
+    if not path.exists():
+        return []
+    with path.open(newline="") as file:
+        return list(csv.DictReader(file))
+
+
+def _write(path: Path, columns: Sequence[str], rows: list[Row]) -> None:
+    path.parent.mkdir(parents=True, exist_ok=True)
+    temporary = path.with_name(f".{path.name}.tmp")
+    with temporary.open("w", newline="") as file:
+        writer = csv.DictWriter(file, columns, lineterminator="\n")
+        writer.writeheader()
+        writer.writerows(rows)
+    temporary.replace(path)

@@ -1,0 +1,146 @@
+"""From a training run to the files that ship: expert, medium, and the ladder of snapshots behind medium_replay.
+
+The folder that `export_run` writes also holds the run's config, curve and networks: small enough for a repository, and
+all that another machine needs to go on.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+import shutil
+from collections.abc import Iterator
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.policies.actor import Actor, Ladder, read_actor, read_ladder
+from vd4rl_pomdp.policies.state_env import StateEnv
+from vd4rl_pomdp.tasks import Task, get_task
+
+CARD_EPISODES = 20
+CARD_SEED = 10_000
+"""Episode i of an actor's card starts from environment seed CARD_SEED + i."""
+NETWORKS = "networks.safetensors"
+PROGRESS = ("config.json", "curve.csv", NETWORKS)
+"""Files of a run from which another one can start."""
+LADDER_RUNGS = 15
+"""Snapshots in a ladder, at most: the actors of all tasks together stay under 10 MB."""
+
+
+def episode_returns(actor: Actor, task: Task, episodes: int, first_seed: int = CARD_SEED) -> list[float]:
+    """Returns of the actor's mean action on episodes seeded first_seed, first_seed + 1, ..."""
+    env = StateEnv(task)
+    returns = []
+    for episode in range(episodes):
+        state, _ = env.reset(seed=first_seed + episode)
+        total, ended = 0.0, False
+        while not ended:
+            state, reward, _, ended, _ = env.step(actor.act(state))
+            total += reward
+        returns.append(total)
+    return returns
+
+
+def read_curve(run: Path) -> list[tuple[int, float]]:
+    """Learning curve of a run: (decisions, mean return) rows."""
+    with (run / "curve.csv").open(newline="") as file:
+        return [(int(row["decisions"]), float(row["return_mean"])) for row in csv.DictReader(file)]
+
+
+def snapshot_path(run: Path, decisions: int) -> Path:
+    """File of the actor that a run saved after so many decisions."""
+    return run / "snapshots" / f"{decisions:08d}.safetensors"
+
+
+def export_run(run: Path, out: Path) -> dict[str, Path]:
+    """Choose and write a run's expert, medium and ladder, and copy its progress; the run may still be going on.
+
+    The expert is the best of the three best snapshots, the medium actor the one of the three snapshots before it whose
+    return is nearest to half of the expert's; all are judged on the same 20 episodes.
+
+    Args:
+        run: folder of a training run.
+        out: folder for the files.
+
+    Returns:
+        The files by quality: `expert`, `medium`, `replay`.
+    """
+    if not (run / "curve.csv").exists() or not (run / "config.json").exists():
+        raise UserError(f"{run}: is not the folder of a policy run with a snapshot; `policy train` makes one")
+    config = json.loads((run / "config.json").read_text())
+    task = get_task(config["task"])
+    curve = read_curve(run)
+    kept = [row for row in curve if snapshot_path(run, row[0]).exists()]
+    judged = _judge(run, task, [step for step, _ in sorted(kept, key=lambda row: row[1])[-3:]])
+    expert = max(judged, key=lambda step: float(np.mean(judged[step])))
+    half = float(np.mean(judged[expert])) / 2
+    near = sorted((row for row in kept if row[0] < expert), key=lambda row: abs(row[1] - half))[:3]
+    judged |= _judge(run, task, [step for step, _ in near])
+    medium = min((step for step, _ in near), key=lambda step: abs(float(np.mean(judged[step])) - half), default=expert)
+    out.mkdir(parents=True, exist_ok=True)
+    for name in PROGRESS:
+        if (run / name).exists() and out.resolve() != run.resolve():
+            shutil.copy(run / name, out / name)
+    files = {
+        quality: _publish(run, out / f"{task.name}_{quality}.safetensors", config, quality, step, judged[step], curve)
+        for quality, step in (("expert", expert), ("medium", medium))
+    }
+    return files | {"replay": _publish_ladder(run, out, task, [row for row in kept if row[0] <= medium])}
+
+
+def _judge(run: Path, task: Task, steps: list[int]) -> dict[int, list[float]]:
+    return {step: episode_returns(read_actor(snapshot_path(run, step)), task, CARD_EPISODES) for step in steps}
+
+
+def _publish(
+    run: Path,
+    path: Path,
+    config: dict[str, Any],
+    quality: str,
+    step: int,
+    returns: list[float],
+    curve: list[tuple[int, float]],
+) -> Path:
+    """Write the actor with its card, and beside it the card with the learning curve."""
+    card = {
+        "task": config["task"],
+        "quality": quality,
+        "decisions": step,
+        "return_mean": round(float(np.mean(returns)), 3),
+        "return_min": round(min(returns), 3),
+        "return_max": round(max(returns), 3),
+        "returns": returns,
+        "returns_seeds": [CARD_SEED, CARD_SEED + CARD_EPISODES - 1],
+        "config": config,
+        "versions": {name: version(name) for name in ("sbx-rl", "jax", "dm-control", "mujoco", "numpy")},
+    }
+    Actor(read_actor(snapshot_path(run, step)).weights, card).save(path)
+    path.with_suffix(".json").write_text(json.dumps(card | {"learning_curve": curve}, indent=1) + "\n")
+    return path
+
+
+def _publish_ladder(run: Path, out: Path, task: Task, rows: list[tuple[int, float]]) -> Path:
+    """Write at most LADDER_RUNGS snapshots, evenly spread over the run up to the last of `rows`, into one file."""
+    chosen = sorted({round(i) for i in np.linspace(0, len(rows) - 1, min(LADDER_RUNGS, len(rows)))})
+    steps = [rows[i][0] for i in chosen]
+    actors = [read_actor(snapshot_path(run, step)) for step in steps]
+    path = out / f"{task.name}_replay.safetensors"
+    Ladder.of(actors, {"task": task.name, "decisions": steps, "curve": [rows[i][1] for i in chosen]}).save(path)
+    return path
+
+
+def exported_actors(folder: Path, task: Task) -> Iterator[tuple[int, Actor]]:
+    """Actors that `export_run` wrote into a folder, with their decisions; a ladder's first, rounded as they are."""
+    ladder = folder / f"{task.name}_replay.safetensors"
+    if ladder.exists():
+        read = read_ladder(ladder, task)
+        yield from zip(read.card["decisions"], read.rungs, strict=True)
+    for quality in ("medium", "expert"):
+        path = folder / f"{task.name}_{quality}.safetensors"
+        if path.exists():
+            actor = read_actor(path, task)
+            yield actor.card["decisions"], actor
