@@ -319,7 +319,7 @@ class ReportCommand:
     """Write an HTML page and CSV files about fine-tuning runs."""
 
     runs: tyro.conf.Positional[list[Path]]
-    """Run folders, or folders that contain some."""
+    """Run folders, or folders that contain some; a folder that `theory --out` wrote adds its section."""
     out: Path = Path("report")
     """Folder of the report."""
 
@@ -491,8 +491,8 @@ def _theory(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.theory import theory_study
 
     command = _parse(TheoryCommand, words, program)
-    if command.out is not None and command.out.is_file():
-        raise UserError(f"{command.out}: is a file; --out names a folder")
+    if command.out is not None:
+        _make_folder(command.out)
     study = theory_study()
     if command.json:
         print(json.dumps(study))
@@ -500,6 +500,14 @@ def _theory(words: Arguments, program: str) -> None:
         print_theory(study)
     if command.out is not None:
         print(f"page: {write_theory(study, command.out)}", file=sys.stderr if command.json else sys.stdout)
+
+
+def _make_folder(out: Path) -> None:
+    """Make --out's folder before anything is computed."""
+    try:
+        out.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UserError(f"{out}: cannot be a folder ({error.strerror}); --out names a folder") from error
 
 
 def _show(result: dict[str, Any], as_json: bool) -> None:

@@ -9,8 +9,8 @@ from pretrain.objectives import METHODS, build_objective
 from tests.theory.random_worlds import worlds
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.theory.classifiers import Memory, compare
+from vd4rl_pomdp.theory.decodability import future_memory, past_memory
 from vd4rl_pomdp.theory.gallery import WORLDS, biased, counterexample, echo, momentum
-from vd4rl_pomdp.theory.law import future_memory, past_memory
 from vd4rl_pomdp.theory.views import VIEWS
 
 MANY = settings(max_examples=40, deadline=None, suppress_health_check=[HealthCheck.filter_too_much])
@@ -20,8 +20,8 @@ LIMIT = 2
 @MANY
 @given(worlds())
 def test_mik_a_is_the_multi_step_inverse_where_past_and_future_decode(world):
-    m, n = past_memory(world, True, LIMIT), future_memory(world, True, limit=LIMIT)
-    assume(m is not None and n is not None)
+    m, n = past_memory(world, actions=True), future_memory(world, actions=True)
+    assume(m is not None and n is not None and max(m, n) <= LIMIT)
     for k in (1, 2, 3):
         found = compare(world, VIEWS["mik+a"], Memory(m, n), k)
         assert found.multi_step
@@ -31,8 +31,8 @@ def test_mik_a_is_the_multi_step_inverse_where_past_and_future_decode(world):
 @MANY
 @given(worlds())
 def test_ah_is_the_one_step_inverse_where_observations_decode(world):
-    m = past_memory(world, False, LIMIT)
-    assume(m is not None)
+    m = past_memory(world, actions=False)
+    assume(m is not None and m <= LIMIT)
     assert all(compare(world, VIEWS["ah"], Memory(m, 0), k).one_step for k in (1, 2, 3))
 
 

@@ -1,5 +1,6 @@
 from itertools import combinations
 
+import numpy as np
 import pytest
 from hypothesis import given, settings
 
@@ -21,7 +22,7 @@ MEMORY = Memory(3, 3)
 
 def classes(world, method, max_k):
     found = relation(world, VIEWS[method], MEMORY, range(1, max_k + 1))
-    return list(state_classes(found, found.coarsest(), world.states).values())
+    return state_classes(found, found.coarsest())
 
 
 @settings(max_examples=20, deadline=None)
@@ -30,10 +31,10 @@ def classes(world, method, max_k):
 def test_a_coarsest_partition_factors_and_cannot_be_coarsened(method, world):
     found = relation(world, VIEWS[method], Memory(1, 1), (1, 2))
     blocks = found.coarsest()
-    assert set(blocks) == set(found.rows)
-    assert found.factors(blocks.get)
-    for one, other in combinations(sorted(set(blocks.values())), 2):
-        assert not found.factors(lambda h, a=one, b=other: a if blocks[h] == b else blocks[h])
+    assert len(blocks) == len(found.histories)
+    assert found.factors(blocks)
+    for one, other in combinations(sorted(set(blocks.tolist())), 2):
+        assert not found.factors(np.where(blocks == other, one, blocks))
 
 
 @settings(max_examples=15, deadline=None)
@@ -41,11 +42,10 @@ def test_a_coarsest_partition_factors_and_cannot_be_coarsened(method, world):
 @pytest.mark.parametrize("method", ["fj+a", "mik+a"])
 def test_conflicts_are_the_pairs_that_no_partition_can_merge(method, world):
     found = relation(world, VIEWS[method], Memory(1, 1), (1, 2))
-    conflicts = found.conflicts()
-    for pair in list(combinations(found.rows, 2))[:60]:
-        merged = found.factors(lambda h, p=pair: p[0] if h in p else h)
-        assert merged is not found.must_differ(*pair)
-        assert (frozenset(pair) in conflicts) is found.must_differ(*pair)
+    conflicts, apart = found.conflicts(), np.arange(len(found.histories))
+    for one, other in list(combinations(apart, 2))[:60]:
+        merged = found.factors(np.where(apart == other, one, apart))
+        assert merged is not bool(conflicts[one, other])
 
 
 def test_forward_jumps_merge_what_mik_a_must_separate():
@@ -56,7 +56,7 @@ def test_forward_jumps_merge_what_mik_a_must_separate():
     assert classes(world, "mik+a literal", 3) == [0, 0, 0, 0, 1, 1, 1, 1]
     opposite = {frozenset(((x, b), (x + 2, c))) for x in (0, 1) for b in (-1, 1) for c in (-1, 1)}
     shares = {
-        name: forced_shares(relation(world, VIEWS[name], MEMORY, (1, 2, 3)), world.states)
+        name: forced_shares(relation(world, VIEWS[name], MEMORY, (1, 2, 3)))
         for name in ("fj+a", "mik+a", "mik+a literal")
     }
     assert {pair for pair, share in shares["mik+a literal"].items() if share == 1} == opposite
@@ -67,34 +67,35 @@ def test_forward_jumps_merge_what_mik_a_must_separate():
 def test_beyond_m_forward_jumps_separate_these_states_again():
     """At k = m+1 the later window begins at t+1, so FJ+A with k <= 5 cannot merge opposite states either."""
     world = counterexample()
-    shares = forced_shares(relation(world, VIEWS["fj+a"], MEMORY, range(1, 6)), world.states)
+    shares = forced_shares(relation(world, VIEWS["fj+a"], MEMORY, range(1, 6)))
     assert shares[frozenset(((0, 1), (2, 1)))] == 1
     assert classes(world, "fj+a", 5) == [0, 1, 0, 1, 2, 3, 2, 3]
 
 
 def test_no_inverse_model_separates_parities_of_the_counterexample():
     found = state_relation(counterexample(), range(1, 11))
-    blocks = found.coarsest()
-    assert len(set(blocks.values())) == 4
-    assert blocks[((0, 1),)] == blocks[((1, 1),)]
-    assert not found.must_differ(((0, 1),), ((1, 1),))
-    assert found.must_differ(((0, 1),), ((2, 1),))
+    blocks, conflicts = found.coarsest(), found.conflicts()
+    here, beside, opposite = (found.histories[state,] for state in ((0, 1), (1, 1), (2, 1)))
+    assert len(set(blocks)) == 4
+    assert blocks[here] == blocks[beside]
+    assert not conflicts[here, beside]
+    assert conflicts[here, opposite]
 
 
 def test_one_encoder_on_true_states_recovers_aperiodic_worlds():
     for world, diameter in ((echo(), 4), (momentum(), 4)):
         blocks = state_relation(world, range(1, diameter + 1)).coarsest()
-        assert len(set(blocks.values())) == len(world.states)
+        assert len(set(blocks)) == len(world.states)
 
 
 def test_the_past_encoder_alone_may_merge_states_that_act_alike():
     """echo: (0, 1) and (2, 0) have the same successors; f can merge them under a policy that treats them alike."""
     world, ks = echo(), range(1, 5)
-    even = forced_shares(relation(world, VIEWS["mik+a"], Memory(1, 1), ks), world.states)
+    even = forced_shares(relation(world, VIEWS["mik+a"], Memory(1, 1), ks))
     assert {pair for pair, share in even.items() if share == 0} == {
         frozenset(((x, b), ((x + 2) % 4, 1 - b))) for x in range(4) for b in (0, 1)
     }
-    partial = forced_shares(relation(biased(world), VIEWS["mik+a"], Memory(1, 1), ks), world.states)
+    partial = forced_shares(relation(biased(world), VIEWS["mik+a"], Memory(1, 1), ks))
     assert set(partial.values()) == {1}
 
 

@@ -1,11 +1,16 @@
 import json
 import re
+from importlib.resources import files
 from pathlib import Path
 
 import pytest
+from matplotlib.text import Annotation
 
+from tests.report.test_report import write_run
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.report.theory import MARKS, table_rows
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.report.theory import diagram_figure, table_rows
 from vd4rl_pomdp.theory import table
 
 OUT = "page"
@@ -84,8 +89,46 @@ def test_the_page_stands_alone(shown):
     assert json.loads((out / "theory.json").read_text()) == study
     text = (out / "index.html").read_text()
     assert "16368" in text
-    assert text.count("<svg") == 2
+    assert text.count("<svg") == 3
     assert not re.search(r'(src|href)="?(https?:)?//', text), "the page must not need a network"
+
+
+def test_the_page_about_runs_has_the_same_section(shown, tmp_path):
+    study, folder = shown
+    write_run(tmp_path / "runs/acro", "acro", 0, {10: [50.0]})
+    text = write_report([tmp_path / "runs", folder], tmp_path / "out")[0].read_text()
+    template = files("vd4rl_pomdp.report").joinpath("theory_section.html").read_text()
+    for title in re.findall(r"<h[23]>.*?</h[23]>", template):
+        assert title in text
+    assert study["counterexample_differences"][0] in text
+    alone, _ = write_report([tmp_path / "runs"], tmp_path / "alone")
+    assert "finite worlds" not in alone.read_text()
+
+
+def test_studies_that_cannot_be_reported_are_one_line(shown, tmp_path):
+    _, folder = shown
+    run = write_run(tmp_path / "runs/acro", "acro", 0, {10: [50.0]})
+    for name in ("one", "two"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "theory.json").write_text((folder / "theory.json").read_text())
+    with pytest.raises(UserError, match="two studies of the theory"):
+        write_report([tmp_path], tmp_path / "out")
+    (tmp_path / "one" / "theory.json").write_text('{"tables": {}}')
+    with pytest.raises(UserError, match=r"has no 'counterexample'; write it again: vd4rl-pomdp theory --out"):
+        write_report([run, tmp_path / "one"], tmp_path / "out")
+    (tmp_path / "one" / "theory.json").write_text("{")
+    with pytest.raises(UserError, match="cannot be read as JSON"):
+        write_report([run, tmp_path / "one"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_the_figure_draws_every_transition_with_its_action(shown):
+    study, _ = shown
+    figure = diagram_figure(study)
+    for axes in figure.axes:
+        labels = [text.get_text() for text in axes.texts]
+        assert (labels.count("+1"), labels.count("-1")) == (8, 8)
+        assert sum(text.arrow_patch is not None for text in axes.texts if isinstance(text, Annotation)) == 16
 
 
 def test_the_terminal_tables_say_the_same(shown, monkeypatch, capsys):
@@ -99,10 +142,11 @@ def test_the_terminal_tables_say_the_same(shown, monkeypatch, capsys):
         assert method in text
 
 
-def test_out_that_is_a_file_is_one_line(tmp_path, capsys):
+@pytest.mark.parametrize("out", ["x", "x/below"])
+def test_out_that_cannot_be_a_folder_is_one_line(out, tmp_path, capsys):
     (tmp_path / "x").write_text("")
     with pytest.raises(SystemExit) as end:
-        main(["theory", "--out", str(tmp_path / "x")])
+        main(["theory", "--out", str(tmp_path / out)])
     assert end.value.code == 2
     assert "--out names a folder" in capsys.readouterr().err
 
@@ -110,15 +154,9 @@ def test_out_that_is_a_file_is_one_line(tmp_path, capsys):
 def test_the_documentation_shows_the_computed_numbers(shown):
     study, _ = shown
     text = (Path(__file__).parents[2] / "docs" / "theory.md").read_text()
-    for entry in table_rows(study):
-        cells = []
-        for column in table.COLUMNS:
-            computed = [
-                MARKS[row[column]] if row["decodes_past"] and row["decodes_end"] else f"({MARKS[row[column]]})"
-                for row in entry["worlds"].values()
-            ]
-            cells.append(f"{MARKS[entry['printed'][column]]} / {' '.join(computed)}")
-        assert f"| `{entry['method']}` | {' | '.join(cells)} |" in text
+    for row in table_rows(study):
+        cells = [f"{printed} / {' '.join(computed)}" for printed, *computed in row["cells"].values()]
+        assert f"| `{row['method']}` | {' | '.join(cells)} |" in text
     held = sum(row["assumptions_hold"] for row in study["disagreements"])
     assert f"All {len(study['disagreements'])} disagreements, {held} of them where the assumptions hold" in text
     code = re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]

@@ -6,9 +6,9 @@ from hypothesis import given, settings
 
 from tests.theory.random_worlds import worlds
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.theory.gallery import NOISE, biased, counterexample, echo, momentum
-from vd4rl_pomdp.theory.law import future_memory, joint_law, past_memory
-from vd4rl_pomdp.theory.world import diameter, distances, finite_world, period, uniform, with_noise, with_policy
+from vd4rl_pomdp.theory.gallery import counterexample
+from vd4rl_pomdp.theory.law import joint_law
+from vd4rl_pomdp.theory.world import diameter, distances, finite_world, period, uniform, with_policy
 
 HALF = Fraction(1, 2)
 
@@ -33,6 +33,8 @@ def small(**changes):
         ({"policy": lambda s, xi: {0: "1/3", 1: "1/3"}}, r"policy\(0, dark\) sums to 2/3"),
         ({"policy": lambda s, xi: {0: 1} if xi == "dark" else {1: 1}}, "the policy reads the exogenous part"),
         ({"policy": lambda s, xi: {0: 0.5, 1: 0.5}}, "not float"),
+        ({"emit": lambda s, xi: {s: "all"}}, r"emit\(0, dark\) holds 'all': write probabilities as Fraction"),
+        ({"emit": lambda s, xi: {s: "1/0"}}, r"emit\(0, dark\) holds '1/0'"),
         ({"step": lambda s, a: s + a}, r"step\(1, 1\) gives 2, which is not declared"),
         ({"states": [0, 1, 2], "initial": {(0, "dark"): 1}}, "state 2 is unreachable"),
         ({"drift": lambda xi: {xi: 1}, "initial": {(0, "dark"): 1}}, "exogenous state light is unreachable"),
@@ -102,23 +104,6 @@ def test_large_denominators_stay_exact():
     law = joint_law(world, ALL)
     assert law.counts.dtype == object
     assert as_fractions(law) == brute_force(world, 3)
-
-
-def test_decodability_of_the_gallery():
-    assert [past_memory(w(), actions=True) for w in (counterexample, echo, momentum)] == [3, 1, 1]
-    assert [past_memory(w(), actions=False) for w in (counterexample, echo, momentum)] == [None, 1, 1]
-    assert [future_memory(w(), actions=True) for w in (counterexample, echo, momentum)] == [None, 1, 1]
-    assert [future_memory(w(), actions=False) for w in (counterexample, echo, momentum)] == [None, 1, None]
-    assert future_memory(counterexample(), actions=True, literal=True) == 3
-
-
-def test_noise_and_policies_change_neither_dynamics_nor_decodability():
-    noisy = with_noise(biased(momentum()), "noise", NOISE)
-    assert (past_memory(noisy, True), future_memory(noisy, True)) == (1, 1)
-    assert diameter(noisy) == diameter(momentum()) == 4
-    assert len(noisy.symbols) == 2 * len(momentum().symbols)
-    with pytest.raises(UserError, match="noise"):
-        with_noise(momentum(), "noise", {0: {0: HALF}})
 
 
 def test_distances_diameter_and_period():

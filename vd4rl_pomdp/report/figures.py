@@ -70,6 +70,11 @@ def _svg(figure: Figure, axes: Any) -> str:
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
     axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    return to_svg(figure)
+
+
+def to_svg(figure: Figure) -> str:
+    """The figure as an <svg> element, the same bytes every time."""
     buffer = io.StringIO()
     figure.savefig(buffer, format="svg", metadata={"Date": None})
     text = buffer.getvalue()

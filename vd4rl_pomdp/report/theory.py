@@ -1,59 +1,84 @@
-"""The page and the terminal tables about exact finite worlds."""
+"""The section of the page, the page of its own and the terminal tables about exact finite worlds."""
 
 from __future__ import annotations
 
-import io
-import json
-from importlib.resources import files
-from math import cos, pi, sin
+from itertools import chain
+from math import cos, hypot, pi, sin
 from pathlib import Path
 from typing import Any
 
-import jinja2
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
 from rich.table import Table
 
-from vd4rl_pomdp.report.figures import COLOURS
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.report.figures import COLOURS, to_svg
+from vd4rl_pomdp.report.templates import render
+from vd4rl_pomdp.runs.folder import read_json, write_json
 
 Row = dict[str, Any]
-COLUMNS = ("correct", "complete", "discards")
-MARKS = {True: "yes", False: "no"}
+FILE = "theory.json"
+COLUMNS = {"correct": "correct classifier", "complete": "complete state", "discards": "discards noise"}
+LABEL: dict[str, Any] = {"fontsize": 7, "ha": "center", "va": "center", "zorder": 3}
+KEYS = ("counterexample", "tables", "disagreements", "comparisons", "worlds", "states", "transitions", "diagrams")
 
 
 def write_theory(study: Row, out: Path) -> Path:
-    """Write the study as a page and as JSON into a folder; returns the page."""
-    out.mkdir(parents=True, exist_ok=True)
-    (out / "theory.json").write_text(json.dumps(study, indent=1))
-    template = files("vd4rl_pomdp.report").joinpath("theory.html").read_text()
-    style = files("vd4rl_pomdp.report").joinpath("page.html").read_text()
-    style = style[style.index("<style>") : style.index("</style>") + len("</style>")]
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    page = environment.from_string(template).render(
-        study=study,
-        style=style,
-        table=table_rows(study),
-        columns=COLUMNS,
-        mark=MARKS,
-        diagram=_svg(diagram_figure(study["diagrams"])),
-        entropies=_svg(entropy_figure(study["comparisons"])),
-    )
-    (out / "index.html").write_text(page)
+    """Write the study as a page and as JSON into a folder that exists; returns the page."""
+    write_json(out / FILE, study)
+    (out / "index.html").write_text(render("theory.html", theory=section(study)))
     return out / "index.html"
 
 
+def load_study(paths: list[Path]) -> Row | None:
+    """The study that `write_theory` left at or below some paths, if there is one."""
+    files = sorted(set(chain.from_iterable(path.rglob(FILE) for path in paths)))
+    if len(files) > 1:
+        raise UserError(f"{files[0]} and {files[1]}: two studies of the theory; report one of them")
+    for file in files:
+        study = read_json(file)
+        missing = [key for key in KEYS if key not in study]
+        if missing:
+            raise UserError(f"{file}: has no {missing[0]!r}; write it again: vd4rl-pomdp theory --out {file.parent}")
+        return study
+    return None
+
+
+def section(study: Row) -> Row:
+    """What the template of the section shows."""
+    return {
+        "study": study,
+        "columns": COLUMNS,
+        "table": table_rows(study),
+        "diagram": to_svg(diagram_figure(study)),
+        "forced": to_svg(forced_figure(study)),
+        "entropies": to_svg(entropy_figure(study["comparisons"])),
+    }
+
+
 def table_rows(study: Row) -> list[Row]:
-    """Table 1 with one entry a method: what is printed, and each world's computed row."""
-    methods = [row["method"] for row in next(iter(study["tables"].values()))]
-    return [
-        {
-            "method": method,
-            "printed": study["printed"][method.removesuffix(" literal")],
-            "worlds": {w: next(r for r in rows if r["method"] == method) for w, rows in study["tables"].items()},
-        }
-        for method in methods
-    ]
+    """Table 1 by method: for each column what is printed, then each world's entry.
+
+    Entries are bracketed where the method's assumptions fail, so that the paper claims none.
+    """
+    rows = []
+    for entries in zip(*study["tables"].values(), strict=True):
+        method = entries[0]["method"]
+        printed = study["printed"][method.removesuffix(" literal")]
+        cells = {column: [_mark(printed[column]), *(_entry(row, column) for row in entries)] for column in COLUMNS}
+        rows.append({"method": method, "cells": cells})
+    return rows
+
+
+def _entry(row: Row, column: str) -> str:
+    mark = _mark(row[column])
+    return mark if row["decodes_past"] and row["decodes_end"] else f"({mark})"
+
+
+def _mark(value: bool) -> str:
+    return "yes" if value else "no"
 
 
 def print_theory(study: Row, console: Console | None = None) -> None:
@@ -75,58 +100,78 @@ def print_theory(study: Row, console: Console | None = None) -> None:
 
 
 def _terminal_table(study: Row) -> Table:
-    worlds = list(study["tables"])
-    table = Table(
-        title="Table 1: printed, then computed on " + ", ".join(worlds) + "; ( ) if its assumptions fail there"
-    )
-    table.add_column("method")
-    for column in ("Bayes-optimal correct?", "complete state?", "discards noise?"):
-        table.add_column(column)
-    for entry in table_rows(study):
-        table.add_row(entry["method"], *(_cell(entry, column) for column in COLUMNS))
+    worlds = ", ".join(study["tables"])
+    title = f"Table 1: printed | computed on {worlds}; ( ) where a method's assumptions fail"
+    table = Table(title=title, box=None, padding=(0, 2, 0, 0), title_justify="left")
+    for title in ("method", *COLUMNS.values()):
+        table.add_column(title, no_wrap=True)
+    for row in table_rows(study):
+        table.add_row(row["method"], *(f"{printed} | {' '.join(found)}" for printed, *found in row["cells"].values()))
     return table
 
 
-def _cell(entry: Row, column: str) -> str:
-    shown = [
-        MARKS[row[column]] if row["decodes_past"] and row["decodes_end"] else f"({MARKS[row[column]]})"
-        for row in entry["worlds"].values()
-    ]
-    return f"{MARKS[entry['printed'][column]]} | {' '.join(shown)}"
+def diagram_figure(study: Row) -> Figure:
+    """The counterexample, one panel an objective: one colour for states that a coarsest partition merges.
 
-
-def diagram_figure(diagrams: list[Row]) -> Figure:
-    """The counterexample's states, one panel an objective: one colour for states that a coarsest partition merges.
-
-    Lines join states that the objective must tell apart; thin ones where it must for some histories only.
+    Arrows are transitions, labelled by their action.
     """
-    figure = Figure(figsize=(9.6, 7.0), layout="constrained")
-    for axes, diagram in zip(figure.subplots(2, 3).flat, diagrams, strict=True):
-        _draw(axes, diagram)
+    figure = Figure(figsize=(9.6, 7.2), layout="constrained")
+    for axes, diagram in zip(figure.subplots(2, 3).flat, study["diagrams"], strict=True):
+        _draw(axes, diagram, study["states"], study["transitions"])
     return figure
 
 
-def _draw(axes: Axes, diagram: Row) -> None:
-    places = [_place(x, b) for x, b in diagram["states"]]
-    for one, other, share in diagram["forced"]:
-        (x0, y0), (x1, y1) = places[one], places[other]
-        axes.plot(
-            [x0, x1], [y0, y1], color="#8a8a8a", lw=1.6 if share == 1 else 0.6, ls="-" if share == 1 else ":", zorder=1
-        )
-    for (x, y), state, group in zip(places, diagram["states"], diagram["classes"], strict=True):
-        axes.scatter([x], [y], s=620, color=COLOURS[group % len(COLOURS)], zorder=2)
-        axes.text(x, y, f"{state[0]},{state[1]:+d}", color="white", ha="center", va="center", fontsize=9, zorder=3)
-    axes.set_title(
-        f"{diagram['title']}\nstates in {len(set(diagram['classes']))} classes, {diagram['blocks']} codes", fontsize=10
-    )
-    axes.set(xlim=(-1.3, 1.3), ylim=(-1.3, 1.3), aspect="equal")
+def _draw(axes: Axes, diagram: Row, states: list, transitions: list) -> None:
+    places = [_place(x, b) for x, b in states]
+    for start, action, end in transitions:
+        _arrow(axes, places[start], places[end], action)
+    for (x, y), state, group in zip(places, states, diagram["classes"], strict=True):
+        axes.scatter([x], [y], s=480, color=COLOURS[group % len(COLOURS)], zorder=2)
+        axes.text(x, y, f"{state[0]},{state[1]:+d}", color="white", ha="center", va="center", fontsize=8, zorder=3)
+    axes.set_title(_title(diagram), fontsize=10)
+    axes.set(xlim=(-1.45, 1.45), ylim=(-1.45, 1.45), aspect="equal")
     axes.axis("off")
 
 
+def _title(diagram: Row) -> str:
+    return f"{diagram['title']}\n{diagram['blocks']} codes; classes of states: {len(set(diagram['classes']))}"
+
+
 def _place(position: int, last: int) -> tuple[float, float]:
-    """States sit on two rings: s^A is the angle, s^B the ring."""
-    radius, angle = (1.05 if last > 0 else 0.52), pi / 2 - position * pi / 2 + (0.28 if last > 0 else -0.28)
-    return radius * cos(angle), radius * sin(angle)
+    """States that +1 leads to sit on the outer ring, clockwise by s^A, the others within, beside their successors.
+
+    (x, +1) leads to (x-1, -1) and back, so these two share an angle and no two arrows cross.
+    """
+    radius, angle = (1.2, position) if last > 0 else (0.5, position + 1)
+    return radius * sin(angle * pi / 2), radius * cos(angle * pi / 2)
+
+
+def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], action: int) -> None:
+    """A bent arrow with its action at the middle of the bend; +1 and -1 differ in colour."""
+    bend, colour = -0.18, ("#222222" if action > 0 else "#999999")
+    style = {"arrowstyle": "-|>", "color": colour, "shrinkA": 12, "shrinkB": 12, "connectionstyle": f"arc3,rad={bend}"}
+    axes.annotate("", end, start, arrowprops=style, zorder=1)
+    (x0, y0), (x1, y1) = start, end
+    dx, dy = x1 - x0, y1 - y0
+    out = bend / 2 - 0.13 / hypot(dx, dy)
+    axes.text((x0 + x1) / 2 + out * dy, (y0 + y1) / 2 - out * dx, f"{action:+d}", color=colour, **LABEL)
+
+
+def forced_figure(study: Row) -> Figure:
+    """For every two states, the share of pairs of their histories that the objective must tell apart."""
+    names = [f"{x},{b:+d}" for x, b in study["states"]]
+    figure = Figure(figsize=(9.6, 6.4), layout="constrained")
+    panels = figure.subplots(2, 3)
+    for axes, diagram in zip(panels.flat, study["diagrams"], strict=True):
+        share = np.zeros((len(names), len(names)))
+        for one, other, value in diagram["forced"]:
+            share[one, other] = share[other, one] = value
+        picture = axes.imshow(share, cmap="Greys", vmin=0, vmax=1)
+        axes.set_title(diagram["title"], fontsize=10)
+        axes.set_xticks(range(len(names)), names, fontsize=7, rotation=90)
+        axes.set_yticks(range(len(names)), names, fontsize=7)
+    figure.colorbar(picture, ax=panels, shrink=0.5, label="share of pairs of histories that must differ")
+    return figure
 
 
 def entropy_figure(rows: list[Row]) -> Figure:
@@ -148,13 +193,6 @@ def entropy_figure(rows: list[Row]) -> Figure:
     figure.axes[0].set_ylabel("H(a_t | seen), nats")
     figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside right center", frameon=False, fontsize=9)
     return figure
-
-
-def _svg(figure: Figure) -> str:
-    buffer = io.StringIO()
-    figure.savefig(buffer, format="svg", metadata={"Date": None})
-    text = buffer.getvalue()
-    return text[text.index("<svg") :]
 
 
 def _list(ks: list[int]) -> str:

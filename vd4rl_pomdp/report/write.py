@@ -5,11 +5,9 @@ from __future__ import annotations
 import base64
 import csv
 import json
-from importlib.resources import files
 from pathlib import Path
 from typing import Any
 
-import jinja2
 import numpy as np
 from rich.console import Console
 from rich.table import Table
@@ -20,13 +18,18 @@ from vd4rl_pomdp.evaluation import COLUMNS
 from vd4rl_pomdp.report import figures, tables
 from vd4rl_pomdp.report.load import Run, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
+from vd4rl_pomdp.report.templates import render
+from vd4rl_pomdp.report.theory import load_study, section
 
 Row = dict[str, Any]
 
 
 def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
-    """Write the report of all runs at or below `paths` into `out`; returns the page and the table of final scores."""
-    runs = load_runs(paths)
+    """Write the report of all runs at or below `paths` into `out`; returns the page and the table of final scores.
+
+    A study that `vd4rl-pomdp theory` wrote at or below `paths` becomes a section of the page.
+    """
+    runs, study = load_runs(paths), load_study(paths)
     rows = [row for run in runs for row in run.rows]
     if not rows:
         raise UserError(f"{paths[0]}: holds no evaluated run yet; `vd4rl-pomdp finetune` evaluates")
@@ -43,7 +46,7 @@ def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
         if table:
             _write_csv(out / f"{name}.csv", table, list(table[0]))
     _write_csv(out / "episodes.csv", rows, list(COLUMNS))
-    (out / "index.html").write_text(_render(runs, rows, made))
+    (out / "index.html").write_text(_render(runs, rows, made, study))
     return out / "index.html", made["summary"]
 
 
@@ -61,13 +64,13 @@ def print_summary(summary: list[Row], console: Console | None = None) -> None:
     (console or Console()).print(table)
 
 
-def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]]) -> str:
-    template = files("vd4rl_pomdp.report").joinpath("page.html").read_text()
-    environment = jinja2.Environment(autoescape=True, undefined=jinja2.StrictUndefined, trim_blocks=True)
-    environment.filters |= {"label": tables.label, "number": _number}
+def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]], study: Row | None) -> str:
     names = list(dict.fromkeys(map(tables.label, made["summary"])))
     pretraining = {_title(run): run.metrics for run in runs if run.stage == "pretrain" and _has_losses(run)}
-    return environment.from_string(template).render(
+    return render(
+        "page.html",
+        label=tables.label,
+        number=_number,
         finished=sum(run.seconds is not None for run in runs),
         rows=len(rows),
         few=FEW_SEEDS,
@@ -80,6 +83,7 @@ def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]]) -> str
         losses=figures.loss_figure(pretraining) if pretraining else "",
         films=_films(runs),
         published=_published(rows),
+        theory=section(study) if study else None,
         runs=[_facts(run) for run in runs],
     )
 

@@ -10,8 +10,8 @@ from collections import Counter
 from itertools import product
 from typing import Any
 
+from vd4rl_pomdp.theory.decodability import future_memory, past_memory
 from vd4rl_pomdp.theory.gallery import counterexample
-from vd4rl_pomdp.theory.law import future_memory, past_memory
 from vd4rl_pomdp.theory.world import Action, State, World, diameter, period
 
 MAX_K = 10

@@ -11,13 +11,13 @@ from __future__ import annotations
 from collections.abc import Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fractions import Fraction
-from functools import cached_property
+from functools import cached_property, lru_cache
 from math import lcm, log
 from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.theory.world import Pair, World, uniform
+from vd4rl_pomdp.theory.world import World
 
 Variable = tuple[str, int]
 """("o", j), ("a", j), ("s", j) or ("xi", j): observation, action, agent-centric or exogenous state of row j."""
@@ -34,7 +34,7 @@ class Law:
 
     variables: tuple[Variable, ...]
     codes: np.ndarray
-    """(N, V) int64: places in `names`."""
+    """(N, V) int32: places in `names`."""
     counts: np.ndarray
     """(N,) integers."""
     names: dict[str, tuple[Hashable, ...]]
@@ -43,26 +43,27 @@ class Law:
     def values(self, group: Iterable[Variable], rows: np.ndarray) -> list[tuple]:
         """Joint values of a group of variables, by row and in the order of `KINDS`, at some of the N rows."""
         chosen = sorted(group, key=_place)
-        columns = [[self.names[kind][c] for c in self._column((kind, j))[rows]] for kind, j in chosen]
+        columns = [[self.names[kind][c] for c in self.column((kind, j))[rows]] for kind, j in chosen]
         return list(zip(*columns, strict=True)) if columns else [()] * len(rows)
 
-    def ids(self, group: Iterable[Variable]) -> np.ndarray:
-        """(N,) int64: a number for each distinct joint value of a group."""
-        return _number([self._column(v) for v in sorted(group, key=_place)], len(self.counts))
+    def numbered(self, group: Iterable[Variable]) -> tuple[np.ndarray, np.ndarray]:
+        """The number of the joint value of a group at each row, (N,) int64, and the first row that has each."""
+        return number_rows([self.column(v) for v in sorted(group, key=_place)])
 
     def given(self, group: Iterable[Variable], action: Variable) -> Conditional:
         """The conditional law of an action given a group of variables."""
-        ids = self.ids(group)
-        counts = np.zeros((int(ids.max()) + 1, len(self.names["a"])), self.counts.dtype)
-        np.add.at(counts, (ids, self._column(action)), self.counts)
-        return Conditional(ids, counts)
+        ids, first = self.numbered(group)
+        counts = np.zeros((len(first), len(self.names["a"])), self.counts.dtype)
+        np.add.at(counts, (ids, self.column(action)), self.counts)
+        return Conditional(ids, first, counts)
 
     def tells(self, group: Iterable[Variable], value: Iterable[Variable]) -> bool:
         """Whether some variables are a function of a group."""
-        ids, told = self.ids(group), self.ids(value)
-        return len(np.unique(ids)) == len(np.unique(np.stack([ids, told]), axis=1).T)
+        (ids, first), (told, _) = self.numbered(group), self.numbered(value)
+        return bool((told == told[first][ids]).all())
 
-    def _column(self, variable: Variable) -> np.ndarray:
+    def column(self, variable: Variable) -> np.ndarray:
+        """(N,) int32: codes of one variable."""
         return self.codes[:, self.variables.index(variable)]
 
 
@@ -72,6 +73,8 @@ class Conditional:
 
     ids: np.ndarray
     """(N,) int64."""
+    first: np.ndarray
+    """(views,) int64: the first row of each view."""
     counts: np.ndarray
     """(views, actions) integers."""
 
@@ -79,16 +82,16 @@ class Conditional:
     def kinds(self) -> tuple[np.ndarray, list[Prediction]]:
         """Which of the distinct predictions belongs to each view, and those predictions."""
         rows = [np.unique(column, return_inverse=True)[1] for column in self.counts.T]
-        kinds = _number(rows, len(self.counts))
-        first = np.unique(kinds, return_index=True)[1]
+        kinds, first = number_rows(rows)
         distinct = [tuple(Fraction(n, sum(row)) for n in row) for row in self.counts[first].astype(object).tolist()]
         return kinds, distinct
 
     def agrees(self, other: Conditional) -> bool:
         """Whether two classifiers say the same wherever their views occur together."""
         (mine, one), (theirs, two) = self.kinds, other.kinds
-        met = np.unique(np.stack([mine[self.ids], theirs[other.ids]]), axis=1)
-        return all(one[i] == two[j] for i, j in met.T)
+        mine, theirs = mine[self.ids], theirs[other.ids]
+        first = number_rows([mine, theirs])[1]
+        return all(one[i] == two[j] for i, j in zip(mine[first], theirs[first], strict=True))
 
     def certain(self) -> bool:
         """Whether the action is known, whatever the view."""
@@ -107,120 +110,115 @@ class Conditional:
         return sum(float(Fraction(w, sum(weights))) * bit for w, bit in zip(weights, bits, strict=True))
 
 
-def joint_law(world: World, variables: Iterable[Variable], initial: Mapping[Pair, Fraction] | None = None) -> Law:
-    """Exact joint law of some variables of a sequence that starts in the world's initial law, or in another."""
+def joint_law(world: World, variables: Iterable[Variable]) -> Law:
+    """Exact joint law of some variables of a sequence that starts in the world's initial law."""
     wanted = sorted(set(variables), key=_place)
     rows = 1 + max(row for _, row in wanted)
-    walk = _Walk(world, initial or world.initial, rows)
+    walk = _Walk(world, rows)
     for row in range(rows):
         kinds = {kind for kind, j in wanted if j == row}
         walk.observe(kinds)
-        walk.act("a" in kinds)
+        if row < rows - 1 or "a" in kinds:
+            walk.act("a" in kinds)
     walk.forget_pair()
     names = {"s": world.states, "xi": world.exogenous, "o": world.symbols, "a": world.actions}
     return Law(tuple(wanted), np.stack(walk.columns, 1), walk.counts, names)
 
 
+class _Table:
+    """Laws of what comes next, with one common denominator: for each row, entries and their weights."""
+
+    def __init__(self, laws: Sequence[Mapping[Any, Fraction]], names: Sequence[Hashable]) -> None:
+        scale = lcm(*(p.denominator for law in laws for p in law.values()))
+        place = {name: i for i, name in enumerate(names)}
+        width = max(map(len, laws))
+        self.entries = np.zeros((len(laws), width), np.int32)
+        self.weights = np.zeros((len(laws), width), object)
+        """Padded with zeros."""
+        for row, law in enumerate(laws):
+            self.entries[row, : len(law)] = [place[name] for name in law]
+            self.weights[row, : len(law)] = [int(p * scale) for p in law.values()]
+        self.total = int(self.weights[0].sum())
+
+
+@lru_cache(maxsize=16)
+def _tables(world: World) -> tuple[np.ndarray, _Table, _Table, _Table, _Table]:
+    """A world as numbers: next states (S, A), and the laws of the first pair, the action, the drift and the symbol."""
+    states, noises, actions = world.states, world.exogenous, world.actions
+    pairs = [(s, xi) for s in states for xi in noises]
+    return (
+        np.array([[states.index(world.step[s, a]) for a in actions] for s in states], np.int32),
+        _Table([world.initial], pairs),
+        _Table([world.policy[s] for s in states], actions),
+        _Table([world.drift[xi] for xi in noises], noises),
+        _Table([world.emission[pair] for pair in pairs], world.symbols),
+    )
+
+
 class _Walk:
     """All sequences so far: kept columns, the present pair, and a count."""
 
-    def __init__(self, world: World, initial: Mapping[Pair, Fraction], rows: int) -> None:
-        states, noises, symbols = world.states, world.exogenous, world.symbols
-        self.step = np.array([[states.index(world.step[s, a]) for a in world.actions] for s in states])
-        self.policy = _matrix([world.policy[s] for s in states], world.actions)
-        self.drift = _matrix([world.drift[xi] for xi in noises], noises)
-        self.emission = _matrix([world.emission[s, xi] for s in states for xi in noises], symbols)
-        pairs = [(s, xi) for s in states for xi in noises]
-        start = _matrix([dict(initial)], pairs)[0]
-        scales = [int(m[0].sum()) for m in (self.policy, self.drift, self.emission)]
-        self.dtype = np.int64 if int(start.sum()) * (scales[0] * scales[1] * scales[2]) ** rows < LARGEST else object
-        (pair,) = np.nonzero(start)
-        self.s, self.xi = np.divmod(pair, len(noises))
-        self.counts = start[pair].astype(self.dtype)
+    def __init__(self, world: World, rows: int) -> None:
+        self.step, initial, self.policy, self.drift, self.emission = _tables(world)
+        total = initial.total * (self.policy.total * self.drift.total * self.emission.total) ** rows
+        self.counts = initial.weights[0].astype(np.int64 if total < LARGEST else object)
+        self.noises = len(world.exogenous)
+        self.s, self.xi = np.divmod(initial.entries[0], self.noises)
         self.columns: list[np.ndarray] = []
 
     def observe(self, kinds: set[str]) -> None:
         """Keep what is wanted of a row's s, xi and o."""
         self.columns += [self.s] * ("s" in kinds) + [self.xi] * ("xi" in kinds)
         if "o" in kinds:
-            symbol = self._branch(self.emission[self.s * len(self.drift) + self.xi])
+            symbol = self._branch(self.emission, self.s * self.noises + self.xi)
             self.columns.append(symbol)
 
     def act(self, wanted: bool) -> None:
         """Move on by one action, kept if it is wanted; sequences that have become alike are added up."""
-        action = self._branch(self.policy[self.s])
+        action = self._branch(self.policy, self.s)
         self.s = self.step[self.s, action]
         self.columns += [action] * wanted
-        self.xi = self._branch(self.drift[self.xi])
+        self.xi = self._branch(self.drift, self.xi)
         self._merge([*self.columns, self.s, self.xi])
 
     def forget_pair(self) -> None:
         """Sum out the last pair."""
         self._merge(self.columns)
 
-    def _branch(self, weights: np.ndarray) -> np.ndarray:
-        """Split every sequence by the nonzero entries of its row of (N, C) weights; returns each branch's entry."""
-        parent, entry = np.nonzero(weights)
+    def _branch(self, table: _Table, row: np.ndarray) -> np.ndarray:
+        """Split every sequence by what may come next, by its row of a table; returns each branch's entry."""
+        weights = table.weights.astype(self.counts.dtype)
+        parent, nth = np.nonzero(weights[row])
         self.columns = [column[parent] for column in self.columns]
-        self.s, self.xi = self.s[parent], self.xi[parent]
-        self.counts = self.counts[parent] * weights[parent, entry].astype(self.dtype)
-        return entry
+        self.s, self.xi, row = self.s[parent], self.xi[parent], row[parent]
+        self.counts = self.counts[parent] * weights[row, nth]
+        return table.entries[row, nth]
 
     def _merge(self, keys: list[np.ndarray]) -> None:
-        ids = _number(keys, len(self.counts))
-        first = np.unique(ids, return_index=True)[1]
-        counts = np.zeros(len(first), self.dtype)
+        ids, first = number_rows(keys)
+        counts = np.zeros(len(first), self.counts.dtype)
         np.add.at(counts, ids, self.counts)
         self.columns = [column[first] for column in self.columns]
         self.s, self.xi, self.counts = self.s[first], self.xi[first], counts
 
 
-def _number(columns: list[np.ndarray], length: int) -> np.ndarray:
-    """(N,) int64: 0, 1, ... for each distinct row of some columns of small integers."""
-    ids, distinct = np.zeros(length, np.int64), 1
+def number_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Number the distinct rows of some (N,) columns of small integers.
+
+    Returns:
+        (N,) int64, the number 0, 1, ... of each row, and the first row that has each number.
+    """
+    ids, distinct = np.zeros(len(columns[0]), np.int64), 1
     for column in columns:
         width = int(column.max()) + 1
         if distinct * width >= LARGEST:
             values, ids = np.unique(ids, return_inverse=True)
             distinct = len(values)
         ids, distinct = ids * width + column, distinct * width
-    return np.unique(ids, return_inverse=True)[1]
-
-
-def _matrix(table: Sequence[Mapping[Any, Fraction]], columns: Sequence[Hashable]) -> np.ndarray:
-    """A table of laws with one common denominator: (rows, columns) integers."""
-    scale = lcm(*(p.denominator for row in table for p in row.values()))
-    return np.array([[int(row.get(c, 0) * scale) for c in columns] for row in table], dtype=object)
+    _, first, ids = np.unique(ids, return_index=True, return_inverse=True)
+    return ids, first
 
 
 def _place(variable: Variable) -> tuple[int, int]:
     kind, row = variable
     return row, KINDS.index(kind)
-
-
-def past_memory(world: World, actions: bool, limit: int = 6) -> int | None:
-    """Smallest m at which o_{t-m}..o_t (with a_{t-m}..a_{t-1}) always tells s_t; None if no m up to `limit` does."""
-    for m in range(limit + 1):
-        seen = [("o", j) for j in range(m + 1)] + [("a", j) for j in range(m if actions else 0)]
-        if _decodes(world, seen, m):
-            return m
-    return None
-
-
-def future_memory(world: World, actions: bool, literal: bool = False, limit: int = 6) -> int | None:
-    """Smallest n at which the future from row t on always tells s_t; None if no n up to `limit` does.
-
-    The future is o_t..o_{t+n}, with actions a_t..a_{t+n}; read literally, each row carries the action before it:
-    a_{t-1}..a_{t+n-1}.
-    """
-    for n in range(limit + 1):
-        first = 0 if literal else 1
-        seen = [("o", j) for j in range(1, n + 2)] + [("a", j) for j in range(first, first + n + 1 if actions else 0)]
-        if _decodes(world, seen, 1):
-            return n
-    return None
-
-
-def _decodes(world: World, seen: list[Variable], row: int) -> bool:
-    """Whether the seen variables determine s at a row of every sequence that starts anywhere in the world."""
-    return joint_law(world, [*seen, ("s", row)], uniform(world.reachable())).tells(seen, [("s", row)])

@@ -11,16 +11,15 @@ the future and has an encoder of its own). Every refinement of such a phi is eno
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Callable, Hashable, Iterable, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Sequence
 from fractions import Fraction
-from itertools import combinations, product
+from functools import cached_property
+from itertools import combinations
 
 import numpy as np
 
 from vd4rl_pomdp.theory.classifiers import Memory, first_row
-from vd4rl_pomdp.theory.law import Prediction, Variable, joint_law
+from vd4rl_pomdp.theory.law import Law, Prediction, Variable, joint_law, number_rows
 from vd4rl_pomdp.theory.views import View
 from vd4rl_pomdp.theory.world import World
 
@@ -28,140 +27,188 @@ History = tuple
 """Values of what a representation is computed from, oldest first."""
 
 
-@dataclass(frozen=True)
-class Facts:
-    """What a history goes with."""
-
-    states: frozenset
-    """Agent-centric states it may end in; one, if it decodes."""
-    noises: frozenset
-    """Exogenous states it may end in."""
-    contents: frozenset
-    """Its agent-centric content: the states of the rows it shows and the actions it shows."""
-    actions: tuple
-    """The actions it shows, oldest first."""
-
-
 class Relation:
-    """F: which prediction goes with which pair of histories at which k."""
+    """F: which prediction goes with which pair of histories at which k. Histories and predictions go by numbers."""
 
-    def __init__(self, shared: bool) -> None:
+    def __init__(self, world: World, shared: bool) -> None:
+        self.world = world
         self.shared = shared
-        self.facts: dict[Hashable, Facts] = {}
-        self.rows: dict[Hashable, dict[tuple, int]] = {}
-        """History -> {(role, k, other side) -> prediction}; role is start or end."""
-        self.ks: set[int] = set()
+        """Whether one representation serves both ends."""
+        self.histories: dict[History, int] = {}
+        self.acted: dict[int, tuple] = {}
+        """History -> the actions it shows, oldest first."""
+        self._laters: dict[tuple, int] = self.histories if shared else {}
+        self._contents: dict[tuple, int] = {}
         self._predictions: dict[Prediction, int] = {}
+        self._entries: list[np.ndarray] = []
+        self._facts: dict[str, list[np.ndarray]] = {"s": [], "xi": [], "content": []}
 
-    def number(self, prediction: Prediction) -> int:
-        """The number by which `rows` know a prediction."""
-        return self._predictions.setdefault(prediction, len(self._predictions))
+    def add(self, law: Law, start: Iterable[Variable], end: Iterable[Variable], t: int, k: int) -> None:
+        """Record F_k from a law of both views and a_t."""
+        seen = law.given({*start, *end}, ("a", t))
+        kinds, distinct = seen.kinds
+        values = np.array([self._predictions.setdefault(p, len(self._predictions)) for p in distinct])[kinds]
+        past, later = (_numbers(*side, law)[seen.first] for side in ((self.histories, start), (self._laters, end)))
+        self._entries.append(np.stack([np.full_like(past, k), past, later, values]))
 
-    def add(self, past: Hashable, later: Hashable, k: int, value: int) -> None:
-        """Record one value of F, a prediction's number."""
-        self.ks.add(k)
-        self.rows.setdefault(past, {})["start", k, later if self.shared else ("future", later)] = value
+    def add_facts(self, law: Law, past: Iterable[Variable], content: Iterable[Variable], row: int) -> None:
+        """Record what histories that end at a row go with, from a law of all that is named.
+
+        Args:
+            law: of `past`, `content` and the s and xi of `row`.
+            past: what histories consist of.
+            content: their agent-centric content: the states of the rows they show, and the actions they show.
+            row: their last row.
+        """
+        history = _numbers(self.histories, past, law)
+        told = {kind: law.column((kind, row)) for kind in ("s", "xi")}
+        told["content"] = _numbers(self._contents, content, law)
+        for kind, values in told.items():
+            self._facts[kind].append(np.unique(np.stack([history, values], axis=1), axis=0))
+        numbers, first = np.unique(history, return_index=True)
+        acted = law.values([v for v in past if v[0] == "a"], first)
+        self.acted.update(zip(numbers.tolist(), acted, strict=True))
+
+    @cached_property
+    def entries(self) -> np.ndarray:
+        """(4, E): k, history, other side and prediction of every pair that occurs."""
+        return np.concatenate(self._entries, axis=1)
+
+    @cached_property
+    def states(self) -> np.ndarray:
+        """(H, S) bool: agent-centric states that a history may end in; one, if it decodes."""
+        return self._incidence("s", len(self.world.states))
+
+    @cached_property
+    def noises(self) -> np.ndarray:
+        """(H, X) bool: exogenous states that a history may end in."""
+        return self._incidence("xi", len(self.world.exogenous))
+
+    @cached_property
+    def contents(self) -> np.ndarray:
+        """(P, 2): each history with each agent-centric content that it may have."""
+        return np.concatenate(self._facts["content"])
+
+    def _incidence(self, kind: str, width: int) -> np.ndarray:
+        table = np.zeros((len(self.histories), width), bool)
+        table[tuple(np.concatenate(self._facts[kind]).T)] = True
+        return table
+
+    def conflicts(self) -> np.ndarray:
+        """(H, H) bool: pairs of histories that no representation that is enough can put together."""
+        k, past, later, value = self.entries
+        found = np.zeros((len(self.histories),) * 2, bool)
+        _mark_differing(found, past, number_rows([k, later])[0], value)
         if self.shared:
-            self.rows.setdefault(later, {})["end", k, past] = value
+            _mark_differing(found, later, number_rows([k, past])[0], value)
+            for each in np.unique(k):
+                found |= self._contradict_as_one(self.entries[1:, k == each])
+        return found | found.T
 
-    def must_differ(self, one: Hashable, other: Hashable) -> bool:
-        """Whether no representation that is enough can put two histories together."""
-        return not _fits(self.rows[one], self.rows[other], one, other, self.ks)
+    def _contradict_as_one(self, entries: np.ndarray) -> np.ndarray:
+        """(H, H): pairs whose predictions between themselves, at one k, would differ under one name."""
+        past, later, value = entries
+        table = np.full((len(self.histories),) * 2, -1, np.int32)
+        table[past, later] = value
+        loop = table.diagonal()
+        low, high = np.full_like(table, len(self._predictions)), table
+        for other in (table, table.T, loop[:, None], loop):
+            low, high = np.where(other < 0, low, np.minimum(low, other)), np.maximum(high, other)
+        return low < high
 
-    def conflicts(self) -> set[frozenset]:
-        """Every pair of histories that must differ."""
-        meeting: dict[tuple, list] = {}
-        for history, row in self.rows.items():
-            for key in row:
-                meeting.setdefault(key, []).append(history)
-        pairs = {frozenset(pair) for met in meeting.values() for pair in combinations(met, 2)}
-        direct = [(h, other) for h, row in self.rows.items() for _, _, other in row if other in self.rows]
-        loops = dict.fromkeys(h for h, other in direct if h == other)
-        pairs |= {frozenset(pair) for pair in [*direct, *combinations(loops, 2)]}
-        return {pair for pair in pairs if len(pair) == 2 and self.must_differ(*pair)}
+    def factors(self, codes: np.ndarray) -> bool:
+        """Whether F is a function of the codes of both sides; codes (H,) integers."""
+        k, past, later, value = self.entries
+        key, first = number_rows([k, codes[past], codes[later] if self.shared else later])
+        return bool((value == value[first][key]).all())
 
-    def factors(self, code: Callable[[Hashable], Hashable]) -> bool:
-        """Whether F is a function of the codes of both sides."""
-        told: dict[tuple, int] = {}
-        for past, row in self.rows.items():
-            for (role, k, later), value in row.items():
-                if role == "start":
-                    key = (k, code(past), code(later) if self.shared else later)
-                    if told.setdefault(key, value) != value:
-                        return False
-        return True
+    def coarsest(self) -> np.ndarray:
+        """(H,) integers: a coarsest partition, the smallest of those that the orders lead to."""
+        names = np.fromiter(self.world.states, object, len(self.world.states))
+        ends = [repr(sorted(names[row], key=repr)) for row in self.states]
+        recent = [repr(self.acted[h][::-1]) for h in range(len(ends))]
+        found = [self._first_fit(groups, ends) for groups in (recent, ends)]
+        return min(found, key=lambda blocks: len(set(blocks)))
 
-    def coarsest(self) -> dict[Hashable, int]:
-        """A coarsest partition, block by history: the smallest of those that the orders lead to."""
-        groupings: tuple[Callable[[Hashable], tuple], ...] = (
-            lambda h: (_text(self.facts[h].actions[::-1]),),
-            lambda h: (_text(self.facts[h].states),),
-        )
-        found = [self._first_fit(group) for group in groupings]
-        return min(found, key=lambda blocks: len(set(blocks.values())))
-
-    def _first_fit(self, group: Callable[[Hashable], tuple]) -> dict[Hashable, int]:
+    def _first_fit(self, groups: Sequence[str], ends: Sequence[str]) -> np.ndarray:
         """Blocks by first fit: at first within groups (of equal states, or of equal actions), then across them."""
-        blocks = _Blocks(self.rows, self.ks)
-        order = sorted(self.rows, key=lambda h: (group(h), _text(self.facts[h].states), _text(h)))
-        blocks.join(order, lambda a, b: group(a) == group(b))
-        blocks.join([h for h in order if h in blocks.rows], lambda a, b: True)
-        names = {name: i for i, name in enumerate(blocks.rows)}
-        return {h: names[blocks.find(h)] for h in self.rows}
+        texts = [repr(history) for history in self.histories]
+        order = sorted(range(len(texts)), key=lambda h: (groups[h], ends[h], texts[h]))
+        blocks = _Blocks(self._tables(), self.shared)
+        heads = blocks.join(order, lambda a, b: groups[a] == groups[b])
+        blocks.join(heads, lambda a, b: True)
+        return np.unique([blocks.find(h) for h in range(len(texts))], return_inverse=True)[1]
 
-
-def _text(value: object) -> str:
-    """A sort key for values of mixed types."""
-    return repr(sorted(value, key=repr)) if isinstance(value, frozenset) else repr(value)
-
-
-def _fits(mine: dict[tuple, int], theirs: dict[tuple, int], me: Hashable, them: Hashable, ks: set[int]) -> bool:
-    """Whether two rows of F agree once the two sides have one name."""
-    if any(mine[key] != theirs[key] for key in mine.keys() & theirs.keys()):
-        return False
-    for role, k in product(("start", "end"), ks):
-        between = {row[role, k, name] for row in (mine, theirs) for name in (me, them) if (role, k, name) in row}
-        if len(between) > 1:
-            return False
-    return True
+    def _tables(self) -> np.ndarray:
+        """(K, H, L): the prediction for every k, history and other side, -1 where they never occur together."""
+        k, past, later, value = self.entries
+        place = np.unique(k, return_inverse=True)[1]
+        tables = np.full((int(place.max()) + 1, len(self.histories), len(self._laters)), -1)
+        tables[place, past, later] = value
+        return tables
 
 
 class _Blocks:
-    """Blocks of histories, each named by its first member, with the rows of F between blocks."""
+    """Blocks of histories, each named by its first member, with the tables of F between blocks."""
 
-    def __init__(self, rows: dict[Hashable, dict[tuple, int]], ks: set[int]) -> None:
-        self.ks = ks
-        self.rows = {name: dict(row) for name, row in rows.items()}
-        self.parent: dict[Hashable, Hashable] = {name: name for name in rows}
+    def __init__(self, tables: np.ndarray, shared: bool) -> None:
+        self.tables, self.shared = tables, shared
+        self.parent = list(range(tables.shape[1]))
 
-    def find(self, name: Hashable) -> Hashable:
+    def find(self, name: int) -> int:
         """The block of a history."""
         while self.parent[name] != name:
             name = self.parent[name]
         return name
 
-    def join(self, order: Sequence[Hashable], allowed: Callable[[Hashable, Hashable], bool]) -> None:
-        """Put every block, in order, into the first earlier one that is allowed and contradicts nothing."""
-        heads: list[Hashable] = []
+    def join(self, order: Iterable[int], allowed: Callable[[int, int], bool]) -> list[int]:
+        """Put every block, in order, into the first earlier one that is allowed and fits; returns what is left."""
+        heads: list[int] = []
         for name in order:
-            fitting = (h for h in heads if allowed(h, name) and _fits(self.rows[h], self.rows[name], h, name, self.ks))
-            head = next(fitting, None)
+            head = next((h for h in heads if allowed(h, name) and self.fit(h, name)), None)
             if head is None:
                 heads.append(name)
             else:
                 self._merge(head, name)
+        return heads
 
-    def _merge(self, head: Hashable, name: Hashable) -> None:
-        mirror = {"start": "end", "end": "start"}
+    def fit(self, one: int, other: int) -> bool:
+        """Whether two blocks put together contradict nothing."""
+        both = [one, other]
+        if _differ(self.tables[:, both], axis=1):
+            return False
+        if not self.shared:
+            return True
+        between = self.tables[:, both][:, :, both].reshape(len(self.tables), 4)
+        return not (_differ(self.tables[:, :, both], axis=2) or _differ(between, axis=1))
+
+    def _merge(self, head: int, name: int) -> None:
+        """Give a block the entries of another, which are equal where both have one."""
         self.parent[name] = head
-        for (role, k, other), value in self.rows.pop(name).items():
-            if other == name:
-                other = head
-            elif other in self.rows:
-                self.rows[other].pop((mirror[role], k, name), None)
-                self.rows[other][mirror[role], k, head] = value
-            self.rows[head].pop((role, k, name), None)
-            self.rows[head][role, k, other] = value
+        for side in (self.tables, self.tables.swapaxes(1, 2)) if self.shared else (self.tables,):
+            side[:, head] = np.maximum(side[:, head], side[:, name])
+            side[:, name] = -1
+
+
+def _differ(values: np.ndarray, axis: int) -> bool:
+    """Whether known values (those that are not -1) differ anywhere along an axis."""
+    low = np.where(values < 0, values.max(initial=0), values).min(axis)
+    return bool((low < values.max(axis)).any())
+
+
+def _numbers(known: dict[tuple, int], group: Iterable[Variable], law: Law) -> np.ndarray:
+    """(N,) numbers of the joint values of a group; values that are not known yet get the next ones."""
+    ids, first = law.numbered(group)
+    return np.array([known.setdefault(name, len(known)) for name in law.values(group, first)])[ids]
+
+
+def _mark_differing(found: np.ndarray, mine: np.ndarray, key: np.ndarray, value: np.ndarray) -> None:
+    """Mark each two of (E,) entries that have one key and two values."""
+    order = np.argsort(key, kind="stable")
+    mine, key, value = mine[order], key[order], value[order]
+    for gap in range(1, int(np.bincount(key).max())):
+        differ = (key[gap:] == key[:-gap]) & (value[gap:] != value[:-gap])
+        found[mine[gap:][differ], mine[:-gap][differ]] = True
 
 
 def relation(world: World, view: View, memory: Memory, ks: Iterable[int]) -> Relation:
@@ -171,100 +218,74 @@ def relation(world: World, view: View, memory: Memory, ks: Iterable[int]) -> Rel
     within the rows m..m+K is taken, because one late history must serve all earlier t.
     """
     ks, first = list(ks), first_row(view, memory)
-    found, histories = Relation(shared=not view.masked), {}
+    found, histories = Relation(world, shared=not view.masked), {}
     for t in range(first, first + (max(ks) if view.past == "all" else 1)):
         for k in (k for k in ks if view.past != "all" or t + k <= first + max(ks)):
             rows = t + k + memory.n + 1
             start, end = view.start(t, memory.m), view.end(t, k, memory.m, memory.n, rows)
-            _add_predictions(found, world, start, end, t, k)
+            found.add(joint_law(world, start | end | {("a", t)}), start, end, t, k)
             histories[t] = start
             if found.shared:
                 histories[t + k] = end
     for row, seen in histories.items():
-        _add_facts(found, world, seen, row)
+        content = {("s", j) if kind == "o" else (kind, j) for kind, j in seen}
+        found.add_facts(joint_law(world, seen | content | {("s", row), ("xi", row)}), seen, content, row)
     return found
-
-
-def _add_predictions(
-    found: Relation, world: World, start: frozenset[Variable], end: frozenset[Variable], t: int, k: int
-) -> None:
-    law = joint_law(world, start | end | {("a", t)})
-    seen = law.given(start | end, ("a", t))
-    rows = np.unique(seen.ids, return_index=True)[1]
-    kinds, distinct = seen.kinds
-    numbers = [found.number(prediction) for prediction in distinct]
-    for kind, past, later in zip(kinds, law.values(start, rows), law.values(end, rows), strict=True):
-        found.add(past, later, k, numbers[kind])
-
-
-def _add_facts(found: Relation, world: World, past: frozenset[Variable], row: int) -> None:
-    shown = {("s", j) for kind, j in past if kind == "o"}
-    actions = {v for v in past if v[0] == "a"}
-    law = joint_law(world, past | shown | {("s", row), ("xi", row)})
-    everything = np.arange(len(law.counts))
-    columns = [law.values(g, everything) for g in (past, [("s", row)], [("xi", row)], shown | actions, actions)]
-    for history, (state,), (noise,), content, acted in zip(*columns, strict=True):
-        old = found.facts.get(history, Facts(frozenset(), frozenset(), frozenset(), acted))
-        found.facts[history] = Facts(old.states | {state}, old.noises | {noise}, old.contents | {content}, acted)
 
 
 def state_relation(world: World, ks: Iterable[int]) -> Relation:
     """F_k(s, s') = P(a_t | s_t = s, s_{t+k} = s') with one encoder for both ends: multi-step inverse on true states."""
-    found = Relation(shared=True)
+    found = Relation(world, shared=True)
     for k in ks:
-        _add_predictions(found, world, frozenset([("s", 0)]), frozenset([("s", k)]), 0, k)
-    for state in world.states:
-        found.facts[state,] = Facts(frozenset([state]), frozenset(world.exogenous), frozenset([state]), ())
+        start, end = [("s", 0)], [("s", k)]
+        found.add(joint_law(world, [*start, *end, ("a", 0)]), start, end, 0, k)
+    found.add_facts(joint_law(world, [("s", 0), ("xi", 0)]), [("s", 0)], [("s", 0)], 0)
     return found
 
 
-def forced_shares(found: Relation, states: Sequence[Hashable]) -> dict[frozenset, Fraction]:
+def forced_shares(found: Relation) -> dict[frozenset, Fraction]:
     """For every pair of states, the share of pairs of their histories that every optimal representation separates.
 
     Only histories whose exogenous parts can be the same are paired: else a code could lean on what the future shows of
     the exogenous part.
     """
-    eligible: Counter = Counter()
-    groups = Counter((facts.states, facts.noises) for facts in found.facts.values())
-    for (mine, here), (theirs, there) in product(groups, repeat=2):
-        if here & there:
-            count = groups[mine, here] * groups[theirs, there]
-            eligible.update({(s, other): count for s in mine for other in theirs})
-    forced: Counter = Counter()
-    for pair in found.conflicts():
-        one, other = (found.facts[h] for h in pair)
-        if one.noises & other.noises:
-            forced.update(frozenset(ends) for ends in product(one.states, other.states))
-    return {frozenset(pair): Fraction(forced[frozenset(pair)], eligible[pair]) for pair in combinations(states, 2)}
+    ends, noises = found.states.astype(float), found.noises.astype(float)  # whole numbers, far below 2^53: exact
+    eligible = noises @ noises.T > 0
+    possible, forced = (ends.T @ pairs.astype(float) @ ends for pairs in (eligible, found.conflicts() & eligible))
+    names = found.world.states
+    return {
+        frozenset((names[i], names[j])): Fraction(int(forced[i, j]), max(1, int(possible[i, j])))
+        for i, j in combinations(range(len(names)), 2)
+    }
 
 
 def discards_noise(found: Relation) -> bool:
     """Whether F factors through the agent-centric content of histories: what differs in noise alone is put together."""
-    blocks = {h: h for h in found.facts}
-
-    def find(h: Hashable) -> Hashable:
-        while blocks[h] != h:
-            h = blocks[h]
-        return h
-
-    first: dict[Hashable, Hashable] = {}
-    for history, facts in found.facts.items():
-        for content in facts.contents:
-            blocks[find(history)] = find(first.setdefault(content, history))
-    return found.factors(find)
+    return found.factors(_linked(found.contents))
 
 
-def state_classes(found: Relation, blocks: dict[Hashable, int], states: Sequence[Hashable]) -> dict[Hashable, int]:
-    """Classes of states that a partition of histories cannot tell: they share a block at an equal exogenous state,
-    directly or through others."""
-    label = {s: s for s in states}
-    members: dict[tuple, set] = {}
-    for history, block in blocks.items():
-        for noise in found.facts[history].noises:
-            members.setdefault((block, noise), set()).update(found.facts[history].states)
-    for together in members.values():
-        joined = {label[s] for s in together}
-        target = min(joined, key=states.index)
-        label = {s: target if name in joined else name for s, name in label.items()}
-    numbers = {name: i for i, name in enumerate(dict.fromkeys(label[s] for s in states))}
-    return {s: numbers[label[s]] for s in states}
+def state_classes(found: Relation, blocks: np.ndarray) -> list[int]:
+    """Class of each state: states that a partition of histories cannot tell have one class.
+
+    They share a block at an equal exogenous state, directly or through others.
+    """
+    history, noise = np.nonzero(found.noises)
+    table = np.zeros((found.states.shape[1], int(blocks.max()) + 1, found.noises.shape[1]), bool)
+    for state, ends in enumerate(found.states.T):
+        there = ends[history]
+        table[state, blocks[history[there]], noise[there]] = True
+    return _linked(np.argwhere(table.reshape(len(table), -1))).tolist()
+
+
+def _linked(pairs: np.ndarray) -> np.ndarray:
+    """Classes of the left numbers of (P, 2) pairs: those that share a right number, directly or through others."""
+    left, right = pairs.T
+    label = np.arange(int(left.max()) + 1)
+    while True:
+        lowest = np.full(int(right.max()) + 1, len(label))
+        np.minimum.at(lowest, right, label[left])
+        linked = label.copy()
+        np.minimum.at(linked, left, lowest[right])
+        if (linked == label).all():
+            return np.unique(label, return_inverse=True)[1]
+        label = linked

@@ -8,7 +8,6 @@ from vd4rl_pomdp.theory import counterexample, table
 from vd4rl_pomdp.theory.gallery import WORLDS
 from vd4rl_pomdp.theory.partition import Relation, forced_shares, relation, state_classes, state_relation
 from vd4rl_pomdp.theory.views import VIEWS
-from vd4rl_pomdp.theory.world import World
 
 DIAGRAMS = (
     ("fj", 3),
@@ -29,6 +28,7 @@ def theory_study() -> dict[str, Any]:
         name: [table.cells(_of(rows, name), _of(needs, name), method) for method in table.METHODS] for name in places
     }
     equations = table.check_equations(rows, {name: place.memory for name, place in places.items()})
+    world = places["counterexample"].worlds[False, False]
     appendix, main_text = counterexample.study((-1, 1)), counterexample.study((0, 1))
     return {
         "counterexample": {"appendix": appendix, "main_text": main_text},
@@ -40,6 +40,8 @@ def theory_study() -> dict[str, Any]:
         "disagreements": table.disagreements(tables, equations),
         "comparisons": rows,
         "representations": needs,
+        "states": [list(s) for s in world.states],  # type: ignore[call-overload]
+        "transitions": [[world.states.index(s), a, world.states.index(end)] for (s, a), end in world.step.items()],
         "diagrams": diagrams(places["counterexample"]),
     }
 
@@ -51,22 +53,22 @@ def _of(rows: list[dict[str, Any]], world: str) -> list[dict[str, Any]]:
 def diagrams(place: table.Setting) -> list[dict[str, Any]]:
     """For some objectives, the counterexample's states in classes that a coarsest partition cannot tell apart."""
     world = place.worlds[False, False]
-    found = []
-    for method, max_k in DIAGRAMS:
-        wanted = relation(world, VIEWS[method], place.memory, range(1, max_k + 1))
-        found.append(_diagram(f"{method}, k <= {max_k}", wanted, world))
+    found = [
+        _diagram(f"{method}, k <= {max_k}", relation(world, VIEWS[method], place.memory, range(1, max_k + 1)))
+        for method, max_k in DIAGRAMS
+    ]
     states = state_relation(world, range(1, place.max_k + 1))
-    return [*found, _diagram(f"one encoder on true states, k <= {place.max_k}", states, world)]
+    return [*found, _diagram(f"one encoder on true states, k <= {place.max_k}", states)]
 
 
-def _diagram(title: str, wanted: Relation, world: World) -> dict[str, Any]:
-    blocks = wanted.coarsest()
-    shares = forced_shares(wanted, world.states)
+def _diagram(title: str, found: Relation) -> dict[str, Any]:
+    blocks = found.coarsest()
+    places = {state: i for i, state in enumerate(found.world.states)}
+    shares = ((sorted(places[s] for s in pair), share) for pair, share in forced_shares(found).items())
     return {
         "title": title,
-        "blocks": len(set(blocks.values())),
+        "blocks": len(set(blocks.tolist())),
         "histories": len(blocks),
-        "states": [list(s) for s in world.states],  # type: ignore[call-overload]
-        "classes": list(state_classes(wanted, blocks, world.states).values()),
-        "forced": sorted([*sorted(world.states.index(s) for s in pair), float(x)] for pair, x in shares.items() if x),
+        "classes": state_classes(found, blocks),
+        "forced": sorted([*pair, float(share)] for pair, share in shares if share),
     }

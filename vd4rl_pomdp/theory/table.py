@@ -7,8 +7,8 @@ from dataclasses import asdict, dataclass
 from typing import Any
 
 from vd4rl_pomdp.theory.classifiers import Memory, compare
+from vd4rl_pomdp.theory.decodability import future_memory, past_memory
 from vd4rl_pomdp.theory.gallery import WORLDS, variants
-from vd4rl_pomdp.theory.law import future_memory, past_memory
 from vd4rl_pomdp.theory.partition import discards_noise, forced_shares, relation
 from vd4rl_pomdp.theory.views import VIEWS
 from vd4rl_pomdp.theory.world import World, diameter, period
@@ -105,7 +105,7 @@ def representations(place: Setting) -> list[dict[str, Any]]:
             noisy = relation(place.worlds[True, biased], VIEWS[method], place.memory, range(1, place.diameter + 1))
             for max_k in sorted({place.diameter, place.diameter if whole else place.max_k}):
                 found = relation(world, VIEWS[method], place.memory, range(1, max_k + 1))
-                shares = forced_shares(found, world.states).values()
+                shares = forced_shares(found).values()
                 forced = sum(share == 1 for share in shares)
                 label = {"world": place.name, "state_dependent": biased, "method": method, "max_k": max_k}
                 rows.append(

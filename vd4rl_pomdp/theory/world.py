@@ -30,9 +30,9 @@ Row = dict[Any, Fraction]
 """A probability distribution."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class World:
-    """A checked finite world; build it with `finite_world`."""
+    """A checked finite world; build it with `finite_world`. Two worlds are equal if they are the same object."""
 
     name: str
     states: tuple[State, ...]
@@ -152,8 +152,11 @@ def _law(name: str, where: str, row: Mapping[Any, Any], allowed: Iterable[Any] |
 
 
 def _fraction(name: str, where: str, value: Any) -> Fraction:
-    if isinstance(value, int | Fraction | str):
-        return Fraction(value)
+    try:
+        if isinstance(value, int | Fraction | str):
+            return Fraction(value)
+    except (ValueError, ZeroDivisionError):
+        pass
     raise UserError(
         f"world {name!r}: {where} holds {value!r}: write probabilities as Fraction, int or '1/3', not float"
     )
