@@ -34,6 +34,8 @@ def test_every_command_has_help(words, capsys):
         (["policy", "train", "--task", "ant", "--out", "x"], "unknown task 'ant'"),
         (["policy", "train", "--out", "x"], "--task"),
         (["policy", "export", "nowhere", "--out", "x"], "nowhere"),
+        (["policy", "train", "--task", "walker_walk", "--out", "file/below"], "file/below"),
+        (["theory", "--out", "file/below"], "file/below: cannot be used (not a directory)"),
         (["data", "card", "nowhere"], "nowhere"),
         (["pretrain", "--data", "x"], "Missing from vd4rl-pomdp pretrain: --out"),
         (["pretrain", "--data", "x", "--out", "y", "--steps", "many"], "--steps: invalid literal"),
@@ -42,6 +44,7 @@ def test_every_command_has_help(words, capsys):
 )
 def test_a_slip_is_one_line_and_exit_code_2(words, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
+    (tmp_path / "file").touch()
     with pytest.raises(SystemExit) as end:
         main(words)
     assert end.value.code == 2
@@ -49,7 +52,7 @@ def test_a_slip_is_one_line_and_exit_code_2(words, message, capsys, tmp_path, mo
     assert len(error.splitlines()) == 1
     assert error.startswith("error: ")
     assert message in error
-    assert not list(tmp_path.iterdir()), "nothing may be left behind"
+    assert [p.name for p in tmp_path.iterdir()] == ["file"], "nothing may be left behind"
 
 
 def test_without_words_the_commands_are_listed(capsys):

@@ -15,7 +15,7 @@ from typing import Annotated, Any
 
 import tyro
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.folder import flatten
 
 Arguments = list[str]
@@ -39,6 +39,9 @@ def main(arguments: Sequence[str] | None = None) -> None:
         sys.exit(130)
     except BrokenPipeError:
         sys.exit(141)
+    except OSError as error:
+        print(f"error: {disk_error(error.filename, error)}", file=sys.stderr)
+        sys.exit(2)
 
 
 def _dispatch(table: dict[str, Command | dict[str, Command]], words: Arguments, program: str) -> None:
@@ -492,7 +495,7 @@ def _theory(words: Arguments, program: str) -> None:
 
     command = _parse(TheoryCommand, words, program)
     if command.out is not None:
-        _make_folder(command.out)
+        command.out.mkdir(parents=True, exist_ok=True)  # before anything is computed
     study = theory_study()
     if command.json:
         print(json.dumps(study))
@@ -500,14 +503,6 @@ def _theory(words: Arguments, program: str) -> None:
         print_theory(study)
     if command.out is not None:
         print(f"page: {write_theory(study, command.out)}", file=sys.stderr if command.json else sys.stdout)
-
-
-def _make_folder(out: Path) -> None:
-    """Make --out's folder before anything is computed."""
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise UserError(f"{out}: cannot be a folder ({error.strerror}); --out names a folder") from error
 
 
 def _show(result: dict[str, Any], as_json: bool) -> None:

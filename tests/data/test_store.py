@@ -146,7 +146,7 @@ def test_too_little_space_is_told_before_decoding(tmp_path, cache, monkeypatch):
 
 def test_an_unusable_cache_is_told(tmp_path):
     (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"file: cannot write"):
+    with pytest.raises(UserError, match=r"file: cannot be used"):
         open_store(write_fake_set(tmp_path / "set"), tmp_path / "file")
 
 

@@ -148,7 +148,7 @@ def test_out_that_cannot_be_a_folder_is_one_line(out, tmp_path, capsys):
     with pytest.raises(SystemExit) as end:
         main(["theory", "--out", str(tmp_path / out)])
     assert end.value.code == 2
-    assert "--out names a folder" in capsys.readouterr().err
+    assert "cannot be used" in capsys.readouterr().err
 
 
 def test_the_documentation_shows_the_computed_numbers(shown):

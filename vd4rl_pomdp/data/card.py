@@ -14,8 +14,9 @@ from matplotlib.figure import Figure
 
 from vd4rl_pomdp.data.dataset import identity
 from vd4rl_pomdp.data.episodes import join_shards
-from vd4rl_pomdp.data.format import disk_error, read_attributes, read_rows, read_some_frames, shard_paths
+from vd4rl_pomdp.data.format import read_attributes, read_rows, read_some_frames, shard_paths
 from vd4rl_pomdp.data.published import published_scores
+from vd4rl_pomdp.errors import disk_error
 from vd4rl_pomdp.runs.folder import read_json
 from vd4rl_pomdp.tasks import SCORE_DIVISOR
 from vd4rl_pomdp.types import StepType

@@ -15,8 +15,8 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vd4rl_pomdp.data.format import disk_error, write_shard
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.folder import jsonable, read_json, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine

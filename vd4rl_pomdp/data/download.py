@@ -17,8 +17,7 @@ import requests
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
-from vd4rl_pomdp.data.format import disk_error
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.tasks import QUALITIES, get_task
 
 DEFAULT_ENDPOINT = "https://huggingface.co"

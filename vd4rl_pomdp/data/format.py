@@ -10,7 +10,6 @@ an episode may continue in the next shard.
 
 from __future__ import annotations
 
-import errno
 import io
 import json
 import re
@@ -22,7 +21,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.tasks import FRAME_SIZE
 from vd4rl_pomdp.types import StepType
 
@@ -100,13 +99,6 @@ def _encode(rows: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> by
             chunks = (min(len(data), 50), *data.shape[1:]) if key == FRAMES_KEY else True
             file.create_dataset(key, data=data, chunks=chunks, compression="gzip", compression_opts=4)
     return buffer.getvalue()
-
-
-def disk_error(path: Path, error: OSError) -> UserError:
-    """A sentence for a failed write."""
-    if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return UserError(f"{path}: the disk is full: free some space and start the same command again")
-    return UserError(f"{path}: cannot write ({error.strerror or error}); check the folder or choose another")
 
 
 def read_attributes(path: Path) -> dict[str, Any]:

@@ -25,8 +25,8 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.data.episodes import join_shards
-from vd4rl_pomdp.data.format import disk_error, read_attributes, read_frames, read_rows, shard_paths
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.data.format import read_attributes, read_frames, read_rows, shard_paths
+from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.tasks import FRAME_SIZE
 
