@@ -7,6 +7,7 @@ import tempfile
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -36,6 +37,8 @@ if TYPE_CHECKING:
 
 BATCH = 256
 EPISODE_ROWS = 501
+ROUNDS = 5
+"""Times that two ways of rendering take turns."""
 GOALS: dict[str, tuple[str, float]] = {
     "opening.open_seconds": ("<=", 1.0),
     "memory.peak_over_frames": ("<=", 1.3),
@@ -109,6 +112,12 @@ def _seconds(function: Callable[[], Any], repeats: int) -> float:
     return statistics.median(times[1:])
 
 
+def _alternating(rounds: int, *functions: Callable[[], Any]) -> list[float]:
+    """Median seconds of each function, called in turns: a machine that slows down slows all of them."""
+    times = [[_seconds(function, 1) for function in functions] for _ in range(rounds)]
+    return [statistics.median(column) for column in zip(*times, strict=True)]
+
+
 def _synthetic_set(folder: Path, episodes: int) -> tuple[Dataset, dict[str, Any]]:
     """Write, decode and open a set of `episodes` full episodes; random stripes compress fast and cost like pixels."""
     rng = np.random.default_rng(0)
@@ -151,9 +160,9 @@ def _sampling(dataset: Dataset, repeats: int) -> dict[str, float]:
 
     obs, keys = dataset.stacks(rows()), dataset.keys(rows())
     target = torch.empty_like(obs).view(-1, *dataset.frames.shape[1:])
-    copying = _seconds(copy, repeats)
-    gathering = _seconds(lambda: dataset.stacks(rows()), repeats)
-    changing = _seconds(lambda: corruption(random_shift(obs, keys), keys), repeats)
+    copying, gathering, changing = _alternating(
+        repeats, copy, lambda: dataset.stacks(rows()), lambda: corruption(random_shift(obs, keys), keys)
+    )
     return {
         "copy_ms": copying * 1e3,
         "gather_ms": gathering * 1e3,
@@ -175,8 +184,9 @@ def _pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]
             PRESETS["paper"], data=folder, out=folder, batch_size=8, corruption="patch+zero_frames", precision=precision
         )
         trainer = make_trainer(dataset, config)
-        steps[precision] = _seconds(lambda t=trainer: t.update(), max(3, repeats // 3))  # type: ignore[misc]
-        passes = _seconds(lambda t=trainer: _forward_backward(t, device), max(3, repeats // 3))  # type: ignore[misc]
+        steps[precision], passes = _alternating(
+            max(3, repeats // 3), trainer.update, partial(_forward_backward, trainer, device)
+        )
         results[f"{precision}_frames_per_s"] = config.batch_size * config.window / steps[precision]
         results[f"{precision}_overhead_share"] = max(0.0, 1 - passes / steps[precision])
     return results | {"bf16_over_fp32": steps["fp32"] / steps["bf16"]}
@@ -229,21 +239,23 @@ def _finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
     algorithm = TD3BC(Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(device), config, generator)
     cached = FeatureSampler(dataset, features, BATCH, 3, 0.99, generator)
     exact = ExactSampler(frozen, BATCH, 3, 0.99, generator)
-    fast = _seconds(lambda: algorithm.update(cached.sample()), 20 * repeats)
-    slow = _seconds(lambda: algorithm.update(exact.sample()), 3)
+    fast, slow = _alternating(
+        repeats, lambda: algorithm.update(cached.sample()), lambda: algorithm.update(exact.sample())
+    )
     return {"cached_updates_per_s": 1 / fast, "exact_updates_per_s": 1 / slow, "cached_over_exact": slow / fast}
 
 
 def _collection(frames: int) -> dict[str, float]:
     """Frames per CPU-second of the fast rendering against dm_control's default, and two workers against one."""
-    speed = {render: _render_speed((render, frames)) for render in ("exact", "fast")}
+    rounds = [[_render_speed((render, frames // ROUNDS)) for render in ("exact", "fast")] for _ in range(ROUNDS)]
+    exact, fast = (statistics.median(column) for column in zip(*rounds, strict=True))
     difference = compare(canary_frames("walker_walk", "fast"), canary_frames("walker_walk", "exact"))
     alone = frames / next(iter(run_jobs(_render_wall, [("fast", frames)], 1)))
     together = sum(frames / seconds for seconds in run_jobs(_render_wall, [("fast", 4 * frames)] * 2, 2)) * 4
     return {
-        "exact_frames_per_cpu_s": speed["exact"],
-        "fast_frames_per_cpu_s": speed["fast"],
-        "fast_over_exact": speed["fast"] / speed["exact"],
+        "exact_frames_per_cpu_s": exact,
+        "fast_frames_per_cpu_s": fast,
+        "fast_over_exact": fast / exact,
         "fast_mean_difference_of_255": difference["mean_difference"],
         "two_workers_over_one": together / alone,
     }
@@ -313,7 +325,6 @@ def _maze_training() -> dict[str, float]:
         data = MazeData(*open_maze_set(folder / "set", folder / "cache"), config, None)
         device = pick_device("auto")
         trainer = Trainer(make_objective(data, config).to(device), data.on(device), config)
-    step = _seconds(trainer.update, 5)
     kept = trainer.batch()
 
     def passes() -> None:
@@ -321,7 +332,8 @@ def _maze_training() -> dict[str, float]:
             loss, *_ = trainer.losses(kept)
         loss.backward()
 
-    return {"training_steps_per_s": 1 / step, "training_overhead_share": max(0.0, 1 - _seconds(passes, 5) / step)}
+    step, network = _alternating(5, trainer.update, passes)
+    return {"training_steps_per_s": 1 / step, "training_overhead_share": max(0.0, 1 - network / step)}
 
 
 def _rate(function: Callable[[], Any], count: int) -> float:
