@@ -10,7 +10,6 @@ between the policy's action and the expert's at these rows, whoever acts.
 
 from __future__ import annotations
 
-import csv
 import sys
 from dataclasses import dataclass
 from pathlib import Path
@@ -26,7 +25,7 @@ from vd4rl_pomdp.evaluation import EVALUATION_SEED, Agent
 from vd4rl_pomdp.nn.folder import load_encoder
 from vd4rl_pomdp.nn.policy import load_policy
 from vd4rl_pomdp.policies.actor import Actor, load_actor
-from vd4rl_pomdp.runs.folder import read_json
+from vd4rl_pomdp.runs.folder import read_json, write_csv
 
 SPANS = ((0, 10), (10, 50), (50, None))
 
@@ -77,10 +76,7 @@ def main(config: Config) -> None:
                 row = labels | {"after": after, "episode": episode}
                 rows.append(row | play(agent, expert, env, card.task, after, episode))
                 print(" ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
-    with config.out.open("w", newline="") as file:
-        writer = csv.DictWriter(file, list(rows[0]), lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
+    write_csv(config.out, list(rows[0]), rows)
 
 
 if __name__ == "__main__":

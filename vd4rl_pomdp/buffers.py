@@ -36,9 +36,3 @@ class FrameBuffers:
             elif idle:
                 self._blocks[idle[0]] = block, weakref.ref(view)
         return torch.from_numpy(view)
-
-    def take_like(self, obs: Tensor) -> Tensor:
-        """Uninitialised contiguous tensor of the shape and dtype of `obs`, on its device; lent if it is CPU frames."""
-        if obs.device.type == "cpu" and obs.dtype == torch.uint8:
-            return self.take(obs.shape)
-        return torch.empty_like(obs, memory_format=torch.contiguous_format)

@@ -19,7 +19,7 @@ import numpy as np
 from vd4rl_pomdp.data.collect import CollectConfig, collect, replay_returns
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import ships
-from vd4rl_pomdp.runs.folder import write_json
+from vd4rl_pomdp.runs.folder import write_csv, write_json
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, QUALITIES, get_task
 
@@ -47,22 +47,24 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
     unknown = sorted(set(qualities) - set(QUALITIES))
     if unknown:
         raise UserError(f"unknown quality {unknown[0]!r}: choose from {', '.join(QUALITIES)}")
-    returns, costs = _read(out / "returns.csv"), _read(out / "costs.csv")
     for task in tasks:
         get_task(task)
+    out.mkdir(parents=True, exist_ok=True)
+    returns, costs = _read(out / "returns.csv"), _read(out / "costs.csv")
+    for task in tasks:
         for quality in qualities:
             if ships(task, quality) and not any((r["task"], r["quality"]) == (task, quality) for r in returns):
                 config = CollectConfig(task, quality, Path(), EPISODES, workers=workers)  # type: ignore[arg-type]
                 played = enumerate(replay_returns(config))
                 returns += [{"task": task, "quality": quality, "episode": i, "return": repr(v)} for i, v in played]
-                _write(out / "returns.csv", RETURNS, returns)
-                _write(out / "sets.csv", SETS, summarise(returns, costs))
+                write_csv(out / "returns.csv", RETURNS, returns)
+                write_csv(out / "sets.csv", SETS, summarise(returns, costs))
     for task in tasks:
         if not any(row["task"] == task for row in costs):
             costs.append(_cost(task, timed_episodes))
-            _write(out / "costs.csv", COSTS, costs)
+            write_csv(out / "costs.csv", COSTS, costs)
     table = summarise(returns, costs)
-    _write(out / "sets.csv", SETS, table)
+    write_csv(out / "sets.csv", SETS, table)
     write_json(out / "provenance.json", {"git_commit": git_commit(), "versions": versions(), "machine": machine()})
     return table
 
@@ -97,13 +99,3 @@ def _read(path: Path) -> list[Row]:
         return []
     with path.open(newline="") as file:
         return list(csv.DictReader(file))
-
-
-def _write(path: Path, columns: Sequence[str], rows: list[Row]) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    with temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    temporary.replace(path)

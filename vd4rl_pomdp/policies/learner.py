@@ -7,7 +7,6 @@ the observation statistics alone, small enough for a repository, and is what ano
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -19,6 +18,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import OBSERVATION_CLIP, Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
 from vd4rl_pomdp.policies.state_env import StateEnv
+from vd4rl_pomdp.runs.folder import replacing
 from vd4rl_pomdp.tasks import Task
 
 if TYPE_CHECKING:
@@ -151,22 +151,16 @@ def refill(model: SAC, decisions: int, critic_updates: int) -> None:
 
 def save_checkpoint(model: SAC, run: Path) -> None:
     """Write the checkpoint beside the old one and exchange the two."""
-    fresh, current, old = run / "checkpoint.new", run / "checkpoint", run / "checkpoint.old"
-    shutil.rmtree(fresh, ignore_errors=True)
-    fresh.mkdir()
     leaves, _ = _flatten(_states(model))
     arrays = {f"{i:04d}": np.array(leaf) for i, leaf in enumerate(leaves)} | _statistics(model)
-    save_file(arrays, fresh / "model.safetensors")
     buffer: Any = model.replay_buffer
     stop = buffer.buffer_size if buffer.full else buffer.pos
-    save_file({k: np.ascontiguousarray(getattr(buffer, k)[:stop]) for k in REPLAY_ARRAYS}, fresh / "replay.safetensors")
+    replay = {k: np.ascontiguousarray(getattr(buffer, k)[:stop]) for k in REPLAY_ARRAYS}
     counters = {"decisions": model.num_timesteps, "updates": model._n_updates, "position": buffer.pos}
-    (fresh / "counters.json").write_text(json.dumps(counters))
-    shutil.rmtree(old, ignore_errors=True)
-    if current.exists():
-        current.rename(old)
-    fresh.rename(current)
-    shutil.rmtree(old, ignore_errors=True)
+    with replacing(run / "checkpoint") as fresh:
+        save_file(arrays, fresh / "model.safetensors")
+        save_file(replay, fresh / "replay.safetensors")
+        (fresh / "counters.json").write_text(json.dumps(counters))
 
 
 def restore_checkpoint(model: SAC, run: Path) -> int:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import base64
-import csv
 import json
 from pathlib import Path
 from typing import Any
@@ -20,6 +19,7 @@ from vd4rl_pomdp.report.load import Run, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.report.theory import load_study, section
+from vd4rl_pomdp.runs.folder import write_csv
 
 Row = dict[str, Any]
 
@@ -44,8 +44,8 @@ def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
     out.mkdir(parents=True, exist_ok=True)
     for name, table in made.items():
         if table:
-            _write_csv(out / f"{name}.csv", table, list(table[0]))
-    _write_csv(out / "episodes.csv", rows, list(COLUMNS))
+            write_csv(out / f"{name}.csv", list(table[0]), table)
+    write_csv(out / "episodes.csv", COLUMNS, rows)
     (out / "index.html").write_text(_render(runs, rows, made, study))
     return out / "index.html", made["summary"]
 
@@ -162,10 +162,3 @@ def _facts(run: Run) -> dict[str, str]:
         "command": run.record.get("command", ""),
         "config": json.dumps({k: run.record.get(k) for k in ("config", "versions")}, indent=1),
     }
-
-
-def _write_csv(path: Path, rows: list[Row], columns: list[str]) -> None:
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, columns, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,6 +12,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs.folder import replacing
 
 State = dict[str, Any]
 """Nested dicts with str or int keys, lists, tensors, and JSON scalars."""
@@ -23,16 +23,9 @@ def save_checkpoint(folder: Path, state: State) -> None:
     """Write `state`; a reader sees the old checkpoint or the new one, never a mixture."""
     tensors: dict[str, Tensor] = {}
     tree = _split(state, "", tensors)
-    fresh, old = folder.with_name(folder.name + ".new"), folder.with_name(folder.name + ".old")
-    shutil.rmtree(fresh, ignore_errors=True)
-    fresh.mkdir(parents=True)
-    save_file(tensors, fresh / "state.safetensors")
-    (fresh / "state.json").write_text(json.dumps(tree))
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.rename(old)
-    fresh.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
+    with replacing(folder) as fresh:
+        save_file(tensors, fresh / "state.safetensors")
+        (fresh / "state.json").write_text(json.dumps(tree))
 
 
 def load_checkpoint(folder: Path) -> State | None:

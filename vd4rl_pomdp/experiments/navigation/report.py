@@ -8,7 +8,6 @@ OUT/figures/      accuracy.png, trajectories.png, observations.png
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -22,6 +21,7 @@ from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, Cell, cell_of, p
 from vd4rl_pomdp.experiments.navigation.rows import Run, Value, load_runs, save_runs
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.report.stats import bootstrap_interval, mean
+from vd4rl_pomdp.runs.folder import write_csv
 
 VIEWS = {
     "training averages, probe trained beside the model (the paper's way)": ("training", "online"),
@@ -244,14 +244,14 @@ def _commands(runs: list[Run]) -> list[str]:
 
 def _write_tables(tables: list[Table], path: Path) -> None:
     names = ["table", "view", "row", "maze", "mean", "low", "high", "seeds", "paper"]
-    with path.open("w", newline="") as file:
-        writer = csv.DictWriter(file, names, lineterminator="\n")
-        writer.writeheader()
-        for table in tables:
-            for label, entries in table.rows:
-                for maze, entry in zip(table.mazes, entries, strict=True):
-                    if len(entry.numbers):
-                        writer.writerow(_csv_row(table, label, maze, entry))
+    rows = (
+        _csv_row(table, label, maze, entry)
+        for table in tables
+        for label, entries in table.rows
+        for maze, entry in zip(table.mazes, entries, strict=True)
+        if len(entry.numbers)
+    )
+    write_csv(path, names, rows)
 
 
 def _csv_row(table: Table, label: str, maze: str, entry: Entry) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from typing import Any
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.grid import Cell
-from vd4rl_pomdp.runs.folder import read_json
+from vd4rl_pomdp.runs.folder import read_json, write_csv
 
 ROWS, RUNS, TRAJECTORIES = "rows.csv", "runs.csv", "trajectories"
 Value = tuple[str, str, str, str, int]
@@ -83,22 +83,13 @@ def save_runs(runs: list[Run], out: Path) -> None:
         for run in runs
         for value, number in run.values.items()
     ]
-    _write(out / ROWS, (*_IDENTITY, *_MEASURED), rows)
-    _write(out / RUNS, (*_IDENTITY, *_FACTS), [run.identity | run.facts for run in runs])
+    write_csv(out / ROWS, (*_IDENTITY, *_MEASURED), rows)
+    write_csv(out / RUNS, (*_IDENTITY, *_FACTS), [run.identity | run.facts for run in runs])
     (out / TRAJECTORIES).mkdir(exist_ok=True)
     for run in runs:
         target = out / TRAJECTORIES / run.file_name
         if run.trajectory is not None and run.trajectory.resolve() != target.resolve():
             shutil.copyfile(run.trajectory, target)
-
-
-def _write(path: Path, names: tuple[str, ...], rows: list[dict[str, Any]]) -> None:
-    temporary = path.with_name(f".{path.name}.tmp")
-    with temporary.open("w", newline="") as file:
-        writer = csv.DictWriter(file, names, lineterminator="\n")
-        writer.writeheader()
-        writer.writerows(rows)
-    temporary.replace(path)
 
 
 def _from_folders(source: Path) -> list[Run]:
