@@ -465,7 +465,7 @@ class BenchCommand:
     json: bool = False
     """Print one JSON object instead of a table."""
     quick: bool = False
-    """Fewer repetitions: numbers are rougher."""
+    """A tenth of the frames and fewer repetitions: rougher numbers, and a peak memory that fixed costs dominate."""
 
 
 def _bench(words: Arguments, program: str) -> None:

@@ -148,7 +148,7 @@ def _synthetic_set(folder: Path, episodes: int) -> tuple[Dataset, dict[str, Any]
 
 def _sampling(dataset: Dataset, repeats: int) -> dict[str, float]:
     """Gathering against copying the same bytes, corruption and shift against gathering; new rows every time."""
-    some = min(dataset.num_rows, 20_000)
+    some = min(dataset.num_transitions, 20_000)
     touch(dataset.frames[:some])
     generator = torch.Generator().manual_seed(0)
     corruption = BatchCorruption(CorruptionConfig("patch+zero_frames"), 0)
