@@ -34,7 +34,7 @@ def finetune(config: FinetuneConfig) -> RunFolder:
     """Run the stage, or go on with it; writes the policy and `episodes.csv` into the run's folder."""
     get_algorithm(config.algorithm)
     dataset = open_dataset(config.data)
-    encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim)
+    encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frames.shape[-1])
     if card.end_to_end:
         config = replace(config, algorithm=card.end_to_end, views=0)
     if encoder.reads_state:

@@ -2,6 +2,8 @@
 
 import csv
 import hashlib
+import json
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -199,6 +201,16 @@ def test_user_slips_are_one_line(data, encoder, tmp_path):
         with pytest.raises(UserError, match="must be at least"):
             run_pretrain(smoke_pretrain(data, tmp_path / "e", **wrong))
     assert not any((tmp_path / name).exists() for name in "abcde")
+
+
+def test_an_encoder_of_another_image_size_is_refused(data, encoder, tmp_path):
+    shutil.copytree(encoder, tmp_path / "small")
+    config = json.loads((tmp_path / "small" / "config.json").read_text())
+    config["encoder"]["size"] = 64
+    (tmp_path / "small" / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match=r"small: this encoder reads pictures of 64x64 pixels, the data set has 84x84"):
+        run_finetune(smoke_finetune(tmp_path / "small", data, tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
 
 
 def test_td3_bc_finds_the_better_action_and_bc_the_common_one():

@@ -427,7 +427,7 @@ class NavigationGridCommand:
     """Train all runs of a grid, seed by seed; finished runs are skipped, a cut one goes on."""
 
     grid: str = "evidence"
-    """evidence: all objectives at K=15 and the K=1 comparisons; options: self-prediction and exogenous noise."""
+    """evidence: all objectives at K=15, and K=1 comparisons; options: self-prediction, noise; paper: every table."""
     mazes: list[str] = field(default_factory=lambda: ["no_curtain", "three_curtains"])
     """Mazes."""
     seeds: list[int] = field(default_factory=lambda: [0, 1, 2])

@@ -23,7 +23,7 @@ from pretrain.navigation.probe import ErrorSums, StateProbe, TrueStates, refit
 from pretrain.objectives import build_objective, get_method
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.experiments.navigation.exogenous import ExogenousNoise
 from vd4rl_pomdp.experiments.navigation.observations import SHAPES, observe, open_maze_set, shrink
 from vd4rl_pomdp.mazes import MazeSpec
@@ -351,14 +351,10 @@ def make_objective(data: MazeData, config: NavigationConfig) -> InverseObjective
 def _check(config: NavigationConfig) -> None:
     """Refuse settings that cannot work, before anything is read or written."""
     get_method(config.method)
-    lowest = {
-        "steps": 1, "batch_size": 1, "window": 2, "max_k": 1, "codes": 1, "m": 0, "n": 0, "burn_in": 0,
-        "average_last": 1, "log_every": 1, "evaluation_windows": 1, "refit_windows": 1, "refit_steps": 1,
-    }  # fmt: skip
-    for name, low in lowest.items():
-        value = getattr(config, name)
-        if value is not None and value < low:
-            raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {low}")
+    refuse_outside(
+        config, seed=(0, MAX_SEED), steps=1, batch_size=1, window=2, max_k=1, codes=1, m=0, n=0, burn_in=0,
+        average_last=1, log_every=1, checkpoint_every=1, evaluation_windows=1, refit_windows=1, refit_steps=1,
+    )  # fmt: skip
     if config.picture not in SHAPES:
         raise UserError(f"unknown picture {config.picture!r}: choose one of {', '.join(SHAPES)}")
     if config.literal_future and config.method != "mik+a":
@@ -369,3 +365,9 @@ def _check(config: NavigationConfig) -> None:
         raise UserError(
             f"--checkpoint-every {config.checkpoint_every} is no multiple of --log-every {config.log_every}: change one"
         )
+    refuse_outside(
+        config, learning_rate=0, warm_up=0, feature_dim=1, hidden_dim=1, gru_layers=1, head_dim=1, self_prediction=0,
+        l2_states=0,
+    )  # fmt: skip
+    if config.max_k >= config.window:
+        raise UserError(f"--max-k {config.max_k} needs windows of more than that many rows: raise --window or lower it")

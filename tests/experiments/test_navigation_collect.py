@@ -110,6 +110,7 @@ def test_the_planner_reaches_goals_everywhere():
         ({"noise": -1.0}, "--noise is -1.0"),
         ({"trajectory_rows": 1}, "--trajectory-rows is 1"),
         ({"action_repeat": 0}, "--action-repeat is 0"),
+        ({"seed": -1}, "--seed is -1"),
     ],
 )
 def test_wrong_settings_are_named(changes, message, tmp_path):
@@ -142,6 +143,13 @@ def test_first_person_data_holds_headings_and_moves(tmp_path):
     assert np.ptp(dataset.physics[:, 2]) > 1
     assert np.ptp(dataset.physics[:, :2], axis=0).max() > 1
     assert len({frame.numpy().tobytes() for frame in dataset.frames}) > 100
+
+
+def test_a_policy_of_no_decisions_is_refused(tmp_path):
+    from vd4rl_pomdp.experiments.navigation.policy import MazePolicyConfig, train_policy
+
+    with pytest.raises(UserError, match="--decisions is 0"):
+        train_policy(MazePolicyConfig(tmp_path / "actor.safetensors", decisions=0))
 
 
 def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):

@@ -1,3 +1,4 @@
+import io
 import struct
 
 import numpy as np
@@ -50,6 +51,16 @@ def cifar_binary(folder, count: int = 4) -> np.ndarray:
     return images
 
 
+def torn_png() -> bytes:
+    """A PNG whose pixels are longer than they say, so that no chunk follows where one should."""
+    whole = io.BytesIO()
+    noise = np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(whole, "PNG")
+    raw = whole.getvalue()
+    place = raw.index(b"IDAT")
+    return raw[: place - 4] + struct.pack(">I", 100) + raw[place:]
+
+
 def python_batch(pixels: bytes) -> bytes:
     """A protocol-2 pickle of {"data": pixels}, as Python 2 wrote strings."""
     return b"\x80\x02}q\x01U\x04dataq\x02T" + struct.pack("<i", len(pixels)) + pixels + b"q\x03s."
@@ -93,6 +104,7 @@ def test_other_images_are_read_too(tmp_path):
         ("data_batch_1", python_batch(b"\x00" * 100), "holds no pixels"),
         ("data_batch_1", b"\xfe\xfe\xfe", "is damaged"),
         ("a.png", b"not a picture", "cannot be read as an image"),
+        ("a.png", torn_png(), "cannot be read as an image"),
     ],
 )
 def test_folders_without_usable_images_are_named(tmp_path, name, content, message):

@@ -102,6 +102,41 @@ def test_the_report_made_from_its_own_rows_is_the_same(runs, tmp_path):
     assert load_runs([tmp_path / "first", runs]) != []
 
 
+def test_damaged_reports_and_runs_are_named(runs, tmp_path):
+    whole = tmp_path / "whole"
+    write_report([runs], whole, pictures=False)
+    lines = (whole / "rows.csv").read_text().splitlines(keepends=True)
+    for damaged in (lines[:5], [*lines[:4], lines[4].replace("80", "eighty")], ["a,b\n", "1,2\n"]):
+        (whole / "rows.csv").write_text("".join(damaged))
+        with pytest.raises(UserError, match=r"whole: rows.csv and runs.csv do not fit together") as caught:
+            load_runs([whole])
+        assert len(str(caught.value).splitlines()) == 1
+    folder = runs / "three_curtains" / "ah-K15" / "seed0"
+    (folder / "results.json").write_text("{}")
+    with pytest.raises(UserError, match="seed0: its results are damaged"):
+        load_runs([runs])
+    with pytest.raises(UserError, match="no runs to report"):
+        load_runs([])
+
+
+def test_seeds_of_another_budget_or_set_make_no_mean(tmp_path):
+    for seed in (0, 1):
+        folder = write_run(tmp_path / "runs", Cell("no_curtain", "ah"), seed, 9.0)
+    for name, fact in (("timing.json", {"steps": 30, "seconds": 3.0}), ("results.json", {"set": "b17"})):
+        before = json.loads((folder / name).read_text())
+        (folder / name).write_text(json.dumps(before | fact))
+        with pytest.raises(UserError, match=f"seeds 0 and 1 differ in their {next(iter(fact))}"):
+            load_runs([tmp_path / "runs"])
+        (folder / name).write_text(json.dumps(before))
+    assert len(load_runs([tmp_path / "runs"])) == 2
+
+
+def test_the_grid_of_the_paper_holds_every_cell_of_its_tables():
+    commands = list(grid_commands("paper", ("no_curtain", "first_person"), (0,), "paper", Path("d"), Path("r")))
+    assert len(commands) == 2 * (12 + 7 + 7), "K=1 and 15, then self-prediction, then exogenous noise"
+    assert len({tuple(words) for words in commands}) == len(commands)
+
+
 def test_claims_are_judged_by_means_and_seed_by_seed(runs):
     found = load_runs([runs])
     verdicts = {claim.text: judge(claim, found) for claim in claims("three_curtains")}
@@ -184,6 +219,7 @@ def test_sample_observations_are_of_different_moments_and_mazes(tmp_path):
         (["report", "nowhere"], "nowhere: no such folder"),
         (["grid", "--grid", "all"], "unknown grid 'all'"),
         (["grid", "--mazes", "spiral"], "unknown maze 'spiral'"),
+        (["grid", "--preset", "huge"], "unknown preset 'huge'"),
     ],
 )
 def test_slips_are_one_line_and_exit_code_2(words, message, capsys, tmp_path, monkeypatch):

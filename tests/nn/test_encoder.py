@@ -82,6 +82,8 @@ def test_bad_encoder_folders_are_refused_in_one_line(tmp_path):
         load_encoder(tmp_path, action_dim=6)
     with pytest.raises(UserError, match="pretrained on walker_walk, not on cheetah_run"):
         load_encoder(tmp_path, task="cheetah_run")
+    with pytest.raises(UserError, match=r"pictures of 84x84 pixels, the data set has 50x50"):
+        load_encoder(tmp_path, size=50)
     (tmp_path / "model.safetensors").write_bytes(b"damaged")
     with pytest.raises(UserError, match="cannot be read"):
         load_encoder(tmp_path)

@@ -12,6 +12,7 @@ from safetensors.torch import load_file, save_file
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.nn.frame import STATE
 
 
 @dataclass(frozen=True)
@@ -45,16 +46,19 @@ def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard) -> None:
     temporary.replace(folder / "config.json")
 
 
-def load_encoder(folder: Path, task: str | None = None, action_dim: int | None = None) -> tuple[Encoder, EncoderCard]:
+def load_encoder(
+    folder: Path, task: str | None = None, action_dim: int | None = None, size: int | None = None
+) -> tuple[Encoder, EncoderCard]:
     """Read an encoder folder into a frozen module in eval mode.
 
     Args:
         folder: written by `save_encoder`.
         task: the task it will be used on, if that is to be checked.
         action_dim: the action dimension it will be used with, if that is to be checked.
+        size: height and width of the pictures it will see, if that is to be checked.
 
     Raises:
-        UserError: the folder is missing, damaged, pickled, or of another task.
+        UserError: the folder is missing, damaged, pickled, or of another task or image size.
     """
     config = _read_config(folder)
     encoder_config, card = EncoderConfig(**config["encoder"]), EncoderCard(**config["pretrain"])
@@ -62,6 +66,11 @@ def load_encoder(folder: Path, task: str | None = None, action_dim: int | None =
         raise UserError(
             f"{folder}: this encoder was pretrained on {card.task} with {encoder_config.action_dim} action dimensions, "
             f"the data set has {action_dim}; pretrain one on this task"
+        )
+    if size is not None and encoder_config.frame_encoder != STATE and encoder_config.size != size:
+        raise UserError(
+            f"{folder}: this encoder reads pictures of {encoder_config.size}x{encoder_config.size} pixels, the data set "
+            f"has {size}x{size}; pretrain one on this set"
         )
     if task is not None and card.task != task:
         raise UserError(

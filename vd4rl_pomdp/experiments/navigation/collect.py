@@ -111,6 +111,8 @@ def _check(config: CollectConfig) -> None:
         raise UserError(f"--trajectory-rows is {config.trajectory_rows}; a trajectory needs at least 2")
     if not config.noise >= 0:
         raise UserError(f"--noise is {config.noise}; a standard deviation cannot be negative")
+    if config.seed < 0:
+        raise UserError(f"--seed is {config.seed}; it must be at least 0")
 
 
 def _plan(config: CollectConfig) -> Iterator[tuple[Path, range]]:

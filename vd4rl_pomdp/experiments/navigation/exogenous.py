@@ -88,7 +88,7 @@ def _resized(folder: Path) -> Iterator[Tensor]:
         elif path.suffix.lower() in (".png", ".jpg", ".jpeg"):
             try:
                 yield _to_size(np.asarray(Image.open(path).convert("RGB"))[None])
-            except OSError as error:
+            except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # Pillow's, by format
                 raise UserError(f"{path}: cannot be read as an image ({error}); remove or replace it") from error
 
 

@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.mazes import get_maze
+from vd4rl_pomdp.experiments.navigation.collect import PRESETS
+from vd4rl_pomdp.mazes import MAZES, get_maze
 
 PAPER = Path(__file__).parent / "paper.csv"
 """The paper's numbers: one line a table row, one column a maze."""
@@ -59,7 +60,12 @@ def options(mazes: tuple[str, ...] = EVIDENCE_MAZES) -> list[Cell]:
     return cells + [Cell(maze, method, exogenous=True) for maze in mazes for method in reversed(OBJECTIVES)]
 
 
-GRIDS = {"evidence": evidence, "options": options}
+def paper(mazes: tuple[str, ...] = tuple(MAZES)) -> list[Cell]:
+    """Every cell of the paper's tables."""
+    return list(dict.fromkeys(cell_of(row, maze) for maze in mazes for row in paper_rows()))
+
+
+GRIDS = {"evidence": evidence, "options": options, "paper": paper}
 
 
 def grid_commands(
@@ -68,6 +74,8 @@ def grid_commands(
     """Words of all runs of a grid, seed by seed, so that every cell has its first seed early."""
     if grid not in GRIDS:
         raise UserError(f"unknown grid {grid!r}: choose one of {', '.join(GRIDS)}")
+    if preset not in PRESETS:
+        raise UserError(f"unknown preset {preset!r}: choose one of {', '.join(PRESETS)}")
     for maze in mazes:
         get_maze(maze)
     for seed in seeds:

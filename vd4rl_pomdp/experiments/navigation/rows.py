@@ -53,7 +53,8 @@ def load_runs(sources: Iterable[Path]) -> list[Run]:
     """Finished runs of all sources: run folders, folders that hold some, or folders with `rows.csv` and `runs.csv`.
 
     Raises:
-        UserError: a source is missing or holds nothing, or the same run comes with two results.
+        UserError: there is no source, one is missing, damaged or holds nothing, the same run comes with two results,
+            or seeds of one cell differ in their steps or data.
     """
     runs: dict[tuple[Any, ...], Run] = {}
     for source in sources:
@@ -69,10 +70,26 @@ def load_runs(sources: Iterable[Path]) -> list[Run]:
                     f"{source}: {run.cell.name} seed {run.seed} is there twice with other results; keep one"
                 )
             runs.setdefault(key, run)
+    if not runs:
+        raise UserError("no runs to report: name folders of `vd4rl-pomdp navigation train`, or an earlier report's")
     presets = sorted({run.preset for run in runs.values()})
     if len(presets) > 1:
         raise UserError(f"runs of different presets ({', '.join(presets)}) do not make one table; report them apart")
+    _refuse_mixtures(runs.values())
     return sorted(runs.values(), key=lambda run: tuple(run.identity.values()))
+
+
+def _refuse_mixtures(runs: Iterable[Run]) -> None:
+    """Seeds of one cell make a mean only if they had the same budget and the same data."""
+    first: dict[Cell, Run] = {}
+    for run in runs:
+        other = first.setdefault(run.cell, run)
+        for fact in ("steps", "set"):
+            if run.facts[fact] != other.facts[fact]:
+                raise UserError(
+                    f"{run.cell.name}: seeds {other.seed} and {run.seed} differ in their {fact} ({other.facts[fact]}, "
+                    f"{run.facts[fact]}) and make no mean; report them apart"
+                )
 
 
 def save_runs(runs: list[Run], out: Path) -> None:
@@ -101,6 +118,13 @@ def _is_navigation(folder: Path) -> bool:
 
 
 def _read_run(folder: Path) -> Run:
+    try:
+        return _run_of(folder)
+    except (KeyError, TypeError) as error:
+        raise UserError(f"{folder}: its results are damaged ({error}); train it again") from error
+
+
+def _run_of(folder: Path) -> Run:
     record, results = read_json(folder / "config.json"), read_json(folder / "results.json")
     config, timing, machine = record["config"], read_json(folder / "timing.json"), read_json(folder / "machine.json")
     cell = Cell(
@@ -130,6 +154,15 @@ def _value(row: dict[str, Any]) -> Value:
 
 
 def _from_csv(source: Path) -> list[Run]:
+    try:
+        return _runs_of(source)
+    except (KeyError, TypeError, ValueError) as error:
+        if isinstance(error, UserError):
+            raise
+        raise UserError(f"{source}: {ROWS} and {RUNS} do not fit together ({error}); make the report anew") from error
+
+
+def _runs_of(source: Path) -> list[Run]:
     values: dict[tuple[str, ...], dict[Value, float]] = {}
     for row in _read(source / ROWS):
         values.setdefault(_identity(row), {})[_value(row)] = float(row["value"])
