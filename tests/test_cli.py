@@ -1,6 +1,8 @@
+import shlex
+
 import pytest
 
-from vd4rl_pomdp.cli import COMMANDS, main
+from vd4rl_pomdp.cli import COMMANDS, Command, main
 from vd4rl_pomdp.experiments.demo import demo_commands
 
 NAMES = [
@@ -64,3 +66,38 @@ def test_without_words_the_commands_are_listed(capsys):
 def test_the_demo_uses_every_stage(tmp_path):
     stages = [words[0] for words in demo_commands(tmp_path, 1)]
     assert stages == ["data", *["pretrain", "finetune"] * 3, "report"]
+
+
+SWEEP = ["sweep", "--data", "my data", "--out", "runs", "--methods", "acro", "random", "--seeds", "0", "1"]
+
+
+@pytest.fixture
+def executed(monkeypatch) -> list[list[str]]:
+    """Stages are not run here, but their words are kept."""
+    stages: list[list[str]] = []
+    for name in ("pretrain", "finetune"):
+        keep = Command("", lambda words, program: stages.append([*program.split(), *words]))
+        monkeypatch.setitem(COMMANDS, name, keep)
+    return stages
+
+
+def test_a_dry_sweep_prints_a_line_a_run_that_does_the_same(executed, capsys):
+    main([*SWEEP, "--algorithms", "td3_bc", "bc", "--pretrain=--steps 5", "--dry-run"])
+    lines = capsys.readouterr().out.splitlines()
+    assert not executed
+    main([*SWEEP, "--algorithms", "td3_bc", "bc", "--pretrain=--steps 5"])
+    assert [stage[1] for stage in executed] == ["pretrain", "finetune", "finetune"] * 4
+    assert [" && ".join(map(shlex.join, executed[i : i + 3])) for i in range(0, 12, 3)] == lines
+
+
+@pytest.mark.parametrize(
+    "words",
+    [["--methods", "acro", "acor"], ["--corruptions", "none", "fog"], ["--algorithms", "bc", "td3"]],
+    ids=" ".join,
+)
+def test_a_sweep_looks_at_its_names_before_the_first_run(executed, words, capsys):
+    with pytest.raises(SystemExit) as end:
+        main([*SWEEP, *words])
+    assert end.value.code == 2
+    assert f"{words[-1]!r}: choose one of" in capsys.readouterr().err
+    assert not executed

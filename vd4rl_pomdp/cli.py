@@ -360,15 +360,26 @@ class SweepCommand:
     """More flags for every pretraining, with an equals sign: --pretrain="--steps 1000 --shift 0"."""
     finetune: str = ""
     """More flags for every fine-tuning, likewise."""
+    dry_run: bool = False
+    """Print the commands only, one line a run, which other machines or a cluster's queue can take in any order."""
 
 
 def _sweep(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.runs.sweep import sweep_commands
+    from vd4rl_pomdp.runs.sweep import sweep_runs
 
     command = _parse(SweepCommand, words, program)
-    for stage in sweep_commands(command):
-        print(f"$ vd4rl-pomdp {' '.join(stage)}", file=sys.stderr)
-        _dispatch(COMMANDS, stage, "vd4rl-pomdp")
+    for run in sweep_runs(command):
+        _run_stages(run, command.dry_run)
+
+
+def _run_stages(stages: list[Arguments], dry_run: bool) -> None:
+    """Print the stages of a run as one line of shell, and execute them unless `dry_run`."""
+    print(
+        " && ".join(f"vd4rl-pomdp {shlex.join(stage)}" for stage in stages), file=sys.stdout if dry_run else sys.stderr
+    )
+    if not dry_run:
+        for stage in stages:
+            _dispatch(COMMANDS, stage, "vd4rl-pomdp")
 
 
 def _navigation_collect(words: Arguments, program: str) -> None:
@@ -439,9 +450,7 @@ def _navigation_grid(words: Arguments, program: str) -> None:
     command = _parse(NavigationGridCommand, words, program)
     where = (tuple(command.mazes), tuple(command.seeds), command.preset, command.data, command.out)
     for stage in grid_commands(command.grid, *where):
-        print(f"vd4rl-pomdp {shlex.join(stage)}", file=sys.stdout if command.dry_run else sys.stderr)
-        if not command.dry_run:
-            _dispatch(COMMANDS, stage, "vd4rl-pomdp")
+        _run_stages([stage], command.dry_run)
 
 
 @dataclass(frozen=True)
@@ -467,7 +476,7 @@ class BenchCommand:
     json: bool = False
     """Print one JSON object instead of a table."""
     quick: bool = False
-    """Fewer repetitions: numbers are rougher."""
+    """A tenth of the frames and fewer repetitions: rougher numbers, and a peak memory that fixed costs dominate."""
 
 
 def _bench(words: Arguments, program: str) -> None:

@@ -7,6 +7,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
 
+from vd4rl_pomdp.corruptions import make_corruption
+
 
 class Sweep(Protocol):
     """Settings of `vd4rl-pomdp sweep`."""
@@ -22,16 +24,35 @@ class Sweep(Protocol):
     finetune: str
 
 
-def sweep_commands(sweep: Sweep) -> Iterator[list[str]]:
-    """Words of every stage's command line, in an order in which they can be run."""
+def sweep_runs(sweep: Sweep) -> Iterator[list[list[str]]]:
+    """Every run as the words of its stages' command lines, in order; unknown names raise UserError before the first."""
+    _check_names(sweep)
     for seed in sweep.seeds:
         for corruption in sweep.corruptions:
             for method in sweep.methods:
-                folder = sweep.out / method / corruption / f"seed{seed}"
-                common = ["--data", str(sweep.data), "--preset", sweep.preset, "--seed", str(seed)]
-                chosen = ["--method", method, "--corruption", corruption, "--out", str(folder / "pretrain")]
-                yield ["pretrain", *common, *chosen, *shlex.split(sweep.pretrain)]
-                for algorithm in sweep.algorithms:
-                    place = ["--encoder", str(folder / "pretrain" / "encoder"), "--algorithm", algorithm]
-                    out = ["--out", str(folder / f"finetune-{algorithm}")]
-                    yield ["finetune", *common, *place, *out, *shlex.split(sweep.finetune)]
+                yield _stages(sweep, method, corruption, seed)
+
+
+def _stages(sweep: Sweep, method: str, corruption: str, seed: int) -> list[list[str]]:
+    folder = sweep.out / method / corruption / f"seed{seed}"
+    common = ["--data", str(sweep.data), "--preset", sweep.preset, "--seed", str(seed)]
+    chosen = ["--method", method, "--corruption", corruption, "--out", str(folder / "pretrain")]
+    stages = [["pretrain", *common, *chosen, *shlex.split(sweep.pretrain)]]
+    for algorithm in sweep.algorithms:
+        place = ["--encoder", str(folder / "pretrain" / "encoder"), "--algorithm", algorithm]
+        out = ["--out", str(folder / f"finetune-{algorithm}")]
+        stages.append(["finetune", *common, *place, *out, *shlex.split(sweep.finetune)])
+    return stages
+
+
+def _check_names(sweep: Sweep) -> None:
+    from finetune.algorithms import get_algorithm
+    from pretrain.objectives import get_method
+
+    for check, names in (
+        (get_method, sweep.methods),
+        (make_corruption, sweep.corruptions),
+        (get_algorithm, sweep.algorithms),
+    ):
+        for name in names:
+            check(name)

@@ -1,0 +1,13 @@
+from vd4rl_pomdp.experiments import bench as module
+from vd4rl_pomdp.runs.folder import flatten
+
+
+def test_a_set_smaller_than_the_usual_one_can_be_measured(tmp_path, monkeypatch):
+    dataset, opening = module._synthetic_set(tmp_path, 8)
+    sections = {"opening": opening, "sampling": module._sampling(dataset, 5)}
+    monkeypatch.setattr(module, "BATCH", 4)
+    sections["finetuning"] = module._finetuning(dataset, 1)
+    measured = flatten(sections)
+    assert opening["rows"] == dataset.num_rows == 8 * module.EPISODE_ROWS
+    assert all(value > 0 for value in measured.values())
+    assert {name for name in module.GOALS if name.split(".")[0] in sections} <= set(measured)
