@@ -30,7 +30,7 @@ from vd4rl_pomdp.mazes import MazeSpec
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
 from vd4rl_pomdp.objective import InverseObjective
-from vd4rl_pomdp.runs.checkpoint import load_checkpoint, save_checkpoint, seed_everything
+from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint, seed_everything
 from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.folder import RunFolder, jsonable, write_json
 from vd4rl_pomdp.runs.metrics import MetricsLog
@@ -153,7 +153,7 @@ class Trainer:
 
     def run(self, run: RunFolder, steps: int) -> None:
         """Train up to `steps`, from the newest checkpoint if there is one."""
-        self._restore(load_checkpoint(run.checkpoint))
+        restore_checkpoint(run.checkpoint, self._restore)
         before = self.seconds
         log = MetricsLog(run.path / "metrics.jsonl", self.step, self.config.wandb, jsonable(asdict(self.config)))
         with ProgressLine(f"{self.data.maze.name} {self.config.method}", steps, "steps", self.step) as progress:
@@ -189,9 +189,7 @@ class Trainer:
             "batches": self.generator.get_state(),
         }
 
-    def _restore(self, state: dict[str, Any] | None) -> None:
-        if state is None:
-            return
+    def _restore(self, state: dict[str, Any]) -> None:
         self.step, self.seconds = state["step"], state["seconds"]
         self.objective.load_state_dict(state["objective"])
         self.probe.load_state_dict(state["probe"])

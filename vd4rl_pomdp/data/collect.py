@@ -16,7 +16,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.errors import MAX_SEED, UserError, disk_error, refuse_outside
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.folder import jsonable, read_json, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
@@ -76,8 +76,7 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
         length: decisions an episode; everything but tests keeps the benchmark's.
     """
     get_task(config.task)
-    if config.episodes < 1 or config.episodes_per_shard < 1:
-        raise UserError("--episodes and --episodes-per-shard must be at least 1")
+    refuse_outside(config, episodes=1, episodes_per_shard=1, seed=(0, MAX_SEED))
     if config.quality not in get_args(Quality):
         raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(get_args(Quality))}")
     if config.actor is not None and config.quality not in ("medium", "expert"):

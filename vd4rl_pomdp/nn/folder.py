@@ -10,6 +10,7 @@ from typing import Any
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE
@@ -67,22 +68,31 @@ def load_encoder(
             f"{folder}: this encoder was pretrained on {card.task} with {encoder_config.action_dim} action dimensions, "
             f"the data set has {action_dim}; pretrain one on this task"
         )
-    if size is not None and encoder_config.frame_encoder != STATE and encoder_config.size != size:
+    trained = encoder_config.size
+    if size is not None and encoder_config.frame_encoder != STATE and trained != size:
         raise UserError(
-            f"{folder}: this encoder reads pictures of {encoder_config.size}x{encoder_config.size} pixels, the data set "
-            f"has {size}x{size}; pretrain one on this set"
+            f"{folder}: this encoder reads pictures of {trained}x{trained} pixels, the data set has {size}x{size}; "
+            "pretrain one on this set"
         )
     if task is not None and card.task != task:
         raise UserError(
             f"{folder}: this encoder was pretrained on {card.task}, not on {task}; pretrain one on this task"
         )
-    encoder = Encoder(encoder_config)
+    try:
+        encoder = Encoder(encoder_config)
+        CorruptionConfig(**card.corruption)
+    except (TypeError, RuntimeError, ValueError) as error:
+        raise UserError(f"{folder}/config.json: names no encoder ({_first_line(error)}); pretrain it again") from error
     try:
         encoder.load_state_dict(load_file(folder / "model.safetensors"))
     except (OSError, SafetensorError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
+        reason = _first_line(error)
         raise UserError(f"{folder}/model.safetensors: cannot be read ({reason}); pretrain the encoder again") from error
     return encoder.eval().requires_grad_(False), card
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0]
 
 
 def _read_config(folder: Path) -> dict[str, Any]:
@@ -92,7 +102,7 @@ def _read_config(folder: Path) -> dict[str, Any]:
     try:
         config = json.loads((folder / "config.json").read_text())
         EncoderConfig(**config["encoder"]), EncoderCard(**config["pretrain"])
-    except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{folder}: not an encoder folder (config.json: {error}); `vd4rl-pomdp pretrain` writes one as RUN/encoder"
         ) from error

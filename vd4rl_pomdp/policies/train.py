@@ -18,7 +18,7 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.policies import learner
 from vd4rl_pomdp.policies.actor import Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
@@ -49,6 +49,10 @@ def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None]
         The exported files by quality.
     """
     task = get_task(config.task)
+    refuse_outside(
+        config, seed=(0, MAX_SEED), decisions=1, learning_rate=0, hidden=1, n_step=1, envs=1, batch_size=1,
+        temperature=0, temperature_rate=0, replay_size=1, eval_every=1, eval_episodes=1, refill=0, critic_warmup=0,
+    )  # fmt: skip
     _claim(config)
     model = learner.build(config, task)
     done = learner.restore_checkpoint(model, config.out)
