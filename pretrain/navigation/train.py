@@ -352,6 +352,8 @@ def _check(config: NavigationConfig) -> None:
     refuse_outside(
         config, seed=(0, MAX_SEED), steps=1, batch_size=1, window=2, max_k=1, codes=1, m=0, n=0, burn_in=0,
         average_last=1, log_every=1, checkpoint_every=1, evaluation_windows=1, refit_windows=1, refit_steps=1,
+        learning_rate=0, warm_up=0, feature_dim=1, hidden_dim=1, gru_layers=1, head_dim=1, self_prediction=0,
+        l2_states=0,
     )  # fmt: skip
     if config.picture not in SHAPES:
         raise UserError(f"unknown picture {config.picture!r}: choose one of {', '.join(SHAPES)}")
@@ -363,9 +365,5 @@ def _check(config: NavigationConfig) -> None:
         raise UserError(
             f"--checkpoint-every {config.checkpoint_every} is no multiple of --log-every {config.log_every}: change one"
         )
-    refuse_outside(
-        config, learning_rate=0, warm_up=0, feature_dim=1, hidden_dim=1, gru_layers=1, head_dim=1, self_prediction=0,
-        l2_states=0,
-    )  # fmt: skip
     if config.max_k >= config.window:
         raise UserError(f"--max-k {config.max_k} needs windows of more than that many rows: raise --window or lower it")

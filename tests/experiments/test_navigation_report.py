@@ -8,6 +8,7 @@ import pytest
 
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import claims, judge, paper_number
 from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, Cell, cell_of, evidence, grid_commands, paper_rows
 from vd4rl_pomdp.experiments.navigation.report import write_report
@@ -88,6 +89,7 @@ def test_the_report_shows_means_seeds_and_the_papers_numbers(runs, tmp_path):
     assert (best["mean"], best["seeds"], best["paper"]) == ("21", "3", "6.0")
     assert float(best["low"]) < 21 < float(best["high"])
     assert "**21.0** [20.0, 22.0] n=3 (6.0)" in page
+    assert "(-)" not in page
     assert page.count("--seed 1 --out runs/") == 10, "one command for every run of seed 1"
     for name in ("accuracy.png", "trajectories.png"):
         assert (tmp_path / "out" / "figures" / name).stat().st_size > 5_000
@@ -141,13 +143,39 @@ def test_claims_are_judged_by_means_and_seed_by_seed(runs):
     found = load_runs([runs])
     verdicts = {claim.text: judge(claim, found) for claim in claims("three_curtains")}
     k1 = verdicts["K=1: ah+a's state error, of mik+a's"]
-    assert (k1.seeds_holding, k1.seeds, k1.holds, k1.paper) == (2, 3, True, True)
+    assert (k1.seeds_holding, k1.seeds, k1.holds, k1.paper) == (2, 3, True, (46.8, 8.0))
     assert k1.left == pytest.approx(44)
     gate = verdicts["gate: mik+a's action loss at k=1, of that at k=15"]
     assert gate.holds == ((21 + 1) <= 0.85 * (21 + 15))
     assert gate.paper is None
     assert verdicts["K=1: ah+a's action loss is near zero"].holds is False
-    assert verdicts["K=1: mik+a's state error with the literal future, of the default's"] is None
+    waiting = verdicts["K=1: mik+a's state error with the literal future, of the default's"]
+    assert (waiting.seeds, waiting.holds) == (0, False)
+
+
+def test_the_page_says_which_statements_hold_and_what_the_paper_has(runs, tmp_path):
+    page = write_report([runs], tmp_path / "out", pictures=False).read_text()
+    rows = {line.split(" | ")[1]: line for line in page.splitlines() if line.startswith("| three_curtains | ")}
+    assert rows["no_history's velocity error, of mik+a's >= 3 x"].endswith(
+        "| 81.0 / 21.0 | **yes** | 3 of 3 | 91.9 / 5.7: yes |"
+    )
+    assert rows["ah+a's position error, of the untrained one's < 0.5 x"].endswith("| **no** | 0 of 3 | none |")
+    assert rows["K=1: mik+a's state error with the literal future, of the default's >= 2 x"].endswith(
+        "| no run yet | - | - | none |"
+    )
+    answers = page.count("| **yes** |"), page.count("| **no** |"), page.count("| no run yet |")
+    assert f"{answers[0]} of {answers[0] + answers[1]} hold, {answers[2]} wait for runs." in page
+    assert "Budget: 2,500 gradient steps on 100,000 samples, 5 to 5 minutes a run (some, no GPU)." in page
+    headings = [line for line in page.splitlines() if line.startswith("## ")]
+    assert len(headings) == len(set(headings))
+
+
+def test_the_bar_plot_has_the_papers_variants(runs, tmp_path, monkeypatch):
+    drawn = []
+    monkeypatch.setattr(figures, "_bar", lambda axes, place, cell, *rest: drawn.append(cell))
+    figures.accuracy_bars(load_runs([runs]), STATE, tmp_path / "bars.png")
+    paper = {cell_of(line, "three_curtains") for line in paper_rows() if line["exogenous"] == "N"}
+    assert paper < set(drawn)
 
 
 def test_which_way_round_a_relation_is():

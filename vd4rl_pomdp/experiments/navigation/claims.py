@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from vd4rl_pomdp.experiments.navigation.grid import Cell, paper_rows
 from vd4rl_pomdp.experiments.navigation.rows import Run, Value
+from vd4rl_pomdp.mazes import MAZES
 
 RECURRENT = ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
 NEAR_ZERO = 5.0
@@ -40,13 +42,13 @@ class Verdict:
     seeds: int
     """Seeds for which both numbers exist."""
     seeds_holding: int
-    paper: bool | None
-    """Whether the paper's own numbers hold it; None where it has none."""
+    paper: tuple[float, float] | None
+    """The paper's own two numbers; None where it has none."""
 
     @property
     def holds(self) -> bool:
         """Whether it holds for the means over seeds."""
-        return self.claim.holds(self.left, self.right)
+        return self.seeds > 0 and self.claim.holds(self.left, self.right)
 
 
 def claims(maze: str) -> list[Claim]:
@@ -97,16 +99,14 @@ def claims(maze: str) -> list[Claim]:
     return found
 
 
-def judge(claim: Claim, runs: Sequence[Run]) -> Verdict | None:
-    """What the runs say of a claim, seeds paired; None while a side has no run."""
+def judge(claim: Claim, runs: Sequence[Run]) -> Verdict:
+    """What the runs say of a claim, seeds paired; no seeds and NaN while a side has no run."""
     left = _by_seed(claim.left, runs)
     right = dict.fromkeys(left, 1.0) if claim.right is None else _by_seed(claim.right, runs)
     seeds = sorted(left.keys() & right.keys())
-    if not seeds:
-        return None
     holding = sum(claim.holds(left[seed], right[seed]) for seed in seeds)
-    means = [sum(side[seed] for seed in seeds) / len(seeds) for side in (left, right)]
-    return Verdict(claim, means[0], means[1], len(seeds), holding, _paper_says(claim))
+    means = [sum(side[seed] for seed in seeds) / len(seeds) if seeds else math.nan for side in (left, right)]
+    return Verdict(claim, means[0], means[1], len(seeds), holding, _paper_numbers(claim))
 
 
 def _by_seed(side: tuple[Cell, Value], runs: Sequence[Run]) -> dict[int, float]:
@@ -114,10 +114,10 @@ def _by_seed(side: tuple[Cell, Value], runs: Sequence[Run]) -> dict[int, float]:
     return {run.seed: run.values[value] for run in runs if run.cell == cell and value in run.values}
 
 
-def _paper_says(claim: Claim) -> bool | None:
+def _paper_numbers(claim: Claim) -> tuple[float, float] | None:
     left = paper_number(*claim.left)
     right = 1.0 if claim.right is None else paper_number(*claim.right)
-    return None if left is None or right is None else claim.holds(left, right)
+    return None if left is None or right is None else (left, right)
 
 
 def paper_number(cell: Cell, value: Value) -> float | None:
@@ -131,3 +131,43 @@ def paper_number(cell: Cell, value: Value) -> float | None:
         if name == (cell.method, cell.max_k, component) and options == (cell.self_prediction, cell.exogenous):
             return float(row[cell.maze])
     return None
+
+
+def verdict_lines(runs: Sequence[Run]) -> list[str]:
+    """A section of a page: all statements about the mazes of some runs, whether they hold, and the paper's numbers."""
+    mazes = [maze for maze in MAZES if any(run.cell.maze == maze for run in runs)]
+    verdicts = [(maze, judge(claim, runs)) for maze in mazes for claim in claims(maze)]
+    position: Value = ("position_error", "training", "online", "all", 0)
+    judged = [verdict for _, verdict in verdicts if verdict.seeds]
+    lines = ["## Which statements hold", ""]
+    recorder = " and ".join(f"{paper_number(Cell(maze, 'ah+a'), position):.1f} ({maze})" for maze in mazes)
+    return [
+        *lines,
+        f"{sum(v.holds for v in judged)} of {len(judged)} hold, {len(verdicts) - len(judged)} wait for runs.",
+        "Means over seeds, held-out trajectories, probe refitted on frozen states; `seeds` says how many hold alone.",
+        "",
+        "| maze | statement | here | holds | seeds | the paper's numbers |",
+        "|---|---|---|---|---|---|",
+        *(_verdict_row(maze, verdict) for maze, verdict in verdicts),
+        "",
+        "That ah+a beats the untrained encoder is not to be expected: it tells an action from its record of past ones",
+        f"and need not keep the state. In the paper its position error is {recorder}.",
+        "",
+    ]
+
+
+def _verdict_row(maze: str, verdict: Verdict) -> str:
+    claim = verdict.claim
+    bound = f"{claim.relation} {claim.factor:g}" + (" x" if claim.right else "")
+    cells = [maze, f"{claim.text} {bound}", "no run yet", "-", "-"]
+    if verdict.seeds:
+        answer = "**yes**" if verdict.holds else "**no**"
+        cells[2:] = [_sides(claim, verdict.left, verdict.right), answer, f"{verdict.seeds_holding} of {verdict.seeds}"]
+    paper = "none"
+    if verdict.paper:
+        paper = f"{_sides(claim, *verdict.paper)}: {'yes' if claim.holds(*verdict.paper) else 'no'}"
+    return f"| {' | '.join([*cells, paper])} |"
+
+
+def _sides(claim: Claim, left: float, right: float) -> str:
+    return f"{left:.1f} / {right:.1f}" if claim.right else f"{left:.1f}"

@@ -17,7 +17,7 @@ import numpy as np
 
 from vd4rl_pomdp.data.collect import claim_set, episode_seed, join_rollouts, record_set
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.errors import UserError, refuse_outside
+from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
 from vd4rl_pomdp.mazes import get_maze
 from vd4rl_pomdp.runs.folder import jsonable
 from vd4rl_pomdp.runs.progress import ProgressLine
@@ -104,13 +104,10 @@ def drive(maze: str, rows: int, action_repeat: int = 5, noise: float = 0.5, seed
 
 def _check(config: CollectConfig) -> None:
     get_maze(config.maze)
-    refuse_outside(config, trajectories=1, action_repeat=1, trajectories_per_shard=1, workers=1)
-    if config.trajectory_rows < 2:
-        raise UserError(f"--trajectory-rows is {config.trajectory_rows}; a trajectory needs at least 2")
-    if not config.noise >= 0:
-        raise UserError(f"--noise is {config.noise}; a standard deviation cannot be negative")
-    if config.seed < 0:
-        raise UserError(f"--seed is {config.seed}; it must be at least 0")
+    refuse_outside(
+        config, trajectories=1, trajectory_rows=2, action_repeat=1, noise=0, seed=(0, MAX_SEED),
+        trajectories_per_shard=1, workers=1,
+    )  # fmt: skip
 
 
 def _plan(config: CollectConfig) -> Iterator[tuple[Path, range]]:

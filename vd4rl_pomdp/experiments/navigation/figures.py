@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 import torch
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from vd4rl_pomdp.experiments.navigation.claims import paper_number
@@ -16,38 +17,54 @@ from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, Cell
 from vd4rl_pomdp.experiments.navigation.rows import Run, Value
 from vd4rl_pomdp.mazes import FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
 
-_OURS, _PAPER, _ESTIMATE = "#0072b2", "#e69f00", "#d55e00"
+_ESTIMATE = "#d55e00"
+_VARIANTS = {
+    "K = 1": (1, False, "#9ecae1"),
+    "K = 15": (15, False, "#0072b2"),
+    "K = 15, self-prediction": (15, True, "#009e73"),
+}
+"""Bars of an objective: K, self-prediction, colour."""
+_OFFSETS, _WIDTH = (-0.27, 0.0, 0.27), 0.25
+_SEED: dict[str, Any] = {"color": "black", "linestyle": "", "marker": ".", "markersize": 3}
+_MARK: dict[str, Any] = {"color": "#e69f00", "linestyle": "", "marker": "_", "markersize": 9, "markeredgewidth": 2.5}
 _SAMPLES = 6
 _FIRST_ROW, _ROW_STEP = 20, 12
 
 
 def accuracy_bars(runs: list[Run], value: Value, path: Path) -> None:
-    """State prediction accuracy, 100 - error, of every objective and maze at K = 15, beside the paper's."""
+    """State prediction accuracy, 100 - error, of every objective and maze beside the paper's, as in its bar plot."""
     mazes = [maze for maze in MAZES if any(run.cell.maze == maze for run in runs)]
-    figure = Figure(figsize=(1.2 + 3.6 * len(mazes), 3.4), layout="constrained")
-    panels = np.atleast_1d(figure.subplots(1, len(mazes), sharey=True))
+    columns = min(2, len(mazes))
+    rows = -(-len(mazes) // columns)
+    figure = Figure(figsize=(1 + 5.2 * columns, 0.8 + 2.9 * rows), layout="constrained")
+    panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
     methods = [*OBJECTIVES, "random"]
-    for axes, maze in zip(panels, mazes, strict=True):
+    for axes in panels.flat[len(mazes) :]:
+        axes.set_axis_off()
+    for axes, maze in zip(panels.flat, mazes, strict=False):
         for place, method in enumerate(methods):
-            _bar(axes, place, Cell(maze, method), runs, value)
+            for offset, (max_k, self_prediction, colour) in zip(_OFFSETS, _VARIANTS.values(), strict=True):
+                _bar(axes, place + offset, Cell(maze, method, max_k, self_prediction), runs, value, colour)
         axes.set_title(maze, fontsize=10)
         axes.set_xticks(range(len(methods)), methods, rotation=40, ha="right", fontsize=8)
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_ylim(0, 100)
-    panels[0].set_ylabel("accuracy: 100 - state error (%)")
-    handles = [Rectangle((0, 0), 1, 1, color=colour) for colour in (_OURS, _PAPER)]
-    figure.legend(handles, ["here (points are seeds)", "paper"], loc="outside upper right", ncols=2, frameon=False)
+    for axes in panels[:, 0]:
+        axes.set_ylabel("100 - state error (%)")
+    handles: list[Any] = [Rectangle((0, 0), 1, 1, color=colour) for *_, colour in _VARIANTS.values()]
+    handles += [Line2D([], [], **_SEED), Line2D([], [], **_MARK)]
+    figure.legend(handles, [*_VARIANTS, "a seed", "the paper"], loc="outside upper center", ncols=5, frameon=False)
     figure.savefig(path, dpi=130, metadata={"Software": None})
 
 
-def _bar(axes: Any, place: int, cell: Cell, runs: list[Run], value: Value) -> None:
+def _bar(axes: Any, place: float, cell: Cell, runs: list[Run], value: Value, colour: str) -> None:
     accuracy = [100 - run.values[value] for run in runs if run.cell == cell and value in run.values]
     if accuracy:
-        axes.bar(place - 0.2, np.mean(accuracy), 0.38, color=_OURS)
-        axes.plot([place - 0.2] * len(accuracy), accuracy, "k.", markersize=3)
+        axes.bar(place, np.mean(accuracy), _WIDTH, color=colour)
+        axes.plot([place] * len(accuracy), accuracy, **_SEED)
     paper = paper_number(cell, ("state_error", "training", "online", "all", 0))
     if paper is not None:
-        axes.bar(place + 0.2, 100 - paper, 0.38, color=_PAPER)
+        axes.plot(place, 100 - paper, **_MARK)
 
 
 def trajectories(runs: list[Run], path: Path, methods: tuple[str, ...] = ("mik+a", "ah+a", "no_history")) -> bool:

@@ -9,7 +9,7 @@ from pathlib import Path
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.collect import PRESETS
-from vd4rl_pomdp.mazes import MAZES, get_maze
+from vd4rl_pomdp.mazes import get_maze
 
 PAPER = Path(__file__).parent / "paper.csv"
 """The paper's numbers: one line a table row, one column a maze."""
@@ -60,7 +60,7 @@ def options(mazes: tuple[str, ...] = EVIDENCE_MAZES) -> list[Cell]:
     return cells + [Cell(maze, method, exogenous=True) for maze in mazes for method in reversed(OBJECTIVES)]
 
 
-def paper(mazes: tuple[str, ...] = tuple(MAZES)) -> list[Cell]:
+def paper(mazes: tuple[str, ...]) -> list[Cell]:
     """Every cell of the paper's tables."""
     return list(dict.fromkeys(cell_of(row, maze) for maze in mazes for row in paper_rows()))
 

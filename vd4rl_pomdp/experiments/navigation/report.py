@@ -10,13 +10,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vd4rl_pomdp.experiments.navigation import figures
-from vd4rl_pomdp.experiments.navigation.claims import claims, judge, paper_number
+from vd4rl_pomdp.experiments.navigation.claims import paper_number, verdict_lines
+from vd4rl_pomdp.experiments.navigation.collect import PRESETS
 from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, Cell, cell_of, paper_rows
 from vd4rl_pomdp.experiments.navigation.rows import Run, Value, load_runs, save_runs
 from vd4rl_pomdp.mazes import MAZES
@@ -28,6 +30,10 @@ VIEWS = {
     "held-out trajectories, probe refitted on frozen states": ("held_out", "refit"),
 }
 """Where an error is measured, and by which probe."""
+_LOSS_VIEWS = {
+    "training averages (the paper's way)": ("training", ""),
+    "held-out trajectories": ("held_out", ""),
+}
 _TITLES = {
     "state_error": "State estimation errors (%), K = 1 and 15",
     "position_error": "Position errors (%), K = 15",
@@ -55,13 +61,13 @@ class Entry:
         return paper_number(self.cell, self.value)
 
     def text(self) -> str:
-        """Mean, interval, seeds, and the paper's number in brackets."""
-        paper = "-" if self.paper is None else f"{self.paper:.1f}"
+        """Mean, interval, seeds, and the paper's number in brackets; what is missing is left out."""
+        paper = "" if self.paper is None else f"({self.paper:.1f})"
         if not len(self.numbers):
-            return f"({paper})"
+            return paper
         interval = self.interval()
         spread = "" if interval is None else f" [{interval[0]:.1f}, {interval[1]:.1f}]"
-        return f"**{self.numbers.mean():.1f}**{spread} n={len(self.numbers)} ({paper})"
+        return f"**{self.numbers.mean():.1f}**{spread} n={len(self.numbers)} {paper}".rstrip()
 
     def interval(self) -> tuple[float, float] | None:
         """Bootstrap interval over seeds."""
@@ -107,7 +113,7 @@ def make_tables(runs: list[Run]) -> list[Table]:
     """The paper's six tables (position and velocity are one of them), then three of our own."""
     tables = []
     for name in _TITLES:
-        for view, (split, probe) in VIEWS.items():
+        for view, (split, probe) in (_LOSS_VIEWS if name == "action_loss" else VIEWS).items():
             tables.append(_paper_table(name, view, split, probe, runs))
     return [*tables, _floor_table(runs), _hidden_table(runs), _by_k_table(runs)]
 
@@ -118,10 +124,8 @@ def _paper_table(name: str, view: str, split: str, probe: str, runs: list[Run]) 
     for line in paper_rows():
         if line["table"] != name.removesuffix("_main"):
             continue
-        loss = line["component"] == "action_loss"
-        value: Value = (
-            ("action_loss", split, "", "all", 0) if loss else (f"{line['component']}_error", split, probe, "all", 0)
-        )
+        measure = line["component"] if name == "action_loss" else f"{line['component']}_error"
+        value: Value = measure, split, probe, "all", 0
         options = "".join(f", {o}" for o in ("self-prediction",) if line["self_prediction"] == "Y")
         label = f"{line['objective']}, K={line['k_max']}{options}"
         rows.append((label, [_entry(cell_of(line, maze), value, runs) for maze in mazes]))
@@ -157,7 +161,7 @@ def _hidden_table(runs: list[Run]) -> Table:
 
 
 def _by_k_table(runs: list[Run]) -> Table:
-    """Action losses at the least and the greatest k."""
+    """Action losses at a small, a middle and the greatest k."""
     rows = []
     for method in OBJECTIVES:
         for k in (1, 5, 15):
@@ -180,49 +184,50 @@ _OWN_TITLES = {
 
 def _page(runs: list[Run], tables: list[Table], drawn: bool, pictures: bool) -> list[str]:
     preset, seeds = runs[0].preset, sorted({run.seed for run in runs})
-    steps = sorted({int(run.facts["steps"]) for run in runs if run.cell.method != "random"})
     lines = ["# Navigation: what the objectives know of the state", ""]
     lines += [
-        f"{len(runs)} runs, preset `{preset}`, {' or '.join(map(str, steps))} gradient steps, seeds "
-        f"{', '.join(map(str, seeds))}. A cell reads: **mean over seeds** [95% bootstrap interval] n=seeds (the",
-        "paper's number). The paper's budget is 200,000 steps on 500k samples. Intervals of few seeds are too narrow.",
+        f"{len(runs)} runs, preset `{preset}`, seeds {', '.join(map(str, seeds))}. {_budget(runs)}",
+        "",
+        "A cell of a table reads: **mean over seeds** [95% bootstrap interval] n=seeds (the paper's number).",
+        "Intervals of few seeds are too narrow.",
         "",
         "![Accuracy of every objective](figures/accuracy.png)",
         "",
-        *_verdicts(runs),
+        "Bars: held-out trajectories, probe refitted on frozen states. The paper's marks are training averages.",
+        "",
+        *verdict_lines(runs),
     ]
     lines += ["![True and estimated trajectories](figures/trajectories.png)", ""] if drawn else []
     lines += ["![Sample observations](figures/observations.png)", ""] if pictures else []
-    for table in tables:
-        lines += _markdown(table)
+    for name, views in groupby(tables, lambda table: table.name):
+        lines += [f"## {_TITLES.get(name) or _OWN_TITLES[name]}", ""]
+        for table in views:
+            lines += _markdown(table)
     return lines + _commands(runs)
 
 
-def _verdicts(runs: list[Run]) -> list[str]:
-    lines = ["## Which statements hold", "", "Held-out trajectories, probe refitted on frozen states.", ""]
-    lines += ["| maze | statement | here | holds | seeds | paper's numbers |", "|---|---|---|---|---|---|"]
-    for maze in MAZES:
-        for claim in claims(maze):
-            verdict = judge(claim, runs)
-            if verdict is None:
-                continue
-            bound = f"{claim.relation} {claim.factor:g}" + (" x" if claim.right else "")
-            ratio = f"{verdict.left:.1f} / {verdict.right:.1f}" if claim.right else f"{verdict.left:.1f}"
-            paper = {True: "hold it", False: "do not", None: "none"}[verdict.paper]
-            answer = "**yes**" if verdict.holds else "**no**"
-            cells = [maze, f"{claim.text} {bound}", ratio, answer, f"{verdict.seeds_holding} of {verdict.seeds}", paper]
-            lines.append(f"| {' | '.join(cells)} |")
-    return [*lines, ""]
+def _budget(runs: list[Run]) -> str:
+    """What the runs cost, and where."""
+    trained = [run for run in runs if run.cell.method != "random"]
+    steps = " or ".join(f"{count:,}" for count in sorted({int(run.facts["steps"]) for run in trained}))
+    minutes = [float(run.facts["seconds"]) / 60 for run in trained]
+    machines = sorted({run.facts["gpu"] or f"{run.facts['processor']}, no GPU" for run in runs})
+    data = PRESETS[runs[0].preset]
+    return (
+        f"Budget: {steps} gradient steps on {data.trajectories * data.trajectory_rows:,} samples, "
+        f"{min(minutes, default=0):.0f} to {max(minutes, default=0):.0f} minutes a run ({'; '.join(machines)}). "
+        "The paper's: 200,000 steps on 500,000 samples."
+    )
 
 
 def _markdown(table: Table) -> list[str]:
-    title = _TITLES.get(table.name) or _OWN_TITLES[table.name]
-    shown = [(label, entries) for label, entries in table.rows if any(len(entry.numbers) for entry in entries)]
-    if not shown:
-        return [f"## {title}", "", f"*{table.view}*: no run yet.", ""]
-    lines = [f"## {title}", "", f"*{table.view}*", "", "| | " + " | ".join(table.mazes) + " |"]
-    lines += ["|---|" + "---|" * len(table.mazes)]
-    lines += [f"| {label} | " + " | ".join(entry.text() for entry in entries) + " |" for label, entries in table.rows]
+    """A table under its view; lines that neither a run nor the paper has a number for are left out."""
+    if not any(len(entry.numbers) for _, entries in table.rows for entry in entries):
+        return [f"*{table.view}*: no run yet.", ""]
+    lines = [f"*{table.view}*", "", "| | " + " | ".join(table.mazes) + " |", "|---|" + "---|" * len(table.mazes)]
+    for label, entries in table.rows:
+        cells = [entry.text() for entry in entries]
+        lines += [f"| {label} | {' | '.join(cells)} |"] if any(cells) else []
     return [*lines, ""]
 
 
@@ -232,6 +237,7 @@ def _commands(runs: list[Run]) -> list[str]:
         "## Commands",
         "",
         "Each line computes one run; `navigation collect` makes its data. Seconds are wall-clock.",
+        f"`vd4rl-pomdp navigation grid --grid paper --mazes {' '.join(MAZES)} --dry-run` prints those of every cell.",
     ]
     lines += ["", "```bash"]
     for maze in dict.fromkeys(run.cell.maze for run in runs):
