@@ -4,9 +4,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies import Actor, Ladder, actor, load_actor, load_ladder, read_actor
+from vd4rl_pomdp.policies.actor import read_ladder
 from vd4rl_pomdp.policies.export import CARD_EPISODES, LADDER_RUNGS, episode_returns
 from vd4rl_pomdp.tasks import get_task
 
@@ -88,6 +90,42 @@ def test_bad_actors_are_refused(tmp_path, monkeypatch):
         load_actor("humanoid_walk", "expert")
     with pytest.raises(UserError, match="no replay actor ships for humanoid_walk"):
         load_ladder("humanoid_walk")
+
+
+def spoil(weights, how):
+    if how == "none":
+        return {"x": np.zeros(3, np.float32)}
+    if how == "narrow":
+        return weights | {"hidden.0.weight": weights["hidden.0.weight"][:20]}
+    if how == "wide":
+        return weights | {f"{n}.{k}": np.repeat(weights[f"{n}.{k}"], 2, -1) for n in HEADS for k in ("weight", "bias")}
+    return weights | {"log_std.bias": np.full_like(weights["log_std.bias"], np.nan)}
+
+
+HEADS = ("mean", "log_std")
+
+
+@pytest.mark.parametrize("how", ["none", "narrow", "wide", "nan"])
+def test_whole_files_whose_weights_are_no_actor_are_refused(tmp_path, how):
+    shipped, path = load_actor("walker_walk", "medium"), tmp_path / "actor.safetensors"
+    Actor(spoil(shipped.weights, how), shipped.card).save(path)
+    with pytest.raises(UserError, match="its weights form no actor of walker_walk"):
+        read_actor(path, get_task("walker_walk"))
+
+
+def test_a_ladder_is_no_actor_and_an_actor_no_ladder():
+    with pytest.raises(UserError, match="form no actor"):
+        read_actor(actor.ASSETS / "walker_walk_replay.safetensors")
+    with pytest.raises(UserError, match="holds no ladder"):
+        read_ladder(actor.ASSETS / "walker_walk_medium.safetensors")
+
+
+@pytest.mark.parametrize("card", [{}, {"card": "{"}, {"card": "[1]"}, {"card": "3"}, {"card": "{}"}])
+def test_a_file_without_a_whole_card_is_one_sentence(tmp_path, card):
+    path = tmp_path / "actor.safetensors"
+    save_file(load_actor("walker_walk", "medium").weights, path, card)
+    with pytest.raises(UserError, match="not an actor file|trained on None"):
+        read_actor(path, get_task("walker_walk"))
 
 
 SETTINGS = {
