@@ -124,7 +124,7 @@ def test_a_ladder_is_no_actor_and_an_actor_no_ladder():
 def test_a_file_without_a_whole_card_is_one_sentence(tmp_path, card):
     path = tmp_path / "actor.safetensors"
     save_file(load_actor("walker_walk", "medium").weights, path, card)
-    with pytest.raises(UserError, match="not an actor file|trained on None"):
+    with pytest.raises(UserError, match=r"not an actor file|trained on None"):
         read_actor(path, get_task("walker_walk"))
 
 
