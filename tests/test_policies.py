@@ -1,4 +1,5 @@
 import json
+import sys
 from importlib.metadata import version
 from pathlib import Path
 
@@ -257,6 +258,62 @@ def test_a_start_that_does_not_fit_is_one_sentence(configure, tmp_path):
     train_policy(configure(tmp_path / "old", decisions=20))
     with pytest.raises(UserError, match="networks of another shape"):
         train_policy(configure(tmp_path / "new", start_from=tmp_path / "old", hidden=8))
+
+
+def test_settings_that_train_nothing_are_refused_before_anything_is_written(configure, tmp_path):
+    from vd4rl_pomdp.policies.train import AT_LEAST_ONE, train_policy
+
+    for name in AT_LEAST_ONE:
+        with pytest.raises(UserError, match=f"--{name.replace('_', '-')} must be at least 1"):
+            train_policy(configure(tmp_path / "run", **{name: 0}))
+    assert not (tmp_path / "run").exists()
+
+
+def test_a_folder_with_something_else_is_refused_untouched(configure, tmp_path):
+    from vd4rl_pomdp.policies.train import train_policy
+
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match="holds no policy run"):
+        train_policy(configure(tmp_path, decisions=40))
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_without_the_training_library_nothing_is_begun(tmp_path, monkeypatch):
+    from vd4rl_pomdp.policies.config import PolicyConfig
+    from vd4rl_pomdp.policies.train import train_policy
+
+    monkeypatch.setitem(sys.modules, "sbx", None)  # importing it raises ImportError
+    with pytest.raises(UserError, match=r"pip install 'vd4rl-pomdp\[policy\]'"):
+        train_policy(PolicyConfig("walker_walk", tmp_path / "run"))
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_a_damaged_run_is_one_sentence(configure, tmp_path, monkeypatch):
+    from vd4rl_pomdp.policies import learner
+    from vd4rl_pomdp.policies.export import export_run
+    from vd4rl_pomdp.policies.train import decisions_made, train_policy
+
+    monkeypatch.setattr(learner, "RANDOM_DECISIONS", 1_000)  # no update is compiled
+    config = configure(tmp_path / "run", decisions=40)
+    train_policy(config)
+    checkpoint = tmp_path / "run" / "checkpoint"
+    checkpoint.rename(tmp_path / "run" / "checkpoint.old")  # cut between the two renames of an exchange
+    assert decisions_made(tmp_path / "run") == 40
+    (tmp_path / "run" / "checkpoint.old" / "replay.safetensors").write_bytes(b"cut")
+    with pytest.raises(UserError, match="checkpoint is damaged"):
+        train_policy(config)
+    kept = tmp_path / "kept"
+    export_run(tmp_path / "run", kept)
+    with pytest.raises(UserError, match="keeps no snapshot"):
+        export_run(kept, tmp_path / "again")
+    (kept / "curve.csv").write_text("garbage,1\n2,3\n")
+    with pytest.raises(UserError, match=r"curve.csv: is no learning curve"):
+        export_run(kept, tmp_path / "again")
+    (kept / "config.json").write_text("{")
+    for attempt in (lambda: export_run(kept, tmp_path / "again"), lambda: train_policy(configure(kept))):
+        with pytest.raises(UserError, match="cannot be read as JSON"):
+            attempt()
+    assert not (tmp_path / "again").exists()
 
 
 def test_what_is_no_run_cannot_be_exported(tmp_path):

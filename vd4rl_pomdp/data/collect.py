@@ -107,9 +107,7 @@ def _check(config: CollectConfig) -> None:
     if config.episodes < 1 or config.episodes_per_shard < 1:
         raise UserError("--episodes and --episodes-per-shard must be at least 1")
     if config.quality == "medium_expert" and config.episodes < 2:
-        raise UserError(
-            "--episodes must be at least 2 for medium_expert, half by the medium and half by the expert actor"
-        )
+        raise UserError("--episodes must be at least 2 for medium_expert, which is half medium and half expert")
     if config.seed < 0:
         raise UserError(f"--seed is {config.seed}; it must be 0 or more")
     if config.actor is not None and config.quality not in ("medium", "expert"):
