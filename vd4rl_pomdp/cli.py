@@ -170,7 +170,7 @@ class TableCommand:
     """Tabulate all sets: returns of their 200 episodes, played by physics alone, and what collecting them costs."""
 
     out: Path = Path("results/datasets")
-    """Folder of the table; sets that are in it already are not played again."""
+    """Folder of the table; sets that are in it already, by the same actors, are not played again."""
     tasks: list[str] = field(default_factory=lambda: _names("TASKS"))
     """Tasks."""
     qualities: list[str] = field(default_factory=lambda: _names("QUALITIES"))

@@ -179,7 +179,9 @@ def restore_checkpoint(model: SAC, run: Path) -> int:
     try:
         stored, replay = load_file(folder / "model.safetensors"), load_file(folder / "replay.safetensors")
     except (OSError, SafetensorError) as error:
-        raise UserError(f"{folder}: this checkpoint is damaged ({error}); go on with --start-from {run} in a new --out") from error
+        raise UserError(
+            f"{folder}: this checkpoint is damaged ({error}); go on with --start-from {run} in a new --out"
+        ) from error
     model.set_random_seed(model.seed + counters["decisions"])  # other episodes than the run began with
     policy = model.policy
     leaves, structure = _flatten(_states(model))
