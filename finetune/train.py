@@ -17,35 +17,46 @@ from finetune.features import BATCH_STREAM, ExactSampler, FeatureSampler, Frozen
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.envs.parity import render_info
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, rows_of
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import EncoderCard, load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.probes import probe_state
-from vd4rl_pomdp.runs.checkpoint import load_checkpoint, save_checkpoint, seed_everything
+from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint, seed_everything
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.folder import RunFolder, jsonable, write_json
 from vd4rl_pomdp.runs.metrics import MetricsLog
 from vd4rl_pomdp.runs.progress import ProgressLine
-from vd4rl_pomdp.tasks import get_task
+from vd4rl_pomdp.tasks import FRAME_SIZE, get_task
 
 
 def finetune(config: FinetuneConfig) -> RunFolder:
     """Run the stage, or go on with it; writes the policy and `episodes.csv` into the run's folder."""
     get_algorithm(config.algorithm)
+    refuse_outside(
+        config, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, gamma=(0, 1), n_step=1,
+        alpha=0, views=0, shift=(0, FRAME_SIZE - 1), eval_every=1, eval_episodes=1, eval_length=1, log_every=1,
+        checkpoint_every=1,
+    )  # fmt: skip
+    device = pick_device(config.device)
     dataset = open_dataset(config.data)
+    if not dataset.num_transitions:
+        raise UserError(f"{config.data}: holds no transition; every episode in it is a single row")
     encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim)
     if card.end_to_end:
         config = replace(config, algorithm=card.end_to_end, views=0)
     if encoder.reads_state:
         dataset.states()
     run = RunFolder(config.out, "finetune", config)
+    quality = dataset.quality or card.quality
+    card = replace(card, quality=quality)  # the set that the policy is trained on names its rows
     write_json(run.path / "labels.json", _labels(config, card))
     if run.finished:
         return run
     _keep_encoder(config.encoder, run.path)
-    dataset.to(pick_device(config.device))
-    _trainer(config, dataset, encoder.to(dataset.t.device), card, run).run(run)
+    dataset.to(device)
+    _trainer(config, dataset, encoder.to(device), card, run).run(run)
     return run
 
 
@@ -95,25 +106,26 @@ class Trainer:
         self.algorithm, self.sampler, self.generator = algorithm, sampler, generator
         self.config, self.card = config, card
         self.step = 0
+        self.metrics: dict[str, torch.Tensor] = {}
+        """The newest value of each: an actor is not updated at every step."""
         self.seconds = 0.0
 
     def run(self, run: RunFolder) -> None:
         """Train to the end, from the newest checkpoint if there is one."""
         config = self.config
-        self._restore(load_checkpoint(run.checkpoint))
+        restore_checkpoint(run.checkpoint, self._restore)
         drop_rows_after(run.path / "episodes.csv", self.step)
         before = self.seconds
         log = MetricsLog(run.path / "metrics.jsonl", self.step, config.wandb, jsonable(asdict(config)))
-        metrics: dict[str, torch.Tensor] = {}
         title = f"finetune {config.algorithm} on {self.card.method}"
         with ProgressLine(title, config.updates, "updates", self.step) as progress:
             while self.step < config.updates:
-                metrics |= self.algorithm.update(self.sampler.sample())  # type: ignore[arg-type]
+                self.metrics |= self.algorithm.update(self.sampler.sample())  # type: ignore[arg-type]
                 self.step += 1
                 progress.advance()
                 last = self.step == config.updates
                 if last or self.step % config.log_every == 0:
-                    row = {name: float(value) for name, value in metrics.items()}
+                    row = {name: float(value) for name, value in self.metrics.items()}
                     log.write(self.step, row)
                     progress.advance(0, **row)
                 if last or self.step % config.eval_every == 0:
@@ -150,20 +162,22 @@ class Trainer:
         rows = rows_of(episodes, _labels(config, self.card) | {"step": self.step})
         append_rows(run.path / "episodes.csv", rows)
         if episodes[0].film is not None:
-            np.savez_compressed(run.path / "film.npz", **episodes[0].film)  # type: ignore[arg-type]
+            temporary = run.path / ".film.tmp.npz"
+            np.savez_compressed(temporary, **episodes[0].film)  # type: ignore[arg-type]
+            temporary.replace(run.path / "film.npz")
         return float(np.mean([row["score"] for row in rows]))
 
     def _state(self) -> dict[str, Any]:
         state = {"step": self.step, "seconds": self.seconds, "algorithm": self.algorithm.state_dict()}
+        state["metrics"] = self.metrics
         state["batches"] = self.generator.get_state()
         if isinstance(self.sampler, ExactSampler | PixelSampler):
             state |= {"corruption": self.sampler.corruption.stream.position, "shifts": self.sampler.shifts.position}
         return state
 
-    def _restore(self, state: dict[str, Any] | None) -> None:
-        if state is None:
-            return
+    def _restore(self, state: dict[str, Any]) -> None:
         self.step, self.seconds = state["step"], state["seconds"]
+        self.metrics = state.get("metrics", {})
         self.algorithm.load_state_dict(state["algorithm"])
         self.generator.set_state(state["batches"])
         if isinstance(self.sampler, ExactSampler | PixelSampler):

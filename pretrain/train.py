@@ -12,17 +12,18 @@ from pretrain.objectives import build_objective, get_method
 from vd4rl_pomdp.augmentation import random_shift
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, make_corruption
 from vd4rl_pomdp.data import Dataset, WindowSampler, open_dataset
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
+from vd4rl_pomdp.nn.frame import FRAME_ENCODERS
 from vd4rl_pomdp.objective import Objective
-from vd4rl_pomdp.runs.checkpoint import load_checkpoint, save_checkpoint, seed_everything
+from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint, seed_everything
 from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.folder import RunFolder, jsonable
 from vd4rl_pomdp.runs.metrics import MetricsLog, read_metrics
 from vd4rl_pomdp.runs.progress import ProgressLine
-from vd4rl_pomdp.tasks import get_task
+from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, get_task
 from vd4rl_pomdp.types import Windows
 
 SHIFT_STREAM, BATCH_STREAM = 1, 2
@@ -32,7 +33,7 @@ SHIFT_STREAM, BATCH_STREAM = 1, 2
 def pretrain(config: PretrainConfig) -> RunFolder:
     """Run the stage, or go on with it, and write `out/encoder`; returns the run's folder."""
     method = get_method(config.method)
-    make_corruption(config)
+    _check(config)
     dataset = open_dataset(config.data)
     task = _task_of(dataset, config)
     seed_everything(config.seed)
@@ -84,7 +85,7 @@ class Trainer:
 
     def run(self, run: RunFolder, steps: int) -> None:
         """Train up to `steps`, from the newest checkpoint if there is one."""
-        self._restore(load_checkpoint(run.checkpoint))
+        restore_checkpoint(run.checkpoint, self._restore)
         before = self.seconds
         log = MetricsLog(run.path / "metrics.jsonl", self.step, self.config.wandb, jsonable(asdict(self.config)))
         with ProgressLine(f"pretrain {self.config.method}", steps, "steps", self.step) as progress:
@@ -112,9 +113,7 @@ class Trainer:
             "shifts": self.shifts.position,
         }
 
-    def _restore(self, state: dict[str, Any] | None) -> None:
-        if state is None:
-            return
+    def _restore(self, state: dict[str, Any]) -> None:
         self.step, self.seconds = state["step"], state["seconds"]
         self.objective.load_state_dict(state["objective"])
         self.optimiser.load_state_dict(state["optimiser"])
@@ -128,8 +127,20 @@ def corruption_of(config: CorruptionConfig) -> CorruptionConfig:
     return CorruptionConfig(**{f.name: getattr(config, f.name) for f in fields(CorruptionConfig)})
 
 
+def _check(config: PretrainConfig) -> None:
+    """Refuse settings that cannot work, before anything is read or written."""
+    refuse_outside(
+        config, seed=(0, MAX_SEED), steps=0, batch_size=1, window=2, learning_rate=0, shift=(0, FRAME_SIZE - 1),
+        feature_dim=1, hidden_dim=1, gru_layers=1, head_dim=1, m=0, n=0, history_window=0, max_k=1, codes=1,
+        homer_codes=0, self_prediction=0, l2_states=0, log_every=1, checkpoint_every=1,
+    )  # fmt: skip
+    if config.frame_encoder not in FRAME_ENCODERS:
+        raise UserError(f"unknown frame encoder {config.frame_encoder!r}: choose one of {', '.join(FRAME_ENCODERS)}")
+    stack = torch.zeros(1, 3 * FRAME_STACK, FRAME_SIZE, FRAME_SIZE, dtype=torch.uint8)
+    make_corruption(config)(stack, torch.zeros(1, dtype=torch.int64))  # which fails where it does not fit a frame
+
+
 def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
-    _refuse_below({"max_k": 1, "batch_size": 1, "window": 2, "codes": 1, "m": 0, "n": 0, "homer_codes": 0}, config)
     actions = dataset.action[dataset.t > 0]
     target = make_action_target(config.action_target, actions.numpy(), config.codes, config.seed)
     state_dim = dataset.states().shape[1] if get_method(config.method).reads_state else 0
@@ -138,17 +149,12 @@ def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
     return objective
 
 
-def _refuse_below(lowest: dict[str, int], config: PretrainConfig) -> None:
-    for name, low in lowest.items():
-        value = getattr(config, name)
-        if value is not None and value < low:
-            raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {low}")
-
-
 def _task_of(dataset: Dataset, config: PretrainConfig) -> str:
     name = config.task or dataset.task
     if name is None:
         raise UserError(f"{config.data}: cannot tell the task of this set; pass --task")
+    if dataset.task is not None and name != dataset.task:
+        raise UserError(f"{config.data}: is a set of {dataset.task}, not of {name}; leave --task out")
     task = get_task(name)
     if task.action_dim != dataset.action_dim:
         raise UserError(

@@ -260,15 +260,6 @@ def test_a_start_that_does_not_fit_is_one_sentence(configure, tmp_path):
         train_policy(configure(tmp_path / "new", start_from=tmp_path / "old", hidden=8))
 
 
-def test_settings_that_train_nothing_are_refused_before_anything_is_written(configure, tmp_path):
-    from vd4rl_pomdp.policies.train import AT_LEAST_ONE, train_policy
-
-    for name in AT_LEAST_ONE:
-        with pytest.raises(UserError, match=f"--{name.replace('_', '-')} must be at least 1"):
-            train_policy(configure(tmp_path / "run", **{name: 0}))
-    assert not (tmp_path / "run").exists()
-
-
 def test_a_folder_with_something_else_is_refused_untouched(configure, tmp_path):
     from vd4rl_pomdp.policies.train import train_policy
 

@@ -2,6 +2,7 @@
 
 import csv
 import hashlib
+import shutil
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.evaluation import append_rows, drop_rows_after, evaluate_run, read_rows
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.runs import checkpoint
 
@@ -194,10 +196,123 @@ def test_user_slips_are_one_line(data, encoder, tmp_path):
     other = write_fake_set(tmp_path / "humanoid_walk" / "expert", [20, 20], action_dim=21)
     with pytest.raises(UserError, match="6 action dimensions"):
         run_finetune(smoke_finetune(encoder, other, tmp_path / "d"))
-    for wrong in ({"m": -1}, {"n": -1}, {"max_k": 0}, {"homer_codes": -1}):
-        with pytest.raises(UserError, match="must be at least"):
-            run_pretrain(smoke_pretrain(data, tmp_path / "e", **wrong))
-    assert not any((tmp_path / name).exists() for name in "abcde")
+    assert not any((tmp_path / name).exists() for name in "abcd")
+
+
+BELOW = {
+    **{"m": -1, "n": -1, "max_k": 0, "homer_codes": -1, "steps": -1, "window": 1, "feature_dim": 0, "hidden_dim": 0},
+    **{"gru_layers": 0, "head_dim": 0, "history_window": -1, "self_prediction": -1.0, "l2_states": float("nan")},
+    **{"patch_size": 0, "patch_count": -1, "patch_fill": 256, "zeroed_frames": -1},
+}
+BELOW_IN_BOTH = {
+    **{"seed": -1, "batch_size": 0, "learning_rate": float("nan"), "shift": -1, "log_every": 0, "checkpoint_every": 0},
+}
+BELOW_IN_FINETUNING = {
+    **{"updates": 0, "gamma": 1.5, "n_step": 0, "alpha": -1.0, "views": -1, "eval_every": 0, "eval_episodes": 0},
+    **{"eval_length": -1, "hidden_dim": 0},
+}
+
+
+@pytest.mark.parametrize(("field", "value"), [*BELOW.items(), *BELOW_IN_BOTH.items()])
+def test_numbers_out_of_range_stop_pretraining_before_it_begins(data, tmp_path, field, value):
+    with pytest.raises(UserError, match=f"--{field.replace('_', '-')} is {value}; it must be at least"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "out", **{field: value}))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(("field", "value"), [*BELOW_IN_FINETUNING.items(), *BELOW_IN_BOTH.items()])
+def test_numbers_out_of_range_stop_finetuning_before_it_begins(data, tmp_path, field, value):
+    with pytest.raises(UserError, match=f"--{field.replace('_', '-')} is {value}; it must be at least"):
+        run_finetune(smoke_finetune(tmp_path / "encoder", data, tmp_path / "out", **{field: value}))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"patch_size": 85}, "exceeds the image"),
+        ({"zeroed_frames": 4}, "cannot zero 4 of 3"),
+        ({"device": "meta"}, "unknown device 'meta'"),
+        ({"frame_encoder": "state"}, "unknown frame encoder 'state'"),
+        ({"task": "cheetah_run"}, "is a set of walker_walk, not of cheetah_run"),
+    ],
+)
+def test_what_does_not_fit_leaves_no_run_behind(data, tmp_path, change, message):
+    with pytest.raises(UserError, match=message):
+        run_pretrain(smoke_pretrain(data, tmp_path / "out", **change))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_set_without_transitions_and_a_missing_gpu_leave_no_finetuning_behind(encoder, data, tmp_path):
+    single = write_fake_set(tmp_path / "single" / "walker_walk", [1, 1])
+    for given, change in ((single, {}), (data, {"device": "cuda:99"})):
+        with pytest.raises(UserError, match=r"holds no transition|no such GPU"):
+            run_finetune(smoke_finetune(encoder, given, tmp_path / "out", **change))
+        assert not (tmp_path / "out").exists()
+
+
+def test_rows_are_named_after_the_set_that_the_policy_learned_from(encoder, data, tmp_path):
+    other = write_fake_set(tmp_path / "walker_walk" / "medium", [20, 25])
+    run = run_finetune(smoke_finetune(encoder, other, tmp_path / "out", updates=2, batch_size=4, eval_length=2))
+    assert {row["quality"] for row in csv.DictReader((run.path / "episodes.csv").open())} == {"medium"}
+
+
+def test_a_checkpoint_of_another_config_is_one_line(encoder, data, tmp_path):
+    changes = {"updates": 2, "batch_size": 4, "eval_length": 2}
+    narrow, wide = (
+        smoke_finetune(encoder, data, tmp_path / name, hidden_dim=units, **changes)
+        for name, units in (("narrow", 8), ("wide", 16))
+    )
+    for config in (narrow, wide):
+        run_finetune(config)
+        (config.out / "timing.json").unlink()
+    shutil.rmtree(wide.out / "checkpoint")
+    shutil.copytree(narrow.out / "checkpoint", wide.out / "checkpoint")
+    with pytest.raises(UserError, match=r"wide/checkpoint: this checkpoint is damaged or of another") as caught:
+        run_finetune(wide)
+    assert "\n" not in str(caught.value)
+
+
+def test_metrics_between_two_actor_steps_survive_a_cut(encoder, data, tmp_path, monkeypatch):
+    """The actor learns at every other update: a row right after a resumption shows its last value all the same."""
+    changes = {"updates": 6, "log_every": 1, "checkpoint_every": 2, "eval_every": 6, "batch_size": 4, "eval_length": 2}
+    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes))
+    cut = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
+    with monkeypatch.context() as patch:
+        cut_at(patch, "finetune.train", 2)
+        with pytest.raises(CutError):
+            run_finetune(cut)
+    run_finetune(cut)
+    assert contents(tmp_path / "cut") == contents(whole.path)
+
+
+def test_an_evaluation_names_its_step_and_touches_no_other_file(encoder, data, tmp_path):
+    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2))
+    (run.path / "timing.json").unlink()  # an unfinished run has a step, too
+    with pytest.raises(UserError, match="--episodes is 0"):
+        evaluate_run(run.path, None, 0, 1)
+    with pytest.raises(UserError, match="unknown corruption 'fog'"):
+        evaluate_run(run.path, "fog", 1, 1)
+    with pytest.raises(UserError, match="holds no evaluated run"):
+        evaluate_run(encoder.parent, None, 1, 1)
+    assert [row["step"] for row in evaluate_run(run.path, None, 1, 1)] == [2]
+    thesis = tmp_path / "thesis.csv"
+    thesis.write_text("a,b\n1,2\n")
+    with pytest.raises(UserError, match="has no column 'method'"):
+        append_rows(thesis, [])
+    assert thesis.read_text() == "a,b\n1,2\n"
+
+
+def test_a_line_that_was_cut_is_dropped_with_what_follows_the_checkpoint(tmp_path):
+    path = tmp_path / "episodes.csv"
+    row = dict.fromkeys(("method", "task", "quality", "corruption", "algorithm"), "x")
+    row |= dict.fromkeys(("seed", "episode", "episode_seed", "return", "length", "score"), 1)
+    append_rows(path, [row | {"step": 1}, row | {"step": 2}])
+    path.write_text(path.read_text() + "mik+a,walker_w")
+    with pytest.raises(UserError, match="a row is not whole"):
+        read_rows(path)
+    drop_rows_after(path, 1)
+    assert [row["step"] for row in read_rows(path)] == [1]
 
 
 def test_td3_bc_finds_the_better_action_and_bc_the_common_one():

@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         _dispatch(COMMANDS, words, "vd4rl-pomdp")
     except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
     except FloatingPointError as error:
         print(f"error: training diverged, {error}; lower --learning-rate or use --precision fp32", file=sys.stderr)
@@ -97,7 +97,7 @@ def _parse(config: Any, words: Arguments, program: str, default: Any = None) -> 
 def _one_line(box: str, program: str) -> str:
     """tyro's boxed message, without its title and frame, as one sentence."""
     text = " ".join(line for line in box.splitlines() if not line.startswith(("╭", "╰")))
-    text = re.sub(r"[\u2500-\u257f]+", " ", text.partition("For full helptext")[0])
+    text = re.sub(r"[\u2500-\u257f]+|-{5,}", " ", text.partition("For full helptext")[0])
     return f"{' '.join(text.split())} (see `{program} --help`)"
 
 
@@ -280,6 +280,8 @@ def _evaluate(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.evaluation import append_rows, evaluate_run
 
     command = _parse(EvaluateCommand, words, program)
+    if command.out is not None:
+        append_rows(command.out, [])  # before any episode is played
     rows = evaluate_run(command.run, command.corruption, command.episodes, command.workers)
     if command.out is not None:
         append_rows(command.out, rows)

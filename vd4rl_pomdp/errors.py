@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import errno
+import math
 from pathlib import Path
+from typing import Any
 
 
 class UserError(ValueError):
@@ -11,6 +13,20 @@ class UserError(ValueError):
 
     The command line prints the message and exits with code 2; a library caller catches a ValueError.
     """
+
+
+MAX_SEED = 2**31 - 1
+"""Largest seed that every random generator in use takes."""
+
+
+def refuse_outside(config: Any, **ranges: float | tuple[float, float]) -> None:
+    """Raise UserError, naming the flag, for a field outside its range (lowest, or lowest and highest); None passes."""
+    for name, limits in ranges.items():
+        low, high = limits if isinstance(limits, tuple) else (limits, math.inf)
+        value = getattr(config, name)
+        if value is not None and not low <= value <= high:
+            most = "" if high == math.inf else f" and at most {high}"
+            raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {low}{most}")
 
 
 def disk_error(path: Path | str | None, error: OSError) -> UserError:

@@ -11,13 +11,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.corruptions import CorruptionConfig, make_corruption
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
 from vd4rl_pomdp.envs.rendering import Render
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import load_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy
-from vd4rl_pomdp.runs.folder import read_json
+from vd4rl_pomdp.runs.folder import read_json, write_csv
 from vd4rl_pomdp.runs.workers import default_workers, run_jobs
 from vd4rl_pomdp.tasks import SCORE_DIVISOR, get_task
 
@@ -116,7 +117,8 @@ def rows_of(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, A
 
 
 def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Append rows to an `episodes.csv`, writing its header first."""
+    """Append rows to an `episodes.csv`, writing its header first; another kind of file raises UserError untouched."""
+    read_rows(path)
     new = not path.exists() or path.stat().st_size == 0
     with path.open("a", newline="") as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
@@ -125,15 +127,41 @@ def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
+def read_rows(path: Path) -> list[dict[str, Any]]:
+    """Rows of an `episodes.csv`, numbers parsed, none if there is no file or it is empty.
+
+    Raises:
+        UserError: the file was not written by this package, or is damaged.
+    """
+    if not path.is_file() or path.stat().st_size == 0:
+        return []
+    whole = ("seed", "step", "episode", "episode_seed", "length")
+    try:
+        with path.open(newline="") as file:
+            reader = csv.DictReader(file)
+            missing = [name for name in COLUMNS if name not in (reader.fieldnames or [])]
+            if missing:
+                raise UserError(f"{path}: has no column {missing[0]!r}; it was not written by this package")
+            return [
+                row | {k: int(row[k]) for k in whole} | {k: float(row[k]) for k in ("return", "score")}
+                for row in reader
+            ]
+    except UserError:
+        raise
+    except (ValueError, TypeError) as error:
+        raise UserError(f"{path}: a row is not whole ({error}); remove it") from error
+
+
 def drop_rows_after(path: Path, step: int) -> None:
-    """Forget evaluations that a cut run made after its last checkpoint."""
+    """Forget evaluations that a cut run made after its last checkpoint, and a last line that is not whole."""
     if not path.exists():
         return
-    with path.open(newline="") as file:
-        kept = [row for row in csv.DictReader(file) if int(row["step"]) <= step]
-    path.unlink()
+    whole = path.read_text().rpartition("\n")[0].splitlines()
+    kept = [row for row in csv.DictReader(whole) if int(row["step"]) <= step]
     if kept:
-        append_rows(path, kept)
+        write_csv(path, COLUMNS, kept)
+    else:
+        path.unlink()
 
 
 _AGENTS: dict[tuple, Agent] = {}
@@ -182,15 +210,24 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
         workers: processes, 0 for every core.
 
     Returns:
-        Rows of `episodes.csv`.
+        Rows of `episodes.csv`; `step` is that of the run's newest policy.
+
+    Raises:
+        UserError: an unknown corruption, no episode, or a folder without an evaluated run.
     """
+    if episodes < 1:
+        raise UserError(f"--episodes is {episodes}; it must be at least 1")
+    evaluated = read_rows(run / "episodes.csv")
+    if not evaluated:
+        raise UserError(f"{run}: holds no evaluated run; name a folder that `vd4rl-pomdp finetune` wrote")
     labels = read_json(run / "labels.json")
     card = load_encoder(run / "encoder")[1]
     chosen = CorruptionConfig(**card.corruption) if corruption is None else CorruptionConfig(corruption)
+    make_corruption(chosen)
     jobs = [
         EpisodeJob(run / "encoder", run / "policy", 0, card.task, chosen, episode, film=False)
         for episode in range(episodes)
     ]
-    step = read_json(run / "timing.json").get("updates", 0) if (run / "timing.json").exists() else 0
+    step = max(row["step"] for row in evaluated)
     done = evaluate(jobs, workers or default_workers())
     return rows_of(done, labels | {"corruption": chosen.corruption, "step": step})

@@ -13,6 +13,7 @@ Shape suffixes: B batch, T rows of a window, S frames of a stack, C = 3*S channe
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass, fields, replace
 from enum import IntEnum
 from typing import Any, Self
@@ -42,6 +43,9 @@ class Batch:
         if name not in self.keys():
             raise KeyError(name)
         return getattr(self, name)
+
+    def __iter__(self) -> Iterator[str]:
+        return iter(self.keys())
 
     def keys(self) -> tuple[str, ...]:
         """Names of the tensors."""

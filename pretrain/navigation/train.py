@@ -23,14 +23,14 @@ from pretrain.navigation.probe import ErrorSums, StateProbe, TrueStates, refit
 from pretrain.objectives import build_objective, get_method
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.experiments.navigation.exogenous import ExogenousNoise
 from vd4rl_pomdp.experiments.navigation.observations import SHAPES, observe, open_maze_set, shrink
 from vd4rl_pomdp.mazes import MazeSpec
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
 from vd4rl_pomdp.objective import InverseObjective
-from vd4rl_pomdp.runs.checkpoint import load_checkpoint, save_checkpoint, seed_everything
+from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint, seed_everything
 from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.folder import RunFolder, jsonable, write_json
 from vd4rl_pomdp.runs.metrics import MetricsLog
@@ -153,7 +153,7 @@ class Trainer:
 
     def run(self, run: RunFolder, steps: int) -> None:
         """Train up to `steps`, from the newest checkpoint if there is one."""
-        self._restore(load_checkpoint(run.checkpoint))
+        restore_checkpoint(run.checkpoint, self._restore)
         before = self.seconds
         log = MetricsLog(run.path / "metrics.jsonl", self.step, self.config.wandb, jsonable(asdict(self.config)))
         with ProgressLine(f"{self.data.maze.name} {self.config.method}", steps, "steps", self.step) as progress:
@@ -189,9 +189,7 @@ class Trainer:
             "batches": self.generator.get_state(),
         }
 
-    def _restore(self, state: dict[str, Any] | None) -> None:
-        if state is None:
-            return
+    def _restore(self, state: dict[str, Any]) -> None:
         self.step, self.seconds = state["step"], state["seconds"]
         self.objective.load_state_dict(state["objective"])
         self.probe.load_state_dict(state["probe"])
@@ -351,14 +349,10 @@ def make_objective(data: MazeData, config: NavigationConfig) -> InverseObjective
 def _check(config: NavigationConfig) -> None:
     """Refuse settings that cannot work, before anything is read or written."""
     get_method(config.method)
-    lowest = {
-        "steps": 1, "batch_size": 1, "window": 2, "max_k": 1, "codes": 1, "m": 0, "n": 0, "burn_in": 0,
-        "average_last": 1, "log_every": 1, "evaluation_windows": 1, "refit_windows": 1, "refit_steps": 1,
-    }  # fmt: skip
-    for name, low in lowest.items():
-        value = getattr(config, name)
-        if value is not None and value < low:
-            raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {low}")
+    refuse_outside(
+        config, seed=(0, MAX_SEED), steps=1, batch_size=1, window=2, max_k=1, codes=1, m=0, n=0, burn_in=0,
+        average_last=1, log_every=1, checkpoint_every=1, evaluation_windows=1, refit_windows=1, refit_steps=1,
+    )  # fmt: skip
     if config.picture not in SHAPES:
         raise UserError(f"unknown picture {config.picture!r}: choose one of {', '.join(SHAPES)}")
     if config.literal_future and config.method != "mik+a":

@@ -72,3 +72,16 @@ def test_differing_dtypes_are_all_listed(tmp_path):
 def test_physics_without_a_task_is_refused(tmp_path):
     with pytest.raises(UserError, match="has physics but names no task"):
         check_dataset(write_fake_set(tmp_path / "set", (4,), physics_dim=2), tmp_path / "cache", true_replay)
+
+
+@pytest.mark.parametrize(("action_dim", "physics"), [(6, 0.0), (4, 0.0), (6, 1e30)])
+def test_states_and_actions_of_another_simulator_are_one_line(tmp_path, action_dim, physics):
+    """A state too narrow, an action too narrow, a state that no simulator survives."""
+    width = 18 if action_dim == 4 or physics else 5
+    folder = write_fake_set(tmp_path / "walker_walk", (4,), action_dim=action_dim, physics_dim=width)
+    if physics:
+        with h5py.File(folder / "0_fake.hdf5", "a") as file:
+            file["physics"][...] = physics
+    with pytest.raises(UserError, match=r"the episode of row 0 cannot be replayed in walker_walk \(.+\)") as caught:
+        check_dataset(folder, tmp_path / "cache")
+    assert "\n" not in str(caught.value)

@@ -124,7 +124,11 @@ def test_an_episode_shorter_than_the_window_is_named(dataset):
             call()
 
 
-@pytest.mark.parametrize("index", [7, [7], (7,), np.int64(7), np.array([7]), torch.tensor(7), torch.tensor([7])])
+ARRAYS = [np.array([7]), np.array([7], np.uint64), np.arange(7, 8)[::-1], np.broadcast_to(np.int64(7), (1,))]
+
+
+@pytest.mark.parametrize("index", [7, [7], (7,), np.int64(7), torch.tensor(7), torch.tensor([7]), *ARRAYS])
+@pytest.mark.filterwarnings("error")
 def test_an_index_may_be_any_integers(dataset, index):
     assert dataset.transitions(index).key.tolist() == [row_key(torch.tensor(2), torch.tensor(1)).item()]
     assert dataset.windows(index, 2).key[:, 0].tolist() == dataset.transitions(index).key.tolist()
@@ -147,6 +151,21 @@ def test_an_empty_index_gives_an_empty_batch(dataset):
 def test_counts_below_one_are_refused(dataset, arguments):
     with pytest.raises(UserError, match=f"{next(iter(arguments))} is 0"):
         dataset.transitions(0, **arguments)
+
+
+@pytest.mark.parametrize("batch_size", [0, -1])
+def test_samplers_need_a_batch(dataset, batch_size):
+    with pytest.raises(UserError, match=f"batch_size is {batch_size}"):
+        TransitionSampler(dataset, batch_size, torch.Generator())
+    with pytest.raises(UserError, match=f"batch_size is {batch_size}"):
+        WindowSampler(dataset, batch_size, 2, torch.Generator())
+
+
+def test_a_batch_can_be_asked_for_its_tensors(dataset):
+    batch = dataset.transitions(0)
+    assert "obs" in batch
+    assert "observation" not in batch
+    assert tuple(batch) == batch.keys()
 
 
 def test_gathered_frames_do_not_share_the_map(dataset):

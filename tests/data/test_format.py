@@ -42,7 +42,7 @@ def test_shards_are_ordered_by_name_then_by_number(tmp_path, names, expected):
 
 
 def test_only_visible_shards_are_listed(tmp_path):
-    for name in (".0_a.hdf5.tmp", ".0_b.hdf5", "0_a.hdf5.part", "0_a.hdf5", "collection.json"):
+    for name in (".0_a.hdf5.tmp", ".0_b.hdf5", "0_a.txt", "0_a.hdf5", "collection.json"):
         (tmp_path / name).touch()
     assert [p.name for p in shard_paths(tmp_path)] == ["0_a.hdf5"]
 
@@ -173,3 +173,26 @@ def test_damaged_pixels_are_an_error(tmp_path):
     path.write_bytes(content)
     with pytest.raises(UserError, match=r"0_fake\.hdf5: is truncated, damaged"):
         read_shard(path)
+
+
+def test_a_key_that_is_no_array_is_named(shard):
+    with h5py.File(shard, "a") as file:
+        file.create_group("physics")
+    with pytest.raises(UserError, match="has no 'physics'"):
+        read_shard(shard)
+
+
+@pytest.mark.parametrize("stored", ["[1]", "{", 5])
+def test_attributes_that_are_no_json_object_are_refused(shard, stored):
+    with h5py.File(shard, "a") as file:
+        file.attrs["vd4rl_pomdp"] = stored
+    with pytest.raises(UserError, match=r"0_fake\.hdf5: "):
+        read_attributes(shard)
+
+
+def test_capital_suffixes_are_shards_and_a_cut_download_is_no_set(tmp_path):
+    write_fake_set(tmp_path, (4, 4), cuts=(4,), names=["0_fake.hdf5", "1_fake.HDF5"])
+    assert [path.name for path in shard_paths(tmp_path)] == ["0_fake.hdf5", "1_fake.HDF5"]
+    (tmp_path / "2_fake.hdf5.part").touch()
+    with pytest.raises(UserError, match=r"2_fake\.hdf5\.part: the set's download is not finished"):
+        shard_paths(tmp_path)

@@ -96,6 +96,22 @@ def test_verify_finds_a_flipped_byte_and_open_a_short_file(tmp_path, cache, name
     verify_store(open_store(folder, cache))  # decoded anew
 
 
+@pytest.mark.parametrize("content", ["", "{"])
+def test_a_broken_description_is_decoded_anew(tmp_path, cache, content):
+    folder = write_fake_set(tmp_path / "set")
+    store = open_store(folder, cache)
+    (store.folder / "meta.json").write_text(content)
+    assert open_store(folder, cache).meta == store.meta
+
+
+def test_an_unreadable_array_is_one_line(tmp_path, cache):
+    store = open_store(write_fake_set(tmp_path / "set"), cache)
+    file = store.folder / "action.npy"
+    file.write_bytes(bytes(file.stat().st_size))
+    with pytest.raises(UserError, match=r"action\.npy: is damaged; delete"):
+        store.array("action")
+
+
 def test_two_processes_decode_once_and_agree(tmp_path, cache, monkeypatch):
     folder = write_fake_set(tmp_path / "set", (5, 4), cuts=(3,))
     log = tmp_path / "log"

@@ -9,6 +9,7 @@ from gymnasium.utils.env_checker import check_env
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys, make_corruption
 from vd4rl_pomdp.envs import GYM_IDS
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.types import row_key
 
 
@@ -86,3 +87,11 @@ def test_the_environment_corrupts_a_row_as_a_batch_would(name):
     batch = make_corruption(name)(torch.stack([step.clean for step in steps]), keys)
     torch.testing.assert_close(torch.stack([step.obs for step in steps]), batch, rtol=0, atol=0)
     assert not torch.equal(batch[0], steps[0].clean)
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"), [({"length": 0}, "episode of 0"), ({"length": -1}, "of -1"), ({"render": "x"}, "'x'")]
+)
+def test_bad_arguments_are_refused(arguments, message):
+    with pytest.raises(UserError, match=message):
+        make("WalkerWalk", **arguments)

@@ -94,3 +94,20 @@ def test_bad_encoder_folders_are_refused_in_one_line(tmp_path):
     (tmp_path / "config.json").write_text(json.dumps(config))
     with pytest.raises(UserError, match="unknown"):
         load_encoder(tmp_path)
+
+
+@pytest.mark.parametrize(
+    ("part", "field", "value"),
+    [("encoder", "hidden_dim", "64"), ("encoder", "size", 2), ("pretrain", "corruption", {"fog": 1})],
+)
+def test_an_encoder_card_of_nonsense_is_one_line(tmp_path, part, field, value):
+    save_encoder(tmp_path, make("gru", False), CARD)
+    config = json.loads((tmp_path / "config.json").read_text())
+    config[part][field] = value
+    (tmp_path / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match=r"config\.json: names no encoder") as caught:
+        load_encoder(tmp_path)
+    assert "\n" not in str(caught.value)
+    (tmp_path / "config.json").write_bytes(b"\x80\x04")
+    with pytest.raises(UserError, match="not an encoder folder"):
+        load_encoder(tmp_path)

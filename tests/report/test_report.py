@@ -116,7 +116,20 @@ def test_bad_input_is_one_line(tmp_path):
     write_run(tmp_path / "b", "acro", 0, {10: [2.0]})
     with pytest.raises(UserError, match="two runs of one method"):
         write_report([tmp_path / "a", tmp_path / "b"], tmp_path / "out")
-    (tmp_path / "a" / "metrics.jsonl").write_text("{")
+    (tmp_path / "a" / "metrics.jsonl").write_text("{\n")
     with pytest.raises(UserError, match="not JSON"):
         write_report([tmp_path / "a"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_cut_rows_and_films_are_named(tmp_path):
+    write_run(tmp_path / "a", "acro", 0, {10: [1.0]})
+    rows = tmp_path / "a" / "episodes.csv"
+    whole = rows.read_text()
+    rows.write_text(whole + "acro,walker_w")
+    with pytest.raises(UserError, match=r"episodes\.csv: a row is not whole"):
+        write_report([tmp_path / "a"], tmp_path / "out")
+    rows.write_text(whole)
+    (tmp_path / "a" / "film.npz").write_bytes(b"cut")
+    with pytest.raises(UserError, match=r"film\.npz: cannot be read"):
+        write_report([tmp_path / "a"], tmp_path / "out")

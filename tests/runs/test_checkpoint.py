@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.runs.checkpoint import load_checkpoint, save_checkpoint
+from vd4rl_pomdp.runs.checkpoint import load_checkpoint, restore_checkpoint, save_checkpoint
 from vd4rl_pomdp.runs.metrics import MetricsLog
 
 
@@ -43,6 +43,9 @@ def test_damage_is_one_sentence(tmp_path):
     (folder / "state.safetensors").write_bytes(b"\x80\x04pickle")
     with pytest.raises(UserError, match="damaged or of another format"):
         load_checkpoint(folder)
+    save_checkpoint(folder, {"step": 1})
+    with pytest.raises(UserError, match=r"another format or config \('updates'\)"):
+        restore_checkpoint(folder, lambda state: state["updates"])
 
 
 def test_metrics_after_the_checkpoint_are_dropped(tmp_path):

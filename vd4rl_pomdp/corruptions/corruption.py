@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_integers, hash_keys
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_outside
 
 Mode = Literal["resample", "emission"]
 _CHANNELS = 3
@@ -141,13 +141,15 @@ class Corruption:
 
 
 def make_corruption(config: CorruptionConfig | str) -> Corruption:
-    """Build a corruption from its config, or from its name with default fields; unknown names raise UserError."""
+    """Build a corruption from its config, or from its name with default fields; an unknown name or a field
+    out of range raises UserError."""
     if isinstance(config, str):
         config = CorruptionConfig(config)
     names = [] if config.corruption == "none" else config.corruption.split("+")
     unknown = [name for name in names if name not in STAGES]
     if unknown:
         raise UserError(f"unknown corruption {config.corruption!r}: choose one of {', '.join(CORRUPTIONS)}")
+    refuse_outside(config, patch_size=1, patch_count=1, patch_fill=(0, 255), zeroed_frames=1)
     return Corruption(config.corruption, [STAGES[name](config) for name in names])
 
 

@@ -74,7 +74,15 @@ def _replay_error(dataset: Dataset, replay: ReplayFn | None) -> float | None:
     worst = 0.0
     for start, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):
         if end - start > 1:
-            replayed = replay(dataset.task, dataset.physics[start], action[start + 1 : end])
+            try:
+                replayed = replay(dataset.task, dataset.physics[start], action[start + 1 : end])
+            except UserError:
+                raise
+            except (RuntimeError, ValueError) as error:  # dm_control's, also where the simulation diverges
+                raise UserError(
+                    f"{dataset.path}: the episode of row {start} cannot be replayed in {dataset.task} "
+                    f"({str(error).splitlines()[0]}); put the set in a folder called like its task, or collect it again"
+                ) from error
             worst = max(worst, float(np.abs(replayed - reward[start + 1 : end]).max()))
     return worst
 

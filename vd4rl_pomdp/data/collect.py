@@ -16,7 +16,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.errors import MAX_SEED, UserError, disk_error, refuse_outside
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.folder import jsonable, read_json, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
@@ -102,14 +102,11 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
 def _check(config: CollectConfig) -> None:
     """Refuse settings that make no set."""
     get_task(config.task)
+    refuse_outside(config, episodes=1, episodes_per_shard=1, seed=(0, MAX_SEED))
     if config.quality not in QUALITIES:
         raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(QUALITIES)}")
-    if config.episodes < 1 or config.episodes_per_shard < 1:
-        raise UserError("--episodes and --episodes-per-shard must be at least 1")
     if config.quality == "medium_expert" and config.episodes < 2:
         raise UserError("--episodes must be at least 2 for medium_expert, which is half medium and half expert")
-    if config.seed < 0:
-        raise UserError(f"--seed is {config.seed}; it must be 0 or more")
     if config.actor is not None and config.quality not in ("medium", "expert"):
         raise UserError(f"--actor is for medium or expert sets, not {config.quality}: leave it out or change --quality")
 

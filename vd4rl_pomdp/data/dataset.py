@@ -120,7 +120,7 @@ class Dataset:
 
         A stack never reaches before its episode: there the first frame is repeated.
         """
-        _require_positive(frame_stack=frame_stack)
+        require_positive(frame_stack=frame_stack)
         back = torch.arange(frame_stack - 1, -1, -1, device=rows.device)
         first = self.episode_start[self.episode[rows]]
         index = torch.maximum(rows[..., None] - back, first[..., None])
@@ -164,7 +164,7 @@ class Dataset:
 
         An episode's last row has no successor: there they are 0, 1 and the row itself.
         """
-        _require_positive(n_step=n_step)
+        require_positive(n_step=n_step)
         last = (self.episode_end - 1)[self.episode[rows]]
         step = torch.arange(n_step, device=rows.device)
         inside = rows[:, None] + step < last[:, None]
@@ -208,7 +208,7 @@ class Dataset:
         )
 
     def _windows_per_episode(self, length: int) -> Tensor:
-        _require_positive(length=length)
+        require_positive(length=length)
         short = torch.nonzero(self.episode_end - self.episode_start < length)
         if len(short):
             episode = int(short[0, 0])
@@ -231,18 +231,22 @@ class Dataset:
 
     def _index(self, index: Index, size: int) -> Tensor:
         """`index` as (B,) int64 on the set's device; checked where it is, so a CPU index never waits for a GPU."""
+        if isinstance(index, np.ndarray):
+            index = index.copy()  # torch takes neither negative strides nor, without a warning, read-only memory
         number = torch.atleast_1d(torch.as_tensor(index))
         if not number.numel():
             return torch.zeros(0, dtype=torch.int64, device=self.t.device)
         if number.is_floating_point() or number.dtype == torch.bool or number.ndim != 1:
             raise IndexError(f"an index is an integer or a flat list of them, not {number.dtype} of {number.ndim} axes")
+        number = number.to(torch.int64)
         low, high = int(number.min()), int(number.max())
         if low < 0 or high >= size:
             raise IndexError(f"index {low if low < 0 else high} is outside 0..{size - 1}")
-        return number.to(self.t.device, torch.int64)
+        return number.to(self.t.device)
 
 
-def _require_positive(**values: int) -> None:
+def require_positive(**values: int) -> None:
+    """Raise UserError for a count below 1."""
     for name, value in values.items():
         if value < 1:
             raise UserError(f"{name} is {value}; it must be at least 1")

@@ -42,13 +42,16 @@ def shard_paths(folder: Path) -> list[Path]:
     `9_mixed`, and the two halves of a medium_expert folder are not interleaved. Hidden files are no shards.
 
     Raises:
-        UserError: there is no such folder, or no shard in it.
+        UserError: there is no such folder, no shard in it, or a download of it was cut.
     """
     if folder.is_file():
         return [folder]
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; collect a set there or download one with `vd4rl-pomdp data`")
-    shards = [p for p in folder.iterdir() if p.suffix in SUFFIXES and not p.name.startswith(".")]
+    partial = next(folder.glob("[!.]*.part"), None)
+    if partial:
+        raise UserError(f"{partial}: the set's download is not finished; start the same `data download` command again")
+    shards = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
     if not shards:
         inner = next((p.parent for suffix in SUFFIXES for p in sorted(folder.rglob(f"[!.]*{suffix}"))), None)
         hint = f"name a folder of shards such as {inner}" if inner else "collect or download a set there"
@@ -104,7 +107,11 @@ def _encode(rows: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> by
 def read_attributes(path: Path) -> dict[str, Any]:
     """What `write_shard` kept with a shard; empty for a published one."""
     with _open(path) as file:
-        return json.loads(file.attrs.get(_ATTRIBUTE, "{}"))
+        stored = file.attrs.get(_ATTRIBUTE, "{}")
+        attributes = json.loads(stored) if isinstance(stored, str) else None
+        if not isinstance(attributes, dict):
+            raise UserError(f"{path}: its attribute {_ATTRIBUTE!r} is no JSON object; {_REPAIR}")
+        return attributes
 
 
 def read_dtypes(path: Path) -> dict[str, str]:
@@ -184,10 +191,11 @@ def _one_line(error: Exception) -> str:
 def _present(path: Path, file: h5py.File) -> list[str]:
     """The format's keys in a file; a missing one is an error, apart from physics."""
     keys = [FRAMES_KEY, *_ROW_KEYS]
-    missing = [key for key in keys if key != _OPTIONAL and not isinstance(file.get(key), h5py.Dataset)]
+    wanted = [key for key in keys if key != _OPTIONAL or key in file]
+    missing = [key for key in wanted if not isinstance(file.get(key), h5py.Dataset)]
     if missing:
         raise UserError(f"{path}: has no {missing[0]!r}, so it is no V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
-    return [key for key in keys if key in file]
+    return wanted
 
 
 def _validate(path: Path, key: str, value: np.ndarray, count: int) -> None:

@@ -6,7 +6,7 @@ from collections.abc import Iterator
 
 import torch
 
-from vd4rl_pomdp.data.dataset import Dataset
+from vd4rl_pomdp.data.dataset import Dataset, require_positive
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_STACK
 from vd4rl_pomdp.types import Transitions, Windows
@@ -26,6 +26,7 @@ class WindowSampler:
         generator: torch.Generator,
         frame_stack: int = FRAME_STACK,
     ) -> None:
+        require_positive(batch_size=batch_size)
         self._dataset, self._batch_size, self._length = dataset, batch_size, length
         self._generator, self._frame_stack = generator, frame_stack
         self._count = dataset.num_windows(length)
@@ -54,6 +55,7 @@ class TransitionSampler:
     ) -> None:
         if not dataset.num_transitions:
             raise UserError(f"{dataset.path}: holds no transition; every episode in it is a single row")
+        require_positive(batch_size=batch_size, n_step=n_step)
         self._dataset, self._batch_size, self._generator = dataset, batch_size, generator
         self._n_step, self._frame_stack, self._gamma = n_step, frame_stack, gamma
 

@@ -61,7 +61,14 @@ class Store:
 
     def array(self, key: str) -> np.ndarray:
         """Rows of `action` (N, A) float32, `reward` or `discount` (N,) float64, or `step_type` (N,) uint8."""
-        return np.load(self.folder / f"{key}.npy")
+        try:
+            return np.load(self.folder / f"{key}.npy")
+        except (OSError, ValueError) as error:
+            raise self.damaged(f"{key}.npy") from error
+
+    def damaged(self, name: str) -> UserError:
+        """A sentence for a file that has changed since it was decoded."""
+        return UserError(f"{self.folder / name}: is damaged; delete {self.folder} and the set is decoded anew")
 
     def physics(self) -> np.ndarray | None:
         """(N, P) float64 simulator states, mapped read-only; None if the set has none."""
@@ -100,7 +107,7 @@ def verify_store(store: Store) -> None:
     """Recompute every checksum; raises UserError naming the file that has changed since it was decoded."""
     for name, file in store.meta["files"].items():
         if _checksum(store.folder / name) != file["blake2b"]:
-            raise UserError(f"{store.folder / name}: is damaged; delete {store.folder} and the set is decoded anew")
+            raise store.damaged(name)
 
 
 def _key(shards: Sequence[Path]) -> str:
@@ -109,10 +116,11 @@ def _key(shards: Sequence[Path]) -> str:
 
 
 def _read_meta(folder: Path) -> dict[str, Any] | None:
-    """The folder's meta.json; None unless every file is there in its full size."""
-    if not (folder / _META).is_file():
+    """The folder's meta.json; None unless it is whole and every file is there in its full size."""
+    try:
+        meta = json.loads((folder / _META).read_text())
+    except (OSError, ValueError):
         return None
-    meta = json.loads((folder / _META).read_text())
     files = [(folder / name, file["bytes"]) for name, file in meta["files"].items()]
     return meta if all(path.is_file() and path.stat().st_size == size for path, size in files) else None
 

@@ -9,6 +9,7 @@ import numpy as np
 
 from vd4rl_pomdp.envs import rendering
 from vd4rl_pomdp.envs.rendering import Render, suite
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import ACTION_REPEAT, EPISODE_TRANSITIONS, Task, get_task
 from vd4rl_pomdp.types import StepType
 
@@ -43,7 +44,9 @@ class PixelEnv:
         self.simulator = _load(self.task, self._random)
         """The dm_control environment."""
         self._pixels = pixels
-        self._length = length or EPISODE_TRANSITIONS
+        self._length = EPISODE_TRANSITIONS if length is None else length
+        if self._length < 1:
+            raise UserError(f"an episode of {length} decisions is too short; it needs at least 1")
         self._decisions = 0
         if pixels:
             rendering.prepare(self.physics, render)

@@ -10,7 +10,7 @@ import hashlib
 import os
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
@@ -56,6 +56,8 @@ def check_mujoco(version: str = mujoco.__version__) -> None:
 
 def prepare(physics: Any, render: Render) -> None:
     """Restore the old sky and set the shadow map's size; must be called before the first render of `physics`."""
+    if render not in get_args(Render):
+        raise UserError(f"unknown rendering {render!r}: choose one of {', '.join(get_args(Render))}")
     model = physics.model
     sky = _sky()
     number = next(i for i in range(model.ntex) if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX)

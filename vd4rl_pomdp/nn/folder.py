@@ -10,6 +10,7 @@ from typing import Any
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 
+from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 
@@ -67,13 +68,21 @@ def load_encoder(folder: Path, task: str | None = None, action_dim: int | None =
         raise UserError(
             f"{folder}: this encoder was pretrained on {card.task}, not on {task}; pretrain one on this task"
         )
-    encoder = Encoder(encoder_config)
+    try:
+        encoder = Encoder(encoder_config)
+        CorruptionConfig(**card.corruption)
+    except (TypeError, RuntimeError, ValueError) as error:
+        raise UserError(f"{folder}/config.json: names no encoder ({_first_line(error)}); pretrain it again") from error
     try:
         encoder.load_state_dict(load_file(folder / "model.safetensors"))
     except (OSError, SafetensorError, RuntimeError) as error:
-        reason = str(error).splitlines()[0]
+        reason = _first_line(error)
         raise UserError(f"{folder}/model.safetensors: cannot be read ({reason}); pretrain the encoder again") from error
     return encoder.eval().requires_grad_(False), card
+
+
+def _first_line(error: Exception) -> str:
+    return str(error).splitlines()[0]
 
 
 def _read_config(folder: Path) -> dict[str, Any]:
@@ -83,7 +92,7 @@ def _read_config(folder: Path) -> dict[str, Any]:
     try:
         config = json.loads((folder / "config.json").read_text())
         EncoderConfig(**config["encoder"]), EncoderCard(**config["pretrain"])
-    except (OSError, json.JSONDecodeError, KeyError, TypeError) as error:
+    except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{folder}: not an encoder folder (config.json: {error}); `vd4rl-pomdp pretrain` writes one as RUN/encoder"
         ) from error

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.policies import learner
 from vd4rl_pomdp.policies.actor import Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
@@ -36,9 +36,6 @@ from vd4rl_pomdp.tasks import get_task
 
 if TYPE_CHECKING:
     from sbx import SAC
-
-AT_LEAST_ONE = ("decisions", "hidden", "n_step", "envs", "batch_size", "replay_size", "eval_every", "eval_episodes")
-"""Settings that must be positive."""
 
 
 def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None] | None = None) -> dict[str, Path]:
@@ -83,9 +80,10 @@ def decisions_made(run: Path) -> int:
 
 def _check(config: PolicyConfig) -> dict[str, Any]:
     """Settings to keep in config.json; raises UserError if the folder holds others (a run's length may change)."""
-    for name in AT_LEAST_ONE:
-        if getattr(config, name) < 1:
-            raise UserError(f"--{name.replace('_', '-')} must be at least 1")
+    refuse_outside(
+        config, seed=(0, MAX_SEED), decisions=1, learning_rate=0, hidden=1, n_step=1, envs=1, batch_size=1,
+        temperature=0, temperature_rate=0, replay_size=1, eval_every=1, eval_episodes=1, refill=0, critic_warmup=0,
+    )  # fmt: skip
     settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in ("out", "decisions", "stop_at")}
     path = config.out / "config.json"
     if path.exists():

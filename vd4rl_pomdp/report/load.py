@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import csv
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import COLUMNS
+from vd4rl_pomdp.evaluation import read_rows
 from vd4rl_pomdp.runs.folder import read_json
 from vd4rl_pomdp.runs.metrics import read_metrics
 
@@ -43,8 +43,11 @@ class Run:
         path = self.path / "film.npz"
         if not path.exists():
             return None
-        with np.load(path) as file:
-            return dict(file)
+        try:
+            with np.load(path) as file:
+                return dict(file)
+        except (OSError, ValueError, EOFError, BadZipFile) as error:
+            raise UserError(f"{path}: cannot be read ({error}); remove it, and the report goes without") from error
 
 
 def load_runs(paths: list[Path]) -> list[Run]:
@@ -74,7 +77,7 @@ def _load(folder: Path) -> Run:
         path=folder,
         stage=record["stage"],
         record=record,
-        rows=_rows(folder / "episodes.csv"),
+        rows=read_rows(folder / "episodes.csv"),
         metrics=read_metrics(folder / "metrics.jsonl"),
         seconds=read_json(timing)["seconds"] if timing.exists() else None,
         representation=_representation(folder),
@@ -92,20 +95,6 @@ def _representation(folder: Path) -> dict[str, float | None]:
         "probe_velocity": probe.get("probe_velocity"),
         "pretrain_seconds": timing.get("seconds"),
     }
-
-
-def _rows(path: Path) -> list[dict[str, Any]]:
-    if not path.exists():
-        return []
-    with path.open(newline="") as file:
-        reader = csv.DictReader(file)
-        missing = [name for name in COLUMNS if name not in (reader.fieldnames or [])]
-        if missing:
-            raise UserError(f"{path}: has no column {missing[0]!r}; it was not written by this package")
-        whole = ("seed", "step", "episode", "episode_seed", "length")
-        return [
-            row | {k: int(row[k]) for k in whole} | {k: float(row[k]) for k in ("return", "score")} for row in reader
-        ]
 
 
 def _refuse_twins(runs: list[Run]) -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +35,30 @@ def load_checkpoint(folder: Path) -> State | None:
     for candidate in (folder, folder.with_name(folder.name + ".old")):
         if not candidate.exists():
             continue
-        try:
+        with _readable(candidate):
             tree = json.loads((candidate / "state.json").read_text())
             return _join(tree, load_file(candidate / "state.safetensors"))
-        except (OSError, SafetensorError, json.JSONDecodeError, KeyError) as error:
-            raise UserError(
-                f"{candidate}: this checkpoint is damaged or of another format ({str(error).splitlines()[0]}); "
-                "remove it to start the run again"
-            ) from error
     return None
+
+
+def restore_checkpoint(folder: Path, restore: Callable[[State], None]) -> None:
+    """Hand the newest whole checkpoint, if there is one, to `restore`; one that does not fit raises UserError."""
+    state = load_checkpoint(folder)
+    if state is not None:
+        with _readable(folder):
+            restore(state)
+
+
+@contextmanager
+def _readable(folder: Path) -> Iterator[None]:
+    """Whatever a checkpoint that is damaged or of another run leads to becomes a sentence."""
+    try:
+        yield
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
+        raise UserError(
+            f"{folder}: this checkpoint is damaged or of another format or config "
+            f"({str(error).splitlines()[0]}); remove it to start the run again"
+        ) from error
 
 
 def _split(node: Any, path: str, tensors: dict[str, Tensor]) -> Any:

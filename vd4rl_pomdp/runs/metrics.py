@@ -18,8 +18,10 @@ class MetricsLog:
 
     def __init__(self, path: Path, step: int, wandb: WandbMode = "off", config: dict[str, Any] | None = None) -> None:
         self._path = path
-        lines = path.read_text().splitlines(keepends=True) if path.exists() else []
-        path.write_text("".join(line for line in lines if line.endswith("\n") and json.loads(line)["step"] <= step))
+        kept = [row for row in read_metrics(path) if row["step"] <= step]
+        temporary = path.with_name(f".{path.name}.tmp")
+        temporary.write_text("".join(json.dumps(row) + "\n" for row in kept))
+        temporary.replace(path)
         self._wandb = _start_wandb(wandb, path.parent, config or {})
 
     def write(self, step: int, metrics: dict[str, float]) -> None:
@@ -39,12 +41,16 @@ class MetricsLog:
 
 
 def read_metrics(path: Path) -> list[dict[str, float]]:
-    """Rows of a metrics.jsonl, none if there is no file; a damaged line raises UserError."""
+    """Rows of a metrics.jsonl, none if there is no file; a last line that is not whole is left out.
+
+    Raises:
+        UserError: a line is damaged.
+    """
     if not path.exists():
         return []
     try:
-        return [json.loads(line) for line in path.read_text().splitlines()]
-    except json.JSONDecodeError as error:
+        return [json.loads(line) for line in path.read_text().rpartition("\n")[0].splitlines()]
+    except ValueError as error:
         raise UserError(f"{path}: a line is not JSON ({error})") from error
 
 

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Protocol
 
 from vd4rl_pomdp.corruptions import make_corruption
+from vd4rl_pomdp.errors import UserError
 
 
 class Sweep(Protocol):
@@ -37,12 +38,19 @@ def _stages(sweep: Sweep, method: str, corruption: str, seed: int) -> list[list[
     folder = sweep.out / method / corruption / f"seed{seed}"
     common = ["--data", str(sweep.data), "--preset", sweep.preset, "--seed", str(seed)]
     chosen = ["--method", method, "--corruption", corruption, "--out", str(folder / "pretrain")]
-    stages = [["pretrain", *common, *chosen, *shlex.split(sweep.pretrain)]]
+    stages = [["pretrain", *common, *chosen, *_flags(sweep.pretrain)]]
     for algorithm in sweep.algorithms:
         place = ["--encoder", str(folder / "pretrain" / "encoder"), "--algorithm", algorithm]
         out = ["--out", str(folder / f"finetune-{algorithm}")]
-        stages.append(["finetune", *common, *place, *out, *shlex.split(sweep.finetune)])
+        stages.append(["finetune", *common, *place, *out, *_flags(sweep.finetune)])
     return stages
+
+
+def _flags(text: str) -> list[str]:
+    try:
+        return shlex.split(text)
+    except ValueError as error:
+        raise UserError(f"the flags {text!r} cannot be split into words ({error}): close the quotation") from error
 
 
 def _check_names(sweep: Sweep) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from vd4rl_pomdp.data.collect import claim_set, episode_seed, join_rollouts, record_set
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_outside
 from vd4rl_pomdp.mazes import get_maze
 from vd4rl_pomdp.runs.folder import jsonable
 from vd4rl_pomdp.runs.progress import ProgressLine
@@ -104,9 +104,7 @@ def drive(maze: str, rows: int, action_repeat: int = 5, noise: float = 0.5, seed
 
 def _check(config: CollectConfig) -> None:
     get_maze(config.maze)
-    for name in ("trajectories", "action_repeat", "trajectories_per_shard", "workers"):
-        if getattr(config, name) < 1:
-            raise UserError(f"--{name.replace('_', '-')} is {getattr(config, name)}; it must be at least 1")
+    refuse_outside(config, trajectories=1, action_repeat=1, trajectories_per_shard=1, workers=1)
     if config.trajectory_rows < 2:
         raise UserError(f"--trajectory-rows is {config.trajectory_rows}; a trajectory needs at least 2")
     if not config.noise >= 0:
