@@ -158,17 +158,22 @@ def _card(words: Arguments, program: str) -> None:
     print(f"card: {write_card(_parse(CardCommand, words, program).path)}")
 
 
+def _names(table: str) -> list[str]:
+    """Names in a table of `tasks`, which needs numpy: not imported before a command does."""
+    from vd4rl_pomdp import tasks
+
+    return list(getattr(tasks, table))
+
+
 @dataclass(frozen=True)
 class TableCommand:
     """Tabulate all sets: returns of their 200 episodes, played by physics alone, and what collecting them costs."""
 
     out: Path = Path("results/datasets")
-    """Folder of the table; sets that are in it already are not played again."""
-    tasks: list[str] = field(default_factory=lambda: ["walker_walk", "cheetah_run", "humanoid_walk"])
+    """Folder of the table; sets that are in it already, by the same actors, are not played again."""
+    tasks: list[str] = field(default_factory=lambda: _names("TASKS"))
     """Tasks."""
-    qualities: list[str] = field(
-        default_factory=lambda: ["random", "medium_replay", "medium", "medium_expert", "expert"]
-    )
+    qualities: list[str] = field(default_factory=lambda: _names("QUALITIES"))
     """Qualities; one whose actor does not ship is left out."""
     timed_episodes: int = 4
     """Episodes of the short rendered collection that is timed for each task."""
