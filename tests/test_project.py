@@ -17,11 +17,8 @@ MAY_IMPORT = {
     "pretrain": {"pretrain", "baselines", "vd4rl_pomdp"},
     "finetune": {"finetune", "vd4rl_pomdp"},
 }
-DISPATCHERS = (
-    *("vd4rl_pomdp/cli.py", "vd4rl_pomdp/runs/sweep.py"),
-    *("vd4rl_pomdp/experiments/bench.py", "vd4rl_pomdp/experiments/bench_memory.py"),
-)
-"""Files that call the stages or check their names, and import them inside functions only."""
+DISPATCHERS = ("vd4rl_pomdp/cli.py", "vd4rl_pomdp/experiments/bench.py", "vd4rl_pomdp/experiments/bench_memory.py")
+"""Files that call the stages and import them inside functions only."""
 
 
 def imports(tree: ast.AST) -> set[str]:

@@ -373,15 +373,30 @@ def _sweep(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.runs.sweep import sweep_runs
 
     command = _parse(SweepCommand, words, program)
+    _check_names(command)
     for run in sweep_runs(command):
         _run_stages(run, command.dry_run)
 
 
+def _check_names(sweep: SweepCommand) -> None:
+    """Find a misspelt name before the first run, not after the hours that the runs before it take."""
+    from finetune.algorithms import get_algorithm
+    from pretrain.objectives import get_method
+    from vd4rl_pomdp.corruptions import make_corruption
+
+    for check, names in (
+        (get_method, sweep.methods),
+        (make_corruption, sweep.corruptions),
+        (get_algorithm, sweep.algorithms),
+    ):
+        for name in names:
+            check(name)
+
+
 def _run_stages(stages: list[Arguments], dry_run: bool) -> None:
     """Print the stages of a run as one line of shell, and execute them unless `dry_run`."""
-    print(
-        " && ".join(f"vd4rl-pomdp {shlex.join(stage)}" for stage in stages), file=sys.stdout if dry_run else sys.stderr
-    )
+    line = " && ".join(f"vd4rl-pomdp {shlex.join(stage)}" for stage in stages)
+    print(line, file=sys.stdout if dry_run else sys.stderr)
     if not dry_run:
         for stage in stages:
             _dispatch(COMMANDS, stage, "vd4rl-pomdp")
