@@ -1,4 +1,6 @@
 import shlex
+import subprocess
+import sys
 
 import pytest
 
@@ -59,6 +61,11 @@ def test_a_slip_is_one_line_and_exit_code_2(words, message, capsys, tmp_path, mo
     assert error.startswith("error: ")
     assert message in error
     assert [p.name for p in tmp_path.iterdir()] == ["file"], "nothing may be left behind"
+
+
+def test_help_needs_neither_numpy_nor_torch():
+    code = "import sys, vd4rl_pomdp.cli; sys.exit(bool({'numpy', 'torch'} & set(sys.modules)))"
+    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
 
 
 def test_without_words_the_commands_are_listed(capsys):

@@ -1,12 +1,15 @@
 import json
+import sys
 from importlib.metadata import version
 from pathlib import Path
 
 import numpy as np
 import pytest
+from safetensors.numpy import save_file
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies import Actor, Ladder, actor, load_actor, load_ladder, read_actor
+from vd4rl_pomdp.policies.actor import read_ladder
 from vd4rl_pomdp.policies.export import CARD_EPISODES, LADDER_RUNGS, episode_returns
 from vd4rl_pomdp.tasks import get_task
 
@@ -88,6 +91,42 @@ def test_bad_actors_are_refused(tmp_path, monkeypatch):
         load_actor("humanoid_walk", "expert")
     with pytest.raises(UserError, match="no replay actor ships for humanoid_walk"):
         load_ladder("humanoid_walk")
+
+
+def spoil(weights, how):
+    if how == "none":
+        return {"x": np.zeros(3, np.float32)}
+    if how == "narrow":
+        return weights | {"hidden.0.weight": weights["hidden.0.weight"][:20]}
+    if how == "wide":
+        return weights | {f"{n}.{k}": np.repeat(weights[f"{n}.{k}"], 2, -1) for n in HEADS for k in ("weight", "bias")}
+    return weights | {"log_std.bias": np.full_like(weights["log_std.bias"], np.nan)}
+
+
+HEADS = ("mean", "log_std")
+
+
+@pytest.mark.parametrize("how", ["none", "narrow", "wide", "nan"])
+def test_whole_files_whose_weights_are_no_actor_are_refused(tmp_path, how):
+    shipped, path = load_actor("walker_walk", "medium"), tmp_path / "actor.safetensors"
+    Actor(spoil(shipped.weights, how), shipped.card).save(path)
+    with pytest.raises(UserError, match="its weights form no actor of walker_walk"):
+        read_actor(path, get_task("walker_walk"))
+
+
+def test_a_ladder_is_no_actor_and_an_actor_no_ladder():
+    with pytest.raises(UserError, match="form no actor"):
+        read_actor(actor.ASSETS / "walker_walk_replay.safetensors")
+    with pytest.raises(UserError, match="holds no ladder"):
+        read_ladder(actor.ASSETS / "walker_walk_medium.safetensors")
+
+
+@pytest.mark.parametrize("card", [{}, {"card": "{"}, {"card": "[1]"}, {"card": "3"}, {"card": "{}"}])
+def test_a_file_without_a_whole_card_is_one_sentence(tmp_path, card):
+    path = tmp_path / "actor.safetensors"
+    save_file(load_actor("walker_walk", "medium").weights, path, card)
+    with pytest.raises(UserError, match=r"not an actor file|trained on None"):
+        read_actor(path, get_task("walker_walk"))
 
 
 SETTINGS = {
@@ -219,6 +258,53 @@ def test_a_start_that_does_not_fit_is_one_sentence(configure, tmp_path):
     train_policy(configure(tmp_path / "old", decisions=20))
     with pytest.raises(UserError, match="networks of another shape"):
         train_policy(configure(tmp_path / "new", start_from=tmp_path / "old", hidden=8))
+
+
+def test_a_folder_with_something_else_is_refused_untouched(configure, tmp_path):
+    from vd4rl_pomdp.policies.train import train_policy
+
+    (tmp_path / "notes.txt").write_text("mine")
+    with pytest.raises(UserError, match="holds no policy run"):
+        train_policy(configure(tmp_path, decisions=40))
+    assert [path.name for path in tmp_path.iterdir()] == ["notes.txt"]
+
+
+def test_without_the_training_library_nothing_is_begun(tmp_path, monkeypatch):
+    from vd4rl_pomdp.policies.config import PolicyConfig
+    from vd4rl_pomdp.policies.train import train_policy
+
+    monkeypatch.setitem(sys.modules, "sbx", None)  # importing it raises ImportError
+    with pytest.raises(UserError, match=r"pip install 'vd4rl-pomdp\[policy\]'"):
+        train_policy(PolicyConfig("walker_walk", tmp_path / "run"))
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_a_damaged_run_is_one_sentence(configure, tmp_path, monkeypatch):
+    from vd4rl_pomdp.policies import learner
+    from vd4rl_pomdp.policies.export import export_run
+    from vd4rl_pomdp.policies.train import decisions_made, train_policy
+
+    monkeypatch.setattr(learner, "RANDOM_DECISIONS", 1_000)  # no update is compiled
+    config = configure(tmp_path / "run", decisions=40)
+    train_policy(config)
+    checkpoint = tmp_path / "run" / "checkpoint"
+    checkpoint.rename(tmp_path / "run" / "checkpoint.old")  # cut between the two renames of an exchange
+    assert decisions_made(tmp_path / "run") == 40
+    (tmp_path / "run" / "checkpoint.old" / "replay.safetensors").write_bytes(b"cut")
+    with pytest.raises(UserError, match="checkpoint is damaged"):
+        train_policy(config)
+    kept = tmp_path / "kept"
+    export_run(tmp_path / "run", kept)
+    with pytest.raises(UserError, match="keeps no snapshot"):
+        export_run(kept, tmp_path / "again")
+    (kept / "curve.csv").write_text("garbage,1\n2,3\n")
+    with pytest.raises(UserError, match=r"curve.csv: is no learning curve"):
+        export_run(kept, tmp_path / "again")
+    (kept / "config.json").write_text("{")
+    for attempt in (lambda: export_run(kept, tmp_path / "again"), lambda: train_policy(configure(kept))):
+        with pytest.raises(UserError, match="cannot be read as JSON"):
+            attempt()
+    assert not (tmp_path / "again").exists()
 
 
 def test_what_is_no_run_cannot_be_exported(tmp_path):

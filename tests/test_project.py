@@ -18,7 +18,7 @@ MAY_IMPORT = {
     "finetune": {"finetune", "vd4rl_pomdp"},
 }
 DISPATCHERS = ("vd4rl_pomdp/cli.py", "vd4rl_pomdp/experiments/bench.py", "vd4rl_pomdp/experiments/bench_memory.py")
-"""Files that call the stages, and import them inside functions only."""
+"""Files that call the stages and import them inside functions only."""
 
 
 def imports(tree: ast.AST) -> set[str]:

@@ -102,22 +102,28 @@ def smoke_finetune(encoder: Path, data: Path, out: Path, **changes: object) -> f
     return replace(finetune.config.PRESETS["smoke"], encoder=encoder, data=data, out=out, workers=1, **changes)
 
 
-@pytest.mark.parametrize(("algorithm", "views"), [("td3_bc", 2), ("drqv2_bc", 1), ("bc", 1), ("td3_bc", 0)])
-def test_finetuning_resumes_to_the_bit(encoder, data, tmp_path, monkeypatch, algorithm, views):
-    changes = {"algorithm": algorithm, "views": views, "eval_length": 2, "updates": 30, "eval_every": 15}
-    changes |= {"checkpoint_every": 10, "batch_size": 4}
-    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes))
-    cut = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
+def finetune_cut_and_whole(monkeypatch, encoder: Path, data: Path, out: Path, **changes: object) -> Path:
+    """Fine-tune in one go, and again with a cut at the second checkpoint; both must agree. Returns the whole run."""
+    whole = run_finetune(smoke_finetune(encoder, data, out / "whole", **changes))
+    cut = smoke_finetune(encoder, data, out / "cut", **changes)
     with monkeypatch.context() as patch:
         cut_at(patch, "finetune.train", 2)
         with pytest.raises(CutError):
             run_finetune(cut)
     run_finetune(cut)
-    assert contents(tmp_path / "cut") == contents(whole.path)
-    rows = list(csv.DictReader((whole.path / "episodes.csv").open()))
+    assert contents(out / "cut") == contents(whole.path)
+    return whole.path
+
+
+@pytest.mark.parametrize(("algorithm", "views"), [("td3_bc", 2), ("drqv2_bc", 1), ("bc", 1), ("td3_bc", 0)])
+def test_finetuning_resumes_to_the_bit(encoder, data, tmp_path, monkeypatch, algorithm, views):
+    changes = {"algorithm": algorithm, "views": views, "eval_length": 2, "updates": 30, "eval_every": 15}
+    changes |= {"checkpoint_every": 10, "batch_size": 4}
+    whole = finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
+    rows = list(csv.DictReader((whole / "episodes.csv").open()))
     assert [row["step"] for row in rows] == ["15", "30"]
     assert {row["method"] for row in rows} == {"mik+a"}
-    assert not (whole.path / "features.npy").exists()
+    assert not (whole / "features.npy").exists()
 
 
 @pytest.fixture
@@ -129,17 +135,10 @@ def with_states(tmp_path) -> Path:
 def test_references_resume_to_the_bit(with_states, tmp_path, monkeypatch, method):
     made = run_pretrain(smoke_pretrain(with_states, tmp_path / "made", method=method)).path / "encoder"
     changes = {"updates": 12, "eval_every": 6, "checkpoint_every": 4, "batch_size": 4, "eval_length": 2}
-    whole = run_finetune(smoke_finetune(made, with_states, tmp_path / "whole", **changes))
-    cut = smoke_finetune(made, with_states, tmp_path / "cut", **changes)
-    with monkeypatch.context() as patch:
-        cut_at(patch, "finetune.train", 2)
-        with pytest.raises(CutError):
-            run_finetune(cut)
-    run_finetune(cut)
-    assert contents(tmp_path / "cut") == contents(whole.path)
-    trained = (whole.path / "encoder" / "model.safetensors").read_bytes()
+    whole = finetune_cut_and_whole(monkeypatch, made, with_states, tmp_path, **changes)
+    trained = (whole / "encoder" / "model.safetensors").read_bytes()
     assert (trained != (made / "model.safetensors").read_bytes()) == (method != "state")
-    rows = list(csv.DictReader((whole.path / "episodes.csv").open()))
+    rows = list(csv.DictReader((whole / "episodes.csv").open()))
     assert {row["algorithm"] for row in rows} == {{"bc": "bc", "drq_bc": "drqv2_bc", "state": "td3_bc"}[method]}
 
 

@@ -158,17 +158,22 @@ def _card(words: Arguments, program: str) -> None:
     print(f"card: {write_card(_parse(CardCommand, words, program).path)}")
 
 
+def _names(table: str) -> list[str]:
+    """Names in a table of `tasks`, which needs numpy: not imported before a command does."""
+    from vd4rl_pomdp import tasks
+
+    return list(getattr(tasks, table))
+
+
 @dataclass(frozen=True)
 class TableCommand:
     """Tabulate all sets: returns of their 200 episodes, played by physics alone, and what collecting them costs."""
 
     out: Path = Path("results/datasets")
-    """Folder of the table; sets that are in it already are not played again."""
-    tasks: list[str] = field(default_factory=lambda: ["walker_walk", "cheetah_run", "humanoid_walk"])
+    """Folder of the table; sets that are in it already, by the same actors, are not played again."""
+    tasks: list[str] = field(default_factory=lambda: _names("TASKS"))
     """Tasks."""
-    qualities: list[str] = field(
-        default_factory=lambda: ["random", "medium_replay", "medium", "medium_expert", "expert"]
-    )
+    qualities: list[str] = field(default_factory=lambda: _names("QUALITIES"))
     """Qualities; one whose actor does not ship is left out."""
     timed_episodes: int = 4
     """Episodes of the short rendered collection that is timed for each task."""
@@ -368,15 +373,30 @@ def _sweep(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.runs.sweep import sweep_runs
 
     command = _parse(SweepCommand, words, program)
+    _check_names(command)
     for run in sweep_runs(command):
         _run_stages(run, command.dry_run)
 
 
+def _check_names(sweep: SweepCommand) -> None:
+    """Find a misspelt name before the first run, not after the hours that the runs before it take."""
+    from finetune.algorithms import get_algorithm
+    from pretrain.objectives import get_method
+    from vd4rl_pomdp.corruptions import make_corruption
+
+    for check, names in (
+        (get_method, sweep.methods),
+        (make_corruption, sweep.corruptions),
+        (get_algorithm, sweep.algorithms),
+    ):
+        for name in names:
+            check(name)
+
+
 def _run_stages(stages: list[Arguments], dry_run: bool) -> None:
     """Print the stages of a run as one line of shell, and execute them unless `dry_run`."""
-    print(
-        " && ".join(f"vd4rl-pomdp {shlex.join(stage)}" for stage in stages), file=sys.stdout if dry_run else sys.stderr
-    )
+    line = " && ".join(f"vd4rl-pomdp {shlex.join(stage)}" for stage in stages)
+    print(line, file=sys.stdout if dry_run else sys.stderr)
     if not dry_run:
         for stage in stages:
             _dispatch(COMMANDS, stage, "vd4rl-pomdp")

@@ -1,6 +1,7 @@
 """The benchmark's tasks: dm_control's names, dimensions and V-D4RL's conventions, in one place."""
 
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -13,7 +14,8 @@ EPISODE_TRANSITIONS = 500
 """Decisions an episode: 1000 simulator steps at action repeat 2; an episode has one row more."""
 SCORE_DIVISOR = 10.0
 """V-D4RL's normalised score is return / 10."""
-QUALITIES = ("random", "medium_replay", "medium", "medium_expert", "expert")
+Quality = Literal["random", "medium_replay", "medium", "medium_expert", "expert"]
+QUALITIES: tuple[Quality, ...] = get_args(Quality)
 
 
 @dataclass(frozen=True)

@@ -193,6 +193,7 @@ def test_a_folder_with_something_else_is_refused(tmp_path):
         ({"quality": "mixed"}, "cannot collect quality"),
         ({"actor": Path("a.safetensors"), "quality": "medium_replay"}, "--actor is for medium or expert"),
         ({"episodes": 0}, "--episodes is 0; it must be at least 1"),
+        ({"episodes": 1, "quality": "medium_expert"}, "at least 2 for medium_expert"),
         ({"seed": -1}, "--seed is -1; it must be at least 0"),
         ({"actor": Path("a.safetensors")}, "--actor is for medium or expert"),
         ({"actor": Path("a.safetensors"), "quality": "medium_expert"}, "--actor is for medium or expert"),

@@ -1,10 +1,12 @@
 import csv
+import json
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from vd4rl_pomdp.data.collect import CollectConfig, _job, _plan, _roll_out, replay_returns
+from vd4rl_pomdp.data.collect import CollectConfig, _job, _plan, _roll_out, actor_hashes, replay_returns
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments import datasets as module
 
@@ -41,7 +43,39 @@ def test_what_is_in_the_table_is_not_played_again(played, tmp_path, monkeypatch)
     assert [row["quality"] for row in rows] == ["random", "medium"]
 
 
+def test_a_set_whose_actor_has_changed_is_played_again(played, tmp_path, monkeypatch):
+    module.tabulate(tmp_path, ["walker_walk"], ["random", "expert"], 2, 1)
+    monkeypatch.setattr(module, "actor_hashes", lambda config: ["new"] if config.quality == "expert" else [])
+    monkeypatch.setattr(module, "replay_returns", lambda config: [7.0] * config.episodes)
+    rows = module.tabulate(tmp_path, ["walker_walk"], ["random", "expert"], 2, 1)
+    assert [(row["quality"], row["episodes"], row["mean"]) for row in rows] == [
+        ("random", 3, "1.0"),
+        ("expert", 3, "7.0"),
+    ]
+
+
+def test_a_foreign_file_is_not_taken_for_a_table(played, tmp_path):
+    (tmp_path / "returns.csv").write_text("foo\n1\n")
+    with pytest.raises(UserError, match=r"returns\.csv: has other columns"):
+        module.tabulate(tmp_path, ["walker_walk"], ["random"], 2, 1)
+    assert (tmp_path / "returns.csv").read_text() == "foo\n1\n"
+    assert not played
+
+
+def test_the_published_table_is_by_the_actors_that_ship():
+    table = Path(__file__).parents[2] / "results" / "datasets"
+    recorded = json.loads((table / "actors.json").read_text())
+    with (table / "sets.csv").open() as file:
+        sets = [(row["task"], row["quality"]) for row in csv.DictReader(file)]
+    assert set(recorded) == {" ".join(names) for names in sets}
+    shipped = {" ".join(names): actor_hashes(CollectConfig(*names, Path(), 200)) for names in sets}
+    assert recorded == shipped
+
+
 def test_a_slip_is_a_sentence(played, tmp_path):
+    with pytest.raises(UserError, match="--timed-episodes must be at least 1"):
+        module.tabulate(tmp_path, ["walker_walk"], ["random"], 0, 1)
+    assert not played
     with pytest.raises(UserError, match="unknown quality 'good'"):
         module.tabulate(tmp_path, ["walker_walk"], ["good"], 2, 1)
     with pytest.raises(UserError, match="unknown task"):

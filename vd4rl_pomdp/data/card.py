@@ -16,7 +16,7 @@ from vd4rl_pomdp.data.dataset import identity
 from vd4rl_pomdp.data.episodes import join_shards
 from vd4rl_pomdp.data.format import read_attributes, read_rows, read_some_frames, shard_paths
 from vd4rl_pomdp.data.published import published_scores
-from vd4rl_pomdp.errors import disk_error
+from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.folder import read_json
 from vd4rl_pomdp.tasks import SCORE_DIVISOR
 from vd4rl_pomdp.types import StepType
@@ -41,14 +41,16 @@ def write_card(path: Path) -> Path:
     """Describe a set in `card.md` and `card.png`, in its folder.
 
     Args:
-        path: folder of the shards, collected here or published.
+        path: folder of all shards, collected here or published.
 
     Returns:
         The card's file.
 
     Raises:
-        UserError: the set is damaged, or the folder cannot be written.
+        UserError: this is no folder, the set is damaged, or the folder cannot be written.
     """
+    if path.is_file():
+        raise UserError(f"{path}: is one file; a card describes a whole set: name its folder")
     shards = shard_paths(path)
     parts = [read_rows(shard) for shard in shards]
     rows = join_shards(shards, parts)
@@ -60,13 +62,12 @@ def write_card(path: Path) -> Path:
     published = _published(*names)
     film = _film(shards, [len(part["reward"]) for part in parts], starts, lengths, returns)
     text = _text(path, names, attributes, returns, lengths, published)
-    folder = path if path.is_dir() else path.parent
     try:
-        (folder / "card.png").write_bytes(_picture(names, returns, published, film))
-        (folder / "card.md").write_text(text)
+        (path / "card.png").write_bytes(_picture(names, returns, published, film))
+        (path / "card.md").write_text(text)
     except OSError as error:
-        raise disk_error(folder / "card.md", error) from error
-    return folder / "card.md"
+        raise disk_error(path / "card.md", error) from error
+    return path / "card.md"
 
 
 def _published(task: str | None, quality: str | None) -> float | None:
@@ -96,17 +97,18 @@ def _picture(
     figure = Figure(figsize=(8.4, 4.0), layout="constrained", dpi=110)
     above, below = figure.subplots(2, 1, height_ratios=(2.4, 1))
     top = max(returns.max(), published or 0.0)
-    counts, _, _ = above.hist(returns, bins=np.linspace(0, max(top, 1.0) * 1.02, 41), color="#56b4e9")
+    counts, edges, _ = above.hist(returns, bins=np.linspace(0, max(top, 1.0) * 1.02, 41), color="#56b4e9")
     above.axvline(returns.mean(), ymax=LINES, color="#0072b2", label=f"mean of this set, {returns.mean():.1f}")
     if published is not None:
         label = f"published: plain BC on V-D4RL's set of this name, {published:.0f}"
         above.axvline(published, ymax=LINES, color="#d55e00", ls="--", label=label)
-    above.set(xlabel="episode return", ylabel="episodes", title=_title(names), ylim=(0, counts.max() / LINES))
+    above.set(xlabel="episode return", ylabel="episodes", title=_title(names))
+    above.set(xlim=(0, edges[-1]), ylim=(0, counts.max() / LINES))
     above.yaxis.get_major_locator().set_params(integer=True)
     above.spines[["top", "right"]].set_visible(False)
     above.legend(frameon=False, fontsize=8, ncols=2, loc="upper center")
     below.imshow(np.concatenate(list(film.transpose(0, 2, 3, 1)), axis=1), interpolation="nearest")
-    below.set_title("the episode of median return", fontsize=9)
+    below.set_title("the episode of median return, first row to last", fontsize=9)
     below.axis("off")
     buffer = io.BytesIO()
     figure.savefig(buffer, format="png", metadata={"Software": None})

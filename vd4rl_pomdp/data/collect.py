@@ -11,7 +11,7 @@ import time
 from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, Literal
 
 import numpy as np
 
@@ -22,9 +22,8 @@ from vd4rl_pomdp.runs.folder import jsonable, read_json, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
 from vd4rl_pomdp.runs.workers import default_workers, run_jobs
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, get_task
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, QUALITIES, Quality, get_task
 
-Quality = Literal["random", "medium_replay", "medium", "medium_expert", "expert"]
 Policy = Actor | Ladder | None
 """Who acts in a shard: an actor, a ladder of them, or nobody (random actions)."""
 _RUNTIME_FIELDS = ("out", "workers")
@@ -75,14 +74,9 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
         config: what to collect.
         length: decisions an episode; everything but tests keeps the benchmark's.
     """
-    get_task(config.task)
-    refuse_outside(config, episodes=1, episodes_per_shard=1, seed=(0, MAX_SEED))
-    if config.quality not in get_args(Quality):
-        raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(get_args(Quality))}")
-    if config.actor is not None and config.quality not in ("medium", "expert"):
-        raise UserError(f"--actor is for medium or expert sets, not {config.quality}: leave it out or change --quality")
+    _check(config)
     plan = list(_plan(config))
-    _claim(config, [policy for _, _, policy in plan])
+    _claim(config)
     started, frames = time.monotonic(), 0
     with ProgressLine("collect", config.episodes, "episodes") as progress:
         for path, episodes, policy in plan:
@@ -103,6 +97,23 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
 
     write_card(config.out)
     return [path for path, _, _ in plan]
+
+
+def _check(config: CollectConfig) -> None:
+    """Refuse settings that make no set."""
+    get_task(config.task)
+    refuse_outside(config, episodes=1, episodes_per_shard=1, seed=(0, MAX_SEED))
+    if config.quality not in QUALITIES:
+        raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(QUALITIES)}")
+    if config.quality == "medium_expert" and config.episodes < 2:
+        raise UserError("--episodes must be at least 2 for medium_expert, which is half medium and half expert")
+    if config.actor is not None and config.quality not in ("medium", "expert"):
+        raise UserError(f"--actor is for medium or expert sets, not {config.quality}: leave it out or change --quality")
+
+
+def actor_hashes(config: CollectConfig) -> list[str]:
+    """SHA-256 of the files whose actors make the set, sorted."""
+    return sorted({policy.sha256 for _, _, policy in _plan(config) if policy is not None})
 
 
 def replay_returns(config: CollectConfig) -> list[float]:
@@ -210,9 +221,9 @@ def _attributes(config: CollectConfig, path: Path, policy: Policy) -> dict[str, 
     }
 
 
-def _claim(config: CollectConfig, policies: list[Policy]) -> None:
+def _claim(config: CollectConfig) -> None:
     settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS}
-    settings["actors"] = sorted({policy.sha256 for policy in policies if policy is not None})
+    settings["actors"] = actor_hashes(config)
     claim_set(config.out, settings)
 
 

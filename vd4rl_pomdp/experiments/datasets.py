@@ -11,15 +11,16 @@ import csv
 import tempfile
 import time
 from collections.abc import Sequence
+from itertools import product
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.data.collect import CollectConfig, collect, replay_returns
+from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, replay_returns
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import ships
-from vd4rl_pomdp.runs.folder import write_csv, write_json
+from vd4rl_pomdp.runs.folder import read_json, write_csv, write_json
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, QUALITIES, get_task
 
@@ -32,10 +33,11 @@ SETS = ("task", "quality", "episodes", "mean", "min", "max", "seconds_100k")
 
 
 def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_episodes: int, workers: int) -> list[Row]:
-    """Play and time the sets that are not in the table yet, and write it anew.
+    """Play and time the sets that are not in the table yet, or not by the actors that ship now, and write it anew.
 
     Args:
-        out: folder of `returns.csv` (one row an episode), `costs.csv` (one row a task) and `sets.csv`, the table.
+        out: folder of `returns.csv` (one row an episode), `actors.json` (hashes of the actors behind each set),
+            `costs.csv` (one row a task) and `sets.csv`, the table.
         tasks: tasks to add.
         qualities: qualities to add; one whose actor does not ship yet is left out.
         timed_episodes: episodes of the short collection that is timed, on one core.
@@ -43,22 +45,27 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
 
     Returns:
         Rows of the table, in the order of `tasks` and `QUALITIES`.
+
+    Raises:
+        UserError: an unknown task or quality, no episode to time, or a damaged file in the folder.
     """
-    unknown = sorted(set(qualities) - set(QUALITIES))
-    if unknown:
-        raise UserError(f"unknown quality {unknown[0]!r}: choose from {', '.join(QUALITIES)}")
-    for task in tasks:
-        get_task(task)
+    _check(tasks, qualities, timed_episodes)
     out.mkdir(parents=True, exist_ok=True)
-    returns, costs = _read(out / "returns.csv"), _read(out / "costs.csv")
-    for task in tasks:
-        for quality in qualities:
-            if ships(task, quality) and not any((r["task"], r["quality"]) == (task, quality) for r in returns):
-                config = CollectConfig(task, quality, Path(), EPISODES, workers=workers)  # type: ignore[arg-type]
-                played = enumerate(replay_returns(config))
-                returns += [{"task": task, "quality": quality, "episode": i, "return": repr(v)} for i, v in played]
-                write_csv(out / "returns.csv", RETURNS, returns)
-                write_csv(out / "sets.csv", SETS, summarise(returns, costs))
+    returns, costs = _read(out / "returns.csv", RETURNS), _read(out / "costs.csv", COSTS)
+    actors = read_json(out / "actors.json") if (out / "actors.json").exists() else {}
+    for task, quality in product(tasks, qualities):
+        if not ships(task, quality):
+            continue
+        config = CollectConfig(task, quality, Path(), EPISODES, workers=workers)  # type: ignore[arg-type]
+        name, hashes = f"{task} {quality}", actor_hashes(config)
+        if actors.get(name) != hashes:
+            played = enumerate(replay_returns(config))
+            returns = [row for row in returns if (row["task"], row["quality"]) != (task, quality)]
+            returns += [{"task": task, "quality": quality, "episode": i, "return": repr(v)} for i, v in played]
+            write_csv(out / "returns.csv", RETURNS, returns)
+            write_csv(out / "sets.csv", SETS, summarise(returns, costs))
+            actors[name] = hashes
+            write_json(out / "actors.json", actors)
     for task in tasks:
         if not any(row["task"] == task for row in costs):
             costs.append(_cost(task, timed_episodes))
@@ -67,6 +74,16 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
     write_csv(out / "sets.csv", SETS, table)
     write_json(out / "provenance.json", {"git_commit": git_commit(), "versions": versions(), "machine": machine()})
     return table
+
+
+def _check(tasks: Sequence[str], qualities: Sequence[str], timed_episodes: int) -> None:
+    unknown = sorted(set(qualities) - set(QUALITIES))
+    if unknown:
+        raise UserError(f"unknown quality {unknown[0]!r}: choose from {', '.join(QUALITIES)}")
+    if timed_episodes < 1:
+        raise UserError("--timed-episodes must be at least 1")
+    for task in tasks:
+        get_task(task)
 
 
 def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:
@@ -94,8 +111,11 @@ def _cost(task: str, episodes: int) -> Row:
     return {"task": task, "episodes": episodes, "rows": rows, "cpu_seconds": f"{spent:.1f}", "commit": git_commit()}
 
 
-def _read(path: Path) -> list[Row]:
+def _read(path: Path, columns: Sequence[str]) -> list[Row]:
     if not path.exists():
         return []
     with path.open(newline="") as file:
-        return list(csv.DictReader(file))
+        reader = csv.DictReader(file)
+        if tuple(reader.fieldnames or ()) != columns:
+            raise UserError(f"{path}: has other columns than {', '.join(columns)}; remove it or choose another --out")
+        return list(reader)

@@ -20,13 +20,14 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import Task, get_task
+from vd4rl_pomdp.tasks import TASKS, Task, get_task
 
 LOG_STD_RANGE = (-20.0, 2.0)
 OBSERVATION_CLIP = 10.0
 """Standardised observations are cut off here."""
 LAYER_NORM_EPSILON = 1e-6
 ASSETS = Path(__file__).parent / "assets"
+_REMEDY = "make one with `vd4rl-pomdp policy train`"
 
 
 @dataclass(frozen=True)
@@ -151,25 +152,49 @@ def _save(weights: dict[str, np.ndarray], card: dict[str, Any], path: Path) -> N
 
 
 def read_actor(path: Path, task: Task | None = None) -> Actor:
-    """Read an actor file; raises UserError if it is missing, damaged, or made for another task than `task`."""
-    return Actor(*_read(path, task))
+    """Read an actor file; raises UserError if it is missing, damaged, or made for another task than `task`.
+
+    A whole file is not enough: its weights must be finite and act on a state of the task.
+    """
+    actor = Actor(*_read(path, task))
+    _try(path, actor, task)
+    return actor
 
 
 def read_ladder(path: Path, task: Task | None = None) -> Ladder:
-    """Read a ladder's file; raises UserError as `read_actor` does."""
-    return Ladder(*_read(path, task))
+    """Read a ladder's file; raises UserError as `read_actor` does, for any of its actors."""
+    ladder = Ladder(*_read(path, task))
+    steps = ladder.card.get("decisions")
+    if not isinstance(steps, list) or any(len(value) != len(steps) for value in ladder.weights.values()):
+        raise UserError(f"{path}: holds no ladder of actors; {_REMEDY}")
+    for rung in ladder.rungs:
+        _try(path, rung, task)
+    return ladder
 
 
 def _read(path: Path, task: Task | None) -> tuple[dict[str, np.ndarray], dict[str, Any], str]:
     try:
         with safe_open(path, framework="np") as file:
-            card = json.loads((file.metadata() or {})["card"])
+            card = dict(json.loads((file.metadata() or {}).get("card", "none")))
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
-    except (OSError, SafetensorError, KeyError, json.JSONDecodeError) as error:
-        raise UserError(f"{path}: not an actor file ({error}); make one with `vd4rl-pomdp policy train`") from error
+    except (OSError, SafetensorError, ValueError, TypeError) as error:
+        raise UserError(f"{path}: not an actor file ({error}); {_REMEDY}") from error
     if task is not None and card.get("task") != task.name:
         raise UserError(f"{path}: this actor was trained on {card.get('task')}, not on {task.name}")
     return weights, card, hashlib.sha256(path.read_bytes()).hexdigest()
+
+
+def _try(path: Path, actor: Actor, task: Task | None) -> None:
+    """Refuse weights that are not finite, or that make no action out of a state of their task (a maze's has none)."""
+    task = task or TASKS.get(actor.card.get("task", ""))
+    if task is None:
+        return
+    try:
+        action = actor.act(np.zeros(task.state_dim, np.float32), np.random.default_rng(0))
+    except (KeyError, ValueError) as error:
+        raise UserError(f"{path}: its weights form no actor of {task.name} ({error}); {_REMEDY}") from error
+    if action.shape != (task.action_dim,) or not all(np.isfinite(value).all() for value in actor.weights.values()):
+        raise UserError(f"{path}: its weights form no actor of {task.name}; {_REMEDY}")
 
 
 def load_actor(task: str, quality: str) -> Actor:

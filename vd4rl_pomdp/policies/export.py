@@ -19,12 +19,14 @@ import numpy as np
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import Actor, Ladder, read_actor, read_ladder
 from vd4rl_pomdp.policies.state_env import StateEnv
+from vd4rl_pomdp.runs.folder import read_json
 from vd4rl_pomdp.tasks import Task, get_task
 
 CARD_EPISODES = 20
 CARD_SEED = 10_000
 """Episode i of an actor's card starts from environment seed CARD_SEED + i."""
 NETWORKS = "networks.safetensors"
+CURVE_COLUMNS = ("decisions", "return_mean")
 PROGRESS = ("config.json", "curve.csv", NETWORKS)
 """Files of a run from which another one can start."""
 LADDER_RUNGS = 15
@@ -46,9 +48,13 @@ def episode_returns(actor: Actor, task: Task, episodes: int, first_seed: int = C
 
 
 def read_curve(run: Path) -> list[tuple[int, float]]:
-    """Learning curve of a run: (decisions, mean return) rows."""
-    with (run / "curve.csv").open(newline="") as file:
-        return [(int(row["decisions"]), float(row["return_mean"])) for row in csv.DictReader(file)]
+    """Learning curve of a run: (decisions, mean return) rows; raises UserError if it is damaged."""
+    steps, mean = CURVE_COLUMNS
+    try:
+        with (run / "curve.csv").open(newline="") as file:
+            return [(int(row[steps]), float(row[mean])) for row in csv.DictReader(file)]
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{run / 'curve.csv'}: is no learning curve ({error}); take another copy of the run") from error
 
 
 def snapshot_path(run: Path, decisions: int) -> Path:
@@ -71,10 +77,12 @@ def export_run(run: Path, out: Path) -> dict[str, Path]:
     """
     if not (run / "curve.csv").exists() or not (run / "config.json").exists():
         raise UserError(f"{run}: is not the folder of a policy run with a snapshot; `policy train` makes one")
-    config = json.loads((run / "config.json").read_text())
-    task = get_task(config["task"])
+    config = read_json(run / "config.json")
+    task = get_task(config.get("task", ""))
     curve = read_curve(run)
     kept = [row for row in curve if snapshot_path(run, row[0]).exists()]
+    if not kept:
+        raise UserError(f"{run}: keeps no snapshot of its curve; export the run's own folder, not an exported one")
     judged = _judge(run, task, [step for step, _ in sorted(kept, key=lambda row: row[1])[-3:]])
     expert = max(judged, key=lambda step: float(np.mean(judged[step])))
     half = float(np.mean(judged[expert])) / 2

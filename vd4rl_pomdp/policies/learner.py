@@ -18,7 +18,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import OBSERVATION_CLIP, Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
 from vd4rl_pomdp.policies.state_env import StateEnv
-from vd4rl_pomdp.runs.folder import replacing
+from vd4rl_pomdp.runs.folder import read_json, replacing
 from vd4rl_pomdp.tasks import Task
 
 if TYPE_CHECKING:
@@ -163,22 +163,33 @@ def save_checkpoint(model: SAC, run: Path) -> None:
         (fresh / "counters.json").write_text(json.dumps(counters))
 
 
+def newest_checkpoint(run: Path) -> Path | None:
+    """Folder of a run's newest whole checkpoint (see `replacing`), None without one."""
+    return next((path for path in (run / "checkpoint", run / "checkpoint.old") if path.exists()), None)
+
+
 def restore_checkpoint(model: SAC, run: Path) -> int:
     """Load the newest whole checkpoint; returns the decisions made so far, 0 without one. New episodes begin there."""
     import jax
 
-    folder = run / "checkpoint" if (run / "checkpoint").exists() else run / "checkpoint.old"
-    if not folder.exists():
+    folder = newest_checkpoint(run)
+    if folder is None:
         return 0
-    counters = json.loads((folder / "counters.json").read_text())
+    counters = read_json(folder / "counters.json")
+    try:
+        stored, replay = load_file(folder / "model.safetensors"), load_file(folder / "replay.safetensors")
+    except (OSError, SafetensorError) as error:
+        raise UserError(
+            f"{folder}: this checkpoint is damaged ({error}); go on with --start-from {run} in a new --out"
+        ) from error
     model.set_random_seed(model.seed + counters["decisions"])  # other episodes than the run began with
-    stored, policy = load_file(folder / "model.safetensors"), model.policy
+    policy = model.policy
     leaves, structure = _flatten(_states(model))
     restored = [np.asarray(stored[f"{i:04d}"], dtype=np.asarray(leaf).dtype) for i, leaf in enumerate(leaves)]
     states = jax.tree_util.tree_unflatten(structure, [jax.numpy.asarray(leaf) for leaf in restored])
     policy.actor_state, policy.qf_state, model.ent_coef_state, model.key, policy.key = states
     _set_statistics(model, stored)
-    _restore_replay(model.replay_buffer, load_file(folder / "replay.safetensors"), counters["position"])
+    _restore_replay(model.replay_buffer, replay, counters["position"])
     model.num_timesteps, model._n_updates = counters["decisions"], counters["updates"]
     return int(counters["decisions"])
 

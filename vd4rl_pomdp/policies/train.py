@@ -8,13 +8,11 @@ half of the expert's the medium actor, and a ladder of snapshots up to the mediu
 
 from __future__ import annotations
 
-import csv
-import json
 import shutil
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -24,6 +22,7 @@ from vd4rl_pomdp.policies.actor import Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
 from vd4rl_pomdp.policies.export import (
     CARD_SEED,
+    CURVE_COLUMNS,
     NETWORKS,
     PROGRESS,
     episode_returns,
@@ -32,6 +31,7 @@ from vd4rl_pomdp.policies.export import (
     read_curve,
     snapshot_path,
 )
+from vd4rl_pomdp.runs.folder import jsonable, read_json, write_csv, write_json
 from vd4rl_pomdp.tasks import get_task
 
 if TYPE_CHECKING:
@@ -49,12 +49,10 @@ def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None]
         The exported files by quality.
     """
     task = get_task(config.task)
-    refuse_outside(
-        config, seed=(0, MAX_SEED), decisions=1, learning_rate=0, hidden=1, n_step=1, envs=1, batch_size=1,
-        temperature=0, temperature_rate=0, replay_size=1, eval_every=1, eval_episodes=1, refill=0, critic_warmup=0,
-    )  # fmt: skip
-    _claim(config)
+    settings = _check(config)
+    config.out.mkdir(parents=True, exist_ok=True)
     model = learner.build(config, task)
+    write_json(config.out / "config.json", settings)
     done = learner.restore_checkpoint(model, config.out)
     _forget_newer(config.out, done)
     if done == 0 and config.start_from is not None:
@@ -76,40 +74,46 @@ def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None]
 
 def decisions_made(run: Path) -> int:
     """Decisions behind a run's newest checkpoint, 0 for a new run."""
-    counters = run / "checkpoint" / "counters.json"
-    return int(json.loads(counters.read_text())["decisions"]) if counters.exists() else 0
+    folder = learner.newest_checkpoint(run)
+    return int(read_json(folder / "counters.json")["decisions"]) if folder else 0
 
 
-def _claim(config: PolicyConfig) -> None:
-    """Write the run's config, or check that the folder holds the same one (its length may grow)."""
-    settings = {k: v for k, v in asdict(config).items() if k not in ("out", "decisions", "stop_at")}
-    settings["start_from"] = None if config.start_from is None else str(config.start_from)
+def _check(config: PolicyConfig) -> dict[str, Any]:
+    """Settings to keep in config.json; raises UserError if the folder holds others (a run's length may change)."""
+    refuse_outside(
+        config, seed=(0, MAX_SEED), decisions=1, learning_rate=0, hidden=1, n_step=1, envs=1, batch_size=1,
+        temperature=0, temperature_rate=0, replay_size=1, eval_every=1, eval_episodes=1, refill=0, critic_warmup=0,
+    )  # fmt: skip
+    settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in ("out", "decisions", "stop_at")}
     path = config.out / "config.json"
     if path.exists():
-        stored = json.loads(path.read_text())
+        stored = read_json(path)
         differing = [k for k in settings if stored.get(k) != settings[k]]
         if differing:
             raise UserError(f"{config.out}: holds a run with another {', '.join(differing)}; choose another --out")
-        return
+        return stored
+    if config.out.is_dir() and any(not file.name.startswith(".") for file in config.out.iterdir()):
+        raise UserError(f"{config.out}: is not empty and holds no policy run; choose another --out")
     if config.start_from is not None:
         _check_start(config, config.start_from)
-    (config.out / "snapshots").mkdir(parents=True, exist_ok=True)
-    path.write_text(json.dumps(settings, indent=2) + "\n")
+    return settings
 
 
 def _check_start(config: PolicyConfig, start: Path) -> None:
     missing = [name for name in PROGRESS if not (start / name).exists()]
     if missing:
         raise UserError(f"{start}: has no {' and no '.join(missing)}; --start-from takes the folder of a policy run")
-    task = json.loads((start / "config.json").read_text())["task"]
+    task = read_json(start / "config.json").get("task")
     if task != config.task:
         raise UserError(f"{start}: is a run of {task}, not of {config.task}")
+    read_curve(start)
 
 
 def _start_from(model: SAC, config: PolicyConfig, start: Path) -> int:
     """Take over another run's networks, curve and snapshots; its replay is made anew. Returns the decisions so far."""
     learner.start_from_networks(model, start / NETWORKS)
     curve = read_curve(start)
+    (config.out / "snapshots").mkdir(exist_ok=True)
     for step, actor in exported_actors(start, get_task(config.task)):
         actor.save(snapshot_path(config.out, step))
     for step, _ in curve:
@@ -128,12 +132,8 @@ def _record(run: Path, actor: Actor, decisions: int, mean: float) -> None:
 
 
 def _write_curve(run: Path, curve: list[tuple[int, float]]) -> None:
-    temporary = run / ".curve.csv.tmp"
-    with temporary.open("w", newline="") as file:
-        writer = csv.writer(file)
-        writer.writerow(["decisions", "return_mean"])
-        writer.writerows([step, f"{mean:.3f}"] for step, mean in curve)
-    temporary.replace(run / "curve.csv")
+    rows = ({"decisions": step, "return_mean": f"{mean:.3f}"} for step, mean in curve)
+    write_csv(run / "curve.csv", CURVE_COLUMNS, rows)
 
 
 def _forget_newer(run: Path, decisions: int) -> None:

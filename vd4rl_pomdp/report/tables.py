@@ -16,8 +16,6 @@ SETTING = ("corruption", "algorithm")
 GROUP = ("task", "quality", "corruption", "algorithm", "method")
 REFERENCES = ("random", "bc", "drq_bc", "state")
 """Methods that are references: last in a table."""
-
-
 END_TO_END = ("bc", "drq_bc")
 """References that bring their own algorithm."""
 
@@ -47,8 +45,7 @@ def improvement(rows: list[Row]) -> list[Row]:
     for setting, members in _grouped(rows, ("corruption",)):
         final: dict[str, dict[tuple, np.ndarray]] = {}
         for (task, quality, *_), group in _grouped(members, (*GROUP,)):
-            curve = _by_step(group)
-            final.setdefault(label(group[0]), {})[task, quality] = _per_seed(curve[max(curve)])
+            final.setdefault(label(group[0]), {})[task, quality] = _final_scores(group)
         for name, scores in final.items():
             for other, others in final.items():
                 common = [task for task in scores if task in others]
@@ -63,10 +60,7 @@ def profiles(rows: list[Row], thresholds: np.ndarray) -> list[Row]:
     """Share of runs (all tasks and seeds of a method) whose final score is above each threshold."""
     table = []
     for (corruption, *_), members in _grouped(rows, (*SETTING, "method")):
-        strata = []
-        for _, task_rows in _grouped(members, ("task", "quality")):
-            curve = _by_step(task_rows)
-            strata.append(_per_seed(curve[max(curve)]))
+        strata = _strata(members)
         share = stats.performance_profile(np.concatenate(strata), thresholds)
         place = {"corruption": corruption, "method": label(members[0])}
         table += [place | {"threshold": float(t), "share": float(v)} for t, v in zip(thresholds, share, strict=True)]
@@ -110,10 +104,7 @@ def aggregate(rows: list[Row]) -> list[Row]:
     """IQM and optimality gap over tasks and qualities for every method and setting, with stratified intervals."""
     table = []
     for group, members in _grouped(rows, (*SETTING, "method")):
-        strata = []
-        for _, task_rows in _grouped(members, ("task", "quality")):
-            curve = _by_step(task_rows)
-            strata.append(_per_seed(curve[max(curve)]))
+        strata = _strata(members)
         scores = np.concatenate(strata)
         interval = stats.bootstrap_interval(strata, stats.iqm, np.random.default_rng(0))
         table.append(
@@ -139,6 +130,16 @@ def _grouped(rows: list[Row], names: Iterable[str]) -> list[tuple[tuple, list[Ro
 
 def _by_step(rows: list[Row]) -> dict[int, list[Row]]:
     return {step[0]: members for step, members in _grouped(rows, ("step",))}
+
+
+def _strata(rows: list[Row]) -> list[np.ndarray]:
+    """Final score of every seed, one array a task and quality."""
+    return [_final_scores(members) for _, members in _grouped(rows, ("task", "quality"))]
+
+
+def _final_scores(rows: list[Row]) -> np.ndarray:
+    curve = _by_step(rows)
+    return _per_seed(curve[max(curve)])
 
 
 def _per_seed(rows: list[Row]) -> np.ndarray:

@@ -7,7 +7,6 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Protocol
 
-from vd4rl_pomdp.corruptions import make_corruption
 from vd4rl_pomdp.errors import UserError
 
 
@@ -26,8 +25,7 @@ class Sweep(Protocol):
 
 
 def sweep_runs(sweep: Sweep) -> Iterator[list[list[str]]]:
-    """Every run as the words of its stages' command lines, in order; unknown names raise UserError before the first."""
-    _check_names(sweep)
+    """Every run as the words of its stages' command lines, in the order in which they depend on one another."""
     for seed in sweep.seeds:
         for corruption in sweep.corruptions:
             for method in sweep.methods:
@@ -51,16 +49,3 @@ def _flags(text: str) -> list[str]:
         return shlex.split(text)
     except ValueError as error:
         raise UserError(f"the flags {text!r} cannot be split into words ({error}): close the quotation") from error
-
-
-def _check_names(sweep: Sweep) -> None:
-    from finetune.algorithms import get_algorithm
-    from pretrain.objectives import get_method
-
-    for check, names in (
-        (get_method, sweep.methods),
-        (make_corruption, sweep.corruptions),
-        (get_algorithm, sweep.algorithms),
-    ):
-        for name in names:
-            check(name)
