@@ -1,3 +1,5 @@
+import pytest
+
 from vd4rl_pomdp.experiments import bench as module
 from vd4rl_pomdp.runs.folder import flatten
 
@@ -11,3 +13,13 @@ def test_a_set_smaller_than_the_usual_one_can_be_measured(tmp_path, monkeypatch)
     assert opening["rows"] == dataset.num_rows == 8 * module.EPISODE_ROWS
     assert all(value > 0 for value in measured.values())
     assert {name for name in module.GOALS if name.split(".")[0] in sections} <= set(measured)
+
+
+def test_what_a_maze_step_spends_beside_the_network_is_timed_itself(monkeypatch):
+    def in_turns(rounds, *functions):
+        for function in functions:
+            function()
+        return [1.0, 0.1, 0.05]
+
+    monkeypatch.setattr(module, "_alternating", in_turns)
+    assert module._maze_training() == {"training_steps_per_s": 1.0, "training_overhead_share": pytest.approx(0.15)}
