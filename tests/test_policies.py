@@ -16,10 +16,10 @@ from vd4rl_pomdp.tasks import get_task
 ACTORS = sorted(p.stem for p in actor.ASSETS.glob("*.json"))
 LADDERS = sorted(p.stem.removesuffix("_replay") for p in actor.ASSETS.glob("*_replay.safetensors"))
 AT_LEAST = {
-    "walker_walk_expert": 900,
-    "walker_walk_medium": 400,
-    "cheetah_run_expert": 750,
-    "cheetah_run_medium": 300,
+    "walker_walk_expert": 950,
+    "walker_walk_medium": 450,
+    "cheetah_run_expert": 850,
+    "cheetah_run_medium": 400,
 }
 
 
