@@ -10,7 +10,7 @@ import pytest
 from vd4rl_pomdp.data import collect as module
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
-from vd4rl_pomdp.data.format import read_attributes, read_shard
+from vd4rl_pomdp.data.format import read_attributes, read_shard, shard_paths
 from vd4rl_pomdp.envs.dmc import replay_rewards
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies import Actor, Ladder
@@ -102,6 +102,8 @@ def test_an_interrupted_collection_ends_in_the_same_files(whole, tmp_path, monke
         with pytest.raises(type(error)):
             collect(config(out), LENGTH)
     assert sorted(p.name for p in out.iterdir()) == ["0_walker_walk_random.hdf5", "collection.json"]
+    with pytest.raises(UserError, match="set: the set's collection is not finished"):
+        shard_paths(out)
     (out / ".1_walker_walk_random.hdf5.tmp").write_bytes(b"half")
     first = (out / "0_walker_walk_random.hdf5").stat().st_mtime_ns
     collect(config(out), LENGTH)

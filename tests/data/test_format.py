@@ -42,7 +42,7 @@ def test_shards_are_ordered_by_name_then_by_number(tmp_path, names, expected):
 
 
 def test_only_visible_shards_are_listed(tmp_path):
-    for name in (".0_a.hdf5.tmp", ".0_b.hdf5", "0_a.txt", "0_a.hdf5", "collection.json"):
+    for name in (".0_a.hdf5.tmp", ".0_b.hdf5", "0_a.txt", "0_a.hdf5", "collection.json", "provenance.json"):
         (tmp_path / name).touch()
     assert [p.name for p in shard_paths(tmp_path)] == ["0_a.hdf5"]
 

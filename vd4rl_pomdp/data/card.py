@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from vd4rl_pomdp.data.dataset import identity
 from vd4rl_pomdp.data.episodes import join_shards
-from vd4rl_pomdp.data.format import read_attributes, read_rows, read_some_frames, shard_paths
+from vd4rl_pomdp.data.format import RECORD, read_attributes, read_rows, read_some_frames, shard_paths
 from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.folder import read_json
@@ -154,7 +154,7 @@ def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, Any]:
     actors = {a["policy"]: a.get("actor_sha256") for a in attributes if a.get("actor_sha256")}
     facts = {"seed": first.get("seed"), "render": first.get("render")}
     facts |= {f"actor {name}, SHA-256": sha for name, sha in actors.items()}
-    record = path / "provenance.json"
+    record = path / RECORD
     if record.exists():
         provenance = read_json(record)
         rendered = provenance.get("render", {})

@@ -15,7 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.data.format import PLAN, RECORD, write_shard
 from vd4rl_pomdp.errors import MAX_SEED, UserError, disk_error, refuse_outside
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.folder import jsonable, read_json, write_json
@@ -229,7 +229,7 @@ def _claim(config: CollectConfig) -> None:
 
 def claim_set(out: Path, settings: dict[str, Any]) -> None:
     """Write collection.json, or check that the folder holds the same collection."""
-    path = out / "collection.json"
+    path = out / PLAN
     if path.exists():
         stored = read_json(path)
         differing = sorted(k for k in settings if stored.get(k) != settings[k])
@@ -247,7 +247,7 @@ def claim_set(out: Path, settings: dict[str, Any]) -> None:
 
 def record_set(out: Path, seconds: float, frames: int, workers: int) -> None:
     """Keep what a repeated collection would not reproduce."""
-    path = out / "provenance.json"
+    path = out / RECORD
     if not frames and path.exists():
         return
     from vd4rl_pomdp.envs.parity import render_info

@@ -26,6 +26,8 @@ from vd4rl_pomdp.tasks import FRAME_SIZE
 from vd4rl_pomdp.types import StepType
 
 SUFFIXES = (".hdf5", ".h5")
+PLAN, RECORD = "collection.json", "provenance.json"
+"""What a collection writes before its first shard, and after its last."""
 FRAMES_KEY = "observation"
 _ROW_KEYS = {"action": 2, "reward": 1, "discount": 1, "step_type": 1, "physics": 2}
 _OPTIONAL = "physics"
@@ -42,7 +44,7 @@ def shard_paths(folder: Path) -> list[Path]:
     `9_mixed`, and the two halves of a medium_expert folder are not interleaved. Hidden files are no shards.
 
     Raises:
-        UserError: there is no such folder, no shard in it, or a download of it was cut.
+        UserError: there is no such folder, no shard in it, or a download or collection of it was cut.
     """
     if folder.is_file():
         return [folder]
@@ -51,6 +53,8 @@ def shard_paths(folder: Path) -> list[Path]:
     partial = next(folder.glob("[!.]*.part"), None)
     if partial:
         raise UserError(f"{partial}: the set's download is not finished; start the same `data download` command again")
+    if (folder / PLAN).exists() and not (folder / RECORD).exists():
+        raise UserError(f"{folder}: the set's collection is not finished; start the command that collects it again")
     shards = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
     if not shards:
         inner = next((p.parent for suffix in SUFFIXES for p in sorted(folder.rglob(f"[!.]*{suffix}"))), None)
