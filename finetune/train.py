@@ -17,7 +17,7 @@ from finetune.features import BATCH_STREAM, ExactSampler, FeatureSampler, Frozen
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.envs.parity import render_info
-from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
+from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
 from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, rows_of
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import EncoderCard, load_encoder, save_encoder
@@ -41,8 +41,7 @@ def finetune(config: FinetuneConfig) -> RunFolder:
     )  # fmt: skip
     device = pick_device(config.device)
     dataset = open_dataset(config.data)
-    if not dataset.num_transitions:
-        raise UserError(f"{config.data}: holds no transition; every episode in it is a single row")
+    dataset.require_transitions()
     encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frames.shape[-1])
     if card.end_to_end:
         config = replace(config, algorithm=card.end_to_end, views=0)

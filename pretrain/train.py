@@ -16,7 +16,7 @@ from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
-from vd4rl_pomdp.nn.frame import FRAME_ENCODERS
+from vd4rl_pomdp.nn.frame import check_frame_encoder
 from vd4rl_pomdp.objective import Objective
 from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint, seed_everything
 from vd4rl_pomdp.runs.device import autocast, pick_device
@@ -134,8 +134,7 @@ def _check(config: PretrainConfig) -> None:
         feature_dim=1, hidden_dim=1, gru_layers=1, head_dim=1, m=0, n=0, history_window=0, max_k=1, codes=1,
         homer_codes=0, self_prediction=0, l2_states=0, log_every=1, checkpoint_every=1,
     )  # fmt: skip
-    if config.frame_encoder not in FRAME_ENCODERS:
-        raise UserError(f"unknown frame encoder {config.frame_encoder!r}: choose one of {', '.join(FRAME_ENCODERS)}")
+    check_frame_encoder(config.frame_encoder)
     stack = torch.zeros(1, 3 * FRAME_STACK, FRAME_SIZE, FRAME_SIZE, dtype=torch.uint8)
     make_corruption(config)(stack, torch.zeros(1, dtype=torch.int64))  # which fails where it does not fit a frame
 

@@ -277,14 +277,7 @@ def test_a_checkpoint_of_another_config_is_one_line(encoder, data, tmp_path):
 def test_metrics_between_two_actor_steps_survive_a_cut(encoder, data, tmp_path, monkeypatch):
     """The actor learns at every other update: a row right after a resumption shows its last value all the same."""
     changes = {"updates": 6, "log_every": 1, "checkpoint_every": 2, "eval_every": 6, "batch_size": 4, "eval_length": 2}
-    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes))
-    cut = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
-    with monkeypatch.context() as patch:
-        cut_at(patch, "finetune.train", 2)
-        with pytest.raises(CutError):
-            run_finetune(cut)
-    run_finetune(cut)
-    assert contents(tmp_path / "cut") == contents(whole.path)
+    finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
 
 
 def test_an_evaluation_names_its_step_and_touches_no_other_file(encoder, data, tmp_path):

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -76,7 +76,7 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
     """
     _check(config)
     plan = list(_plan(config))
-    _claim(config)
+    _claim(config, _hashes(plan))
     started, frames = time.monotonic(), 0
     with ProgressLine("collect", config.episodes, "episodes") as progress:
         for path, episodes, policy in plan:
@@ -113,7 +113,11 @@ def _check(config: CollectConfig) -> None:
 
 def actor_hashes(config: CollectConfig) -> list[str]:
     """SHA-256 of the files whose actors make the set, sorted."""
-    return sorted({policy.sha256 for _, _, policy in _plan(config) if policy is not None})
+    return _hashes(_plan(config))
+
+
+def _hashes(plan: Iterable[tuple[Path, range, Policy]]) -> list[str]:
+    return sorted({policy.sha256 for _, _, policy in plan if policy is not None})
 
 
 def replay_returns(config: CollectConfig) -> list[float]:
@@ -221,9 +225,9 @@ def _attributes(config: CollectConfig, path: Path, policy: Policy) -> dict[str, 
     }
 
 
-def _claim(config: CollectConfig) -> None:
+def _claim(config: CollectConfig, actors: list[str]) -> None:
     settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS}
-    settings["actors"] = actor_hashes(config)
+    settings["actors"] = actors
     claim_set(config.out, settings)
 
 

@@ -93,6 +93,11 @@ class Dataset:
         """Rows that have a successor in their episode."""
         return self.num_rows - self.num_episodes
 
+    def require_transitions(self) -> None:
+        """Raise UserError if the set holds none."""
+        if not self.num_transitions:
+            raise UserError(f"{self.path}: holds no transition; every episode in it is a single row")
+
     @property
     def action_dim(self) -> int:
         """Action dimension A."""

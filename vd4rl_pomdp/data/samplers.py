@@ -7,7 +7,6 @@ from collections.abc import Iterator
 import torch
 
 from vd4rl_pomdp.data.dataset import Dataset, require_positive
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_STACK
 from vd4rl_pomdp.types import Transitions, Windows
 
@@ -53,8 +52,7 @@ class TransitionSampler:
         frame_stack: int = FRAME_STACK,
         gamma: float = 0.99,
     ) -> None:
-        if not dataset.num_transitions:
-            raise UserError(f"{dataset.path}: holds no transition; every episode in it is a single row")
+        dataset.require_transitions()
         require_positive(batch_size=batch_size, n_step=n_step)
         self._dataset, self._batch_size, self._generator = dataset, batch_size, generator
         self._n_step, self._frame_stack, self._gamma = n_step, frame_stack, gamma

@@ -150,10 +150,15 @@ STATE = "state"
 """Frame encoder of the `state` reference."""
 
 
-def make_frame_encoder(name: str, channels: int, size: int, feature_dim: int) -> FrameEncoder:
-    """Build a frame encoder by name; an unknown name raises UserError listing the choices."""
+def check_frame_encoder(name: str) -> None:
+    """Raise UserError, listing the choices, for an unknown name."""
     if name not in FRAME_ENCODERS:
         raise UserError(f"unknown frame encoder {name!r}: choose one of {', '.join(FRAME_ENCODERS)}")
+
+
+def make_frame_encoder(name: str, channels: int, size: int, feature_dim: int) -> FrameEncoder:
+    """Build a frame encoder by name; an unknown name raises UserError listing the choices."""
+    check_frame_encoder(name)
     return FrameEncoder(FRAME_ENCODERS[name](channels, size), channels, size, feature_dim).to(
         memory_format=torch.channels_last  # type: ignore[call-overload]
     )

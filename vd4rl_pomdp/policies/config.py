@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
@@ -59,36 +59,35 @@ class PolicyConfig:
     """After --start-from: updates of the critics alone, before the actor learns on."""
 
 
+_STEADY = PolicyConfig(
+    "",
+    Path(),
+    learning_rate=5e-4,
+    critic_norm=True,
+    normalise=True,
+    n_step=3,
+    temperature_rate=1e-4,
+    target_entropy=-0.5,
+)
+"""What cheetah_run and humanoid_walk share."""
 RECIPES: dict[str, PolicyConfig] = {
     "walker_walk": PolicyConfig("walker_walk", Path()),
-    "cheetah_run": PolicyConfig(
-        "cheetah_run",
-        Path(),
+    "cheetah_run": replace(
+        _STEADY,
+        task="cheetah_run",
         decisions=600_000,
-        learning_rate=5e-4,
-        critic_norm=True,
-        normalise=True,
-        n_step=3,
         envs=4,
         temperature=0.1,
-        temperature_rate=1e-4,
-        target_entropy=-0.5,
         replay_size=800_000,
         eval_every=4_000,
     ),
-    "humanoid_walk": PolicyConfig(
-        "humanoid_walk",
-        Path(),
+    "humanoid_walk": replace(
+        _STEADY,
+        task="humanoid_walk",
         decisions=20_000_000,
-        learning_rate=5e-4,
-        critic_norm=True,
-        normalise=True,
-        n_step=3,
         envs=16,
         updates_per_decision=0.5,
         temperature=0.01,
-        temperature_rate=1e-4,
-        target_entropy=-0.5,
         eval_every=24_000,
     ),
 }

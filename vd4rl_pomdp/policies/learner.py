@@ -18,7 +18,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import OBSERVATION_CLIP, Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
 from vd4rl_pomdp.policies.state_env import StateEnv
-from vd4rl_pomdp.runs.folder import read_json, replacing
+from vd4rl_pomdp.runs.folder import newest, read_json, replacing
 from vd4rl_pomdp.tasks import Task
 
 if TYPE_CHECKING:
@@ -163,16 +163,11 @@ def save_checkpoint(model: SAC, run: Path) -> None:
         (fresh / "counters.json").write_text(json.dumps(counters))
 
 
-def newest_checkpoint(run: Path) -> Path | None:
-    """Folder of a run's newest whole checkpoint (see `replacing`), None without one."""
-    return next((path for path in (run / "checkpoint", run / "checkpoint.old") if path.exists()), None)
-
-
 def restore_checkpoint(model: SAC, run: Path) -> int:
     """Load the newest whole checkpoint; returns the decisions made so far, 0 without one. New episodes begin there."""
     import jax
 
-    folder = newest_checkpoint(run)
+    folder = newest(run / "checkpoint")
     if folder is None:
         return 0
     counters = read_json(folder / "counters.json")

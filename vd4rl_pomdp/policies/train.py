@@ -31,7 +31,7 @@ from vd4rl_pomdp.policies.export import (
     read_curve,
     snapshot_path,
 )
-from vd4rl_pomdp.runs.folder import jsonable, read_json, write_csv, write_json
+from vd4rl_pomdp.runs.folder import jsonable, newest, read_json, write_csv, write_json
 from vd4rl_pomdp.tasks import get_task
 
 if TYPE_CHECKING:
@@ -74,7 +74,7 @@ def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None]
 
 def decisions_made(run: Path) -> int:
     """Decisions behind a run's newest checkpoint, 0 for a new run."""
-    folder = learner.newest_checkpoint(run)
+    folder = newest(run / "checkpoint")
     return int(read_json(folder / "counters.json")["decisions"]) if folder else 0
 
 

@@ -14,7 +14,7 @@ from safetensors.torch import load_file, save_file
 from torch import Tensor
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.runs.folder import replacing
+from vd4rl_pomdp.runs.folder import newest, replacing
 
 State = dict[str, Any]
 """Nested dicts with str or int keys, lists, tensors, and JSON scalars."""
@@ -32,13 +32,11 @@ def save_checkpoint(folder: Path, state: State) -> None:
 
 def load_checkpoint(folder: Path) -> State | None:
     """Read the newest whole checkpoint, None if there is none; a damaged or pickled one raises UserError."""
-    for candidate in (folder, folder.with_name(folder.name + ".old")):
-        if not candidate.exists():
-            continue
-        with _readable(candidate):
-            tree = json.loads((candidate / "state.json").read_text())
-            return _join(tree, load_file(candidate / "state.safetensors"))
-    return None
+    whole = newest(folder)
+    if whole is None:
+        return None
+    with _readable(whole):
+        return _join(json.loads((whole / "state.json").read_text()), load_file(whole / "state.safetensors"))
 
 
 def restore_checkpoint(folder: Path, restore: Callable[[State], None]) -> None:

@@ -110,9 +110,9 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]
 def replacing(folder: Path) -> Iterator[Path]:
     """An empty folder to fill that then takes `folder`'s place; cut at any moment, the old or the new one is whole.
 
-    Between the two renames the old one is called `folder` with `.old` at its end.
+    Between the two renames only `newest` finds the old one.
     """
-    fresh, old = folder.with_name(folder.name + ".new"), folder.with_name(folder.name + ".old")
+    fresh, old = folder.with_name(folder.name + ".new"), _old(folder)
     shutil.rmtree(fresh, ignore_errors=True)
     fresh.mkdir(parents=True)
     yield fresh
@@ -121,6 +121,15 @@ def replacing(folder: Path) -> Iterator[Path]:
         folder.rename(old)
     fresh.rename(folder)
     shutil.rmtree(old, ignore_errors=True)
+
+
+def newest(folder: Path) -> Path | None:
+    """Where the newest whole content of a folder lies that `replacing` fills; None if it never did."""
+    return next((path for path in (folder, _old(folder)) if path.exists()), None)
+
+
+def _old(folder: Path) -> Path:
+    return folder.with_name(folder.name + ".old")
 
 
 def flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:
