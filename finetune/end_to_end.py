@@ -18,7 +18,7 @@ from torch import Tensor
 
 from finetune.config import FinetuneConfig
 from finetune.features import SHIFT_STREAM, FeatureBatch
-from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.augmentation import observe
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream
 from vd4rl_pomdp.data import Dataset, TransitionSampler
 from vd4rl_pomdp.nn.encoder import Encoder
@@ -32,21 +32,19 @@ class PixelSampler:
     def __init__(
         self, dataset: Dataset, corruption: CorruptionConfig, config: FinetuneConfig, generator: torch.Generator
     ) -> None:
-        self._sampler = TransitionSampler(dataset, config.batch_size, generator, config.n_step, gamma=config.gamma)
-        self._shift = config.shift
+        self._dataset, self._shift = dataset, config.shift
+        self._sampler = TransitionSampler(
+            dataset, config.batch_size, generator, config.n_step, gamma=config.gamma, observe=self._observe
+        )
         self.corruption = BatchCorruption(corruption, config.seed)
         self.shifts = KeyStream(config.seed * 10 + SHIFT_STREAM)
 
     def sample(self) -> Transitions:
         """The next batch."""
-        batch = self._sampler.sample()
-        return batch.replace(
-            obs=self._observed(batch.obs, batch.key), next_obs=self._observed(batch.next_obs, batch.next_key)
-        )
+        return self._sampler.sample()
 
-    def _observed(self, obs: Tensor, key: Tensor) -> Tensor:
-        shifted = random_shift(obs, self.shifts.take((len(obs),), obs.device), self._shift)
-        return self.corruption(shifted, key)
+    def _observe(self, rows: Tensor) -> Tensor:
+        return observe(self._dataset, rows, self.shifts.take((len(rows),), rows.device), self._shift, self.corruption)
 
 
 class EndToEnd:

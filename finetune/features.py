@@ -9,7 +9,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.augmentation import observe
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, derive_keys
 from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.nn.encoder import Encoder
@@ -68,9 +68,9 @@ class FrozenEncoder:
             return self.encoder.frame(self.states[rows, :, None, None])
         parts = []
         for part, key in zip(rows.split(CHUNK), shift_key.split(CHUNK), strict=True):
-            obs = random_shift(self.dataset.stacks(part), key, self.shift)
+            obs = observe(self.dataset, part, key, self.shift, corruption)
             with autocast(self.device, self.precision):
-                parts.append(self.encoder.frame(corruption(obs, self.dataset.keys(part))).float())
+                parts.append(self.encoder.frame(obs).float())
         return torch.cat(parts)
 
     @torch.no_grad()

@@ -9,7 +9,7 @@ import torch
 
 from pretrain.config import PretrainConfig
 from pretrain.objectives import build_objective, get_method
-from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.augmentation import observe
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, make_corruption
 from vd4rl_pomdp.data import Dataset, WindowSampler, open_dataset
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
@@ -58,7 +58,7 @@ class Trainer:
         self.objective, self.dataset, self.config = objective, dataset, config
         self.device = dataset.t.device
         self.generator = torch.Generator().manual_seed(config.seed * 10 + BATCH_STREAM)
-        self.sampler = WindowSampler(dataset, config.batch_size, config.window, self.generator)
+        self.sampler = WindowSampler(dataset, config.batch_size, config.window, self.generator, observe=self._observe)
         self.corruption = BatchCorruption(corruption_of(config), config.seed)
         self.shifts = KeyStream(config.seed * 10 + SHIFT_STREAM)
         self.optimiser = torch.optim.Adam(objective.parameters(), lr=config.learning_rate)
@@ -67,9 +67,11 @@ class Trainer:
 
     def batch(self) -> Windows:
         """The next windows, shifted and corrupted: what the agent would see."""
-        window = self.sampler.sample()
-        obs = random_shift(window.obs, self.shifts.take((len(window.length),), self.device), self.config.shift)
-        return window.replace(obs=self.corruption(obs, window.key))
+        return self.sampler.sample()
+
+    def _observe(self, rows: torch.Tensor) -> torch.Tensor:
+        shift_key = self.shifts.take((len(rows),), self.device)
+        return observe(self.dataset, rows, shift_key, self.config.shift, self.corruption)
 
     def update(self) -> dict[str, torch.Tensor]:
         """One gradient step; returns the objective's scalars."""

@@ -1,7 +1,9 @@
+import numpy as np
 import pytest
 import torch
 
-from vd4rl_pomdp.augmentation import _shift_by_copying, _shift_by_index, random_shift
+from tests.helpers_data import fake_rows
+from vd4rl_pomdp.augmentation import _shift_by_index, _shift_by_lines, observe, random_shift
 from vd4rl_pomdp.corruptions import (
     CORRUPTIONS,
     BatchCorruption,
@@ -11,11 +13,23 @@ from vd4rl_pomdp.corruptions import (
     draw_integers,
     make_corruption,
 )
+from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.errors import UserError
 
 
 def stacks(n: int = 64) -> torch.Tensor:
     return torch.randint(1, 256, (n, 9, 84, 84), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+
+
+@pytest.fixture(scope="module")
+def dataset(tmp_path_factory) -> Dataset:
+    """Three short episodes of random pixels."""
+    folder = tmp_path_factory.mktemp("noise")
+    rows = fake_rows([7, 5, 12])
+    rows["observation"] = np.random.default_rng(0).integers(1, 256, rows["observation"].shape, dtype=np.uint8)
+    write_shard(folder / "0_noise.hdf5", rows, {})
+    return open_dataset(folder)
 
 
 def test_draws_are_uniform_and_depend_on_every_key():
@@ -97,6 +111,8 @@ def test_a_key_stream_goes_on_from_its_position():
 def test_unknown_and_impossible_corruptions_are_refused():
     with pytest.raises(UserError, match=r"unknown corruption 'fog'.*patch\+zero_frames"):
         make_corruption("fog")
+    with pytest.raises(UserError, match=r"unknown corruption 'zero_frames\+patch'"):
+        make_corruption("zero_frames+patch")
     with pytest.raises(UserError, match="--patch-size"):
         make_corruption(CorruptionConfig("patch", patch_size=85))(stacks(1), torch.zeros(1, dtype=torch.int64))
     with pytest.raises(UserError, match="--zeroed-frames"):
@@ -117,9 +133,27 @@ def test_random_shift_equals_padding_and_cropping():
     assert random_shift(obs, key, pad=0) is obs
 
 
-@pytest.mark.parametrize("shape", [(1, 3, 20, 30), (7, 2, 3, 12, 12), (64, 9, 84, 84)])
+@pytest.mark.parametrize("shape", [(1, 3, 20, 30), (7, 2, 3, 12, 12), (64, 9, 84, 84), (400, 3, 84, 84)])
 @pytest.mark.parametrize("pad", [1, 4])
 def test_both_ways_to_shift_agree(shape, pad):
     obs = torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     offset = draw_integers(torch.arange(shape[0]), 2 * pad + 1, 2) - pad
-    assert torch.equal(_shift_by_copying(obs, offset), _shift_by_index(obs, offset))
+    expected = _shift_by_index(obs, offset)
+    assert torch.equal(random_shift(obs, torch.arange(shape[0]), pad), expected)
+    some = torch.arange(len(obs) - 1, -1, -2)
+    images, out = obs.flatten(1, -3), torch.empty_like(obs[some]).flatten(1, -3)
+    _shift_by_lines(images, some, offset[some], out)
+    assert torch.equal(out, expected[some].view_as(out))
+
+
+@pytest.mark.parametrize("name", CORRUPTIONS)
+@pytest.mark.parametrize("mode", ["resample", "emission"])
+@pytest.mark.parametrize("zeroed", [1, 2, 3])
+def test_observing_rows_equals_shifting_then_corrupting_their_stacks(dataset, name, mode, zeroed):
+    config = CorruptionConfig(name, mode, patch_fill=7, patch_count=2, zeroed_frames=zeroed)
+    rows, key = torch.arange(dataset.num_rows).view(2, -1), torch.tensor([5, 6])
+    for pad in (0, 4):
+        apart, together = (BatchCorruption(config, seed=1) for _ in range(2))
+        for _ in range(2):
+            expected = apart(random_shift(dataset.stacks(rows), key, pad).clone(), dataset.keys(rows))
+            assert torch.equal(observe(dataset, rows, key, pad, together), expected)

@@ -8,7 +8,6 @@ from vd4rl_pomdp.corruptions.corruption import (
     CorruptionConfig,
     Patch,
     Stage,
-    ZeroFrames,
     make_corruption,
 )
 from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_integers
@@ -22,7 +21,6 @@ __all__ = [
     "KeyStream",
     "Patch",
     "Stage",
-    "ZeroFrames",
     "derive_keys",
     "draw_integers",
     "make_corruption",

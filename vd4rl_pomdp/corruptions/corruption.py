@@ -12,7 +12,7 @@ from typing import Literal, Protocol
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_integers, hash_keys
+from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_integers, draw_numbered, hash_keys
 from vd4rl_pomdp.errors import UserError, refuse_outside
 
 Mode = Literal["resample", "emission"]
@@ -20,10 +20,16 @@ _CHANNELS = 3
 
 
 class Stage(Protocol):
-    """One step of a corruption."""
+    """One step of a corruption, applied to the frames that are not zeroed."""
 
-    def __call__(self, obs: Tensor, key: Tensor) -> None:
-        """Change (N, S, 3, H, W) uint8 stacks in place, drawing from (N,) int64 keys."""
+    def __call__(self, frames: Tensor, key: Tensor, number: Tensor) -> None:
+        """Change frames in place.
+
+        Args:
+            frames: (N, K, 3, H, W) uint8, K frames of each stack.
+            key: (N,) int64, what to draw from.
+            number: (N, K) int64 place of each frame in its stack.
+        """
 
 
 def _assign(target: Tensor, index: tuple[Tensor, ...], value: int) -> None:
@@ -47,36 +53,21 @@ class Patch:
     shared: bool = False
     """Whether the frames of a stack share their squares."""
 
-    def __call__(self, obs: Tensor, key: Tensor) -> None:
+    def __call__(self, frames: Tensor, key: Tensor, number: Tensor) -> None:
         """See `Stage`."""
-        n, s, _, height, width = obs.shape
+        n, k, _, height, width = frames.shape
         if self.size > min(height, width):
             raise UserError(
                 f"patch size {self.size} exceeds the image ({height}x{width}): choose a smaller --patch-size"
             )
-        places = self.count * (1 if self.shared else s)
-        shape = (n, 1 if self.shared else s, self.count)
-        top = draw_integers(key, height - self.size + 1, places).view(shape).expand(n, s, self.count)
-        left = draw_integers(hash_keys(key), width - self.size + 1, places).view(shape).expand(n, s, self.count)
-        squares = obs.unfold(3, self.size, 1).unfold(4, self.size, 1)
-        sample = torch.arange(n, device=obs.device)[:, None, None]
-        frame = torch.arange(s, device=obs.device)[:, None]
+        square = torch.arange(self.count, device=key.device)
+        draw = (0 if self.shared else number[..., None] * self.count) + square.expand(n, k, self.count)
+        top = draw_numbered(key, height - self.size + 1, draw)
+        left = draw_numbered(hash_keys(key), width - self.size + 1, draw)
+        squares = frames.unfold(3, self.size, 1).unfold(4, self.size, 1)
+        sample = torch.arange(n, device=key.device)[:, None, None]
+        frame = torch.arange(k, device=key.device)[:, None]
         _assign(squares.movedim(2, 4), (sample, frame, top, left), self.fill)
-
-
-@dataclass(frozen=True)
-class ZeroFrames:
-    """`frames` of the stacked frames, chosen uniformly, become 0; the newest may be among them."""
-
-    frames: int = 2
-
-    def __call__(self, obs: Tensor, key: Tensor) -> None:
-        """See `Stage`."""
-        n, s = obs.shape[:2]
-        if self.frames > s:
-            raise UserError(f"cannot zero {self.frames} of {s} stacked frames: choose a smaller --zeroed-frames")
-        order = draw_integers(hash_keys(key ^ 1), 1 << 31, s).argsort(dim=1)
-        _assign(obs, (torch.arange(n, device=obs.device)[:, None], order[:, : self.frames]), 0)
 
 
 @dataclass(frozen=True)
@@ -103,22 +94,22 @@ def _patch(config: CorruptionConfig) -> Stage:
     return Patch(config.patch_size, config.patch_count, config.patch_fill, config.patch_shared)
 
 
-def _zero_frames(config: CorruptionConfig) -> Stage:
-    return ZeroFrames(config.zeroed_frames)
-
-
-STAGES = {"patch": _patch, "zero_frames": _zero_frames}
-"""Every stage by name. A corruption's name joins its stages with `+`, in the order they are applied."""
+STAGES = {"patch": _patch}
+"""Every stage by name. A corruption's name joins its stages with `+`, in the order they are applied; zero_frames, which
+drops whole frames, may end it."""
 CORRUPTIONS = ("none", "patch", "zero_frames", "patch+zero_frames")
 """The benchmark's settings."""
 
 
 class Corruption:
-    """A sequence of stages applied to frame stacks."""
+    """Stages that change frames, and a number of frames of each stack, chosen uniformly, that become 0.
 
-    def __init__(self, name: str, stages: list[Stage]) -> None:
+    The newest frame may be among the zeroed ones.
+    """
+
+    def __init__(self, name: str, stages: list[Stage], zeroed: int = 0) -> None:
         self.name = name
-        self._stages = stages
+        self._stages, self._zeroed = stages, zeroed
 
     def __call__(self, obs: Tensor, key: Tensor) -> Tensor:
         """Corrupted copy of a batch.
@@ -128,16 +119,38 @@ class Corruption:
             key: (...,) int64 on the same device, one a stack; equal keys give equal masks.
 
         Returns:
-            uint8 like `obs`.
+            uint8 like `obs`; `obs` itself where there is nothing to do.
         """
-        return self.apply_(obs.clone(memory_format=torch.contiguous_format), key) if self._stages else obs
+        if not self._stages and not self._zeroed:
+            return obs
+        return self.apply_(obs.clone(memory_format=torch.contiguous_format), key)
 
     def apply_(self, obs: Tensor, key: Tensor) -> Tensor:
         """The same in place, for a contiguous batch that is the caller's own."""
-        stacks = obs.view(-1, obs.shape[-3] // _CHANNELS, _CHANNELS, *obs.shape[-2:])
-        for number, stage in enumerate(self._stages):
-            stage(stacks, derive_keys(number, key.reshape(-1)))
+        stacks, key = obs.view(-1, obs.shape[-3] // _CHANNELS, _CHANNELS, *obs.shape[-2:]), key.reshape(-1)
+        kept = self.kept(key, stacks.shape[1])
+        if not self._zeroed:
+            self.change_(stacks, key, kept)
+            return obs
+        sample = torch.arange(len(stacks), device=obs.device)[:, None]
+        frames = stacks[sample, kept]
+        self.change_(frames, key, kept)
+        stacks.zero_()[sample, kept] = frames
         return obs
+
+    def kept(self, key: Tensor, stack: int) -> Tensor:
+        """Numbers of the frames that are not zeroed, (N, K) int64, in stacks of `stack` frames with (N,) int64 keys."""
+        if not self._zeroed:
+            return torch.arange(stack, device=key.device).expand(len(key), stack)
+        if self._zeroed > stack:
+            raise UserError(f"cannot zero {self._zeroed} of {stack} stacked frames: choose a smaller --zeroed-frames")
+        key = hash_keys(derive_keys(len(self._stages), key) ^ 1)
+        return draw_integers(key, 1 << 31, stack).argsort(dim=1)[:, self._zeroed :]
+
+    def change_(self, frames: Tensor, key: Tensor, kept: Tensor) -> None:
+        """Apply the stages, in place, to the (N, K, 3, H, W) frames that (N, K) `kept` names."""
+        for number, stage in enumerate(self._stages):
+            stage(frames, derive_keys(number, key), kept)
 
 
 def make_corruption(config: CorruptionConfig | str) -> Corruption:
@@ -146,11 +159,12 @@ def make_corruption(config: CorruptionConfig | str) -> Corruption:
     if isinstance(config, str):
         config = CorruptionConfig(config)
     names = [] if config.corruption == "none" else config.corruption.split("+")
-    unknown = [name for name in names if name not in STAGES]
-    if unknown:
+    zeroes = names[-1:] == ["zero_frames"]
+    stages = names[:-1] if zeroes else names
+    if any(name not in STAGES for name in stages):
         raise UserError(f"unknown corruption {config.corruption!r}: choose one of {', '.join(CORRUPTIONS)}")
     refuse_outside(config, patch_size=1, patch_count=1, patch_fill=(0, 255), zeroed_frames=1)
-    return Corruption(config.corruption, [STAGES[name](config) for name in names])
+    return Corruption(config.corruption, [STAGES[name](config) for name in stages], config.zeroed_frames * zeroes)
 
 
 class BatchCorruption:
@@ -160,12 +174,16 @@ class BatchCorruption:
     """
 
     def __init__(self, config: CorruptionConfig, seed: int) -> None:
-        self._corruption = make_corruption(config)
         self._mode = config.corruption_mode
+        self.corruption = make_corruption(config)
         self.stream = KeyStream(seed)
 
     def __call__(self, obs: Tensor, row_key: Tensor) -> Tensor:
         """Corrupt, in place, contiguous (..., C, H, W) uint8 stacks whose rows are named by (...,) int64 `row_key`."""
+        return self.corruption.apply_(obs, self.keys(row_key))
+
+    def keys(self, row_key: Tensor) -> Tensor:
+        """What the next batch's rows, named by (...,) int64 `row_key`, are corrupted by: (...,) int64."""
         if self._mode == "emission":
-            return self._corruption.apply_(obs, derive_keys(self.stream.seed, row_key))
-        return self._corruption.apply_(obs, self.stream.take(row_key.shape, obs.device))
+            return derive_keys(self.stream.seed, row_key)
+        return self.stream.take(row_key.shape, row_key.device)

@@ -34,8 +34,13 @@ def derive_keys(seed: int, key: Tensor) -> Tensor:
 
 def draw_integers(key: Tensor, high: int, count: int) -> Tensor:
     """`count` integers in [0, high) from each key: (...,) int64 -> (..., count) int64."""
-    streams = torch.arange(1, count + 1, device=key.device)
-    bits = _shift_right(hash_keys(key.unsqueeze(-1) ^ hash_keys(streams)), 33)
+    return draw_numbered(key, high, torch.arange(count, device=key.device))
+
+
+def draw_numbered(key: Tensor, high: int, number: Tensor) -> Tensor:
+    """The draws called `number`, int64 of shape (..., n) or one that broadcasts with it, of `draw_integers`."""
+    key = key.view(*key.shape, *[1] * max(1, number.ndim - key.ndim))
+    bits = _shift_right(hash_keys(key ^ hash_keys(number + 1)), 33)
     return (bits * high) >> 31
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,8 @@ from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, QUALITIES, TASKS
 from vd4rl_pomdp.types import StepType, Transitions, Windows, row_key
 
 Index = int | Sequence[int] | np.ndarray | Tensor
+Observe = Callable[[Tensor], Tensor]
+"""Observations (..., C, H, W) uint8 of (...,) int64 rows."""
 
 
 def open_dataset(path: Path | str, cache: Path | None = None, frame_size: int = FRAME_SIZE) -> Dataset:
@@ -125,16 +127,25 @@ class Dataset:
 
         A stack never reaches before its episode: there the first frame is repeated.
         """
-        require_positive(frame_stack=frame_stack)
-        back = torch.arange(frame_stack - 1, -1, -1, device=rows.device)
-        first = self.episode_start[self.episode[rows]]
-        index = torch.maximum(rows[..., None] - back, first[..., None])
+        index = self.stack_rows(rows, frame_stack)
         out = self._buffers.take((index.numel(), *self.frames.shape[1:])) if self.frames.device.type == "cpu" else None
         frames = torch.index_select(self.frames, 0, index.reshape(-1), out=out)
         return frames.view(*rows.shape, self.frames.shape[1] * frame_stack, *self.frames.shape[2:])
 
+    def stack_rows(self, rows: Tensor, frame_stack: int = FRAME_STACK) -> Tensor:
+        """Rows (..., frame_stack) int64 whose frames `stacks` puts together."""
+        require_positive(frame_stack=frame_stack)
+        back = torch.arange(frame_stack - 1, -1, -1, device=rows.device)
+        first = self.episode_start[self.episode[rows]]
+        return torch.maximum(rows[..., None] - back, first[..., None])
+
     def transitions(
-        self, index: Index, n_step: int = 1, frame_stack: int = FRAME_STACK, gamma: float = 0.99
+        self,
+        index: Index,
+        n_step: int = 1,
+        frame_stack: int = FRAME_STACK,
+        gamma: float = 0.99,
+        observe: Observe | None = None,
     ) -> Transitions:
         """Gather n-step transitions.
 
@@ -143,6 +154,7 @@ class Dataset:
             n_step: rewards to sum; fewer at an episode's end.
             frame_stack: frames in an observation.
             gamma: discount between the summed rewards.
+            observe: what makes observations of (B,) rows, in place of `stacks`.
 
         Returns:
             `Transitions`. With m = min(n_step, steps left), `reward` is the sum of gamma^i r_{t+i} for i < m and
@@ -154,12 +166,13 @@ class Dataset:
         """
         rows = self._starts(self._index(index, self.num_transitions), self._per_episode(2))
         reward, discount, next_rows = self.n_step_returns(rows, n_step, gamma)
+        observe = observe or (lambda rows: self.stacks(rows, frame_stack))
         return Transitions(
-            obs=self.stacks(rows, frame_stack),
+            obs=observe(rows),
             action=self.action[rows + 1],
             reward=reward,
             discount=discount,
-            next_obs=self.stacks(next_rows, frame_stack),
+            next_obs=observe(next_rows),
             key=self.keys(rows),
             next_key=self.keys(next_rows),
         )
@@ -182,13 +195,16 @@ class Dataset:
         """Number of windows of `length` consecutive rows of one episode; raises UserError as `windows` does."""
         return int(self._windows_per_episode(length).sum())
 
-    def windows(self, index: Index, length: int, frame_stack: int = FRAME_STACK) -> Windows:
+    def windows(
+        self, index: Index, length: int, frame_stack: int = FRAME_STACK, observe: Observe | None = None
+    ) -> Windows:
         """Gather windows of consecutive rows.
 
         Args:
             index: (B,) numbers in 0..num_windows(length)-1; they count all starts within episodes, in order.
             length: rows T of each window.
             frame_stack: frames in an observation; a stack may reach before its window, never before its episode.
+            observe: what makes observations of (B, T) rows, in place of `stacks`.
 
         Returns:
             `Windows`, none of them padded. `action` of the last row is the next row's, outside the window, if any.
@@ -204,7 +220,7 @@ class Dataset:
         action = self.action[torch.where(has_action, rows + 1, rows)] * has_action[..., None]
         prev_action = torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], dim=1)
         return Windows(
-            obs=self.stacks(rows, frame_stack),
+            obs=self.stacks(rows, frame_stack) if observe is None else observe(rows),
             prev_action=prev_action,
             action=action,
             has_action=has_action,

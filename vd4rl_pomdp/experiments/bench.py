@@ -15,7 +15,7 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.augmentation import observe
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.data.format import write_shard
@@ -28,7 +28,7 @@ from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.folder import flatten
 from vd4rl_pomdp.runs.provenance import machine, versions
 from vd4rl_pomdp.runs.workers import run_jobs
-from vd4rl_pomdp.tasks import FRAME_SIZE
+from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.types import StepType
 
 if TYPE_CHECKING:
@@ -146,29 +146,32 @@ def _synthetic_set(folder: Path, episodes: int) -> tuple[Dataset, dict[str, Any]
 
 
 def _sampling(dataset: Dataset, repeats: int) -> dict[str, float]:
-    """Gathering against copying the same bytes, corruption and shift against gathering; new rows every time."""
+    """Gathering against copying the same bytes, and what shift and corruption add to it; new rows every time."""
     some = min(dataset.num_transitions, 20_000)
     touch(dataset.frames[:some])
     generator = torch.Generator().manual_seed(0)
-    corruption = BatchCorruption(CorruptionConfig("patch+zero_frames"), 0)
+    corruptions = {name: BatchCorruption(CorruptionConfig(name), 0) for name in ("patch", "patch+zero_frames")}
 
     def rows() -> torch.Tensor:
         return torch.randint(3, some - 1, (2 * BATCH,), generator=generator)
 
     def copy() -> None:
-        start = int(rows()[0]) * (some - 3 * len(obs)) // some
+        start = int(rows()[0]) * (some - len(target)) // some
         target.copy_(dataset.frames[start : start + len(target)])
 
-    obs, keys = dataset.stacks(rows()), dataset.keys(rows())
-    target = torch.empty_like(obs).view(-1, *dataset.frames.shape[1:])
-    copying, gathering, changing = _alternating(
-        repeats, copy, lambda: dataset.stacks(rows()), lambda: corruption(random_shift(obs, keys), keys)
+    def see(name: str) -> Callable[[], Any]:
+        return lambda: observe(dataset, rows(), torch.arange(2 * BATCH), 4, corruptions[name])
+
+    target = torch.empty(2 * BATCH * FRAME_STACK, *dataset.frames.shape[1:], dtype=torch.uint8)
+    copying, gathering, patch, both = _alternating(
+        repeats, copy, lambda: dataset.stacks(rows()), see("patch"), see("patch+zero_frames")
     )
     return {
         "copy_ms": copying * 1e3,
         "gather_ms": gathering * 1e3,
         "gather_speed_over_copy": copying / gathering,
-        "corrupt_and_shift_over_gather": changing / gathering,
+        "corrupt_and_shift_over_gather": both / gathering - 1,
+        "patch_and_shift_over_gather": patch / gathering - 1,
         "transitions_ms": _seconds(lambda: dataset.transitions(rows(), 3), repeats) * 1e3,
     }
 
@@ -241,9 +244,15 @@ def _updates_per_s(dataset: Dataset, encoder_config: EncoderConfig, repeats: int
     algorithm = TD3BC(Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(device), config, generator)
     cached = FeatureSampler(dataset, features, BATCH, 3, 0.99, generator)
     exact = ExactSampler(frozen, BATCH, 3, 0.99, generator)
-    fast, slow = _alternating(
-        repeats, lambda: algorithm.update(cached.sample()), lambda: algorithm.update(exact.sample())
-    )
+
+    def update(sampler: FeatureSampler | ExactSampler) -> Callable[[], None]:
+        def some() -> None:
+            for _ in range(algorithm.policy_delay):
+                algorithm.update(sampler.sample())
+
+        return some
+
+    fast, slow = (seconds / algorithm.policy_delay for seconds in _alternating(repeats, update(cached), update(exact)))
     return {"cached_updates_per_s": 1 / fast, "exact_updates_per_s": 1 / slow, "cached_over_exact": slow / fast}
 
 
