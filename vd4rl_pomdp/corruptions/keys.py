@@ -6,6 +6,9 @@ independent draws without a generator's state, so a corruption can be drawn agai
 
 from __future__ import annotations
 
+from functools import lru_cache
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -14,22 +17,33 @@ _MIX_A = 0xBF58476D1CE4E5B9 - (1 << 64)
 _MIX_B = 0x94D049BB133111EB - (1 << 64)
 
 
-def _shift_right(x: Tensor, bits: int) -> Tensor:
-    """Logical right shift of int64."""
-    return (x >> bits) & ((1 << (64 - bits)) - 1)
-
-
 def hash_keys(key: Tensor) -> Tensor:
     """Mix int64 keys of any shape into int64 values that look uniform."""
+    if key.device.type == "cpu":  # numpy takes a fraction of the time that torch needs for so few numbers
+        return torch.from_numpy(_mix(key.numpy().reshape(-1))).view(key.shape)
+    return _mix(key)
+
+
+def _mix(key: Any) -> Any:
     key = key + _GOLDEN
     key = (key ^ _shift_right(key, 30)) * _MIX_A
     key = (key ^ _shift_right(key, 27)) * _MIX_B
     return key ^ _shift_right(key, 31)
 
 
+def _shift_right(x: Any, bits: int) -> Any:
+    """Logical right shift of int64."""
+    return (x >> bits) & ((1 << (64 - bits)) - 1)
+
+
 def derive_keys(seed: int, key: Tensor) -> Tensor:
     """Keys of a stream of draws: one for every int64 in `key`, another set for every seed."""
-    return hash_keys(hash_keys(torch.tensor(seed, dtype=torch.int64, device=key.device)) ^ key)
+    return hash_keys(_hash_seed(seed) ^ key)
+
+
+@lru_cache(maxsize=1024)
+def _hash_seed(seed: int) -> int:
+    return int(hash_keys(torch.tensor(seed)))
 
 
 def draw_integers(key: Tensor, high: int, count: int) -> Tensor:
