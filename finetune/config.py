@@ -7,7 +7,6 @@ from pathlib import Path
 
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
-from vd4rl_pomdp.runs.workers import default_workers
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -52,8 +51,8 @@ class FinetuneConfig:
     """Episodes of an evaluation."""
     eval_length: int = 500
     """Decisions in an evaluation episode; fewer only for trials."""
-    workers: int = default_workers()
-    """Processes that evaluate."""
+    workers: int = 0
+    """Processes that evaluate; 0 uses every core."""
     device: str = "auto"
     """auto, cpu or cuda."""
     log_every: int = 500

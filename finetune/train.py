@@ -37,7 +37,7 @@ def finetune(config: FinetuneConfig) -> RunFolder:
     refuse_outside(
         config, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, gamma=(0, 1), n_step=1,
         alpha=0, views=0, shift=(0, FRAME_SIZE - 1), eval_every=1, eval_episodes=1, eval_length=1, log_every=1,
-        checkpoint_every=1,
+        checkpoint_every=1, workers=0,
     )  # fmt: skip
     device = pick_device(config.device)
     dataset = open_dataset(config.data)

@@ -177,8 +177,8 @@ class TableCommand:
     """Qualities; one whose actor does not ship is left out."""
     timed_episodes: int = 4
     """Episodes of the short rendered collection that is timed for each task."""
-    workers: int = 1
-    """Processes that play."""
+    workers: int = 0
+    """Processes that play; 0 uses every core."""
 
 
 def _table(words: Arguments, program: str) -> None:

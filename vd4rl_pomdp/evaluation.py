@@ -19,7 +19,7 @@ from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import load_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy
 from vd4rl_pomdp.runs.folder import read_json, write_csv
-from vd4rl_pomdp.runs.workers import default_workers, run_jobs
+from vd4rl_pomdp.runs.workers import run_jobs
 from vd4rl_pomdp.tasks import SCORE_DIVISOR, get_task
 
 EVALUATION_SEED = 20_000
@@ -229,5 +229,5 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
         for episode in range(episodes)
     ]
     step = max(row["step"] for row in evaluated)
-    done = evaluate(jobs, workers or default_workers())
+    done = evaluate(jobs, workers)
     return rows_of(done, labels | {"corruption": chosen.corruption, "step": step})

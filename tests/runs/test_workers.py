@@ -6,7 +6,7 @@ import time
 
 import pytest
 
-from vd4rl_pomdp.runs.workers import run_jobs
+from vd4rl_pomdp.runs.workers import count_workers, run_jobs
 
 PARENT = """
 import os, time
@@ -53,3 +53,8 @@ def test_a_killed_parent_leaves_no_workers(tmp_path):
     while any(map(_alive, workers)) and time.monotonic() < deadline:
         time.sleep(0.05)
     assert not any(map(_alive, workers))
+
+
+def test_no_number_of_workers_is_one_for_every_core():
+    assert count_workers(0) >= 1
+    assert count_workers(3) == 3

@@ -21,7 +21,7 @@ from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, r
 from vd4rl_pomdp.runs.folder import jsonable, read_json, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
-from vd4rl_pomdp.runs.workers import default_workers, run_jobs
+from vd4rl_pomdp.runs.workers import count_workers, run_jobs
 from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, QUALITIES, Quality, get_task
 
 Policy = Actor | Ladder | None
@@ -44,8 +44,8 @@ class CollectConfig:
     """Episodes in all, 501 rows each (V-D4RL's sets have 200)."""
     seed: int = 0
     """Seed of initial states and actions."""
-    workers: int = default_workers()
-    """Processes that simulate and render."""
+    workers: int = 0
+    """Processes that simulate and render; 0 uses every core."""
     render: Literal["fast", "exact"] = "fast"
     """fast: a smaller shadow map, 0.03 of 255 away from exact; exact: dm_control's default."""
     episodes_per_shard: int = 50
@@ -102,7 +102,7 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
 def _check(config: CollectConfig) -> None:
     """Refuse settings that make no set."""
     get_task(config.task)
-    refuse_outside(config, episodes=1, episodes_per_shard=1, seed=(0, MAX_SEED))
+    refuse_outside(config, episodes=1, episodes_per_shard=1, seed=(0, MAX_SEED), workers=0)
     if config.quality not in QUALITIES:
         raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(QUALITIES)}")
     if config.quality == "medium_expert" and config.episodes < 2:
@@ -256,7 +256,7 @@ def record_set(out: Path, seconds: float, frames: int, workers: int) -> None:
         return
     from vd4rl_pomdp.envs.parity import render_info
 
-    facts = {"seconds": round(seconds, 1), "frames": frames, "workers": workers}
+    facts = {"seconds": round(seconds, 1), "frames": frames, "workers": count_workers(workers)}
     origin = {"command": command(), "git_commit": git_commit(), "versions": versions()}
     _write_json(path, facts | origin | {"render": render_info()})
 

@@ -7,8 +7,6 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from vd4rl_pomdp.runs.workers import default_workers
-
 METHODS = ("mik+a", "acro", "random")
 CORRUPTION = "patch+zero_frames"
 EPISODES = 8
@@ -39,7 +37,7 @@ def demo(out: Path, workers: int, run: Callable[[list[str]], None]) -> None:
         run: what carries out one command line.
     """
     started = time.monotonic()
-    for words in demo_commands(out, workers or default_workers()):
+    for words in demo_commands(out, workers):
         print(f"\n$ vd4rl-pomdp {' '.join(words)}", file=sys.stderr)
         run(words)
     print(f"demo finished in {(time.monotonic() - started) / 60:.1f} minutes")

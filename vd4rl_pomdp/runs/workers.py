@@ -19,8 +19,9 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
     """Yield function(job) for every job, in order.
 
     Workers are fresh processes (no GL context or thread pool is inherited) with one thread each; they end with the
-    caller. With one worker everything runs in the calling process.
+    caller. With one worker everything runs in the calling process; 0 is a worker for every core.
     """
+    workers = count_workers(workers)
     if workers <= 1 or len(jobs) <= 1:
         yield from map(function, jobs)
         return
@@ -32,8 +33,10 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
         pool.shutdown(wait=True, cancel_futures=True)
 
 
-def default_workers() -> int:
-    """Cores this process may use."""
+def count_workers(workers: int) -> int:
+    """`workers`, or for 0 the number of cores that this process may use."""
+    if workers:
+        return workers
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 

@@ -22,7 +22,7 @@ from vd4rl_pomdp.mazes import get_maze
 from vd4rl_pomdp.runs.folder import jsonable
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import versions
-from vd4rl_pomdp.runs.workers import default_workers, run_jobs
+from vd4rl_pomdp.runs.workers import run_jobs
 from vd4rl_pomdp.types import StepType
 
 _RUNTIME_FIELDS = ("out", "workers", "preset")
@@ -48,8 +48,8 @@ class CollectConfig:
     """Standard deviation of the Gaussian noise on actions in [-1, 1]."""
     seed: int = 0
     """Seed of starts, goals and noise."""
-    workers: int = default_workers()
-    """Processes that simulate and draw."""
+    workers: int = 0
+    """Processes that simulate and draw; 0 uses every core."""
     trajectories_per_shard: int = 5
     """Trajectories in a shard."""
 
@@ -106,7 +106,7 @@ def _check(config: CollectConfig) -> None:
     get_maze(config.maze)
     refuse_outside(
         config, trajectories=1, trajectory_rows=2, action_repeat=1, noise=0, seed=(0, MAX_SEED),
-        trajectories_per_shard=1, workers=1,
+        trajectories_per_shard=1, workers=0,
     )  # fmt: skip
 
 
