@@ -14,6 +14,7 @@ from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream
 from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.runs.device import Precision, autocast
+from vd4rl_pomdp.runs.folder import replacing_file
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.types import Batch
 
@@ -101,10 +102,8 @@ def encode_views(frozen: FrozenEncoder, views: int, path: Path) -> Tensor:
                     start, end = int(dataset.episode_start[number]), int(dataset.episode_end[number])
                     out[view, start:end] = frozen.episode(number, view, corruption).cpu().numpy()
                     progress.advance()
-        temporary = path.with_name(f".{path.name}.tmp")
-        with temporary.open("wb") as file:
+        with replacing_file(path) as fresh, fresh.open("wb") as file:
             np.save(file, out)
-        temporary.replace(path)
     return torch.from_numpy(np.load(path)).to(dataset.t.device)
 
 

@@ -25,7 +25,7 @@ from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.probes import probe_state
 from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint, seed_everything
 from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.folder import RunFolder, jsonable, write_json
+from vd4rl_pomdp.runs.folder import RunFolder, jsonable, replacing_file, write_json
 from vd4rl_pomdp.runs.metrics import MetricsLog
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.tasks import FRAME_SIZE, get_task
@@ -161,9 +161,8 @@ class Trainer:
         rows = rows_of(episodes, _labels(config, self.card) | {"step": self.step})
         append_rows(run.path / "episodes.csv", rows)
         if episodes[0].film is not None:
-            temporary = run.path / ".film.tmp.npz"
-            np.savez_compressed(temporary, **episodes[0].film)  # type: ignore[arg-type]
-            temporary.replace(run.path / "film.npz")
+            with replacing_file(run.path / "film.npz") as fresh, fresh.open("wb") as file:
+                np.savez_compressed(file, **episodes[0].film)  # type: ignore[arg-type]
         return float(np.mean([row["score"] for row in rows]))
 
     def _state(self) -> dict[str, Any]:

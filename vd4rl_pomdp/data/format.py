@@ -22,6 +22,7 @@ import h5py
 import numpy as np
 
 from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.runs.folder import replacing_file
 from vd4rl_pomdp.tasks import FRAME_SIZE
 from vd4rl_pomdp.types import StepType
 
@@ -86,15 +87,12 @@ def write_shard(path: Path, rows: Mapping[str, np.ndarray], attributes: Mapping[
     Raises:
         UserError: the disk is full or the folder cannot be written; nothing is left behind.
     """
-    temporary = path.with_name(f".{path.name}.tmp")
     try:
-        # compressed in memory: HDF5 cannot close a file on a full disk
-        temporary.write_bytes(_encode(rows, attributes))
-        temporary.replace(path)
+        with replacing_file(path) as fresh:
+            # compressed in memory: HDF5 cannot close a file on a full disk
+            fresh.write_bytes(_encode(rows, attributes))
     except OSError as error:
         raise disk_error(path, error) from error
-    finally:
-        temporary.unlink(missing_ok=True)
 
 
 def _encode(rows: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> bytes:

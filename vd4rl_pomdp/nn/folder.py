@@ -14,6 +14,7 @@ from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE
+from vd4rl_pomdp.runs.folder import replacing_file, write_json
 
 
 @dataclass(frozen=True)
@@ -38,13 +39,9 @@ def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard) -> None:
     """Write an encoder folder; whole files only, config last."""
     folder.mkdir(parents=True, exist_ok=True)
     weights = {name: value.contiguous().cpu() for name, value in encoder.state_dict().items()}
-    temporary = folder / ".model.safetensors.tmp"
-    save_file(weights, temporary)
-    temporary.replace(folder / "model.safetensors")
-    config = {"encoder": asdict(encoder.config), "pretrain": asdict(card)}
-    temporary = folder / ".config.json.tmp"
-    temporary.write_text(json.dumps(config, indent=2) + "\n")
-    temporary.replace(folder / "config.json")
+    with replacing_file(folder / "model.safetensors") as fresh:
+        save_file(weights, fresh)
+    write_json(folder / "config.json", {"encoder": asdict(encoder.config), "pretrain": asdict(card)})
 
 
 def load_encoder(

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.heads import mlp
-from vd4rl_pomdp.runs.folder import read_json, write_json
+from vd4rl_pomdp.runs.folder import read_json, replacing_file, write_json
 
 
 class Standardise(nn.Module):
@@ -63,9 +63,8 @@ class Policy(nn.Module):
     def save(self, folder: Path) -> None:
         """Write the policy folder."""
         folder.mkdir(parents=True, exist_ok=True)
-        temporary = folder / ".model.safetensors.tmp"
-        save_file({k: v.contiguous().cpu() for k, v in self.state_dict().items()}, temporary)
-        temporary.replace(folder / "model.safetensors")
+        with replacing_file(folder / "model.safetensors") as fresh:
+            save_file({k: v.contiguous().cpu() for k, v in self.state_dict().items()}, fresh)
         write_json(folder / "config.json", self.shape)
 
 

@@ -20,6 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save_file
 
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs.folder import replacing_file
 from vd4rl_pomdp.tasks import TASKS, Task, get_task
 
 LOG_STD_RANGE = (-20.0, 2.0)
@@ -146,9 +147,8 @@ class Ladder:
 
 def _save(weights: dict[str, np.ndarray], card: dict[str, Any], path: Path) -> None:
     path.parent.mkdir(parents=True, exist_ok=True)
-    temporary = path.with_name(f".{path.name}.tmp")
-    save_file({k: np.ascontiguousarray(v) for k, v in weights.items()}, temporary, {"card": json.dumps(card)})
-    temporary.replace(path)
+    with replacing_file(path) as fresh:
+        save_file({k: np.ascontiguousarray(v) for k, v in weights.items()}, fresh, {"card": json.dumps(card)})
 
 
 def read_actor(path: Path, task: Task | None = None) -> Actor:

@@ -18,7 +18,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import OBSERVATION_CLIP, Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
 from vd4rl_pomdp.policies.state_env import StateEnv
-from vd4rl_pomdp.runs.folder import newest, read_json, replacing
+from vd4rl_pomdp.runs.folder import newest, read_json, replacing, replacing_file
 from vd4rl_pomdp.tasks import Task
 
 if TYPE_CHECKING:
@@ -110,9 +110,8 @@ def save_networks(model: SAC, path: Path) -> None:
     """Write actor, critics, temperature and observation statistics, without optimisers, to one small file."""
     leaves, _ = _flatten(_networks(model))
     arrays = {f"{i:04d}": np.array(leaf) for i, leaf in enumerate(leaves)} | _statistics(model)
-    temporary = path.with_name(f".{path.name}.tmp")
-    save_file(arrays, temporary)
-    temporary.replace(path)
+    with replacing_file(path) as fresh:
+        save_file(arrays, fresh)
 
 
 def start_from_networks(model: SAC, path: Path) -> None:

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs.folder import replacing_file
 
 WandbMode = Literal["off", "offline", "online"]
 
@@ -19,9 +20,8 @@ class MetricsLog:
     def __init__(self, path: Path, step: int, wandb: WandbMode = "off", config: dict[str, Any] | None = None) -> None:
         self._path = path
         kept = [row for row in read_metrics(path) if row["step"] <= step]
-        temporary = path.with_name(f".{path.name}.tmp")
-        temporary.write_text("".join(json.dumps(row) + "\n" for row in kept))
-        temporary.replace(path)
+        with replacing_file(path) as fresh:
+            fresh.write_text("".join(json.dumps(row) + "\n" for row in kept))
         self._wandb = _start_wandb(wandb, path.parent, config or {})
 
     def write(self, step: int, metrics: dict[str, float]) -> None:
