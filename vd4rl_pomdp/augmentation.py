@@ -33,10 +33,9 @@ def observe(dataset: Dataset, rows: Tensor, shift_key: Tensor, pad: int, corrupt
     Returns:
         (N, ..., C, H, W) uint8.
     """
-    keys = corruption.keys(dataset.keys(rows))
     if not _by_lines(dataset.frames, pad):
-        return corruption.corruption.apply_(random_shift(dataset.stacks(rows), shift_key, pad), keys)
-    keys = keys.flatten()
+        return corruption(random_shift(dataset.stacks(rows), shift_key, pad), dataset.keys(rows))
+    keys = corruption.keys(dataset.keys(rows)).flatten()
     kept = corruption.corruption.kept(keys, FRAME_STACK)
     chosen = dataset.stack_rows(rows).view(-1, FRAME_STACK).gather(1, kept)
     images = _BUFFERS.take((chosen.numel() + 1, *dataset.frames.shape[1:]))
