@@ -105,7 +105,7 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]
 
 @contextmanager
 def replacing_file(path: Path) -> Iterator[Path]:
-    """A hidden name beside `path` to write; it takes `path`'s place when the block ends, and goes if the block fails."""
+    """A hidden name beside `path` to write, which takes `path`'s place when the block ends, or goes if it fails."""
     fresh = path.with_name(f".{path.name}.tmp")
     try:
         yield fresh
