@@ -20,6 +20,8 @@ AT_LEAST = {
     "walker_walk_medium": 450,
     "cheetah_run_expert": 850,
     "cheetah_run_medium": 400,
+    "humanoid_walk_expert": 700,
+    "humanoid_walk_medium": 350,
 }
 
 
@@ -39,7 +41,7 @@ def test_twenty_episodes_return_what_the_card_says_to_the_digit(name):
 
 def test_the_required_actors_ship_and_all_stay_small():
     assert set(AT_LEAST) <= set(ACTORS)
-    assert {"walker_walk", "cheetah_run"} <= set(LADDERS)
+    assert {"walker_walk", "cheetah_run", "humanoid_walk"} <= set(LADDERS)
     assert sum(p.stat().st_size for p in actor.ASSETS.iterdir()) < 10e6
 
 

@@ -93,4 +93,4 @@ RECIPES: dict[str, PolicyConfig] = {
 }
 """Defaults by task. Plain SAC is enough for walker_walk. The others get standardised observations, layer norms in the
 critics and three-step returns; humanoid_walk also more fresh decisions for each update: physics is far cheaper than
-gradients. Where a run has levelled off, a second one with a lower learning rate (--start-from) climbs on."""
+gradients. Where a run has levelled off, another from it (--start-from) with other steps or exploration climbs on."""
