@@ -25,7 +25,7 @@ from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.probes import probe_state
 from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint, seed_everything
 from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.folder import RunFolder, jsonable, replacing_file, write_json
+from vd4rl_pomdp.runs.folder import RunFolder, jsonable, replacing, replacing_file, write_json
 from vd4rl_pomdp.runs.metrics import MetricsLog
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.tasks import FRAME_SIZE, get_task
@@ -203,8 +203,5 @@ def _keep_encoder(source: Path, run: Path) -> None:
     timing = source.parent / "timing.json"
     if timing.exists():
         shutil.copyfile(timing, run / "pretrain_timing.json")
-    scratch = target.with_name(".encoder.tmp")
-    shutil.rmtree(scratch, ignore_errors=True)
-    shutil.copytree(source, scratch)
-    shutil.rmtree(target, ignore_errors=True)
-    scratch.rename(target)
+    with replacing(target) as fresh:
+        shutil.copytree(source, fresh, dirs_exist_ok=True)

@@ -18,6 +18,7 @@ from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 
 from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.runs.folder import replacing_file
 from vd4rl_pomdp.tasks import QUALITIES, get_task
 
 DEFAULT_ENDPOINT = "https://huggingface.co"
@@ -116,16 +117,15 @@ def _is_complete(file: RemoteFile, path: Path, verify: bool) -> bool:
 
 def _link(source: Path, target: Path) -> None:
     """Give an existing file a second name: a hard link, a symbolic one, or where neither works a copy."""
-    temporary = target.with_name(f".{target.name}.tmp")
-    temporary.unlink(missing_ok=True)
-    try:
-        os.link(source.resolve(), temporary)
-    except OSError:
+    with replacing_file(target) as fresh:
+        fresh.unlink(missing_ok=True)
         try:
-            temporary.symlink_to(os.path.relpath(source, target.parent.resolve()))
+            os.link(source.resolve(), fresh)
         except OSError:
-            shutil.copyfile(source, temporary)
-    temporary.replace(target)
+            try:
+                fresh.symlink_to(os.path.relpath(source, target.parent.resolve()))
+            except OSError:
+                shutil.copyfile(source, fresh)
 
 
 def _fetch(file: RemoteFile, target: Path, url: str, bar: Progress) -> None:
