@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from pretrain.navigation import train as module
 from pretrain.navigation.config import PRESETS, NavigationConfig, command_of
+from pretrain.navigation.data import MazeData
 from pretrain.navigation.probe import ErrorSums, StateProbe, TrueStates, refit
-from pretrain.navigation.train import METHOD_NAMES, MazeData, Trainer, learning_rate, train
+from pretrain.navigation.train import train
+from pretrain.navigation.trainer import METHOD_NAMES, Trainer, learning_rate, make_objective
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.observations import open_maze_set
@@ -33,7 +34,7 @@ def smoke(data: Path, out: Path, **changes: object) -> NavigationConfig:
 def trainer_of(config: NavigationConfig) -> Trainer:
     torch.manual_seed(0)
     data = MazeData(*open_maze_set(config.data), config, None)
-    return Trainer(module.make_objective(data, config), data.on(torch.device("cpu")), config)
+    return Trainer(make_objective(data, config), data.on(torch.device("cpu")), config)
 
 
 def results(out: Path) -> dict[tuple, float]:

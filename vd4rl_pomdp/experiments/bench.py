@@ -325,7 +325,8 @@ def _mazes(frames: int) -> dict[str, float]:
 def _maze_training() -> dict[str, float]:
     """Steps/s of `navigation train --preset cpu`, and the share of a step that sampling and the optimiser take."""
     from pretrain.navigation.config import PRESETS
-    from pretrain.navigation.train import MazeData, Trainer, make_objective
+    from pretrain.navigation.data import MazeData
+    from pretrain.navigation.trainer import Trainer, make_objective
     from vd4rl_pomdp.experiments.navigation import collect
     from vd4rl_pomdp.experiments.navigation.observations import open_maze_set
 

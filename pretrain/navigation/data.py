@@ -1,0 +1,68 @@
+"""A maze's set as the model sees it: windows of observations with the true states of their rows."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from pretrain.navigation.config import NavigationConfig
+from pretrain.navigation.probe import TrueStates
+from vd4rl_pomdp.data import Dataset
+from vd4rl_pomdp.experiments.navigation.exogenous import ExogenousNoise
+from vd4rl_pomdp.experiments.navigation.observations import observe, open_maze_set, shrink
+from vd4rl_pomdp.mazes import MazeSpec
+from vd4rl_pomdp.types import Windows
+
+HELD_OUT = 10
+"""One in this many trajectories, the last ones, is never trained on."""
+_NOISE_STREAM = 2
+
+
+def open_data(config: NavigationConfig) -> MazeData:
+    """The set that a config names, with its exogenous noise, on the CPU."""
+    noise = None
+    if config.exogenous != "none":
+        noise = ExogenousNoise(config.exogenous, config.exogenous_weight, config.seed * 10 + _NOISE_STREAM)
+    return MazeData(*open_maze_set(config.data), config, noise)
+
+
+class MazeData:
+    """Batches of a maze's set: the first trajectories are for training, the last tenth is held out."""
+
+    def __init__(
+        self, dataset: Dataset, maze: MazeSpec, config: NavigationConfig, noise: ExogenousNoise | None
+    ) -> None:
+        self.dataset, self.maze, self._config, self._noise = dataset, maze, config, noise
+        held_out = max(1, dataset.num_episodes // HELD_OUT)
+        self.first_held_out = dataset.num_episodes - held_out
+        split = int(dataset.episode_start[self.first_held_out])
+        self.states = TrueStates.of(dataset, maze, split)
+        self.training_actions = dataset.action[:split][dataset.t[:split] > 0]
+        """(M, 2) float32."""
+        windows = (dataset.episode_end - dataset.episode_start - config.window + 1).clamp(min=0)
+        self.total = dataset.num_windows(config.window)
+        self.training = int(windows[: self.first_held_out].sum())
+        """Windows 0..training-1 are for training, the rest is held out."""
+        self._stored = config.picture == "rgb100"
+
+    def on(self, device: torch.device) -> MazeData:
+        """Prepare the observations and move everything to a device."""
+        if not self._stored:
+            shrink(self.dataset, self._config.picture, self._noise)
+        self.dataset.to(device)
+        self.states = self.states.to(device)
+        return self
+
+    def windows(self, number: Tensor, length: int | None = None) -> Windows:
+        """Windows by (B,) numbers, as the model sees them."""
+        window = self.dataset.windows(number, length or self._config.window, 1)
+        if self._stored and self._noise is not None:
+            obs = observe(window.obs.flatten(0, 1), window.key.flatten(), self._config.picture, self._noise)
+            window = window.replace(obs=obs.view(window.obs.shape))
+        return window
+
+    def spread(self, count: int, held_out: bool) -> list[Tensor]:
+        """Numbers of `count` windows, evenly spread over the training or the held-out ones, in batches."""
+        first, last = (self.training, self.total) if held_out else (0, self.training)
+        numbers = torch.linspace(first, last - 1, min(count, last - first)).long()
+        return list(numbers.split(self._config.batch_size))

@@ -1,0 +1,134 @@
+"""What a trained objective knows of the state: errors by split and probe, action losses, and one trajectory to draw.
+
+Numbers are rows of (measure, split, probe, rows, k, value), which is what `results.json` keeps of a run.
+"""
+
+from __future__ import annotations
+
+import csv
+import json
+from collections import defaultdict
+from pathlib import Path
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pretrain.navigation.config import NavigationConfig
+from pretrain.navigation.probe import ErrorSums, StateProbe, refit
+from pretrain.navigation.trainer import UNTRAINED, Trainer
+from vd4rl_pomdp.data import Dataset
+from vd4rl_pomdp.runs.device import autocast
+
+TRAJECTORY_ROWS = 200
+"""Rows of the held-out trajectory whose estimated states are kept for a figure."""
+
+
+@torch.no_grad()
+def evaluate(trainer: Trainer) -> tuple[dict[str, float], dict[str, float]]:
+    """Action losses, and errors of the probe as trained, on held-out windows."""
+    sums: dict[str, float] = defaultdict(float)
+    errors, count = ErrorSums(), 0
+    trainer.objective.eval()
+    for number in trainer.data.spread(trainer.config.evaluation_windows, held_out=True):
+        with autocast(trainer.device, trainer.config.precision):
+            _, logs, states = trainer.losses(trainer.data.windows(number))
+        errors.add(*states, trainer.config.burn_in)
+        count += len(number)
+        for name, value in logs.items():
+            sums[name] += float(value) * len(number)
+    return {name: value / count for name, value in sums.items()}, errors.percent()
+
+
+@torch.no_grad()
+def encode(trainer: Trainer, number: Tensor, length: int | None = None) -> tuple[Tensor, Tensor]:
+    """Frozen states (B, T, D) float32 of windows, and their rows (B, T)."""
+    window = trainer.data.windows(number, length)
+    with autocast(trainer.device, trainer.config.precision):
+        return trainer.objective.encoder.encode(window).float(), trainer.data.states.rows(window)
+
+
+def refitted_errors(trainer: Trainer) -> tuple[StateProbe, dict[str, dict[str, float]]]:
+    """A probe fitted on frozen states of training windows, and its errors by split."""
+    config, states = trainer.config, trainer.data.states
+    trainer.objective.eval()
+    parts = [encode(trainer, number) for number in trainer.data.spread(config.refit_windows, held_out=False)]
+    features, rows = (torch.cat([part[i][:, config.burn_in :].flatten(0, 1) for part in parts]) for i in (0, 1))
+    probe = refit(features, states.values[rows], config.refit_steps, config.seed)
+    found = {}
+    for split, held_out in (("training", False), ("held_out", True)):
+        errors = ErrorSums()
+        for number in trainer.data.spread(config.evaluation_windows, held_out):
+            past, at = encode(trainer, number)
+            errors.add(probe(past), states.values[at], states.hidden[at], config.burn_in)
+        found[split] = errors.percent()
+    return probe, found
+
+
+def measure(trainer: Trainer, log: Path) -> tuple[StateProbe, list[dict[str, Any]]]:
+    """The probe refitted on frozen states, and all rows that `results.json` keeps; `log` is the run's metrics.jsonl."""
+    probe, refitted = refitted_errors(trainer)
+    rows = [row for split, errors in refitted.items() for row in _error_rows(split, "refit", errors)]
+    if trainer.config.method == UNTRAINED:  # its online probe and its action head were never trained
+        return probe, rows
+    losses, online = evaluate(trainer)
+    averages = _training_averages(log, trainer.config)
+    rows += _error_rows("held_out", "online", online) + _error_rows("training", "online", averages)
+    return probe, rows + _loss_rows("training", averages) + _loss_rows("held_out", losses)
+
+
+def _error_rows(split: str, probe: str, errors: dict[str, float]) -> list[dict[str, Any]]:
+    named = [name for name in errors if name.removesuffix("_hidden") in ("state", "position", "velocity")]
+    return [
+        {
+            "measure": f"{name.removesuffix('_hidden')}_error",
+            "split": split,
+            "probe": probe,
+            "rows": "hidden" if name.endswith("_hidden") else "all",
+            "k": 0,
+            "value": errors[name],
+        }
+        for name in named
+    ]
+
+
+def _loss_rows(split: str, logs: dict[str, float]) -> list[dict[str, Any]]:
+    """Action losses in nats x 100, as in the paper's table: k = 0 stands for the mean over all pairs."""
+    by_k = {0: logs["action_loss"]} | {int(n[6:]): v for n, v in logs.items() if n.startswith("loss_k")}
+    common = {"measure": "action_loss", "split": split, "probe": "", "rows": "all"}
+    return [common | {"k": k, "value": 100 * value} for k, value in by_k.items()]
+
+
+def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]:
+    """Means of the logged intervals that end in the last `average_last` steps."""
+    logged = [json.loads(line) for line in path.read_text().splitlines()]
+    last = [row for row in logged if row["step"] > config.steps - config.average_last]
+    values: dict[str, list[float]] = defaultdict(list)
+    for row in last:
+        for name, value in row.items():
+            values[name].append(value)
+    return {name: sum(numbers) / len(numbers) for name, numbers in values.items()}
+
+
+def write_trajectory(path: Path, trainer: Trainer, probe: StateProbe) -> None:
+    """True and estimated states of the first held-out trajectory, read as one stream."""
+    dataset, states = trainer.data.dataset, trainer.data.states
+    start = int(dataset.episode_start[trainer.data.first_held_out])
+    length = min(TRAJECTORY_ROWS, int((dataset.episode_end - dataset.episode_start).min()))
+    past, rows = encode(trainer, torch.tensor([_window_at(dataset, start, length)]), length)
+    estimate = (probe(past)[0].detach() * states.std + states.mean).cpu()
+    truth = (states.values[rows[0]] * states.std + states.mean).cpu()
+    with path.open("w", newline="") as file:
+        writer = csv.writer(file)
+        names = ("x", "y", "vx", "vy")
+        writer.writerow(["t", *names, *(f"estimated_{name}" for name in names), "hidden"])
+        for t, hidden in enumerate(states.hidden[rows[0]].tolist()):
+            numbers = [*truth[t].tolist(), *estimate[t].tolist()]
+            writer.writerow([t, *(f"{number:.5f}" for number in numbers), int(hidden)])
+
+
+def _window_at(dataset: Dataset, row: int, length: int) -> int:
+    """Number of the window of `length` rows that begins at a row."""
+    episode = int(dataset.episode[row])
+    per_episode = (dataset.episode_end - dataset.episode_start - length + 1).clamp(min=0)
+    return int(per_episode[:episode].sum()) + int(dataset.t[row])

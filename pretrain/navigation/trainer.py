@@ -1,0 +1,140 @@
+"""An objective and a state probe, trained together on one maze; resumable to the bit on a CPU."""
+
+from __future__ import annotations
+
+import math
+from collections import defaultdict
+from dataclasses import asdict
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from pretrain.navigation.config import NavigationConfig
+from pretrain.navigation.data import MazeData
+from pretrain.navigation.probe import ErrorSums, StateProbe
+from pretrain.objectives import build_objective
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES
+from vd4rl_pomdp.experiments.navigation.observations import SHAPES
+from vd4rl_pomdp.nn.action_target import make_action_target
+from vd4rl_pomdp.objective import InverseObjective
+from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint
+from vd4rl_pomdp.runs.device import autocast
+from vd4rl_pomdp.runs.folder import RunFolder, jsonable
+from vd4rl_pomdp.runs.metrics import MetricsLog
+from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.types import Windows
+
+UNTRAINED = "random"
+METHOD_NAMES = (*OBJECTIVES, UNTRAINED)
+"""The paper's objectives, and the floor."""
+_UNTRAINED_IS = "mik+a"
+_BATCH_STREAM = 1
+
+
+def make_objective(data: MazeData, config: NavigationConfig) -> InverseObjective:
+    """The objective of a config on a maze's data, on the CPU."""
+    method = _UNTRAINED_IS if config.method == UNTRAINED else config.method
+    target = make_action_target(config.action_target, data.training_actions.numpy(), config.codes, config.seed)
+    objective = build_objective(
+        config.objective_config(method), data.training_actions, target, observation=SHAPES[config.picture]
+    )
+    if not isinstance(objective, InverseObjective):
+        raise UserError(f"{method} predicts no actions: choose one of {', '.join(METHOD_NAMES)}")
+    return objective
+
+
+class Trainer:
+    """One objective and its probe on one maze's data."""
+
+    def __init__(self, objective: InverseObjective, data: MazeData, config: NavigationConfig) -> None:
+        self.objective, self.data, self.config = objective, data, config
+        self.probe = StateProbe(objective.encoder.dim).to(next(objective.parameters()).device)
+        self.device = next(objective.parameters()).device
+        self.generator = torch.Generator().manual_seed(config.seed * 10 + _BATCH_STREAM)
+        parameters = [*objective.parameters(), *self.probe.parameters()]
+        self.optimiser = torch.optim.Adam(parameters, lr=config.learning_rate)
+        self.step, self.seconds = 0, 0.0
+
+    def batch(self) -> Windows:
+        """The next training windows."""
+        number = torch.randint(self.data.training, (self.config.batch_size,), generator=self.generator)
+        return self.data.windows(number)
+
+    def update(self) -> tuple[dict[str, Tensor], tuple[Tensor, Tensor, Tensor]]:
+        """One gradient step; returns scalars, and (estimated, true, hidden) states."""
+        window = self.batch()
+        with autocast(self.device, self.config.precision):
+            loss, logs, states = self.losses(window)
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        for group in self.optimiser.param_groups:
+            group["lr"] = learning_rate(self.config, self.step)
+        self.optimiser.step()
+        self.objective.after_step()
+        self.step += 1
+        return logs, states
+
+    def losses(self, window: Windows) -> tuple[Tensor, dict[str, Tensor], tuple[Tensor, Tensor, Tensor]]:
+        """Objective's and probe's loss of one batch, whose frames are encoded once."""
+        past, future = self.objective.representations(window)
+        loss, logs = self.objective.loss_of(past, future, window, self.step / max(1, self.config.steps))
+        rows = self.data.states.rows(window)
+        estimate, truth = self.probe(past), self.data.states.values[rows]
+        error = (estimate.float() - truth).square().mean()
+        logs["probe_loss"] = error.detach()
+        return loss + error, logs, (estimate, truth, self.data.states.hidden[rows])
+
+    def run(self, run: RunFolder, steps: int) -> None:
+        """Train up to `steps`, from the newest checkpoint if there is one."""
+        restore_checkpoint(run.checkpoint, self._restore)
+        before = self.seconds
+        log = MetricsLog(run.path / "metrics.jsonl", self.step, self.config.wandb, jsonable(asdict(self.config)))
+        with ProgressLine(f"{self.data.maze.name} {self.config.method}", steps, "steps", self.step) as progress:
+            while self.step < steps:
+                count = min(self.config.log_every, steps - self.step)
+                row = self._interval(count)
+                log.write(self.step, row)
+                progress.advance(count, loss=row["loss"], state_error=row["state"])
+                if self.step % self.config.checkpoint_every == 0 or self.step == steps:
+                    self.seconds = run.seconds(before)
+                    save_checkpoint(run.checkpoint, self._state())
+        self.seconds = run.seconds(before)
+        log.close()
+
+    def _interval(self, count: int) -> dict[str, float]:
+        """Means over the next `count` steps."""
+        sums: dict[str, Tensor | float] = defaultdict(float)
+        errors = ErrorSums()
+        for _ in range(count):
+            logs, states = self.update()
+            errors.add(*states, self.config.burn_in)
+            for name, value in logs.items():
+                sums[name] = sums[name] + value
+        return {name: float(value) / count for name, value in sums.items()} | errors.percent()
+
+    def _state(self) -> dict[str, Any]:
+        return {
+            "step": self.step,
+            "seconds": self.seconds,
+            "objective": self.objective.state_dict(),
+            "probe": self.probe.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+            "batches": self.generator.get_state(),
+        }
+
+    def _restore(self, state: dict[str, Any]) -> None:
+        self.step, self.seconds = state["step"], state["seconds"]
+        self.objective.load_state_dict(state["objective"])
+        self.probe.load_state_dict(state["probe"])
+        self.optimiser.load_state_dict(state["optimiser"])
+        self.generator.set_state(state["batches"])
+
+
+def learning_rate(config: NavigationConfig, step: int) -> float:
+    """Adam's learning rate of a step, the first being 0."""
+    rising = min(1.0, (step + 1) / config.warm_up) if config.warm_up else 1.0
+    share = max(0, step - config.warm_up) / max(1, config.steps - config.warm_up)
+    falling = (1 + math.cos(math.pi * share)) / 2 if config.schedule == "cosine" else 1.0
+    return config.learning_rate * rising * falling
