@@ -4,7 +4,8 @@ import sys
 
 import pytest
 
-from vd4rl_pomdp.cli import COMMANDS, Command, main
+from vd4rl_pomdp.cli import COMMANDS, main
+from vd4rl_pomdp.cli.dispatch import Command
 from vd4rl_pomdp.experiments.demo import demo_commands
 
 NAMES = [

@@ -17,7 +17,12 @@ MAY_IMPORT = {
     "pretrain": {"pretrain", "baselines", "vd4rl_pomdp"},
     "finetune": {"finetune", "vd4rl_pomdp"},
 }
-DISPATCHERS = ("vd4rl_pomdp/cli.py", "vd4rl_pomdp/experiments/bench.py", "vd4rl_pomdp/experiments/bench_memory.py")
+DISPATCHERS = (
+    "vd4rl_pomdp/cli/stages.py",
+    "vd4rl_pomdp/cli/navigation.py",
+    "vd4rl_pomdp/experiments/bench.py",
+    "vd4rl_pomdp/experiments/bench_memory.py",
+)
 """Files that call the stages and import them inside functions only."""
 
 
@@ -91,10 +96,10 @@ def test_every_flag_of_the_navigation_page_exists():
     from dataclasses import fields
 
     from pretrain.navigation.config import NavigationConfig
-    from vd4rl_pomdp.cli import NavigationGridCommand
+    from vd4rl_pomdp.cli.navigation import GridCommand
     from vd4rl_pomdp.experiments.navigation.collect import CollectConfig
 
-    configs = (NavigationConfig, CollectConfig, NavigationGridCommand)
+    configs = (NavigationConfig, CollectConfig, GridCommand)
     flags = {f.name.replace("_", "-") for config in configs for f in fields(config)}
     named = re.findall(r"`--([a-z0-9-]+)", (ROOT / "docs" / "navigation.md").read_text())
     assert len(named) > 20

@@ -192,13 +192,13 @@ def test_the_grid_is_the_issues_and_its_commands_parse(capsys):
     assert len(commands) == 33
     assert len({tuple(words) for words in commands}) == 33
     from pretrain.navigation.config import PRESETS, NavigationConfig
-    from vd4rl_pomdp.cli import _with_presets
+    from vd4rl_pomdp.cli.parsing import with_presets
 
     literal = next(words for words in commands if "--literal-future" in words)
-    config = _with_presets(NavigationConfig, PRESETS, literal[2:], "x")
+    config = with_presets(NavigationConfig, PRESETS, literal[2:], "x")
     assert (config.literal_future, config.max_k, config.preset) == (True, 1, "cpu")
     options = Cell("no_curtain", "ah", self_prediction=True, exogenous=True)
-    config = _with_presets(NavigationConfig, PRESETS, options.words("cpu", Path("d"), Path("r"), 4)[2:], "x")
+    config = with_presets(NavigationConfig, PRESETS, options.words("cpu", Path("d"), Path("r"), 4)[2:], "x")
     assert (config.self_prediction, config.exogenous, config.seed) == (1.0, "photographs", 4)
     main(["navigation", "grid", "--dry-run", "--seeds", "0", "--mazes", "no_curtain"])
     assert len(capsys.readouterr().out.splitlines()) == 11

@@ -277,7 +277,7 @@ def test_streaming_and_windows_agree_for_the_mazes_encoders(maze_set, tmp_path, 
 
 
 def test_the_command_that_a_run_names_has_its_config(maze_set, tmp_path):
-    from vd4rl_pomdp.cli import _with_presets
+    from vd4rl_pomdp.cli.parsing import with_presets
 
     for config in (
         smoke(maze_set, tmp_path / "a run", method="fj+a", m=3, self_prediction=0.5, k_embedding=False),
@@ -286,4 +286,4 @@ def test_the_command_that_a_run_names_has_its_config(maze_set, tmp_path):
     ):
         words = command_of(config)
         assert words[:3] == ["vd4rl-pomdp", "navigation", "train"]
-        assert _with_presets(NavigationConfig, PRESETS, words[3:], "x") == config
+        assert with_presets(NavigationConfig, PRESETS, words[3:], "x") == config

@@ -1,0 +1,42 @@
+"""The command line: one subcommand a stage. Bad input ends with one line and exit code 2, never with a traceback."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Sequence
+
+from vd4rl_pomdp.cli import data, navigation, policy, stages, studies
+from vd4rl_pomdp.cli.dispatch import Table, run_stage
+from vd4rl_pomdp.errors import UserError, disk_error
+
+COMMANDS: Table = {
+    "demo": stages.DEMO,
+    "data": data.COMMANDS,
+    "policy": policy.COMMANDS,
+    **stages.COMMANDS,
+    "navigation": navigation.COMMANDS,
+    "sweep": stages.SWEEP,
+    **studies.COMMANDS,
+}
+"""All subcommands, in the order in which they are listed."""
+
+
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of `vd4rl-pomdp`."""
+    words = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        run_stage(words)
+    except UserError as error:
+        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
+        sys.exit(2)
+    except FloatingPointError as error:
+        print(f"error: training diverged, {error}; lower --learning-rate or use --precision fp32", file=sys.stderr)
+        sys.exit(1)
+    except KeyboardInterrupt:
+        print("interrupted; the same command goes on from here", file=sys.stderr)
+        sys.exit(130)
+    except BrokenPipeError:
+        sys.exit(141)
+    except OSError as error:
+        print(f"error: {disk_error(error.filename, error)}", file=sys.stderr)
+        sys.exit(2)

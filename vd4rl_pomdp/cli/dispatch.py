@@ -1,0 +1,70 @@
+"""From a command line's first words to the function that they name."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+
+from vd4rl_pomdp.errors import UserError
+
+PROGRAM = "vd4rl-pomdp"
+Arguments = list[str]
+
+
+@dataclass(frozen=True)
+class Command:
+    """One subcommand."""
+
+    summary: str
+    run: Callable[[Arguments, str], None]
+
+
+Table = Mapping[str, Command | Mapping[str, Command]]
+"""Subcommands by name, and groups of them."""
+
+
+def dispatch(table: Table, words: Arguments, program: str) -> None:
+    """Run the subcommand that `words` name, or print what there is."""
+    if not words or words[0] in ("-h", "--help"):
+        print(_overview(table, program))
+        return
+    if words[0] == "--version":
+        from vd4rl_pomdp import __version__
+
+        print(__version__)
+        return
+    if words[0] not in table:
+        raise UserError(f"unknown command '{program} {words[0]}': choose one of {', '.join(table)}")
+    entry = table[words[0]]
+    program = f"{program} {words[0]}"
+    if isinstance(entry, Mapping):
+        dispatch(entry, words[1:], program)
+    else:
+        entry.run(words[1:], program)
+
+
+def _overview(table: Table, program: str) -> str:
+    width = max(map(len, table))
+    lines = [f"usage: {program} COMMAND [--flags]   ({program} COMMAND --help says more)", ""]
+    for name, entry in table.items():
+        text = ", ".join(entry) if isinstance(entry, Mapping) else entry.summary
+        lines.append(f"  {name:<{width}}  {text}")
+    return "\n".join(lines)
+
+
+def run_stage(words: Arguments) -> None:
+    """Do what `vd4rl-pomdp WORDS` does, in this process."""
+    from vd4rl_pomdp.cli import COMMANDS
+
+    dispatch(COMMANDS, words, PROGRAM)
+
+
+def run_stages(stages: list[Arguments], dry_run: bool) -> None:
+    """Print the stages of a run as one line of shell, and execute them unless `dry_run`."""
+    line = " && ".join(f"{PROGRAM} {shlex.join(stage)}" for stage in stages)
+    print(line, file=sys.stdout if dry_run else sys.stderr)
+    if not dry_run:
+        for stage in stages:
+            run_stage(stage)

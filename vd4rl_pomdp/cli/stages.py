@@ -1,0 +1,136 @@
+"""The stages of an experiment, and the commands that run several: pretrain, finetune, evaluate, sweep, demo."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import tyro
+
+from vd4rl_pomdp.cli.dispatch import Arguments, Command, run_stage, run_stages
+from vd4rl_pomdp.cli.parsing import parse, show, with_presets
+
+
+def _pretrain(words: Arguments, program: str) -> None:
+    from pretrain.config import PRESETS, PretrainConfig
+    from pretrain.train import pretrain
+
+    run = pretrain(with_presets(PretrainConfig, PRESETS, words, program))
+    print(f"encoder: {run.path / 'encoder'}")
+
+
+def _finetune(words: Arguments, program: str) -> None:
+    from finetune.config import PRESETS, FinetuneConfig
+    from finetune.train import finetune
+
+    run = finetune(with_presets(FinetuneConfig, PRESETS, words, program))
+    print(f"episodes: {run.path / 'episodes.csv'}")
+
+
+@dataclass(frozen=True)
+class EvaluateCommand:
+    """Evaluate a fine-tuned run again, also under another corruption; prints the rows' summary."""
+
+    run: tyro.conf.Positional[Path]
+    """A fine-tuning run's folder."""
+    corruption: str | None = None
+    """Corruption at evaluation; default: the one it was trained under."""
+    episodes: int = 10
+    """Episodes."""
+    workers: int = 0
+    """Processes; 0 uses every core."""
+    out: Path | None = None
+    """Append the raw rows to this CSV file."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def _evaluate(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.evaluation import append_rows, evaluate_run
+
+    command = parse(EvaluateCommand, words, program)
+    if command.out is not None:
+        append_rows(command.out, [])  # before any episode is played
+    rows = evaluate_run(command.run, command.corruption, command.episodes, command.workers)
+    if command.out is not None:
+        append_rows(command.out, rows)
+    scores = [row["score"] for row in rows]
+    labels = {k: rows[0][k] for k in ("method", "task", "quality", "corruption", "algorithm", "seed", "step")}
+    summary = {"score_mean": sum(scores) / len(scores), "score_min": min(scores), "score_max": max(scores)}
+    show(labels | summary | {"episodes": rows if command.json else len(rows)}, command.json)
+
+
+@dataclass(frozen=True)
+class SweepCommand:
+    """Run methods x seeds through pretraining and fine-tuning, one after the other; finished runs are skipped."""
+
+    data: Path
+    """Folder of the data set."""
+    out: Path
+    """Folder of the runs: OUT/METHOD/CORRUPTION/seedN/{pretrain,finetune-ALGORITHM}."""
+    methods: list[str] = field(default_factory=lambda: ["mik+a", "acro", "random"])
+    """Pretraining methods."""
+    corruptions: list[str] = field(default_factory=lambda: ["patch+zero_frames"])
+    """Corruptions."""
+    algorithms: list[str] = field(default_factory=lambda: ["td3_bc"])
+    """Fine-tuning algorithms."""
+    seeds: list[int] = field(default_factory=lambda: [0])
+    """Training seeds."""
+    preset: str = "paper"
+    """paper, cpu or smoke."""
+    pretrain: str = ""
+    """More flags for every pretraining, with an equals sign: --pretrain="--steps 1000 --shift 0"."""
+    finetune: str = ""
+    """More flags for every fine-tuning, likewise."""
+    dry_run: bool = False
+    """Print the commands only, one line a run, which other machines or a cluster's queue can take in any order."""
+
+
+def _sweep(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.runs.sweep import sweep_runs
+
+    command = parse(SweepCommand, words, program)
+    _check_names(command)
+    for run in sweep_runs(command):
+        run_stages(run, command.dry_run)
+
+
+def _check_names(sweep: SweepCommand) -> None:
+    """Find a misspelt name before the first run, not after the hours that the runs before it take."""
+    from finetune.algorithms import get_algorithm
+    from pretrain.objectives import get_method
+    from vd4rl_pomdp.corruptions import make_corruption
+
+    for check, names in (
+        (get_method, sweep.methods),
+        (make_corruption, sweep.corruptions),
+        (get_algorithm, sweep.algorithms),
+    ):
+        for name in names:
+            check(name)
+
+
+@dataclass(frozen=True)
+class DemoCommand:
+    """Every stage on a small walker_walk set with real rendering, in minutes, ending with a table and a report."""
+
+    out: Path = Path("runs/demo")
+    """Folder of the demo's data and runs; the same command continues where it was cut."""
+    workers: int = 0
+    """Processes; 0 uses every core."""
+
+
+def _demo(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.experiments.demo import demo
+
+    command = parse(DemoCommand, words, program)
+    demo(command.out, command.workers, run_stage)
+
+
+DEMO = Command("every stage on a small set, in minutes", _demo)
+COMMANDS = {
+    "pretrain": Command("train an encoder", _pretrain),
+    "finetune": Command("TD3+BC on a frozen encoder", _finetune),
+    "evaluate": Command("evaluate a fine-tuned run again", _evaluate),
+}
+SWEEP = Command("methods x corruptions x seeds", _sweep)

@@ -1,0 +1,86 @@
+"""Commands that measure or summarise: report, theory, bench."""
+
+from __future__ import annotations
+
+import json
+import sys
+from dataclasses import dataclass
+from pathlib import Path
+
+import tyro
+
+from vd4rl_pomdp.cli.dispatch import Arguments, Command
+from vd4rl_pomdp.cli.parsing import parse, show
+
+
+@dataclass(frozen=True)
+class ReportCommand:
+    """Write an HTML page and CSV files about fine-tuning runs."""
+
+    runs: tyro.conf.Positional[list[Path]]
+    """Run folders, or folders that contain some; a folder that `theory --out` wrote adds its section."""
+    out: Path = Path("report")
+    """Folder of the report."""
+
+
+def _report(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.report import print_summary, write_report
+
+    command = parse(ReportCommand, words, program)
+    page, summary = write_report(command.runs, command.out)
+    print_summary(summary)
+    print(f"report: {page}")
+
+
+@dataclass(frozen=True)
+class TheoryCommand:
+    """Compute the paper's claims on finite worlds by enumeration, and list where its text differs."""
+
+    json: bool = False
+    """Print one JSON object."""
+    out: Path | None = None
+    """Also write an HTML page with figures, and the JSON, into this folder."""
+
+
+def _theory(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.report.theory import print_theory, write_theory
+    from vd4rl_pomdp.theory import theory_study
+
+    command = parse(TheoryCommand, words, program)
+    if command.out is not None:
+        command.out.mkdir(parents=True, exist_ok=True)  # before anything is computed
+    study = theory_study()
+    if command.json:
+        print(json.dumps(study))
+    else:
+        print_theory(study)
+    if command.out is not None:
+        print(f"page: {write_theory(study, command.out)}", file=sys.stderr if command.json else sys.stdout)
+
+
+@dataclass(frozen=True)
+class BenchCommand:
+    """Measure speed and memory of every stage on this machine, as ratios within one run."""
+
+    json: bool = False
+    """Print one JSON object instead of a table."""
+    quick: bool = False
+    """A tenth of the frames and fewer repetitions: rougher numbers, and a peak memory that fixed costs dominate."""
+
+
+def _bench(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.experiments.bench import bench, print_table
+
+    command = parse(BenchCommand, words, program)
+    results = bench(command.quick)
+    if command.json:
+        show(results, as_json=True)
+    else:
+        print_table(results)
+
+
+COMMANDS = {
+    "report": Command("an HTML page and CSV files about runs", _report),
+    "theory": Command("the paper's claims on finite worlds, by enumeration", _theory),
+    "bench": Command("speed and memory on this machine", _bench),
+}
