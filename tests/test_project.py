@@ -20,8 +20,8 @@ MAY_IMPORT = {
 DISPATCHERS = (
     "vd4rl_pomdp/cli/stages.py",
     "vd4rl_pomdp/cli/navigation.py",
-    "vd4rl_pomdp/experiments/bench.py",
-    "vd4rl_pomdp/experiments/bench_memory.py",
+    "vd4rl_pomdp/experiments/bench/training.py",
+    "vd4rl_pomdp/experiments/bench/memory.py",
 )
 """Files that call the stages and import them inside functions only."""
 

@@ -69,7 +69,7 @@ class BenchCommand:
 
 
 def _bench(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.experiments.bench import bench, print_table
+    from vd4rl_pomdp.experiments.bench.suite import bench, print_table
 
     command = parse(BenchCommand, words, program)
     results = bench(command.quick)

@@ -1,4 +1,4 @@
-"""Peak memory of pretraining, a module of its own: its workers import what training imports and no more."""
+"""Peak memory of pretraining; its workers import this module alone, and so what training imports and no more."""
 
 from __future__ import annotations
 

@@ -1,0 +1,123 @@
+"""Updates of pretraining and fine-tuning: rates, overheads, and what caching features saves."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import Dataset
+from vd4rl_pomdp.experiments.bench.data import BATCH
+from vd4rl_pomdp.experiments.bench.memory import make_trainer
+from vd4rl_pomdp.experiments.bench.timing import alternating, seconds_of
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.runs.device import Precision, pick_device
+
+HISTORY_WINDOW = 32
+
+
+def pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
+    """Share of a step that the batch (sampling, corruption, shift) and the optimiser take, and bf16 against fp32."""
+    from pretrain.config import PRESETS
+
+    device = pick_device("auto")
+    results: dict[str, Any] = {"device": str(device)}
+    steps: dict[str, float] = {}
+    for precision in ("fp32", "bf16"):
+        config = replace(
+            PRESETS["paper"], data=folder, out=folder, batch_size=8, corruption="patch+zero_frames", precision=precision
+        )
+        trainer = make_trainer(dataset, config)
+        steps[precision], batch, optimiser = alternating(
+            max(3, repeats // 3), trainer.update, trainer.batch, trainer.optimiser.step
+        )
+        results[f"{precision}_frames_per_s"] = config.batch_size * config.window / steps[precision]
+        results[f"{precision}_overhead_share"] = (batch + optimiser) / steps[precision]
+    return results | {"bf16_over_fp32": steps["fp32"] / steps["bf16"]}
+
+
+def methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
+    """Step time and frames/s of every method in the cpu preset, and what doubling K costs MIK+A."""
+    from pretrain.config import PRESETS
+    from pretrain.objectives import METHODS
+
+    trained = [name for name, method in METHODS.items() if method.trained]
+    config = replace(PRESETS["cpu"], data=folder, out=folder, corruption="patch+zero_frames")
+    results: dict[str, Any] = {}
+    for name in trained:
+        trainer = make_trainer(dataset, replace(config, method=name))
+        seconds = seconds_of(trainer.update, max(3, repeats // 3))
+        frames = config.batch_size * config.window / seconds
+        results[name] = {"step_ms": seconds * 1e3, "frames_per_s": frames}
+    narrow, wide = (make_trainer(dataset, replace(config, max_k=k)).update for k in (15, 30))
+    once, twice = alternating(repeats, narrow, wide)
+    return results | {"k_30_over_k_15": twice / once}
+
+
+def finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
+    """Updates on cached features against updates that encode every batch, for both kinds of encoder.
+
+    The history is cut to a window: encoding whole episodes for every batch would take longer still.
+    """
+    memoryless = EncoderConfig(dataset.action_dim)
+    history = replace(memoryless, history="gru", use_actions=True, history_window=HISTORY_WINDOW)
+    results = {
+        "fp32": _updates_per_s(dataset, memoryless, "fp32", repeats // 3),
+        "bf16": _updates_per_s(dataset, memoryless, "bf16", repeats),
+        "history_bf16": _updates_per_s(dataset, history, "bf16", 1),
+    }
+    return {f"{kind}_{name}": value for kind, values in results.items() for name, value in values.items()}
+
+
+def _updates_per_s(
+    dataset: Dataset, encoder_config: EncoderConfig, precision: Precision, repeats: int
+) -> dict[str, float]:
+    """Rates of many cached updates in a row, as in training, and of as few exact ones as count both kinds of update."""
+    from finetune.algorithms import TD3BC
+    from finetune.config import PRESETS
+    from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder
+    from vd4rl_pomdp.nn.policy import Policy
+
+    config = PRESETS["cpu"]
+    device = dataset.t.device
+    encoder = Encoder(encoder_config).eval().to(device)
+    corruption = CorruptionConfig("patch+zero_frames")
+    frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, precision, 0)
+    features = torch.randn(1, dataset.num_rows, encoder.dim, dtype=torch.float16, device=device)
+    generator = torch.Generator().manual_seed(0)
+    algorithm = TD3BC(Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(device), config, generator)
+
+    def train(sampler: FeatureSampler | ExactSampler, updates: int) -> None:
+        for _ in range(updates):
+            algorithm.update(sampler.sample())
+
+    cached = FeatureSampler(dataset, features, BATCH, 3, 0.99, generator)
+    exact = ExactSampler(frozen, BATCH, 3, 0.99, generator)
+    many, few = 20, algorithm.policy_delay
+    fast, slow = alternating(max(1, repeats), lambda: train(cached, many), lambda: train(exact, few))
+    fast, slow = fast / many, slow / few
+    return {"cached_updates_per_s": 1 / fast, "exact_updates_per_s": 1 / slow, "cached_over_exact": slow / fast}
+
+
+def maze_training() -> dict[str, float]:
+    """Steps/s of `navigation train --preset cpu`, and the share of a step that sampling and the optimiser take."""
+    from pretrain.navigation.config import PRESETS
+    from pretrain.navigation.data import MazeData
+    from pretrain.navigation.trainer import Trainer, make_objective
+    from vd4rl_pomdp.experiments.navigation import collect
+    from vd4rl_pomdp.experiments.navigation.observations import open_maze_set
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        shape = {"maze": "no_curtain", "out": folder / "set", "workers": 1}
+        collect.collect(replace(collect.PRESETS["smoke"], **shape))  # type: ignore[arg-type]
+        config = replace(PRESETS["cpu"], data=folder / "set", out=folder)
+        data = MazeData(*open_maze_set(folder / "set", folder / "cache"), config, None)
+        device = pick_device("auto")
+        trainer = Trainer(make_objective(data, config).to(device), data.on(device), config)
+    step, sampling, optimiser = alternating(5, trainer.update, trainer.batch, trainer.optimiser.step)
+    return {"training_steps_per_s": 1 / step, "training_overhead_share": (sampling + optimiser) / step}
