@@ -20,13 +20,17 @@ MAX_SEED = 2**31 - 1
 
 
 def refuse_outside(config: Any, **ranges: float | tuple[float, float]) -> None:
-    """Raise UserError, naming the flag, for a field outside its range (lowest, or lowest and highest); None passes."""
+    """Refuse fields of a config outside their range: lowest, or lowest and highest; None passes."""
     for name, limits in ranges.items():
-        low, high = limits if isinstance(limits, tuple) else (limits, math.inf)
-        value = getattr(config, name)
-        if value is not None and not low <= value <= high:
-            most = "" if high == math.inf else f" and at most {high}"
-            raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {low}{most}")
+        if (value := getattr(config, name)) is not None:
+            refuse_number(name, value, *(limits if isinstance(limits, tuple) else (limits,)))
+
+
+def refuse_number(name: str, value: float, low: float, high: float = math.inf) -> None:
+    """Raise UserError, naming the flag, for a number below `low`, above `high`, or NaN."""
+    if not low <= value <= high:
+        most = "" if high == math.inf else f" and at most {high}"
+        raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {low}{most}")
 
 
 def disk_error(path: Path | str | None, error: OSError) -> UserError:

@@ -14,7 +14,7 @@ import torch
 from vd4rl_pomdp.corruptions import CorruptionConfig, make_corruption
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
 from vd4rl_pomdp.envs.rendering import Render
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import load_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy
@@ -215,8 +215,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     Raises:
         UserError: an unknown corruption, no episode, or a folder without an evaluated run.
     """
-    if episodes < 1:
-        raise UserError(f"--episodes is {episodes}; it must be at least 1")
+    refuse_number("episodes", episodes, 1)
     evaluated = read_rows(run / "episodes.csv")
     if not evaluated:
         raise UserError(f"{run}: holds no evaluated run; name a folder that `vd4rl-pomdp finetune` wrote")

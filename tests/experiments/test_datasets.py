@@ -73,7 +73,7 @@ def test_the_published_table_is_by_the_actors_that_ship():
 
 
 def test_a_slip_is_a_sentence(played, tmp_path):
-    with pytest.raises(UserError, match="--timed-episodes must be at least 1"):
+    with pytest.raises(UserError, match="--timed-episodes is 0; it must be at least 1"):
         module.tabulate(tmp_path, ["walker_walk"], ["random"], 0, 1)
     assert not played
     with pytest.raises(UserError, match="unknown quality 'good'"):

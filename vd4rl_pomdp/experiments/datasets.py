@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, replay_returns
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.policies.actor import ships
 from vd4rl_pomdp.runs.folder import read_json, write_csv, write_json
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
@@ -80,8 +80,7 @@ def _check(tasks: Sequence[str], qualities: Sequence[str], timed_episodes: int) 
     unknown = sorted(set(qualities) - set(QUALITIES))
     if unknown:
         raise UserError(f"unknown quality {unknown[0]!r}: choose from {', '.join(QUALITIES)}")
-    if timed_episodes < 1:
-        raise UserError("--timed-episodes must be at least 1")
+    refuse_number("timed_episodes", timed_episodes, 1)
     for task in tasks:
         get_task(task)
 
