@@ -47,7 +47,7 @@ if [ ! -x "$VENV/bin/python" ]; then
     "$PYTHON" -m venv "$VENV"
 fi
 say "setup: installing Python packages (a few minutes the first time)"
-"$VENV/bin/python" -m pip install --quiet --disable-pip-version-check -e ".[dev]"
+"$VENV/bin/python" -m pip install --quiet --disable-pip-version-check -e ".[dev,policy]"
 
 can_render() {
     "$VENV/bin/python" scripts/can_render.py >/dev/null 2>&1

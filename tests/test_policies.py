@@ -140,7 +140,6 @@ SETTINGS = {
 @pytest.fixture
 def configure(monkeypatch):
     """Settings of a run that trains after 40 decisions and lasts seconds."""
-    pytest.importorskip("sbx")
     from vd4rl_pomdp.policies import learner
     from vd4rl_pomdp.policies.config import PolicyConfig
 

@@ -153,7 +153,6 @@ def test_a_policy_of_no_decisions_is_refused(tmp_path):
 
 
 def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
-    pytest.importorskip("stable_baselines3")
     from vd4rl_pomdp.experiments.navigation.policy import MazePolicyConfig, train_policy
     from vd4rl_pomdp.policies.actor import read_actor
 
