@@ -6,6 +6,7 @@ import pytest
 
 from vd4rl_pomdp.cli import COMMANDS, main
 from vd4rl_pomdp.cli.dispatch import Command
+from vd4rl_pomdp.cli.parsing import show
 from vd4rl_pomdp.experiments.demo import demo_commands
 
 NAMES = [
@@ -73,6 +74,18 @@ def test_without_words_the_commands_are_listed(capsys):
     main([])
     shown = capsys.readouterr().out
     assert all(name in shown for name in COMMANDS)
+
+
+def test_results_stay_on_one_line_each(capsys):
+    show(
+        {"shards": [f"{i}.hdf5" for i in range(100)], "dtypes": {"reward": ["float64"]}, "seconds": 0.123456789}, False
+    )
+    lines = [line.split() for line in capsys.readouterr().out.splitlines()]
+    assert lines == [
+        ["shards", "0.hdf5", "...", "99.hdf5", "(100)"],
+        ["dtypes.reward", "float64"],
+        ["seconds", "0.123457"],
+    ]
 
 
 def test_the_demo_uses_every_stage(tmp_path):

@@ -16,6 +16,8 @@ from vd4rl_pomdp.cli.dispatch import Arguments
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.folder import flatten
 
+_LONGEST_LIST = 6
+
 
 def parse(config: Any, words: Arguments, program: str, default: Any = None) -> Any:
     """Arguments as an instance of a config class; `--preset`-like defaults come in as `default`."""
@@ -59,4 +61,12 @@ def show(result: dict[str, Any], as_json: bool) -> None:
         print(json.dumps(result))
         return
     for name, value in flatten(result).items():
-        print(f"{name:<40} {value:.6g}" if isinstance(value, float) else f"{name:<40} {value}")
+        print(f"{name:<40} {_text(value)}")
+
+
+def _text(value: Any) -> str:
+    """A value on one line; of a long list its ends and its length."""
+    if isinstance(value, list):
+        shown = value if len(value) <= _LONGEST_LIST else [value[0], "...", value[-1], f"({len(value)})"]
+        return " ".join(map(str, shown))
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
