@@ -22,7 +22,8 @@ class NavigationConfig(InverseConfig):
     out: Path
     """Run folder; the same command continues a run that was cut."""
     method: str = "mik+a"
-    """no_history, ah, ah+a, fj, fj+a, mik, mik+a, another method that predicts actions, or random (untrained mik+a)."""
+    """no_history, ah, ah+a, fj, fj+a, mik, mik+a, another method that predicts actions, random (mik+a, untrained), or
+    supervised and supervised+a (the networks of ah and ah+a, trained on the true states)."""
     preset: str = "paper"
     """paper, cpu or smoke: the defaults of all other settings."""
     seed: int = 0

@@ -16,8 +16,9 @@ from torch import Tensor
 
 from pretrain.navigation.config import NavigationConfig
 from pretrain.navigation.probe import ErrorSums, StateProbe, refit
-from pretrain.navigation.trainer import UNTRAINED, Trainer
+from pretrain.navigation.trainer import Trainer
 from vd4rl_pomdp.data import Dataset
+from vd4rl_pomdp.experiments.navigation.grid import UNTRAINED
 from vd4rl_pomdp.runs.device import autocast
 
 TRAJECTORY_ROWS = 200
@@ -74,7 +75,9 @@ def measure(trainer: Trainer, log: Path) -> tuple[StateProbe, list[dict[str, Any
     losses, online = evaluate(trainer)
     averages = _training_averages(log, trainer.config)
     rows += _error_rows("held_out", "online", online) + _error_rows("training", "online", averages)
-    return probe, rows + _loss_rows("training", averages) + _loss_rows("held_out", losses)
+    if "action_loss" in losses:
+        rows += _loss_rows("training", averages) + _loss_rows("held_out", losses)
+    return probe, rows
 
 
 def _error_rows(split: str, probe: str, errors: dict[str, float]) -> list[dict[str, Any]]:

@@ -63,9 +63,9 @@ class StateProbe(nn.Module):
         self.standardise = Standardise(dim)
         self.net = mlp(dim, 256, STATE_DIM, layers=2)
 
-    def forward(self, z: Tensor) -> Tensor:
-        """Estimated states; no gradient reaches the representation."""
-        return self.net(self.standardise(z.detach()))
+    def forward(self, z: Tensor, frozen: bool = True) -> Tensor:
+        """Estimated states; no gradient reaches the representation unless it is not `frozen`."""
+        return self.net(self.standardise(z.detach() if frozen else z))
 
 
 class ErrorSums:

@@ -12,10 +12,11 @@ from dataclasses import asdict
 from pretrain.navigation.config import NavigationConfig, command_of
 from pretrain.navigation.data import open_data
 from pretrain.navigation.measure import measure, write_trajectory
-from pretrain.navigation.trainer import UNTRAINED, Trainer, make_objective
+from pretrain.navigation.trainer import Trainer, make_objective, network_of
 from pretrain.objectives import get_method
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
+from vd4rl_pomdp.experiments.navigation.grid import UNTRAINED
 from vd4rl_pomdp.experiments.navigation.observations import SHAPES
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
 from vd4rl_pomdp.runs.checkpoint import seed_everything
@@ -64,7 +65,7 @@ def _conclude(run: RunFolder, trainer: Trainer) -> None:
 
 def _check(config: NavigationConfig) -> None:
     """Refuse settings that cannot work, before anything is read or written."""
-    get_method(config.method)
+    get_method(network_of(config.method))
     refuse_outside(
         config, seed=(0, MAX_SEED), steps=1, batch_size=1, window=2, max_k=1, codes=1, m=0, n=0, burn_in=0,
         average_last=1, log_every=1, checkpoint_every=1, evaluation_windows=1, refit_windows=1, refit_steps=1,

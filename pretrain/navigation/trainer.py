@@ -15,7 +15,7 @@ from pretrain.navigation.data import MazeData
 from pretrain.navigation.probe import ErrorSums, StateProbe
 from pretrain.objectives import build_objective
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES
+from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, REFERENCES, SUPERVISED, UNTRAINED
 from vd4rl_pomdp.experiments.navigation.observations import SHAPES
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.objective import InverseObjective
@@ -26,16 +26,20 @@ from vd4rl_pomdp.runs.metrics import MetricsLog
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.types import Windows
 
-UNTRAINED = "random"
-METHOD_NAMES = (*OBJECTIVES, UNTRAINED)
-"""The paper's objectives, and the floor."""
-_UNTRAINED_IS = "mik+a"
+METHOD_NAMES = (*OBJECTIVES, *REFERENCES)
+"""The paper's objectives, the floor and the ceilings."""
+_NETWORK_OF = {UNTRAINED: "mik+a"} | dict(zip(SUPERVISED, ("ah", "ah+a"), strict=True))
 _BATCH_STREAM = 1
+
+
+def network_of(method: str) -> str:
+    """The objective whose network a method has: its own, unless it is a reference."""
+    return _NETWORK_OF.get(method, method)
 
 
 def make_objective(data: MazeData, config: NavigationConfig) -> InverseObjective:
     """The objective of a config on a maze's data, on the CPU."""
-    method = _UNTRAINED_IS if config.method == UNTRAINED else config.method
+    method = network_of(config.method)
     target = make_action_target(config.action_target, data.training_actions.numpy(), config.codes, config.seed)
     objective = build_objective(
         config.objective_config(method), data.training_actions, target, observation=SHAPES[config.picture]
@@ -79,12 +83,15 @@ class Trainer:
     def losses(self, window: Windows) -> tuple[Tensor, dict[str, Tensor], tuple[Tensor, Tensor, Tensor]]:
         """Objective's and probe's loss of one batch, whose frames are encoded once."""
         past, future = self.objective.representations(window)
-        loss, logs = self.objective.loss_of(past, future, window, self.step / max(1, self.config.steps))
         rows = self.data.states.rows(window)
-        estimate, truth = self.probe(past), self.data.states.values[rows]
+        supervised = self.config.method in SUPERVISED
+        estimate, truth = self.probe(past, frozen=not supervised), self.data.states.values[rows]
         error = (estimate.float() - truth).square().mean()
-        logs["probe_loss"] = error.detach()
-        return loss + error, logs, (estimate, truth, self.data.states.hidden[rows])
+        states = (estimate, truth, self.data.states.hidden[rows])
+        if supervised:
+            return error, {"loss": error.detach()}, states
+        loss, logs = self.objective.loss_of(past, future, window, self.step / max(1, self.config.steps))
+        return loss + error, logs | {"probe_loss": error.detach()}, states
 
     def run(self, run: RunFolder, steps: int) -> None:
         """Train up to `steps`, from the newest checkpoint if there is one."""

@@ -10,7 +10,15 @@ from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import claims, judge, paper_number
-from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, Cell, cell_of, evidence, grid_commands, paper_rows
+from vd4rl_pomdp.experiments.navigation.grid import (
+    OBJECTIVES,
+    REFERENCES,
+    Cell,
+    cell_of,
+    evidence,
+    grid_commands,
+    paper_rows,
+)
 from vd4rl_pomdp.experiments.navigation.report import write_report
 from vd4rl_pomdp.experiments.navigation.rows import load_runs
 from vd4rl_pomdp.mazes import FREE_CELLS, MAZES
@@ -184,12 +192,12 @@ def test_which_way_round_a_relation_is():
     assert not claim.holds(89.0, 30.0)
 
 
-def test_the_grid_is_the_issues_and_its_commands_parse(capsys):
+def test_the_grid_has_every_cell_and_its_commands_parse(capsys):
     cells = evidence()
-    assert len(cells) == len(set(cells)) == 2 * (8 + 3)
-    assert {c.method for c in cells if c.max_k == 15} == {*OBJECTIVES, "random"}
+    assert len(cells) == len(set(cells)) == 2 * (10 + 3)
+    assert {c.method for c in cells if c.max_k == 15} == {*OBJECTIVES, *REFERENCES}
     commands = list(grid_commands("evidence", ("no_curtain",), (0, 1, 2), "cpu", Path("d"), Path("r")))
-    assert len(commands) == 33
+    assert len(commands) == 39
     assert len({tuple(words) for words in commands}) == 33
     from pretrain.navigation.config import PRESETS, NavigationConfig
     from vd4rl_pomdp.cli.parsing import with_presets
@@ -201,7 +209,7 @@ def test_the_grid_is_the_issues_and_its_commands_parse(capsys):
     config = with_presets(NavigationConfig, PRESETS, options.words("cpu", Path("d"), Path("r"), 4)[2:], "x")
     assert (config.self_prediction, config.exogenous, config.seed) == (1.0, "photographs", 4)
     main(["navigation", "grid", "--dry-run", "--seeds", "0", "--mazes", "no_curtain"])
-    assert len(capsys.readouterr().out.splitlines()) == 11
+    assert len(capsys.readouterr().out.splitlines()) == 13
 
 
 def test_free_cells_are_the_librarys():

@@ -14,6 +14,7 @@ from pretrain.navigation.train import train
 from pretrain.navigation.trainer import METHOD_NAMES, Trainer, learning_rate, make_objective
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES
 from vd4rl_pomdp.experiments.navigation.observations import open_maze_set
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.nn import load_encoder
@@ -48,7 +49,7 @@ def test_every_objective_of_the_paper_trains_and_is_measured(maze_set, tmp_path,
     found = results(tmp_path / "run")
     for component in ("state", "position", "velocity"):
         assert found[f"{component}_error", "held_out", "refit", "all", 0] > 0
-    assert (("action_loss", "held_out", "", "all", 0) in found) == (method != "random")
+    assert (("action_loss", "held_out", "", "all", 0) in found) == (method in OBJECTIVES)
     encoder, card = load_encoder(tmp_path / "run" / "encoder")
     assert (card.method, card.task) == (method, "three_curtains")
     assert (encoder.config.channels, encoder.config.size) == (1, 50)
@@ -106,6 +107,16 @@ def test_the_probe_leaves_the_representation_alone(maze_set, tmp_path):
         torch.testing.assert_close(one, other)
     trainer.losses(window)[0].backward()
     assert all(parameter.grad is not None for parameter in trainer.probe.parameters())
+
+
+def test_a_supervised_reference_learns_from_the_states_alone(maze_set, tmp_path):
+    trainer = trainer_of(smoke(maze_set, tmp_path / "run", method="supervised+a"))
+    loss, logs, _ = trainer.losses(trainer.batch())
+    loss.backward()
+    assert set(logs) == {"loss"}
+    assert all(p.grad is not None and p.grad.any() for p in trainer.objective.encoder.parameters())
+    assert trainer.objective.encoder.config.use_actions
+    assert not trainer_of(smoke(maze_set, tmp_path / "run", method="supervised")).objective.encoder.config.use_actions
 
 
 def test_frames_of_a_window_are_encoded_once(maze_set, tmp_path):

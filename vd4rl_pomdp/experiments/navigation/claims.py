@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from vd4rl_pomdp.experiments.navigation.grid import Cell, paper_rows
+from vd4rl_pomdp.experiments.navigation.grid import UNTRAINED, Cell, paper_rows
 from vd4rl_pomdp.experiments.navigation.rows import Run, Value
 from vd4rl_pomdp.mazes import MAZES
 
@@ -85,7 +85,7 @@ def claims(maze: str) -> list[Claim]:
             Claim("mik's velocity error, of mik+a's", (Cell(maze, "mik"), velocity), ">=", 1.5, (best, velocity)),
             Claim("ah's state error, of mik+a's", (Cell(maze, "ah"), state), ">", 1, (best, state)),
         ]
-    untrained = Cell(maze, "random"), position
+    untrained = Cell(maze, UNTRAINED), position
     for method in RECURRENT:
         found.append(
             Claim(

@@ -13,7 +13,7 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from vd4rl_pomdp.experiments.navigation.claims import paper_number
-from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, Cell
+from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, REFERENCES, Cell
 from vd4rl_pomdp.experiments.navigation.rows import Run, Value
 from vd4rl_pomdp.mazes import FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
 
@@ -38,7 +38,7 @@ def accuracy_bars(runs: list[Run], value: Value, path: Path) -> None:
     rows = -(-len(mazes) // columns)
     figure = Figure(figsize=(1 + 5.2 * columns, 0.8 + 2.9 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
-    methods = [*OBJECTIVES, "random"]
+    methods = [*OBJECTIVES, *(name for name in REFERENCES if any(run.cell.method == name for run in runs))]
     for axes in panels.flat[len(mazes) :]:
         axes.set_axis_off()
     for axes, maze in zip(panels.flat, mazes, strict=False):

@@ -14,6 +14,10 @@ from vd4rl_pomdp.mazes import get_maze
 PAPER = Path(__file__).parent / "paper.csv"
 """The paper's numbers: one line a table row, one column a maze."""
 OBJECTIVES = ("no_history", "ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
+UNTRAINED = "random"
+SUPERVISED = ("supervised", "supervised+a")
+REFERENCES = (UNTRAINED, *SUPERVISED)
+"""What a table is read against: mik+a's network untrained; ah's and ah+a's trained on the true states themselves."""
 EVIDENCE_MAZES = ("no_curtain", "three_curtains")
 
 
@@ -47,11 +51,11 @@ class Cell:
 
 
 def evidence(mazes: tuple[str, ...] = EVIDENCE_MAZES) -> list[Cell]:
-    """The first evidence: all objectives and the floor at K = 15, and what K = 1 does to those that read actions."""
-    cells = [Cell(maze, method) for maze in mazes for method in ("mik+a", "ah+a", "no_history", "random")]
+    """The first evidence: all objectives and references at K = 15, and what K = 1 does to those that read actions."""
+    cells = [Cell(maze, method) for maze in mazes for method in ("mik+a", "ah+a", "no_history", UNTRAINED)]
     cells += [Cell(maze, method, 1) for maze in mazes for method in ("ah+a", "mik+a")]
     cells += [Cell(maze, "mik+a", 1, literal_future=True) for maze in mazes]
-    return cells + [Cell(maze, method) for maze in mazes for method in ("mik", "ah", "fj+a", "fj")]
+    return cells + [Cell(maze, method) for maze in mazes for method in ("mik", "ah", "fj+a", "fj", *SUPERVISED)]
 
 
 def options(mazes: tuple[str, ...] = EVIDENCE_MAZES) -> list[Cell]:

@@ -19,7 +19,7 @@ import numpy as np
 from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import paper_number, verdict_lines
 from vd4rl_pomdp.experiments.navigation.collect import PRESETS
-from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, Cell, cell_of, paper_rows
+from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, REFERENCES, UNTRAINED, Cell, cell_of, paper_rows
 from vd4rl_pomdp.experiments.navigation.rows import Run, Value, load_runs, save_runs
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.report.stats import bootstrap_interval, mean
@@ -133,12 +133,13 @@ def _paper_table(name: str, view: str, split: str, probe: str, runs: list[Run]) 
 
 
 def _floor_table(runs: list[Run]) -> Table:
-    """What the paper does not show: the untrained encoder, and the literal future."""
+    """What the paper does not show: the floor, the ceilings, and the literal future."""
     mazes = tuple(MAZES)
     rows = []
-    for component in ("state", "position", "velocity"):
-        value: Value = (f"{component}_error", "held_out", "refit", "all", 0)
-        rows.append((f"untrained, {component}", [_entry(Cell(m, "random"), value, runs) for m in mazes]))
+    for method in REFERENCES:
+        for component in ("state", "position", "velocity"):
+            value: Value = (f"{component}_error", "held_out", "refit", "all", 0)
+            rows.append((f"{method}, {component}", [_entry(Cell(m, method), value, runs) for m in mazes]))
     literal = [Cell(maze, "mik+a", 1, literal_future=True) for maze in mazes]
     measures: dict[str, Value] = {
         "state error": ("state_error", "held_out", "refit", "all", 0),
@@ -153,7 +154,7 @@ def _hidden_table(runs: list[Run]) -> Table:
     """Errors on hidden steps alone."""
     mazes = tuple(maze for maze, spec in MAZES.items() if spec.curtains)
     rows = []
-    for method in (*OBJECTIVES, "random"):
+    for method in (*OBJECTIVES, *REFERENCES):
         for component in ("position", "velocity"):
             value: Value = (f"{component}_error", "held_out", "refit", "hidden", 0)
             rows.append((f"{method}, {component}", [_entry(Cell(maze, method), value, runs) for maze in mazes]))
@@ -176,7 +177,7 @@ def _entry(cell: Cell, value: Value, runs: list[Run]) -> Entry:
 
 
 _OWN_TITLES = {
-    "references": "References: the untrained encoder, and MIK+A whose future holds a_{t+k-1}",
+    "references": "References: untrained, trained on the true states, and MIK+A whose future holds a_{t+k-1}",
     "hidden": "Errors (%) on steps that a curtain hides, K = 15",
     "by_k": "Action losses (nats x 100) by k, K = 15",
 }
@@ -208,7 +209,7 @@ def _page(runs: list[Run], tables: list[Table], drawn: bool, pictures: bool) -> 
 
 def _budget(runs: list[Run]) -> str:
     """What the runs cost, and where."""
-    trained = [run for run in runs if run.cell.method != "random"]
+    trained = [run for run in runs if run.cell.method != UNTRAINED]
     steps = " or ".join(f"{count:,}" for count in sorted({int(run.facts["steps"]) for run in trained}))
     minutes = [float(run.facts["seconds"]) / 60 for run in trained]
     machines = sorted({run.facts["gpu"] or f"{run.facts['processor']}, no GPU" for run in runs})
