@@ -198,7 +198,7 @@ def test_the_grid_has_every_cell_and_its_commands_parse(capsys):
     assert {c.method for c in cells if c.max_k == 15} == {*OBJECTIVES, *REFERENCES}
     commands = list(grid_commands("evidence", ("no_curtain",), (0, 1, 2), "cpu", Path("d"), Path("r")))
     assert len(commands) == 39
-    assert len({tuple(words) for words in commands}) == 33
+    assert len({tuple(words) for words in commands}) == 39
     from pretrain.navigation.config import PRESETS, NavigationConfig
     from vd4rl_pomdp.cli.parsing import with_presets
 
