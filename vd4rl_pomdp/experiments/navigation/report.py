@@ -187,7 +187,7 @@ def _page(runs: list[Run], tables: list[Table], drawn: bool, pictures: bool) -> 
     preset, seeds = runs[0].preset, sorted({run.seed for run in runs})
     lines = ["# Navigation: what the objectives know of the state", ""]
     lines += [
-        f"{len(runs)} runs, preset `{preset}`, seeds {', '.join(map(str, seeds))}. {_budget(runs)}",
+        f"Runs: {len(runs)}. Preset: `{preset}`. Seeds: {', '.join(map(str, seeds))}. {_budget(runs)}",
         "",
         "A cell of a table reads: **mean over seeds** [95% bootstrap interval] n=seeds (the paper's number).",
         "Intervals of few seeds are too narrow.",
