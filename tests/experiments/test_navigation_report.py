@@ -9,7 +9,7 @@ import pytest
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation import figures
-from vd4rl_pomdp.experiments.navigation.claims import claims, judge, paper_number
+from vd4rl_pomdp.experiments.navigation.claims import claims, judge, paper_number, verdict_lines
 from vd4rl_pomdp.experiments.navigation.grid import (
     OBJECTIVES,
     REFERENCES,
@@ -85,6 +85,19 @@ def test_every_line_of_the_papers_tables_is_a_cell_with_its_own_number():
     assert paper_number(Cell("no_curtain", "mik+a"), STATE) == 3.4
     assert paper_number(Cell("no_curtain", "mik+a", literal_future=True), STATE) is None
     assert paper_number(Cell("no_curtain", "random"), STATE) is None
+
+
+def test_the_page_says_what_training_on_the_true_states_reaches(runs, tmp_path):
+    assert "true states" not in verdicts_of(runs)
+    write_run(tmp_path / "runs", Cell("three_curtains", "supervised"), 0, 8.0)
+    assert "true states" not in verdicts_of(runs), "one side alone compares nothing"
+    write_run(tmp_path / "runs", Cell("three_curtains", "supervised"), 1, 9.0)
+    write_run(tmp_path / "runs", Cell("three_curtains", "supervised+a"), 0, 4.0)
+    assert "without and with past actions: three_curtains 8.5 and 4.0." in verdicts_of(runs)
+
+
+def verdicts_of(runs: Path) -> str:
+    return "\n".join(verdict_lines(load_runs([runs])))
 
 
 def test_the_report_shows_means_seeds_and_the_papers_numbers(runs, tmp_path):
