@@ -29,6 +29,8 @@ from vd4rl_pomdp.types import Windows
 METHOD_NAMES = (*OBJECTIVES, *REFERENCES)
 """The paper's objectives, the floor and the ceilings."""
 _NETWORK_OF = {UNTRAINED: "mik+a"} | dict(zip(SUPERVISED, ("ah", "ah+a"), strict=True))
+_LARGEST_GRADIENT = 1.0
+"""Norm to which gradients of the error in the states are clipped: they spike, and one spike can end the learning."""
 _BATCH_STREAM = 1
 
 
@@ -73,6 +75,8 @@ class Trainer:
             loss, logs, states = self.losses(window)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
+        if self.config.method in SUPERVISED:
+            torch.nn.utils.clip_grad_norm_([*self.objective.parameters(), *self.probe.parameters()], _LARGEST_GRADIENT)
         for group in self.optimiser.param_groups:
             group["lr"] = learning_rate(self.config, self.step)
         self.optimiser.step()
