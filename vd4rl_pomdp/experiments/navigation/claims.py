@@ -140,7 +140,7 @@ def verdict_lines(runs: Sequence[Run]) -> list[str]:
     position: Value = ("position_error", "training", "online", "all", 0)
     judged = [verdict for _, verdict in verdicts if verdict.seeds]
     lines = ["## Which statements hold", ""]
-    recorder = " and ".join(f"{paper_number(Cell(maze, 'ah+a'), position):.1f} ({maze})" for maze in mazes)
+    recorder = ", ".join(f"{paper_number(Cell(maze, 'ah+a'), position):.1f} ({maze})" for maze in mazes)
     return [
         *lines,
         f"{sum(v.holds for v in judged)} of {len(judged)} hold, {len(verdicts) - len(judged)} wait for runs.",

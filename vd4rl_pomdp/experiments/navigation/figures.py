@@ -48,6 +48,7 @@ def accuracy_bars(runs: list[Run], value: Value, path: Path) -> None:
         axes.set_title(maze, fontsize=10)
         axes.set_xticks(range(len(methods)), methods, rotation=40, ha="right", fontsize=8)
         axes.spines[["top", "right"]].set_visible(False)
+        axes.set_xlim(-0.6, len(methods) - 0.4)
         axes.set_ylim(0, 100)
     for axes in panels[:, 0]:
         axes.set_ylabel("100 - state error (%)")
