@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from pretrain.navigation.config import PRESETS, NavigationConfig, command_of
-from pretrain.navigation.data import MazeData
+from pretrain.navigation.data import MazeData, open_data
 from pretrain.navigation.probe import ErrorSums, StateProbe, TrueStates, refit
 from pretrain.navigation.train import train
 from pretrain.navigation.trainer import METHOD_NAMES, Trainer, learning_rate, make_objective
@@ -34,7 +34,7 @@ def smoke(data: Path, out: Path, **changes: object) -> NavigationConfig:
 
 def trainer_of(config: NavigationConfig) -> Trainer:
     torch.manual_seed(0)
-    data = MazeData(*open_maze_set(config.data), config, None)
+    data = open_data(config)
     return Trainer(make_objective(data, config), data.on(torch.device("cpu")), config)
 
 

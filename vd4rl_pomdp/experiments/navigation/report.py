@@ -115,7 +115,7 @@ def make_tables(runs: list[Run]) -> list[Table]:
     for name in _TITLES:
         for view, (split, probe) in (_LOSS_VIEWS if name == "action_loss" else VIEWS).items():
             tables.append(_paper_table(name, view, split, probe, runs))
-    return [*tables, _floor_table(runs), _hidden_table(runs), _by_k_table(runs)]
+    return [*tables, _references_table(runs), _hidden_table(runs), _by_k_table(runs)]
 
 
 def _paper_table(name: str, view: str, split: str, probe: str, runs: list[Run]) -> Table:
@@ -132,7 +132,7 @@ def _paper_table(name: str, view: str, split: str, probe: str, runs: list[Run]) 
     return Table(name, view, mazes, rows)
 
 
-def _floor_table(runs: list[Run]) -> Table:
+def _references_table(runs: list[Run]) -> Table:
     """What the paper does not show: the floor, the ceilings, and the literal future."""
     mazes = tuple(MAZES)
     rows = []
