@@ -42,7 +42,7 @@ class CURL(Objective):
         self.encoder = encoder
         self.momentum_encoder = copy.deepcopy(encoder).requires_grad_(False)
         self.bilinear = nn.Parameter(torch.rand(encoder.dim, encoder.dim))
-        self.draws = Draws(seed)
+        self.draws = Draws(seed, "curl", "shift")
 
     def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
         """InfoNCE over all real rows of the batch."""

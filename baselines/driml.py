@@ -45,7 +45,7 @@ class DRIML(Objective):
         widths = {"global": encoder.dim, "local": channels}
         self.anchors = nn.ModuleDict({n: mlp(w + actions, 256, SCORE_DIM, layers=1) for n, w in widths.items()})
         self.candidates = nn.ModuleDict({n: mlp(w, 256, SCORE_DIM, layers=1) for n, w in widths.items()})
-        self.draws = Draws(seed)
+        self.draws = Draws(seed, "driml", "k")
 
     def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean of the four InfoNCE terms at one k; `loss_gl` is a global anchor with local candidates."""

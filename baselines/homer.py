@@ -35,7 +35,7 @@ class Bottleneck(nn.Module):
         super().__init__()
         self.logits = nn.Linear(dim, codes)
         self.embedding = nn.Linear(codes, dim, bias=False)
-        self.draws = Draws(seed)
+        self.draws = Draws(seed, "homer", "gumbel")
 
     def forward(self, z: Tensor) -> Tensor:
         """Embedding of each row's code; noise in training alone."""
@@ -53,9 +53,9 @@ class HOMER(Objective):
     def __init__(self, encoder: Encoder, codes: int, seed: int) -> None:
         super().__init__()
         self.encoder = encoder
-        self.bottleneck = Bottleneck(encoder.dim, codes, seed + 1) if codes else nn.Identity()
+        self.bottleneck = Bottleneck(encoder.dim, codes, seed) if codes else nn.Identity()
         self.classifier = mlp(2 * encoder.dim + encoder.config.action_dim, 256, 1)
-        self.draws = Draws(seed)
+        self.draws = Draws(seed, "homer", "imposters")
 
     def logits(self, state: Tensor, action: Tensor, following: Tensor) -> Tensor:
         """Log-odds (N,) that transitions of (N, D), (N, A), (N, D) are real."""

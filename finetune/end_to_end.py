@@ -17,12 +17,13 @@ import torch
 from torch import Tensor
 
 from finetune.config import FinetuneConfig
-from finetune.features import SHIFT_STREAM, FeatureBatch
+from finetune.features import STAGE, FeatureBatch
 from vd4rl_pomdp.augmentation import observe
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream
 from vd4rl_pomdp.data import Dataset, TransitionSampler
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.runs.device import autocast
+from vd4rl_pomdp.seeding import stream_seed
 from vd4rl_pomdp.types import Transitions
 
 
@@ -36,8 +37,8 @@ class PixelSampler:
         self._sampler = TransitionSampler(
             dataset, config.batch_size, generator, config.n_step, gamma=config.gamma, observe=self._observe
         )
-        self.corruption = BatchCorruption(corruption, config.seed)
-        self.shifts = KeyStream(config.seed * 10 + SHIFT_STREAM)
+        self.corruption = BatchCorruption(corruption, config.seed, STAGE)
+        self.shifts = KeyStream(stream_seed(config.seed, STAGE, "shift"))
 
     def sample(self) -> Transitions:
         """The next batch."""

@@ -16,12 +16,12 @@ from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.runs.device import Precision, autocast
 from vd4rl_pomdp.runs.folder import replacing_file
 from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.seeding import stream_seed
 from vd4rl_pomdp.types import Batch
 
 CHUNK = 128
 """Rows that go through the frame encoder at once."""
-SHIFT_STREAM, BATCH_STREAM = 3, 4
-"""Numbers that keep a run's seeded streams apart; view v corrupts with stream (seed, v)."""
+STAGE = "finetune"
 
 
 @dataclass(frozen=True)
@@ -59,8 +59,7 @@ class FrozenEncoder:
 
     def corruption(self, view: int) -> BatchCorruption:
         """The corruption of a view; under `emission` all views look the same."""
-        emission = self._corruption_config.corruption_mode == "emission"
-        return BatchCorruption(self._corruption_config, self.seed if emission else self.seed * 1000 + view)
+        return BatchCorruption(self._corruption_config, self.seed, STAGE, view)
 
     @torch.no_grad()
     def rows(self, rows: Tensor, shift_key: Tensor, corruption: BatchCorruption) -> Tensor:
@@ -79,7 +78,9 @@ class FrozenEncoder:
         """Representations (rows, D) of a whole episode, streamed from its first row."""
         start, end = int(self.dataset.episode_start[number]), int(self.dataset.episode_end[number])
         rows = torch.arange(start, end, device=self.device)
-        key = derive_keys(self.seed * 10 + SHIFT_STREAM, torch.tensor([view << 32 | number], device=self.device))
+        key = derive_keys(
+            stream_seed(self.seed, STAGE, "shift"), torch.tensor([view << 32 | number], device=self.device)
+        )
         features = self.rows(rows, key.expand(len(rows)), corruption)
         prev_action = self.dataset.action[rows].clone()
         prev_action[0] = 0
@@ -142,7 +143,7 @@ class ExactSampler:
         self._frozen, self._batch_size, self._n_step, self._gamma = frozen, batch_size, n_step, gamma
         self._generator = generator
         self.corruption = frozen.corruption(0)
-        self.shifts = KeyStream(frozen.seed * 10 + SHIFT_STREAM)
+        self.shifts = KeyStream(stream_seed(frozen.seed, STAGE, "shift"))
         self._starts = torch.nonzero(frozen.dataset.t[1:] > 0)[:, 0]
 
     def sample(self) -> FeatureBatch:

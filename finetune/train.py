@@ -13,7 +13,7 @@ import torch
 from finetune.algorithms import Algorithm, get_algorithm
 from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd, PixelSampler
-from finetune.features import BATCH_STREAM, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
+from finetune.features import STAGE, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.envs.parity import render_info
@@ -23,11 +23,12 @@ from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import EncoderCard, load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.probes import probe_state
-from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint, seed_everything
+from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.folder import RunFolder, jsonable, replacing, replacing_file, write_json
 from vd4rl_pomdp.runs.metrics import MetricsLog
 from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.tasks import FRAME_SIZE, get_task
 
 
@@ -47,7 +48,7 @@ def finetune(config: FinetuneConfig) -> RunFolder:
         config = replace(config, algorithm=card.end_to_end, views=0)
     if encoder.reads_state:
         dataset.states()
-    run = RunFolder(config.out, "finetune", config)
+    run = RunFolder(config.out, STAGE, config)
     quality = dataset.quality or card.quality
     card = replace(card, quality=quality)  # the set that the policy is trained on names its rows
     write_json(run.path / "labels.json", _labels(config, card))
@@ -61,9 +62,9 @@ def finetune(config: FinetuneConfig) -> RunFolder:
 
 def _trainer(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: EncoderCard, run: RunFolder) -> Trainer:
     """What a run trains and on which batches: cached features, features encoded anew, or pixels."""
-    seed_everything(config.seed)
+    seed_networks(config.seed, STAGE)
     policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(dataset.t.device)
-    generator = torch.Generator().manual_seed(config.seed * 10 + BATCH_STREAM)
+    generator = stream_generator(config.seed, STAGE, "batches")
     corruption = CorruptionConfig(**card.corruption)
     frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed)
     sampler: FeatureSampler | ExactSampler | PixelSampler
@@ -77,7 +78,7 @@ def _trainer(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: E
     else:
         sampler = ExactSampler(frozen, config.batch_size, config.n_step, config.gamma, generator)
         policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(4)]))
-    algorithm = get_algorithm(config.algorithm)(policy, config, generator)
+    algorithm = get_algorithm(config.algorithm)(policy, config, stream_generator(config.seed, STAGE, "noise"))
     return Trainer(
         EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, generator, config, card
     )

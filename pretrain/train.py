@@ -18,16 +18,16 @@ from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
 from vd4rl_pomdp.nn.frame import check_frame_encoder
 from vd4rl_pomdp.objective import Objective
-from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint, seed_everything
+from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint
 from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.folder import RunFolder, jsonable
 from vd4rl_pomdp.runs.metrics import MetricsLog, read_metrics
 from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.seeding import seed_networks, stream_generator, stream_seed
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, get_task
 from vd4rl_pomdp.types import Windows
 
-SHIFT_STREAM, BATCH_STREAM = 1, 2
-"""Numbers that keep the seeded streams of a run apart; the corruption's stream is the seed itself."""
+STAGE = "pretrain"
 
 
 def pretrain(config: PretrainConfig) -> RunFolder:
@@ -36,10 +36,10 @@ def pretrain(config: PretrainConfig) -> RunFolder:
     _check(config)
     dataset = open_dataset(config.data)
     task = _task_of(dataset, config)
-    seed_everything(config.seed)
+    seed_networks(config.seed, STAGE)
     objective = _build(dataset, config)
     device = pick_device(config.device)
-    run = RunFolder(config.out, "pretrain", replace(config, task=task))
+    run = RunFolder(config.out, STAGE, replace(config, task=task))
     if run.finished:
         return run
     trainer = Trainer(objective.to(device), dataset.to(device), config)
@@ -57,10 +57,10 @@ class Trainer:
     def __init__(self, objective: Objective, dataset: Dataset, config: PretrainConfig) -> None:
         self.objective, self.dataset, self.config = objective, dataset, config
         self.device = dataset.t.device
-        self.generator = torch.Generator().manual_seed(config.seed * 10 + BATCH_STREAM)
+        self.generator = stream_generator(config.seed, STAGE, "batches")
         self.sampler = WindowSampler(dataset, config.batch_size, config.window, self.generator, observe=self._observe)
-        self.corruption = BatchCorruption(corruption_of(config), config.seed)
-        self.shifts = KeyStream(config.seed * 10 + SHIFT_STREAM)
+        self.corruption = BatchCorruption(corruption_of(config), config.seed, STAGE)
+        self.shifts = KeyStream(stream_seed(config.seed, STAGE, "shift"))
         self.optimiser = torch.optim.Adam(objective.parameters(), lr=config.learning_rate)
         self.step = 0
         self.seconds = 0.0

@@ -111,13 +111,15 @@ class TD3BC:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on: networks, targets, optimisers, counters."""
-        return {name: part.state_dict() for name, part in self._parts().items()} | {"updates": self.updates}
+        parts = {name: part.state_dict() for name, part in self._parts().items()}
+        return parts | {"updates": self.updates, "noise": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
         for name, part in self._parts().items():
             part.load_state_dict(state[name])
         self.updates = state["updates"]
+        self.generator.set_state(state["noise"])
 
     def _parts(self) -> dict[str, Any]:
         return {

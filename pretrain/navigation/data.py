@@ -15,14 +15,13 @@ from vd4rl_pomdp.types import Windows
 
 HELD_OUT = 10
 """One in this many trajectories, the last ones, is never trained on."""
-_NOISE_STREAM = 2
 
 
 def open_data(config: NavigationConfig) -> MazeData:
     """The set that a config names, with its exogenous noise, on the CPU."""
     noise = None
     if config.exogenous != "none":
-        noise = ExogenousNoise(config.exogenous, config.exogenous_weight, config.seed * 10 + _NOISE_STREAM)
+        noise = ExogenousNoise(config.exogenous, config.exogenous_weight, config.seed)
     return MazeData(*open_maze_set(config.data), config, noise)
 
 

@@ -15,6 +15,7 @@ from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.mazes import MazeSpec
 from vd4rl_pomdp.nn.heads import mlp
 from vd4rl_pomdp.nn.policy import Standardise
+from vd4rl_pomdp.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.types import Windows
 
 STATE_DIM = 4
@@ -95,12 +96,12 @@ class ErrorSums:
 
 def refit(features: Tensor, truth: Tensor, steps: int, seed: int) -> StateProbe:
     """Fit a probe on frozen (N, D) representations and their (N, 4) states."""
-    torch.manual_seed(seed)
+    seed_networks(seed, "refit")
     probe = StateProbe(features.shape[1]).to(features.device)
     probe.standardise.fit(features)
     optimiser = torch.optim.Adam(probe.parameters(), lr=_LEARNING_RATE)
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
-    generator = torch.Generator().manual_seed(seed)
+    generator = stream_generator(seed, "refit", "batches")
     for _ in range(steps):
         rows = torch.randint(len(features), (_BATCH,), generator=generator).to(features.device)
         loss = (probe(features[rows]) - truth[rows]).square().mean()

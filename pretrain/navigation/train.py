@@ -12,25 +12,23 @@ from dataclasses import asdict
 from pretrain.navigation.config import NavigationConfig, command_of
 from pretrain.navigation.data import open_data
 from pretrain.navigation.measure import measure, write_trajectory
-from pretrain.navigation.trainer import Trainer, make_objective, network_of
+from pretrain.navigation.trainer import STAGE, Trainer, make_objective, network_of
 from pretrain.objectives import get_method
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.experiments.navigation.grid import UNTRAINED
 from vd4rl_pomdp.experiments.navigation.observations import SHAPES
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
-from vd4rl_pomdp.runs.checkpoint import seed_everything
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.folder import RunFolder, write_json
-
-STAGE = "navigation"
+from vd4rl_pomdp.seeding import seed_networks
 
 
 def train(config: NavigationConfig) -> RunFolder:
     """Run the stage, or go on with it; returns the run's folder."""
     _check(config)
     data = open_data(config)
-    seed_everything(config.seed)
+    seed_networks(config.seed, STAGE)
     objective = make_objective(data, config)
     run = RunFolder(config.out, STAGE, config)
     if run.finished:

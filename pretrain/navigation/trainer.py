@@ -24,6 +24,7 @@ from vd4rl_pomdp.runs.device import autocast
 from vd4rl_pomdp.runs.folder import RunFolder, jsonable
 from vd4rl_pomdp.runs.metrics import MetricsLog
 from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.seeding import stream_generator
 from vd4rl_pomdp.types import Windows
 
 METHOD_NAMES = (*OBJECTIVES, *REFERENCES)
@@ -31,7 +32,7 @@ METHOD_NAMES = (*OBJECTIVES, *REFERENCES)
 _NETWORK_OF = dict(zip(REFERENCES, ("mik+a", "ah", "ah+a"), strict=True))
 _SUPERVISED_RATE = 0.5
 """Share of the learning rate that supervised references take: at the whole one, two of three seeds predict the mean."""
-_BATCH_STREAM = 1
+STAGE = "navigation"
 
 
 def network_of(method: str) -> str:
@@ -58,7 +59,7 @@ class Trainer:
         self.objective, self.data, self.config = objective, data, config
         self.probe = StateProbe(objective.encoder.dim).to(next(objective.parameters()).device)
         self.device = next(objective.parameters()).device
-        self.generator = torch.Generator().manual_seed(config.seed * 10 + _BATCH_STREAM)
+        self.generator = stream_generator(config.seed, STAGE, "batches")
         parameters = [*objective.parameters(), *self.probe.parameters()]
         self.optimiser = torch.optim.Adam(parameters, lr=config.learning_rate)
         self.step, self.seconds = 0, 0.0

@@ -16,6 +16,7 @@ from vd4rl_pomdp.corruptions import (
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.seeding import stream_seed
 
 
 def stacks(n: int = 64) -> torch.Tensor:
@@ -96,7 +97,8 @@ def test_emission_of_a_batch_equals_the_environments_draw():
     obs, row_key = stacks(4), torch.tensor([5, 6, 1 << 20, (1 << 20) + 1])
     batch = BatchCorruption(CorruptionConfig("patch+zero_frames", "emission"), seed=7)(obs, row_key)
     environment = make_corruption("patch+zero_frames")
-    single = torch.cat([environment(obs[i : i + 1], derive_keys(7, row_key[i : i + 1])) for i in range(4)])
+    seed = stream_seed(7, "corruption", "emission")
+    single = torch.cat([environment(obs[i : i + 1], derive_keys(seed, row_key[i : i + 1])) for i in range(4)])
     assert torch.equal(batch, single)
 
 

@@ -14,6 +14,7 @@ from torch import Tensor
 
 from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_integers, draw_numbered, hash_keys
 from vd4rl_pomdp.errors import UserError, refuse_outside
+from vd4rl_pomdp.seeding import stream_seed
 
 Mode = Literal["resample", "emission"]
 _CHANNELS = 3
@@ -170,13 +171,14 @@ def make_corruption(config: CorruptionConfig | str) -> Corruption:
 class BatchCorruption:
     """A corruption with its source of keys, for batches of a data set.
 
-    The keys come from a stream of their own, so that two methods with the same seed see identical masks.
+    The keys come from a stream of their own, so that two methods with the same seed see identical masks. `name` tells
+    the streams of a run apart; under `emission` all of them share one, since a row always looks the same.
     """
 
-    def __init__(self, config: CorruptionConfig, seed: int) -> None:
-        self._mode = config.corruption_mode
+    def __init__(self, config: CorruptionConfig, seed: int, *name: str | int) -> None:
+        self._emission = config.corruption_mode == "emission"
         self.corruption = make_corruption(config)
-        self.stream = KeyStream(seed)
+        self.stream = KeyStream(stream_seed(seed, "corruption", *(["emission"] if self._emission else name)))
 
     def __call__(self, obs: Tensor, row_key: Tensor) -> Tensor:
         """Corrupt, in place, contiguous (..., C, H, W) uint8 stacks whose rows are named by (...,) int64 `row_key`."""
@@ -184,6 +186,6 @@ class BatchCorruption:
 
     def keys(self, row_key: Tensor) -> Tensor:
         """What the next batch's rows, named by (...,) int64 `row_key`, are corrupted by: (...,) int64."""
-        if self._mode == "emission":
+        if self._emission:
             return derive_keys(self.stream.seed, row_key)
         return self.stream.take(row_key.shape, row_key.device)

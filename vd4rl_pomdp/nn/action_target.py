@@ -10,6 +10,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.seeding import stream_seed
 
 
 class ActionTarget(Protocol):
@@ -78,7 +79,7 @@ def make_action_target(name: str, actions: np.ndarray, codes: int, seed: int) ->
         name: kmeans, bins, mse or mse_l2.
         actions: (N, A) float32 training actions, the only ones K-means is fitted on.
         codes: K-means centres, or bins per dimension.
-        seed: seed of K-means.
+        seed: the run's seed, which K-means starts from.
     """
     if name not in ACTION_TARGETS:
         raise UserError(f"unknown action target {name!r}: choose one of {', '.join(ACTION_TARGETS)}")
@@ -96,7 +97,8 @@ def _fit_centers(actions: np.ndarray, codes: int, seed: int) -> np.ndarray:
     distinct = len(np.unique(actions, axis=0))
     if distinct < codes:
         raise UserError(f"the data set has {distinct} distinct actions, fewer than --codes {codes}: lower --codes")
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(stream_seed(seed, "kmeans", "sample"))
     sample = actions if len(actions) <= 50_000 else actions[rng.choice(len(actions), 50_000, replace=False)]
-    fitted = KMeans(codes, n_init=3, random_state=seed).fit(sample.astype(np.float64))
+    start = stream_seed(seed, "kmeans", "centres") % 2**32  # the largest that scikit-learn takes
+    fitted = KMeans(codes, n_init=3, random_state=start).fit(sample.astype(np.float64))
     return fitted.cluster_centers_.astype(np.float32)

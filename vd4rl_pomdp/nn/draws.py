@@ -6,14 +6,15 @@ import torch
 from torch import Tensor, nn
 
 from vd4rl_pomdp.corruptions.keys import KeyStream
+from vd4rl_pomdp.seeding import stream_seed
 
 
 class Draws(nn.Module):
-    """A stream of keys and numbers whose position is a buffer."""
+    """The stream called `name` of a run, as keys and numbers; its position is a buffer."""
 
-    def __init__(self, seed: int) -> None:
+    def __init__(self, seed: int, *name: str) -> None:
         super().__init__()
-        self.seed = seed
+        self.seed = stream_seed(seed, *name)
         self.register_buffer("position", torch.zeros((), dtype=torch.int64))
         self.position: Tensor
 

@@ -8,7 +8,6 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-import torch
 from safetensors import SafetensorError
 from safetensors.torch import load_file, save_file
 from torch import Tensor
@@ -81,8 +80,3 @@ def _join(node: Any, tensors: dict[str, Tensor]) -> Any:
     if isinstance(node, list):
         return [_join(value, tensors) for value in node]
     return node
-
-
-def seed_everything(seed: int) -> None:
-    """Seed the global generators, which only network initialisation uses; every other draw has its own."""
-    torch.manual_seed(seed)

@@ -19,6 +19,7 @@ from torch import Tensor
 from vd4rl_pomdp.corruptions.keys import derive_keys, draw_integers
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.mazes import PICTURE_SIZE
+from vd4rl_pomdp.seeding import stream_seed
 
 PHOTOGRAPHS = "photographs"
 """Name of the pool that needs no files."""
@@ -36,7 +37,7 @@ class ExogenousNoise:
     def __init__(self, source: str, weight: float, seed: int) -> None:
         if not 0 < weight <= 1:
             raise UserError(f"--exogenous-weight is {weight}; it must be above 0 and at most 1")
-        self._seed, self._weight = seed, weight
+        self._seed, self._weight = stream_seed(seed, "exogenous", "choice"), weight
         self.pool = load_pool(source, seed)
         """(P, 3, 100, 100) uint8."""
 
@@ -50,7 +51,7 @@ class ExogenousNoise:
 
 def load_pool(source: str, seed: int) -> Tensor:
     """Images to add: (P, 3, 100, 100) uint8; raises UserError if there is none."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(stream_seed(seed, "exogenous", "images"))
     if source == PHOTOGRAPHS:
         return _photographs(rng)
     images = list(_resized(Path(source)))
