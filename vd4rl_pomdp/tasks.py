@@ -16,6 +16,12 @@ SCORE_DIVISOR = 10.0
 """V-D4RL's normalised score is return / 10."""
 Quality = Literal["random", "medium_replay", "medium", "medium_expert", "expert"]
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
+"""V-D4RL's."""
+NoisyQuality = Literal["expert_noisy", "medium_expert_noisy"]
+NOISY_QUALITIES: tuple[NoisyQuality, ...] = get_args(NoisyQuality)
+"""This package's own: where actions are not decided by the state, an inverse model can tell them from what they did."""
+SET_QUALITIES = (*QUALITIES, *NOISY_QUALITIES)
+"""All that `data collect` makes."""
 
 
 @dataclass(frozen=True)
@@ -32,6 +38,9 @@ class Task:
     """Generalised positions: the first columns of the simulator state, velocities the others."""
     travel: tuple[int, ...]
     """Positions along the ground, which the tracking camera does not show."""
+    action_noise: float
+    """Standard deviation of the noise in the noisy sets: of 0.2, 0.3, 0.4 and 0.5 the largest that leaves the expert
+    more than half of its mean return."""
 
     def pose(self, physics: np.ndarray) -> np.ndarray:
         """Positions of (..., P) simulator states, without the place on the ground."""
@@ -47,9 +56,9 @@ class Task:
 
 
 TASKS = {
-    "walker_walk": Task("walker_walk", "walker", "walk", 6, 24, positions=9, travel=(1,)),
-    "cheetah_run": Task("cheetah_run", "cheetah", "run", 6, 17, positions=9, travel=(0,)),
-    "humanoid_walk": Task("humanoid_walk", "humanoid", "walk", 21, 67, positions=28, travel=(0, 1)),
+    "walker_walk": Task("walker_walk", "walker", "walk", 6, 24, positions=9, travel=(1,), action_noise=0.5),
+    "cheetah_run": Task("cheetah_run", "cheetah", "run", 6, 17, positions=9, travel=(0,), action_noise=0.4),
+    "humanoid_walk": Task("humanoid_walk", "humanoid", "walk", 21, 67, positions=28, travel=(0, 1), action_noise=0.3),
 }
 
 

@@ -228,3 +228,46 @@ def test_a_full_disk_at_the_start_is_a_sentence(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "write_text", full)
     with pytest.raises(UserError, match="disk is full"):
         collect(config(tmp_path / "set"), LENGTH)
+
+
+@pytest.mark.parametrize(
+    ("changes", "name", "std"),
+    [
+        ({"quality": "expert_noisy"}, "expert_noisy", 0.5),
+        ({"quality": "medium_expert_noisy"}, "medium_expert_noisy", 0.5),
+        ({"quality": "expert", "action_noise": 0.25}, "expert_noise0.25", 0.25),
+    ],
+)
+def test_noise_is_executed_stored_and_named(monkeypatch, tmp_path, changes, name, std):
+    monkeypatch.setattr(module, "load_actor", lambda task, quality: actor(1))
+    out = tmp_path / "set"
+    shards = collect(config(out, episodes=2, **changes), LENGTH)
+    stored = read_shard(shards[0])
+    rows = slice(0, LENGTH + 1)
+    action, reward = stored["action"][rows], stored["reward"][rows]
+    np.testing.assert_array_equal(replay_rewards("walker_walk", stored["physics"][0], action[1:]), reward[1:])
+    quiet = collect(config(tmp_path / "quiet", episodes=2, quality="expert"), LENGTH)
+    noise = action[1] - read_shard(quiet[0])["action"][1]
+    assert 0 < np.abs(noise).max() < 6 * std
+    assert all(read_attributes(shard)["set"] == name for shard in shards)
+    assert {read_attributes(shard)["action_noise"] for shard in shards} == {std}
+    assert f"standard deviation | {std} |" in (out / "card.md").read_text()
+    assert open_dataset(out, cache=tmp_path / "cache").quality == name
+    assert "action_noise" not in read_attributes(quiet[0])
+
+
+def test_the_noise_has_the_standard_deviation_it_says(monkeypatch, tmp_path):
+    job = module._job(config(tmp_path, quality="expert_noisy"), actor(1), 0, 200)
+    still = replace(actor(1), weights={k: 0 * v for k, v in actor(1).weights.items()})
+    still.weights["log_std.bias"][:] = -20
+    noise = module._roll_out(replace(job, actor=still, render=None))["action"][1:]
+    assert noise[np.abs(noise) < 1].std() == pytest.approx(0.4371, abs=0.03)  # a Gaussian of 0.5, cut at +-1
+    assert noise.mean() == pytest.approx(0.0, abs=0.05)
+
+
+def test_a_noisy_quality_keeps_its_own_noise(tmp_path):
+    with pytest.raises(UserError, match="expert_noisy has its own noise"):
+        collect(config(tmp_path / "set", quality="expert_noisy", action_noise=0.1), LENGTH)
+    with pytest.raises(UserError, match="--action-noise is nan"):
+        collect(config(tmp_path / "set", action_noise=float("nan")), LENGTH)
+    assert not (tmp_path / "set").exists()

@@ -77,7 +77,7 @@ class TableCommand:
     """Folder of the table; sets that are in it already, by the same actors, are not played again."""
     tasks: list[str] = field(default_factory=lambda: _names("TASKS"))
     """Tasks."""
-    qualities: list[str] = field(default_factory=lambda: _names("QUALITIES"))
+    qualities: list[str] = field(default_factory=lambda: _names("SET_QUALITIES"))
     """Qualities; one whose actor does not ship is left out."""
     timed_episodes: int = 4
     """Episodes of the short rendered collection that is timed for each task."""

@@ -34,6 +34,11 @@ HOW = {
         "each episode is played anew, with the run's exploration noise, by the actor saved nearest to the moment of "
         "the run that the episode stands for, in proportion and in order; the earliest by uniformly random actions."
     ),
+    "expert_noisy": "The expert actor's sampled actions, with Gaussian noise added. Not one of V-D4RL's sets.",
+    "medium_expert_noisy": (
+        "The first half of the episodes by the medium actor, the second half by the expert actor, with Gaussian noise "
+        "added to their sampled actions. Not one of V-D4RL's sets."
+    ),
 }
 
 
@@ -153,6 +158,7 @@ def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, Any]:
     first = attributes[0]
     actors = {a["policy"]: a.get("actor_sha256") for a in attributes if a.get("actor_sha256")}
     facts = {"seed": first.get("seed"), "render": first.get("render")}
+    facts["noise added to actions, standard deviation"] = first.get("action_noise")
     facts |= {f"actor {name}, SHA-256": sha for name, sha in actors.items()}
     record = path / RECORD
     if record.exists():

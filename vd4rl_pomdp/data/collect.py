@@ -22,11 +22,14 @@ from vd4rl_pomdp.runs.folder import jsonable, read_json, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
 from vd4rl_pomdp.runs.workers import count_workers, run_jobs
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, QUALITIES, Quality, get_task
+from vd4rl_pomdp.seeding import stream_seed
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, NOISY_QUALITIES, SET_QUALITIES, NoisyQuality, Quality, get_task
 
 Policy = Actor | Ladder | None
 """Who acts in a shard: an actor, a ladder of them, or nobody (random actions)."""
 _RUNTIME_FIELDS = ("out", "workers")
+MAX_NOISE = 2.0
+"""Actions lie in [-1, 1]: noise beyond this leaves nothing of them."""
 
 
 @dataclass(frozen=True)
@@ -35,9 +38,9 @@ class CollectConfig:
 
     task: str
     """walker_walk, cheetah_run or humanoid_walk."""
-    quality: Quality
+    quality: Quality | NoisyQuality
     """Whose episodes: random actions, actors saved on the way to the medium one, the medium actor, half of medium and
-    expert each, or the expert actor."""
+    expert each, or the expert actor; the noisy ones, which V-D4RL has not, add the task's noise to every action."""
     out: Path
     """Folder of the set."""
     episodes: int = 200
@@ -52,6 +55,9 @@ class CollectConfig:
     """Episodes in a shard."""
     actor: Path | None = None
     """An actor file to use instead of the shipped one (for medium or expert)."""
+    action_noise: float | None = None
+    """Standard deviation of Gaussian noise that is added to every action, executed and stored, and becomes part of the
+    set's name; default: the quality's own, which is none but for the noisy ones."""
 
 
 @dataclass(frozen=True)
@@ -65,6 +71,8 @@ class _Job:
     render: Literal["fast", "exact"] | None
     """None: physics alone, no frames."""
     length: int
+    noise: float
+    """Standard deviation of the noise on actions."""
 
 
 def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Path]:
@@ -103,12 +111,36 @@ def _check(config: CollectConfig) -> None:
     """Refuse settings that make no set."""
     get_task(config.task)
     refuse_outside(config, episodes=1, episodes_per_shard=1, seed=(0, MAX_SEED), workers=0)
-    if config.quality not in QUALITIES:
-        raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(QUALITIES)}")
-    if config.quality == "medium_expert" and config.episodes < 2:
-        raise UserError("--episodes must be at least 2 for medium_expert, which is half medium and half expert")
-    if config.actor is not None and config.quality not in ("medium", "expert"):
+    refuse_outside(config, action_noise=(0, MAX_NOISE))
+    if config.quality not in SET_QUALITIES:
+        raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(SET_QUALITIES)}")
+    base = _base(config)
+    if base == "medium_expert" and config.episodes < 2:
+        raise UserError(f"--episodes must be at least 2 for {config.quality}, which is half medium and half expert")
+    if config.actor is not None and base not in ("medium", "expert"):
         raise UserError(f"--actor is for medium or expert sets, not {config.quality}: leave it out or change --quality")
+    if config.action_noise is not None and config.quality in NOISY_QUALITIES:
+        raise UserError(
+            f"{config.quality} has its own noise: leave --action-noise out, or take --quality {base} with it"
+        )
+
+
+def _base(config: CollectConfig) -> str:
+    """Whose episodes they are, noise aside."""
+    return config.quality.removesuffix("_noisy")
+
+
+def _noise(config: CollectConfig) -> float:
+    """Standard deviation of the noise on actions."""
+    own = get_task(config.task).action_noise if config.quality in NOISY_QUALITIES else 0.0
+    return own if config.action_noise is None else config.action_noise
+
+
+def _suffix(config: CollectConfig) -> str:
+    """What the noise adds to the names of set and shards."""
+    if config.quality in NOISY_QUALITIES:
+        return "_noisy"
+    return f"_noise{config.action_noise:g}" if config.action_noise else ""
 
 
 def actor_hashes(config: CollectConfig) -> list[str]:
@@ -143,14 +175,14 @@ def episode_seed(seed: int, episode: int) -> int:
 
 def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Policy]]:
     """Shards to write: file, episode numbers, policy. medium_expert is all medium shards, then all expert ones."""
-    halves = ["medium", "expert"] if config.quality == "medium_expert" else [config.quality]
+    halves = ["medium", "expert"] if _base(config) == "medium_expert" else [_base(config)]
     first = 0
     for number, quality in enumerate(halves):
         stop = config.episodes * (number + 1) // len(halves)
         policy = _policy(config, quality)
         for shard, start in enumerate(range(first, stop, config.episodes_per_shard)):
             episodes = range(start, min(start + config.episodes_per_shard, stop))
-            yield config.out / f"{shard}_{config.task}_{quality}.hdf5", episodes, policy
+            yield config.out / f"{shard}_{config.task}_{quality}{_suffix(config)}.hdf5", episodes, policy
         first = stop
 
 
@@ -167,13 +199,14 @@ def _policy(config: CollectConfig, quality: str) -> Policy:
 def _job(config: CollectConfig, policy: Policy, episode: int, length: int) -> _Job:
     """One episode; with a ladder, by who acted at the moment of training that the episode stands for."""
     actor = policy.actor_at((episode + 0.5) / config.episodes) if isinstance(policy, Ladder) else policy
-    return _Job(config.task, episode, config.seed, actor, config.render, length)
+    return _Job(config.task, episode, config.seed, actor, config.render, length, _noise(config))
 
 
 def _roll_out(job: _Job) -> dict[str, np.ndarray]:
     """Rows of one episode, by key."""
     env = _environment(job.task, job.render, job.length)
     rng = np.random.default_rng([job.seed, job.episode])
+    noise = np.random.default_rng(stream_seed(job.seed, "action noise", job.episode))
     row = env.reset(episode_seed(job.seed, job.episode))
     action = np.zeros(env.task.action_dim, np.float32)
     rows = [(row, action)]
@@ -182,6 +215,9 @@ def _roll_out(job: _Job) -> dict[str, np.ndarray]:
             action = rng.uniform(-1.0, 1.0, env.task.action_dim).astype(np.float32)
         else:
             action = job.actor.act(row.state, rng)
+        if job.noise:
+            shaken = action + job.noise * noise.standard_normal(action.shape)
+            action = shaken.clip(-1.0, 1.0).astype(np.float32)
         row = env.step(action)
         rows.append((row, action))
     frames = {} if job.render is None else {"observation": np.stack([r.frame for r, _ in rows])}
@@ -216,11 +252,12 @@ def join_rollouts(rollouts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray
 def _attributes(config: CollectConfig, path: Path, policy: Policy) -> dict[str, Any]:
     return {
         "task": config.task,
-        "set": config.quality,
+        "set": _base(config) + _suffix(config),
         "policy": path.stem.split("_", 1)[1].removeprefix(f"{config.task}_"),
         "seed": config.seed,
         "render": config.render,
         "actor_sha256": policy.sha256 if policy else None,
+        **({"action_noise": noise} if (noise := _noise(config)) else {}),
         "versions": {k: v for k, v in versions().items() if k in ("mujoco", "dm-control", "vd4rl-pomdp")},
     }
 

@@ -14,7 +14,7 @@ from torch import Tensor
 from vd4rl_pomdp.buffers import FrameBuffers
 from vd4rl_pomdp.data.store import Store, open_store
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, QUALITIES, TASKS
+from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, SET_QUALITIES, TASKS
 from vd4rl_pomdp.types import StepType, Transitions, Windows, row_key
 
 Index = int | Sequence[int] | np.ndarray | Tensor
@@ -281,7 +281,7 @@ def _read_only_tensor(array: np.ndarray) -> Tensor:
 
 def identity(path: Path, attributes: list[dict[str, Any]]) -> tuple[str | None, str | None]:
     """Task and quality of a set: as the attributes of all its shards say, else as its folders are named."""
-    return _name(path, attributes, "task", tuple(TASKS)), _name(path, attributes, "set", QUALITIES)
+    return _name(path, attributes, "task", tuple(TASKS)), _name(path, attributes, "set", SET_QUALITIES)
 
 
 def _name(path: Path, attributes: list[dict[str, Any]], attribute: str, choices: tuple[str, ...]) -> str | None:

@@ -22,7 +22,7 @@ from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.policies.actor import ships
 from vd4rl_pomdp.runs.folder import read_json, write_csv, write_json
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, QUALITIES, get_task
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, SET_QUALITIES, get_task
 
 EPISODES = 200
 CORES = 2
@@ -44,7 +44,7 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
         workers: processes that play.
 
     Returns:
-        Rows of the table, in the order of `tasks` and `QUALITIES`.
+        Rows of the table, in the order of `tasks` and `SET_QUALITIES`.
 
     Raises:
         UserError: an unknown task or quality, no episode to time, or a damaged file in the folder.
@@ -77,9 +77,9 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
 
 
 def _check(tasks: Sequence[str], qualities: Sequence[str], timed_episodes: int) -> None:
-    unknown = sorted(set(qualities) - set(QUALITIES))
+    unknown = sorted(set(qualities) - set(SET_QUALITIES))
     if unknown:
-        raise UserError(f"unknown quality {unknown[0]!r}: choose from {', '.join(QUALITIES)}")
+        raise UserError(f"unknown quality {unknown[0]!r}: choose from {', '.join(SET_QUALITIES)}")
     refuse_number("timed_episodes", timed_episodes, 1)
     for task in tasks:
         get_task(task)
@@ -90,7 +90,7 @@ def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:
     seconds = {r["task"]: float(r["cpu_seconds"]) / float(r["rows"]) * 1e5 / CORES for r in costs}
     table = []
     for task in dict.fromkeys(row["task"] for row in returns):
-        for quality in QUALITIES:
+        for quality in SET_QUALITIES:
             mine = [float(r["return"]) for r in returns if (r["task"], r["quality"]) == (task, quality)]
             if mine:
                 statistics = {"mean": np.mean(mine), "min": min(mine), "max": max(mine)}

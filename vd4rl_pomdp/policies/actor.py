@@ -210,6 +210,7 @@ def load_ladder(task: str) -> Ladder:
 def ships(task: str, quality: str) -> bool:
     """Whether the actors of a set ship: random needs none, medium_expert needs two."""
     needed = {"random": (), "medium_replay": ("replay",), "medium_expert": ("medium", "expert")}
+    quality = quality.removesuffix("_noisy")
     return all(_asset(task, name).exists() for name in needed.get(quality, (quality,)))
 
 
