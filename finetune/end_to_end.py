@@ -38,7 +38,7 @@ class PixelSampler:
             dataset, config.batch_size, generator, config.n_step, gamma=config.gamma, observe=self._observe
         )
         self.corruption = BatchCorruption(corruption, config.seed, STAGE)
-        self.shifts = KeyStream(stream_seed(config.seed, STAGE, "shift"))
+        self.shifts = KeyStream(stream_seed(config.seed, "shift", STAGE))
 
     def sample(self) -> Transitions:
         """The next batch."""

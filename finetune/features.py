@@ -78,9 +78,7 @@ class FrozenEncoder:
         """Representations (rows, D) of a whole episode, streamed from its first row."""
         start, end = int(self.dataset.episode_start[number]), int(self.dataset.episode_end[number])
         rows = torch.arange(start, end, device=self.device)
-        key = derive_keys(
-            stream_seed(self.seed, STAGE, "shift"), torch.tensor([view << 32 | number], device=self.device)
-        )
+        key = derive_keys(stream_seed(self.seed, "shift", STAGE, view), torch.tensor([number], device=self.device))
         features = self.rows(rows, key.expand(len(rows)), corruption)
         prev_action = self.dataset.action[rows].clone()
         prev_action[0] = 0
@@ -143,7 +141,7 @@ class ExactSampler:
         self._frozen, self._batch_size, self._n_step, self._gamma = frozen, batch_size, n_step, gamma
         self._generator = generator
         self.corruption = frozen.corruption(0)
-        self.shifts = KeyStream(stream_seed(frozen.seed, STAGE, "shift"))
+        self.shifts = KeyStream(stream_seed(frozen.seed, "shift", STAGE, 0))
         self._starts = torch.nonzero(frozen.dataset.t[1:] > 0)[:, 0]
 
     def sample(self) -> FeatureBatch:

@@ -60,7 +60,7 @@ class Trainer:
         self.generator = stream_generator(config.seed, STAGE, "batches")
         self.sampler = WindowSampler(dataset, config.batch_size, config.window, self.generator, observe=self._observe)
         self.corruption = BatchCorruption(corruption_of(config), config.seed, STAGE)
-        self.shifts = KeyStream(stream_seed(config.seed, STAGE, "shift"))
+        self.shifts = KeyStream(stream_seed(config.seed, "shift", STAGE))
         self.optimiser = torch.optim.Adam(objective.parameters(), lr=config.learning_rate)
         self.step = 0
         self.seconds = 0.0

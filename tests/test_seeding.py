@@ -12,9 +12,10 @@ from vd4rl_pomdp.seeding import seed_networks, stream_generator, stream_seed
 
 ROOT = Path(__file__).parents[1]
 NAMES = [
-    *[(stage, part) for stage in ("pretrain", "finetune", "navigation") for part in ("batches", "shift", "networks")],
-    *[("corruption", "finetune", view) for view in range(8)],
-    *[("corruption", stage) for stage in ("pretrain", "finetune", "emission")],
+    *[(stage, part) for stage in ("pretrain", "finetune", "navigation") for part in ("batches", "networks")],
+    *[(kind, "finetune", view) for kind in ("corruption", "shift") for view in range(8)],
+    *[(kind, stage) for kind in ("corruption", "shift") for stage in ("pretrain", "finetune")],
+    ("corruption", "emission"),
     *[("curl", "shift"), ("driml", "k"), ("homer", "gumbel"), ("homer", "imposters"), ("finetune", "noise")],
 ]
 
