@@ -50,7 +50,7 @@ class CURL(Objective):
         with torch.no_grad():
             positive = self.momentum_encoder.encode(self._shifted(window))
         batch, rows = query.shape[:2]
-        real = torch.arange(rows, device=query.device) < window.length[:, None]
+        real = window.real
         group = torch.arange(batch, device=query.device)[:, None].expand(-1, rows)[real]
         scores = query[real] @ self.bilinear @ positive[real].T
         loss = info_nce(scores, group)

@@ -54,7 +54,7 @@ class DRIML(Objective):
         maps = self._frame.maps(window.obs)
         states = self.encoder.from_features(self._frame.from_maps(maps), window.prev_action)
         features = {"global": states[:, :, None], "local": self._places(maps)}
-        real = torch.arange(k, rows, device=states.device) < window.length[:, None]
+        real = window.real[:, k:]
         group = torch.arange(batch, device=states.device)[:, None].expand(-1, rows - k)[real]
         action = window.action[:, :-k][real]
         anchors = {n: self._anchor(n, x[:, :-k][real], action) for n, x in features.items()}

@@ -64,7 +64,7 @@ class HOMER(Objective):
     def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean binary cross-entropy of every real transition of the batch and one imposter for each."""
         states = self.encoder.encode(window)
-        real = torch.arange(1, states.shape[1], device=states.device) < window.length[:, None]
+        real = window.real[:, 1:]
         state, action, following = states[:, :-1][real], window.action[:, :-1][real], states[:, 1:][real]
         imposter = following[self.draws.integers(len(following), len(following))]
         logits = torch.stack([self.logits(state, action, following), self.logits(state, action, imposter)])

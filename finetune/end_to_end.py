@@ -17,35 +17,10 @@ import torch
 from torch import Tensor
 
 from finetune.config import FinetuneConfig
-from finetune.features import STAGE, FeatureBatch
-from vd4rl_pomdp.augmentation import observe
-from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream
-from vd4rl_pomdp.data import Dataset, TransitionSampler
+from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.runs.device import autocast
-from vd4rl_pomdp.seeding import stream_seed
 from vd4rl_pomdp.types import Transitions
-
-
-class PixelSampler:
-    """Uniform n-step transitions of pixels, both observations shifted and corrupted on their own."""
-
-    def __init__(
-        self, dataset: Dataset, corruption: CorruptionConfig, config: FinetuneConfig, generator: torch.Generator
-    ) -> None:
-        self._dataset, self._shift = dataset, config.shift
-        self._sampler = TransitionSampler(
-            dataset, config.batch_size, generator, config.n_step, gamma=config.gamma, observe=self._observe
-        )
-        self.corruption = BatchCorruption(corruption, config.seed, STAGE)
-        self.shifts = KeyStream(stream_seed(config.seed, "shift", STAGE))
-
-    def sample(self) -> Transitions:
-        """The next batch."""
-        return self._sampler.sample()
-
-    def _observe(self, rows: Tensor) -> Tensor:
-        return observe(self._dataset, rows, self.shifts.take((len(rows),), rows.device), self._shift, self.corruption)
 
 
 class EndToEnd:

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.augmentation import observe
-from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, derive_keys
-from vd4rl_pomdp.data import Dataset
+from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
+from vd4rl_pomdp.data import Dataset, View
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.runs.device import Precision, autocast
 from vd4rl_pomdp.runs.folder import replacing_file
 from vd4rl_pomdp.runs.progress import ProgressLine
-from vd4rl_pomdp.seeding import stream_seed
 from vd4rl_pomdp.types import Batch
 
 CHUNK = 128
@@ -52,37 +51,36 @@ class FrozenEncoder:
         precision: Precision,
         seed: int,
     ) -> None:
-        self.encoder, self.dataset, self.shift, self.precision, self.seed = encoder, dataset, shift, precision, seed
+        self.encoder, self.dataset, self.precision = encoder, dataset, precision
+        self._shift, self._seed = shift, seed
         self.device = dataset.t.device
-        self._corruption_config = corruption
+        self._corruption = corruption
         self.states = dataset.states() if encoder.reads_state else torch.empty(0)
 
-    def corruption(self, view: int) -> BatchCorruption:
-        """The corruption of a view; under `emission` all views look the same."""
-        return BatchCorruption(self._corruption_config, self.seed, STAGE, view)
+    def view(self, number: int) -> View:
+        """One draw of corruption and shift; under `emission` all are corrupted alike."""
+        return View(self.dataset, self._corruption, self._shift, self._seed, STAGE, number)
 
     @torch.no_grad()
-    def rows(self, rows: Tensor, shift_key: Tensor, corruption: BatchCorruption) -> Tensor:
+    def rows(self, rows: Tensor, shift_key: Tensor, view: View) -> Tensor:
         """Frame features (N, F) of (N,) rows, shifted by (N,) keys, in chunks."""
         if self.encoder.reads_state:
             return self.encoder.frame(self.states[rows, :, None, None])
         parts = []
         for part, key in zip(rows.split(CHUNK), shift_key.split(CHUNK), strict=True):
-            obs = observe(self.dataset, part, key, self.shift, corruption)
+            obs = view.observe(part, key)
             with autocast(self.device, self.precision):
                 parts.append(self.encoder.frame(obs).float())
         return torch.cat(parts)
 
     @torch.no_grad()
-    def episode(self, number: int, view: int, corruption: BatchCorruption) -> Tensor:
-        """Representations (rows, D) of a whole episode, streamed from its first row."""
+    def episode(self, number: int, view: View) -> Tensor:
+        """Representations (rows, D) of a whole episode, streamed from its first row; one shift for all of it."""
         start, end = int(self.dataset.episode_start[number]), int(self.dataset.episode_end[number])
         rows = torch.arange(start, end, device=self.device)
-        key = derive_keys(stream_seed(self.seed, "shift", STAGE, view), torch.tensor([number], device=self.device))
-        features = self.rows(rows, key.expand(len(rows)), corruption)
-        prev_action = self.dataset.action[rows].clone()
-        prev_action[0] = 0
-        return self.encoder.from_features(features[None], prev_action[None])[0]
+        key = derive_keys(view.shifts.seed, torch.tensor([number], device=self.device))
+        features = self.rows(rows, key.expand(len(rows)), view)
+        return self.encoder.from_features(features[None], self.dataset.actions_before(rows)[None])[0]
 
 
 def encode_views(frozen: FrozenEncoder, views: int, path: Path) -> Tensor:
@@ -95,11 +93,10 @@ def encode_views(frozen: FrozenEncoder, views: int, path: Path) -> Tensor:
     if not path.exists():
         out = np.empty((views, dataset.num_rows, frozen.encoder.dim), np.float16)
         with ProgressLine("encode", views * dataset.num_episodes, "episodes") as progress:
-            for view in range(views):
-                corruption = frozen.corruption(view)
+            for features, view in zip(out, map(frozen.view, range(views)), strict=True):
                 for number in range(dataset.num_episodes):
                     start, end = int(dataset.episode_start[number]), int(dataset.episode_end[number])
-                    out[view, start:end] = frozen.episode(number, view, corruption).cpu().numpy()
+                    features[start:end] = frozen.episode(number, view).cpu().numpy()
                     progress.advance()
         with replacing_file(path) as fresh, fresh.open("wb") as file:
             np.save(file, out)
@@ -113,10 +110,17 @@ class FeatureSampler:
         self, dataset: Dataset, features: Tensor, batch_size: int, n_step: int, gamma: float, generator: torch.Generator
     ) -> None:
         self._features, self._batch_size, self._generator = features, batch_size, generator
-        starts = torch.nonzero(dataset.t[1:] > 0)[:, 0]
-        self._rows = starts
-        self._reward, self._discount, self._next = dataset.n_step_returns(starts, n_step, gamma)
-        self._action = dataset.action[starts + 1]
+        self._rows = dataset.transition_rows
+        self._reward, self._discount, self._next = dataset.n_step_returns(self._rows, n_step, gamma)
+        self._action = dataset.action_after(self._rows)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on with the same batches."""
+        return {"batches": self._generator.get_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        self._generator.set_state(state["batches"])
 
     def sample(self) -> FeatureBatch:
         """The next batch."""
@@ -140,9 +144,17 @@ class ExactSampler:
     ) -> None:
         self._frozen, self._batch_size, self._n_step, self._gamma = frozen, batch_size, n_step, gamma
         self._generator = generator
-        self.corruption = frozen.corruption(0)
-        self.shifts = KeyStream(stream_seed(frozen.seed, "shift", STAGE, 0))
-        self._starts = torch.nonzero(frozen.dataset.t[1:] > 0)[:, 0]
+        self._view = frozen.view(0)
+        self._starts = frozen.dataset.transition_rows
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on with the same batches."""
+        return {"batches": self._generator.get_state(), "view": self._view.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        self._generator.set_state(state["batches"])
+        self._view.load_state_dict(state["view"])
 
     def sample(self) -> FeatureBatch:
         """The next batch; sequence encoders read every row from the episode's start, or their history window."""
@@ -151,23 +163,21 @@ class ExactSampler:
         rows = self._starts[index.to(self._starts.device)]
         reward, discount, next_rows = dataset.n_step_returns(rows, self._n_step, self._gamma)
         z, next_z = self._encode(rows, next_rows)
-        return FeatureBatch(z, dataset.action[rows + 1], reward, discount, next_z)
+        return FeatureBatch(z, dataset.action_after(rows), reward, discount, next_z)
 
     @torch.no_grad()
     def _encode(self, rows: Tensor, next_rows: Tensor) -> tuple[Tensor, Tensor]:
         dataset, encoder = self._frozen.dataset, self._frozen.encoder
-        key = self.shifts.take((len(rows),), rows.device)
+        key = self._view.shifts.take((len(rows),), rows.device)
         if encoder.gru is None:
-            features = self._frozen.rows(torch.cat([rows, next_rows]), key.repeat(2), self.corruption)
+            features = self._frozen.rows(torch.cat([rows, next_rows]), key.repeat(2), self._view)
             return features[: len(rows)], features[len(rows) :]
         first = dataset.episode_start[dataset.episode[rows]]
         if encoder.config.history_window:
             first = torch.maximum(first, rows - encoder.config.history_window + 1)
         span = torch.arange(int((next_rows - first).max()) + 1, device=rows.device)
         history = torch.minimum(first[:, None] + span, next_rows[:, None])
-        features = self._frozen.rows(history.reshape(-1), key.repeat_interleave(len(span)), self.corruption)
-        prev_action = dataset.action[history].clone()
-        prev_action[:, 0] = 0
-        states = encoder.from_features(features.view(*history.shape, -1), prev_action)
+        features = self._frozen.rows(history.reshape(-1), key.repeat_interleave(len(span)), self._view)
+        states = encoder.from_features(features.view(*history.shape, -1), dataset.actions_before(history))
         pick = torch.arange(len(rows), device=rows.device)
         return states[pick, rows - first], states[pick, next_rows - first]

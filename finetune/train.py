@@ -12,10 +12,10 @@ import torch
 
 from finetune.algorithms import Algorithm, get_algorithm
 from finetune.config import FinetuneConfig
-from finetune.end_to_end import EndToEnd, PixelSampler
+from finetune.end_to_end import EndToEnd
 from finetune.features import STAGE, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.envs.parity import render_info
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
 from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, rows_of
@@ -67,9 +67,10 @@ def _trainer(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: E
     generator = stream_generator(config.seed, STAGE, "batches")
     corruption = CorruptionConfig(**card.corruption)
     frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed)
-    sampler: FeatureSampler | ExactSampler | PixelSampler
+    sampler: FeatureSampler | ExactSampler | TransitionSampler
     if card.end_to_end:
-        sampler = PixelSampler(dataset, corruption, config, generator)
+        view = View(dataset, corruption, config.shift, config.seed, STAGE)
+        sampler = TransitionSampler(view, config.batch_size, generator, config.n_step, config.gamma)
     elif config.views:
         features = encode_views(frozen, config.views, run.path / "features.npy")
         policy.standardise.fit(features)
@@ -79,9 +80,7 @@ def _trainer(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: E
         sampler = ExactSampler(frozen, config.batch_size, config.n_step, config.gamma, generator)
         policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(4)]))
     algorithm = get_algorithm(config.algorithm)(policy, config, stream_generator(config.seed, STAGE, "noise"))
-    return Trainer(
-        EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, generator, config, card
-    )
+    return Trainer(EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, config, card)
 
 
 def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
@@ -98,12 +97,11 @@ class Trainer:
     def __init__(
         self,
         algorithm: Algorithm | EndToEnd,
-        sampler: FeatureSampler | ExactSampler | PixelSampler,
-        generator: torch.Generator,
+        sampler: FeatureSampler | ExactSampler | TransitionSampler,
         config: FinetuneConfig,
         card: EncoderCard,
     ) -> None:
-        self.algorithm, self.sampler, self.generator = algorithm, sampler, generator
+        self.algorithm, self.sampler = algorithm, sampler
         self.config, self.card = config, card
         self.step = 0
         self.metrics: dict[str, torch.Tensor] = {}
@@ -168,20 +166,13 @@ class Trainer:
 
     def _state(self) -> dict[str, Any]:
         state = {"step": self.step, "seconds": self.seconds, "algorithm": self.algorithm.state_dict()}
-        state["metrics"] = self.metrics
-        state["batches"] = self.generator.get_state()
-        if isinstance(self.sampler, ExactSampler | PixelSampler):
-            state |= {"corruption": self.sampler.corruption.stream.position, "shifts": self.sampler.shifts.position}
-        return state
+        return state | {"metrics": self.metrics, "sampler": self.sampler.state_dict()}
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.step, self.seconds = state["step"], state["seconds"]
         self.metrics = state.get("metrics", {})
         self.algorithm.load_state_dict(state["algorithm"])
-        self.generator.set_state(state["batches"])
-        if isinstance(self.sampler, ExactSampler | PixelSampler):
-            self.sampler.corruption.stream.position = state["corruption"]
-            self.sampler.shifts.position = state["shifts"]
+        self.sampler.load_state_dict(state["sampler"])
 
 
 def _labels(config: FinetuneConfig, card: EncoderCard) -> dict[str, Any]:

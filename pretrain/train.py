@@ -9,9 +9,8 @@ import torch
 
 from pretrain.config import PretrainConfig
 from pretrain.objectives import build_objective, get_method
-from vd4rl_pomdp.augmentation import observe
-from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, make_corruption
-from vd4rl_pomdp.data import Dataset, WindowSampler, open_dataset
+from vd4rl_pomdp.corruptions import CorruptionConfig, make_corruption
+from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.nn.encoder import Encoder
@@ -23,7 +22,7 @@ from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.folder import RunFolder, jsonable
 from vd4rl_pomdp.runs.metrics import MetricsLog, read_metrics
 from vd4rl_pomdp.runs.progress import ProgressLine
-from vd4rl_pomdp.seeding import seed_networks, stream_generator, stream_seed
+from vd4rl_pomdp.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, get_task
 from vd4rl_pomdp.types import Windows
 
@@ -57,10 +56,9 @@ class Trainer:
     def __init__(self, objective: Objective, dataset: Dataset, config: PretrainConfig) -> None:
         self.objective, self.dataset, self.config = objective, dataset, config
         self.device = dataset.t.device
-        self.generator = stream_generator(config.seed, STAGE, "batches")
-        self.sampler = WindowSampler(dataset, config.batch_size, config.window, self.generator, observe=self._observe)
-        self.corruption = BatchCorruption(corruption_of(config), config.seed, STAGE)
-        self.shifts = KeyStream(stream_seed(config.seed, "shift", STAGE))
+        view = View(dataset, corruption_of(config), config.shift, config.seed, STAGE)
+        batches = stream_generator(config.seed, STAGE, "batches")
+        self.sampler = WindowSampler(view, config.batch_size, config.window, batches)
         self.optimiser = torch.optim.Adam(objective.parameters(), lr=config.learning_rate)
         self.step = 0
         self.seconds = 0.0
@@ -68,10 +66,6 @@ class Trainer:
     def batch(self) -> Windows:
         """The next windows, shifted and corrupted: what the agent would see."""
         return self.sampler.sample()
-
-    def _observe(self, rows: torch.Tensor) -> torch.Tensor:
-        shift_key = self.shifts.take((len(rows),), self.device)
-        return observe(self.dataset, rows, shift_key, self.config.shift, self.corruption)
 
     def update(self) -> dict[str, torch.Tensor]:
         """One gradient step; returns the objective's scalars."""
@@ -110,18 +104,14 @@ class Trainer:
             "seconds": self.seconds,
             "objective": self.objective.state_dict(),
             "optimiser": self.optimiser.state_dict(),
-            "batches": self.generator.get_state(),
-            "corruption": self.corruption.stream.position,
-            "shifts": self.shifts.position,
+            "sampler": self.sampler.state_dict(),
         }
 
     def _restore(self, state: dict[str, Any]) -> None:
         self.step, self.seconds = state["step"], state["seconds"]
         self.objective.load_state_dict(state["objective"])
         self.optimiser.load_state_dict(state["optimiser"])
-        self.generator.set_state(state["batches"])
-        self.corruption.stream.position = state["corruption"]
-        self.shifts.position = state["shifts"]
+        self.sampler.load_state_dict(state["sampler"])
 
 
 def corruption_of(config: CorruptionConfig) -> CorruptionConfig:
@@ -142,7 +132,7 @@ def _check(config: PretrainConfig) -> None:
 
 
 def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
-    actions = dataset.action[dataset.t > 0]
+    actions = dataset.action_after(dataset.transition_rows)
     target = make_action_target(config.action_target, actions.numpy(), config.codes, config.seed)
     state_dim = dataset.states().shape[1] if get_method(config.method).reads_state else 0
     objective = build_objective(config, actions, target, state_dim)

@@ -106,14 +106,14 @@ class InverseObjective(Objective):
         """`loss`, given the `representations` of the window."""
         pairs = self.pairs(window.obs.shape[1]).to(past.device)
         losses = self.target.loss(self.head(past, future, pairs), window.action[:, pairs[:, 0]])
-        real = (pairs.sum(1) < window.length[:, None]).to(losses)
+        real = window.real[:, pairs.sum(1)].to(losses)
         total = (losses * real).sum() / real.sum()
         logs = {"action_loss": total.detach()} | self._per_k(losses.detach() * real, real, pairs)
         if self.predictor is not None:
             term = self._self_prediction(past, pairs, real)
             total, logs["self_prediction"] = total + self.config.self_prediction * term, term.detach()
         if self.config.l2_states:
-            term = _masked_mean(past.square().mean(-1), window.length)
+            term = _mean_over(window.real, past.square().mean(-1))
             total, logs["l2_states"] = total + self.config.l2_states * (1 - progress) * term, term.detach()
         logs["loss"] = total.detach()
         return total, logs
@@ -153,7 +153,6 @@ class StateInverse(InverseObjective):
         return observations | later, actions | later_actions
 
 
-def _masked_mean(values: Tensor, length: Tensor) -> Tensor:
+def _mean_over(real: Tensor, values: Tensor) -> Tensor:
     """Mean of (B, T) values over real rows."""
-    real = (torch.arange(values.shape[1], device=values.device) < length[:, None]).to(values)
-    return (values * real).sum() / real.sum()
+    return (values * real).sum() / real.to(values).sum()

@@ -30,9 +30,18 @@ class StepType(IntEnum):
     LAST = 2
 
 
+_T_BITS = 20
+"""Bits of a row's place within its episode."""
+
+
 def row_key(episode: Tensor, t: Tensor) -> Tensor:
     """Name of row t of an episode as one int64, the same in a data set and in the environment."""
-    return (episode << 20) | t
+    return (episode << _T_BITS) | t
+
+
+def unpack_row_key(key: Tensor) -> tuple[Tensor, Tensor]:
+    """Episode and t that a `row_key` names."""
+    return key >> _T_BITS, key & ((1 << _T_BITS) - 1)
 
 
 @dataclass(frozen=True)
@@ -96,3 +105,8 @@ class Windows(Batch):
     """(B,) int64: real rows of each window; rows at and after it are padding."""
     key: Tensor
     """(B, T) int64: `row_key` of every row, which keys `emission` corruptions."""
+
+    @property
+    def real(self) -> Tensor:
+        """(B, T) bool: rows that are no padding."""
+        return torch.arange(self.has_action.shape[1], device=self.length.device) < self.length[:, None]

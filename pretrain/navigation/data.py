@@ -7,9 +7,9 @@ from torch import Tensor
 
 from pretrain.navigation.config import NavigationConfig
 from pretrain.navigation.probe import TrueStates
-from vd4rl_pomdp.data import Dataset
+from vd4rl_pomdp.data import Dataset, View
 from vd4rl_pomdp.experiments.navigation.exogenous import ExogenousNoise
-from vd4rl_pomdp.experiments.navigation.observations import observe, open_maze_set, shrink
+from vd4rl_pomdp.experiments.navigation.observations import MazeView, open_maze_set
 from vd4rl_pomdp.mazes import MazeSpec
 from vd4rl_pomdp.types import Windows
 
@@ -31,34 +31,31 @@ class MazeData:
     def __init__(
         self, dataset: Dataset, maze: MazeSpec, config: NavigationConfig, noise: ExogenousNoise | None
     ) -> None:
-        self.dataset, self.maze, self._config, self._noise = dataset, maze, config, noise
+        self.dataset, self.maze, self._config = dataset, maze, config
         held_out = max(1, dataset.num_episodes // HELD_OUT)
         self.first_held_out = dataset.num_episodes - held_out
         split = int(dataset.episode_start[self.first_held_out])
         self.states = TrueStates.of(dataset, maze, split)
-        self.training_actions = dataset.action[:split][dataset.t[:split] > 0]
+        rows = dataset.transition_rows
+        self.training_actions = dataset.action_after(rows[rows < split])
         """(M, 2) float32."""
         windows = (dataset.episode_end - dataset.episode_start - config.window + 1).clamp(min=0)
         self.total = dataset.num_windows(config.window)
         self.training = int(windows[: self.first_held_out].sum())
         """Windows 0..training-1 are for training, the rest is held out."""
-        self._stored = config.picture == "rgb100"
+        self._view: View = MazeView(dataset, noise)
 
     def on(self, device: torch.device) -> MazeData:
         """Prepare the observations and move everything to a device."""
-        if not self._stored:
-            shrink(self.dataset, self._config.picture, self._noise)
+        if isinstance(self._view, MazeView) and self._config.picture == "grey50":
+            self._view = self._view.shrunk()
         self.dataset.to(device)
         self.states = self.states.to(device)
         return self
 
     def windows(self, number: Tensor, length: int | None = None) -> Windows:
         """Windows by (B,) numbers, as the model sees them."""
-        window = self.dataset.windows(number, length or self._config.window, 1)
-        if self._stored and self._noise is not None:
-            obs = observe(window.obs.flatten(0, 1), window.key.flatten(), self._config.picture, self._noise)
-            window = window.replace(obs=obs.view(window.obs.shape))
-        return window
+        return self._view.windows(number, length or self._config.window)
 
     def spread(self, count: int, held_out: bool) -> list[Tensor]:
         """Numbers of `count` windows, evenly spread over the training or the held-out ones, in batches."""

@@ -16,7 +16,7 @@ from vd4rl_pomdp.mazes import MazeSpec
 from vd4rl_pomdp.nn.heads import mlp
 from vd4rl_pomdp.nn.policy import Standardise
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.types import Windows
+from vd4rl_pomdp.types import Windows, unpack_row_key
 
 STATE_DIM = 4
 COMPONENTS = {"state": slice(0, 4), "position": slice(0, 2), "velocity": slice(2, 4)}
@@ -49,7 +49,8 @@ class TrueStates:
 
     def rows(self, window: Windows) -> Tensor:
         """(B, T) int64 rows of a batch's windows."""
-        return self.episode_start[window.key >> 20] + (window.key & (1 << 20) - 1)
+        episode, t = unpack_row_key(window.key)
+        return self.episode_start[episode] + t
 
     def to(self, device: torch.device) -> TrueStates:
         """Copy on a device."""

@@ -3,7 +3,8 @@ import pytest
 import torch
 
 from tests.helpers_data import fake_rows
-from vd4rl_pomdp.augmentation import _shift_by_index, _shift_by_lines, observe, random_shift
+from vd4rl_pomdp._shift import shift_by_index, shift_by_lines
+from vd4rl_pomdp.augmentation import random_shift
 from vd4rl_pomdp.corruptions import (
     CORRUPTIONS,
     BatchCorruption,
@@ -13,7 +14,7 @@ from vd4rl_pomdp.corruptions import (
     draw_integers,
     make_corruption,
 )
-from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.seeding import stream_seed
@@ -140,7 +141,7 @@ def test_random_shift_equals_padding_and_cropping():
 def test_both_ways_to_shift_agree(shape, pad):
     obs = torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
     offset = draw_integers(torch.arange(shape[0]), 2 * pad + 1, 2) - pad
-    expected = _shift_by_index(obs, offset)
+    expected = shift_by_index(obs, offset)
     assert torch.equal(random_shift(obs, torch.arange(shape[0]), pad), expected)
 
 
@@ -148,8 +149,8 @@ def test_shifting_some_of_the_images_by_lines_leaves_out_the_others():
     obs, some = stacks(8), torch.tensor([7, 2, 0, 2])
     offset = torch.tensor([[4, 4], [-4, 3], [-4, -4], [0, -1]])
     out = torch.empty_like(obs[some])
-    _shift_by_lines(obs, some, offset, out)
-    assert torch.equal(out, _shift_by_index(obs[some], offset))
+    shift_by_lines(obs, some, offset, out)
+    assert torch.equal(out, shift_by_index(obs[some], offset))
 
 
 @pytest.mark.parametrize("name", CORRUPTIONS)
@@ -159,7 +160,7 @@ def test_observing_rows_equals_shifting_then_corrupting_their_stacks(dataset, na
     config = CorruptionConfig(name, mode, patch_fill=7, patch_count=2, zeroed_frames=zeroed)
     rows, key = torch.arange(dataset.num_rows).view(2, -1), torch.tensor([5, 6])
     for pad in (0, 4):
-        apart, together = (BatchCorruption(config, seed=1) for _ in range(2))
+        apart, together = BatchCorruption(config, 1, "a"), View(dataset, config, pad, 1, "a")
         for _ in range(2):
             expected = apart(random_shift(dataset.stacks(rows), key, pad).clone(), dataset.keys(rows))
-            assert torch.equal(observe(dataset, rows, key, pad, together), expected)
+            assert torch.equal(together.observe(rows, key), expected)

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from tests.helpers_data import fake_action, fake_reward, fake_rows, frame_identity, write_fake_set
-from vd4rl_pomdp.data import TransitionSampler, WindowSampler, open_dataset
+from vd4rl_pomdp.data import TransitionSampler, View, WindowSampler, open_dataset
 from vd4rl_pomdp.data.format import shard_paths, write_shard
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.types import row_key
@@ -200,10 +200,10 @@ def test_samplers_repeat_with_their_generator_and_cover_the_set(dataset):
         return [next(batches).key.tolist() for batches in [iter(sampler)] for _ in range(count)]
 
     def transitions(seed):
-        return TransitionSampler(dataset, 64, torch.Generator().manual_seed(seed), n_step=2, frame_stack=1)
+        return TransitionSampler(View(dataset, frame_stack=1), 64, torch.Generator().manual_seed(seed), n_step=2)
 
     def windows(seed):
-        return WindowSampler(dataset, 64, 2, torch.Generator().manual_seed(seed), frame_stack=1)
+        return WindowSampler(View(dataset, frame_stack=1), 64, 2, torch.Generator().manual_seed(seed))
 
     for make in (transitions, windows):
         first = draws(make(0), 30)
@@ -214,7 +214,7 @@ def test_samplers_repeat_with_their_generator_and_cover_the_set(dataset):
 
 
 def test_samplers_draw_uniformly_over_transitions(dataset):
-    sampler = TransitionSampler(dataset, 2000, torch.Generator().manual_seed(0), frame_stack=1)
+    sampler = TransitionSampler(View(dataset, frame_stack=1), 2000, torch.Generator().manual_seed(0))
     short = np.mean([key < (2 << 20) for key in sampler.sample().key.tolist()])
     assert short == pytest.approx(6 / 265, abs=0.012)
 

@@ -111,6 +111,7 @@ class Corruption:
     def __init__(self, name: str, stages: list[Stage], zeroed: int = 0) -> None:
         self.name = name
         self._stages, self._zeroed = stages, zeroed
+        self._nothing = not stages and not zeroed
 
     def __call__(self, obs: Tensor, key: Tensor) -> Tensor:
         """Corrupted copy of a batch.
@@ -122,12 +123,14 @@ class Corruption:
         Returns:
             uint8 like `obs`; `obs` itself where there is nothing to do.
         """
-        if not self._stages and not self._zeroed:
+        if self._nothing:
             return obs
         return self.apply_(obs.clone(memory_format=torch.contiguous_format), key)
 
     def apply_(self, obs: Tensor, key: Tensor) -> Tensor:
         """The same in place, for a contiguous batch that is the caller's own."""
+        if self._nothing:
+            return obs
         stacks, key = obs.view(-1, obs.shape[-3] // _CHANNELS, _CHANNELS, *obs.shape[-2:]), key.reshape(-1)
         kept = self.kept(key, stacks.shape[1])
         if not self._zeroed:

@@ -1,6 +1,7 @@
-"""V-D4RL data: format, store, data sets, samplers, collection and download."""
+"""V-D4RL data: format, store, data sets, views, samplers, collection and download."""
 
 from vd4rl_pomdp.data.dataset import Dataset, open_dataset
 from vd4rl_pomdp.data.samplers import TransitionSampler, WindowSampler
+from vd4rl_pomdp.data.view import View
 
-__all__ = ["Dataset", "TransitionSampler", "WindowSampler", "open_dataset"]
+__all__ = ["Dataset", "TransitionSampler", "View", "WindowSampler", "open_dataset"]

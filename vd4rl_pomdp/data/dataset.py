@@ -122,6 +122,21 @@ class Dataset:
         """`row_key` of every row in `rows`."""
         return row_key(self.episode[rows], self.t[rows])
 
+    @property
+    def transition_rows(self) -> Tensor:
+        """(M,) int64: rows that have a successor in their episode, in order."""
+        return torch.nonzero(self.t[1:] > 0)[:, 0]
+
+    def action_after(self, rows: Tensor) -> Tensor:
+        """a_t (..., A) float32 of (...,) int64 rows t that have a successor."""
+        return self.action[rows + 1]
+
+    def actions_before(self, rows: Tensor) -> Tensor:
+        """a_{t-1} (..., T, A) float32 of (..., T) consecutive rows; zero in the first: a history begins without one."""
+        actions = self.action[rows]
+        actions[..., 0, :] = 0
+        return actions
+
     def stacks(self, rows: Tensor, frame_stack: int = FRAME_STACK) -> Tensor:
         """Frame stacks (..., 3 * frame_stack, S, S) uint8 of (...,) int64 rows, oldest frame first.
 
@@ -169,7 +184,7 @@ class Dataset:
         observe = observe or (lambda rows: self.stacks(rows, frame_stack))
         return Transitions(
             obs=observe(rows),
-            action=self.action[rows + 1],
+            action=self.action_after(rows),
             reward=reward,
             discount=discount,
             next_obs=observe(next_rows),
@@ -217,12 +232,11 @@ class Dataset:
         start = self._starts(self._index(index, int(per_episode.sum())), per_episode)
         rows = start[:, None] + torch.arange(length, device=start.device)
         has_action = rows + 1 < self.episode_end[self.episode[rows]]
-        action = self.action[torch.where(has_action, rows + 1, rows)] * has_action[..., None]
-        prev_action = torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], dim=1)
+        following = self.action_after(torch.where(has_action, rows, 0))
         return Windows(
             obs=self.stacks(rows, frame_stack) if observe is None else observe(rows),
-            prev_action=prev_action,
-            action=action,
+            prev_action=self.actions_before(rows),
+            action=following * has_action[..., None],
             has_action=has_action,
             length=torch.full_like(start, length),
             key=self.keys(rows),

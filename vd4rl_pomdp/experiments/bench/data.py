@@ -10,9 +10,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from vd4rl_pomdp.augmentation import observe
-from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig
-from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.experiments.bench.memory import touch
 from vd4rl_pomdp.experiments.bench.timing import alternating, seconds_of
@@ -54,7 +53,6 @@ def sampling(dataset: Dataset, repeats: int) -> dict[str, float]:
     some = min(dataset.num_transitions, 20_000)
     touch(dataset.frames[:some])
     generator = torch.Generator().manual_seed(0)
-    corruptions = {name: BatchCorruption(CorruptionConfig(name), 0) for name in ("patch", "patch+zero_frames")}
 
     def rows() -> torch.Tensor:
         return torch.randint(3, some - 1, (2 * BATCH,), generator=generator)
@@ -64,7 +62,8 @@ def sampling(dataset: Dataset, repeats: int) -> dict[str, float]:
         target.copy_(dataset.frames[start : start + len(target)])
 
     def see(name: str) -> Callable[[], Any]:
-        return lambda: observe(dataset, rows(), torch.arange(2 * BATCH), 4, corruptions[name])
+        view = View(dataset, CorruptionConfig(name), shift=4)
+        return lambda: view.observe(rows())
 
     target = torch.empty(2 * BATCH * FRAME_STACK, *dataset.frames.shape[1:], dtype=torch.uint8)
     copying, gathering, patch, both = alternating(

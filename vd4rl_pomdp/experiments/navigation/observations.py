@@ -8,7 +8,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.exogenous import ExogenousNoise
 from vd4rl_pomdp.mazes import MAZES, PICTURE_SIZE, MazeSpec
@@ -45,24 +45,26 @@ def to_grey50(pictures: Tensor) -> Tensor:
     return torch.einsum("nchw,c->nhw", sums.float(), weights).round_().to(torch.uint8)[:, None]
 
 
-def observe(pictures: Tensor, key: Tensor, picture: Picture, noise: ExogenousNoise | None) -> Tensor:
-    """Observations (N, C, S, S) uint8 of (N, 3, 100, 100) uint8 pictures with (N,) int64 row keys."""
-    if noise is not None:
-        pictures = noise(pictures, key)
-    return to_grey50(pictures) if picture == "grey50" else pictures
+class MazeView(View):
+    """A maze's set as a model sees it: one picture a row, with the exogenous noise of its key."""
 
+    def __init__(self, dataset: Dataset, noise: ExogenousNoise | None) -> None:
+        super().__init__(dataset, frame_stack=1)
+        self._noise = noise
 
-def shrink(dataset: Dataset, picture: Picture, noise: ExogenousNoise | None) -> Dataset:
-    """Replace a set's pictures by small observations, once for all: training then never touches the large ones."""
-    blocks = torch.arange(dataset.num_rows).split(_BLOCK)
-    small = torch.empty(dataset.num_rows, *_shape(picture), dtype=torch.uint8)
-    for rows in blocks:
-        part = slice(int(rows[0]), int(rows[-1]) + 1)
-        small[part] = observe(dataset.frames[part], dataset.keys(rows), picture, noise)
-    dataset.frames = small
-    return dataset
+    def observe(self, rows: Tensor, shift_key: Tensor | None = None) -> Tensor:
+        """Observations (N, ..., 3, 100, 100) uint8 of (N, ...) int64 rows."""
+        pictures = super().observe(rows, shift_key)
+        if self._noise is None:
+            return pictures
+        noisy = self._noise(pictures.flatten(0, -4), self.dataset.keys(rows).flatten())
+        return noisy.view(pictures.shape)
 
-
-def _shape(picture: Picture) -> tuple[int, int, int]:
-    channels, size = SHAPES[picture]
-    return channels, size, size
+    def shrunk(self) -> View:
+        """The same at 50x50 in grey, drawn once for all: training then never touches the large pictures."""
+        channels, size = SHAPES["grey50"]
+        small = torch.empty(self.dataset.num_rows, channels, size, size, dtype=torch.uint8)
+        for rows in torch.arange(self.dataset.num_rows).split(_BLOCK):
+            small[rows] = to_grey50(self.observe(rows))
+        self.dataset.frames = small
+        return View(self.dataset, frame_stack=1)

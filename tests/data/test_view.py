@@ -1,0 +1,86 @@
+"""One view of the data: what an agent sees, batch after batch, and the names that the time axis has."""
+
+import pytest
+import torch
+
+from tests.helpers_data import fake_action, write_fake_set
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import Dataset, TransitionSampler, View, WindowSampler, open_dataset
+from vd4rl_pomdp.types import row_key, unpack_row_key
+
+LENGTHS = (9, 5)
+
+
+@pytest.fixture
+def dataset(tmp_path) -> Dataset:
+    return open_dataset(write_fake_set(tmp_path / "set", LENGTHS), tmp_path / "cache")
+
+
+def generator() -> torch.Generator:
+    return torch.Generator().manual_seed(0)
+
+
+MAKE = {
+    "windows": lambda view: WindowSampler(view, 4, 3, generator()),
+    "transitions": lambda view: TransitionSampler(view, 4, generator(), n_step=2),
+}
+
+
+@pytest.mark.parametrize("kind", MAKE)
+def test_a_samplers_state_is_all_that_its_next_batches_depend_on(dataset, kind):
+    def sampler():
+        return MAKE[kind](View(dataset, CorruptionConfig("patch+zero_frames"), 4, 3, "test"))
+
+    first, second = sampler(), sampler()
+    for _ in range(3):
+        first.sample()
+    second.load_state_dict(first.state_dict())
+    for _ in range(2):
+        one, other = first.sample(), second.sample()
+        assert all(torch.equal(one[name], other[name]) for name in one)
+    assert not torch.equal(sampler().sample().obs, one.obs)
+
+
+def test_views_of_different_names_draw_apart_and_of_one_name_alike(dataset):
+    rows = torch.arange(8)
+    config = CorruptionConfig("patch+zero_frames")
+    seen = [View(dataset, config, 4, 0, *name).observe(rows) for name in (["a"], ["a"], ["b"], ["a", 1])]
+    assert torch.equal(seen[0], seen[1])
+    assert not torch.equal(seen[0], seen[2])
+    assert not torch.equal(seen[0], seen[3])
+
+
+def test_a_window_is_shifted_as_one_and_the_next_one_anew(dataset):
+    dataset.frames = torch.randint(0, 256, dataset.frames.shape, dtype=torch.uint8, generator=generator())
+    view = View(dataset, None, 4)
+    rows = torch.tensor([[2, 2, 2], [2, 2, 2], [3, 3, 3]])
+    seen = view.observe(rows)
+    assert torch.equal(seen[0, 0], seen[0, 2])
+    assert not torch.equal(seen[0, 0], seen[1, 0])
+    assert not torch.equal(view.observe(rows), seen)
+
+
+def test_the_plain_view_is_the_set_itself(dataset):
+    index = torch.arange(dataset.num_transitions)
+    plain, seen = dataset.transitions(index, 3), View(dataset).transitions(index, 3)
+    assert all(torch.equal(plain[name], seen[name]) for name in plain)
+
+
+def test_actions_before_and_after_a_row(dataset):
+    rows = dataset.transition_rows
+    assert rows.tolist() == [*range(8), *range(9, 13)]
+    for row, action in zip(rows.tolist(), dataset.action_after(rows), strict=True):
+        episode, t = int(dataset.episode[row]), int(dataset.t[row])
+        torch.testing.assert_close(action, torch.from_numpy(fake_action(episode, t)))
+    history = torch.tensor([[2, 3, 4], [9, 10, 11]])
+    before = dataset.actions_before(history)
+    assert not before[:, 0].any()
+    assert torch.equal(before[:, 1:], dataset.action_after(history[:, :-1]))
+    assert dataset.action[3].any(), "the set itself must keep its actions"
+
+
+def test_row_keys_unpack_and_padding_is_not_real(dataset):
+    episode, t = torch.tensor([0, 3, 70_000]), torch.tensor([0, 500, 1_000_000])
+    assert [x.tolist() for x in unpack_row_key(row_key(episode, t))] == [episode.tolist(), t.tolist()]
+    window = dataset.windows([0, 1], 4).replace(length=torch.tensor([4, 2]))
+    assert window.real.tolist() == [[True] * 4, [True, True, False, False]]

@@ -1,0 +1,100 @@
+"""A data set as an agent sees it: stacked frames, shifted at random, then corrupted."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vd4rl_pomdp import _shift
+from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream
+from vd4rl_pomdp.data.dataset import Dataset, Index
+from vd4rl_pomdp.seeding import stream_seed
+from vd4rl_pomdp.tasks import FRAME_STACK
+from vd4rl_pomdp.types import Transitions, Windows
+
+
+class View:
+    """A set, the shift and the corruption under which it is seen, and the streams that both are drawn from."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        corruption: CorruptionConfig | None = None,
+        shift: int = 0,
+        seed: int = 0,
+        *name: str | int,
+        frame_stack: int = FRAME_STACK,
+    ) -> None:
+        """See the class.
+
+        Args:
+            dataset: the set; moving it to a device moves what the view shows.
+            corruption: what makes the observations partial; None for nothing.
+            shift: largest random shift in pixels.
+            seed: the run's seed.
+            name: tells the views of a run apart: each draws from streams of its own.
+            frame_stack: frames in an observation.
+        """
+        self.dataset = dataset
+        self.corruption = BatchCorruption(corruption or CorruptionConfig(), seed, *name)
+        self.shifts = KeyStream(stream_seed(seed, "shift", *name))
+        self._pad, self._frame_stack = shift, frame_stack
+
+    def observe(self, rows: Tensor, shift_key: Tensor | None = None) -> Tensor:
+        """Observations of rows. On a CPU, frames that the corruption zeroes are never read.
+
+        Args:
+            rows: (N, ...) int64; everything under one leading index is shifted alike.
+            shift_key: (N,) int64, what the shifts are drawn from; None: the next keys of the view's stream.
+
+        Returns:
+            (N, ..., C, H, W) uint8, C = 3 * frame_stack.
+        """
+        if shift_key is None:
+            shift_key = self.shifts.take((len(rows),), rows.device)
+        keys = self.corruption.keys(self.dataset.keys(rows))
+        if _shift.by_lines(self.dataset.frames, self._pad):
+            return self._observe_by_lines(rows, shift_key, keys)
+        stacks = random_shift(self.dataset.stacks(rows, self._frame_stack), shift_key, self._pad)
+        return self.corruption.corruption.apply_(stacks, keys)
+
+    def windows(self, index: Index, length: int) -> Windows:
+        """`Dataset.windows` of what the agent sees."""
+        return self.dataset.windows(index, length, observe=self.observe)
+
+    def transitions(self, index: Index, n_step: int = 1, gamma: float = 0.99) -> Transitions:
+        """`Dataset.transitions` of what the agent sees; both ends are shifted and corrupted on their own."""
+        return self.dataset.transitions(index, n_step, gamma=gamma, observe=self.observe)
+
+    def state_dict(self) -> dict[str, Any]:
+        """Where the streams stand."""
+        return {"corruption": self.corruption.stream.position, "shift": self.shifts.position}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        self.corruption.stream.position, self.shifts.position = state["corruption"], state["shift"]
+
+    def _observe_by_lines(self, rows: Tensor, shift_key: Tensor, keys: Tensor) -> Tensor:
+        """The same for a set on a CPU: only frames that stay are read, shifted, changed, and put into their stacks."""
+        corruption, frames, stack = self.corruption.corruption, self.dataset.frames, self._frame_stack
+        keys = keys.flatten()
+        kept = corruption.kept(keys, stack)
+        chosen = self.dataset.stack_rows(rows, stack).view(-1, stack).gather(1, kept)
+        images = _shift.BUFFERS.take((chosen.numel() + 1, *frames.shape[1:]))
+        offset = _shift.draw_offset(shift_key, self._pad).repeat_interleave(chosen.numel() // len(shift_key), 0)
+        _shift.shift_by_lines(frames, chosen.flatten(), offset, images[:-1])
+        corruption.change_(images[:-1].view(*chosen.shape, *images.shape[1:]), keys, kept)
+        obs = images[:-1] if kept.shape[1] == stack else _spread(images, kept, stack)
+        return obs.view(*rows.shape, -1, *images.shape[2:])
+
+
+def _spread(images: Tensor, kept: Tensor, stack: int) -> Tensor:
+    """Put frames at their (N, K) places in stacks of zeros; `images` has room for one of zeros behind them."""
+    images[-1] = 0
+    source = torch.full((len(kept), stack), kept.numel())
+    source.scatter_(1, kept, torch.arange(kept.numel()).view(kept.shape))
+    out = _shift.BUFFERS.take((source.numel(), *images.shape[1:]))
+    return torch.index_select(images, 0, source.flatten(), out=out)
