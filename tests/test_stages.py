@@ -48,6 +48,8 @@ def contents(folder: Path) -> dict[str, str]:
 def _stable(path: Path) -> bytes:
     """A file's bytes without run paths."""
     text = path.read_bytes()
+    if path.name == "results.json":
+        return b"\n".join(line for line in text.splitlines() if b'"command"' not in line)
     if path.name == "config.json":
         return b"\n".join(line for line in text.splitlines() if b'"out"' not in line and b'"encoder":' not in line)
     return text
