@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import hashlib
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +15,7 @@ from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.data import Dataset, View
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.runs.device import Precision, autocast
-from vd4rl_pomdp.runs.folder import replacing_file
+from vd4rl_pomdp.runs.folder import read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.types import Batch
 
@@ -83,24 +84,58 @@ class FrozenEncoder:
         return self.encoder.from_features(features[None], self.dataset.actions_before(rows)[None])[0]
 
 
-def encode_views(frozen: FrozenEncoder, views: int, path: Path) -> Tensor:
+class FeatureFile:
+    """A run's features on disk, for its resumption; they count only while they are what these inputs gave."""
+
+    def __init__(self, run: Path, inputs: dict[str, str]) -> None:
+        self._path, self._origin = run / "features.npy", run / "features.json"
+        self._inputs = inputs
+
+    def read(self) -> np.ndarray | None:
+        """What was written, None if that is missing, damaged or of other inputs."""
+        if not (self._path.exists() and self._origin.exists()):
+            return None
+        return np.load(self._path) if read_json(self._origin) == self._description() else None
+
+    def write(self, features: np.ndarray) -> None:
+        """Keep the features."""
+        with replacing_file(self._path) as fresh, fresh.open("wb") as file:
+            np.save(file, features)
+        write_json(self._origin, self._description())
+
+    def remove(self) -> None:
+        """The run needs them no more."""
+        self._origin.unlink(missing_ok=True)
+        self._path.unlink(missing_ok=True)
+
+    def _description(self) -> dict[str, str]:
+        with self._path.open("rb") as file:
+            return self._inputs | {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+
+
+def encode_views(frozen: FrozenEncoder, views: int, kept: FeatureFile) -> Tensor:
     """Encode the whole set under `views` draws, or read what was encoded before.
 
     Returns:
-        (views, N, D) float16 on the data set's device; `path` keeps them for the run's resumption.
+        (views, N, D) float16 on the data set's device; `kept` keeps them for the run's resumption.
     """
+    features = kept.read()
+    if features is None:
+        features = _encode_all(frozen, views)
+        kept.write(features)
+    return torch.from_numpy(features).to(frozen.device)
+
+
+def _encode_all(frozen: FrozenEncoder, views: int) -> np.ndarray:
     dataset = frozen.dataset
-    if not path.exists():
-        out = np.empty((views, dataset.num_rows, frozen.encoder.dim), np.float16)
-        with ProgressLine("encode", views * dataset.num_episodes, "episodes") as progress:
-            for features, view in zip(out, map(frozen.view, range(views)), strict=True):
-                for number in range(dataset.num_episodes):
-                    start, end = int(dataset.episode_start[number]), int(dataset.episode_end[number])
-                    features[start:end] = frozen.episode(number, view).cpu().numpy()
-                    progress.advance()
-        with replacing_file(path) as fresh, fresh.open("wb") as file:
-            np.save(file, out)
-    return torch.from_numpy(np.load(path)).to(dataset.t.device)
+    out = np.empty((views, dataset.num_rows, frozen.encoder.dim), np.float16)
+    with ProgressLine("encode", views * dataset.num_episodes, "episodes") as progress:
+        for features, view in zip(out, map(frozen.view, range(views)), strict=True):
+            for number in range(dataset.num_episodes):
+                start, end = int(dataset.episode_start[number]), int(dataset.episode_end[number])
+                features[start:end] = frozen.episode(number, view).cpu().numpy()
+                progress.advance()
+    return out
 
 
 class FeatureSampler:

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import shutil
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -13,21 +12,21 @@ import torch
 from finetune.algorithms import Algorithm, get_algorithm
 from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd
-from finetune.features import STAGE, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
+from finetune.features import STAGE, ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.envs.parity import render_info
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
-from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, rows_of
+from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, read_rows, rows_of
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.folder import EncoderCard, load_encoder, save_encoder
+from vd4rl_pomdp.nn.folder import CONFIG, EncoderCard, copy_encoder, encoder_hash, load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.probes import probe_state
-from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint
+from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.folder import RunFolder, jsonable, replacing, replacing_file, write_json
-from vd4rl_pomdp.runs.metrics import MetricsLog
-from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.runs.folder import read_json, replacing_file, write_json
+from vd4rl_pomdp.runs.loop import Loop, training
+from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.tasks import FRAME_SIZE, get_task
 
@@ -48,15 +47,14 @@ def finetune(config: FinetuneConfig) -> RunFolder:
         config = replace(config, algorithm=card.end_to_end, views=0)
     if encoder.reads_state:
         dataset.states()
-    run = RunFolder(config.out, STAGE, config)
-    quality = dataset.quality or card.quality
-    card = replace(card, quality=quality)  # the set that the policy is trained on names its rows
-    write_json(run.path / "labels.json", _labels(config, card))
-    if run.finished:
-        return run
-    _keep_encoder(config.encoder, run.path)
-    dataset.to(device)
-    _trainer(config, dataset, encoder.to(device), card, run).run(run)
+    card = replace(card, quality=dataset.quality or card.quality)  # the policy's set names its rows
+    inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
+    with RunFolder(config.out, STAGE, config, inputs) as run:
+        if not run.finished:
+            write_json(run.path / "labels.json", _labels(config, card))
+            _keep_encoder(config.encoder, run.path)
+            dataset.to(device)
+            _trainer(config, dataset, encoder.to(device), card, run).run(run)
     return run
 
 
@@ -72,7 +70,7 @@ def _trainer(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: E
         view = View(dataset, corruption, config.shift, config.seed, STAGE)
         sampler = TransitionSampler(view, config.batch_size, generator, config.n_step, config.gamma)
     elif config.views:
-        features = encode_views(frozen, config.views, run.path / "features.npy")
+        features = encode_views(frozen, config.views, FeatureFile(run.path, run.inputs))
         policy.standardise.fit(features)
         _probe(features, dataset, run)
         sampler = FeatureSampler(dataset, features, config.batch_size, config.n_step, config.gamma, generator)
@@ -106,38 +104,45 @@ class Trainer:
         self.step = 0
         self.metrics: dict[str, torch.Tensor] = {}
         """The newest value of each: an actor is not updated at every step."""
-        self.seconds = 0.0
 
     def run(self, run: RunFolder) -> None:
         """Train to the end, from the newest checkpoint if there is one."""
         config = self.config
-        restore_checkpoint(run.checkpoint, self._restore)
-        drop_rows_after(run.path / "episodes.csv", self.step)
-        before = self.seconds
-        log = MetricsLog(run.path / "metrics.jsonl", self.step, config.wandb, jsonable(asdict(config)))
         title = f"finetune {config.algorithm} on {self.card.method}"
-        with ProgressLine(title, config.updates, "updates", self.step) as progress:
+        with training(run, self, title, config.updates, "updates") as loop:
+            if self._lacks_evaluation(run, loop):
+                self._evaluate(run, loop)
             while self.step < config.updates:
                 self.metrics |= self.algorithm.update(self.sampler.sample())  # type: ignore[arg-type]
                 self.step += 1
-                progress.advance()
-                last = self.step == config.updates
-                if last or self.step % config.log_every == 0:
-                    row = {name: float(value) for name, value in self.metrics.items()}
-                    log.write(self.step, row)
-                    progress.advance(0, **row)
-                if last or self.step % config.eval_every == 0:
-                    progress.advance(0, score=self._evaluate(run))
-                if last or self.step % config.eval_every == 0 or self.step % config.checkpoint_every == 0:
-                    self.seconds = run.seconds(before)
-                    save_checkpoint(run.checkpoint, self._state())
-        log.close()
-        (run.path / "features.npy").unlink(missing_ok=True)
+                if loop.due(config.log_every):
+                    loop.log({name: float(value) for name, value in self.metrics.items()})
+                evaluates = loop.due(config.eval_every)
+                loop.step_done(save=evaluates or self.step % config.checkpoint_every == 0)
+                if evaluates:
+                    self._evaluate(run, loop)
+        FeatureFile(run.path, run.inputs).remove()
         write_json(run.path / "render.json", render_info(self.card.task))
-        run.finish(run.seconds(before), updates=self.step)
+        run.finish(updates=self.step)
 
-    def _evaluate(self, run: RunFolder) -> float:
-        """Evaluate the present policy, append its rows, keep a film of the last; returns the mean score."""
+    def _lacks_evaluation(self, run: RunFolder, loop: Loop) -> bool:
+        """Whether the run was cut between a checkpoint and its evaluation; rows that count no more are dropped."""
+        rows = run.path / "episodes.csv"
+        drop_rows_after(rows, self.step)
+        if not self.step or not loop.due(self.config.eval_every):
+            return False
+        if sum(row["step"] == self.step for row in read_rows(rows)) == self.config.eval_episodes:
+            return False
+        drop_rows_after(rows, self.step - 1)
+        return True
+
+    def _evaluate(self, run: RunFolder, loop: Loop) -> None:
+        """Evaluate the present policy, whose checkpoint is kept: here a signal need not wait."""
+        with interrupt.at_once():
+            loop.show(score=self._play(run))
+
+    def _play(self, run: RunFolder) -> float:
+        """Keep a film of the first episode, then append the rows of all; returns the mean score."""
         config = self.config
         self.algorithm.policy.save(run.path / "policy")
         if isinstance(self.algorithm, EndToEnd):
@@ -158,19 +163,20 @@ class Trainer:
         ]
         episodes = evaluate(jobs, config.workers)
         rows = rows_of(episodes, _labels(config, self.card) | {"step": self.step})
-        append_rows(run.path / "episodes.csv", rows)
         if episodes[0].film is not None:
             with replacing_file(run.path / "film.npz") as fresh, fresh.open("wb") as file:
                 np.savez_compressed(file, **episodes[0].film)  # type: ignore[arg-type]
+        append_rows(run.path / "episodes.csv", rows)
         return float(np.mean([row["score"] for row in rows]))
 
-    def _state(self) -> dict[str, Any]:
-        state = {"step": self.step, "seconds": self.seconds, "algorithm": self.algorithm.state_dict()}
+    def state(self) -> dict[str, Any]:
+        """Everything needed to go on to the bit."""
+        state = {"step": self.step, "algorithm": self.algorithm.state_dict()}
         return state | {"metrics": self.metrics, "sampler": self.sampler.state_dict()}
 
-    def _restore(self, state: dict[str, Any]) -> None:
-        self.step, self.seconds = state["step"], state["seconds"]
-        self.metrics = state.get("metrics", {})
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from `state`."""
+        self.step, self.metrics = state["step"], state["metrics"]
         self.algorithm.load_state_dict(state["algorithm"])
         self.sampler.load_state_dict(state["sampler"])
 
@@ -189,11 +195,9 @@ def _labels(config: FinetuneConfig, card: EncoderCard) -> dict[str, Any]:
 
 def _keep_encoder(source: Path, run: Path) -> None:
     """Copy the encoder into the run, so that the run can be evaluated wherever it is moved; its timing, too."""
-    target = run / "encoder"
-    if (target / "config.json").exists():
+    if (run / "encoder" / CONFIG).exists():
         return
     timing = source.parent / "timing.json"
     if timing.exists():
-        shutil.copyfile(timing, run / "pretrain_timing.json")
-    with replacing(target) as fresh:
-        shutil.copytree(source, fresh, dirs_exist_ok=True)
+        write_json(run / "pretrain_timing.json", read_json(timing))
+    copy_encoder(source, run / "encoder")

@@ -17,11 +17,10 @@ from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
 from vd4rl_pomdp.nn.frame import check_frame_encoder
 from vd4rl_pomdp.objective import Objective
-from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint
 from vd4rl_pomdp.runs.device import autocast, pick_device
-from vd4rl_pomdp.runs.folder import RunFolder, jsonable
-from vd4rl_pomdp.runs.metrics import MetricsLog, read_metrics
-from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.runs.loop import training
+from vd4rl_pomdp.runs.metrics import read_metrics
+from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, get_task
 from vd4rl_pomdp.types import Windows
@@ -38,15 +37,13 @@ def pretrain(config: PretrainConfig) -> RunFolder:
     seed_networks(config.seed, STAGE)
     objective = _build(dataset, config)
     device = pick_device(config.device)
-    run = RunFolder(config.out, STAGE, replace(config, task=task))
-    if run.finished:
-        return run
-    trainer = Trainer(objective.to(device), dataset.to(device), config)
-    trainer.run(run, config.steps if method.trained else 0)
-    save_encoder(
-        run.path / "encoder", _with_history_window(objective.encoder, config), _card(config, task, dataset, run)
-    )
-    run.finish(trainer.seconds, steps=trainer.step, frames=trainer.step * config.batch_size * config.window)
+    with RunFolder(config.out, STAGE, replace(config, task=task), {"data": dataset.fingerprint}) as run:
+        if not run.finished:
+            trainer = Trainer(objective.to(device), dataset.to(device), config)
+            trainer.run(run, config.steps if method.trained else 0)
+            card = _card(config, task, dataset, run)
+            save_encoder(run.path / "encoder", _with_history_window(objective.encoder, config), card)
+            run.finish(steps=trainer.step, frames=trainer.step * config.batch_size * config.window)
     return run
 
 
@@ -61,7 +58,6 @@ class Trainer:
         self.sampler = WindowSampler(view, config.batch_size, config.window, batches)
         self.optimiser = torch.optim.Adam(objective.parameters(), lr=config.learning_rate)
         self.step = 0
-        self.seconds = 0.0
 
     def batch(self) -> Windows:
         """The next windows, shifted and corrupted: what the agent would see."""
@@ -81,34 +77,25 @@ class Trainer:
 
     def run(self, run: RunFolder, steps: int) -> None:
         """Train up to `steps`, from the newest checkpoint if there is one."""
-        restore_checkpoint(run.checkpoint, self._restore)
-        before = self.seconds
-        log = MetricsLog(run.path / "metrics.jsonl", self.step, self.config.wandb, jsonable(asdict(self.config)))
-        with ProgressLine(f"pretrain {self.config.method}", steps, "steps", self.step) as progress:
+        with training(run, self, f"pretrain {self.config.method}", steps) as loop:
             while self.step < steps:
                 logs = self.update()
-                if self.step % self.config.log_every == 0 or self.step == steps:
-                    row = {name: float(value) for name, value in logs.items()}
-                    log.write(self.step, row)
-                    progress.advance(0, loss=row["loss"])
-                progress.advance()
-                if self.step % self.config.checkpoint_every == 0 or self.step == steps:
-                    self.seconds = run.seconds(before)
-                    save_checkpoint(run.checkpoint, self._state())
-        self.seconds = run.seconds(before)
-        log.close()
+                if loop.due(self.config.log_every):
+                    loop.log({name: float(value) for name, value in logs.items()}, "loss")
+                loop.step_done(save=loop.due(self.config.checkpoint_every))
 
-    def _state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
+        """Everything needed to go on to the bit."""
         return {
             "step": self.step,
-            "seconds": self.seconds,
             "objective": self.objective.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "sampler": self.sampler.state_dict(),
         }
 
-    def _restore(self, state: dict[str, Any]) -> None:
-        self.step, self.seconds = state["step"], state["seconds"]
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from `state`."""
+        self.step = state["step"]
         self.objective.load_state_dict(state["objective"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.sampler.load_state_dict(state["sampler"])
@@ -166,6 +153,7 @@ def _card(config: PretrainConfig, task: str, dataset: Dataset, run: RunFolder) -
         preset=config.preset,
         end_to_end=get_method(config.method).end_to_end,
         action_loss=_last_action_loss(run),
+        data=dataset.fingerprint,
     )
 
 

@@ -288,10 +288,8 @@ def test_a_damaged_run_is_one_sentence(configure, tmp_path, monkeypatch):
     monkeypatch.setattr(learner, "RANDOM_DECISIONS", 1_000)  # no update is compiled
     config = configure(tmp_path / "run", decisions=40)
     train_policy(config)
-    checkpoint = tmp_path / "run" / "checkpoint"
-    checkpoint.rename(tmp_path / "run" / "checkpoint.old")  # cut between the two renames of an exchange
     assert decisions_made(tmp_path / "run") == 40
-    (tmp_path / "run" / "checkpoint.old" / "replay.safetensors").write_bytes(b"cut")
+    (tmp_path / "run" / "checkpoints" / "40" / "replay.safetensors").write_bytes(b"cut")
     with pytest.raises(UserError, match="checkpoint is damaged"):
         train_policy(config)
     kept = tmp_path / "kept"

@@ -23,9 +23,9 @@ from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import append_rows, drop_rows_after, evaluate_run, read_rows
 from vd4rl_pomdp.nn import load_encoder
-from vd4rl_pomdp.runs import checkpoint
+from vd4rl_pomdp.runs.checkpoint import Checkpoints
 
-VARYING = ("timing.json", "pretrain_timing.json", "machine.json")
+VARYING = ("timing.json", "pretrain_timing.json", "machine.json", "manifest.json")
 
 
 @pytest.fixture(autouse=True)
@@ -46,12 +46,10 @@ def contents(folder: Path) -> dict[str, str]:
 
 
 def _stable(path: Path) -> bytes:
-    """A file's bytes without seconds and run paths."""
+    """A file's bytes without run paths."""
     text = path.read_bytes()
-    if path.name == "state.json":
-        import re
-
-        return re.sub(rb'\["seconds", [0-9.e-]+\]', b"", text)
+    if path.name == "results.json":
+        return b"\n".join(line for line in text.splitlines() if b'"command"' not in line)
     if path.name == "config.json":
         return b"\n".join(line for line in text.splitlines() if b'"out"' not in line and b'"encoder":' not in line)
     return text
@@ -61,17 +59,17 @@ class CutError(Exception):
     pass
 
 
-def cut_at(monkeypatch, module: str, number: int) -> None:
+def cut_at(monkeypatch, number: int) -> None:
     """Raise in place of writing the `number`-th checkpoint."""
-    calls = []
+    calls, add = [], Checkpoints.add
 
-    def save(folder, state):
-        calls.append(state)
+    def cut(self, *arguments):
+        calls.append(arguments)
         if len(calls) == number:
             raise CutError
-        checkpoint.save_checkpoint(folder, state)
+        add(self, *arguments)
 
-    monkeypatch.setattr(f"{module}.save_checkpoint", save)
+    monkeypatch.setattr(Checkpoints, "add", cut)
 
 
 def smoke_pretrain(data: Path, out: Path, **changes: object) -> pretrain.config.PretrainConfig:
@@ -83,7 +81,7 @@ def test_pretraining_resumes_to_the_bit(data, tmp_path, monkeypatch, method):
     whole = run_pretrain(smoke_pretrain(data, tmp_path / "whole", method=method))
     cut = smoke_pretrain(data, tmp_path / "cut", method=method)
     with monkeypatch.context() as patch:
-        cut_at(patch, "pretrain.train", 2)
+        cut_at(patch, 2)
         with pytest.raises(CutError):
             run_pretrain(cut)
     assert not (tmp_path / "cut" / "encoder").exists()
@@ -107,7 +105,7 @@ def finetune_cut_and_whole(monkeypatch, encoder: Path, data: Path, out: Path, **
     whole = run_finetune(smoke_finetune(encoder, data, out / "whole", **changes))
     cut = smoke_finetune(encoder, data, out / "cut", **changes)
     with monkeypatch.context() as patch:
-        cut_at(patch, "finetune.train", 2)
+        cut_at(patch, 2)
         with pytest.raises(CutError):
             run_finetune(cut)
     run_finetune(cut)
@@ -267,9 +265,9 @@ def test_a_checkpoint_of_another_config_is_one_line(encoder, data, tmp_path):
     for config in (narrow, wide):
         run_finetune(config)
         (config.out / "timing.json").unlink()
-    shutil.rmtree(wide.out / "checkpoint")
-    shutil.copytree(narrow.out / "checkpoint", wide.out / "checkpoint")
-    with pytest.raises(UserError, match=r"wide/checkpoint: this checkpoint is damaged or of another") as caught:
+    shutil.rmtree(wide.out / "checkpoints")
+    shutil.copytree(narrow.out / "checkpoints", wide.out / "checkpoints")
+    with pytest.raises(UserError, match=r"wide/checkpoints/2: this checkpoint does not fit the run") as caught:
         run_finetune(wide)
     assert "\n" not in str(caught.value)
 

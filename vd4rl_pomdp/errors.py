@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import errno
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -38,5 +40,17 @@ def disk_error(path: Path | str | None, error: OSError) -> UserError:
     where = f"{path}: " if path is not None else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return UserError(f"{where}the disk is full: free some space and start the same command again")
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        reason = (error.strerror or str(error)).lower()
+        return UserError(f"{where}may not be used ({reason}); ask its owner for access, or choose another path")
     reason = (error.strerror or str(error)).lower()
     return UserError(f"{where}cannot be used ({reason}); check the path or choose another")
+
+
+@contextmanager
+def disk_errors(path: Path) -> Iterator[None]:
+    """Whatever the system refuses within becomes one sentence about `path`."""
+    try:
+        yield
+    except OSError as error:
+        raise disk_error(path, error) from error

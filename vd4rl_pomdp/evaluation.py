@@ -18,7 +18,7 @@ from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import load_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy
-from vd4rl_pomdp.runs.folder import read_json, write_csv
+from vd4rl_pomdp.runs.folder import appending, read_json, write_csv
 from vd4rl_pomdp.runs.workers import run_jobs
 from vd4rl_pomdp.tasks import SCORE_DIVISOR, get_task
 
@@ -120,7 +120,7 @@ def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
     """Append rows to an `episodes.csv`, writing its header first; another kind of file raises UserError untouched."""
     read_rows(path)
     new = not path.exists() or path.stat().st_size == 0
-    with path.open("a", newline="") as file:
+    with appending(path) as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
         if new:
             writer.writeheader()

@@ -44,6 +44,8 @@ class MazeData:
         self.training = int(windows[: self.first_held_out].sum())
         """Windows 0..training-1 are for training, the rest is held out."""
         self._view: View = MazeView(dataset, noise)
+        self.inputs = {"data": dataset.fingerprint} | ({} if noise is None else {"exogenous": noise.fingerprint()})
+        """What a run on it reads, by name and content."""
 
     def on(self, device: torch.device) -> MazeData:
         """Prepare the observations and move everything to a device."""

@@ -20,6 +20,7 @@ from pretrain.navigation.trainer import Trainer
 from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.experiments.navigation.grid import UNTRAINED
 from vd4rl_pomdp.runs.device import autocast
+from vd4rl_pomdp.runs.folder import replacing_file
 
 TRAJECTORY_ROWS = 200
 """Rows of the held-out trajectory whose estimated states are kept for a figure."""
@@ -121,7 +122,7 @@ def write_trajectory(path: Path, trainer: Trainer, probe: StateProbe) -> None:
     past, rows = encode(trainer, torch.tensor([_window_at(dataset, start, length)]), length)
     estimate = (probe(past)[0].detach() * states.std + states.mean).cpu()
     truth = (states.values[rows[0]] * states.std + states.mean).cpu()
-    with path.open("w", newline="") as file:
+    with replacing_file(path) as fresh, fresh.open("w", newline="") as file:
         writer = csv.writer(file)
         names = ("x", "y", "vx", "vy")
         writer.writerow(["t", *names, *(f"estimated_{name}" for name in names), "hidden"])

@@ -85,6 +85,14 @@ class ErrorSums:
         self._sums += (weights @ error).double().cpu()
         self._counts += weights.sum(1).double().cpu()
 
+    def state(self) -> list[Tensor]:
+        """What `restore` takes."""
+        return [self._sums, self._counts]
+
+    def restore(self, state: list[Tensor]) -> None:
+        """Go on counting."""
+        self._sums, self._counts = state
+
     def percent(self) -> dict[str, float]:
         """`state`, `position`, `velocity`, and the same with `_hidden` where any counted row was hidden."""
         named: dict[str, float] = {}

@@ -20,7 +20,8 @@ from vd4rl_pomdp.experiments.navigation.grid import UNTRAINED
 from vd4rl_pomdp.experiments.navigation.observations import SHAPES
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
 from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.folder import RunFolder, write_json
+from vd4rl_pomdp.runs.folder import write_json
+from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import seed_networks
 
 
@@ -30,19 +31,18 @@ def train(config: NavigationConfig) -> RunFolder:
     data = open_data(config)
     seed_networks(config.seed, STAGE)
     objective = make_objective(data, config)
-    run = RunFolder(config.out, STAGE, config)
-    if run.finished:
-        return run
     device = pick_device(config.device)
-    trainer = Trainer(objective.to(device), data.on(device), config)
-    trainer.run(run, 0 if config.method == UNTRAINED else config.steps)
-    _conclude(run, trainer)
+    with RunFolder(config.out, STAGE, config, data.inputs) as run:
+        if not run.finished:
+            trainer = Trainer(objective.to(device), data.on(device), config)
+            trainer.run(run, 0 if config.method == UNTRAINED else config.steps)
+            _conclude(run, trainer)
     return run
 
 
 def _conclude(run: RunFolder, trainer: Trainer) -> None:
     """Measure, and write what is kept of a run."""
-    config, data = trainer.config, trainer.data
+    config, data, trained = trainer.config, trainer.data, run.seconds
     probe, rows = measure(trainer, run.path / "metrics.jsonl")
     write_trajectory(run.path / "trajectory.csv", trainer, probe)
     card = EncoderCard(
@@ -53,12 +53,13 @@ def _conclude(run: RunFolder, trainer: Trainer) -> None:
         seed=config.seed,
         steps=trainer.step,
         preset=config.preset,
+        data=data.dataset.fingerprint,
     )
     save_encoder(run.path / "encoder", trainer.objective.encoder, card)
     record = {"maze": data.maze.name, "set": data.dataset.fingerprint, "command": shlex.join(command_of(config))}
     write_json(run.path / "results.json", record | {"rows": rows})
     frames = trainer.step * config.batch_size * config.window
-    run.finish(trainer.seconds, steps=trainer.step, frames=frames, total_seconds=round(run.seconds(0.0), 2))
+    run.finish(seconds=round(trained, 2), steps=trainer.step, frames=frames, total_seconds=round(run.seconds, 2))
 
 
 def _check(config: NavigationConfig) -> None:

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import defaultdict
-from dataclasses import asdict
 from typing import Any
 
 import torch
@@ -19,11 +17,9 @@ from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, REFERENCES, SUPE
 from vd4rl_pomdp.experiments.navigation.observations import SHAPES
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.objective import InverseObjective
-from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint
 from vd4rl_pomdp.runs.device import autocast
-from vd4rl_pomdp.runs.folder import RunFolder, jsonable
-from vd4rl_pomdp.runs.metrics import MetricsLog
-from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.runs.loop import training
+from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import stream_generator
 from vd4rl_pomdp.types import Windows
 
@@ -62,7 +58,8 @@ class Trainer:
         self.generator = stream_generator(config.seed, STAGE, "batches")
         parameters = [*objective.parameters(), *self.probe.parameters()]
         self.optimiser = torch.optim.Adam(parameters, lr=config.learning_rate)
-        self.step, self.seconds = 0, 0.0
+        self.step = 0
+        self.interval = _Interval()
 
     def batch(self) -> Windows:
         """The next training windows."""
@@ -98,48 +95,63 @@ class Trainer:
 
     def run(self, run: RunFolder, steps: int) -> None:
         """Train up to `steps`, from the newest checkpoint if there is one."""
-        restore_checkpoint(run.checkpoint, self._restore)
-        before = self.seconds
-        log = MetricsLog(run.path / "metrics.jsonl", self.step, self.config.wandb, jsonable(asdict(self.config)))
-        with ProgressLine(f"{self.data.maze.name} {self.config.method}", steps, "steps", self.step) as progress:
+        with training(run, self, f"{self.data.maze.name} {self.config.method}", steps) as loop:
             while self.step < steps:
-                count = min(self.config.log_every, steps - self.step)
-                row = self._interval(count)
-                log.write(self.step, row)
-                progress.advance(count, loss=row["loss"], state_error=row["state"])
-                if self.step % self.config.checkpoint_every == 0 or self.step == steps:
-                    self.seconds = run.seconds(before)
-                    save_checkpoint(run.checkpoint, self._state())
-        self.seconds = run.seconds(before)
-        log.close()
+                logs, states = self.update()
+                self.interval.add(logs, states, self.config.burn_in)
+                if loop.due(self.config.log_every):
+                    loop.log(self.interval.means(), "loss", "state")
+                    self.interval = _Interval()
+                loop.step_done(save=loop.due(self.config.checkpoint_every))
 
-    def _interval(self, count: int) -> dict[str, float]:
-        """Means over the next `count` steps."""
-        sums: dict[str, Tensor | float] = defaultdict(float)
-        errors = ErrorSums()
-        for _ in range(count):
-            logs, states = self.update()
-            errors.add(*states, self.config.burn_in)
-            for name, value in logs.items():
-                sums[name] = sums[name] + value
-        return {name: float(value) / count for name, value in sums.items()} | errors.percent()
-
-    def _state(self) -> dict[str, Any]:
+    def state(self) -> dict[str, Any]:
+        """Everything needed to go on to the bit, also between two rows of metrics."""
         return {
             "step": self.step,
-            "seconds": self.seconds,
+            "interval": self.interval.state(),
             "objective": self.objective.state_dict(),
             "probe": self.probe.state_dict(),
             "optimiser": self.optimiser.state_dict(),
             "batches": self.generator.get_state(),
         }
 
-    def _restore(self, state: dict[str, Any]) -> None:
-        self.step, self.seconds = state["step"], state["seconds"]
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on from `state`."""
+        self.step = state["step"]
+        self.interval.restore(state["interval"])
         self.objective.load_state_dict(state["objective"])
         self.probe.load_state_dict(state["probe"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.generator.set_state(state["batches"])
+
+
+class _Interval:
+    """Means over the steps since the last row of metrics."""
+
+    def __init__(self) -> None:
+        self._count = 0
+        self._sums: dict[str, Tensor] = {}
+        self._errors = ErrorSums()
+
+    def add(self, logs: dict[str, Tensor], states: tuple[Tensor, Tensor, Tensor], burn_in: int) -> None:
+        """Count a step's scalars and its (estimated, true, hidden) states."""
+        self._count += 1
+        self._errors.add(*states, burn_in)
+        for name, value in logs.items():
+            self._sums[name] = self._sums[name].to(value.device) + value if name in self._sums else value
+
+    def means(self) -> dict[str, float]:
+        """Means of the scalars, and errors in percent."""
+        return {name: float(value) / self._count for name, value in self._sums.items()} | self._errors.percent()
+
+    def state(self) -> dict[str, Any]:
+        """What `restore` takes."""
+        return {"count": self._count, "sums": self._sums, "errors": self._errors.state()}
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Go on counting."""
+        self._count, self._sums = state["count"], state["sums"]
+        self._errors.restore(state["errors"])
 
 
 def learning_rate(config: NavigationConfig, step: int) -> float:

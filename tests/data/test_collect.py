@@ -101,14 +101,21 @@ def test_an_interrupted_collection_ends_in_the_same_files(whole, tmp_path, monke
         patch.setattr(module, "_roll_out", fail_in_the_second_shard)
         with pytest.raises(type(error)):
             collect(config(out), LENGTH)
-    assert sorted(p.name for p in out.iterdir()) == ["0_walker_walk_random.hdf5", "collection.json"]
+    seen = sorted(p.name for p in out.iterdir() if not p.name.startswith("."))
+    assert seen == ["0_walker_walk_random.hdf5", "collection.json"]
     with pytest.raises(UserError, match="set: the set's collection is not finished"):
         shard_paths(out)
     (out / ".1_walker_walk_random.hdf5.tmp").write_bytes(b"half")
     first = (out / "0_walker_walk_random.hdf5").stat().st_mtime_ns
+    kept = json.loads((out / ".parts.json").read_text())["0_walker_walk_random.hdf5"]
+    (out / ".parts.json").write_text(json.dumps({"0_walker_walk_random.hdf5": [1000.0, kept[1]]}))
     collect(config(out), LENGTH)
     assert contents(out) == contents(whole)
     assert (out / "0_walker_walk_random.hdf5").stat().st_mtime_ns == first
+    provenance = json.loads((out / "provenance.json").read_text())
+    assert provenance["frames"] == json.loads((whole / "provenance.json").read_text())["frames"]
+    assert provenance["seconds"] >= 1000.0
+    assert not (out / ".parts.json").exists()
 
 
 def test_an_interrupt_before_the_config_was_written_does_not_block_the_folder(whole, tmp_path):
@@ -216,7 +223,7 @@ def test_a_full_disk_leaves_nothing_half_written_and_the_collection_goes_on(whol
         patch.setattr(Path, "write_bytes", full)
         with pytest.raises(UserError, match="disk is full"):
             collect(config(tmp_path), LENGTH)
-    assert [p.name for p in tmp_path.iterdir()] == ["collection.json"]
+    assert [p.name for p in tmp_path.glob("[!.]*")] == ["collection.json"]
     collect(config(tmp_path), LENGTH)
     assert contents(tmp_path) == contents(whole)
 

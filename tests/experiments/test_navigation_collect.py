@@ -7,11 +7,11 @@ import h5py
 import numpy as np
 import pytest
 
+from vd4rl_pomdp.data import collect as shards
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.envs.maze import MazeEnv
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.experiments.navigation import collect as module
 from vd4rl_pomdp.experiments.navigation.collect import PRESETS, CollectConfig, collect
 
 
@@ -61,7 +61,7 @@ def test_a_check_replays_the_states(maze_set, tmp_path):
 
 
 def test_an_interrupted_collection_ends_in_the_same_files(maze_set, tmp_path, monkeypatch):
-    whole, written = module.write_shard, []
+    whole, written = shards.write_shard, []
 
     def cut(path, rows, attributes):
         if written:
@@ -69,11 +69,11 @@ def test_an_interrupted_collection_ends_in_the_same_files(maze_set, tmp_path, mo
         whole(path, rows, attributes)
         written.append(path)
 
-    monkeypatch.setattr(module, "write_shard", cut)
+    monkeypatch.setattr(shards, "write_shard", cut)
     with pytest.raises(KeyboardInterrupt):
         collect(small(tmp_path / "set"))
     assert len(hashes(tmp_path / "set")) == 1
-    monkeypatch.setattr(module, "write_shard", whole)
+    monkeypatch.setattr(shards, "write_shard", whole)
     collect(small(tmp_path / "set", workers=2))
     assert hashes(tmp_path / "set") == hashes(maze_set)
 

@@ -1,11 +1,15 @@
+import multiprocessing
 import os
 import signal
 import subprocess
 import sys
+import threading
 import time
 
 import pytest
 
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs import workers
 from vd4rl_pomdp.runs.workers import count_workers, run_jobs
 
 PARENT = """
@@ -58,3 +62,37 @@ def test_a_killed_parent_leaves_no_workers(tmp_path):
 def test_no_number_of_workers_is_one_for_every_core():
     assert count_workers(0) >= 1
     assert count_workers(3) == 3
+
+
+def fail_or_die(job: int) -> int:
+    if job == 1:
+        raise ValueError("job 1 is wrong")
+    if job == 3:
+        os._exit(7)
+    return job
+
+
+def test_what_a_job_raises_is_raised_with_where_it_was():
+    with pytest.raises(ValueError, match="job 1 is wrong") as caught:
+        list(run_jobs(fail_or_die, [0, 1, 2], 2))
+    assert "in fail_or_die" in caught.value.__notes__[0]
+
+
+def test_a_worker_that_dies_is_one_sentence():
+    with pytest.raises(UserError, match=r"a worker process ended before its job \(exit code 7\)"):
+        list(run_jobs(fail_or_die, [2, 3], 2))
+
+
+def test_results_that_nobody_takes_leave_no_workers():
+    results = run_jobs(tell_and_sleep, [0, 1], 2)
+    crews = set(workers._CREWS)
+    with pytest.raises(KeyboardInterrupt):
+        raise_in_place_of(next, results)
+    assert set(workers._CREWS) == crews
+    assert not multiprocessing.active_children()
+
+
+def raise_in_place_of(function, *arguments):
+    """Call a function that Ctrl-C cuts."""
+    threading.Timer(1.0, lambda: signal.pthread_kill(threading.main_thread().ident, signal.SIGINT)).start()
+    function(*arguments)

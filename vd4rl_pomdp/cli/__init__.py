@@ -8,6 +8,7 @@ from collections.abc import Sequence
 from vd4rl_pomdp.cli import data, navigation, policy, stages, studies
 from vd4rl_pomdp.cli.dispatch import Table, run_stage
 from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.runs import interrupt
 
 COMMANDS: Table = {
     "demo": stages.DEMO,
@@ -25,18 +26,28 @@ def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vd4rl-pomdp`."""
     words = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        run_stage(words)
+        with interrupt.handled(program=True):
+            run_stage(words)
     except UserError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
         sys.exit(2)
     except FloatingPointError as error:
         print(f"error: training diverged, {error}; lower --learning-rate or use --precision fp32", file=sys.stderr)
         sys.exit(1)
-    except KeyboardInterrupt:
-        print("interrupted; the same command goes on from here", file=sys.stderr)
+    except KeyboardInterrupt as error:
+        _say_ended("interrupted", str(error))
         sys.exit(130)
+    except interrupt.Terminated as error:
+        _say_ended("terminated", error.reason)
+        raise
     except BrokenPipeError:
         sys.exit(141)
     except OSError as error:
         print(f"error: {disk_error(error.filename, error)}", file=sys.stderr)
         sys.exit(2)
+
+
+def _say_ended(how: str, kept: str) -> None:
+    """One line for a signal's end; what was `kept` is where a training loop stood."""
+    where = f"{kept}, and the same command goes on from there" if kept else "the same command does what is left"
+    print(f"{how}: {where}", file=sys.stderr)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import hashlib
 import time
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
@@ -16,9 +16,10 @@ from typing import Any, Literal
 import numpy as np
 
 from vd4rl_pomdp.data.format import PLAN, RECORD, write_shard
-from vd4rl_pomdp.errors import MAX_SEED, UserError, disk_error, refuse_outside
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
-from vd4rl_pomdp.runs.folder import jsonable, read_json, write_json
+from vd4rl_pomdp.runs.folder import holds_anything, jsonable, read_json, write_json
+from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
 from vd4rl_pomdp.runs.workers import count_workers, run_jobs
@@ -27,6 +28,8 @@ from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, NOISY_QUALITIES, SET_QUALITIE
 
 Policy = Actor | Ladder | None
 """Who acts in a shard: an actor, a ladder of them, or nobody (random actions)."""
+Rows = dict[str, np.ndarray]
+"""An episode's rows, by key."""
 _RUNTIME_FIELDS = ("out", "workers")
 MAX_NOISE = 2.0
 """Actions lie in [-1, 1]: noise beyond this leaves nothing of them."""
@@ -84,27 +87,60 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
     """
     _check(config)
     plan = list(_plan(config))
-    _claim(config, _hashes(plan))
-    started, frames = time.monotonic(), 0
-    with ProgressLine("collect", config.episodes, "episodes") as progress:
-        for path, episodes, policy in plan:
-            if path.exists():
-                progress.advance(len(episodes))
+    shards = [
+        Shard(
+            path,
+            [_job(config, policy, episode, length) for episode in episodes],
+            _attributes(config, path, policy),
+        )
+        for path, episodes, policy in plan
+    ]
+    with owned(config.out):
+        _claim(config, _hashes(plan))
+        collect_shards(config.out, shards, _roll_out, config.workers, ("collect", "episodes"))
+        from vd4rl_pomdp.data.card import write_card  # draws; the processes that render need it not
+
+        write_card(config.out)
+    return [shard.path for shard in shards]
+
+
+@dataclass(frozen=True)
+class Shard:
+    """One shard to write."""
+
+    path: Path
+    jobs: list[Any]
+    """Its episodes."""
+    attributes: dict[str, Any]
+
+
+def collect_shards(
+    out: Path, shards: list[Shard], roll_out: Callable[[Any], Rows], workers: int, title: tuple[str, str]
+) -> None:
+    """Write the shards that are missing, then the set's record.
+
+    Args:
+        out: folder of the set, which this process owns.
+        shards: all shards of the set.
+        roll_out: plays a job; its rows by key.
+        workers: processes, 0 for every core.
+        title: what is going on, and the unit of a job.
+    """
+    record = _Record(out)
+    with ProgressLine(title[0], sum(len(shard.jobs) for shard in shards), title[1]) as progress:
+        for shard in shards:
+            if shard.path.exists():
+                progress.advance(len(shard.jobs))
                 continue
-            jobs = [_job(config, policy, episode, length) for episode in episodes]
-            rollouts = []
-            for rollout in run_jobs(_roll_out, jobs, config.workers):
+            started, frames, rollouts = time.monotonic(), 0, []
+            for rollout in run_jobs(roll_out, shard.jobs, workers):
                 rollouts.append(rollout)
                 frames += len(rollout["reward"])
                 speed = frames / (time.monotonic() - started)
                 progress.advance(1, ret=float(rollout["reward"].sum()), frames_per_s=speed)
-            write_shard(path, join_rollouts(rollouts), _attributes(config, path, policy))
-    seconds = time.monotonic() - started
-    record_set(config.out, seconds, frames, config.workers)
-    from vd4rl_pomdp.data.card import write_card  # draws; the processes that render need it not
-
-    write_card(config.out)
-    return [path for path, _, _ in plan]
+            record.note(shard.path, time.monotonic() - started, frames)
+            write_shard(shard.path, join_rollouts(rollouts), shard.attributes)
+    record.write(workers)
 
 
 def _check(config: CollectConfig) -> None:
@@ -277,29 +313,31 @@ def claim_set(out: Path, settings: dict[str, Any]) -> None:
         if differing:
             raise UserError(f"{out}: holds a set collected with another {', '.join(differing)}; choose another --out")
         return
-    if out.exists() and any(not file.name.startswith(".") for file in out.iterdir()):
+    if holds_anything(out):
         raise UserError(f"{out}: is not empty and holds no collected set; choose another --out")
-    try:
-        out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise disk_error(out, error) from error
-    _write_json(path, settings)
+    write_json(path, settings)
 
 
-def record_set(out: Path, seconds: float, frames: int, workers: int) -> None:
-    """Keep what a repeated collection would not reproduce."""
-    path = out / RECORD
-    if not frames and path.exists():
-        return
-    from vd4rl_pomdp.envs.parity import render_info
+class _Record:
+    """What a repeated collection would not reproduce: seconds and frames, over all its parts, and where it ran."""
 
-    facts = {"seconds": round(seconds, 1), "frames": frames, "workers": count_workers(workers)}
-    origin = {"command": command(), "git_commit": git_commit(), "versions": versions()}
-    _write_json(path, facts | origin | {"render": render_info()})
+    def __init__(self, out: Path) -> None:
+        self._path, self._parts_path = out / RECORD, out / ".parts.json"
+        self._parts: dict[str, list[float]] = read_json(self._parts_path) if self._parts_path.exists() else {}
 
+    def note(self, shard: Path, seconds: float, frames: int) -> None:
+        """Remember a shard's part, just before it is written, until the set is whole."""
+        self._parts[shard.name] = [round(seconds, 1), frames]
+        write_json(self._parts_path, self._parts)
 
-def _write_json(path: Path, value: dict[str, Any]) -> None:
-    try:
-        write_json(path, value)
-    except OSError as error:
-        raise disk_error(path, error) from error
+    def write(self, workers: int) -> None:
+        """Write the set's record, unless it has one and nothing was added."""
+        if not self._parts and self._path.exists():
+            return
+        from vd4rl_pomdp.envs.parity import render_info
+
+        seconds, frames = (sum(part[i] for part in self._parts.values()) for i in (0, 1))
+        facts = {"seconds": round(seconds, 1), "frames": int(frames), "workers": count_workers(workers)}
+        origin = {"command": command(), "git_commit": git_commit(), "versions": versions()}
+        write_json(self._path, facts | origin | {"render": render_info()})
+        self._parts_path.unlink(missing_ok=True)

@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 
 from vd4rl_pomdp.errors import UserError, disk_error
-from vd4rl_pomdp.runs.folder import replacing_file
+from vd4rl_pomdp.runs.folder import write_bytes
 from vd4rl_pomdp.tasks import FRAME_SIZE
 from vd4rl_pomdp.types import StepType
 
@@ -87,12 +87,7 @@ def write_shard(path: Path, rows: Mapping[str, np.ndarray], attributes: Mapping[
     Raises:
         UserError: the disk is full or the folder cannot be written; nothing is left behind.
     """
-    try:
-        with replacing_file(path) as fresh:
-            # compressed in memory: HDF5 cannot close a file on a full disk
-            fresh.write_bytes(_encode(rows, attributes))
-    except OSError as error:
-        raise disk_error(path, error) from error
+    write_bytes(path, _encode(rows, attributes))  # compressed in memory: HDF5 cannot close a file on a full disk
 
 
 def _encode(rows: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> bytes:
@@ -182,6 +177,8 @@ def _open(path: Path) -> Iterator[h5py.File]:
             yield file
     except UserError:
         raise
+    except PermissionError as error:
+        raise disk_error(path, error) from error
     except (OSError, RuntimeError, KeyError, ValueError) as error:
         raise UserError(f"{path}: is truncated, damaged or no HDF5 file ({_one_line(error)}); {_REPAIR}") from error
 

@@ -27,6 +27,7 @@ import numpy as np
 from vd4rl_pomdp.data.episodes import join_shards
 from vd4rl_pomdp.data.format import read_attributes, read_frames, read_rows, shard_paths
 from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.runs.folder import read_bytes
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.tasks import FRAME_SIZE
 
@@ -63,6 +64,8 @@ class Store:
         """Rows of `action` (N, A) float32, `reward` or `discount` (N,) float64, or `step_type` (N,) uint8."""
         try:
             return np.load(self.folder / f"{key}.npy")
+        except PermissionError as error:
+            raise disk_error(self.folder / f"{key}.npy", error) from error
         except (OSError, ValueError) as error:
             raise self.damaged(f"{key}.npy") from error
 
@@ -118,8 +121,10 @@ def _key(shards: Sequence[Path]) -> str:
 def _read_meta(folder: Path) -> dict[str, Any] | None:
     """The folder's meta.json; None unless it is whole and every file is there in its full size."""
     try:
-        meta = json.loads((folder / _META).read_text())
-    except (OSError, ValueError):
+        meta = json.loads(read_bytes(folder / _META))
+    except UserError:
+        raise
+    except (FileNotFoundError, ValueError):
         return None
     files = [(folder / name, file["bytes"]) for name, file in meta["files"].items()]
     return meta if all(path.is_file() and path.stat().st_size == size for path, size in files) else None

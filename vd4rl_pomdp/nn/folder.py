@@ -2,19 +2,22 @@
 
 from __future__ import annotations
 
+import hashlib
 import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load, save
 
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE
-from vd4rl_pomdp.runs.folder import replacing_file, write_json
+from vd4rl_pomdp.runs.folder import read_bytes, write_bytes, write_json
+
+WEIGHTS, CONFIG = "model.safetensors", "config.json"
 
 
 @dataclass(frozen=True)
@@ -33,15 +36,33 @@ class EncoderCard:
     """Fine-tuning algorithm that trains the encoder, too; empty for a frozen encoder."""
     action_loss: float | None = None
     """Mean over the last tenth of the pretraining's logged steps, for methods that predict actions."""
+    data: str = ""
+    """Fingerprint of the set it was pretrained on."""
 
 
 def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard) -> None:
     """Write an encoder folder; whole files only, config last."""
-    folder.mkdir(parents=True, exist_ok=True)
+    with disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
     weights = {name: value.contiguous().cpu() for name, value in encoder.state_dict().items()}
-    with replacing_file(folder / "model.safetensors") as fresh:
-        save_file(weights, fresh)
-    write_json(folder / "config.json", {"encoder": asdict(encoder.config), "pretrain": asdict(card)})
+    write_bytes(folder / WEIGHTS, save(weights))
+    write_json(folder / CONFIG, {"encoder": asdict(encoder.config), "pretrain": asdict(card)})
+
+
+def copy_encoder(source: Path, target: Path) -> None:
+    """Copy an encoder folder; the copy is one only when it is whole."""
+    with disk_errors(target):
+        target.mkdir(parents=True, exist_ok=True)
+    for name in (WEIGHTS, CONFIG):
+        write_bytes(target / name, read_bytes(source / name))
+
+
+def encoder_hash(folder: Path) -> str:
+    """Name of an encoder folder's content: equal for equal files, wherever they lie."""
+    digest = hashlib.blake2b(digest_size=12)
+    for name in (WEIGHTS, CONFIG):
+        digest.update(hashlib.blake2b(read_bytes(folder / name)).digest())
+    return digest.hexdigest()
 
 
 def load_encoder(
@@ -81,8 +102,8 @@ def load_encoder(
     except (TypeError, RuntimeError, ValueError) as error:
         raise UserError(f"{folder}/config.json: names no encoder ({_first_line(error)}); pretrain it again") from error
     try:
-        encoder.load_state_dict(load_file(folder / "model.safetensors"))
-    except (OSError, SafetensorError, RuntimeError) as error:
+        encoder.load_state_dict(load(read_bytes(folder / WEIGHTS)))
+    except (FileNotFoundError, SafetensorError, RuntimeError) as error:
         reason = _first_line(error)
         raise UserError(f"{folder}/model.safetensors: cannot be read ({reason}); pretrain the encoder again") from error
     return encoder.eval().requires_grad_(False), card
@@ -97,9 +118,11 @@ def _read_config(folder: Path) -> dict[str, Any]:
     if pickles and not (folder / "model.safetensors").exists():
         raise UserError(f"{folder}: {pickles[0]} is a pickle, which can run code; only model.safetensors is read")
     try:
-        config = json.loads((folder / "config.json").read_text())
+        config = json.loads(read_bytes(folder / CONFIG))
         EncoderConfig(**config["encoder"]), EncoderCard(**config["pretrain"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except UserError:
+        raise
+    except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{folder}: not an encoder folder (config.json: {error}); `vd4rl-pomdp pretrain` writes one as RUN/encoder"
         ) from error

@@ -6,12 +6,12 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import load, save
 from torch import Tensor, nn
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.nn.heads import mlp
-from vd4rl_pomdp.runs.folder import read_json, replacing_file, write_json
+from vd4rl_pomdp.runs.folder import read_bytes, read_json, write_bytes, write_json
 
 
 class Standardise(nn.Module):
@@ -62,9 +62,9 @@ class Policy(nn.Module):
 
     def save(self, folder: Path) -> None:
         """Write the policy folder."""
-        folder.mkdir(parents=True, exist_ok=True)
-        with replacing_file(folder / "model.safetensors") as fresh:
-            save_file({k: v.contiguous().cpu() for k, v in self.state_dict().items()}, fresh)
+        with disk_errors(folder):
+            folder.mkdir(parents=True, exist_ok=True)
+        write_bytes(folder / "model.safetensors", save({k: v.contiguous().cpu() for k, v in self.state_dict().items()}))
         write_json(folder / "config.json", self.shape)
 
 
@@ -72,8 +72,8 @@ def load_policy(folder: Path) -> Policy:
     """Read a policy folder; raises UserError if it is missing or damaged."""
     try:
         policy = Policy(**read_json(folder / "config.json"))
-        policy.load_state_dict(load_file(folder / "model.safetensors"))
-    except (OSError, SafetensorError, RuntimeError, TypeError) as error:
+        policy.load_state_dict(load(read_bytes(folder / "model.safetensors")))
+    except (FileNotFoundError, SafetensorError, RuntimeError, TypeError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(
             f"{folder}: not a policy folder ({reason}); `vd4rl-pomdp finetune` writes one as RUN/policy"

@@ -17,10 +17,10 @@ from typing import Any
 
 import numpy as np
 from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save_file
+from safetensors.numpy import save
 
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.runs.folder import replacing_file
+from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.runs.folder import read_bytes, write_bytes
 from vd4rl_pomdp.tasks import TASKS, Task, get_task
 
 LOG_STD_RANGE = (-20.0, 2.0)
@@ -146,9 +146,10 @@ class Ladder:
 
 
 def _save(weights: dict[str, np.ndarray], card: dict[str, Any], path: Path) -> None:
-    path.parent.mkdir(parents=True, exist_ok=True)
-    with replacing_file(path) as fresh:
-        save_file({k: np.ascontiguousarray(v) for k, v in weights.items()}, fresh, {"card": json.dumps(card)})
+    with disk_errors(path.parent):
+        path.parent.mkdir(parents=True, exist_ok=True)
+    arrays = {k: np.ascontiguousarray(v) for k, v in weights.items()}
+    write_bytes(path, save(arrays, {"card": json.dumps(card)}))
 
 
 def read_actor(path: Path, task: Task | None = None) -> Actor:
@@ -174,14 +175,17 @@ def read_ladder(path: Path, task: Task | None = None) -> Ladder:
 
 def _read(path: Path, task: Task | None) -> tuple[dict[str, np.ndarray], dict[str, Any], str]:
     try:
+        sha256 = hashlib.sha256(read_bytes(path)).hexdigest()
         with safe_open(path, framework="np") as file:
             card = dict(json.loads((file.metadata() or {}).get("card", "none")))
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except UserError:
+        raise
     except (OSError, SafetensorError, ValueError, TypeError) as error:
         raise UserError(f"{path}: not an actor file ({error}); {_REMEDY}") from error
     if task is not None and card.get("task") != task.name:
         raise UserError(f"{path}: this actor was trained on {card.get('task')}, not on {task.name}")
-    return weights, card, hashlib.sha256(path.read_bytes()).hexdigest()
+    return weights, card, sha256
 
 
 def _try(path: Path, actor: Actor, task: Task | None) -> None:

@@ -19,7 +19,7 @@ import numpy as np
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import Actor, Ladder, read_actor, read_ladder
 from vd4rl_pomdp.policies.state_env import StateEnv
-from vd4rl_pomdp.runs.folder import read_json
+from vd4rl_pomdp.runs.folder import read_json, write_bytes
 from vd4rl_pomdp.tasks import Task, get_task
 
 CARD_EPISODES = 20
@@ -127,7 +127,7 @@ def _publish(
         "versions": {name: version(name) for name in ("sbx-rl", "jax", "dm-control", "mujoco", "numpy")},
     }
     Actor(read_actor(snapshot_path(run, step)).weights, card).save(path)
-    path.with_suffix(".json").write_text(json.dumps(card | {"learning_curve": curve}, indent=1) + "\n")
+    write_bytes(path.with_suffix(".json"), (json.dumps(card | {"learning_curve": curve}, indent=1) + "\n").encode())
     return path
 
 

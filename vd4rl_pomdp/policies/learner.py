@@ -12,19 +12,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from safetensors import SafetensorError
-from safetensors.numpy import load_file, save_file
+from safetensors.numpy import load, save
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import OBSERVATION_CLIP, Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
 from vd4rl_pomdp.policies.state_env import StateEnv
-from vd4rl_pomdp.runs.folder import newest, read_json, replacing, replacing_file
+from vd4rl_pomdp.runs.checkpoint import Checkpoints, fitting
+from vd4rl_pomdp.runs.folder import read_bytes, write_bytes
 from vd4rl_pomdp.tasks import Task
 
 if TYPE_CHECKING:
     from sbx import SAC
 
 REPLAY_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+_MODEL, _REPLAY, _COUNTERS = "model.safetensors", "replay.safetensors", "counters.json"
 STATISTICS = ("mean", "var", "count")
 DECISIONS_A_ROUND = 4
 """Decisions between two rounds of updates, or one for each environment if those are more."""
@@ -110,8 +112,7 @@ def save_networks(model: SAC, path: Path) -> None:
     """Write actor, critics, temperature and observation statistics, without optimisers, to one small file."""
     leaves, _ = _flatten(_networks(model))
     arrays = {f"{i:04d}": np.array(leaf) for i, leaf in enumerate(leaves)} | _statistics(model)
-    with replacing_file(path) as fresh:
-        save_file(arrays, fresh)
+    write_bytes(path, save(arrays))
 
 
 def start_from_networks(model: SAC, path: Path) -> None:
@@ -119,8 +120,8 @@ def start_from_networks(model: SAC, path: Path) -> None:
     import jax
 
     try:
-        stored = load_file(path)
-    except (OSError, SafetensorError) as error:
+        stored = load(read_bytes(path))
+    except (FileNotFoundError, SafetensorError) as error:
         raise UserError(f"{path}: not a networks file ({error}); policy training writes one into its folder") from error
     leaves, structure = _flatten(_networks(model))
     if any(f"{i:04d}" not in stored or stored[f"{i:04d}"].shape != leaf.shape for i, leaf in enumerate(leaves)):
@@ -149,33 +150,31 @@ def refill(model: SAC, decisions: int, critic_updates: int) -> None:
 
 
 def save_checkpoint(model: SAC, run: Path) -> None:
-    """Write the checkpoint beside the old one and exchange the two."""
+    """Write the checkpoint of the decisions made so far."""
     leaves, _ = _flatten(_states(model))
     arrays = {f"{i:04d}": np.array(leaf) for i, leaf in enumerate(leaves)} | _statistics(model)
     buffer: Any = model.replay_buffer
     stop = buffer.buffer_size if buffer.full else buffer.pos
     replay = {k: np.ascontiguousarray(getattr(buffer, k)[:stop]) for k in REPLAY_ARRAYS}
     counters = {"decisions": model.num_timesteps, "updates": model._n_updates, "position": buffer.pos}
-    with replacing(run / "checkpoint") as fresh:
-        save_file(arrays, fresh / "model.safetensors")
-        save_file(replay, fresh / "replay.safetensors")
-        (fresh / "counters.json").write_text(json.dumps(counters))
+    files = {_MODEL: save(arrays), _REPLAY: save(replay), _COUNTERS: json.dumps(counters).encode()}
+    Checkpoints(run).add(model.num_timesteps, files, 0.0)
 
 
 def restore_checkpoint(model: SAC, run: Path) -> int:
     """Load the newest whole checkpoint; returns the decisions made so far, 0 without one. New episodes begin there."""
+    checkpoint = Checkpoints(run).newest()
+    if checkpoint is None:
+        return 0
+    with fitting(checkpoint):
+        _restore(model, checkpoint.files)
+    return int(model.num_timesteps)
+
+
+def _restore(model: SAC, files: dict[str, bytes]) -> None:
     import jax
 
-    folder = newest(run / "checkpoint")
-    if folder is None:
-        return 0
-    counters = read_json(folder / "counters.json")
-    try:
-        stored, replay = load_file(folder / "model.safetensors"), load_file(folder / "replay.safetensors")
-    except (OSError, SafetensorError) as error:
-        raise UserError(
-            f"{folder}: this checkpoint is damaged ({error}); go on with --start-from {run} in a new --out"
-        ) from error
+    counters, stored, replay = json.loads(files[_COUNTERS]), load(files[_MODEL]), load(files[_REPLAY])
     model.set_random_seed(model.seed + counters["decisions"])  # other episodes than the run began with
     policy = model.policy
     leaves, structure = _flatten(_states(model))
@@ -185,7 +184,6 @@ def restore_checkpoint(model: SAC, run: Path) -> int:
     _set_statistics(model, stored)
     _restore_replay(model.replay_buffer, replay, counters["position"])
     model.num_timesteps, model._n_updates = counters["decisions"], counters["updates"]
-    return int(counters["decisions"])
 
 
 def _restore_replay(buffer: Any, replay: dict[str, np.ndarray], position: int) -> None:

@@ -1,9 +1,9 @@
 """Train the data-collecting policies: soft actor-critic on simulator states (SBX), resumable, exported as small files.
 
 A run keeps `snapshots/` (an actor and its mean return every `eval_every` decisions), `curve.csv`,
-`networks.safetensors` (what another machine can start from) and `checkpoint/` (networks, optimisers, replay buffer). At
-its end, or with `policy export` at any time, the best snapshot becomes the expert, the one whose return is nearest to
-half of the expert's the medium actor, and a ladder of snapshots up to the medium one stands for the replay buffer.
+`networks.safetensors` (what another machine can start from) and `checkpoints/` (networks, optimisers, replay buffer).
+At its end, or with `policy export` at any time, the best snapshot becomes the expert, the one whose return is nearest
+to half of the expert's the medium actor, and a ladder of snapshots up to the medium one stands for the replay buffer.
 """
 
 from __future__ import annotations
@@ -31,7 +31,10 @@ from vd4rl_pomdp.policies.export import (
     read_curve,
     snapshot_path,
 )
-from vd4rl_pomdp.runs.folder import jsonable, newest, read_json, write_csv, write_json
+from vd4rl_pomdp.runs import FORMAT, interrupt
+from vd4rl_pomdp.runs.checkpoint import Checkpoints
+from vd4rl_pomdp.runs.folder import holds_anything, jsonable, read_json, write_csv, write_json
+from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.tasks import get_task
 
 if TYPE_CHECKING:
@@ -49,33 +52,50 @@ def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None]
         The exported files by quality.
     """
     task = get_task(config.task)
-    settings = _check(config)
-    config.out.mkdir(parents=True, exist_ok=True)
-    model = learner.build(config, task)
-    write_json(config.out / "config.json", settings)
+    _check(config)
+    with owned(config.out) as owner:
+        settings = _check(config)  # another process may have begun it since
+        model = learner.build(config, task)
+        write_json(config.out / "config.json", settings)
+        _learn(model, config, owner, on_progress)
+        return export_run(config.out, config.out)
+
+
+def _learn(model: SAC, config: PolicyConfig, owner: Owner, on_progress: Callable[[int, float], None] | None) -> None:
+    """Train to the end, from the newest checkpoint if there is one."""
     done = learner.restore_checkpoint(model, config.out)
     _forget_newer(config.out, done)
     if done == 0 and config.start_from is not None:
         done = _start_from(model, config, config.start_from)
-    while done < config.decisions:
-        model.learn(min(config.eval_every, config.decisions - done), reset_num_timesteps=done == 0)
-        done = int(model.num_timesteps)
-        actor = learner.export_actor(model, config, done)
-        mean = float(np.mean(episode_returns(actor, task, config.eval_episodes, CARD_SEED - config.eval_episodes)))
-        _record(config.out, actor, done, mean)
-        learner.save_networks(model, config.out / NETWORKS)
-        learner.save_checkpoint(model, config.out)
+    mean = -np.inf
+    while done < config.decisions and mean < config.stop_at:
+        with interrupt.deferred():
+            mean = _learn_and_evaluate(model, config, done)
+            done = int(model.num_timesteps)
+            owner.check()
+            learner.save_checkpoint(model, config.out)
+            interrupt.check(f"{config.out} keeps {done} decisions")
         if on_progress is not None:
             on_progress(done, mean)
-        if mean >= config.stop_at:
-            break
-    return export_run(config.out, config.out)
+
+
+def _learn_and_evaluate(model: SAC, config: PolicyConfig, done: int) -> float:
+    """Learn until the next evaluation, or until a signal asks for the end; the mean return goes to the curve."""
+    decisions = min(config.eval_every, config.decisions - done)
+    model.learn(decisions, callback=lambda *_: not interrupt.asked(), reset_num_timesteps=done == 0)
+    if interrupt.asked():
+        return -np.inf
+    actor = learner.export_actor(model, config, int(model.num_timesteps))
+    first_seed = CARD_SEED - config.eval_episodes
+    mean = float(np.mean(episode_returns(actor, get_task(config.task), config.eval_episodes, first_seed)))
+    _record(config.out, actor, int(model.num_timesteps), mean)
+    learner.save_networks(model, config.out / NETWORKS)
+    return mean
 
 
 def decisions_made(run: Path) -> int:
     """Decisions behind a run's newest checkpoint, 0 for a new run."""
-    folder = newest(run / "checkpoint")
-    return int(read_json(folder / "counters.json")["decisions"]) if folder else 0
+    return max(Checkpoints(run).steps(), default=0)
 
 
 def _check(config: PolicyConfig) -> dict[str, Any]:
@@ -85,14 +105,20 @@ def _check(config: PolicyConfig) -> dict[str, Any]:
         temperature=0, temperature_rate=0, replay_size=1, eval_every=1, eval_episodes=1, refill=0, critic_warmup=0,
     )  # fmt: skip
     settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in ("out", "decisions", "stop_at")}
+    settings |= {"format": FORMAT}
     path = config.out / "config.json"
     if path.exists():
         stored = read_json(path)
+        if stored.get("format", 1) != FORMAT:
+            raise UserError(
+                f"{config.out}: holds a run of format {stored.get('format', 1)}, this version writes format {FORMAT} "
+                "and cannot go on with it; choose another --out, to which --start-from may bring its networks"
+            )
         differing = [k for k in settings if stored.get(k) != settings[k]]
         if differing:
             raise UserError(f"{config.out}: holds a run with another {', '.join(differing)}; choose another --out")
         return stored
-    if config.out.is_dir() and any(not file.name.startswith(".") for file in config.out.iterdir()):
+    if holds_anything(config.out):
         raise UserError(f"{config.out}: is not empty and holds no policy run; choose another --out")
     if config.start_from is not None:
         _check_start(config, config.start_from)

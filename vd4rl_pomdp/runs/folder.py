@@ -1,72 +1,16 @@
-"""A run is a folder: config.json first, then metrics.jsonl, checkpoint/ and results; the same command continues it.
-
-Everything but `timing.json` and `machine.json` is the same whether a run was interrupted or not.
-"""
+"""Files that are read and written whole, with the permissions that the umask leaves."""
 
 from __future__ import annotations
 
 import csv
 import json
-import shutil
-import time
+import os
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.runs.provenance import command, git_commit, machine, versions
-
-_RUNTIME_FIELDS = {"out", "device", "workers", "wandb", "resume_every"}
-"""Config fields that do not change a result, so that a run may go on with other ones."""
-
-
-class RunFolder:
-    """Owns a run's files."""
-
-    def __init__(self, path: Path, stage: str, config: Any) -> None:
-        self.path = path
-        self._claim(stage, jsonable(asdict(config)))
-        self._started = time.monotonic()
-
-    def _claim(self, stage: str, config: dict[str, Any]) -> None:
-        file = self.path / "config.json"
-        if file.exists():
-            stored = read_json(file)
-            old = stored.get("config", {})
-            keys = (set(old) | set(config)) - _RUNTIME_FIELDS
-            differing = sorted(k for k in keys if old.get(k) != config.get(k))
-            if stored.get("stage") != stage or differing:
-                what = ", ".join(differing) or f"stage {stored.get('stage')}"
-                raise UserError(
-                    f"{self.path}: holds a run with another config ({what}); choose another --out or remove it"
-                )
-            return
-        if self.path.exists() and any(self.path.iterdir()):
-            raise UserError(f"{self.path}: is not empty and holds no run; choose another --out")
-        self.path.mkdir(parents=True, exist_ok=True)
-        record = {"stage": stage, "config": config, "versions": versions(), "git_commit": git_commit()}
-        write_json(self.path / "machine.json", machine())
-        write_json(file, record | {"command": command()})
-
-    @property
-    def checkpoint(self) -> Path:
-        """Folder of the newest checkpoint."""
-        return self.path / "checkpoint"
-
-    @property
-    def finished(self) -> bool:
-        """Whether the run has come to its end."""
-        return (self.path / "timing.json").exists()
-
-    def finish(self, seconds: float, **more: Any) -> None:
-        """Mark the run as done and keep its wall-clock seconds, those before an interruption included."""
-        write_json(self.path / "timing.json", {"seconds": round(seconds, 2)} | more)
-
-    def seconds(self, before: float) -> float:
-        """Wall-clock seconds of the run so far, given those spent before an interruption."""
-        return before + time.monotonic() - self._started
+from vd4rl_pomdp.errors import UserError, disk_error, disk_errors
 
 
 def jsonable(value: Any) -> Any:
@@ -79,10 +23,10 @@ def jsonable(value: Any) -> Any:
 
 
 def read_json(path: Path) -> dict[str, Any]:
-    """Read a JSON object; raises UserError if it is missing or damaged."""
+    """Read a JSON object; raises UserError if it is missing, not readable or damaged."""
     try:
-        value = json.loads(path.read_text())
-    except (OSError, ValueError) as error:
+        value = json.loads(read_bytes(path))
+    except (FileNotFoundError, ValueError) as error:
         raise UserError(f"{path}: cannot be read as JSON ({error})") from error
     if not isinstance(value, dict):
         raise UserError(f"{path}: holds no JSON object")
@@ -103,41 +47,62 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]
         writer.writerows(rows)
 
 
+def read_bytes(path: Path) -> bytes:
+    """A file's content. A missing one raises FileNotFoundError, one that the system withholds UserError.
+
+    Whoever reads on can then take every other trouble for damage.
+    """
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise disk_error(path, error) from error
+
+
+def write_bytes(path: Path, content: bytes) -> None:
+    """Write a file so that a reader sees it whole or not at all."""
+    with replacing_file(path) as fresh:
+        fresh.write_bytes(content)
+
+
 @contextmanager
 def replacing_file(path: Path) -> Iterator[Path]:
-    """A hidden name beside `path` to write, which takes `path`'s place when the block ends, or goes if it fails."""
+    """A hidden name beside `path` to write, which takes `path`'s place when the block ends, or goes if it fails.
+
+    Raises:
+        UserError: the disk is full, or the system refuses otherwise.
+    """
     fresh = path.with_name(f".{path.name}.tmp")
-    try:
-        yield fresh
-        fresh.replace(path)
-    finally:
-        fresh.unlink(missing_ok=True)
+    with disk_errors(path):
+        try:
+            yield fresh
+            synchronise(fresh)
+            fresh.replace(path)
+        finally:
+            fresh.unlink(missing_ok=True)
 
 
 @contextmanager
-def replacing(folder: Path) -> Iterator[Path]:
-    """An empty folder to fill that then takes `folder`'s place; cut at any moment, the old or the new one is whole.
-
-    Between the two renames only `newest` finds the old one.
-    """
-    fresh, old = folder.with_name(folder.name + ".new"), _old(folder)
-    shutil.rmtree(fresh, ignore_errors=True)
-    fresh.mkdir(parents=True)
-    yield fresh
-    shutil.rmtree(old, ignore_errors=True)
-    if folder.exists():
-        folder.rename(old)
-    fresh.rename(folder)
-    shutil.rmtree(old, ignore_errors=True)
+def appending(path: Path) -> Iterator[Any]:
+    """A text file to append lines to; what the system refuses becomes one sentence."""
+    with disk_errors(path), path.open("a", newline="") as file:
+        yield file
 
 
-def newest(folder: Path) -> Path | None:
-    """Where the newest whole content of a folder lies that `replacing` fills; None if it never did."""
-    return next((path for path in (folder, _old(folder)) if path.exists()), None)
+def synchronise(path: Path) -> None:
+    """Wait until a file, or the names in a folder, are on the disk."""
+    handle = os.open(path, os.O_RDONLY)
+    try:
+        os.fsync(handle)
+    finally:
+        os.close(handle)
 
 
-def _old(folder: Path) -> Path:
-    return folder.with_name(folder.name + ".old")
+def holds_anything(folder: Path) -> bool:
+    """Whether a folder exists and holds a file or folder that is not hidden; hidden ones are what a cut left there."""
+    with disk_errors(folder):
+        return folder.is_dir() and any(not file.name.startswith(".") for file in folder.iterdir())
 
 
 def flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.runs.folder import replacing_file
+from vd4rl_pomdp.runs.folder import appending, read_bytes, write_bytes
 
 WandbMode = Literal["off", "offline", "online"]
 
@@ -20,8 +20,7 @@ class MetricsLog:
     def __init__(self, path: Path, step: int, wandb: WandbMode = "off", config: dict[str, Any] | None = None) -> None:
         self._path = path
         kept = [row for row in read_metrics(path) if row["step"] <= step]
-        with replacing_file(path) as fresh:
-            fresh.write_text("".join(json.dumps(row) + "\n" for row in kept))
+        write_bytes(path, "".join(json.dumps(row) + "\n" for row in kept).encode())
         self._wandb = _start_wandb(wandb, path.parent, config or {})
 
     def write(self, step: int, metrics: dict[str, float]) -> None:
@@ -29,7 +28,7 @@ class MetricsLog:
         bad = [name for name, value in metrics.items() if not math.isfinite(value)]
         if bad:
             raise FloatingPointError(f"{self._path.parent}: {bad[0]} is {metrics[bad[0]]} at step {step}")
-        with self._path.open("a") as file:
+        with appending(self._path) as file:
             file.write(json.dumps({"step": step} | metrics) + "\n")
         if self._wandb is not None:
             self._wandb.log(metrics, step=step)
@@ -49,7 +48,7 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
     if not path.exists():
         return []
     try:
-        return [json.loads(line) for line in path.read_text().rpartition("\n")[0].splitlines()]
+        return [json.loads(line) for line in read_bytes(path).decode().rpartition("\n")[0].splitlines()]
     except ValueError as error:
         raise UserError(f"{path}: a line is not JSON ({error})") from error
 

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import time
+from collections.abc import Callable
+from datetime import timedelta
 from types import TracebackType
 from typing import Self
 
@@ -10,11 +13,14 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 class ProgressLine:
-    """A progress bar on stderr; where that is no terminal, a plain line now and then."""
+    """A progress bar on stderr; where that is no terminal, a plain line each tenth of the way and each half minute."""
 
     _PLAIN_LINES = 10
+    _PLAIN_S = 30.0
 
-    def __init__(self, title: str, total: int, unit: str, start: int = 0) -> None:
+    def __init__(
+        self, title: str, total: int, unit: str, start: int = 0, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self._console = Console(stderr=True)
         self._title, self._total, self._unit, self._done = title, total, unit, start
         self._bar = Progress(
@@ -31,23 +37,41 @@ class ProgressLine:
             speed_estimate_period=120,
         )
         self._task = self._bar.add_task(title, total=total, completed=start, speed="", note="")
-        self._next_plain = start + max(1, (total - start) // self._PLAIN_LINES)
+        self._note = ""
+        self._clock, self._first = clock, (start, clock())
+        self._plain = self._first
+        """How far it was, and when, at the last plain line."""
 
     def advance(self, amount: int = 1, **numbers: float) -> None:
         """Move on by `amount`, showing `numbers` when given."""
         self._done += amount
         self._bar.advance(self._task, amount)
         if numbers:
-            self._bar.update(self._task, note="  ".join(f"{k} {v:.4g}" for k, v in numbers.items()))
+            self._note = "  ".join(f"{k} {v:.4g}" for k, v in numbers.items())
+            self._bar.update(self._task, note=self._note)
         speed = self._bar.tasks[0].speed
         if speed:
             self._bar.update(self._task, speed=f"{speed:.3g} {self._unit}/s")
-        if not self._console.is_terminal and self._done >= self._next_plain:
-            note = "  ".join(f"{k} {v:.4g}" for k, v in numbers.items())
-            print(
-                f"{self._title}: {self._done}/{self._total} {self._unit}  {note}", file=self._console.file, flush=True
-            )
-            self._next_plain += max(1, self._total // self._PLAIN_LINES)
+        if amount and not self._console.is_terminal:
+            self._print_now_and_then()
+
+    def _print_now_and_then(self) -> None:
+        now = self._clock()
+        done, then = self._plain
+        a_tenth_on = self._done - done >= max(1, (self._total - self._first[0]) // self._PLAIN_LINES)
+        if a_tenth_on or now - then >= self._PLAIN_S or self._done == self._total:
+            self._plain = self._done, now
+            parts = [f"{self._title}: {self._done}/{self._total} {self._unit}", self._note, self._pace(now)]
+            print("  ".join(part for part in parts if part), file=self._console.file, flush=True)
+
+    def _pace(self, now: float) -> str:
+        """Speed since the start, and the time that is left at it."""
+        start, then = self._first
+        if now <= then or self._done <= start:
+            return ""
+        speed = (self._done - start) / (now - then)
+        left = timedelta(seconds=round((self._total - self._done) / speed))
+        return f"{speed:.3g} {self._unit}/s  ETA {left}"
 
     def reach(self, done: int, **numbers: float) -> None:
         """Move on to `done`, showing `numbers`."""

@@ -7,6 +7,7 @@ import platform
 import shlex
 import subprocess
 import sys
+import tomllib
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -23,6 +24,8 @@ PACKAGES = (
     "scikit-learn",
     "safetensors",
 )
+COMMIT_FILE = "vd4rl_pomdp/commit.txt"
+"""Where a wheel keeps the commit it was built from, below the folder of its packages."""
 
 
 def versions() -> dict[str, str]:
@@ -37,14 +40,36 @@ def versions() -> dict[str, str]:
 
 
 def git_commit() -> str:
-    """Commit of the source tree, with `+` when it has uncommitted changes; empty outside a repository."""
+    """Commit of this project that runs, with `+` for uncommitted changes: a checkout's own, else the wheel's record.
+
+    Empty where neither tells. A repository that merely surrounds the installed package is another project's.
+    """
     root = Path(__file__).resolve().parents[2]
+    return checkout_commit(root) or recorded_commit(root)
+
+
+def checkout_commit(root: Path) -> str:
+    """Commit of a source tree, if it is the top of a git work tree of this project; else empty."""
     try:
-        commit = subprocess.run(["git", "rev-parse", "HEAD"], cwd=root, capture_output=True, text=True, check=True)
+        project = tomllib.loads((root / "pyproject.toml").read_text())["project"]["name"]
+        if project != PACKAGES[0] or Path(_git(root, "rev-parse", "--show-toplevel")).resolve() != root:
+            return ""
         dirty = subprocess.run(["git", "diff", "--quiet", "HEAD"], cwd=root, check=False).returncode
-    except (OSError, subprocess.CalledProcessError):
+        return _git(root, "rev-parse", "HEAD") + ("+" if dirty else "")
+    except (OSError, ValueError, KeyError, TypeError, subprocess.CalledProcessError):
         return ""
-    return commit.stdout.strip() + ("+" if dirty else "")
+
+
+def recorded_commit(root: Path) -> str:
+    """The commit that `setup.py` wrote into a wheel or source archive, if `root` comes from one; else empty."""
+    try:
+        return (root / COMMIT_FILE).read_text().strip()
+    except OSError:
+        return ""
+
+
+def _git(root: Path, *words: str) -> str:
+    return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
 
 
 def machine() -> dict[str, Any]:

@@ -1,15 +1,22 @@
-"""Independent jobs over worker processes, results in order, with clean ends on errors and interrupts."""
+"""Independent jobs over worker processes, results in order; workers end at once with their caller, however it ends."""
 
 from __future__ import annotations
 
+import atexit
 import multiprocessing
 import multiprocessing.connection
 import os
-import signal
 import threading
+import traceback
+import weakref
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from typing import TypeVar
+from contextlib import contextmanager
+from multiprocessing import resource_tracker
+from multiprocessing.connection import Connection
+from typing import Any, TypeVar
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs.interrupt import blocked
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -20,17 +27,19 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
 
     Workers are fresh processes (no GL context or thread pool is inherited) with one thread each; they end with the
     caller. With one worker everything runs in the calling process; 0 is a worker for every core.
+
+    Raises:
+        UserError: a worker died; what a job raises is raised here.
     """
     workers = count_workers(workers)
     if workers <= 1 or len(jobs) <= 1:
         yield from map(function, jobs)
         return
-    context = multiprocessing.get_context("spawn")
-    pool = ProcessPoolExecutor(min(workers, len(jobs)), mp_context=context, initializer=_start_worker)
+    crew = _Crew(function, min(workers, len(jobs)))
     try:
-        yield from pool.map(function, jobs)
+        yield from crew.results(jobs)
     finally:
-        pool.shutdown(wait=True, cancel_futures=True)
+        crew.end()
 
 
 def count_workers(workers: int) -> int:
@@ -40,9 +49,108 @@ def count_workers(workers: int) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
+class _Crew:
+    """Worker processes, each at the other end of a pipe.
+
+    The standard library's pools wait for their running jobs when they are told to end, and leave semaphores behind
+    when they are killed; pipes need neither.
+    """
+
+    def __init__(self, function: Callable[[Any], Any], size: int) -> None:
+        self._workers: dict[Connection, Any] = {}
+        _CREWS.add(self)
+        context = multiprocessing.get_context("spawn")
+        resource_tracker.ensure_running()  # unblocks signals where it is started later
+        for _ in range(size):
+            ours, theirs = context.Pipe()
+            process = context.Process(target=_serve, args=(theirs, function), daemon=True)
+            with blocked():  # Ctrl-C, which a terminal sends to all processes, is the caller's business
+                process.start()
+                self._workers[ours] = process
+            theirs.close()
+
+    def results(self, jobs: Sequence[Any]) -> Iterator[Any]:
+        """Results in the order of the jobs."""
+        waiting, finished, next_out = iter(enumerate(jobs)), {}, 0
+        for connection in self._workers:
+            self._give(connection, waiting)
+        while next_out < len(jobs):
+            ready: list[Any] = multiprocessing.connection.wait(list(self._workers))
+            for connection in ready:
+                number, result, error = self._take(connection)
+                if error is not None:
+                    raise error
+                finished[number] = result
+                self._give(connection, waiting)
+            while next_out in finished:
+                yield finished.pop(next_out)
+                next_out += 1
+
+    def _give(self, connection: Connection, waiting: Iterator[tuple[int, Any]]) -> None:
+        job = next(waiting, None)
+        if job is not None:
+            with self._expecting_life(connection):
+                connection.send(job)
+
+    def _take(self, connection: Connection) -> tuple[int, Any, BaseException | None]:
+        with self._expecting_life(connection):
+            number, result, error = connection.recv()
+        return number, result, error
+
+    @contextmanager
+    def _expecting_life(self, connection: Connection) -> Iterator[None]:
+        try:
+            yield
+        except (EOFError, ConnectionError):
+            process = self._workers[connection]
+            process.join()
+            raise UserError(
+                f"a worker process ended before its job (exit code {process.exitcode}), perhaps for want of memory: "
+                "use fewer --workers and start the same command again"
+            ) from None
+
+    def end(self) -> None:
+        """End all workers at once; they hold nothing that could be lost."""
+        for process in self._workers.values():
+            process.kill()
+        for connection, process in self._workers.items():
+            process.join()
+            connection.close()
+        self._workers.clear()
+        _CREWS.discard(self)
+
+
+_CREWS: weakref.WeakSet[_Crew] = weakref.WeakSet()
+
+
+@atexit.register
+def _end_all() -> None:
+    """End the crews whose results nobody asked for to the end."""
+    for crew in list(_CREWS):
+        crew.end()
+
+
+def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
+    """Do jobs until the pipe is closed."""
+    _start_worker()
+    while True:
+        try:
+            number, job = connection.recv()
+        except EOFError:
+            return
+        connection.send((number, *_attempt(function, job)))
+
+
+def _attempt(function: Callable[[Any], Any], job: Any) -> tuple[Any, BaseException | None]:
+    try:
+        return function(job), None
+    except BaseException as error:
+        error.add_note(f"in a worker process:\n{traceback.format_exc()}")
+        return None, error
+
+
 def _start_worker() -> None:
-    """One thread a worker; Ctrl-C is the parent's business; a worker never outlives its parent."""
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    """One thread a worker; a worker never outlives its parent."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     import threadpoolctl
     import torch

@@ -7,7 +7,6 @@ after an interruption and ends in the same files.
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -15,14 +14,12 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.data.collect import claim_set, episode_seed, join_rollouts, record_set
-from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.data.collect import Shard, claim_set, collect_shards, episode_seed
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
 from vd4rl_pomdp.mazes import get_maze
 from vd4rl_pomdp.runs.folder import jsonable
-from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.provenance import versions
-from vd4rl_pomdp.runs.workers import run_jobs
 from vd4rl_pomdp.types import StepType
 
 _RUNTIME_FIELDS = ("out", "workers", "preset")
@@ -78,22 +75,15 @@ class _Job:
 def collect(config: CollectConfig) -> list[Path]:
     """Collect the set, or what is missing of it; returns its shards."""
     _check(config)
-    claim_set(config.out, {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS})
-    started, frames, shards = time.monotonic(), 0, []
-    with ProgressLine(f"collect {config.maze}", config.trajectories, "trajectories") as progress:
-        for path, trajectories in _plan(config):
-            shards.append(path)
-            if path.exists():
-                progress.advance(len(trajectories))
-                continue
-            rollouts = []
-            for rollout in run_jobs(_roll_out, [_job(config, i) for i in trajectories], config.workers):
-                rollouts.append(rollout)
-                frames += len(rollout["reward"])
-                progress.advance(1, frames_per_s=frames / (time.monotonic() - started))
-            write_shard(path, join_rollouts(rollouts), _attributes(config))
-    record_set(config.out, time.monotonic() - started, frames, config.workers)
-    return shards
+    settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS}
+    shards = [
+        Shard(path, [_job(config, i) for i in trajectories], _attributes(config))
+        for path, trajectories in _plan(config)
+    ]
+    with owned(config.out):
+        claim_set(config.out, settings)
+        collect_shards(config.out, shards, _roll_out, config.workers, (f"collect {config.maze}", "trajectories"))
+    return [shard.path for shard in shards]
 
 
 def drive(maze: str, rows: int, action_repeat: int = 5, noise: float = 0.5, seed: int = 0) -> dict[str, np.ndarray]:

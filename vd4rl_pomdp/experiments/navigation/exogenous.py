@@ -6,6 +6,7 @@ photographs that scikit-learn ships, or images from a folder: CIFAR-10's python 
 
 from __future__ import annotations
 
+import hashlib
 from collections.abc import Iterator
 from pathlib import Path
 from pickletools import genops
@@ -37,9 +38,19 @@ class ExogenousNoise:
     def __init__(self, source: str, weight: float, seed: int) -> None:
         if not 0 < weight <= 1:
             raise UserError(f"--exogenous-weight is {weight}; it must be above 0 and at most 1")
-        self._seed, self._weight = stream_seed(seed, "exogenous", "choice"), weight
+        self._source, self._weight = source, weight
+        self._seed = stream_seed(seed, "exogenous", "choice")
         self.pool = load_pool(source, seed)
         """(P, 3, 100, 100) uint8."""
+
+    def fingerprint(self) -> str:
+        """Name of the content of the pool's files; of photographs, which come with a package, just their name."""
+        if self._source == PHOTOGRAPHS:
+            return PHOTOGRAPHS
+        digest = hashlib.blake2b(digest_size=12)
+        for path in _files(Path(self._source)):
+            digest.update(hashlib.blake2b(path.read_bytes()).digest())
+        return digest.hexdigest()
 
     def __call__(self, pictures: Tensor, key: Tensor) -> Tensor:
         """Noisy copies of (N, 3, 100, 100) uint8 pictures, drawn by (N,) int64 row keys."""
@@ -83,14 +94,24 @@ def _resized(folder: Path) -> Iterator[Tensor]:
     """Batches of a folder's images, at most POOL of each file."""
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; name one with images or use --exogenous {PHOTOGRAPHS}")
-    for path in sorted(p for p in folder.rglob("*") if p.is_file()):
-        if path.name.startswith(("data_batch", "test_batch")):
+    for path in _files(folder):
+        if _is_cifar(path):
             yield _to_size(_read_cifar(path)[:POOL])
-        elif path.suffix.lower() in (".png", ".jpg", ".jpeg"):
+        else:
             try:
                 yield _to_size(np.asarray(Image.open(path).convert("RGB"))[None])
             except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # Pillow's, by format
                 raise UserError(f"{path}: cannot be read as an image ({error}); remove or replace it") from error
+
+
+def _files(folder: Path) -> list[Path]:
+    """Files of a folder that hold images, in order."""
+    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    return [path for path in files if _is_cifar(path) or path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+
+
+def _is_cifar(path: Path) -> bool:
+    return path.name.startswith(("data_batch", "test_batch"))
 
 
 def _read_cifar(path: Path) -> np.ndarray:

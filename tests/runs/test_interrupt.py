@@ -1,0 +1,157 @@
+"""Ctrl-C and SIGTERM: a checkpoint where one can be made, one line, the right exit code, and no process left."""
+
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from tests.helpers_data import write_fake_set
+from tests.runs.test_workers import _alive
+from vd4rl_pomdp.runs import interrupt
+
+SLOW_STEPS = """
+import sys, time
+from pretrain.train import Trainer
+from vd4rl_pomdp.cli import main
+update = Trainer.update
+def slow(self):
+    logs = update(self)
+    if self.step == 3:
+        print("in step 3", flush=True)
+    time.sleep(0.2)
+    return logs
+Trainer.update = slow
+if __name__ == "__main__":
+    main(sys.argv[1:])
+"""
+SLOW_JOBS = """
+import sys
+from tests.runs.test_workers import tell_and_sleep
+from vd4rl_pomdp.cli import COMMANDS, main
+from vd4rl_pomdp.cli.dispatch import Command
+from vd4rl_pomdp.runs.workers import run_jobs
+COMMANDS["jobs"] = Command("", lambda words, program: list(run_jobs(tell_and_sleep, [0, 1], 2)))
+if __name__ == "__main__":
+    main(["jobs"])
+"""
+HANGING = """
+import sys, time
+from vd4rl_pomdp.cli import COMMANDS, main
+from vd4rl_pomdp.cli.dispatch import Command
+from vd4rl_pomdp.runs import interrupt
+def hang(words, program):
+    with interrupt.deferred():
+        print("hanging", flush=True)
+        time.sleep(60)
+COMMANDS["hang"] = Command("", hang)
+main(["hang"])
+"""
+ENDS = [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
+
+
+def start(folder: Path, script: str, *words: object) -> subprocess.Popen:
+    """A program in a process group of its own, as in a terminal."""
+    file = folder / "program.py"
+    file.write_text(script)
+    environment = os.environ | {"PYTHONPATH": os.getcwd(), "VD4RL_POMDP_CACHE": str(folder / "cache")}
+    return subprocess.Popen(
+        [sys.executable, file, *map(str, words)],
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+        env=environment,
+        start_new_session=True,
+    )
+
+
+def said(program: subprocess.Popen) -> list[str]:
+    """What a program that has ended said on stderr, progress left out."""
+    _, error = program.communicate(timeout=60)
+    return [line for line in error.splitlines() if " steps  " not in line]
+
+
+@pytest.mark.parametrize(("number", "code", "word"), ENDS[:1])
+def test_a_training_run_keeps_its_running_step_and_goes_on_from_there(tmp_path, number, code, word):
+    data = write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25])
+    words = ["pretrain", "--preset", "smoke", "--method", "acro", "--data", data, "--out", tmp_path / "run"]
+    program = start(tmp_path, SLOW_STEPS, *words)
+    assert program.stdout.readline() == "in step 3\n"
+    program.send_signal(number)
+    kept = f"{word}: {tmp_path / 'run'} keeps step 3, and the same command goes on from there"
+    assert said(program) == [kept]
+    assert program.returncode == code
+    assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["3"]
+    assert not list((tmp_path / "run").glob(".*"))
+
+
+@pytest.mark.parametrize(("number", "code", "word"), ENDS[1:])
+def test_workers_end_with_the_first_signal(tmp_path, number, code, word):
+    program = start(tmp_path, SLOW_JOBS)
+    workers = [int(program.stdout.readline()) for _ in range(2)]
+    os.killpg(program.pid, number)  # as a terminal's Ctrl-C and a cluster's scancel do
+    assert said(program) == [f"{word}: the same command does what is left"]
+    assert program.returncode == code
+    assert not any(map(_alive, workers))
+
+
+def test_a_signal_while_workers_start_is_the_callers_business(tmp_path):
+    program = start(tmp_path, SLOW_JOBS)
+    children = Path(f"/proc/{program.pid}/task/{program.pid}/children")
+    if not children.exists():
+        program.kill()
+        pytest.skip("this system does not list children")
+    while len(pids := children.read_text().split()) < 3:  # two workers, and the tracker of their resources
+        time.sleep(0.01)
+    os.killpg(program.pid, signal.SIGINT)
+    assert said(program) == ["interrupted: the same command does what is left"]
+    assert program.returncode == 130
+    while any(_alive(int(pid)) for pid in pids):  # the tracker ends when it finds its caller gone
+        time.sleep(0.01)
+
+
+@pytest.mark.parametrize(("number", "code", "word"), ENDS)
+def test_a_second_signal_ends_the_program_at_once(tmp_path, number, code, word):
+    program = start(tmp_path, HANGING)
+    assert program.stdout.readline() == "hanging\n"
+    while program.poll() is None:
+        program.send_signal(number)
+        time.sleep(0.2)
+    assert program.returncode == -number
+    assert said(program) == []
+
+
+def test_a_library_caller_gets_the_exceptions_and_its_handlers_back():
+    before = [signal.getsignal(number) for number in interrupt.SIGNALS]
+    with pytest.raises(interrupt.Interrupted), interrupt.handled():
+        signal.raise_signal(signal.SIGINT)
+    with pytest.raises(SystemExit) as end, interrupt.handled():
+        signal.raise_signal(signal.SIGTERM)
+    assert end.value.code == 143
+    assert [signal.getsignal(number) for number in interrupt.SIGNALS] == before
+
+
+def test_a_signal_waits_for_the_end_of_a_deferred_step_except_where_it_need_not():
+    steps = []
+
+    def in_a_step() -> None:
+        with interrupt.handled(), interrupt.deferred():
+            signal.raise_signal(signal.SIGINT)
+            steps.append(1)
+            interrupt.check("step 1")
+            steps.append(2)
+
+    def in_an_evaluation() -> None:
+        with interrupt.handled(), interrupt.deferred(), interrupt.at_once():
+            signal.raise_signal(signal.SIGTERM)
+            steps.append(3)
+
+    with pytest.raises(interrupt.Interrupted, match="step 1"):
+        in_a_step()
+    with pytest.raises(interrupt.Terminated):
+        in_an_evaluation()
+    assert steps == [1]
+    assert not interrupt.asked()

@@ -1,0 +1,66 @@
+import subprocess
+import sys
+from pathlib import Path
+from zipfile import ZipFile
+
+import pytest
+
+from vd4rl_pomdp.runs import provenance
+from vd4rl_pomdp.runs.provenance import COMMIT_FILE, checkout_commit, recorded_commit
+
+ROOT = Path(__file__).resolve().parents[2]
+
+
+def git(folder: Path, *words: str) -> str:
+    who = ["-c", "user.name=A", "-c", "user.email=a@b.c"]
+    return subprocess.run(["git", *who, *words], cwd=folder, capture_output=True, text=True, check=True).stdout.strip()
+
+
+@pytest.fixture
+def checkout(tmp_path) -> Path:
+    root = tmp_path / "project"
+    (root / "vd4rl_pomdp").mkdir(parents=True)
+    (root / "pyproject.toml").write_text('[project]\nname = "vd4rl-pomdp"\n')
+    git(root, "init", "-q")
+    git(root, "add", "-A")
+    git(root, "commit", "-qm", "first")
+    return root
+
+
+def test_a_checkout_of_this_project_tells_its_commit(checkout):
+    head = git(checkout, "rev-parse", "HEAD")
+    assert checkout_commit(checkout) == head
+    (checkout / "pyproject.toml").write_text('[project]\nname = "vd4rl-pomdp"\nversion = "2"\n')
+    assert checkout_commit(checkout) == f"{head}+"
+
+
+def test_a_repository_around_the_package_is_another_project(checkout, monkeypatch):
+    site = checkout / ".venv" / "lib" / "site-packages"
+    (site / "vd4rl_pomdp" / "runs").mkdir(parents=True)
+    assert checkout_commit(site) == ""
+    (site / "pyproject.toml").write_text('[project]\nname = "vd4rl-pomdp"\n')
+    assert checkout_commit(site) == ""
+    (checkout / "pyproject.toml").write_text('[project]\nname = "thesis"\n')
+    assert checkout_commit(checkout) == ""
+    monkeypatch.setattr(provenance, "__file__", str(site / "vd4rl_pomdp" / "runs" / "provenance.py"))
+    assert provenance.git_commit() == ""
+    (site / COMMIT_FILE).write_text("abc\n")
+    assert provenance.git_commit() == "abc" == recorded_commit(site)
+
+
+def test_a_wheel_carries_the_commit_it_was_built_from(checkout):
+    """The real setup.py on a package of one module, without fetching anything."""
+    for name in ("setup.py", "vd4rl_pomdp/runs/provenance.py"):
+        (checkout / name).parent.mkdir(exist_ok=True)
+        (checkout / name).write_text((ROOT / name).read_text())
+    (checkout / "vd4rl_pomdp" / "__init__.py").touch()
+    (checkout / "pyproject.toml").write_text(
+        '[build-system]\nrequires = ["setuptools"]\nbuild-backend = "setuptools.build_meta"\n'
+        '[project]\nname = "vd4rl-pomdp"\nversion = "0"\n[tool.setuptools]\npackages = ["vd4rl_pomdp"]\n'
+    )
+    git(checkout, "add", "-A")
+    git(checkout, "commit", "-qm", "second")
+    build = "from setuptools import build_meta; print(build_meta.build_wheel('.'))"
+    built = subprocess.run([sys.executable, "-c", build], cwd=checkout, capture_output=True, text=True, check=True)
+    with ZipFile(checkout / built.stdout.splitlines()[-1]) as wheel:
+        assert wheel.read(COMMIT_FILE).decode().strip() == git(checkout, "rev-parse", "HEAD")

@@ -1,0 +1,287 @@
+"""Every stage: full disks, signals, second starts and changed inputs cost nothing but the time to start again."""
+
+import errno
+import json
+import shutil
+import signal
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import finetune.train
+import pretrain.navigation.trainer
+import pretrain.train
+from finetune.algorithms import bc
+from finetune.train import finetune as run_finetune
+from pretrain.navigation.config import PRESETS as MAZE_PRESETS
+from pretrain.navigation.train import train as run_navigation
+from pretrain.train import pretrain as run_pretrain
+from tests.helpers_data import write_fake_set
+from tests.test_stages import contents, smoke_finetune, smoke_pretrain
+from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.evaluation import read_rows
+from vd4rl_pomdp.runs.folder import read_json
+from vd4rl_pomdp.runs.interrupt import Terminated
+from vd4rl_pomdp.runs.ownership import owned
+
+FINETUNE = {"updates": 12, "eval_every": 6, "checkpoint_every": 4, "batch_size": 4, "eval_length": 2, "log_every": 3}
+
+
+@pytest.fixture(autouse=True, scope="module")
+def _cache(tmp_path_factory):
+    torch.set_num_threads(1)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VD4RL_POMDP_CACHE", str(tmp_path_factory.mktemp("cache")))
+        patch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
+        yield
+
+
+@pytest.fixture(scope="module")
+def data(tmp_path_factory) -> Path:
+    return write_fake_set(tmp_path_factory.mktemp("set") / "walker_walk" / "expert", [20, 25, 30])
+
+
+@pytest.fixture(scope="module")
+def encoder(data, tmp_path_factory) -> Path:
+    return run_pretrain(smoke_pretrain(data, tmp_path_factory.mktemp("made"), method="no_history")).path / "encoder"
+
+
+@pytest.fixture(scope="module")
+def maze(tmp_path_factory) -> Path:
+    """A maze's set of noise: nothing here depends on what is seen."""
+    folder, rng, rows = tmp_path_factory.mktemp("maze"), np.random.default_rng(0), 120
+    step_type = np.tile([0, *[1] * 28, 2], 4)
+    write_shard(
+        folder / "0_three_curtains.hdf5",
+        {
+            "observation": rng.integers(0, 256, (rows, 3, 100, 100), np.uint8),
+            "action": rng.uniform(-1, 1, (rows, 2)),
+            "reward": np.zeros(rows),
+            "discount": np.ones(rows),
+            "step_type": step_type,
+            "physics": rng.normal(size=(rows, 4)),
+        },
+        {"task": "three_curtains"},
+    )
+    return folder
+
+
+Stage = tuple[Callable[[Any], Any], Callable[[Path], Any], Any]
+"""What runs, its config for a folder, and the class whose `update` is one step."""
+
+
+@pytest.fixture(params=["pretrain", "finetune", "navigation"], scope="module")
+def stage(request) -> Stage:
+    if request.param == "navigation":
+        given = {"steps": 8, "log_every": 4, "checkpoint_every": 4, "precision": "fp32"}
+        config = replace(MAZE_PRESETS["smoke"], data=request.getfixturevalue("maze"), **given)
+        return run_navigation, lambda out: replace(config, out=out), pretrain.navigation.trainer.Trainer
+    data = request.getfixturevalue("data")
+    if request.param == "pretrain":
+        return run_pretrain, lambda out: smoke_pretrain(data, out, method="no_history"), pretrain.train.Trainer
+    encoder, changes = request.getfixturevalue("encoder"), FINETUNE | {"algorithm": "bc"}
+    return run_finetune, lambda out: smoke_finetune(encoder, data, out, **changes), bc.BC
+
+
+@pytest.fixture(scope="module")
+def whole(stage, tmp_path_factory) -> dict[str, str]:
+    """Files of an uninterrupted run."""
+    run, config, _ = stage
+    return contents(run(config(tmp_path_factory.mktemp("whole") / "run")).path)
+
+
+def at_update(monkeypatch, learner: Any, number: int, then: Callable[[], None]) -> None:
+    """Do something in the middle of a run's update of that number."""
+    update, calls = learner.update, []
+
+    def changed(self, *arguments):
+        calls.append(1)
+        if len(calls) == number:
+            then()
+        return update(self, *arguments)
+
+    monkeypatch.setattr(learner, "update", changed)
+
+
+def test_a_signal_keeps_the_running_step_and_the_run_ends_as_if_nothing_had_been(stage, whole, tmp_path, monkeypatch):
+    run, config, learner = stage
+    with monkeypatch.context() as patch:
+        at_update(patch, learner, 7, lambda: signal.raise_signal(signal.SIGTERM))
+        with pytest.raises(Terminated):
+            run(config(tmp_path / "cut"))
+    assert max(int(path.name) for path in (tmp_path / "cut" / "checkpoints").iterdir()) == 7
+    assert not list((tmp_path / "cut").glob(".*"))
+    run(config(tmp_path / "cut"))
+    assert contents(tmp_path / "cut") == whole
+
+
+def fill_disk(monkeypatch, name: str, number: int) -> None:
+    """Have no space for the `number`-th file of a name, of which only a part is written."""
+    write, calls = Path.write_bytes, []
+
+    def limited(path: Path, content: bytes) -> int:
+        calls.extend([1] * (path.name == name))
+        if path.name == name and len(calls) == number:
+            write(path, content[: len(content) // 2])
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, content)
+
+    monkeypatch.setattr(Path, "write_bytes", limited)
+
+
+FULL_AT = [("state.safetensors", 2), ("manifest.json", 1), (".model.safetensors.tmp", 1)]
+
+
+@pytest.mark.parametrize(("name", "number"), FULL_AT)
+def test_a_full_disk_is_one_sentence_and_the_same_command_goes_on(stage, whole, tmp_path, monkeypatch, name, number):
+    run, config, _ = stage
+    with monkeypatch.context() as patch:
+        fill_disk(patch, name, number)
+        with pytest.raises(UserError, match="the disk is full: free some space and start the same command again"):
+            run(config(tmp_path / "cut"))
+    run(config(tmp_path / "cut"))
+    assert contents(tmp_path / "cut") == whole
+
+
+@pytest.mark.parametrize("name", [".config.json.tmp", ".machine.json.tmp"])
+def test_a_disk_that_is_full_from_the_start_leaves_a_folder_that_goes_on(data, tmp_path, monkeypatch, name):
+    config = smoke_pretrain(data, tmp_path / "run", method="no_history")
+    write = Path.write_text
+
+    def full(path: Path, content: str, *arguments: Any) -> int:
+        if path.name == name:
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return write(path, content, *arguments)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Path, "write_text", full)
+        with pytest.raises(UserError, match="the disk is full"):
+            run_pretrain(config)
+    assert run_pretrain(config).finished
+
+
+def test_a_run_that_another_process_writes_is_refused_by_every_stage(stage, tmp_path):
+    run, config, _ = stage
+    with owned(tmp_path / "run"), pytest.raises(UserError, match="run: is in use by process"):
+        run(config(tmp_path / "run"))
+    assert not list((tmp_path / "run").iterdir())
+
+
+def test_a_set_that_another_process_collects_is_refused(tmp_path):
+    from vd4rl_pomdp.data import collect
+    from vd4rl_pomdp.experiments.navigation import collect as navigation
+
+    configs = [
+        (collect.collect, collect.CollectConfig("walker_walk", "random", tmp_path / "set", workers=1)),
+        (navigation.collect, replace(navigation.PRESETS["smoke"], maze="no_curtain", out=tmp_path / "set", workers=1)),
+    ]
+    for run, config in configs:
+        with owned(tmp_path / "set"), pytest.raises(UserError, match="set: is in use by process"):
+            run(config)
+        assert not list((tmp_path / "set").iterdir())
+
+
+def changed(data: Path, by: Path) -> Path:
+    """Another content behind the same path."""
+    shutil.rmtree(data)
+    return Path(shutil.copytree(by, data))
+
+
+@pytest.mark.parametrize("when", ["unfinished", "finished"])
+def test_a_run_whose_data_changed_is_refused_untouched(encoder, tmp_path, monkeypatch, when):
+    data = write_fake_set(tmp_path / "data" / "walker_walk" / "expert", [20, 25, 30])
+    other = write_fake_set(tmp_path / "other" / "walker_walk" / "expert", [20, 30, 25])
+    configs = {
+        run_pretrain: smoke_pretrain(data, tmp_path / "pretrain", method="no_history"),
+        run_finetune: smoke_finetune(encoder, data, tmp_path / "finetune", **FINETUNE),
+    }
+    for run, config in configs.items():
+        run(config)
+        if when == "unfinished":
+            (config.out / "timing.json").unlink()
+    before = {run: contents(config.out) for run, config in configs.items()}
+    changed(data, other)
+    for run, config in configs.items():
+        with pytest.raises(UserError, match=r"holds a run with other content of --data"):
+            run(config)
+        assert contents(config.out) == before[run]
+
+
+def test_a_finished_run_whose_encoder_was_replaced_keeps_its_labels(encoder, data, tmp_path):
+    mine = shutil.copytree(encoder, tmp_path / "encoder")
+    config = smoke_finetune(mine, data, tmp_path / "run", **FINETUNE)
+    run_finetune(config)
+    before = contents(config.out)
+    replaced = run_pretrain(smoke_pretrain(data, tmp_path / "acro", method="acro")).path / "encoder"
+    changed(mine, replaced)
+    with pytest.raises(UserError, match=r"holds a run with other content of --encoder"):
+        run_finetune(config)
+    assert contents(config.out) == before
+    assert read_json(config.out / "labels.json")["method"] == "no_history"
+    moved = smoke_finetune(encoder, data, tmp_path / "run", **FINETUNE)
+    assert run_finetune(moved).finished
+
+
+def test_record_and_card_name_the_inputs(encoder, data, tmp_path):
+    from vd4rl_pomdp.data import open_dataset
+
+    fingerprint = open_dataset(data).fingerprint
+    assert read_json(encoder / "config.json")["pretrain"]["data"] == fingerprint
+    assert read_json(encoder.parent / "config.json")["inputs"] == {"data": fingerprint}
+    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **FINETUNE))
+    inputs = read_json(run.path / "config.json")["inputs"]
+    assert inputs["data"] == fingerprint
+    assert set(inputs) == {"data", "encoder"}
+
+
+def test_features_of_other_inputs_or_damaged_ones_are_made_anew(encoder, data, tmp_path, monkeypatch):
+    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **FINETUNE))
+    config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
+    with monkeypatch.context() as patch:
+        fill_disk(patch, "state.safetensors", 1)
+        with pytest.raises(UserError):
+            run_finetune(config)
+    features, origin = config.out / "features.npy", config.out / "features.json"
+    assert read_json(origin).keys() == {"data", "encoder", "sha256"}
+    features.write_bytes(features.read_bytes()[:-100] + bytes(100))
+    run_finetune(config)
+    assert contents(config.out) == contents(whole.path)
+    assert not features.exists()
+    assert not origin.exists()
+
+
+@pytest.mark.parametrize("rows_written", [False, True])
+def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(encoder, data, tmp_path, monkeypatch, rows_written):
+    changes = FINETUNE | {"eval_episodes": 2}
+    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes))
+    config = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
+    append = finetune.train.append_rows
+
+    def cut(path: Path, rows: list[dict[str, Any]]) -> None:
+        append(path, rows[:1] if rows_written else [])
+        raise KeyboardInterrupt
+
+    with monkeypatch.context() as patch:
+        patch.setattr(finetune.train, "append_rows", cut)
+        with pytest.raises(KeyboardInterrupt):
+            run_finetune(config)
+    run_finetune(config)
+    assert contents(config.out) == contents(whole.path)
+    assert [row["step"] for row in read_rows(config.out / "episodes.csv")] == [6, 6, 12, 12]
+
+
+def test_an_old_format_is_refused_before_anything_is_written(data, tmp_path):
+    run = run_pretrain(smoke_pretrain(data, tmp_path / "run", method="no_history"))
+    record = read_json(run.path / "config.json")
+    del record["format"], record["inputs"]  # as the first version wrote them
+    (run.path / "config.json").write_text(json.dumps(record))
+    before = contents(run.path)
+    with pytest.raises(UserError, match="holds a run of format 1"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "run", method="no_history"))
+    assert contents(run.path) == before

@@ -1,0 +1,118 @@
+"""Signals: the first Ctrl-C or SIGTERM ends a run where nothing is lost, a second one ends the process at once.
+
+Outside a training loop the first signal is raised where it arrives; inside one it waits for the end of the running
+step, whose checkpoint is then written.
+"""
+
+from __future__ import annotations
+
+import signal
+import sys
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from types import FrameType
+
+SIGNALS = (signal.SIGINT, signal.SIGTERM)
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C; the message says from where the run goes on, if it does."""
+
+
+class Terminated(SystemExit):
+    """SIGTERM, with the exit code that shells give it; the message is in `reason`."""
+
+    def __init__(self, reason: str = "") -> None:
+        super().__init__(128 + signal.SIGTERM)
+        self.reason = reason
+
+
+class _Signals:
+    """What has arrived in this process, and what is to be done about it."""
+
+    handled = deferred = False
+    asked: int | None = None
+
+
+@contextmanager
+def handled(program: bool = False) -> Iterator[None]:
+    """Answer signals as the module says. Nested, or outside the main thread, it changes nothing.
+
+    Args:
+        program: this is the command line: a second signal kills the process even inside a library's C code. Else it
+            does what it did before.
+    """
+    if _Signals.handled or threading.current_thread() is not threading.main_thread():
+        yield
+        return
+    before = {number: signal.getsignal(number) for number in SIGNALS}
+    before = {number: old for number, old in before.items() if old not in (None, signal.SIG_IGN)}  # nohup stays nohup
+
+    def answer(number: int, frame: FrameType | None) -> None:
+        for other, old in before.items():
+            signal.signal(other, signal.SIG_DFL if program else old)
+        if sys.stderr.isatty():
+            sys.stderr.write("\x1b[?25h")  # a second signal leaves nobody to show the cursor again
+        _Signals.asked = number
+        if not _Signals.deferred:
+            check()
+
+    _Signals.handled, _Signals.asked = True, None
+    for number in before:
+        signal.signal(number, answer)
+    try:
+        yield
+    finally:
+        _Signals.handled = False
+        for number, old in before.items():
+            signal.signal(number, old)
+
+
+@contextmanager
+def deferred() -> Iterator[None]:
+    """Within, a signal waits for the next `check`."""
+    with _deferring(True):
+        yield
+    check()
+
+
+@contextmanager
+def at_once() -> Iterator[None]:
+    """Within, inside `deferred`, a signal is raised where it arrives."""
+    with _deferring(False):
+        check()
+        yield
+
+
+@contextmanager
+def _deferring(value: bool) -> Iterator[None]:
+    before, _Signals.deferred = _Signals.deferred, value
+    try:
+        yield
+    finally:
+        _Signals.deferred = before
+
+
+def asked() -> bool:
+    """Whether a signal has arrived."""
+    return _Signals.handled and _Signals.asked is not None
+
+
+def check(reason: str = "") -> None:
+    """Raise what has arrived, if anything has; `reason` says from where the run goes on."""
+    if asked():
+        raise Interrupted(reason) if _Signals.asked == signal.SIGINT else Terminated(reason)
+
+
+@contextmanager
+def blocked() -> Iterator[None]:
+    """Within, signals stay pending; processes that are started inherit that for their whole life."""
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)

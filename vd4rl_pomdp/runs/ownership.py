@@ -1,0 +1,148 @@
+"""One owner at a time for a folder that is being written.
+
+The lock is filelock's lease: a file `.lock` that names host and process. On the owner's machine its death frees the
+folder at once; from another machine, over a network file system, the owner counts as dead when its heartbeat has not
+been seen for LEASE_S. `.owner.json` beside it says since when.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import secrets
+import socket
+import sys
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
+from pathlib import Path
+from typing import Any
+
+from filelock import SoftFileLease, Timeout
+
+from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.runs.folder import write_json
+from vd4rl_pomdp.runs.interrupt import handled
+
+LEASE_S = 60.0
+EMPTY_S = 2.0
+"""How long a lock without a name in it is given to get one."""
+_LOCK, _NOTE = ".lock", ".owner.json"
+
+
+class Owner:
+    """This process as a folder's owner."""
+
+    def __init__(self, folder: Path) -> None:
+        self._folder = folder
+        since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        self._note = {"host": socket.gethostname(), "pid": os.getpid(), "since": since, "token": secrets.token_hex(8)}
+        write_json(folder / _NOTE, self._note)
+
+    def check(self) -> None:
+        """Raise UserError unless the folder is still this process's: before anything that cannot be taken back."""
+        note = _read_note(self._folder)
+        if note != self._note:
+            taken = f"was taken over by {_name(note)}" if note else "was removed or taken over"
+            raise UserError(f"{self._folder}: {taken} while this process wrote there; it ends and leaves it alone")
+
+    def release(self) -> None:
+        """Remove the note, if it is still this process's."""
+        if _read_note(self._folder) == self._note:
+            (self._folder / _NOTE).unlink(missing_ok=True)
+
+
+@contextmanager
+def owned(folder: Path) -> Iterator[Owner]:
+    """Own a folder, made if missing, and answer signals as `interrupt` says.
+
+    Raises:
+        UserError: another process owns it, which the message names, or it cannot be written.
+    """
+    with disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        lease = SoftFileLease(folder / _LOCK, lease_duration=LEASE_S)
+        _acquire(lease, folder)
+    try:
+        owner = Owner(folder)
+        try:
+            with handled():
+                yield owner
+        finally:
+            owner.release()
+    finally:
+        lease.release()
+
+
+def _acquire(lease: SoftFileLease, folder: Path) -> None:
+    if _is_free(lease):
+        return
+    if _stays_empty(folder / _LOCK):
+        lease.force_break()
+        if _is_free(lease):
+            return
+    note = _read_note(folder)
+    if not _runs_here(note):
+        print(f"{folder}: held by {_name(note)}; waiting for a sign of its life", file=sys.stderr)
+        seen = _heartbeat(folder)
+        if _is_free(lease, 1.5 * LEASE_S, lambda: _heartbeat(folder) not in (seen, None)):
+            return
+    raise UserError(f"{folder}: is in use by {_name(_read_note(folder))}; wait until it ends, or choose another folder")
+
+
+def _is_free(lease: SoftFileLease, wait_s: float = 0.0, refused: Callable[[], bool] | None = None) -> bool:
+    """Take the lease, if it can be had within some seconds and before it is `refused`; whether it was."""
+    try:
+        lease.acquire(timeout=wait_s, cancel_check=refused)
+    except Timeout:
+        return False
+    return True
+
+
+def _stays_empty(lock: Path) -> bool:
+    """Whether a process was killed, or a machine lost power, between making the lock and writing its name there."""
+    for _ in range(20):
+        try:
+            if lock.stat().st_size:
+                return False
+        except FileNotFoundError:
+            return False
+        time.sleep(EMPTY_S / 20)
+    return True
+
+
+def _runs_here(note: dict[str, Any]) -> bool:
+    """Whether the owner is a living process of this machine."""
+    if note.get("host") != socket.gethostname():
+        return False
+    try:
+        os.kill(int(note["pid"]), 0)
+    except ProcessLookupError:  # of another container on this machine, or just gone
+        return False
+    except PermissionError:
+        pass
+    return True
+
+
+def _heartbeat(folder: Path) -> int | None:
+    """When the owner last gave a sign of life."""
+    try:
+        with (folder / _LOCK).open("rb") as file:  # opening makes network file systems look anew
+            return os.fstat(file.fileno()).st_mtime_ns
+    except OSError:
+        return None
+
+
+def _read_note(folder: Path) -> dict[str, Any]:
+    try:
+        note = json.loads((folder / _NOTE).read_text())
+    except (OSError, ValueError):
+        return {}
+    return note if isinstance(note, dict) else {}
+
+
+def _name(note: dict[str, Any]) -> str:
+    if not note:
+        return "another process"
+    return f"process {note.get('pid')} on {note.get('host')} since {note.get('since')}"

@@ -1,0 +1,134 @@
+"""A run is a folder: config.json first, then metrics.jsonl, checkpoints/ and results; the same command continues it.
+
+Everything but `timing.json`, `machine.json` and the checkpoint's `manifest.json` is the same whether a run was
+interrupted or not. One process owns the folder at a time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from dataclasses import asdict
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Self
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs import FORMAT
+from vd4rl_pomdp.runs.checkpoint import Checkpoints, State, fitting, pack, unpack
+from vd4rl_pomdp.runs.folder import holds_anything, jsonable, read_json, write_json
+from vd4rl_pomdp.runs.ownership import Owner, owned
+from vd4rl_pomdp.runs.provenance import command, git_commit, machine, versions
+
+_RUNTIME_FIELDS = {"out", "device", "workers", "wandb", "data", "encoder"}
+"""Config fields that do not change a result, so that a run may go on with other ones; of data and encoder, which may be
+moved, the content is compared."""
+
+
+class RunFolder:
+    """A run's files; `with` begins the run or goes on with it, owns its folder meanwhile, and answers signals."""
+
+    def __init__(self, path: Path, stage: str, config: Any, inputs: dict[str, str]) -> None:
+        """Nothing is written yet.
+
+        Args:
+            path: the folder.
+            stage: the stage's name.
+            config: the stage's settings, a dataclass.
+            inputs: what the run reads, by name: the data's fingerprint, the encoder's hash.
+
+        Raises:
+            UserError: the folder holds something else, or a run with other settings, inputs or of another format.
+        """
+        self.path = path
+        self.config: dict[str, Any] = jsonable(asdict(config))
+        self.inputs = inputs
+        self._stage = stage
+        self._checkpoints = Checkpoints(path)
+        self._started, self._before = time.monotonic(), 0.0
+        self._stack = ExitStack()
+        self._owner: Owner | None = None
+        self._check()
+
+    def _check(self) -> None:
+        """Refuse what is not this run."""
+        file = self.path / "config.json"
+        stored = read_json(file) if file.exists() else {}
+        if "stage" not in stored:
+            if holds_anything(self.path):
+                raise UserError(f"{self.path}: is not empty and holds no run; choose another --out")
+            return
+        if stored.get("format", 1) != FORMAT:
+            raise UserError(
+                f"{self.path}: holds a run of format {stored.get('format', 1)}, this version writes format {FORMAT} "
+                "and cannot go on with it; choose another --out"
+            )
+        old = stored.get("config", {})
+        keys = (set(old) | set(self.config)) - _RUNTIME_FIELDS
+        differing = sorted(k for k in keys if old.get(k) != self.config.get(k))
+        if stored["stage"] != self._stage or differing:
+            what = ", ".join(differing) or f"stage {stored['stage']}"
+            raise UserError(f"{self.path}: holds a run with another config ({what}); choose another --out or remove it")
+        self._check_inputs(stored.get("inputs", {}))
+
+    def _check_inputs(self, old: dict[str, str]) -> None:
+        for name, now in self.inputs.items():
+            if old.get(name) != now:
+                raise UserError(
+                    f"{self.path}: holds a run with other content of --{name} ({self.config.get(name)} was "
+                    f"{old.get(name)} and is {now}); give it what it began with, or choose another --out"
+                )
+
+    def __enter__(self) -> Self:
+        if not self.finished:
+            self._owner = self._stack.enter_context(owned(self.path))
+            try:
+                self._check()  # another process may have begun or ended it since
+                self._begin()
+            except BaseException:
+                self._stack.close()
+                raise
+        return self
+
+    def _begin(self) -> None:
+        if not (self.path / "config.json").exists():
+            record = {"format": FORMAT, "stage": self._stage, "config": self.config, "inputs": self.inputs}
+            origin = {"versions": versions(), "git_commit": git_commit(), "command": command()}
+            write_json(self.path / "config.json", record | origin)
+        if not (self.path / "machine.json").exists():
+            write_json(self.path / "machine.json", machine())
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._stack.__exit__(kind, error, trace)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has come to its end."""
+        return (self.path / "timing.json").exists()
+
+    @property
+    def seconds(self) -> float:
+        """Wall-clock seconds of the run so far, those before its newest checkpoint included."""
+        return self._before + time.monotonic() - self._started
+
+    def restore(self, take: Callable[[State], None]) -> None:
+        """Hand the state of the newest whole checkpoint to `take`, if there is one."""
+        checkpoint = self._checkpoints.newest()
+        if checkpoint is not None:
+            self._before = checkpoint.seconds
+            with fitting(checkpoint):
+                take(unpack(checkpoint.files))
+
+    def save(self, step: int, state: State) -> None:
+        """Keep the state after a step as the newest checkpoint."""
+        assert self._owner is not None, "a run is written inside its `with` block"
+        self._owner.check()
+        self._checkpoints.add(step, pack(state), self.seconds)
+
+    def finish(self, **more: Any) -> None:
+        """Mark the run as done, keeping its wall-clock seconds and the last checkpoint."""
+        self._checkpoints.prune(1)
+        write_json(self.path / "timing.json", {"seconds": round(self.seconds, 2)} | more)
