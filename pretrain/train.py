@@ -22,7 +22,9 @@ from vd4rl_pomdp.runs.checkpoint import restore_checkpoint, save_checkpoint, see
 from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.folder import RunFolder, jsonable
 from vd4rl_pomdp.runs.metrics import MetricsLog, read_metrics
+from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, get_task
 from vd4rl_pomdp.types import Windows
 
@@ -34,6 +36,7 @@ def pretrain(config: PretrainConfig) -> RunFolder:
     """Run the stage, or go on with it, and write `out/encoder`; returns the run's folder."""
     method = get_method(config.method)
     _check(config)
+    refuse_inside(config.out)
     dataset = open_dataset(config.data)
     task = _task_of(dataset, config)
     seed_everything(config.seed)
@@ -176,6 +179,7 @@ def _card(config: PretrainConfig, task: str, dataset: Dataset, run: RunFolder) -
         preset=config.preset,
         end_to_end=get_method(config.method).end_to_end,
         action_loss=_last_action_loss(run),
+        settings=settings_of(jsonable(asdict(replace(config, task=task)))),
     )
 
 

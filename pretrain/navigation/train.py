@@ -21,7 +21,9 @@ from vd4rl_pomdp.experiments.navigation.observations import SHAPES
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
 from vd4rl_pomdp.runs.checkpoint import seed_everything
 from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.folder import RunFolder, write_json
+from vd4rl_pomdp.runs.folder import RunFolder, jsonable, write_json
+from vd4rl_pomdp.runs.outputs import refuse_inside
+from vd4rl_pomdp.runs.settings import settings_of
 
 STAGE = "navigation"
 
@@ -29,6 +31,7 @@ STAGE = "navigation"
 def train(config: NavigationConfig) -> RunFolder:
     """Run the stage, or go on with it; returns the run's folder."""
     _check(config)
+    refuse_inside(config.out)
     data = open_data(config)
     seed_everything(config.seed)
     objective = make_objective(data, config)
@@ -55,6 +58,7 @@ def _conclude(run: RunFolder, trainer: Trainer) -> None:
         seed=config.seed,
         steps=trainer.step,
         preset=config.preset,
+        settings=settings_of(jsonable(asdict(config))),
     )
     save_encoder(run.path / "encoder", trainer.objective.encoder, card)
     record = {"maze": data.maze.name, "set": data.dataset.fingerprint, "command": shlex.join(command_of(config))}

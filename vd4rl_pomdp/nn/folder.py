@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -33,6 +33,8 @@ class EncoderCard:
     """Fine-tuning algorithm that trains the encoder, too; empty for a frozen encoder."""
     action_loss: float | None = None
     """Mean over the last tenth of the pretraining's logged steps, for methods that predict actions."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """What the pretraining was told but for seed, folders, device and logging; empty if it was not recorded."""
 
 
 def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard) -> None:

@@ -32,6 +32,7 @@ from vd4rl_pomdp.policies.export import (
     snapshot_path,
 )
 from vd4rl_pomdp.runs.folder import jsonable, newest, read_json, write_csv, write_json
+from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.tasks import get_task
 
 if TYPE_CHECKING:
@@ -49,6 +50,7 @@ def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None]
         The exported files by quality.
     """
     task = get_task(config.task)
+    refuse_inside(config.out)
     settings = _check(config)
     config.out.mkdir(parents=True, exist_ok=True)
     model = learner.build(config, task)

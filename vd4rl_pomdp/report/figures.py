@@ -8,44 +8,61 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from PIL import Image
 
 from vd4rl_pomdp.report.tables import label
+from vd4rl_pomdp.text import plain
 
 mpl.rcParams["svg.hashsalt"] = "vd4rl-pomdp"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
 """Okabe and Ito's palette, which colour-blind readers can tell apart."""
+LEGEND_WIDTH = 34
+"""Characters in a line of a legend."""
 Film = dict[str, np.ndarray]
 
 
-def curve_figure(rows: list[dict[str, Any]], methods: list[str]) -> str:
-    """Score against updates, one line a method, a band from the lowest to the highest seed."""
+def curve_figure(rows: list[dict[str, Any]], methods: list[str], summary: list[dict[str, Any]]) -> str:
+    """Score against updates, one line a method, a band from the lowest to the highest seed.
+
+    The legend has every method of the setting's `summary`, and says of which seeds are missing.
+    """
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     axes = figure.subplots()
+    notes = {label(row): row["missing"] for row in summary if row["missing"]}
     for method in dict.fromkeys(map(label, rows)):
         mine = [row for row in rows if label(row) == method]
         style = _style(methods.index(method))
         steps = [row["step"] for row in mine]
-        axes.plot(steps, [row["score"] for row in mine], marker="o", label=method, markersize=4, **style)
+        name = _noted(method, notes.pop(method, ""))
+        axes.plot(steps, [row["score"] for row in mine], marker="o", label=name, markersize=4, **style)
         axes.fill_between(
             steps, [r["low"] for r in mine], [r["high"] for r in mine], color=style["color"], alpha=0.15, lw=0
         )
+    for method, note in notes.items():
+        axes.add_line(Line2D([], [], label=_noted(method, note), **(_style(methods.index(method)) | {"alpha": 0.25})))
     axes.set(xlabel="gradient updates", ylabel="score (return / 10)")
     axes.set_xlim(left=0)
     axes.set_ylim(bottom=0)
     return _svg(figure, axes)
 
 
-def profile_figure(rows: list[dict[str, Any]], methods: list[str]) -> str:
-    """Share of runs above a score, one line a method."""
+def profile_figure(rows: list[dict[str, Any]], methods: list[str], notes: dict[str, str]) -> str:
+    """Share of runs above a score, one line a method, with a note in the legend beside some."""
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     axes = figure.subplots()
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = [row for row in rows if row["method"] == method]
         style = _style(methods.index(method))
-        axes.step([r["threshold"] for r in mine], [r["share"] for r in mine], where="post", label=method, **style)
+        name = _noted(method, notes.get(method, ""))
+        axes.step([r["threshold"] for r in mine], [r["share"] for r in mine], where="post", label=name, **style)
     axes.set(xlabel="score", ylabel="share of runs above it", xlim=(0, None), ylim=(0, 1.02))
     return _svg(figure, axes)
+
+
+def _noted(method: str, note: str) -> str:
+    """A legend's entry: plain text, whatever a method is called."""
+    return plain(f"{method} ({note})" if note else method, LEGEND_WIDTH)
 
 
 def _style(number: int) -> dict[str, Any]:
@@ -54,14 +71,14 @@ def _style(number: int) -> dict[str, Any]:
     return {"color": COLOURS[number % len(COLOURS)], "linestyle": dashes}
 
 
-def loss_figure(series: dict[str, list[dict[str, float]]]) -> str:
-    """Pretraining action loss against steps, for every run by name."""
+def loss_figure(series: list[tuple[str, list[dict[str, float]]]]) -> str:
+    """Pretraining action loss against steps, for every run with its title."""
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     axes = figure.subplots()
-    for number, (name, metrics) in enumerate(series.items()):
+    for number, (name, metrics) in enumerate(series):
         steps = [row["step"] for row in metrics if "action_loss" in row]
         values = [row["action_loss"] for row in metrics if "action_loss" in row]
-        axes.plot(steps, values, label=name, lw=1.2, **_style(number))
+        axes.plot(steps, values, label=plain(name, LEGEND_WIDTH), lw=1.2, **_style(number))
     axes.set(xlabel="gradient steps", ylabel="action loss")
     return _svg(figure, axes)
 

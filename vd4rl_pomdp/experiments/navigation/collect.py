@@ -20,6 +20,7 @@ from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
 from vd4rl_pomdp.mazes import get_maze
 from vd4rl_pomdp.runs.folder import jsonable
+from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import versions
 from vd4rl_pomdp.runs.workers import run_jobs
@@ -78,6 +79,7 @@ class _Job:
 def collect(config: CollectConfig) -> list[Path]:
     """Collect the set, or what is missing of it; returns its shards."""
     _check(config)
+    refuse_inside(config.out)
     claim_set(config.out, {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS})
     started, frames, shards = time.monotonic(), 0, []
     with ProgressLine(f"collect {config.maze}", config.trajectories, "trajectories") as progress:
