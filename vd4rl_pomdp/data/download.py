@@ -49,7 +49,7 @@ class RemoteFile:
 @cache
 def manifest() -> tuple[RemoteFile, ...]:
     """All published 84-pixel shards."""
-    text = files("vd4rl_pomdp.data").joinpath("manifest.tsv").read_text()
+    text = files("vd4rl_pomdp.data").joinpath("manifest.tsv").read_text(encoding="utf-8")
     rows = csv.DictReader(text.splitlines(), delimiter="\t")
     return tuple(RemoteFile(row["path"], int(row["bytes"]), row["sha256"]) for row in rows)
 

@@ -118,7 +118,7 @@ def _key(shards: Sequence[Path]) -> str:
 def _read_meta(folder: Path) -> dict[str, Any] | None:
     """The folder's meta.json; None unless it is whole and every file is there in its full size."""
     try:
-        meta = json.loads((folder / _META).read_text())
+        meta = json.loads((folder / _META).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return None
     files = [(folder / name, file["bytes"]) for name, file in meta["files"].items()]
@@ -130,7 +130,7 @@ def _locked(folder: Path) -> Iterator[None]:
     """Let one process at a time decode into a folder; the others wait and find it done."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        file = folder.with_suffix(".lock").open("w")
+        file = folder.with_suffix(".lock").open("w", encoding="utf-8")
     except OSError as error:
         raise disk_error(folder.parent, error) from error
     with file:
@@ -150,7 +150,7 @@ def _decode(shards: Sequence[Path], folder: Path, frame_size: int) -> dict[str, 
         for key, value in rows.items():
             np.save(scratch / f"{key}.npy", value)
         meta = _describe(shards, scratch, len(rows["reward"]))
-        (scratch / _META).write_text(json.dumps(meta, indent=1))
+        (scratch / _META).write_text(json.dumps(meta, indent=1), encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)  # a damaged one
         scratch.rename(folder)
     except OSError as error:

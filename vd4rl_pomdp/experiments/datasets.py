@@ -115,7 +115,7 @@ def _cost(task: str, episodes: int) -> Row:
 def _read(path: Path, columns: Sequence[str]) -> list[Row]:
     if not path.exists():
         return []
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         if tuple(reader.fieldnames or ()) != columns:
             raise UserError(f"{path}: has other columns than {', '.join(columns)}; remove it or choose another --out")

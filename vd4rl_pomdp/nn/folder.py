@@ -99,7 +99,7 @@ def _read_config(folder: Path) -> dict[str, Any]:
     if pickles and not (folder / "model.safetensors").exists():
         raise UserError(f"{folder}: {pickles[0]} is a pickle, which can run code; only model.safetensors is read")
     try:
-        config = json.loads((folder / "config.json").read_text())
+        config = json.loads((folder / "config.json").read_text(encoding="utf-8"))
         EncoderConfig(**config["encoder"]), EncoderCard(**config["pretrain"])
     except (OSError, ValueError, KeyError, TypeError) as error:
         raise UserError(

@@ -52,7 +52,7 @@ def read_curve(run: Path) -> list[tuple[int, float]]:
     """Learning curve of a run: (decisions, mean return) rows; raises UserError if it is damaged."""
     steps, mean = CURVE_COLUMNS
     try:
-        with (run / "curve.csv").open(newline="") as file:
+        with (run / "curve.csv").open(newline="", encoding="utf-8") as file:
             return [(int(row[steps]), float(row[mean])) for row in csv.DictReader(file)]
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{run / 'curve.csv'}: is no learning curve ({error}); take another copy of the run") from error
@@ -139,7 +139,9 @@ def _publish(
         "versions": {name: version(name) for name in ("sbx-rl", "jax", "dm-control", "mujoco", "numpy")},
     }
     Actor(read_actor(snapshot_path(run, step)).weights, card).save(path)
-    path.with_suffix(".json").write_text(json.dumps(card | {"learning_curve": curve}, indent=1) + "\n")
+    path.with_suffix(".json").write_text(
+        json.dumps(card | {"learning_curve": curve}, indent=1) + "\n", encoding="utf-8"
+    )
     return path
 
 

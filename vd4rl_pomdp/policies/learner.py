@@ -159,7 +159,7 @@ def save_checkpoint(model: SAC, run: Path) -> None:
     with replacing(run / "checkpoint") as fresh:
         save_file(arrays, fresh / "model.safetensors")
         save_file(replay, fresh / "replay.safetensors")
-        (fresh / "counters.json").write_text(json.dumps(counters))
+        (fresh / "counters.json").write_text(json.dumps(counters), encoding="utf-8")
 
 
 def restore_checkpoint(model: SAC, run: Path) -> int:

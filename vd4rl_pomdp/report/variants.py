@@ -25,7 +25,7 @@ _PRESETS = ("preset", "pretraining preset")
 _CORRUPTION = frozenset(field.name for field in fields(CorruptionConfig))
 _DATA = ("data", "pretraining data")
 _LABELS = ("method", "task", "quality")
-"""What the encoder's card has besides settings that name its rows."""
+"""Fields that name a run's rows; they are no settings."""
 
 
 def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Settings:
@@ -38,16 +38,16 @@ def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Setting
     own = settings_of(record["config"])
     before = dict(card.get("corruption", {})) | {name: card[name] for name in ("steps", "preset") if name in card}
     before |= card.get("settings") or {}
-    found = own | {(f"pretraining {k}" if k in own else k): v for k, v in before.items() if k not in _LABELS}
-    words = {name: _words(value) for name, value in found.items()}
+    found = own | {(f"pretraining {k}" if k in own else k): v for k, v in before.items()}
+    words = {name: _words(value) for name, value in found.items() if name not in _LABELS}
     if record["stage"] == "finetune" and not card.get("settings"):
         words[UNKNOWN] = _NOT_RECORDED
     return words | _data(record.get("inputs", {}).get("data"), card.get("data"))
 
 
 def _data(own: str | None, before: str | None) -> Settings:
-    """Short fingerprints of the sets behind a run; the pretraining's only where it is another one."""
-    shown = {"data": own or before, "pretraining data": before if own and before != own else None}
+    """Short fingerprints of the sets behind a run, as far as they are recorded."""
+    shown = {"data": own, "pretraining data": "the same" if own and before == own else before}
     return {name: value[:8] for name, value in shown.items() if value}
 
 
