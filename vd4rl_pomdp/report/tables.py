@@ -117,14 +117,17 @@ def curves(rows: list[Row]) -> list[Row]:
     return table
 
 
-def aggregate(rows: list[Row]) -> list[Row]:
+def aggregate(rows: list[Row], gaps: list[Row]) -> list[Row]:
     """IQM and optimality gap over tasks and qualities for every method and setting, with stratified intervals.
 
     `of_tasks` is how many tasks and qualities there are under the corruption: with fewer, the row is another average.
+    A method without any has no numbers.
     """
-    places = {key[0]: len(_grouped(members, ("task", "quality"))) for key, members in _grouped(rows, ("corruption",))}
-    table = []
+    everything = _grouped([*rows, *gaps], ("corruption",))
+    places = {key[0]: len(_grouped(members, ("task", "quality"))) for key, members in everything}
+    table, absent = [], dict.fromkeys(tuple(gap[name] for name in SERIES) for gap in gaps)
     for group, members in _grouped(rows, SERIES):
+        absent.pop(group, None)
         strata = _strata(members)
         scores = np.concatenate(strata)
         interval = stats.bootstrap_interval(strata, stats.iqm, np.random.default_rng(0))
@@ -134,6 +137,11 @@ def aggregate(rows: list[Row]) -> list[Row]:
             | {"low": interval[0] if interval else None, "high": interval[1] if interval else None}
             | {"tasks": len(strata), "of_tasks": places[group[0]], "seeds": min(map(len, strata))}
         )
+    nothing = dict.fromkeys(("iqm", "optimality_gap", "low", "high"))
+    table += [
+        dict(zip(SERIES, group, strict=True)) | nothing | {"tasks": 0, "of_tasks": places[group[0]], "seeds": 0}
+        for group in absent
+    ]
     return sorted(table, key=_table_order)
 
 

@@ -48,7 +48,7 @@ def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
     made = {
         _MARK: tables.summary(final, gaps),
         "curves": tables.curves(rows),
-        "aggregate": tables.aggregate(final),
+        "aggregate": tables.aggregate(final, gaps),
         "runs": tables.representations(runs, gaps),
         "improvement": tables.improvement(final),
         "profiles": tables.profiles(final, np.linspace(0, 100, 101)),
@@ -68,26 +68,35 @@ def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
 
 
 def print_summary(summary: list[Row], console: Console | None = None) -> None:
-    """The table of final scores on the terminal."""
-    table = Table(title="score = return / 10, mean over seeds [95% interval]")
-    for name in ("setting", "method"):
-        table.add_column(name, overflow="fold")
+    """The tables of final scores on the terminal, one a setting."""
+    console = console or Console()
+    console.print("score = return / 10, mean over seeds [95% interval]", markup=False, highlight=False)
+    for setting, members in _by_setting(summary):
+        console.print(_terminal_table(setting, members))
+
+
+def _terminal_table(setting: str, rows: list[Row]) -> Table:
+    table = Table(title=Text(setting), title_justify="left")
+    table.add_column("method", overflow="fold")
     for name in ("score", "interval", "seeds", "episodes"):
-        table.add_column(name, justify="right")
-    gaps = any(row["missing"] for row in summary)
+        table.add_column(name, justify="right", no_wrap=True)
+    gaps = any(row["missing"] for row in rows)
     if gaps:
         table.add_column("not there", overflow="fold")
-    for row in summary:
+    for row in rows:
         interval = f"{row['low']:.1f} - {row['high']:.1f}" if row["low"] is not None else "-"
         score = f"{row['score']:.1f}" if row["score"] is not None else MISSING
-        cells = (_setting(row), tables.label(row), score, interval, str(row["seeds"]), str(row["episodes"]))
+        cells = (tables.label(row), score, interval, str(row["seeds"]), str(row["episodes"]))
         table.add_row(*map(Text, (*cells, row["missing"]) if gaps else cells))
-    (console or Console()).print(table)
+    return table
 
 
 def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]], study: Row | None) -> str:
     names = list(dict.fromkeys(map(tables.label, (*made[_MARK], *rows))))
-    pretraining = [(_title(run), run.metrics) for run in runs if run.stage == "pretrain" and _has_losses(run)]
+    pretraining: dict[str, list[tuple[str, list[dict[str, float]]]]] = {}
+    for run in runs:
+        if run.stage == "pretrain" and _has_losses(run):
+            pretraining.setdefault(_setting(run.labels), []).append((tables.label(_row(run)), run.metrics))
     settings = dict(_by_setting(made[_MARK]))
     return render(
         "page.html",
@@ -101,7 +110,7 @@ def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]], study:
         tables=list(settings.items()),
         differing=_differing(runs),
         aggregate=made["aggregate"],
-        representations=made["runs"],
+        representations=_by_setting(made["runs"]),
         improvement=_matrices(made["improvement"]),
         curves=[
             (name, figures.curve_figure(part, names, settings[name])) for name, part in _by_setting(made["curves"])
@@ -110,7 +119,7 @@ def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]], study:
             (name, figures.profile_figure(part, names, _partial(made["aggregate"], name)))
             for name, part in _by(made["profiles"], "corruption")
         ],
-        losses=figures.loss_figure(pretraining) if pretraining else "",
+        losses=[(name, figures.loss_figure(series)) for name, series in pretraining.items()],
         films=_films(runs),
         published=_published(rows),
         theory=section(study) if study else None,
@@ -148,8 +157,12 @@ def _partial(aggregate: list[Row], corruption: str) -> dict[str, str]:
 
 def _differing(runs: list[Run]) -> list[tuple[str, str]]:
     """Each method of which there are several variants, and all settings that differ, those of a preset included."""
-    told = [(run, filter(None, parts)) for run, parts in zip(runs, compare(runs, brief=False), strict=True)]
-    named = {f"{run.stage} {tables.label(_row(run))}": ", ".join(parts) for run, parts in told if run.variant}
+    told = zip(runs, compare(runs, brief=False), strict=True)
+    named = {
+        tables.label(_row(run)): ", ".join(filter(None, parts))
+        for run, parts in told
+        if run.stage == "finetune" and run.variant
+    }
     return list(named.items())
 
 
@@ -183,8 +196,10 @@ def _films(runs: list[Run]) -> list[Row]:
         film = run.film()
         assert film is not None
         strip, movie = figures.strip(film), figures.movie(film)
+        share = min(1.0, len(film["clean"]) / figures.STRIP_FRAMES)
         shown.append(
-            {"title": _title(run), "strip": _base64(strip), "movie": _base64(movie), "total": film["return"][-1]}
+            {"title": _title(run), "strip": _base64(strip), "movie": _base64(movie)}
+            | {"share": share, "total": film["return"][-1]}
         )
     return shown
 
