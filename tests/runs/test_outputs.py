@@ -26,7 +26,7 @@ def kept(tmp_path) -> dict[str, Path]:
     return {
         "a run": fill(tmp_path / "run", config__json=json.dumps(run), episodes__csv=""),
         "an encoder": fill(tmp_path / "encoder", config__json="{}", model__safetensors=""),
-        "a policy": fill(tmp_path / "policy", config__json='{"task": "walker_walk"}', curve__csv=""),
+        "a policy": fill(tmp_path / "policy", config__json='{"task": "cheetah_run"}', curve__csv=""),
         "a data set": write_fake_set(tmp_path / "walker_walk" / "expert"),
         "a data set ": fill(tmp_path / "collecting", collection__json="{}"),
     }
@@ -68,7 +68,7 @@ def test_folders_that_are_kept_foreign_or_inside_others_are_refused(kept, tmp_pa
         refuse_foreign(mine, "report", "summary.csv")
 
 
-def commands(data: Path, run: Path, out: Path) -> dict[str, list[str]]:
+def commands(data: Path, run: Path) -> dict[str, list[str]]:
     """Words of every command that has an --out, with nothing else wrong."""
     preset = ["--preset", "smoke"]
     return {
@@ -92,7 +92,7 @@ def commands(data: Path, run: Path, out: Path) -> dict[str, list[str]]:
     }
 
 
-NAMES = list(commands(Path(), Path(), Path()))
+NAMES = list(commands(Path(), Path()))
 FILES = ("evaluate", "navigation policy")
 """Commands whose --out is a file."""
 
@@ -107,7 +107,7 @@ def test_no_command_writes_into_what_another_owns(name, kept, tmp_path, capsys, 
             places.append(folder)
         for out in places:
             before = contents(tmp_path)
-            words = [*commands(kept["a data set"], kept["a run"], out)[name], "--out", str(out)]
+            words = [*commands(kept["a data set"], kept["a run"])[name], "--out", str(out)]
             with pytest.raises(SystemExit) as end:
                 main(words)
             error = capsys.readouterr().err.strip()

@@ -40,8 +40,7 @@ def representations(runs: list[Run], gaps: list[Row]) -> list[Row]:
             costs = {"finetune_seconds": run.seconds, "git_commit": run.record.get("git_commit", "")}
             scores = {"score": score, "return": score * SCORE_DIVISOR}
             table.append(identity | run.representation | scores | costs | {"state": run.progress})
-    known = list(table[0]) if table else [*IDENTITY, "state"]
-    return sorted([*table, *(dict.fromkeys(known) | gap for gap in gaps)], key=_table_order)
+    return sorted([*table, *(dict.fromkeys(_RUN) | gap for gap in gaps)], key=_table_order)
 
 
 def improvement(rows: list[Row]) -> list[Row]:
@@ -145,6 +144,10 @@ def aggregate(rows: list[Row], gaps: list[Row]) -> list[Row]:
     return sorted(table, key=_table_order)
 
 
+_RUN = (
+    *(*IDENTITY, "action_loss", "probe_pose", "probe_velocity", "pretrain_seconds"),
+    *("score", "return", "finetune_seconds", "git_commit", "state"),
+)
 _MEASURED = ("step", "score", "low", "high", "seeds", "episodes", "few_seeds", "best_score", "best_step")
 
 

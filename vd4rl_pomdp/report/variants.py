@@ -6,7 +6,7 @@ run has its own config, its encoder's, and the data of both.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import fields
 from typing import Any
 
@@ -68,50 +68,52 @@ def differences(settings: list[Settings], corruption: list[str], place: list[tup
         place: where each run stands (task, quality, corruption): sets are told apart within one place.
         brief: whether a preset stands for all the settings that it decides.
     """
-    shared = [{k: v for k, v in one.items() if k not in _CORRUPTION and k not in _DATA} for one in settings]
-    of_corruption = [{k: v for k, v in one.items() if k in _CORRUPTION} for one in settings]
-    data = [{k: v for k, v in one.items() if k in _DATA} for one in settings]
     columns = (
-        _name(shared, "unset", brief),
-        _by_scope(of_corruption, corruption, "unset", brief),
-        _by_scope(data, place, _NOT_RECORDED, brief),
+        _by_scope(settings, [None] * len(settings), lambda name: name not in _CORRUPTION and name not in _DATA, brief),
+        _by_scope(settings, corruption, _CORRUPTION.__contains__, brief),
+        _by_scope(settings, place, _DATA.__contains__, brief),
     )
     return list(zip(*columns, strict=True))
 
 
-def _by_scope(settings: list[Settings], scope: Sequence[Any], absent: str, brief: bool) -> list[str]:
+def _by_scope(settings: list[Settings], scope: Sequence[Any], wanted: Callable[[str], bool], brief: bool) -> list[str]:
+    """What differs of the wanted settings among runs of one scope, run by run."""
     words = [""] * len(settings)
     for key in dict.fromkeys(scope):
         members = [number for number, other in enumerate(scope) if other == key]
-        for number, text in zip(members, _name([settings[i] for i in members], absent, brief), strict=True):
+        for number, text in zip(members, _name([settings[i] for i in members], wanted, brief), strict=True):
             words[number] = text
     return words
 
 
-def _name(settings: list[Settings], absent: str, brief: bool) -> list[str]:
-    """What differs among some settings: "max_k 1, patch_size 48"."""
-    names = [name for name in dict.fromkeys(n for one in settings for n in one) if _differs(settings, name, absent)]
+def _name(settings: list[Settings], wanted: Callable[[str], bool], brief: bool) -> list[str]:
+    """What differs among some settings: "max_k 1, steps 20"."""
+    known = filter(wanted, dict.fromkeys(name for one in settings for name in one))
+    names = [name for name in known if _differs(settings, name)]
     deciding: list[str] = []
     for preset in _PRESETS if brief else ():
-        if preset in names and not _decided(settings, preset, deciding, absent):
+        if preset in names and not _decided(settings, preset, deciding):
             deciding.append(preset)
-    names = [n for n in names if n in deciding or not _decided(settings, n, deciding, absent)]
-    return [", ".join(f"{n} {v}" for n in names if (v := _value(one, n, absent))) for one in settings]
+    names = [name for name in names if name in deciding or not _decided(settings, name, deciding)]
+    return [", ".join(f"{name} {value}" for name in names if (value := _value(one, name))) for one in settings]
 
 
-def _value(settings: Settings, name: str, absent: str) -> str:
-    """A value in words; none where it is not known."""
-    unknown = "" if UNKNOWN in settings or name == UNKNOWN else absent
-    return settings.get(name, unknown)
+def _value(settings: Settings, name: str) -> str:
+    """A value in words; none where an encoder does not say how it was pretrained."""
+    if name in settings:
+        return settings[name]
+    if name in _DATA:
+        return _NOT_RECORDED
+    return "" if UNKNOWN in settings or name == UNKNOWN else "unset"
 
 
-def _differs(settings: list[Settings], name: str, absent: str) -> bool:
-    values = {_value(one, name, absent) for one in settings}
+def _differs(settings: list[Settings], name: str) -> bool:
+    values = {_value(one, name) for one in settings}
     return len(values if name == UNKNOWN else values - {""}) > 1
 
 
-def _decided(settings: list[Settings], name: str, by: Iterable[str], absent: str) -> bool:
+def _decided(settings: list[Settings], name: str, by: Iterable[str]) -> bool:
     """Whether a setting that differs is the same wherever those of `by` are."""
-    deciding = [tuple(_value(one, other, absent) for other in by) for one in settings]
-    pairs = {(first, _value(one, name, absent)) for first, one in zip(deciding, settings, strict=True)}
+    deciding = [tuple(_value(one, other) for other in by) for one in settings]
+    pairs = {(first, _value(one, name)) for first, one in zip(deciding, settings, strict=True)}
     return len(pairs) == len(set(deciding))
