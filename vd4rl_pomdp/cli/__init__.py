@@ -25,7 +25,9 @@ COMMANDS: Table = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vd4rl-pomdp`."""
     words = list(sys.argv[1:] if arguments is None else arguments)
-    _show_everything()
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # of what a terminal cannot show, the number
     try:
         run_stage(words)
     except UserError as error:
@@ -42,10 +44,3 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except OSError as error:
         print(f"error: {disk_error(error.filename, error)}", file=sys.stderr)
         sys.exit(2)
-
-
-def _show_everything() -> None:
-    """Spell out what the output's encoding lacks, as Python does on stderr: a name in Greek ends no command."""
-    for stream in (sys.stdout, sys.stderr):
-        if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")

@@ -97,7 +97,7 @@ def write_json(path: Path, value: Any) -> None:
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
     """Write a CSV file, its header first, so that a reader sees it whole or not at all."""
-    with replacing_file(path) as fresh, fresh.open("w", newline="") as file:
+    with replacing_file(path) as fresh, fresh.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
