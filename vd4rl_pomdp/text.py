@@ -12,7 +12,7 @@ _MARKS = re.compile(r"([\\*\[\]~]|(?<!\w)_|_(?!\w))")
 
 def one_line(text: str) -> str:
     """Text on one line, with a question mark for every character that cannot be shown."""
-    return "".join(c if c.isprintable() else "?" for c in " ".join(text.split()))
+    return "".join(c if c.isprintable() else "?" for c in " ".join(text.splitlines()).replace("\t", " "))
 
 
 def markdown(text: str) -> str:

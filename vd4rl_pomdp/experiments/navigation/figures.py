@@ -14,7 +14,7 @@ from matplotlib.patches import Rectangle
 
 from vd4rl_pomdp.experiments.navigation.claims import paper_number
 from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, REFERENCES, Cell
-from vd4rl_pomdp.experiments.navigation.rows import Run, Value
+from vd4rl_pomdp.experiments.navigation.rows import Run, Value, is_missing
 from vd4rl_pomdp.mazes import FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
 
 _ESTIMATE = "#d55e00"
@@ -65,17 +65,11 @@ def _bar(axes: Any, place: float, cell: Cell, runs: list[Run], value: Value, col
     if accuracy:
         axes.bar(place, np.mean(accuracy), _WIDTH, color=colour)
         axes.plot([place] * len(accuracy), accuracy, **_SEED)
-    elif _is_expected(cell):
+    elif is_missing(cell, runs):
         axes.plot(place, 2, **_NO_RUN)
     paper = paper_number(cell, ("state_error", "training", "online", "all", 0))
     if paper is not None:
         axes.plot(place, 100 - paper, **_MARK)
-
-
-def _is_expected(cell: Cell) -> bool:
-    """Whether a bar belongs there: the paper has the cell, or it is a reference at its one K."""
-    reference = cell.method in REFERENCES and cell == Cell(cell.maze, cell.method)
-    return reference or paper_number(cell, ("state_error", "training", "online", "all", 0)) is not None
 
 
 def trajectories(runs: list[Run], path: Path, methods: tuple[str, ...] = ("mik+a", "ah+a", "no_history")) -> bool:

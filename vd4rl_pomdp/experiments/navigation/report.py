@@ -20,7 +20,7 @@ from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import paper_number, verdict_lines
 from vd4rl_pomdp.experiments.navigation.collect import PRESETS
 from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, REFERENCES, UNTRAINED, Cell, cell_of, paper_rows
-from vd4rl_pomdp.experiments.navigation.rows import ROWS, Run, Value, load_runs, save_runs, unfinished_runs
+from vd4rl_pomdp.experiments.navigation.rows import ROWS, Run, Value, is_missing, load_runs, save_runs, unfinished_runs
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.report.stats import bootstrap_interval, mean
 from vd4rl_pomdp.runs.folder import write_csv
@@ -58,6 +58,8 @@ class Entry:
     """(n,) one for each seed."""
     of: int
     """Seeds that runs of the maze have, of whatever cell."""
+    missing: bool
+    """Whether other runs have its maze, and others what it trains."""
 
     @property
     def paper(self) -> float | None:
@@ -65,10 +67,10 @@ class Entry:
         return paper_number(self.cell, self.value)
 
     def text(self) -> str:
-        """Mean, interval, seeds, and the paper's number in brackets; a cell without a run says so."""
+        """Mean, interval, seeds, and the paper's number in brackets; a run that is missing is said to be."""
         paper = "" if self.paper is None else f"({self.paper:.1f})"
         if not len(self.numbers):
-            return f"no run {paper}".rstrip()
+            return f"no run {paper}".rstrip() if self.missing else paper
         interval = self.interval()
         spread = "" if interval is None else f" [{interval[0]:.1f}, {interval[1]:.1f}]"
         seeds = f"n={len(self.numbers)}" + (f" of {self.of}" if len(self.numbers) < self.of else "")
@@ -186,7 +188,7 @@ def _by_k_table(runs: list[Run]) -> Table:
 def _entry(cell: Cell, value: Value, runs: list[Run]) -> Entry:
     numbers = [run.values[value] for run in runs if run.cell == cell and value in run.values]
     seeds = {run.seed for run in runs if run.cell.maze == cell.maze}
-    return Entry(cell, value, np.array(numbers), len(seeds))
+    return Entry(cell, value, np.array(numbers), len(seeds), is_missing(cell, runs))
 
 
 _OWN_TITLES = {
@@ -207,7 +209,8 @@ def _page(
         *(f"Unfinished, in no table: {code(str(path))} {state}.  " for path, state in unfinished),
         *([""] if unfinished else []),
         "A cell of a table reads: **mean over seeds** [95% bootstrap interval] n=seeds (the paper's number).",
-        'Intervals of few seeds are too narrow. "n=1 of 3": other cells of the maze have three seeds.',
+        'Intervals of few seeds are too narrow. Missing: "n=1 of 3" where other cells of the maze have three seeds,',
+        '"no run" where other cells of the maze, and other mazes of the row, have one.',
         "",
         "![Accuracy of every objective](figures/accuracy.png)",
         "",
@@ -272,6 +275,7 @@ def _write_tables(tables: list[Table], path: Path) -> None:
         for table in tables
         for label, entries in table.lines()
         for maze, entry in zip(table.mazes, entries, strict=True)
+        if len(entry.numbers) or entry.missing
     )
     write_csv(path, names, rows)
 

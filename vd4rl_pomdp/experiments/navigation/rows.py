@@ -7,7 +7,7 @@ import math
 import shlex
 import shutil
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -121,6 +121,16 @@ def load_runs(sources: Iterable[Path]) -> list[Run]:
         raise UserError(f"runs of different presets ({', '.join(presets)}) do not make one table; report them apart")
     _refuse_mixtures(runs.values())
     return sorted(runs.values(), key=lambda run: tuple(run.identity.values()))
+
+
+def is_missing(cell: Cell, runs: Iterable[Run]) -> bool:
+    """Whether no run has a cell, though others are in its maze and others are like it in another maze."""
+    cells = {run.cell for run in runs}
+    return (
+        cell not in cells
+        and any(other.maze == cell.maze for other in cells)
+        and any(replace(other, maze=cell.maze) == cell for other in cells)
+    )
 
 
 def unfinished_runs(sources: Iterable[Path]) -> list[tuple[Path, str]]:
