@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from itertools import groupby
 from typing import Any
 
@@ -24,7 +24,7 @@ def find_gaps(runs: list[Run]) -> list[Row]:
     rows = []
     for place in dict.fromkeys(map(_place, grid)):
         here = [run for run in grid if _place(run) == place]
-        for algorithm, method, variant in dict.fromkeys(_expected(grid, here, place)):
+        for algorithm, method, variant in _expected(grid, place):
             mine = {
                 run.labels["seed"]: run
                 for run in here
@@ -46,25 +46,36 @@ def _state(run: Run | None) -> str:
     return MISSING if run is None or run.finished else run.progress
 
 
-def _expected(grid: list[Run], here: list[Run], place: Place) -> Iterator[tuple[str, str, str]]:
-    """Algorithm, method and variant of every run that one setting, whose runs are `here`, could have.
+def _expected(grid: list[Run], place: Place) -> Iterator[tuple[str, str, str]]:
+    """Algorithm, method and variant of every run that a setting is to have.
 
     What differs between fields of a corruption is asked for wherever that corruption is, other data nowhere else.
     """
-    for run in grid:
-        same = [other for other in grid if _method(other) == _method(run)]
-        of_corruption = [other for other in same if other.labels["corruption"] == place[2]]
-        for fields in {other.parts[1]: None for other in of_corruption} or [""]:
-            data = {
-                other.parts[2]: None for other in here if _method(other) == _method(run) and other.parts[1] == fields
-            }
-            for name in data or [""]:
-                parts = run.parts[0], fields, name
-                yield run.labels["algorithm"], run.labels["method"], ", ".join(filter(None, parts))
+    for algorithm, method in dict.fromkeys(map(_method, grid)):
+        mine = [run for run in grid if _method(run) == (algorithm, method)]
+        for shared in _shared(mine, place):
+            alike = [run for run in mine if run.parts[0] == shared and run.labels["corruption"] == place[2]]
+            for fields in {run.parts[1]: None for run in alike} or [""]:
+                here = [run for run in alike if run.parts[1] == fields and _place(run) == place]
+                for data in {run.parts[2]: None for run in here} or [""]:
+                    yield algorithm, method, ", ".join(filter(None, (shared, fields, data)))
 
 
-def _method(run: Run) -> tuple[str, str, str]:
-    return run.labels["algorithm"], run.labels["method"], run.parts[0]
+def _shared(mine: list[Run], place: Place) -> Iterable[str]:
+    """Variants of a method that a setting is to have: those of every setting that has one in common with it.
+
+    Settings of which each has its own, such as a budget for every task, ask for nothing of one another.
+    """
+    by_place: dict[Place, dict[str, None]] = {}
+    for run in mine:
+        by_place.setdefault(_place(run), {})[run.parts[0]] = None
+    own = by_place.get(place)
+    wanted = [there for there in by_place.values() if own is None or own.keys() & there.keys()]
+    return {variant: None for there in wanted for variant in there}
+
+
+def _method(run: Run) -> tuple[str, str]:
+    return run.labels["algorithm"], run.labels["method"]
 
 
 def in_words(gaps: list[Row]) -> str:
