@@ -26,6 +26,7 @@ from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.folder import read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.loop import Loop, training
+from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.tasks import FRAME_SIZE, get_task
@@ -39,6 +40,7 @@ def finetune(config: FinetuneConfig) -> RunFolder:
         alpha=0, views=0, shift=(0, FRAME_SIZE - 1), eval_every=1, eval_episodes=1, eval_length=1, log_every=1,
         checkpoint_every=1, workers=0,
     )  # fmt: skip
+    refuse_inside(config.out)
     device = pick_device(config.device)
     dataset = open_dataset(config.data)
     dataset.require_transitions()

@@ -18,9 +18,12 @@ from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
 from vd4rl_pomdp.nn.frame import check_frame_encoder
 from vd4rl_pomdp.objective import Objective
 from vd4rl_pomdp.runs.device import autocast, pick_device
+from vd4rl_pomdp.runs.folder import jsonable
 from vd4rl_pomdp.runs.loop import training
 from vd4rl_pomdp.runs.metrics import read_metrics
+from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
+from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, get_task
 from vd4rl_pomdp.types import Windows
@@ -32,6 +35,7 @@ def pretrain(config: PretrainConfig) -> RunFolder:
     """Run the stage, or go on with it, and write `out/encoder`; returns the run's folder."""
     method = get_method(config.method)
     _check(config)
+    refuse_inside(config.out)
     dataset = open_dataset(config.data)
     task = _task_of(dataset, config)
     seed_networks(config.seed, STAGE)
@@ -154,6 +158,7 @@ def _card(config: PretrainConfig, task: str, dataset: Dataset, run: RunFolder) -
         end_to_end=get_method(config.method).end_to_end,
         action_loss=_last_action_loss(run),
         data=dataset.fingerprint,
+        settings=settings_of(jsonable(asdict(replace(config, task=task)))),
     )
 
 

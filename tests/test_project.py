@@ -57,6 +57,30 @@ def test_nothing_is_read_by_pickle_or_eval():
     assert [p for p in SOURCES if forbidden.search(p.read_text())] == []
 
 
+def _names_no_encoding(call: ast.Call) -> bool:
+    name = getattr(call.func, "attr", getattr(call.func, "id", ""))
+    if name not in ("open", "read_text", "write_text") or ast.unparse(call.func) in ("Image.open", "os.open"):
+        return False
+    words = [node.value for a in call.args for node in ast.walk(a) if isinstance(node, ast.Constant)]
+    binary = any(isinstance(word, str) and "b" in word and set(word) <= set("abrwx+") for word in words)
+    return (
+        not binary
+        and not {k.arg for k in call.keywords} & {"encoding", None}
+        and ast.unparse(call.func) != "write_text"
+    )
+
+
+def test_text_files_are_utf8_whatever_the_machine_speaks():
+    elsewhere = {"vd4rl_pomdp/runs/checkpoint.py", "vd4rl_pomdp/runs/folder.py", "vd4rl_pomdp/runs/metrics.py"}
+    calls = [
+        f"{path.relative_to(ROOT).as_posix()}:{node.lineno}"
+        for path in SOURCES
+        for node in ast.walk(ast.parse(path.read_text()))
+        if isinstance(node, ast.Call) and _names_no_encoding(node)
+    ]
+    assert [call for call in calls if call.split(":")[0] not in elsewhere] == []
+
+
 def test_dependencies_are_bounded_above():
     project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
     extras = [entry for group in project["optional-dependencies"].values() for entry in group]

@@ -96,6 +96,18 @@ def encoder(data, tmp_path) -> Path:
     return run_pretrain(smoke_pretrain(data, tmp_path / "pretrained")).path / "encoder"
 
 
+def test_an_encoder_tells_how_it_was_pretrained_and_an_older_one_still_loads(encoder, data):
+    settings = load_encoder(encoder)[1].settings
+    assert (settings["method"], settings["max_k"], settings["corruption"], settings["task"]) == (
+        *("mik+a", 3, "patch+zero_frames", "walker_walk"),
+    )
+    assert not {"seed", "data", "out", "device", "log_every", "checkpoint_every", "wandb"} & set(settings)
+    config = json.loads((encoder / "config.json").read_text())
+    del config["pretrain"]["settings"]
+    (encoder / "config.json").write_text(json.dumps(config))
+    assert load_encoder(encoder)[1].settings == {}
+
+
 def smoke_finetune(encoder: Path, data: Path, out: Path, **changes: object) -> finetune.config.FinetuneConfig:
     return replace(finetune.config.PRESETS["smoke"], encoder=encoder, data=data, out=out, workers=1, **changes)
 

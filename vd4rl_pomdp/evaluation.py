@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import csv
+import io
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
@@ -137,27 +139,36 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         return []
     whole = ("seed", "step", "episode", "episode_seed", "length")
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8") as file:
             reader = csv.DictReader(file)
             missing = [name for name in COLUMNS if name not in (reader.fieldnames or [])]
             if missing:
                 raise UserError(f"{path}: has no column {missing[0]!r}; it was not written by this package")
-            return [
-                row | {k: int(row[k]) for k in whole} | {k: float(row[k]) for k in ("return", "score")}
-                for row in reader
-            ]
+            return [row | {k: int(row[k]) for k in whole} | _scores(path, row) for row in reader]
     except UserError:
         raise
     except (ValueError, TypeError) as error:
         raise UserError(f"{path}: a row is not whole ({error}); remove it") from error
 
 
+def _scores(path: Path, row: dict[str, str]) -> dict[str, float]:
+    scores = {name: float(row[name]) for name in ("return", "score")}
+    for name, value in scores.items():
+        if not math.isfinite(value):
+            raise UserError(
+                f"{path}: the {name} of seed {row['seed']}, step {row['step']}, episode {row['episode']} is {value}; "
+                "its policy has diverged: train it again with a lower --learning-rate, or leave the run out"
+            )
+    return scores
+
+
 def drop_rows_after(path: Path, step: int) -> None:
     """Forget evaluations that a cut run made after its last checkpoint, and a last line that is not whole."""
     if not path.exists():
         return
-    whole = path.read_text().rpartition("\n")[0].splitlines()
-    kept = [row for row in csv.DictReader(whole) if int(row["step"]) <= step]
+    with path.open(newline="", encoding="utf-8") as file:
+        whole = file.read().rpartition("\n")[0]
+    kept = [row for row in csv.DictReader(io.StringIO(whole, newline="")) if int(row["step"]) <= step]
     if kept:
         write_csv(path, COLUMNS, kept)
     else:

@@ -105,7 +105,7 @@ def _loss_rows(split: str, logs: dict[str, float]) -> list[dict[str, Any]]:
 
 def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]:
     """Means of the logged intervals that end in the last `average_last` steps."""
-    logged = [json.loads(line) for line in path.read_text().splitlines()]
+    logged = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
     last = [row for row in logged if row["step"] > config.steps - config.average_last]
     values: dict[str, list[float]] = defaultdict(list)
     for row in last:
@@ -122,7 +122,7 @@ def write_trajectory(path: Path, trainer: Trainer, probe: StateProbe) -> None:
     past, rows = encode(trainer, torch.tensor([_window_at(dataset, start, length)]), length)
     estimate = (probe(past)[0].detach() * states.std + states.mean).cpu()
     truth = (states.values[rows[0]] * states.std + states.mean).cpu()
-    with replacing_file(path) as fresh, fresh.open("w", newline="") as file:
+    with replacing_file(path) as fresh, fresh.open("w", newline="", encoding="utf-8") as file:
         writer = csv.writer(file)
         names = ("x", "y", "vx", "vy")
         writer.writerow(["t", *names, *(f"estimated_{name}" for name in names), "hidden"])

@@ -20,14 +20,17 @@ from vd4rl_pomdp.experiments.navigation.grid import UNTRAINED
 from vd4rl_pomdp.experiments.navigation.observations import SHAPES
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
 from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.folder import write_json
+from vd4rl_pomdp.runs.folder import jsonable, write_json
+from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
+from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.seeding import seed_networks
 
 
 def train(config: NavigationConfig) -> RunFolder:
     """Run the stage, or go on with it; returns the run's folder."""
     _check(config)
+    refuse_inside(config.out)
     data = open_data(config)
     seed_networks(config.seed, STAGE)
     objective = make_objective(data, config)
@@ -54,6 +57,7 @@ def _conclude(run: RunFolder, trainer: Trainer) -> None:
         steps=trainer.step,
         preset=config.preset,
         data=data.dataset.fingerprint,
+        settings=settings_of(jsonable(asdict(config))),
     )
     save_encoder(run.path / "encoder", trainer.objective.encoder, card)
     record = {"maze": data.maze.name, "set": data.dataset.fingerprint, "command": shlex.join(command_of(config))}

@@ -1,3 +1,6 @@
+import json
+import re
+
 import numpy as np
 import pytest
 from PIL import Image
@@ -8,6 +11,7 @@ from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import QUALITIES, SET_QUALITIES, TASKS
+from vd4rl_pomdp.text import markdown
 
 MADE = {"task": "cheetah_run", "set": "medium_replay", "policy": "medium_replay", "seed": 7, "render": "fast"}
 
@@ -67,3 +71,17 @@ def test_what_is_no_set_gets_no_card(tmp_path):
 def test_every_set_has_a_published_score():
     assert {(row["env"], row["dataset"]) for row in published_scores()} == {(t, q) for t in TASKS for q in QUALITIES}
     assert set(module.HOW) == set(SET_QUALITIES)
+
+
+def test_a_card_shows_names_as_they_are_whatever_they_hold(tmp_path):
+    hostile = "$\\frac$ | `a` <img src=x>\n# b"
+    folder = write_fake_set(tmp_path / "set", attributes=MADE | {"set": hostile, "policy": "a|b", "actor_sha256": "f0"})
+    record = {"command": f"vd4rl-pomdp --out 'x|`y`\n{hostile}'", "git_commit": "<b>", "versions": {"torch": "2|3"}}
+    (folder / "provenance.json").write_text(json.dumps(record))
+    text = write_card(folder).read_text(encoding="utf-8")
+    assert [line for line in text.splitlines() if line.startswith("#")] == [f"# cheetah_run, {markdown(hostile)}"]
+    rows = [line for line in text.splitlines() if line.startswith("| ")][1:]
+    assert all(len(re.findall(r"(?<!\\)\|", row)) == 3 for row in rows), "two cells a row"
+    assert "<b>" not in text
+    assert "<img" not in re.sub("(`+) .*? \\1", "", text), "outside of the command, which is code"
+    assert (folder / "card.png").stat().st_size > 5_000

@@ -23,6 +23,7 @@ from vd4rl_pomdp.experiments.navigation.report import write_report
 from vd4rl_pomdp.experiments.navigation.rows import load_runs
 from vd4rl_pomdp.mazes import FREE_CELLS, MAZES
 
+ROOT = Path(__file__).parents[2]
 STATE = ("state_error", "held_out", "refit", "all", 0)
 
 
@@ -152,6 +153,81 @@ def test_seeds_of_another_budget_or_set_make_no_mean(tmp_path):
             load_runs([tmp_path / "runs"])
         (folder / name).write_text(json.dumps(before))
     assert len(load_runs([tmp_path / "runs"])) == 2
+
+
+def test_seeds_of_other_settings_make_no_mean_and_other_logging_does(tmp_path):
+    folders = [write_run(tmp_path / "runs", Cell("no_curtain", "ah"), seed, 9.0) for seed in (0, 1)]
+    whole = [json.loads((folder / "config.json").read_text()) for folder in folders]
+
+    def say(*flags: str) -> None:
+        for folder, record, more in zip(folders, whole, flags, strict=True):
+            text = json.dumps(record | {"command": f"{record['command']} {more}"})
+            (folder / "config.json").write_text(text)
+
+    for one, other in (("--codes 6", ""), ("--codes 6", "--codes 20"), ("--no-k-embedding", ""), ("", "--window=16")):
+        say(one, other)
+        with pytest.raises(UserError, match=r"seeds 0 and 1 differ in their (codes|no_k_embedding|window)"):
+            load_runs([tmp_path / "runs"])
+    say("--learning-rate 1e-3 --device cpu --log-every 10 --wandb=off", "--learning-rate=0.001 --data elsewhere")
+    assert len(load_runs([tmp_path / "runs"])) == 2
+    say("--codes '6", "")
+    with pytest.raises(UserError, match="command is damaged"):
+        load_runs([tmp_path / "runs"])
+
+
+@pytest.mark.parametrize("folder", ["navigation", "navigation/longer"])
+def test_the_committed_rows_make_a_report(folder):
+    assert len(load_runs([ROOT / "results" / folder])) >= 2
+
+
+def test_missing_cells_seeds_and_unfinished_runs_are_shown(runs, tmp_path, monkeypatch):
+    assert "no run (" not in write_report([runs], tmp_path / "whole", pictures=False).read_text()
+    write_run(tmp_path / "runs", Cell("no_curtain", "no_history"), 0, 50.0)
+    (runs / "three_curtains" / "mik-K15" / "seed1" / "timing.json").unlink()
+    (runs / "three_curtains" / "mik-K15" / "seed1" / "metrics.jsonl").write_text('{"step": 40}\n')
+    config = json.loads((runs / "three_curtains" / "mik-K15" / "seed1" / "config.json").read_text())
+    config["config"]["steps"] = 2500
+    (runs / "three_curtains" / "mik-K15" / "seed1" / "config.json").write_text(json.dumps(config))
+    page = write_report([runs], tmp_path / "out", pictures=False).read_text()
+    assert f"`{runs}/three_curtains/mik-K15/seed1` at 40 of 2500 steps." in page
+    line = next(line for line in page.splitlines() if line.startswith("| MIK, K=15 |"))
+    assert "n=2 of 3 (13.1)" in line
+    assert line.startswith("| MIK, K=15 | no run (6.6) | (12.3) |"), "nobody has been in the other mazes"
+    rows = list(csv.DictReader((tmp_path / "out" / "tables.csv").open()))
+    missing = [row for row in rows if row["row"] == "MIK, K=15" and row["maze"] == "no_curtain"]
+    assert {(row["seeds"], row["mean"]) for row in missing} == {("0", "")}
+    marked = []
+    monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda axes, *at, **style: marked.append(style.get("marker")))
+    figures.accuracy_bars(load_runs([runs]), STATE, tmp_path / "bars.png")
+    assert marked.count("x") == 9, "in no_curtain: six objectives and random at K = 15, two at K = 1"
+
+
+def test_a_navigation_report_writes_over_nothing_but_an_earlier_one(runs, tmp_path):
+    (tmp_path / "mine").mkdir()
+    (tmp_path / "mine" / "README.md").write_text("mine")
+    run = runs / "three_curtains" / "mik-K15" / "seed0"
+    for out in (tmp_path / "mine", runs, run, run / "report"):
+        with pytest.raises(UserError, match="choose another --out"):
+            write_report([runs], out, pictures=False)
+    assert (tmp_path / "mine" / "README.md").read_text() == "mine"
+    first = write_report([runs], tmp_path / "out", pictures=False).read_text()
+    assert write_report([tmp_path / "out"], tmp_path / "out", pictures=False).read_text() == first
+
+
+@pytest.mark.parametrize("value", ["nan", "inf"])
+def test_a_result_that_is_no_number_is_refused(runs, tmp_path, value):
+    write_report([runs], tmp_path / "out", pictures=False)
+    lines = (tmp_path / "out" / "rows.csv").read_text().splitlines(keepends=True)
+    lines[4] = lines[4].rpartition(",")[0] + f",{value}\n"
+    (tmp_path / "out" / "rows.csv").write_text("".join(lines))
+    with pytest.raises(UserError, match=f"rows.csv: a [a-z_]+ is {value}: the run has diverged"):
+        load_runs([tmp_path / "out"])
+    results = runs / "three_curtains" / "mik-K15" / "seed0" / "results.json"
+    stored = json.loads(results.read_text())
+    stored["rows"][0]["value"] = float(value)
+    results.write_text(json.dumps(stored))
+    with pytest.raises(UserError, match=r"results\.json: a state_error is"):
+        load_runs([runs])
 
 
 def test_the_grid_of_the_paper_holds_every_cell_of_its_tables():

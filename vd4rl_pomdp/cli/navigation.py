@@ -75,8 +75,10 @@ class GridCommand:
 
 def _grid(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.experiments.navigation.grid import grid_commands
+    from vd4rl_pomdp.runs.outputs import refuse_kept
 
     command = parse(GridCommand, words, program)
+    refuse_kept(command.out)
     where = (tuple(command.mazes), tuple(command.seeds), command.preset, command.data, command.out)
     for stage in grid_commands(command.grid, *where):
         run_stages([stage], command.dry_run)

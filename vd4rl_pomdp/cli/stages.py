@@ -47,9 +47,11 @@ class EvaluateCommand:
 
 def _evaluate(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.evaluation import append_rows, evaluate_run
+    from vd4rl_pomdp.runs.outputs import refuse_inside
 
     command = parse(EvaluateCommand, words, program)
     if command.out is not None:
+        refuse_inside(command.out)
         append_rows(command.out, [])  # before any episode is played
     rows = evaluate_run(command.run, command.corruption, command.episodes, command.workers)
     if command.out is not None:
@@ -87,10 +89,12 @@ class SweepCommand:
 
 
 def _sweep(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.runs.outputs import refuse_kept
     from vd4rl_pomdp.runs.sweep import sweep_runs
 
     command = parse(SweepCommand, words, program)
     _check_names(command)
+    refuse_kept(command.out)
     for run in sweep_runs(command):
         run_stages(run, command.dry_run)
 

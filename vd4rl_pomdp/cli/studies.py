@@ -43,11 +43,13 @@ class TheoryCommand:
 
 
 def _theory(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.report.theory import print_theory, write_theory
+    from vd4rl_pomdp.report.theory import FILE, print_theory, write_theory
+    from vd4rl_pomdp.runs.outputs import refuse_foreign
     from vd4rl_pomdp.theory import theory_study
 
     command = parse(TheoryCommand, words, program)
     if command.out is not None:
+        refuse_foreign(command.out, "study of the theory", FILE)
         command.out.mkdir(parents=True, exist_ok=True)  # before anything is computed
     study = theory_study()
     if command.json:

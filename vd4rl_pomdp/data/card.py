@@ -19,6 +19,7 @@ from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.folder import read_json
 from vd4rl_pomdp.tasks import SCORE_DIVISOR
+from vd4rl_pomdp.text import code, markdown, plain, write_text
 from vd4rl_pomdp.types import StepType
 
 FILM_FRAMES = 10
@@ -69,7 +70,7 @@ def write_card(path: Path) -> Path:
     text = _text(path, names, attributes, returns, lengths, published)
     try:
         (path / "card.png").write_bytes(_picture(names, returns, published, film))
-        (path / "card.md").write_text(text)
+        write_text(path / "card.md", text)
     except OSError as error:
         raise disk_error(path / "card.md", error) from error
     return path / "card.md"
@@ -107,7 +108,7 @@ def _picture(
     if published is not None:
         label = f"published: plain BC on V-D4RL's set of this name, {published:.0f}"
         above.axvline(published, ymax=LINES, color="#d55e00", ls="--", label=label)
-    above.set(xlabel="episode return", ylabel="episodes", title=_title(names))
+    above.set(xlabel="episode return", ylabel="episodes", title=plain(_title(names)))
     above.set(xlim=(0, edges[-1]), ylim=(0, counts.max() / LINES))
     above.yaxis.get_major_locator().set_params(integer=True)
     above.spines[["top", "right"]].set_visible(False)
@@ -141,18 +142,21 @@ def _text(
         "return, lowest to highest": f"{returns.min():.3f} to {returns.max():.3f}",
         "return, quartiles": ", ".join(f"{q:.1f}" for q in np.quantile(returns, (0.25, 0.5, 0.75))),
         "published return of plain BC on V-D4RL's set": "none" if published is None else f"{published:.0f}",
-    } | _origin(path, attributes)
-    table = "\n".join(f"| {name} | {value} |" for name, value in rows.items())
+    }
+    lines = {name: markdown(str(value)) for name, value in rows.items()} | _origin(path, attributes)
+    table = "\n".join(f"| {name} | {value} |" for name, value in lines.items())
     how = HOW.get(names[1] or "", "") if attributes[0] else "A published set, or one that records no origin."
-    return f"# {_title(names)}\n\n{how}\n\n| | |\n|---|---|\n{table}\n\n![Returns and a film strip](card.png)\n"
+    return (
+        f"# {markdown(_title(names))}\n\n{how}\n\n| | |\n|---|---|\n{table}\n\n![Returns and a film strip](card.png)\n"
+    )
 
 
 def _span(low: Any, high: Any) -> str:
     return f"{low}" if low == high else f"{low} to {high}"
 
 
-def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, Any]:
-    """Seed, actors, rendering, versions and commit, as the shards and provenance.json record them."""
+def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, str]:
+    """Seed, actors, rendering, versions and commit, as the shards and provenance.json record them, in Markdown."""
     if not attributes[0]:
         return {}
     first = attributes[0]
@@ -168,5 +172,6 @@ def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, Any]:
         facts["canary frames"] = rendered.get("canary")
         facts["versions"] = ", ".join(f"{k} {v}" for k, v in provenance.get("versions", {}).items())
         facts["commit"] = provenance.get("git_commit")
-        facts["command"] = f"`{provenance.get('command')}`"
-    return {name: value for name, value in facts.items() if value not in (None, "")}
+        facts["command"] = provenance.get("command")
+    shown = {markdown(name): str(value) for name, value in facts.items() if value not in (None, "")}
+    return {name: code(value) if name == "command" else markdown(value) for name, value in shown.items()}

@@ -19,6 +19,7 @@ from vd4rl_pomdp.data.format import PLAN, RECORD, write_shard
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.folder import holds_anything, jsonable, read_json, write_json
+from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
@@ -86,6 +87,7 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
         length: decisions an episode; everything but tests keeps the benchmark's.
     """
     _check(config)
+    refuse_inside(config.out)
     plan = list(_plan(config))
     shards = [
         Shard(

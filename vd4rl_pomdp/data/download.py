@@ -19,6 +19,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.folder import replacing_file
+from vd4rl_pomdp.runs.outputs import refuse_kept
 from vd4rl_pomdp.tasks import QUALITIES, get_task
 
 DEFAULT_ENDPOINT = "https://huggingface.co"
@@ -48,7 +49,7 @@ class RemoteFile:
 @cache
 def manifest() -> tuple[RemoteFile, ...]:
     """All published 84-pixel shards."""
-    text = files("vd4rl_pomdp.data").joinpath("manifest.tsv").read_text()
+    text = files("vd4rl_pomdp.data").joinpath("manifest.tsv").read_text(encoding="utf-8")
     rows = csv.DictReader(text.splitlines(), delimiter="\t")
     return tuple(RemoteFile(row["path"], int(row["bytes"]), row["sha256"]) for row in rows)
 
@@ -76,6 +77,7 @@ def download(
         raise UserError(f"unknown quality {quality!r}: choose one of {', '.join(QUALITIES)}")
     if not endpoint.startswith(("http://", "https://")):
         raise UserError(f"endpoint {endpoint!r} is no address; it starts with https:// or http://")
+    refuse_kept(destination)
     wanted = [file for file in manifest() if file.path.split("/")[2:4] == [task, quality]]
     with _progress_bar() as bar:
         total = bar.add_task(f"{task} {quality}", total=sum(file.size for file in wanted))

@@ -135,7 +135,7 @@ def _locked(folder: Path) -> Iterator[None]:
     """Let one process at a time decode into a folder; the others wait and find it done."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
-        file = folder.with_suffix(".lock").open("w")
+        file = folder.with_suffix(".lock").open("w", encoding="utf-8")
     except OSError as error:
         raise disk_error(folder.parent, error) from error
     with file:
@@ -155,7 +155,7 @@ def _decode(shards: Sequence[Path], folder: Path, frame_size: int) -> dict[str, 
         for key, value in rows.items():
             np.save(scratch / f"{key}.npy", value)
         meta = _describe(shards, scratch, len(rows["reward"]))
-        (scratch / _META).write_text(json.dumps(meta, indent=1))
+        (scratch / _META).write_text(json.dumps(meta, indent=1), encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)  # a damaged one
         scratch.rename(folder)
     except OSError as error:

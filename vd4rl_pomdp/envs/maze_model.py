@@ -47,7 +47,7 @@ def build_simulator(spec: MazeSpec) -> tuple[PointEnv, Maze]:
         os.unlink(file)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "maze.xml"
-        path.write_text(xml)
+        path.write_text(xml, encoding="utf-8")
         return PointEnv(xml_file=str(path)), maze
 
 

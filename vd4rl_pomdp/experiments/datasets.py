@@ -21,6 +21,7 @@ from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, repla
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.policies.actor import ships
 from vd4rl_pomdp.runs.folder import read_json, write_csv, write_json
+from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, SET_QUALITIES, get_task
 
@@ -50,6 +51,7 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
         UserError: an unknown task or quality, no episode to time, or a damaged file in the folder.
     """
     _check(tasks, qualities, timed_episodes)
+    refuse_foreign(out, "table of sets", "returns.csv", "sets.csv")
     out.mkdir(parents=True, exist_ok=True)
     returns, costs = _read(out / "returns.csv", RETURNS), _read(out / "costs.csv", COSTS)
     actors = read_json(out / "actors.json") if (out / "actors.json").exists() else {}
@@ -113,7 +115,7 @@ def _cost(task: str, episodes: int) -> Row:
 def _read(path: Path, columns: Sequence[str]) -> list[Row]:
     if not path.exists():
         return []
-    with path.open(newline="") as file:
+    with path.open(newline="", encoding="utf-8") as file:
         reader = csv.DictReader(file)
         if tuple(reader.fieldnames or ()) != columns:
             raise UserError(f"{path}: has other columns than {', '.join(columns)}; remove it or choose another --out")

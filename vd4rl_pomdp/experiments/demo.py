@@ -7,6 +7,8 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
+from vd4rl_pomdp.runs.outputs import refuse_kept
+
 METHODS = ("mik+a", "acro", "random")
 CORRUPTION = "patch+zero_frames"
 EPISODES = 8
@@ -36,6 +38,7 @@ def demo(out: Path, workers: int, run: Callable[[list[str]], None]) -> None:
         workers: processes, 0 for every core.
         run: what carries out one command line.
     """
+    refuse_kept(out)
     started = time.monotonic()
     for words in demo_commands(out, workers):
         print(f"\n$ vd4rl-pomdp {' '.join(words)}", file=sys.stderr)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import hashlib
 import json
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -38,6 +38,8 @@ class EncoderCard:
     """Mean over the last tenth of the pretraining's logged steps, for methods that predict actions."""
     data: str = ""
     """Fingerprint of the set it was pretrained on."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """What the pretraining was told but for seed, folders, device and logging; empty if it was not recorded."""
 
 
 def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard) -> None:

@@ -20,6 +20,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import Actor, Ladder, read_actor, read_ladder
 from vd4rl_pomdp.policies.state_env import StateEnv
 from vd4rl_pomdp.runs.folder import read_json, write_bytes
+from vd4rl_pomdp.runs.outputs import refuse_foreign, refuse_inside
 from vd4rl_pomdp.tasks import Task, get_task
 
 CARD_EPISODES = 20
@@ -51,7 +52,7 @@ def read_curve(run: Path) -> list[tuple[int, float]]:
     """Learning curve of a run: (decisions, mean return) rows; raises UserError if it is damaged."""
     steps, mean = CURVE_COLUMNS
     try:
-        with (run / "curve.csv").open(newline="") as file:
+        with (run / "curve.csv").open(newline="", encoding="utf-8") as file:
             return [(int(row[steps]), float(row[mean])) for row in csv.DictReader(file)]
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{run / 'curve.csv'}: is no learning curve ({error}); take another copy of the run") from error
@@ -79,6 +80,8 @@ def export_run(run: Path, out: Path) -> dict[str, Path]:
         raise UserError(f"{run}: is not the folder of a policy run with a snapshot; `policy train` makes one")
     config = read_json(run / "config.json")
     task = get_task(config.get("task", ""))
+    if out.resolve() != run.resolve():
+        _refuse_other(out, task)
     curve = read_curve(run)
     kept = [row for row in curve if snapshot_path(run, row[0]).exists()]
     if not kept:
@@ -98,6 +101,15 @@ def export_run(run: Path, out: Path) -> dict[str, Path]:
         for quality, step in (("expert", expert), ("medium", medium))
     }
     return files | {"replay": _publish_ladder(run, out, task, [row for row in kept if row[0] <= medium])}
+
+
+def _refuse_other(out: Path, task: Task) -> None:
+    """Raise UserError for a folder to export to that holds anything but an earlier export for the same task."""
+    exported = (out / "curve.csv").is_file() and not (out / "snapshots").exists()
+    if exported and read_json(out / "config.json").get("task") == task.name:
+        refuse_inside(out)
+    else:
+        refuse_foreign(out, f"exported policy of {task.name}")
 
 
 def _judge(run: Path, task: Task, steps: list[int]) -> dict[int, list[float]]:

@@ -34,6 +34,7 @@ from vd4rl_pomdp.policies.export import (
 from vd4rl_pomdp.runs import FORMAT, interrupt
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 from vd4rl_pomdp.runs.folder import holds_anything, jsonable, read_json, write_csv, write_json
+from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.tasks import get_task
 
@@ -52,6 +53,7 @@ def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None]
         The exported files by quality.
     """
     task = get_task(config.task)
+    refuse_inside(config.out)
     _check(config)
     with owned(config.out) as owner:
         settings = _check(config)  # another process may have begun it since

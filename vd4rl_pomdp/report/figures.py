@@ -8,44 +8,71 @@ from typing import Any
 import matplotlib as mpl
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 from PIL import Image
 
 from vd4rl_pomdp.report.tables import label
+from vd4rl_pomdp.text import plain
 
 mpl.rcParams["svg.hashsalt"] = "vd4rl-pomdp"
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
 """Okabe and Ito's palette, which colour-blind readers can tell apart."""
+LEGEND_WIDTH = 34
+"""Characters in a line of a legend."""
+LEGEND_LINE = 0.17
+"""Its height in inches, spacing included: a figure grows with its legend."""
+STRIP_FRAMES = 8
+"""Frames in a film strip, at most."""
 Film = dict[str, np.ndarray]
 
 
-def curve_figure(rows: list[dict[str, Any]], methods: list[str]) -> str:
-    """Score against updates, one line a method, a band from the lowest to the highest seed."""
+def curve_figure(rows: list[dict[str, Any]], methods: list[str], summary: list[dict[str, Any]]) -> str:
+    """Score against updates, one line a method, a band from the lowest to the highest seed.
+
+    The legend has every method of the setting's `summary`, and says of which seeds are missing.
+    """
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     axes = figure.subplots()
+    notes = {label(row): row["missing"] for row in summary if row["missing"]}
     for method in dict.fromkeys(map(label, rows)):
         mine = [row for row in rows if label(row) == method]
         style = _style(methods.index(method))
         steps = [row["step"] for row in mine]
-        axes.plot(steps, [row["score"] for row in mine], marker="o", label=method, markersize=4, **style)
+        name = _noted(method, notes.pop(method, ""))
+        axes.plot(steps, [row["score"] for row in mine], marker="o", label=name, markersize=4, **style)
         axes.fill_between(
             steps, [r["low"] for r in mine], [r["high"] for r in mine], color=style["color"], alpha=0.15, lw=0
         )
+    _list_absent(axes, methods, notes)
     axes.set(xlabel="gradient updates", ylabel="score (return / 10)")
     axes.set_xlim(left=0)
-    axes.set_ylim(bottom=0)
+    axes.set_ylim(0, 1.05 * max(row["high"] for row in rows) or 1)
     return _svg(figure, axes)
 
 
-def profile_figure(rows: list[dict[str, Any]], methods: list[str]) -> str:
-    """Share of runs above a score, one line a method."""
+def profile_figure(rows: list[dict[str, Any]], methods: list[str], notes: dict[str, str]) -> str:
+    """Share of runs above a score, one line a method; the legend has those of `notes`, too, and the note."""
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     axes = figure.subplots()
     for method in dict.fromkeys(row["method"] for row in rows):
         mine = [row for row in rows if row["method"] == method]
         style = _style(methods.index(method))
-        axes.step([r["threshold"] for r in mine], [r["share"] for r in mine], where="post", label=method, **style)
+        name = _noted(method, notes.pop(method, ""))
+        axes.step([r["threshold"] for r in mine], [r["share"] for r in mine], where="post", label=name, **style)
+    _list_absent(axes, methods, notes)
     axes.set(xlabel="score", ylabel="share of runs above it", xlim=(0, None), ylim=(0, 1.02))
     return _svg(figure, axes)
+
+
+def _list_absent(axes: Any, methods: list[str], notes: dict[str, str]) -> None:
+    """Give methods that no line shows their entry in the legend, faint."""
+    for method, note in notes.items():
+        axes.add_line(Line2D([], [], label=_noted(method, note), **_style(methods.index(method)), alpha=0.25))
+
+
+def _noted(method: str, note: str) -> str:
+    """A legend's entry: plain text, whatever a method is called."""
+    return plain(f"{method} ({note})" if note else method, LEGEND_WIDTH)
 
 
 def _style(number: int) -> dict[str, Any]:
@@ -54,14 +81,17 @@ def _style(number: int) -> dict[str, Any]:
     return {"color": COLOURS[number % len(COLOURS)], "linestyle": dashes}
 
 
-def loss_figure(series: dict[str, list[dict[str, float]]]) -> str:
-    """Pretraining action loss against steps, for every run by name."""
+def loss_figure(series: list[tuple[str, list[dict[str, float]]]]) -> str:
+    """Pretraining action loss against steps, one line a run; those of one method look alike."""
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     axes = figure.subplots()
-    for number, (name, metrics) in enumerate(series.items()):
+    methods = list(dict.fromkeys(name for name, _ in series))
+    for number, (name, metrics) in enumerate(series):
         steps = [row["step"] for row in metrics if "action_loss" in row]
         values = [row["action_loss"] for row in metrics if "action_loss" in row]
-        axes.plot(steps, values, label=name, lw=1.2, **_style(number))
+        first = name not in (other for other, _ in series[:number])
+        entry = plain(name, LEGEND_WIDTH) if first else None
+        axes.plot(steps, values, lw=1.2, label=entry, **_style(methods.index(name)))
     axes.set(xlabel="gradient steps", ylabel="action loss")
     return _svg(figure, axes)
 
@@ -69,7 +99,9 @@ def loss_figure(series: dict[str, list[dict[str, float]]]) -> str:
 def _svg(figure: Figure, axes: Any) -> str:
     axes.grid(alpha=0.25)
     axes.spines[["top", "right"]].set_visible(False)
-    axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    legend = axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
+    lines = sum(1 + text.get_text().count("\n") for text in legend.get_texts())
+    figure.set_figheight(max(figure.get_figheight(), 0.4 + LEGEND_LINE * lines))
     return to_svg(figure)
 
 
@@ -81,9 +113,9 @@ def to_svg(figure: Figure) -> str:
     return text[text.index("<svg") :]
 
 
-def strip(film: Film, columns: int = 8) -> bytes:
+def strip(film: Film) -> bytes:
     """PNG film strip: clean frames above, the frames of the corrupted stacks (oldest to newest) below."""
-    chosen = np.unique(np.linspace(0, len(film["clean"]) - 1, columns).astype(int))
+    chosen = np.unique(np.linspace(0, len(film["clean"]) - 1, STRIP_FRAMES).astype(int))
     stacks = film["corrupted"][chosen].reshape(len(chosen), -1, 3, *film["corrupted"].shape[-2:])
     rows = [film["clean"][chosen], *stacks.swapaxes(0, 1)]
     return _png(np.concatenate([np.concatenate(list(_spaced(row)), axis=1) for row in rows], axis=0))

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 from zipfile import BadZipFile
@@ -11,10 +12,14 @@ import numpy as np
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import read_rows
+from vd4rl_pomdp.report.variants import Parts, Settings, differences, read_settings
 from vd4rl_pomdp.runs.folder import read_json
 from vd4rl_pomdp.runs.metrics import read_metrics
 
-IDENTITY = ("task", "quality", "corruption", "algorithm", "method", "seed")
+LABELS = ("task", "quality", "corruption", "algorithm", "method", "seed")
+"""What names a run's rows."""
+IDENTITY = ("task", "quality", "corruption", "algorithm", "method", "variant", "seed")
+"""What tells a run's rows from all others of a report."""
 
 
 @dataclass(frozen=True)
@@ -24,19 +29,45 @@ class Run:
     path: Path
     stage: str
     record: dict[str, Any]
-    """config.json: stage, config, versions, git_commit, command."""
+    """config.json: stage, config, versions, git_commit, command, inputs."""
+    labels: dict[str, Any]
+    """Values of LABELS; the task is empty while a run has not told it."""
+    settings: Settings
+    """All that could make it differ from other runs of its method, in words."""
     rows: list[dict[str, Any]]
-    """Evaluation rows, numbers parsed."""
+    """Evaluation rows, numbers parsed, with the run's `variant`."""
     metrics: list[dict[str, float]]
     seconds: float | None
     """Wall-clock time; None while the run is unfinished."""
     representation: dict[str, float | None]
     """What is known of its encoder: action_loss, probe_pose, probe_velocity, pretrain_seconds."""
+    parts: Parts = ("", "", "")
+    """What of its settings differs from other runs of its method, by the runs it is compared with."""
+
+    @property
+    def variant(self) -> str:
+        """What of its settings differs from other runs of its method: "max_k 1", or nothing."""
+        return ", ".join(filter(None, self.parts))
 
     @property
     def identity(self) -> tuple[str, ...]:
-        """Values of IDENTITY, from the first row."""
-        return tuple(str(self.rows[0][name]) for name in IDENTITY)
+        """Values of IDENTITY."""
+        labels = self.labels | {"variant": self.variant}
+        return tuple(str(labels[name]) for name in IDENTITY)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has come to its end."""
+        return self.seconds is not None
+
+    @property
+    def progress(self) -> str:
+        """How far it is: "finished", or "unfinished at 20 of 40 updates"."""
+        if self.finished:
+            return "finished"
+        unit = "updates" if self.stage == "finetune" else "steps"
+        done = max((int(row["step"]) for row in (*self.metrics, *self.rows)), default=0)
+        return f"unfinished at {done} of {self.record['config'].get(unit, '?')} {unit}"
 
     def film(self) -> dict[str, np.ndarray] | None:
         """Pictures of an evaluation episode, if the run kept them."""
@@ -62,8 +93,32 @@ def load_runs(paths: list[Path]) -> list[Run]:
     runs = [_load(folder) for folder in dict.fromkeys(folders)]
     if not runs:
         raise UserError(f"{paths[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl)")
-    _refuse_twins(runs)
-    return runs
+    named = [_with_parts(run, parts) for run, parts in zip(runs, compare(runs), strict=True)]
+    _refuse_twins(named)
+    return named
+
+
+def compare(runs: list[Run], brief: bool = True) -> list[Parts]:
+    """What tells each run from others of its stage, method and algorithm."""
+    parts: dict[Path, Parts] = {}
+    for members in _groups(runs, lambda run: (run.stage, run.labels["method"], run.labels["algorithm"])):
+        corruption = [str(run.labels["corruption"]) for run in members]
+        place = [tuple(run.labels[name] for name in ("task", "quality", "corruption")) for run in members]
+        words = differences([run.settings for run in members], corruption, place, brief)
+        parts |= dict(zip((run.path for run in members), words, strict=True))
+    return [parts[run.path] for run in runs]
+
+
+def _groups(runs: Iterable[Run], key: Callable[[Run], Any]) -> list[list[Run]]:
+    groups: dict[Any, list[Run]] = {}
+    for run in runs:
+        groups.setdefault(key(run), []).append(run)
+    return list(groups.values())
+
+
+def _with_parts(run: Run, parts: Parts) -> Run:
+    named = replace(run, parts=parts)
+    return replace(named, rows=[row | {"variant": named.variant} for row in run.rows])
 
 
 def _is_run(config: Path) -> bool:
@@ -72,25 +127,52 @@ def _is_run(config: Path) -> bool:
 
 def _load(folder: Path) -> Run:
     record = read_json(folder / "config.json")
+    if not isinstance(record.get("config"), dict):
+        raise UserError(f"{folder / 'config.json'}: holds no config; remove the run or start it anew")
+    rows = read_rows(folder / "episodes.csv")
+    card = _card(folder)
     timing = folder / "timing.json"
     return Run(
         path=folder,
         stage=record["stage"],
         record=record,
-        rows=read_rows(folder / "episodes.csv"),
+        labels=_labels(folder, record, rows, card),
+        settings=read_settings(record, card if record["stage"] == "finetune" else {}),
+        rows=rows,
         metrics=read_metrics(folder / "metrics.jsonl"),
         seconds=read_json(timing)["seconds"] if timing.exists() else None,
-        representation=_representation(folder),
+        representation=_representation(folder, card),
     )
 
 
-def _representation(folder: Path) -> dict[str, float | None]:
-    card, probe, timing = (
-        read_json(path) if path.exists() else {}
-        for path in (folder / "encoder" / "config.json", folder / "probe.json", folder / "pretrain_timing.json")
+def _card(folder: Path) -> dict[str, Any]:
+    """What a run's encoder says of its pretraining; nothing where there is none yet."""
+    path = folder / "encoder" / "config.json"
+    card = read_json(path).get("pretrain") if path.exists() else {}
+    if not isinstance(card, dict):
+        raise UserError(f"{path}: does not say how the encoder was pretrained; pretrain it again")
+    return card
+
+
+def _labels(folder: Path, record: dict[str, Any], rows: list[dict[str, Any]], card: dict[str, Any]) -> dict[str, Any]:
+    """A run's names: from its rows, from its labels.json, or as far as its config tells."""
+    path = folder / "labels.json"
+    if rows or path.exists():
+        known = rows[0] if rows else read_json(path)
+        missing = [name for name in LABELS if name not in known]
+        if missing:
+            raise UserError(f"{path}: has no {missing[0]!r}; start the same command again, which writes it anew")
+        return {name: known[name] for name in LABELS}
+    told = {"method": folder.name, "task": card.get("task"), "quality": card.get("quality")} | record["config"]
+    return {name: told.get(name) or "" for name in LABELS if name != "seed"} | {"seed": told.get("seed", "")}
+
+
+def _representation(folder: Path, card: dict[str, Any]) -> dict[str, float | None]:
+    probe, timing = (
+        read_json(path) if path.exists() else {} for path in (folder / "probe.json", folder / "pretrain_timing.json")
     )
     return {
-        "action_loss": card.get("pretrain", {}).get("action_loss"),
+        "action_loss": card.get("action_loss"),
         "probe_pose": probe.get("probe_pose"),
         "probe_velocity": probe.get("probe_velocity"),
         "pretrain_seconds": timing.get("seconds"),

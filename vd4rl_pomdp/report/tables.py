@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.report import stats
+from vd4rl_pomdp.report.gaps import CELL, cell, in_words
 from vd4rl_pomdp.report.load import IDENTITY, Run
 from vd4rl_pomdp.tasks import SCORE_DIVISOR
 
 Row = dict[str, Any]
-SETTING = ("corruption", "algorithm")
-GROUP = ("task", "quality", "corruption", "algorithm", "method")
+SERIES = ("corruption", "algorithm", "method", "variant")
 REFERENCES = ("random", "bc", "drq_bc", "state")
 """Methods that are references: last in a table."""
 END_TO_END = ("bc", "drq_bc")
@@ -21,22 +21,26 @@ END_TO_END = ("bc", "drq_bc")
 
 
 def label(row: Row) -> str:
-    """A method's name in tables and figures, with the algorithm where it is not TD3+BC."""
+    """A method's name in tables and figures, with the algorithm where it is not TD3+BC, and its variant."""
     own = row["algorithm"] == "td3_bc" or row["method"] in END_TO_END
-    return row["method"] if own else f"{row['method']}, {row['algorithm']}"
+    return ", ".join(filter(None, (row["method"], "" if own else row["algorithm"], row["variant"])))
 
 
-def representations(runs: list[Run]) -> list[Row]:
-    """One row for every evaluated run: what its encoder knows, what its policy reached, what both cost."""
+def representations(runs: list[Run], gaps: list[Row]) -> list[Row]:
+    """One row for every evaluated run: what its encoder knows, what its policy reached, what both cost.
+
+    Runs that are missing or unfinished have their state, and no numbers.
+    """
     table = []
     for run in runs:
-        if run.rows:
+        if run.rows and run.finished:
             final = max(row["step"] for row in run.rows)
             score = float(np.mean([row["score"] for row in run.rows if row["step"] == final]))
             identity = dict(zip(IDENTITY, run.identity, strict=True))
             costs = {"finetune_seconds": run.seconds, "git_commit": run.record.get("git_commit", "")}
-            table.append(identity | run.representation | {"score": score, "return": score * SCORE_DIVISOR} | costs)
-    return sorted(table, key=_table_order)
+            scores = {"score": score, "return": score * SCORE_DIVISOR}
+            table.append(identity | run.representation | scores | costs | {"state": run.progress})
+    return sorted([*table, *(dict.fromkeys(_RUN) | gap for gap in gaps)], key=_table_order)
 
 
 def improvement(rows: list[Row]) -> list[Row]:
@@ -44,7 +48,7 @@ def improvement(rows: list[Row]) -> list[Row]:
     table = []
     for setting, members in _grouped(rows, ("corruption",)):
         final: dict[str, dict[tuple, np.ndarray]] = {}
-        for (task, quality, *_), group in _grouped(members, (*GROUP,)):
+        for (task, quality, *_), group in _grouped(members, CELL):
             final.setdefault(label(group[0]), {})[task, quality] = _final_scores(group)
         for name, scores in final.items():
             for other, others in final.items():
@@ -59,7 +63,7 @@ def improvement(rows: list[Row]) -> list[Row]:
 def profiles(rows: list[Row], thresholds: np.ndarray) -> list[Row]:
     """Share of runs (all tasks and seeds of a method) whose final score is above each threshold."""
     table = []
-    for (corruption, *_), members in _grouped(rows, (*SETTING, "method")):
+    for (corruption, *_), members in _grouped(rows, SERIES):
         strata = _strata(members)
         share = stats.performance_profile(np.concatenate(strata), thresholds)
         place = {"corruption": corruption, "method": label(members[0])}
@@ -67,58 +71,91 @@ def profiles(rows: list[Row], thresholds: np.ndarray) -> list[Row]:
     return table
 
 
-def summary(rows: list[Row]) -> list[Row]:
-    """Final score of every group: mean over seeds, 95% interval, n seeds, n episodes, best evaluation's mean."""
+def summary(rows: list[Row], gaps: list[Row]) -> list[Row]:
+    """Final score of every cell: mean over seeds, 95% interval, n seeds, n episodes, best evaluation's mean.
+
+    `missing` tells which of its seeds are not there or not finished; a cell without any has no numbers.
+    """
+    absent: dict[tuple[str, ...], list[Row]] = {}
+    for gap in gaps:
+        absent.setdefault(cell(gap), []).append(gap)
     table = []
-    for group, members in _grouped(rows, GROUP):
+    for group, members in _grouped(rows, CELL):
         curve = _by_step(members)
         final = max(curve)
         scores = _per_seed(curve[final])
         interval = stats.bootstrap_interval([scores], stats.mean, np.random.default_rng(0))
         best = max(curve, key=lambda step: _per_seed(curve[step]).mean())
         table.append(
-            dict(zip(GROUP, group, strict=True))
+            dict(zip(CELL, group, strict=True))
             | {"step": final, "score": float(scores.mean())}
             | {"low": interval[0] if interval else None, "high": interval[1] if interval else None}
             | {"seeds": len(scores), "episodes": len(curve[final]), "few_seeds": len(scores) < stats.FEW_SEEDS}
             | {"best_score": float(_per_seed(curve[best]).mean()), "best_step": best}
+            | {"missing": in_words(absent.pop(group, []))}
         )
+    nothing = dict.fromkeys(_MEASURED) | {"seeds": 0, "episodes": 0}
+    table += [
+        dict(zip(CELL, group, strict=True)) | nothing | {"missing": in_words(members)}
+        for group, members in absent.items()
+    ]
     return sorted(table, key=_table_order)
 
 
 def curves(rows: list[Row]) -> list[Row]:
     """Mean over seeds, and their range, at every evaluation."""
     table = []
-    for group, members in _grouped(rows, GROUP):
+    for group, members in _grouped(rows, CELL):
         for step, at_step in sorted(_by_step(members).items()):
             scores = _per_seed(at_step)
             table.append(
-                dict(zip(GROUP, group, strict=True))
+                dict(zip(CELL, group, strict=True))
                 | {"step": step, "score": float(scores.mean())}
                 | {"low": float(scores.min()), "high": float(scores.max()), "seeds": len(scores)}
             )
     return table
 
 
-def aggregate(rows: list[Row]) -> list[Row]:
-    """IQM and optimality gap over tasks and qualities for every method and setting, with stratified intervals."""
-    table = []
-    for group, members in _grouped(rows, (*SETTING, "method")):
+def aggregate(rows: list[Row], gaps: list[Row]) -> list[Row]:
+    """IQM and optimality gap over tasks and qualities for every method and setting, with stratified intervals.
+
+    `of_tasks` is how many tasks and qualities there are under the corruption: with fewer, the row is another average.
+    A method without any has no numbers.
+    """
+    everything = _grouped([*rows, *gaps], ("corruption",))
+    places = {key[0]: len(_grouped(members, ("task", "quality"))) for key, members in everything}
+    table, absent = [], dict.fromkeys(tuple(gap[name] for name in SERIES) for gap in gaps)
+    for group, members in _grouped(rows, SERIES):
+        absent.pop(group, None)
         strata = _strata(members)
         scores = np.concatenate(strata)
         interval = stats.bootstrap_interval(strata, stats.iqm, np.random.default_rng(0))
         table.append(
-            dict(zip((*SETTING, "method"), group, strict=True))
+            dict(zip(SERIES, group, strict=True))
             | {"iqm": float(stats.iqm(scores)), "optimality_gap": float(stats.optimality_gap(scores))}
             | {"low": interval[0] if interval else None, "high": interval[1] if interval else None}
-            | {"tasks": len(strata), "seeds": min(map(len, strata))}
+            | {"tasks": len(strata), "of_tasks": places[group[0]], "seeds": min(map(len, strata))}
         )
+    nothing = dict.fromkeys(("iqm", "optimality_gap", "low", "high"))
+    table += [
+        dict(zip(SERIES, group, strict=True)) | nothing | {"tasks": 0, "of_tasks": places[group[0]], "seeds": 0}
+        for group in absent
+    ]
     return sorted(table, key=_table_order)
 
 
+_RUN = (
+    *(*IDENTITY, "action_loss", "probe_pose", "probe_velocity", "pretrain_seconds"),
+    *("score", "return", "finetune_seconds", "git_commit", "state"),
+)
+_MEASURED = ("step", "score", "low", "high", "seeds", "episodes", "few_seeds", "best_score", "best_step")
+
+
 def _table_order(row: Row) -> tuple:
+    """By place, references last, the highest first, and what is missing after what is there."""
     place = tuple(row.get(name, "") for name in ("task", "quality", "corruption"))
-    return *place, row["method"] in REFERENCES, -float(row["score"] if "score" in row else row["iqm"])
+    score = row["iqm"] if "iqm" in row else row.get("score")
+    return *place, row["method"] in REFERENCES, np.inf if score is None else -float(score)
 
 
 def _grouped(rows: list[Row], names: Iterable[str]) -> list[tuple[tuple, list[Row]]]:

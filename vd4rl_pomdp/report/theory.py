@@ -17,6 +17,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.report.figures import COLOURS, to_svg
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.runs.folder import read_json, write_json
+from vd4rl_pomdp.text import write_text
 
 Row = dict[str, Any]
 FILE = "theory.json"
@@ -28,7 +29,7 @@ KEYS = ("counterexample", "tables", "disagreements", "comparisons", "worlds", "s
 def write_theory(study: Row, out: Path) -> Path:
     """Write the study as a page and as JSON into a folder that exists; returns the page."""
     write_json(out / FILE, study)
-    (out / "index.html").write_text(render("theory.html", theory=section(study)))
+    write_text(out / "index.html", render("theory.html", theory=section(study)))
     return out / "index.html"
 
 

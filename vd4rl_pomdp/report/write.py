@@ -10,77 +10,116 @@ from typing import Any
 import numpy as np
 from rich.console import Console
 from rich.table import Table
+from rich.text import Text
 
 from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import COLUMNS
 from vd4rl_pomdp.report import figures, tables
-from vd4rl_pomdp.report.load import Run, load_runs
+from vd4rl_pomdp.report.gaps import MISSING, find_gaps
+from vd4rl_pomdp.report.load import Run, compare, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.report.theory import load_study, section
 from vd4rl_pomdp.runs.folder import write_csv
+from vd4rl_pomdp.runs.outputs import refuse_foreign
+from vd4rl_pomdp.text import write_text
 
 Row = dict[str, Any]
+_MARK = "summary"
+"""The table that is always there: its file tells a report's folder."""
 
 
 def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
     """Write the report of all runs at or below `paths` into `out`; returns the page and the table of final scores.
 
     A study that `vd4rl-pomdp theory` wrote at or below `paths` becomes a section of the page.
+
+    Raises:
+        UserError: there is nothing to report, a file is damaged, or `out` holds anything but an earlier report.
     """
+    refuse_foreign(out, "report", f"{_MARK}.csv")
     runs, study = load_runs(paths), load_study(paths)
     rows = [row for run in runs for row in run.rows]
     if not rows:
         raise UserError(f"{paths[0]}: holds no evaluated run yet; `vd4rl-pomdp finetune` evaluates")
+    final = [row for run in runs if run.finished for row in run.rows]
+    gaps = find_gaps(runs)
     made = {
-        "summary": tables.summary(rows),
+        _MARK: tables.summary(final, gaps),
         "curves": tables.curves(rows),
-        "aggregate": tables.aggregate(rows),
-        "runs": tables.representations(runs),
-        "improvement": tables.improvement(rows),
-        "profiles": tables.profiles(rows, np.linspace(0, 100, 101)),
+        "aggregate": tables.aggregate(final, gaps),
+        "runs": tables.representations(runs, gaps),
+        "improvement": tables.improvement(final),
+        "profiles": tables.profiles(final, np.linspace(0, 100, 101)),
+        "missing": gaps,
     }
+    page = _render(runs, rows, made, study)
     out.mkdir(parents=True, exist_ok=True)
     for name, table in made.items():
+        path = out / f"{name}.csv"
         if table:
-            write_csv(out / f"{name}.csv", list(table[0]), table)
-    write_csv(out / "episodes.csv", COLUMNS, rows)
-    (out / "index.html").write_text(_render(runs, rows, made, study))
-    return out / "index.html", made["summary"]
+            write_csv(path, list(table[0]), table)
+        else:
+            path.unlink(missing_ok=True)
+    write_csv(out / "episodes.csv", (*COLUMNS, "variant"), rows)
+    write_text(out / "index.html", page)
+    return out / "index.html", made[_MARK]
 
 
 def print_summary(summary: list[Row], console: Console | None = None) -> None:
-    """The table of final scores on the terminal."""
-    table = Table(title="score = return / 10, mean over seeds [95% interval]")
-    for name in ("setting", "method"):
-        table.add_column(name)
+    """The tables of final scores on the terminal, one a setting."""
+    console = console or Console()
+    console.print("score = return / 10, mean over seeds [95% interval]", markup=False, highlight=False)
+    for setting, members in _by_setting(summary):
+        console.print(_terminal_table(setting, members))
+
+
+def _terminal_table(setting: str, rows: list[Row]) -> Table:
+    table = Table(title=Text(setting), title_justify="left")
+    table.add_column("method", overflow="fold")
     for name in ("score", "interval", "seeds", "episodes"):
-        table.add_column(name, justify="right")
-    for row in summary:
+        table.add_column(name, justify="right", no_wrap=True)
+    gaps = any(row["missing"] for row in rows)
+    if gaps:
+        table.add_column("not there", overflow="fold")
+    for row in rows:
         interval = f"{row['low']:.1f} - {row['high']:.1f}" if row["low"] is not None else "-"
-        cells = (f"{row['score']:.1f}", interval, str(row["seeds"]), str(row["episodes"]))
-        table.add_row(_setting(row), tables.label(row), *cells)
-    (console or Console()).print(table)
+        score = f"{row['score']:.1f}" if row["score"] is not None else MISSING
+        cells = (tables.label(row), score, interval, str(row["seeds"]), str(row["episodes"]))
+        table.add_row(*map(Text, (*cells, row["missing"]) if gaps else cells))
+    return table
 
 
 def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]], study: Row | None) -> str:
-    names = list(dict.fromkeys(map(tables.label, made["summary"])))
-    pretraining = {_title(run): run.metrics for run in runs if run.stage == "pretrain" and _has_losses(run)}
+    names = list(dict.fromkeys(map(tables.label, (*made[_MARK], *rows))))
+    pretraining: dict[str, list[tuple[str, list[dict[str, float]]]]] = {}
+    for run in runs:
+        if run.stage == "pretrain" and _has_losses(run):
+            pretraining.setdefault(_setting(run.labels), []).append((tables.label(_row(run)), run.metrics))
+    settings = dict(_by_setting(made[_MARK]))
     return render(
         "page.html",
         label=tables.label,
         number=_number,
-        finished=sum(run.seconds is not None for run in runs),
+        finished=sum(run.finished for run in runs),
+        unfinished=[(str(run.path), _title(run), run.progress) for run in runs if not run.finished],
+        gaps=len(made["missing"]),
         rows=len(rows),
         few=FEW_SEEDS,
-        tables=_by_setting(made["summary"]),
+        tables=list(settings.items()),
+        differing=_differing(runs),
         aggregate=made["aggregate"],
-        representations=made["runs"],
+        representations=_by_setting(made["runs"]),
         improvement=_matrices(made["improvement"]),
-        curves=[(name, figures.curve_figure(part, names)) for name, part in _by_setting(made["curves"])],
-        profiles=[(name, figures.profile_figure(part, names)) for name, part in _by(made["profiles"], "corruption")],
-        losses=figures.loss_figure(pretraining) if pretraining else "",
+        curves=[
+            (name, figures.curve_figure(part, names, settings[name])) for name, part in _by_setting(made["curves"])
+        ],
+        profiles=[
+            (name, figures.profile_figure(part, names, _partial(made["aggregate"], name)))
+            for name, part in _by(made["profiles"], "corruption")
+        ],
+        losses=[(name, figures.loss_figure(series)) for name, series in pretraining.items()],
         films=_films(runs),
         published=_published(rows),
         theory=section(study) if study else None,
@@ -110,6 +149,27 @@ def _matrices(rows: list[Row]) -> list[Row]:
     return matrices
 
 
+def _partial(aggregate: list[Row], corruption: str) -> dict[str, str]:
+    """Methods that have not been run on all tasks of a corruption, and on how many."""
+    mine = [row for row in aggregate if row["corruption"] == corruption and row["tasks"] < row["of_tasks"]]
+    return {tables.label(row): f"{row['tasks']} of {row['of_tasks']} tasks" for row in mine}
+
+
+def _differing(runs: list[Run]) -> list[tuple[str, str]]:
+    """Each method of which there are several variants, and all settings that differ, those of a preset included."""
+    told = zip(runs, compare(runs, brief=False), strict=True)
+    named = {
+        tables.label(_row(run)): ", ".join(filter(None, parts))
+        for run, parts in told
+        if run.stage == "finetune" and run.variant
+    }
+    return list(named.items())
+
+
+def _row(run: Run) -> Row:
+    return run.labels | {"variant": run.variant}
+
+
 def _setting(row: Row) -> str:
     return f"{row['task']} {row['quality']}, {row['corruption']}"
 
@@ -122,10 +182,7 @@ def _by_setting(rows: list[Row]) -> list[tuple[str, list[Row]]]:
 
 
 def _title(run: Run) -> str:
-    config = run.record["config"]
-    if run.rows:
-        return f"{run.stage} {tables.label(run.rows[0])}, {_setting(run.rows[0])}, seed {config['seed']}"
-    return f"{run.stage} {config.get('method', run.path.name)}, {config.get('corruption', '')}, seed {config['seed']}"
+    return f"{run.stage} {tables.label(_row(run))}, {_setting(run.labels)}, seed {run.labels['seed']}"
 
 
 def _films(runs: list[Run]) -> list[Row]:
@@ -139,8 +196,10 @@ def _films(runs: list[Run]) -> list[Row]:
         film = run.film()
         assert film is not None
         strip, movie = figures.strip(film), figures.movie(film)
+        share = min(1.0, len(film["clean"]) / figures.STRIP_FRAMES)
         shown.append(
-            {"title": _title(run), "strip": _base64(strip), "movie": _base64(movie), "total": film["return"][-1]}
+            {"title": _title(run), "strip": _base64(strip), "movie": _base64(movie)}
+            | {"share": share, "total": film["return"][-1]}
         )
     return shown
 
@@ -158,7 +217,7 @@ def _facts(run: Run) -> dict[str, str]:
     return {
         "title": _title(run),
         "commit": run.record.get("git_commit", ""),
-        "time": f"{run.seconds:.0f} s" if run.seconds is not None else "unfinished",
+        "time": f"{run.seconds:.0f} s" if run.seconds is not None else run.progress,
         "command": run.record.get("command", ""),
         "config": json.dumps({k: run.record.get(k) for k in ("config", "versions")}, indent=1),
     }

@@ -36,12 +36,12 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file so that a reader sees it whole or not at all."""
     with replacing_file(path) as fresh:
-        fresh.write_text(json.dumps(value, indent=2) + "\n")
+        fresh.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
     """Write a CSV file, its header first, so that a reader sees it whole or not at all."""
-    with replacing_file(path) as fresh, fresh.open("w", newline="") as file:
+    with replacing_file(path) as fresh, fresh.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)

@@ -136,7 +136,7 @@ def _heartbeat(folder: Path) -> int | None:
 
 def _read_note(folder: Path) -> dict[str, Any]:
     try:
-        note = json.loads((folder / _NOTE).read_text())
+        note = json.loads((folder / _NOTE).read_text(encoding="utf-8"))
     except (OSError, ValueError):
         return {}
     return note if isinstance(note, dict) else {}

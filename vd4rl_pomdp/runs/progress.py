@@ -24,7 +24,7 @@ class ProgressLine:
         self._console = Console(stderr=True)
         self._title, self._total, self._unit, self._done = title, total, unit, start
         self._bar = Progress(
-            TextColumn("{task.description}"),
+            TextColumn("{task.description}", markup=False),
             BarColumn(bar_width=24),
             MofNCompleteColumn(),
             TextColumn("{task.fields[speed]}"),

@@ -51,7 +51,7 @@ def git_commit() -> str:
 def checkout_commit(root: Path) -> str:
     """Commit of a source tree, if it is the top of a git work tree of this project; else empty."""
     try:
-        project = tomllib.loads((root / "pyproject.toml").read_text())["project"]["name"]
+        project = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["name"]
         if project != PACKAGES[0] or Path(_git(root, "rev-parse", "--show-toplevel")).resolve() != root:
             return ""
         dirty = subprocess.run(["git", "diff", "--quiet", "HEAD"], cwd=root, check=False).returncode
@@ -63,7 +63,7 @@ def checkout_commit(root: Path) -> str:
 def recorded_commit(root: Path) -> str:
     """The commit that `setup.py` wrote into a wheel or source archive, if `root` comes from one; else empty."""
     try:
-        return (root / COMMIT_FILE).read_text().strip()
+        return (root / COMMIT_FILE).read_text(encoding="utf-8").strip()
     except OSError:
         return ""
 
@@ -100,7 +100,7 @@ def command() -> str:
 def _processor() -> str:
     cpuinfo = Path("/proc/cpuinfo")
     if cpuinfo.exists():
-        for line in cpuinfo.read_text().splitlines():
+        for line in cpuinfo.read_text(encoding="utf-8", errors="replace").splitlines():
             if line.startswith("model name"):
                 return line.split(":", 1)[1].strip()
     return platform.processor() or platform.machine()

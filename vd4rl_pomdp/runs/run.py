@@ -20,10 +20,7 @@ from vd4rl_pomdp.runs.checkpoint import Checkpoints, State, fitting, pack, unpac
 from vd4rl_pomdp.runs.folder import holds_anything, jsonable, read_json, write_json
 from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.runs.provenance import command, git_commit, machine, versions
-
-_RUNTIME_FIELDS = {"out", "device", "workers", "wandb", "data", "encoder"}
-"""Config fields that do not change a result, so that a run may go on with other ones; of data and encoder, which may be
-moved, the content is compared."""
+from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS
 
 
 class RunFolder:
@@ -65,7 +62,7 @@ class RunFolder:
                 "and cannot go on with it; choose another --out"
             )
         old = stored.get("config", {})
-        keys = (set(old) | set(self.config)) - _RUNTIME_FIELDS
+        keys = (set(old) | set(self.config)) - RUNTIME_FIELDS
         differing = sorted(k for k in keys if old.get(k) != self.config.get(k))
         if stored["stage"] != self._stage or differing:
             what = ", ".join(differing) or f"stage {stored['stage']}"

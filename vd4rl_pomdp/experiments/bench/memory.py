@@ -54,6 +54,6 @@ def _train_a_little(folder: Path) -> tuple[int, int]:
     for _ in range(STEPS):
         trainer.update()
     touch(dataset.frames)
-    fields = dict(line.split(":") for line in Path("/proc/self/status").read_text().splitlines())
+    fields = dict(line.split(":") for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines())
     kibibytes = {name: int(fields[name].split()[0]) for name in ("VmHWM", "RssAnon")}
     return kibibytes["VmHWM"] * 1024, kibibytes["RssAnon"] * 1024

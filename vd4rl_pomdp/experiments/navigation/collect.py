@@ -18,6 +18,7 @@ from vd4rl_pomdp.data.collect import Shard, claim_set, collect_shards, episode_s
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
 from vd4rl_pomdp.mazes import get_maze
 from vd4rl_pomdp.runs.folder import jsonable
+from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.provenance import versions
 from vd4rl_pomdp.types import StepType
@@ -75,6 +76,7 @@ class _Job:
 def collect(config: CollectConfig) -> list[Path]:
     """Collect the set, or what is missing of it; returns its shards."""
     _check(config)
+    refuse_inside(config.out)
     settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS}
     shards = [
         Shard(path, [_job(config, i) for i in trajectories], _attributes(config))

@@ -14,7 +14,7 @@ from matplotlib.patches import Rectangle
 
 from vd4rl_pomdp.experiments.navigation.claims import paper_number
 from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, REFERENCES, Cell
-from vd4rl_pomdp.experiments.navigation.rows import Run, Value
+from vd4rl_pomdp.experiments.navigation.rows import Run, Value, is_missing
 from vd4rl_pomdp.mazes import FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
 
 _ESTIMATE = "#d55e00"
@@ -27,6 +27,7 @@ _VARIANTS = {
 _OFFSETS, _WIDTH = (-0.27, 0.0, 0.27), 0.25
 _SEED: dict[str, Any] = {"color": "black", "linestyle": "", "marker": ".", "markersize": 3}
 _MARK: dict[str, Any] = {"color": "#e69f00", "linestyle": "", "marker": "_", "markersize": 9, "markeredgewidth": 2.5}
+_NO_RUN: dict[str, Any] = {"color": "#999999", "linestyle": "", "marker": "x", "markersize": 4}
 _SAMPLES = 6
 _FIRST_ROW, _ROW_STEP = 20, 12
 
@@ -53,8 +54,9 @@ def accuracy_bars(runs: list[Run], value: Value, path: Path) -> None:
     for axes in panels[:, 0]:
         axes.set_ylabel("100 - state error (%)")
     handles: list[Any] = [Rectangle((0, 0), 1, 1, color=colour) for *_, colour in _VARIANTS.values()]
-    handles += [Line2D([], [], **_SEED), Line2D([], [], **_MARK)]
-    figure.legend(handles, [*_VARIANTS, "a seed", "the paper"], loc="outside upper center", ncols=5, frameon=False)
+    handles += [Line2D([], [], **style) for style in (_SEED, _MARK, _NO_RUN)]
+    names = [*_VARIANTS, "a seed", "the paper", "no run"]
+    figure.legend(handles, names, loc="outside upper center", ncols=3 if columns == 1 else 6, frameon=False)
     figure.savefig(path, dpi=130, metadata={"Software": None})
 
 
@@ -63,6 +65,8 @@ def _bar(axes: Any, place: float, cell: Cell, runs: list[Run], value: Value, col
     if accuracy:
         axes.bar(place, np.mean(accuracy), _WIDTH, color=colour)
         axes.plot([place] * len(accuracy), accuracy, **_SEED)
+    elif is_missing(cell, runs):
+        axes.plot(place, 2, **_NO_RUN)
     paper = paper_number(cell, ("state_error", "training", "online", "all", 0))
     if paper is not None:
         axes.plot(place, 100 - paper, **_MARK)
@@ -78,11 +82,14 @@ def trajectories(runs: list[Run], path: Path, methods: tuple[str, ...] = ("mik+a
     methods = tuple(method for method in methods if any(run.cell.method == method for run in found))
     figure = Figure(figsize=(3.2 * len(methods), 3.3 * len(mazes)), layout="constrained")
     panels = figure.subplots(len(mazes), len(methods), squeeze=False)
-    for axes in panels.flat:
-        axes.set_axis_off()
-    for run in found:
-        axes = panels[mazes.index(run.cell.maze)][methods.index(run.cell.method)]
-        _draw_trajectory(axes, run)
+    for maze, row in zip(mazes, panels, strict=True):
+        for method, axes in zip(methods, row, strict=True):
+            axes.set_axis_off()
+            run = _first(found, Cell(maze, method))
+            if run is not None:
+                _draw_trajectory(axes, run)
+            else:
+                axes.text(0.5, 0.5, f"{maze}: {method}\nno run", ha="center", va="center", transform=axes.transAxes)
     figure.savefig(path, dpi=120, metadata={"Software": None})
     return True
 
@@ -93,7 +100,7 @@ def _first(runs: list[Run], cell: Cell) -> Run | None:
 
 def _draw_trajectory(axes: Any, run: Run, rows: int = 100) -> None:
     assert run.trajectory is not None
-    with run.trajectory.open(newline="") as file:
+    with run.trajectory.open(newline="", encoding="utf-8") as file:
         table = list(csv.DictReader(file))[:rows]
     draw_maze(axes, MAZES[run.cell.maze])
     for names, colour, label in ((("x", "y"), "black", "true"), (("estimated_x", "estimated_y"), _ESTIMATE, "probe")):

@@ -89,7 +89,7 @@ def grid_commands(
 
 def paper_rows() -> list[dict[str, str]]:
     """The paper's tables, line by line."""
-    with PAPER.open(newline="") as file:
+    with PAPER.open(newline="", encoding="utf-8") as file:
         return list(csv.DictReader(file))
 
 

@@ -20,10 +20,12 @@ from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import paper_number, verdict_lines
 from vd4rl_pomdp.experiments.navigation.collect import PRESETS
 from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, REFERENCES, UNTRAINED, Cell, cell_of, paper_rows
-from vd4rl_pomdp.experiments.navigation.rows import Run, Value, load_runs, save_runs
+from vd4rl_pomdp.experiments.navigation.rows import ROWS, Run, Value, is_missing, load_runs, save_runs, unfinished_runs
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.report.stats import bootstrap_interval, mean
 from vd4rl_pomdp.runs.folder import write_csv
+from vd4rl_pomdp.runs.outputs import refuse_foreign
+from vd4rl_pomdp.text import code, code_block, markdown, write_text
 
 VIEWS = {
     "training averages, probe trained beside the model (the paper's way)": ("training", "online"),
@@ -54,6 +56,10 @@ class Entry:
     value: Value
     numbers: np.ndarray
     """(n,) one for each seed."""
+    of: int
+    """Seeds that runs of the maze have, of whatever cell."""
+    missing: bool
+    """Whether other runs have its maze, and others what it trains."""
 
     @property
     def paper(self) -> float | None:
@@ -61,13 +67,14 @@ class Entry:
         return paper_number(self.cell, self.value)
 
     def text(self) -> str:
-        """Mean, interval, seeds, and the paper's number in brackets; what is missing is left out."""
+        """Mean, interval, seeds, and the paper's number in brackets; a run that is missing is said to be."""
         paper = "" if self.paper is None else f"({self.paper:.1f})"
         if not len(self.numbers):
-            return paper
+            return f"no run {paper}".rstrip() if self.missing else paper
         interval = self.interval()
         spread = "" if interval is None else f" [{interval[0]:.1f}, {interval[1]:.1f}]"
-        return f"**{self.numbers.mean():.1f}**{spread} n={len(self.numbers)} {paper}".rstrip()
+        seeds = f"n={len(self.numbers)}" + (f" of {self.of}" if len(self.numbers) < self.of else "")
+        return f"**{self.numbers.mean():.1f}**{spread} {seeds} {paper}".rstrip()
 
     def interval(self) -> tuple[float, float] | None:
         """Bootstrap interval over seeds."""
@@ -85,6 +92,12 @@ class Table:
     mazes: tuple[str, ...]
     rows: list[tuple[str, list[Entry]]]
 
+    def lines(self) -> list[tuple[str, list[Entry]]]:
+        """Rows that a run or the paper has a number for; none if no run has."""
+        if not any(len(entry.numbers) for _, entries in self.rows for entry in entries):
+            return []
+        return [row for row in self.rows if any(len(e.numbers) or e.paper is not None for e in row[1])]
+
 
 def write_report(sources: Sequence[Path], out: Path, pictures: bool = True) -> Path:
     """Write the report of all runs in `sources` to `out`; returns the page.
@@ -94,7 +107,8 @@ def write_report(sources: Sequence[Path], out: Path, pictures: bool = True) -> P
         out: where to.
         pictures: whether to draw sample observations, which needs OpenGL.
     """
-    runs = load_runs(sources)
+    refuse_foreign(out, "navigation report", ROWS)
+    runs, unfinished = load_runs(sources), unfinished_runs(sources)
     save_runs(runs, out)
     (out / "figures").mkdir(exist_ok=True)
     value = ("state_error", "held_out", "refit", "all", 0)
@@ -105,7 +119,7 @@ def write_report(sources: Sequence[Path], out: Path, pictures: bool = True) -> P
     tables = make_tables(runs)
     _write_tables(tables, out / "tables.csv")
     page = out / "README.md"
-    page.write_text("\n".join(_page(runs, tables, drawn, pictures)) + "\n")
+    write_text(page, "\n".join(_page(runs, unfinished, tables, drawn, pictures)) + "\n")
     return page
 
 
@@ -173,7 +187,8 @@ def _by_k_table(runs: list[Run]) -> Table:
 
 def _entry(cell: Cell, value: Value, runs: list[Run]) -> Entry:
     numbers = [run.values[value] for run in runs if run.cell == cell and value in run.values]
-    return Entry(cell, value, np.array(numbers))
+    seeds = {run.seed for run in runs if run.cell.maze == cell.maze}
+    return Entry(cell, value, np.array(numbers), len(seeds), is_missing(cell, runs))
 
 
 _OWN_TITLES = {
@@ -183,14 +198,19 @@ _OWN_TITLES = {
 }
 
 
-def _page(runs: list[Run], tables: list[Table], drawn: bool, pictures: bool) -> list[str]:
+def _page(
+    runs: list[Run], unfinished: list[tuple[Path, str]], tables: list[Table], drawn: bool, pictures: bool
+) -> list[str]:
     preset, seeds = runs[0].preset, sorted({run.seed for run in runs})
     lines = ["# Navigation: what the objectives know of the state", ""]
     lines += [
-        f"Runs: {len(runs)}. Preset: `{preset}`. Seeds: {', '.join(map(str, seeds))}. {_budget(runs)}",
+        f"Runs: {len(runs)}. Preset: {code(preset)}. Seeds: {', '.join(map(str, seeds))}. {_budget(runs)}",
         "",
+        *(f"Unfinished, in no table: {code(str(path))} {state}.  " for path, state in unfinished),
+        *([""] if unfinished else []),
         "A cell of a table reads: **mean over seeds** [95% bootstrap interval] n=seeds (the paper's number).",
-        "Intervals of few seeds are too narrow.",
+        'Intervals of few seeds are too narrow. Missing: "n=1 of 3" where other cells of the maze have three seeds,',
+        '"no run" where other cells of the maze, and other mazes of the row, have one.',
         "",
         "![Accuracy of every objective](figures/accuracy.png)",
         "",
@@ -212,23 +232,22 @@ def _budget(runs: list[Run]) -> str:
     trained = [run for run in runs if run.cell.method != UNTRAINED]
     steps = " or ".join(f"{count:,}" for count in sorted({int(run.facts["steps"]) for run in trained}))
     minutes = [float(run.facts["seconds"]) / 60 for run in trained]
-    machines = sorted({run.facts["gpu"] or f"{run.facts['processor']}, no GPU" for run in runs})
+    machines = markdown("; ".join(sorted({run.facts["gpu"] or f"{run.facts['processor']}, no GPU" for run in runs})))
     data = PRESETS[runs[0].preset]
     return (
         f"Budget: {steps} gradient steps on {data.trajectories * data.trajectory_rows:,} samples, "
-        f"{min(minutes, default=0):.0f} to {max(minutes, default=0):.0f} minutes a run ({'; '.join(machines)}). "
+        f"{min(minutes, default=0):.0f} to {max(minutes, default=0):.0f} minutes a run ({machines}). "
         "The paper's: 200,000 steps on 500,000 samples."
     )
 
 
 def _markdown(table: Table) -> list[str]:
     """A table under its view; lines that neither a run nor the paper has a number for are left out."""
-    if not any(len(entry.numbers) for _, entries in table.rows for entry in entries):
+    if not table.lines():
         return [f"*{table.view}*: no run yet.", ""]
     lines = [f"*{table.view}*", "", "| | " + " | ".join(table.mazes) + " |", "|---|" + "---|" * len(table.mazes)]
-    for label, entries in table.rows:
-        cells = [entry.text() for entry in entries]
-        lines += [f"| {label} | {' | '.join(cells)} |"] if any(cells) else []
+    for label, entries in table.lines():
+        lines.append(f"| {label} | {' | '.join(entry.text() for entry in entries)} |")
     return [*lines, ""]
 
 
@@ -240,13 +259,13 @@ def _commands(runs: list[Run]) -> list[str]:
         "Each line computes one run; `navigation collect` makes its data. Seconds are wall-clock.",
         f"`vd4rl-pomdp navigation grid --grid paper --mazes {' '.join(MAZES)} --dry-run` prints those of every cell.",
     ]
-    lines += ["", "```bash"]
+    commands = []
     for maze in dict.fromkeys(run.cell.maze for run in runs):
         collect = f"vd4rl-pomdp navigation collect --preset {runs[0].preset} --maze {maze} --out data/{maze}"
-        lines.append(collect)
+        commands.append(collect)
     for run in runs:
-        lines.append(f"{run.facts['command']}  # {float(run.facts['seconds']):.0f} s")
-    return [*lines, "```"]
+        commands.append(f"{run.facts['command']}  # {float(run.facts['seconds']):.0f} s")
+    return [*lines, "", *code_block(commands, "bash")]
 
 
 def _write_tables(tables: list[Table], path: Path) -> None:
@@ -254,9 +273,9 @@ def _write_tables(tables: list[Table], path: Path) -> None:
     rows = (
         _csv_row(table, label, maze, entry)
         for table in tables
-        for label, entries in table.rows
+        for label, entries in table.lines()
         for maze, entry in zip(table.mazes, entries, strict=True)
-        if len(entry.numbers)
+        if len(entry.numbers) or entry.missing
     )
     write_csv(path, names, rows)
 
@@ -268,7 +287,7 @@ def _csv_row(table: Table, label: str, maze: str, entry: Entry) -> dict[str, Any
         "view": table.view,
         "row": label,
         "maze": maze,
-        "mean": f"{entry.numbers.mean():.4g}",
+        "mean": f"{entry.numbers.mean():.4g}" if len(entry.numbers) else "",
         "low": low if low == "" else f"{low:.4g}",
         "high": high if high == "" else f"{high:.4g}",
         "seeds": len(entry.numbers),

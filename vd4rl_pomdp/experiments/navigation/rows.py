@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 import csv
+import math
+import shlex
 import shutil
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.grid import Cell
 from vd4rl_pomdp.runs.folder import read_json, write_csv
+from vd4rl_pomdp.runs.metrics import read_metrics
+from vd4rl_pomdp.runs.settings import settings_of
 
 ROWS, RUNS, TRAJECTORIES = "rows.csv", "runs.csv", "trajectories"
 Value = tuple[str, str, str, str, int]
@@ -44,9 +48,49 @@ class Run:
         }
 
     @property
+    def settings(self) -> dict[str, str]:
+        """Steps, data, and every flag of its command that neither names its cell nor leaves results as they are."""
+        facts = {name: self.facts[name] for name in ("steps", "set")}
+        named = {*_IDENTITY[1:3], "literal_future", "preset"}
+        return facts | settings_of(
+            {k: v for k, v in flags_of(self.facts["command"]).items() if k not in named | {*facts}}
+        )
+
+    @property
     def file_name(self) -> str:
         """Name of its trajectory beside the CSV files."""
         return f"{self.cell.name.replace('/', '-')}-seed{self.seed}.csv"
+
+
+def flags_of(command: str) -> dict[str, str]:
+    """Flags of a command line by field name: "--max-k 1 --k-embedding" is {"max_k": "1", "k_embedding": "yes"}.
+
+    Numbers are written in one way, so that 1 and 1.0 agree.
+    """
+    flags: dict[str, str] = {}
+    name = ""
+    for word in _split(command):
+        if word.startswith("--"):
+            flag, _, value = word[2:].partition("=")
+            name = flag.replace("-", "_")
+            flags[name] = _number(value) if value else "yes"
+        elif name:
+            flags[name] = _number(word)
+    return flags
+
+
+def _split(command: str) -> list[str]:
+    try:
+        return shlex.split(command)
+    except ValueError as error:
+        raise UserError(f"a run's command is damaged ({error}): {command}") from error
+
+
+def _number(word: str) -> str:
+    try:
+        return f"{float(word):g}"
+    except ValueError:
+        return word
 
 
 def load_runs(sources: Iterable[Path]) -> list[Run]:
@@ -54,7 +98,7 @@ def load_runs(sources: Iterable[Path]) -> list[Run]:
 
     Raises:
         UserError: there is no source, one is missing, damaged or holds nothing, the same run comes with two results,
-            or seeds of one cell differ in their steps or data.
+            seeds of one cell differ in their steps, data or settings, or a value is not finite.
     """
     runs: dict[tuple[Any, ...], Run] = {}
     for source in sources:
@@ -79,16 +123,43 @@ def load_runs(sources: Iterable[Path]) -> list[Run]:
     return sorted(runs.values(), key=lambda run: tuple(run.identity.values()))
 
 
+def is_missing(cell: Cell, runs: Iterable[Run]) -> bool:
+    """Whether no run has a cell, though others are in its maze and others are like it in another maze."""
+    cells = {run.cell for run in runs}
+    return (
+        cell not in cells
+        and any(other.maze == cell.maze for other in cells)
+        and any(replace(other, maze=cell.maze) == cell for other in cells)
+    )
+
+
+def unfinished_runs(sources: Iterable[Path]) -> list[tuple[Path, str]]:
+    """Runs below the sources that have not come to their end, and how far they are: "at 10 of 30 steps"."""
+    configs = {path for source in sources for path in source.rglob("config.json") if _is_cut(path.parent)}
+    return [(path.parent, _progress(path.parent)) for path in sorted(configs)]
+
+
+def _is_cut(folder: Path) -> bool:
+    return not (folder / "timing.json").exists() and read_json(folder / "config.json").get("stage") == "navigation"
+
+
+def _progress(folder: Path) -> str:
+    done = max((int(row["step"]) for row in read_metrics(folder / "metrics.jsonl")), default=0)
+    return f"at {done} of {read_json(folder / 'config.json').get('config', {}).get('steps', '?')} steps"
+
+
 def _refuse_mixtures(runs: Iterable[Run]) -> None:
-    """Seeds of one cell make a mean only if they had the same budget and the same data."""
+    """Seeds of one cell make a mean only if they had the same budget, data and settings."""
     first: dict[Cell, Run] = {}
     for run in runs:
         other = first.setdefault(run.cell, run)
-        for fact in ("steps", "set"):
-            if run.facts[fact] != other.facts[fact]:
+        mine, others = run.settings, other.settings
+        for name in dict.fromkeys((*others, *mine)):
+            values = [settings.get(name, "the preset's") for settings in (others, mine)]
+            if values[0] != values[1]:
                 raise UserError(
-                    f"{run.cell.name}: seeds {other.seed} and {run.seed} differ in their {fact} ({other.facts[fact]}, "
-                    f"{run.facts[fact]}) and make no mean; report them apart"
+                    f"{run.cell.name}: seeds {other.seed} and {run.seed} differ in their {name} ({', '.join(values)}) "
+                    "and make no mean; report them apart"
                 )
 
 
@@ -144,9 +215,15 @@ def _run_of(folder: Path) -> Run:
         "gpu": machine["gpu"] or "",
         "command": results.get("command", record["command"]),
     }
-    values = {_value(row): float(f"{row['value']:.6g}") for row in results["rows"]}
+    values = {_value(row): _finite(folder / "results.json", row, f"{row['value']:.6g}") for row in results["rows"]}
     trajectory = folder / "trajectory.csv"
     return Run(cell, config["preset"], config["seed"], values, {k: str(v) for k, v in facts.items()}, trajectory)
+
+
+def _finite(path: Path, row: dict[str, Any], value: str) -> float:
+    if not math.isfinite(float(value)):
+        raise UserError(f"{path}: a {row['measure']} is {value}: the run has diverged; train it again or leave it out")
+    return float(value)
 
 
 def _value(row: dict[str, Any]) -> Value:
@@ -165,7 +242,7 @@ def _from_csv(source: Path) -> list[Run]:
 def _runs_of(source: Path) -> list[Run]:
     values: dict[tuple[str, ...], dict[Value, float]] = {}
     for row in _read(source / ROWS):
-        values.setdefault(_identity(row), {})[_value(row)] = float(row["value"])
+        values.setdefault(_identity(row), {})[_value(row)] = _finite(source / ROWS, row, row["value"])
     runs = []
     for row in _read(source / RUNS):
         flags = {name: row[name] == "1" for name in ("self_prediction", "exogenous", "literal_future")}
@@ -183,7 +260,7 @@ def _identity(row: dict[str, str]) -> tuple[str, ...]:
 
 def _read(path: Path) -> list[dict[str, str]]:
     try:
-        with path.open(newline="") as file:
+        with path.open(newline="", encoding="utf-8") as file:
             return list(csv.DictReader(file))
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); it is written by the report") from error

@@ -1,0 +1,144 @@
+"""No command writes over a run, a policy, an encoder or a data set, nor inside one."""
+
+import hashlib
+import json
+from pathlib import Path
+
+import pytest
+
+from tests.helpers_data import write_fake_set
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs.outputs import kept_in, refuse_foreign, refuse_inside, refuse_kept
+
+
+def fill(folder: Path, **files: str) -> Path:
+    folder.mkdir(parents=True)
+    for name, text in files.items():
+        (folder / name.replace("__", ".")).write_text(text)
+    return folder
+
+
+@pytest.fixture
+def kept(tmp_path) -> dict[str, Path]:
+    """A folder of every kind that owns its files."""
+    run = {"stage": "finetune", "config": {}, "versions": {}, "git_commit": "", "command": ""}
+    return {
+        "a run": fill(tmp_path / "run", config__json=json.dumps(run), episodes__csv=""),
+        "an encoder": fill(tmp_path / "encoder", config__json="{}", model__safetensors=""),
+        "a policy": fill(tmp_path / "policy", config__json='{"task": "cheetah_run"}', curve__csv=""),
+        "a data set": write_fake_set(tmp_path / "walker_walk" / "expert"),
+        "a data set ": fill(tmp_path / "collecting", collection__json="{}"),
+    }
+
+
+def contents(folder: Path) -> dict[str, str]:
+    return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*") if p.is_file()}
+
+
+def test_what_owns_a_folder_is_known_by_its_files(kept, tmp_path):
+    assert {name: kept_in(folder) for name, folder in kept.items()} == {name: name.strip() for name in kept}
+    others = {
+        "reports": {"summary.csv": "", "index.html": ""},
+        "package": {"config.json": "[1]", "a.hdf5": "no shard"},
+        "broken": {"config.json": "{"},
+    }
+    for name, files in others.items():
+        folder = fill(tmp_path / name, **{file.replace(".", "__"): text for file, text in files.items()})
+        assert kept_in(folder) is None
+    assert kept_in(tmp_path / "nowhere") is None
+
+
+def test_folders_that_are_kept_foreign_or_inside_others_are_refused(kept, tmp_path):
+    for what, folder in kept.items():
+        refuse_inside(folder)
+        for check in (refuse_kept, lambda out: refuse_foreign(out, "report", "config.json", "0_fake.hdf5")):
+            with pytest.raises(UserError, match=f"holds {what.strip()}; choose another --out"):
+                check(folder)
+        for inner in (folder / "new", folder / "not" / "there" / "yet.csv", folder / ".." / folder.name / "new"):
+            with pytest.raises(UserError, match=f"lies inside .* holds {what.strip()}; choose another --out"):
+                refuse_inside(inner)
+    (tmp_path / "link").symlink_to(kept["a run"])
+    with pytest.raises(UserError, match="lies inside"):
+        refuse_inside(tmp_path / "link" / "new")
+    papers = fill(tmp_path / "papers", thesis__tex="words")
+    with pytest.raises(UserError, match="is not empty and holds no report"):
+        refuse_foreign(papers, "report", "summary.csv")
+    for mine in (tmp_path / "new", fill(tmp_path / "empty"), fill(tmp_path / "earlier", summary__csv="")):
+        refuse_foreign(mine, "report", "summary.csv")
+
+
+def commands(data: Path, run: Path) -> dict[str, list[str]]:
+    """Words of every command that has an --out, with nothing else wrong."""
+    preset = ["--preset", "smoke"]
+    return {
+        "demo": ["demo"],
+        "data collect": ["data", "collect", "--task", "walker_walk", "--quality", "random", "--episodes", "1"],
+        "data download": ["data", "download", "--task", "walker_walk", "--quality", "random"],
+        "data table": ["data", "table", "--tasks", "walker_walk", "--qualities", "random"],
+        "policy train": ["policy", "train", "--task", "walker_walk", "--decisions", "1"],
+        "policy export": ["policy", "export", str(run.parent / "trained")],
+        "pretrain": ["pretrain", *preset, "--data", str(data)],
+        "finetune": ["finetune", *preset, "--data", str(data), "--encoder", str(run / "encoder")],
+        "evaluate": ["evaluate", str(run)],
+        "navigation collect": ["navigation", "collect", *preset, "--maze", "no_curtain"],
+        "navigation train": ["navigation", "train", *preset, "--data", str(data)],
+        "navigation policy": ["navigation", "policy", "--decisions", "1"],
+        "navigation grid": ["navigation", "grid", "--dry-run"],
+        "navigation report": ["navigation", "report", str(run)],
+        "sweep": ["sweep", "--data", str(data), *preset, "--dry-run"],
+        "report": ["report", str(run)],
+        "theory": ["theory"],
+    }
+
+
+NAMES = list(commands(Path(), Path()))
+FILES = ("evaluate", "navigation policy")
+"""Commands whose --out is a file."""
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_no_command_writes_into_what_another_owns(name, kept, tmp_path, capsys, monkeypatch):
+    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+    fill(tmp_path / "trained", config__json='{"task": "walker_walk"}', curve__csv="decisions,return_mean\n")
+    for folder in kept.values():
+        places = [folder / "inside"] if name not in FILES else [folder / "inside.csv", folder / "not" / "there.csv"]
+        if name not in (*FILES, "pretrain", "finetune", "navigation train"):  # which look at their data first
+            places.append(folder)
+        for out in places:
+            before = contents(tmp_path)
+            words = [*commands(kept["a data set"], kept["a run"])[name], "--out", str(out)]
+            with pytest.raises(SystemExit) as end:
+                main(words)
+            error = capsys.readouterr().err.strip()
+            assert (end.value.code, len(error.splitlines())) == (2, 1), error
+            assert str(out) in error
+            assert "choose another --out" in error
+            assert contents(tmp_path) == before
+
+
+def test_every_command_with_an_out_is_tried(capsys):
+    from vd4rl_pomdp.cli import COMMANDS
+
+    flat = {f"{name} {inner}" for name, entry in COMMANDS.items() if isinstance(entry, dict) for inner in entry}
+    flat |= {name for name, entry in COMMANDS.items() if not isinstance(entry, dict)}
+    with_out = set()
+    for name in flat:
+        with pytest.raises(SystemExit):
+            main([*name.split(), "--help"])
+        if "--out " in capsys.readouterr().out:
+            with_out.add(name)
+    assert with_out == set(NAMES)
+
+
+def test_an_exported_policy_is_replaced_only_by_one_of_its_task(tmp_path):
+    from vd4rl_pomdp.policies.export import _refuse_other
+    from vd4rl_pomdp.tasks import get_task
+
+    fill(tmp_path / "kept", config__json='{"task": "cheetah_run"}', curve__csv="")
+    _refuse_other(tmp_path / "kept", get_task("cheetah_run"))
+    with pytest.raises(UserError, match="holds a policy"):
+        _refuse_other(tmp_path / "kept", get_task("walker_walk"))
+    (tmp_path / "kept" / "snapshots").mkdir()
+    with pytest.raises(UserError, match="holds a policy"):
+        _refuse_other(tmp_path / "kept", get_task("cheetah_run"))

@@ -1,0 +1,119 @@
+"""What tells runs of one method apart: the settings that differ among them, in words beside the method's name.
+
+Runs are seeds of one experiment only if they agree in everything but seed, folders, device and logging. A fine-tuning
+run has its own config, its encoder's, and the data of both.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import fields
+from typing import Any
+
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.runs.settings import settings_of
+
+Settings = dict[str, str]
+"""Values as words, by the name that is shown beside them."""
+Parts = tuple[str, str, str]
+"""What differs among all runs of a method, among those of one corruption, and among those of one set and corruption."""
+
+UNKNOWN = "pretraining"
+"""Stands in the settings of a run whose encoder does not say how it was pretrained."""
+_NOT_RECORDED = "not recorded"
+_PRESETS = ("preset", "pretraining preset")
+_CORRUPTION = frozenset(field.name for field in fields(CorruptionConfig))
+_DATA = ("data", "pretraining data")
+_LABELS = ("method", "task", "quality")
+"""Fields that name a run's rows; they are no settings."""
+
+
+def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Settings:
+    """All settings behind a run.
+
+    Args:
+        record: its config.json.
+        card: its encoder's card, empty for a pretraining run or where there is none.
+    """
+    own = settings_of(record["config"])
+    before = dict(card.get("corruption", {})) | {name: card[name] for name in ("steps", "preset") if name in card}
+    before |= card.get("settings") or {}
+    found = own | {(f"pretraining {k}" if k in own else k): v for k, v in before.items()}
+    words = {name: _words(value) for name, value in found.items() if name not in _LABELS}
+    if record["stage"] == "finetune" and not card.get("settings"):
+        words[UNKNOWN] = _NOT_RECORDED
+    return words | _data(record.get("inputs", {}).get("data"), card.get("data"))
+
+
+def _data(own: str | None, before: str | None) -> Settings:
+    """Short fingerprints of the sets behind a run, as far as they are recorded."""
+    shown = {"data": own, "pretraining data": "the same" if own and before == own else before}
+    return {name: value[:8] for name, value in shown.items() if value}
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None:
+        return "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
+def differences(settings: list[Settings], corruption: list[str], place: list[tuple], brief: bool = True) -> list[Parts]:
+    """Words for what differs among runs of one method, run by run.
+
+    Args:
+        settings: of the runs.
+        corruption: the name of each run's corruption: other fields of it are told apart within one name.
+        place: where each run stands (task, quality, corruption): sets are told apart within one place.
+        brief: whether a preset stands for all the settings that it decides.
+    """
+    columns = (
+        _by_scope(settings, [None] * len(settings), lambda name: name not in _CORRUPTION and name not in _DATA, brief),
+        _by_scope(settings, corruption, _CORRUPTION.__contains__, brief),
+        _by_scope(settings, place, _DATA.__contains__, brief),
+    )
+    return list(zip(*columns, strict=True))
+
+
+def _by_scope(settings: list[Settings], scope: Sequence[Any], wanted: Callable[[str], bool], brief: bool) -> list[str]:
+    """What differs of the wanted settings among runs of one scope, run by run."""
+    words = [""] * len(settings)
+    for key in dict.fromkeys(scope):
+        members = [number for number, other in enumerate(scope) if other == key]
+        for number, text in zip(members, _name([settings[i] for i in members], wanted, brief), strict=True):
+            words[number] = text
+    return words
+
+
+def _name(settings: list[Settings], wanted: Callable[[str], bool], brief: bool) -> list[str]:
+    """What differs among some settings: "max_k 1, steps 20"."""
+    known = filter(wanted, dict.fromkeys(name for one in settings for name in one))
+    names = [name for name in known if _differs(settings, name)]
+    deciding: list[str] = []
+    for preset in _PRESETS if brief else ():
+        if preset in names and not _decided(settings, preset, deciding):
+            deciding.append(preset)
+    names = [name for name in names if name in deciding or not _decided(settings, name, deciding)]
+    return [", ".join(f"{name} {value}" for name in names if (value := _value(one, name))) for one in settings]
+
+
+def _value(settings: Settings, name: str) -> str:
+    """A value in words; none where an encoder does not say how it was pretrained."""
+    if name in settings:
+        return settings[name]
+    if name in _DATA:
+        return _NOT_RECORDED
+    return "" if UNKNOWN in settings or name == UNKNOWN else "unset"
+
+
+def _differs(settings: list[Settings], name: str) -> bool:
+    values = {_value(one, name) for one in settings}
+    return len(values if name == UNKNOWN else values - {""}) > 1
+
+
+def _decided(settings: list[Settings], name: str, by: Iterable[str]) -> bool:
+    """Whether a setting that differs is the same wherever those of `by` are."""
+    deciding = [tuple(_value(one, other) for other in by) for one in settings]
+    pairs = {(first, _value(one, name)) for first, one in zip(deciding, settings, strict=True)}
+    return len(pairs) == len(set(deciding))

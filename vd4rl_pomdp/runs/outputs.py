@@ -1,0 +1,88 @@
+"""Where a command may write: never over what another command keeps, nor inside it.
+
+A run, a policy, an encoder and a data set own their folders. Every command asks here before its first file.
+"""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import h5py
+
+from vd4rl_pomdp.data.format import FRAMES_KEY, PLAN, SUFFIXES
+from vd4rl_pomdp.errors import UserError
+
+_ROWS = {FRAMES_KEY, "action", "reward", "step_type"}
+"""Keys that tell a shard from other HDF5 files."""
+
+
+def refuse_inside(out: Path) -> None:
+    """Raise UserError if a file or folder to write lies inside a run, a policy, an encoder or a data set."""
+    for folder in out.resolve().parents:
+        if what := kept_in(folder):
+            raise UserError(f"{out}: lies inside {folder}, which holds {what}; choose another --out")
+
+
+def refuse_kept(out: Path) -> None:
+    """Raise UserError if a folder of runs or sets to write is itself a run, a policy, an encoder or a data set."""
+    refuse_inside(out)
+    if what := kept_in(out):
+        raise UserError(f"{out}: holds {what}; choose another --out")
+
+
+def refuse_foreign(out: Path, what: str, *marks: str) -> None:
+    """Raise UserError unless a folder is missing or empty, or has been written by the same command before.
+
+    Args:
+        out: folder to write.
+        what: what the command writes, for the message.
+        marks: files that the command leaves; any one of them makes the folder its own. Hidden files do not count.
+    """
+    refuse_kept(out)
+    if _names(out) and not any((out / mark).is_file() for mark in marks):
+        raise UserError(f"{out}: is not empty and holds no {what}; choose another --out")
+
+
+def kept_in(folder: Path) -> str | None:
+    """What a folder keeps: "a run", "a policy", "an encoder", "a data set", or None for nothing of the kind."""
+    config = folder / "config.json"
+    if config.is_file():
+        if (folder / "model.safetensors").is_file():
+            return "an encoder"
+        if any((folder / name).exists() for name in ("curve.csv", "snapshots")):
+            return "a policy"
+        if _is_run(config):
+            return "a run"
+    return "a data set" if _is_set(folder) else None
+
+
+def _is_run(config: Path) -> bool:
+    try:
+        record = json.loads(config.read_text(encoding="utf-8"))
+    except (OSError, ValueError):
+        return False
+    return isinstance(record, dict) and "stage" in record
+
+
+def _is_set(folder: Path) -> bool:
+    if (folder / PLAN).is_file():
+        return True
+    shards = (folder / name for name in _names(folder) if name.lower().endswith(SUFFIXES))
+    return any(path.is_file() and _is_shard(path) for path in shards)
+
+
+def _is_shard(path: Path) -> bool:
+    try:
+        with h5py.File(path, "r") as file:
+            return set(file) >= _ROWS
+    except (OSError, RuntimeError):
+        return False
+
+
+def _names(folder: Path) -> list[str]:
+    """Names in a folder, hidden ones left out; none where nothing can be listed: writing there says what is wrong."""
+    try:
+        return [path.name for path in folder.iterdir() if not path.name.startswith(".")]
+    except OSError:
+        return []

@@ -1,0 +1,20 @@
+"""Which settings of a run can change its result: all but its seed, its folders, its device and its logging.
+
+Runs are seeds of one experiment only if these agree.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+RUNTIME_FIELDS = frozenset({"out", "device", "workers", "wandb", "data", "encoder"})
+"""Config fields that do not change a result, so that a run may go on with other ones; of data and encoder, which may be
+moved, the content is compared."""
+NO_SETTINGS = RUNTIME_FIELDS | {"seed", "log_every", "checkpoint_every"}
+"""Config fields in which the seeds of one experiment may differ."""
+
+
+def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A stage's config, as JSON keeps it, without the fields that do not change a result."""
+    return {name: value for name, value in config.items() if name not in NO_SETTINGS}
