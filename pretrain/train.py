@@ -10,7 +10,7 @@ import torch
 from pretrain.config import PretrainConfig
 from pretrain.objectives import build_objective, get_method
 from vd4rl_pomdp.augmentation import observe
-from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, make_corruption
+from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, check_corruption
 from vd4rl_pomdp.data import Dataset, WindowSampler, open_dataset
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.nn.action_target import make_action_target
@@ -23,7 +23,7 @@ from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.folder import RunFolder, jsonable
 from vd4rl_pomdp.runs.metrics import MetricsLog, read_metrics
 from vd4rl_pomdp.runs.progress import ProgressLine
-from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, get_task
+from vd4rl_pomdp.tasks import FRAME_SIZE, get_task
 from vd4rl_pomdp.types import Windows
 
 SHIFT_STREAM, BATCH_STREAM = 1, 2
@@ -137,8 +137,7 @@ def _check(config: PretrainConfig) -> None:
         homer_codes=0, self_prediction=0, l2_states=0, log_every=1, checkpoint_every=1,
     )  # fmt: skip
     check_frame_encoder(config.frame_encoder)
-    stack = torch.zeros(1, 3 * FRAME_STACK, FRAME_SIZE, FRAME_SIZE, dtype=torch.uint8)
-    make_corruption(config)(stack, torch.zeros(1, dtype=torch.int64))  # which fails where it does not fit a frame
+    check_corruption(config)
 
 
 def _build(dataset: Dataset, config: PretrainConfig) -> Objective:

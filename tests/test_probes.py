@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-from dm_control import suite
 
+from vd4rl_pomdp.envs.rendering import suite
 from vd4rl_pomdp.probes import probe_error, probe_state
 from vd4rl_pomdp.tasks import TASKS, get_task
 
