@@ -41,6 +41,8 @@ try:  # both load the OpenGL library that MUJOCO_GL names, and fail in many ways
     import mujoco
     from dm_control import suite
 except (ImportError, AttributeError, RuntimeError) as _error:
+    if getattr(_error, "name", None) == "dm_control":
+        raise UserError("dm-control is not installed: `pip install --no-deps dm-control==1.0.44`") from _error
     raise gl_error(_error) from _error
 
 __all__ = [
