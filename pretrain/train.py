@@ -9,7 +9,7 @@ import torch
 
 from pretrain.config import PretrainConfig
 from pretrain.objectives import build_objective, get_method
-from vd4rl_pomdp.corruptions import CorruptionConfig, make_corruption
+from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption
 from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.nn.action_target import make_action_target
@@ -25,7 +25,7 @@ from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, get_task
+from vd4rl_pomdp.tasks import FRAME_SIZE, get_task
 from vd4rl_pomdp.types import Windows
 
 STAGE = "pretrain"
@@ -118,8 +118,7 @@ def _check(config: PretrainConfig) -> None:
         homer_codes=0, self_prediction=0, l2_states=0, log_every=1, checkpoint_every=1,
     )  # fmt: skip
     check_frame_encoder(config.frame_encoder)
-    stack = torch.zeros(1, 3 * FRAME_STACK, FRAME_SIZE, FRAME_SIZE, dtype=torch.uint8)
-    make_corruption(config)(stack, torch.zeros(1, dtype=torch.int64))  # which fails where it does not fit a frame
+    check_corruption(config)
 
 
 def _build(dataset: Dataset, config: PretrainConfig) -> Objective:

@@ -30,7 +30,7 @@ install_debian() {
     $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq "$@" >/dev/null
 }
 
-wanted="$(cat pyproject.toml scripts/setup.sh | sha256sum | cut -d' ' -f1) $PYTHON"
+wanted="$(cat pyproject.toml constraints.txt scripts/setup.sh | sha256sum | cut -d' ' -f1) $PYTHON"
 if [ -f "$STAMP" ] && [ "$(cat "$STAMP")" = "$wanted" ]; then
     exit 0
 fi
@@ -38,8 +38,8 @@ fi
 if ! command -v "$PYTHON" >/dev/null; then
     install_debian python3 python3-venv
 fi
-if ! "$PYTHON" -c 'import sys; sys.exit(sys.version_info < (3, 11))'; then
-    say "setup: $PYTHON is $("$PYTHON" -V), 3.11 or newer is needed; name one with PYTHON=python3.12"
+if ! "$PYTHON" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))'; then
+    say "setup: $PYTHON is $("$PYTHON" -V), one of 3.11 to 3.13 is needed; name it with PYTHON=python3.12"
     exit 2
 fi
 if [ ! -x "$VENV/bin/python" ]; then
@@ -47,7 +47,9 @@ if [ ! -x "$VENV/bin/python" ]; then
     "$PYTHON" -m venv "$VENV"
 fi
 say "setup: installing Python packages (a few minutes the first time)"
-"$VENV/bin/python" -m pip install --quiet --disable-pip-version-check -e ".[dev,policy]"
+pip_install() { "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt "$@"; }
+pip_install -e ".[dev,policy]"
+pip_install --no-deps dm-control # which Python 3.13 gets no other way; elsewhere it is there already
 
 can_render() {
     "$VENV/bin/python" scripts/can_render.py >/dev/null 2>&1

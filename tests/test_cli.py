@@ -47,6 +47,7 @@ def test_every_command_has_help(words, capsys):
         (["policy", "train", "--task", "walker_walk", "--out", "file/below"], "file/below"),
         (["theory", "--out", "file/below"], "file/below: cannot be used (not a directory)"),
         (["data", "card", "nowhere"], "nowhere"),
+        (["demo", "--preset", "huge"], "unknown preset 'huge': choose one of cpu, smoke"),
         (["pretrain", "--data", "x"], "Missing from vd4rl-pomdp pretrain: --out"),
         (["pretrain", "--data", "x", "--out", "y", "--steps", "many"], "--steps: invalid literal"),
         (["finetune", "--encoder", "a", "--data", "b", "--out", "c", "--veiws", "3"], "Perhaps you meant: --views"),
@@ -65,9 +66,16 @@ def test_a_slip_is_one_line_and_exit_code_2(words, message, capsys, tmp_path, mo
     assert [p.name for p in tmp_path.iterdir()] == ["file"], "nothing may be left behind"
 
 
-def test_help_needs_neither_numpy_nor_torch():
-    code = "import sys, vd4rl_pomdp.cli; sys.exit(bool({'numpy', 'torch'} & set(sys.modules)))"
-    assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+@pytest.mark.parametrize("package", ["vd4rl_pomdp", "vd4rl_pomdp.cli"])
+def test_the_package_is_the_program_and_its_help_needs_neither_numpy_nor_torch(package, capsys):
+    code = (
+        f"import runpy, sys; sys.argv = ['x', '--help']; runpy.run_module({package!r}, run_name='__main__');"
+        "sys.exit(bool({'numpy', 'torch', 'triton'} & set(sys.modules)))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    main(["--help"])
+    assert done.stdout == capsys.readouterr().out
 
 
 def test_without_words_the_commands_are_listed(capsys):
@@ -88,9 +96,11 @@ def test_results_stay_on_one_line_each(capsys):
     ]
 
 
-def test_the_demo_uses_every_stage(tmp_path):
-    stages = [words[0] for words in demo_commands(tmp_path, 1)]
-    assert stages == ["data", *["pretrain", "finetune"] * 3, "report"]
+@pytest.mark.parametrize("preset", ["cpu", "smoke"])
+def test_the_demo_uses_every_stage(tmp_path, preset):
+    words = list(demo_commands(tmp_path, 1, preset))
+    assert [stage[0] for stage in words] == ["data", *["pretrain", "finetune"] * 3, "report"]
+    assert all(stage[stage.index("--preset") + 1] == preset for stage in words if "--preset" in stage)
 
 
 SWEEP = ["sweep", "--data", "my data", "--out", "runs", "--methods", "acro", "random", "--seeds", "0", "1"]

@@ -50,6 +50,7 @@ def test_the_example_runs_through_every_stage(script, tmp_path):
 @pytest.fixture
 def registry(monkeypatch):
     monkeypatch.setattr(pretrain.objectives, "METHODS", dict(METHODS))
+    monkeypatch.setattr(pretrain.objectives, "_broken", {})
 
 
 def test_the_example_sees_what_it_declares(script, registry):
@@ -69,6 +70,29 @@ def test_an_entry_point_offers_a_method(registry, monkeypatch):
     monkeypatch.setattr(pretrain.objectives, "entry_points", lambda group: [entry])
     assert get_method("theirs") is THEIRS
     assert get_method("theirs") is THEIRS, "asking again registers nothing twice"
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [
+        ("no_such_package:METHOD", "no_such_package:METHOD: ModuleNotFoundError"),
+        ("tests.test_own_method:NOWHERE", "AttributeError"),
+        ("tests.test_own_method:PAGE", "Path, not a pretrain.objectives.Method"),
+    ],
+)
+def test_a_method_that_cannot_be_loaded_is_named_once_and_left_out(registry, monkeypatch, capsys, value, reason):
+    offered = [
+        EntryPoint("broken", value, "vd4rl_pomdp.methods"),
+        EntryPoint("theirs", "tests.test_own_method:THEIRS", "vd4rl_pomdp.methods"),
+    ]
+    monkeypatch.setattr(pretrain.objectives, "entry_points", lambda group: offered)
+    assert get_method("acro") is METHODS["acro"]
+    assert get_method("theirs") is THEIRS
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("warning: method 'broken' cannot be loaded")
+    assert reason in line
+    with pytest.raises(UserError, match="'broken' cannot be loaded"):
+        get_method("broken")
 
 
 def test_a_taken_name_is_refused(registry):

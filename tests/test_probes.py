@@ -1,7 +1,7 @@
 import numpy as np
 import pytest
-from dm_control import suite
 
+from vd4rl_pomdp.envs.rendering import suite
 from vd4rl_pomdp.probes import probe_error, probe_state
 from vd4rl_pomdp.tasks import TASKS, get_task
 
@@ -43,3 +43,13 @@ def test_tasks_name_the_columns_of_their_simulators(name: str):
     travel = (0, 1) if joints[0] == "root" else (joints.index("rootx"),)
     assert task.travel == travel
     assert task.visible_state(physics.get_state()[None]).shape == (1, physics.get_state().size - len(travel))
+
+
+def test_knowing_nothing_scores_the_mean_deviation_over_the_standard_deviation():
+    episode, nothing = np.arange(20_000) // 100, np.zeros((20_000, 1))
+    for targets, score in (
+        (RNG.normal(size=20_000), 100 * np.sqrt(2 / np.pi)),
+        (RNG.laplace(size=20_000), 100 / np.sqrt(2)),
+        (RNG.choice([-3.0, 5.0], 20_000), 100.0),
+    ):
+        assert probe_error(nothing, targets[:, None], episode) == pytest.approx(score, abs=2)

@@ -4,9 +4,12 @@ import ast
 import re
 import subprocess
 import tomllib
+from importlib.metadata import requires
 from pathlib import Path
 
 import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("vd4rl_pomdp", "pretrain", "finetune", "baselines")
@@ -71,14 +74,13 @@ def _names_no_encoding(call: ast.Call) -> bool:
 
 
 def test_text_files_are_utf8_whatever_the_machine_speaks():
-    elsewhere = {"vd4rl_pomdp/runs/checkpoint.py", "vd4rl_pomdp/runs/folder.py", "vd4rl_pomdp/runs/metrics.py"}
     calls = [
         f"{path.relative_to(ROOT).as_posix()}:{node.lineno}"
         for path in SOURCES
         for node in ast.walk(ast.parse(path.read_text()))
         if isinstance(node, ast.Call) and _names_no_encoding(node)
     ]
-    assert [call for call in calls if call.split(":")[0] not in elsewhere] == []
+    assert calls == []
 
 
 def test_dependencies_are_bounded_above():
@@ -86,6 +88,26 @@ def test_dependencies_are_bounded_above():
     extras = [entry for group in project["optional-dependencies"].values() for entry in group]
     unbounded = [entry for entry in project["dependencies"] + extras if "<" not in entry]
     assert unbounded == []
+
+
+def test_constraints_pin_every_dependency_within_its_bounds():
+    lines = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if not line.startswith("#")]
+    pins = {canonicalize_name(name): version for name, _, version in (line.partition("==") for line in lines)}
+    assert all("+" not in line and "/" not in line and line.count("==") == 1 for line in lines), "builds or hosts"
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    extras = [entry for group in project["optional-dependencies"].values() for entry in group]
+    wanted = [Requirement(entry) for entry in project["dependencies"] + extras]
+    assert [str(r) for r in wanted if pins.get(canonicalize_name(r.name), "none") not in r.specifier] == []
+
+
+def test_what_dm_control_needs_is_asked_for_where_it_cannot_ask_itself():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    ours = [Requirement(entry) for entry in project["dependencies"]]
+    newest = {canonicalize_name(r.name) for r in ours if not r.marker or r.marker.evaluate({"python_version": "3.13"})}
+    theirs = [Requirement(entry) for entry in requires("dm-control")]
+    needed = {canonicalize_name(r.name) for r in theirs if not r.marker}
+    assert needed - newest == {"labmaze", "setuptools"}, "neither is imported by dm_control.suite"
+    assert "dm-control" not in newest
 
 
 def test_the_readmes_two_commands_exist_and_ci_runs_the_test_command():

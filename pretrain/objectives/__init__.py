@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import sys
 from collections.abc import Callable
 from dataclasses import dataclass
-from importlib.metadata import entry_points
+from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from torch import Tensor
@@ -88,16 +89,35 @@ def register_method(name: str, method: Method) -> None:
     METHODS[name] = method
 
 
+_broken: dict[str, str] = {}
+"""Methods that an installed package offers and that cannot be loaded, and why."""
+
+
 def _load_plugins() -> None:
-    """Register the methods that installed packages offer."""
+    """Register the methods that installed packages offer; one that cannot be loaded is told of once, and left out."""
     for entry in entry_points(group=ENTRY_POINTS):
-        if entry.name not in METHODS:
-            register_method(entry.name, entry.load())
+        if entry.name not in METHODS and entry.name not in _broken:
+            try:
+                register_method(entry.name, _load(entry))
+            except Exception as error:  # other people's code may raise anything
+                _broken[entry.name] = f"{entry.value}: {type(error).__name__}: {' '.join(str(error).split())}"
+                print(f"warning: method {entry.name!r} cannot be loaded ({_broken[entry.name]})", file=sys.stderr)
+
+
+def _load(entry: EntryPoint) -> Method:
+    method = entry.load()
+    if not isinstance(method, Method):
+        raise TypeError(f"is a {type(method).__name__}, not a pretrain.objectives.Method")
+    return method
 
 
 def get_method(name: str) -> Method:
     """The method called `name`; raises UserError listing the choices."""
     _load_plugins()
+    if name in _broken:
+        raise UserError(
+            f"method {name!r} cannot be loaded ({_broken[name]}): mend or remove the package that offers it"
+        )
     if name not in METHODS:
         raise UserError(f"unknown method {name!r}: choose one of {', '.join(METHODS)}")
     return METHODS[name]

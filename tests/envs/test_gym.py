@@ -4,12 +4,14 @@ import gymnasium
 import numpy as np
 import pytest
 import torch
+from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys, make_corruption
-from vd4rl_pomdp.envs import GYM_IDS
+from vd4rl_pomdp.envs import FINITE_IDS, FINITE_STEPS, GYM_IDS, MAZE_STEPS
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.types import row_key
 
 
@@ -19,7 +21,7 @@ def make(name, **arguments):
 
 @pytest.mark.parametrize("name", GYM_IDS)
 def test_every_id_passes_gymnasiums_checker(name):
-    env = gymnasium.make(name, render_mode="rgb_array", length=4, disable_env_checker=True)
+    env = gymnasium.make(name, render_mode="rgb_array", disable_env_checker=True)
     with warnings.catch_warnings():
         warnings.simplefilter("error")
         check_env(env.unwrapped)
@@ -49,10 +51,43 @@ def test_stacks_repeat_the_first_frame_and_put_the_oldest_first():
 
 
 def test_the_time_limit_truncates():
-    env = make("WalkerWalk", length=3)
+    env = make("WalkerWalk", max_episode_steps=3)
     env.reset(seed=0)
     ends = [env.step(np.zeros(6, np.float32))[2:4] for _ in range(3)]
     assert ends == [(False, False), (False, False), (False, True)]
+
+
+EVERY_ID = {
+    **dict.fromkeys(GYM_IDS, 500),
+    **dict.fromkeys((maze.gym_id for maze in MAZES.values()), MAZE_STEPS),
+    **dict.fromkeys(FINITE_IDS, FINITE_STEPS),
+}
+
+
+def test_every_id_tells_its_time_limit():
+    ours = [name for name in gymnasium.registry if name.startswith("vd4rl_pomdp/")]
+    assert {name: gymnasium.spec(name).max_episode_steps for name in ours} == EVERY_ID
+
+
+@pytest.mark.parametrize(
+    "name", ["vd4rl_pomdp/WalkerWalk-v0", "vd4rl_pomdp/MazeFirstPerson-v0", "vd4rl_pomdp/ForwardJumpCounterexample-v0"]
+)
+def test_a_step_after_the_end_is_refused_until_reset(name):
+    made = gymnasium.make(name, max_episode_steps=2)
+    for env in (made, gymnasium.make(made.spec)):
+        for seed in (0, None):
+            env.reset(seed=seed)
+            action = env.action_space.sample()
+            assert [env.step(action)[3] for _ in range(2)] == [False, True]
+            with pytest.raises(ResetNeeded, match="reset"):
+                env.step(action)
+
+
+def test_a_vector_of_environments_goes_on_after_the_end():
+    envs = gymnasium.make_vec("vd4rl_pomdp/ForwardJumpCounterexample-v0", 2, "sync", max_episode_steps=2)
+    envs.reset(seed=0)
+    ends = [envs.step(envs.action_space.sample())[3].tolist() for _ in range(5)]
+    assert ends == [[False] * 2, [True] * 2, [False] * 2, [False] * 2, [True] * 2]
 
 
 def test_patches_cover_256_pixels_of_each_frame_and_zero_frames_leaves_one():
@@ -89,8 +124,25 @@ def test_the_environment_corrupts_a_row_as_a_batch_would(name):
     assert not torch.equal(batch[0], steps[0].clean)
 
 
+def test_the_corruptions_fields_are_arguments():
+    env = make("WalkerWalk", corruption="patch", patch_size=24, patch_count=1, patch_fill=255, patch_shared=True)
+    obs, info = env.reset(seed=0)
+    changed = (obs != info["clean"]).reshape(3, 3, -1).any(1)
+    assert (changed.sum(1) == 24 * 24).all()
+    assert (changed == changed[0]).all()
+    assert (obs.reshape(3, 3, -1).transpose(0, 2, 1)[changed] == 255).all()
+
+
 @pytest.mark.parametrize(
-    ("arguments", "message"), [({"length": 0}, "episode of 0"), ({"length": -1}, "of -1"), ({"render": "x"}, "'x'")]
+    ("arguments", "message"),
+    [
+        ({"render": "x"}, "'x'"),
+        ({"corruption": "fog"}, "unknown corruption 'fog'"),
+        ({"patch_sise": 8}, "unknown argument 'patch_sise': choose one of corruption, .*patch_size"),
+        ({"corruption": "patch", "patch_size": 0}, "patch-size is 0"),
+        ({"corruption": "patch", "patch_size": 85}, "patch size 85 exceeds the image"),
+        ({"corruption": "zero_frames", "zeroed_frames": 4}, "cannot zero 4 of 3"),
+    ],
 )
 def test_bad_arguments_are_refused(arguments, message):
     with pytest.raises(UserError, match=message):

@@ -67,7 +67,7 @@ def test_the_backward_gru_starts_at_each_windows_last_real_row():
 def test_an_encoder_folder_gives_back_the_same_encoder(tmp_path):
     encoder, batch = make("gru", True), window()
     save_encoder(tmp_path, encoder, CARD)
-    loaded, card = load_encoder(tmp_path, "walker_walk", 2)
+    loaded, card = load_encoder(str(tmp_path), "walker_walk", 2)
     assert card == CARD
     with torch.no_grad():
         torch.testing.assert_close(loaded.encode(batch), encoder.encode(batch))

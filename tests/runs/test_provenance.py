@@ -6,7 +6,7 @@ from zipfile import ZipFile
 import pytest
 
 from vd4rl_pomdp.runs import provenance
-from vd4rl_pomdp.runs.provenance import COMMIT_FILE, checkout_commit, recorded_commit
+from vd4rl_pomdp.runs.provenance import COMMIT_FILE, checkout_commit, command, recorded_commit
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -64,3 +64,20 @@ def test_a_wheel_carries_the_commit_it_was_built_from(checkout):
     built = subprocess.run([sys.executable, "-c", build], cwd=checkout, capture_output=True, text=True, check=True)
     with ZipFile(checkout / built.stdout.splitlines()[-1]) as wheel:
         assert wheel.read(COMMIT_FILE).decode().strip() == git(checkout, "rev-parse", "HEAD")
+
+
+@pytest.mark.parametrize(
+    ("script", "program"),
+    [
+        ("/usr/bin/vd4rl-pomdp", "vd4rl-pomdp"),
+        ("/src/vd4rl_pomdp/__main__.py", "vd4rl-pomdp"),
+        ("/src/vd4rl_pomdp/cli/__main__.py", "vd4rl-pomdp"),
+        ("-c", "vd4rl-pomdp"),
+        ("/src/pretrain/__main__.py", "vd4rl-pomdp pretrain"),
+        ("/src/finetune/__main__.py", "vd4rl-pomdp finetune"),
+        ("my_method.py", "my_method.py"),
+    ],
+)
+def test_the_command_line_is_named_as_it_would_be_typed(monkeypatch, script, program):
+    monkeypatch.setattr("sys.argv", [script, "--out", "a b"])
+    assert command() == f"{program} --out 'a b'"

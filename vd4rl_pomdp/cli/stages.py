@@ -122,13 +122,15 @@ class DemoCommand:
     """Folder of the demo's data and runs; the same command continues where it was cut."""
     workers: int = 0
     """Processes; 0 uses every core."""
+    preset: str = "cpu"
+    """cpu: minutes; smoke: only that every stage runs."""
 
 
 def _demo(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.experiments.demo import demo
 
     command = parse(DemoCommand, words, program)
-    demo(command.out, command.workers, run_stage)
+    demo(command.out, command.workers, command.preset, run_stage)
 
 
 DEMO = Command("every stage on a small set, in minutes", _demo)

@@ -8,6 +8,7 @@ from vd4rl_pomdp.corruptions.corruption import (
     CorruptionConfig,
     Patch,
     Stage,
+    check_corruption,
     make_corruption,
 )
 from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_integers
@@ -21,6 +22,7 @@ __all__ = [
     "KeyStream",
     "Patch",
     "Stage",
+    "check_corruption",
     "derive_keys",
     "draw_integers",
     "make_corruption",

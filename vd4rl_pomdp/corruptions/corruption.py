@@ -15,6 +15,7 @@ from torch import Tensor
 from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_integers, draw_numbered, hash_keys
 from vd4rl_pomdp.errors import UserError, refuse_outside
 from vd4rl_pomdp.seeding import stream_seed
+from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 
 Mode = Literal["resample", "emission"]
 _CHANNELS = 3
@@ -169,6 +170,12 @@ def make_corruption(config: CorruptionConfig | str) -> Corruption:
         raise UserError(f"unknown corruption {config.corruption!r}: choose one of {', '.join(CORRUPTIONS)}")
     refuse_outside(config, patch_size=1, patch_count=1, patch_fill=(0, 255), zeroed_frames=1)
     return Corruption(config.corruption, [STAGES[name](config) for name in stages], config.zeroed_frames * zeroes)
+
+
+def check_corruption(config: CorruptionConfig) -> None:
+    """Raise UserError for a corruption that does not fit the benchmark's stacks, before any is corrupted."""
+    stack = torch.zeros(1, _CHANNELS * FRAME_STACK, FRAME_SIZE, FRAME_SIZE, dtype=torch.uint8)
+    make_corruption(config)(stack, torch.zeros(1, dtype=torch.int64))
 
 
 class BatchCorruption:

@@ -5,12 +5,19 @@ Importing this package registers every task and corruption with Gymnasium, as `v
 `vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0`, and likewise for `CheetahRun` and `HumanoidWalk`; the mazes as
 `vd4rl_pomdp/MazeNoCurtain-v0`, `MazeOneCurtain`, `MazeThreeCurtains` and `MazeFirstPerson`; and the paper's finite
 counterexample, `vd4rl_pomdp/ForwardJumpCounterexample-v0`.
+
+Gymnasium's time limit truncates their episodes (`gymnasium.make(..., max_episode_steps=100)` chooses another); a step
+after the end is refused. Tasks take the corruption's fields, too: `gymnasium.make("vd4rl_pomdp/WalkerWalk-v0",
+corruption="patch", patch_size=24)`.
 """
 
+from typing import Any
+
 import gymnasium
+from gymnasium.envs.registration import WrapperSpec
 
 from vd4rl_pomdp.mazes import MAZES
-from vd4rl_pomdp.tasks import TASKS
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, TASKS
 
 _SUFFIXES = {"": "none", "-Patch16": "patch", "-ZeroFrames": "zero_frames", "-Patch16-ZeroFrames": "patch+zero_frames"}
 
@@ -21,22 +28,25 @@ GYM_IDS = {
 }
 """Every Gymnasium id, and the task and corruption it names."""
 
-for _id, _arguments in GYM_IDS.items():
-    gymnasium.register(_id, entry_point="vd4rl_pomdp.envs.gym:GymEnv", kwargs=_arguments)
-
 FINITE_IDS = {"vd4rl_pomdp/ForwardJumpCounterexample-v0": "counterexample"}
 """Finite worlds by Gymnasium id."""
+MAZE_STEPS, FINITE_STEPS = 500, 16
+"""Actions after which an episode in a maze or a finite world is truncated."""
 
-for _id, _world in FINITE_IDS.items():
-    gymnasium.register(_id, entry_point="vd4rl_pomdp.envs.finite:FiniteEnv", kwargs={"world": _world})
 
-MAZE_STEPS = 500
-"""Actions after which a registered maze truncates its episode."""
-
-for _maze in MAZES.values():
+def _register(name: str, entry_point: str, arguments: dict[str, Any], steps: int) -> None:
     gymnasium.register(
-        _maze.gym_id,
-        entry_point="vd4rl_pomdp.envs.maze:MazeEnv",
-        kwargs={"maze": _maze.name},
-        max_episode_steps=MAZE_STEPS,
+        name,
+        entry_point=f"vd4rl_pomdp.envs.{entry_point}",
+        kwargs=arguments,
+        max_episode_steps=steps,
+        additional_wrappers=(WrapperSpec("ResetAfterEnd", "vd4rl_pomdp.envs.ended:ResetAfterEnd", {}),),
     )
+
+
+for _id, _arguments in GYM_IDS.items():
+    _register(_id, "gym:GymEnv", _arguments, EPISODE_TRANSITIONS)
+for _id, _world in FINITE_IDS.items():
+    _register(_id, "finite:FiniteEnv", {"world": _world}, FINITE_STEPS)
+for _maze in MAZES.values():
+    _register(_maze.gym_id, "maze:MazeEnv", {"maze": _maze.name}, MAZE_STEPS)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from dataclasses import dataclass
 
@@ -14,6 +15,9 @@ from vd4rl_pomdp.envs.dmc import PixelEnv, Row
 from vd4rl_pomdp.envs.rendering import Render
 from vd4rl_pomdp.tasks import FRAME_STACK
 from vd4rl_pomdp.types import row_key
+
+if hasattr(os, "register_at_fork"):  # a forked process would wait for the threads that it did not inherit
+    os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ Info = dict[str, Any]
 
 
 class FiniteEnv(gymnasium.Env[np.ndarray, np.int64]):
-    """One world of the gallery; the time limit truncates, nothing terminates and nothing is rewarded.
+    """One world of the gallery; nothing terminates or is rewarded, and the registered ids add the time limit.
 
     Observations: (C, 1, 1) uint8, one channel a symbol, 255 for the one that is shown, as in `theory.windows`. Actions:
     the place of an action in `world.actions`. `info` holds `state` and `exogenous`, which an agent may not read.
@@ -24,33 +24,29 @@ class FiniteEnv(gymnasium.Env[np.ndarray, np.int64]):
 
     metadata = {"render_modes": ["ansi"], "render_fps": 4}  # noqa: RUF012 (Gymnasium's own name and type)
 
-    def __init__(self, world: str, length: int = 16, render_mode: str | None = None) -> None:
+    def __init__(self, world: str, render_mode: str | None = None) -> None:
         if world not in WORLDS:
             raise UserError(f"unknown world {world!r}: choose one of {', '.join(WORLDS)}")
-        if length < 1:
-            raise UserError(f"length {length}: an episode needs at least one step")
         self.world = WORLDS[world]()
-        self.length = length
         self.render_mode = render_mode
         self.observation_space = gymnasium.spaces.Box(0, 255, (len(self.world.symbols), 1, 1), np.uint8)
         self.action_space = gymnasium.spaces.Discrete(len(self.world.actions))
         self._pair: tuple[Any, Any] = (self.world.states[0], self.world.exogenous[0])
         self._symbol = self.world.symbols[0]
-        self._steps = 0
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
         """Draw a first pair from the world's initial law."""
         super().reset(seed=seed)
-        self._pair, self._steps = self._draw(self.world.initial), 0
+        self._pair = self._draw(self.world.initial)
         return self._show()
 
     def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Apply one action and let the exogenous part run."""
         state, noise = self._pair
         after = self.world.step[state, self.world.actions[int(action)]]
-        self._pair, self._steps = (after, self._draw(self.world.drift[noise])), self._steps + 1
+        self._pair = after, self._draw(self.world.drift[noise])
         obs, info = self._show()
-        return obs, 0.0, False, self._steps >= self.length, info
+        return obs, 0.0, False, False, info
 
     def render(self) -> str:
         """State, exogenous part and observation as text."""

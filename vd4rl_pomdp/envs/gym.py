@@ -2,25 +2,29 @@
 
 from __future__ import annotations
 
+import sys
+from dataclasses import fields
 from typing import Any
 
 import gymnasium
 import numpy as np
 
-from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
 from vd4rl_pomdp.envs.rendering import Render
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import ACTION_REPEAT, FRAME_SIZE, FRAME_STACK
 
 Info = dict[str, Any]
 
 
 class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Corrupted pixels in, actions out; the time limit truncates and nothing terminates.
+    """Corrupted pixels in, actions out; nothing terminates, and the registered ids add the time limit.
 
     Observations: (9, 84, 84) uint8, three frames, oldest first. Actions: (A,) float32 in [-1, 1]. `info` holds `clean`,
     the observation before corruption, and `physics`, the (P,) float64 simulator state. A seed fixes the initial states
-    and corruptions of all episodes that follow it.
+    and corruptions of all episodes that follow it. `corruption_fields` are those of CorruptionConfig; a field that does
+    not exist or fit raises UserError.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's own name and type)
@@ -31,9 +35,9 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         corruption: str = "none",
         render: Render = "fast",
         render_mode: str | None = None,
-        length: int | None = None,
+        **corruption_fields: Any,
     ) -> None:
-        self._env = CorruptedEnv(task, CorruptionConfig(corruption), render, length)
+        self._env = CorruptedEnv(task, _config(corruption, corruption_fields), render, length=sys.maxsize)
         shape = (3 * FRAME_STACK, FRAME_SIZE, FRAME_SIZE)
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._env.env.task.action_dim,), np.float32)
@@ -57,7 +61,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """Apply one action for two simulator steps; the reward is their sum."""
         step = self._env.step(action)
         obs, info = self._show(step)
-        return obs, step.row.reward, False, step.row.last, info
+        return obs, step.row.reward, False, False, info
 
     def render(self) -> np.ndarray:
         """The newest frame before corruption: (84, 84, 3) uint8."""
@@ -70,3 +74,14 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         clean = step.clean.numpy()
         self._frame = np.ascontiguousarray(clean[-3:].transpose(1, 2, 0))
         return step.obs.numpy(), {"clean": clean, "physics": step.row.physics}
+
+
+def _config(corruption: str, settings: Info) -> CorruptionConfig:
+    """The corruption that `gymnasium.make` was asked for."""
+    known = [f.name for f in fields(CorruptionConfig)]
+    unknown = sorted(set(settings) - set(known))
+    if unknown:
+        raise UserError(f"unknown argument {unknown[0]!r}: choose one of {', '.join(known)}")
+    config = CorruptionConfig(corruption, **settings)
+    check_corruption(config)
+    return config

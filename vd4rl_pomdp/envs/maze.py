@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 
 from vd4rl_pomdp.envs.maze_model import COLLISION_RADIUS, TIMESTEP, build_simulator
-from vd4rl_pomdp.envs.maze_view import ExactView, make_view
+from vd4rl_pomdp.envs.maze_view import ExactView, View, make_view
 from vd4rl_pomdp.envs.rendering import Render, mujoco
 from vd4rl_pomdp.mazes import PICTURE_SIZE, get_maze
 
@@ -44,7 +44,8 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._repeat = action_repeat
         self._point, self.maze = build_simulator(self.maze_spec)
         """The library's description of the cells."""
-        self._view = make_view(self.maze_spec, self._point.model, render) if pixels else None
+        self._pixels, self._render = pixels, render
+        self._view: View | None = None
         self.observation_space = gymnasium.spaces.Box(0, 255, (3, PICTURE_SIZE, PICTURE_SIZE), np.uint8)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.render_mode = render_mode
@@ -121,11 +122,13 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def draw(self) -> np.ndarray:
         """Picture of the present state: (3, 100, 100) uint8."""
-        assert self._view is not None, "this environment was made without pixels"
+        assert self._pixels, "this environment was made without pixels"
+        if self._view is None:  # not before: a process that has rendered cannot be forked
+            self._view = make_view(self.maze_spec, self._point.model, self._render)
         return self._view(self._point.data)
 
     def _observe(self) -> tuple[np.ndarray, Info]:
-        if self._view is not None:
+        if self._pixels:
             self._picture = self.draw()
         state = self.state
         info = {"state": state, "goal": self.goal.copy(), "hidden": bool(self.maze_spec.hidden(state))}

@@ -17,7 +17,7 @@ import weakref
 import numpy as np
 
 from vd4rl_pomdp.envs.maze_model import CAMERA_HEIGHT, EYE_FOVY, EYE_HEIGHT, TOP_FOVY, WALL_HEIGHT
-from vd4rl_pomdp.envs.rendering import Render, gl_error, mujoco
+from vd4rl_pomdp.envs.rendering import Render, gl_error, mujoco, refuse_after_fork
 from vd4rl_pomdp.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, PICTURE_SIZE, MazeSpec
 
 _FINE = 4
@@ -35,6 +35,7 @@ class ExactView:
 
     def __init__(self, model: mujoco.MjModel, fine: int = _FINE) -> None:
         self._fine = fine
+        refuse_after_fork()
         model.vis.quality.offsamples = 0
         model.vis.global_.offwidth = model.vis.global_.offheight = PICTURE_SIZE * fine
         try:

@@ -6,12 +6,11 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
 
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.envs.dmc import PixelEnv, start_from
-from vd4rl_pomdp.envs.rendering import ASSETS, Render, frame, frames_hash, gl_strings
+from vd4rl_pomdp.envs.rendering import ASSETS, Render, frame, frames_hash, gl_strings, mujoco
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import TASKS
 

@@ -2,10 +2,13 @@
 
 From mujoco 3.2.0 on the random stars of dm_control's sky are drawn from another seed, so an encoder pretrained on
 V-D4RL would be evaluated under another sky. The sky of mujoco 3.1.6 is written back before the first render.
+
+This module alone imports mujoco and dm_control: whatever must happen before OpenGL is loaded happens here.
 """
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import os
 from functools import cache
@@ -29,13 +32,32 @@ def gl_error(error: Exception) -> UserError:
     )
 
 
+with contextlib.suppress(ImportError):  # not every PyTorch brings it
+    # Triton carries an LLVM of its own. PyTorch's optimisers import it, and the process ends in a segmentation fault
+    # if Mesa's software renderer has loaded another LLVM before.
+    import triton  # noqa: F401
+
 try:  # both load the OpenGL library that MUJOCO_GL names, and fail in many ways where it is missing
     import mujoco
     from dm_control import suite
 except (ImportError, AttributeError, RuntimeError) as _error:
+    if getattr(_error, "name", None) == "dm_control":
+        raise UserError("dm-control is not installed: `pip install --no-deps dm-control==1.0.44`") from _error
     raise gl_error(_error) from _error
 
-__all__ = ["ASSETS", "Render", "check_mujoco", "frame", "frames_hash", "gl_error", "gl_strings", "prepare", "suite"]
+__all__ = [
+    "ASSETS",
+    "Render",
+    "check_mujoco",
+    "frame",
+    "frames_hash",
+    "gl_error",
+    "gl_strings",
+    "mujoco",
+    "prepare",
+    "refuse_after_fork",
+    "suite",
+]
 
 Render = Literal["fast", "exact"]
 ASSETS = Path(__file__).parent / "assets"
@@ -69,8 +91,23 @@ def prepare(physics: Any, render: Render) -> None:
         model.vis.quality.shadowsize = _FAST_SHADOW_SIZE
 
 
+_rendered_in: set[int] = set()
+"""Process that has rendered; a forked one inherits its parent's."""
+
+
+def refuse_after_fork() -> None:
+    """To be called before rendering: OpenGL waits for ever in a process forked from one that has rendered."""
+    _rendered_in.add(os.getpid())
+    if len(_rendered_in) > 1:
+        raise UserError(
+            "this process was forked from one that has rendered, where OpenGL hangs: start processes by spawn, as in "
+            "gymnasium.make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})"
+        )
+
+
 def frame(physics: Any) -> np.ndarray:
     """Camera 0 as V-D4RL stores it: (3, 84, 84) uint8."""
+    refuse_after_fork()
     try:
         image = physics.render(FRAME_SIZE, FRAME_SIZE, camera_id=0)
     except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:

@@ -5,42 +5,64 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.outputs import refuse_kept
 
 METHODS = ("mik+a", "acro", "random")
 CORRUPTION = "patch+zero_frames"
-EPISODES = 8
-PRETRAIN = ["--preset", "cpu", "--steps", "300", "--log-every", "25", "--checkpoint-every", "100"]
-FINETUNE = ["--preset", "cpu", "--updates", "5000", "--views", "2", "--eval-every", "5000", "--eval-episodes", "2"]
 
 
-def demo_commands(out: Path, workers: int) -> Iterator[list[str]]:
+@dataclass(frozen=True)
+class Size:
+    """What the stages of a demo are told."""
+
+    episodes: int
+    pretrain: str
+    finetune: str
+
+
+PRESETS = {
+    "cpu": Size(
+        8,
+        "--preset cpu --steps 300 --log-every 25 --checkpoint-every 100",
+        "--preset cpu --updates 5000 --views 2 --eval-every 5000 --eval-episodes 2",
+    ),
+    "smoke": Size(2, "--preset smoke", "--preset smoke"),
+}
+
+
+def demo_commands(out: Path, workers: int, preset: str = "cpu") -> Iterator[list[str]]:
     """Words of every stage's command line, in order."""
+    size = PRESETS[preset]
     data = str(out / "data" / "walker_walk" / "medium_expert")
-    collect = ["--task", "walker_walk", "--quality", "medium_expert", "--episodes", str(EPISODES), "--out", data]
+    collect = ["--task", "walker_walk", "--quality", "medium_expert", "--episodes", str(size.episodes), "--out", data]
     yield ["data", "collect", *collect, "--workers", str(workers)]
     for method in METHODS:
         folder = out / "runs" / method
         place = ["--data", data, "--out", str(folder / "pretrain")]
-        yield ["pretrain", "--method", method, "--corruption", CORRUPTION, *place, *PRETRAIN]
+        yield ["pretrain", "--method", method, "--corruption", CORRUPTION, *place, *size.pretrain.split()]
         place = ["--encoder", str(folder / "pretrain" / "encoder"), "--data", data, "--out", str(folder / "finetune")]
-        yield ["finetune", *place, *FINETUNE, "--workers", str(workers)]
+        yield ["finetune", *place, *size.finetune.split(), "--workers", str(workers)]
     yield ["report", str(out / "runs"), "--out", str(out / "report")]
 
 
-def demo(out: Path, workers: int, run: Callable[[list[str]], None]) -> None:
+def demo(out: Path, workers: int, preset: str, run: Callable[[list[str]], None]) -> None:
     """Run every command of the demo, printing each so that it can be run by hand.
 
     Args:
         out: folder of data, runs and report.
         workers: processes, 0 for every core.
+        preset: how long the stages take, one of PRESETS; UserError for another.
         run: what carries out one command line.
     """
+    if preset not in PRESETS:
+        raise UserError(f"unknown preset {preset!r}: choose one of {', '.join(PRESETS)}")
     refuse_kept(out)
     started = time.monotonic()
-    for words in demo_commands(out, workers):
+    for words in demo_commands(out, workers, preset):
         print(f"\n$ vd4rl-pomdp {' '.join(words)}", file=sys.stderr)
         run(words)
     print(f"demo finished in {(time.monotonic() - started) / 60:.1f} minutes")

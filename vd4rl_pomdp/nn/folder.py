@@ -68,7 +68,7 @@ def encoder_hash(folder: Path) -> str:
 
 
 def load_encoder(
-    folder: Path, task: str | None = None, action_dim: int | None = None, size: int | None = None
+    folder: Path | str, task: str | None = None, action_dim: int | None = None, size: int | None = None
 ) -> tuple[Encoder, EncoderCard]:
     """Read an encoder folder into a frozen module in eval mode.
 
@@ -81,6 +81,7 @@ def load_encoder(
     Raises:
         UserError: the folder is missing, damaged, pickled, or of another task or image size.
     """
+    folder = Path(folder)
     config = _read_config(folder)
     encoder_config, card = EncoderConfig(**config["encoder"]), EncoderCard(**config["pretrain"])
     if action_dim is not None and encoder_config.action_dim != action_dim:

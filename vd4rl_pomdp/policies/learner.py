@@ -40,7 +40,9 @@ def build(config: PolicyConfig, task: Task) -> SAC:
         from sbx import SAC
         from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
     except ImportError as error:
-        raise UserError("policy training needs SBX: install it with `pip install 'vd4rl-pomdp[policy]'`") from error
+        raise UserError(
+            "policy training needs SBX: install it with `pip install '.[policy]'` in the package's folder"
+        ) from error
     envs = DummyVecEnv([lambda: StateEnv(task)] * config.envs)
     rounds = max(1, DECISIONS_A_ROUND // config.envs)
     network = {"net_arch": [config.hidden] if config.network == "simba" else [config.hidden, config.hidden]}

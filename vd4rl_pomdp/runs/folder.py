@@ -86,7 +86,7 @@ def replacing_file(path: Path) -> Iterator[Path]:
 @contextmanager
 def appending(path: Path) -> Iterator[Any]:
     """A text file to append lines to; what the system refuses becomes one sentence."""
-    with disk_errors(path), path.open("a", newline="") as file:
+    with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
         yield file
 
 

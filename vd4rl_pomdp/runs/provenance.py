@@ -89,12 +89,11 @@ def machine() -> dict[str, Any]:
 
 def command() -> str:
     """The command line, the program named as a user would type it."""
-    program = (
-        "vd4rl-pomdp"
-        if Path(sys.argv[0]).name in ("vd4rl-pomdp", "__main__.py", "cli.py", "-c")
-        else Path(sys.argv[0]).name
-    )
-    return shlex.join([program, *sys.argv[1:]])
+    script = Path(sys.argv[0])
+    program = [script.name]
+    if script.name in ("__main__.py", "-c"):  # python -m PACKAGE, and a worker's own command line
+        program = ["vd4rl-pomdp", *([script.parent.name] if script.parent.name in ("pretrain", "finetune") else [])]
+    return shlex.join([*program, *sys.argv[1:]])
 
 
 def _processor() -> str:

@@ -112,7 +112,7 @@ def train_policy(config: MazePolicyConfig) -> Actor:
         from torch import nn
     except ImportError as error:
         raise UserError(
-            f"training a policy needs stable-baselines3 ({error}): pip install 'vd4rl-pomdp[policy]'"
+            f"training a policy needs stable-baselines3 ({error}): `pip install '.[policy]'` in the package's folder"
         ) from None
 
     class Report(BaseCallback):

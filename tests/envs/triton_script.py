@@ -1,0 +1,50 @@
+"""What `test_triton` runs: every stage in one process, as the demo does, and environments before an optimiser."""
+
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import gymnasium
+
+import vd4rl_pomdp.envs  # noqa: F401 (registers the ids)
+from vd4rl_pomdp.runs.workers import run_jobs
+
+NAMES = ["vd4rl_pomdp/WalkerWalk-v0", "vd4rl_pomdp/MazeOneCurtain-v0", "vd4rl_pomdp/MazeFirstPerson-v0"]
+
+
+def render_then_optimise(name: str) -> bool:
+    gymnasium.make(name).reset(seed=0)
+    import torch
+
+    torch.optim.Adam([torch.zeros(1, requires_grad=True)])
+    return "triton" in sys.modules
+
+
+def environments() -> None:
+    assert all(run_jobs(render_then_optimise, NAMES, workers=2)), "in spawned workers"
+    assert all(map(render_then_optimise, NAMES))
+
+
+def stages() -> None:
+    from vd4rl_pomdp.data.collect import CollectConfig, collect
+
+    data = Path("data/walker_walk/random")
+    collect(CollectConfig("walker_walk", "random", data, episodes=2, workers=1), length=40)
+    from pretrain.config import PRESETS
+    from pretrain.train import pretrain
+
+    encoder = pretrain(replace(PRESETS["smoke"], data=data, out=Path("pretrain"))).path / "encoder"
+    from finetune.config import PRESETS as FINETUNE_PRESETS
+    from finetune.train import finetune
+    from vd4rl_pomdp.corruptions import CorruptionConfig
+    from vd4rl_pomdp.evaluation import EpisodeJob, evaluate
+
+    shape = {"eval_episodes": 2, "eval_length": 4, "workers": 1}
+    finetune(replace(FINETUNE_PRESETS["smoke"], encoder=encoder, data=data, out=Path("finetune"), **shape))
+    job = EpisodeJob(encoder, Path("finetune/policy"), 0, "walker_walk", CorruptionConfig(), 0, film=False, length=4)
+    assert evaluate([job], workers=1)[0].length == 4
+
+
+if __name__ == "__main__":
+    {"stages": stages, "environments": environments}[sys.argv[1]]()
+    print("as expected")

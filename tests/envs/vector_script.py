@@ -1,0 +1,40 @@
+"""What `test_vector` runs: vectors of environments by fork and spawn, before and after the parent has rendered."""
+
+import gymnasium
+import torch
+
+import vd4rl_pomdp.envs  # noqa: F401 (registers the ids)
+from vd4rl_pomdp.errors import UserError
+
+TASK, MAZE = "vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0", "vd4rl_pomdp/MazeOneCurtain-v0"
+
+
+def walk(name: str, start: str) -> None:
+    envs = gymnasium.make_vec(name, 1, "async", vector_kwargs={"context": start})
+    try:
+        obs, _ = envs.reset(seed=0)
+        assert obs.any()
+        envs.step(envs.action_space.sample())
+    finally:
+        envs.close(terminate=True)
+
+
+def refused(name: str) -> bool:
+    try:
+        walk(name, "fork")
+    except UserError as error:
+        return "vector_kwargs={'context': 'spawn'}" in str(error) and len(str(error).splitlines()) == 1
+    return False
+
+
+if __name__ == "__main__":
+    torch.set_num_threads(2)
+    torch.rand(1000, 1000).exp().sum()  # on two threads, which a forked process does not inherit
+    walk(TASK, "fork")
+    walk(MAZE, "fork")
+    gymnasium.make(TASK).reset(seed=0)
+    assert refused(TASK)
+    assert refused(MAZE)
+    walk(TASK, "spawn")
+    walk(MAZE, "spawn")
+    print("as expected")

@@ -1,0 +1,195 @@
+"""Code blocks of the README and of docs/: Python is executed, commands are parsed, and run where that takes seconds."""
+
+import re
+import shlex
+import tomllib
+from dataclasses import replace
+from pathlib import Path
+from unittest.mock import patch
+
+import pytest
+import tyro
+
+from finetune.algorithms import get_algorithm
+from pretrain.config import PRESETS
+from pretrain.objectives import ENTRY_POINTS, METHODS, Method, get_method
+from pretrain.train import pretrain as run_pretrain
+from tests.helpers_data import write_fake_set
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.corruptions import STAGES, make_corruption
+from vd4rl_pomdp.mazes import get_maze
+from vd4rl_pomdp.tasks import QUALITIES, get_task
+
+ROOT = Path(__file__).parents[1]
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+PROGRAMS = (["vd4rl-pomdp"], ["python", "my_method.py"])
+"""What begins a command of ours; the second is the page's own example."""
+NOT_RUN = {
+    "make demo": "minutes of rendering and training; test_cli looks at its commands, the Dockerfile runs them",
+    "make test": "runs these tests",
+    "pip install": "fetches packages",
+    "parallel": "not a program of ours",
+    "sbatch": "needs a cluster",
+    "python my_method.py": "test_own_method runs them",
+    "vd4rl-pomdp data collect": "renders whole episodes; data/test_collect runs shorter ones",
+    "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
+    "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
+    "vd4rl-pomdp policy": "trains for hours; test_policies trains less",
+    "vd4rl-pomdp navigation": "trains for minutes to days; experiments/test_navigation_train trains less",
+    "vd4rl-pomdp pretrain --method": "test_stages runs every method in its smoke size",
+    "vd4rl-pomdp finetune --encoder RUN": "as above",
+}
+"""How a line begins that is parsed, if it is ours, but not run, and why."""
+RUN = (
+    "vd4rl-pomdp data check",
+    "vd4rl-pomdp pretrain",
+    "vd4rl-pomdp finetune",
+    "vd4rl-pomdp report",
+    "vd4rl-pomdp sweep",
+)
+
+
+def blocks(page: Path, language: str) -> list[str]:
+    return re.findall(rf"^```{language}\n(.*?)^```", page.read_text(), re.DOTALL | re.MULTILINE)
+
+
+def commands(page: Path) -> list[str]:
+    """Lines of a page's shell blocks, continued ones joined, comments cut off."""
+    lines = "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines()
+    return [" ".join(re.sub(r"(^|\s)#.*", "", line).split()) for line in lines if line.strip()]
+
+
+COMMANDS = [(page, line) for page in PAGES for line in commands(page)]
+
+
+def is_run(page: Path, line: str) -> bool:
+    return page.name == "README.md" and line.startswith(RUN) and "--data data/vd4rl" not in line
+
+
+class ParsedError(Exception):
+    """Ends a command after its words were parsed."""
+
+
+@pytest.fixture(autouse=True)
+def _registries():
+    with patch.dict(METHODS), patch.dict(STAGES):
+        yield
+
+
+def test_every_block_is_in_a_language_that_is_looked_at():
+    fences = [(page.name, tag) for page in PAGES for tag in re.findall(r"^```(\w*)$", page.read_text(), re.MULTILINE)]
+    assert {tag for _, tag in fences} <= {"python", "bash", "toml", ""}
+    closing = sum(tag == "" for _, tag in fences)
+    assert closing == len(fences) - closing, "a block without a language"
+
+
+def test_every_command_is_run_or_has_a_reason_not_to_be():
+    unexplained = [line for page, line in COMMANDS if not is_run(page, line) and not line.startswith(tuple(NOT_RUN))]
+    assert unexplained == []
+    assert [reason for reason in NOT_RUN if not any(line.startswith(reason) for _, line in COMMANDS)] == []
+
+
+OURS = [(page, line) for page, line in COMMANDS if line.split()[:1] in PROGRAMS or line.split()[:2] in PROGRAMS]
+
+
+@pytest.mark.parametrize(("page", "line"), OURS, ids=[f"{page.stem}: {line}" for page, line in OURS])
+def test_every_command_has_flags_and_values_that_exist(page, line, monkeypatch):
+    parsed = []
+    real = tyro.cli
+
+    def parse_alone(*arguments, **options):
+        parsed.append(real(*arguments, **options))
+        raise ParsedError
+
+    monkeypatch.setattr(tyro, "cli", parse_alone)
+    METHODS["past_to_frame"] = Method(METHODS["acro"].build)
+    words = shlex.split(re.split(r" [>|] ", line)[0].replace("[SET]", "SET"))
+    with pytest.raises(ParsedError):
+        main(words[1:] if words[0] == "vd4rl-pomdp" else words[2:])
+    check_names(parsed[0])
+
+
+CHECKS = {
+    "method": get_method,
+    "methods": get_method,
+    "corruption": make_corruption,
+    "corruptions": make_corruption,
+    "algorithm": get_algorithm,
+    "algorithms": get_algorithm,
+    "task": get_task,
+    "tasks": get_task,
+    "maze": get_maze,
+    "mazes": get_maze,
+    "quality": QUALITIES.index,
+}
+
+
+def check_names(config: object) -> None:
+    """Names that a command looks up after parsing must exist."""
+    if type(config).__name__ == "NavigationConfig":  # its methods are those of pretraining and two more
+        return
+    for field, check in CHECKS.items():
+        value = getattr(config, field, None)
+        for name in value if isinstance(value, list) else [value]:
+            if name:
+                check(name)
+
+
+@pytest.fixture
+def study(tmp_path, monkeypatch) -> Path:
+    """A folder in which the pages' paths exist: a set, and the encoder that was pretrained on it."""
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+    write_fake_set(tmp_path / "data" / "walker_walk" / "expert", [40, 40, 40])
+    return tmp_path
+
+
+@pytest.fixture
+def encoder(study) -> None:
+    data, out = Path("data/walker_walk/expert"), Path("runs/mik+a/pretrain")
+    run_pretrain(replace(PRESETS["smoke"], data=data, out=out, method="mik+a", corruption="patch+zero_frames"))
+
+
+def small(words: list[str]) -> list[str]:
+    """The same command in the smallest size."""
+    return [{"cpu": "smoke", "paper": "smoke"}.get(word, word) for word in words]
+
+
+def test_the_readmes_commands_run_one_after_the_other(study, capsys):
+    lines = [line for page, line in COMMANDS if is_run(page, line)]
+    assert {" ".join(line.split()[:2]) for line in lines} >= {"vd4rl-pomdp pretrain", "vd4rl-pomdp sweep"}
+    for line in lines:
+        main(small(shlex.split(line.partition(" > ")[0])[1:]))
+    assert (study / "report" / "index.html").exists()
+    assert capsys.readouterr().out.count(" && ") == 10, "a line for each of the sweep's runs"
+
+
+PYTHON = [page for page in PAGES if blocks(page, "python")]
+
+
+@pytest.mark.parametrize("page", PYTHON, ids=lambda page: page.stem)
+def test_python_blocks_run_one_after_the_other(page, encoder):
+    namespace = {"__name__": page.stem}
+    for number, code in enumerate(blocks(page, "python")):
+        exec(compile(code, f"{page.name}, block {number}", "exec"), namespace)
+    check_results(page.stem, namespace)
+
+
+def check_results(page: str, names: dict) -> None:
+    """What a page's comments say of its results."""
+    if page == "use_an_encoder":
+        assert (names["card"].method, names["card"].corruption["corruption"]) == ("mik+a", "patch+zero_frames")
+        assert names["windows"].obs.shape == (2, 16, 9, 84, 84)
+        assert names["z"].shape == (1, names["encoder"].dim)
+        assert names["truncated"]
+    elif page == "README":
+        obs, info = names["env"].reset(seed=0)
+        frames, clean = (pixels.reshape(3, 3, 84, 84) for pixels in (obs, info["clean"]))
+        shown = [i for i in range(3) if frames[i].any()]
+        assert len(shown) == 2
+        assert all((frames[i] != clean[i]).any((0, 2)).sum() == 16 for i in shown), "16 rows are black"
+
+
+def test_toml_blocks_are_read_and_name_what_exists():
+    (block,) = [code for page in PAGES for code in blocks(page, "toml")]
+    assert list(tomllib.loads(block)["project"]["entry-points"]) == [ENTRY_POINTS]
