@@ -12,10 +12,12 @@ from torch import Tensor
 from vd4rl_pomdp.augmentation import observe
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, derive_keys
 from vd4rl_pomdp.data import Dataset
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.runs.device import Precision, autocast
 from vd4rl_pomdp.runs.folder import replacing_file
 from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.runs.reading import regular
 from vd4rl_pomdp.types import Batch
 
 CHUNK = 128
@@ -104,7 +106,20 @@ def encode_views(frozen: FrozenEncoder, views: int, path: Path) -> Tensor:
                     progress.advance()
         with replacing_file(path) as fresh, fresh.open("wb") as file:
             np.save(file, out)
-    return torch.from_numpy(np.load(path)).to(dataset.t.device)
+    return torch.from_numpy(_read_views(path, (views, dataset.num_rows, frozen.encoder.dim))).to(dataset.t.device)
+
+
+def _read_views(path: Path, shape: tuple[int, int, int]) -> np.ndarray:
+    """Features as `encode_views` wrote them, or UserError."""
+    try:
+        views = np.load(regular(path))
+    except UserError:
+        raise
+    except (OSError, ValueError, EOFError) as error:
+        raise UserError(f"{path}: cannot be read ({error}); remove it, and the set is encoded anew") from error
+    if views.shape != shape or views.dtype != np.float16 or not all(np.isfinite(view).all() for view in views):
+        raise UserError(f"{path}: is not what this run encoded; remove it, and the set is encoded anew")
+    return views
 
 
 class FeatureSampler:

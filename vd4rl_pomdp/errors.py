@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-import math
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,8 @@ class UserError(ValueError):
 
 MAX_SEED = 2**31 - 1
 """Largest seed that every random generator in use takes."""
+MOST = 10**9
+"""Largest number that any flag takes, unless it says otherwise."""
 
 
 def refuse_outside(config: Any, **ranges: float | tuple[float, float]) -> None:
@@ -26,11 +28,22 @@ def refuse_outside(config: Any, **ranges: float | tuple[float, float]) -> None:
             refuse_number(name, value, *(limits if isinstance(limits, tuple) else (limits,)))
 
 
-def refuse_number(name: str, value: float, low: float, high: float = math.inf) -> None:
+def refuse_number(name: str, value: float, low: float, high: float = MOST) -> None:
     """Raise UserError, naming the flag, for a number below `low`, above `high`, or NaN."""
     if not low <= value <= high:
-        most = "" if high == math.inf else f" and at most {high}"
-        raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {low}{most}")
+        raise UserError(f"{flag_of(name)} is {value}; it must be at least {low} and at most {high}")
+
+
+def flag_of(name: str) -> str:
+    """The flag that sets a config's field."""
+    return f"--{name.replace('_', '-')}"
+
+
+def refuse_unread(config: Any, default: Any, names: Iterable[str], reader: str) -> None:
+    """Raise UserError for a field that differs from its default although nothing reads it: it would be a lie."""
+    for name in sorted(names):
+        if getattr(config, name) != getattr(default, name):
+            raise UserError(f"{flag_of(name)} is not read by {reader}: leave it out")
 
 
 def disk_error(path: Path | str | None, error: OSError) -> UserError:

@@ -132,9 +132,9 @@ def with_value(index, value):
     [
         ("reward", lambda v: None, r"has no 'reward'"),
         ("observation", lambda v: None, r"has no 'observation'"),
-        ("action", with_value((2, 1), np.nan), r"'action' is not finite in row 2 \(1 such rows\)"),
-        ("reward", with_value(slice(3, 5), np.inf), r"'reward' is not finite in row 3 \(2 such rows\)"),
-        ("discount", with_value(0, np.nan), r"'discount' is not finite in row 0"),
+        ("action", with_value((2, 1), np.nan), r"'action' is not finite as float32 in row 2 \(1 such rows\)"),
+        ("reward", with_value(slice(3, 5), np.inf), r"'reward' is not finite as float32 in row 3 \(2 such rows\)"),
+        ("discount", with_value(0, np.nan), r"'discount' is not finite as float32 in row 0"),
         ("action", lambda v: v.astype(int), r"'action' is int64"),
         ("action", lambda v: v[:, 0], r"'action' has shape \(7,\)"),
         ("reward", lambda v: v[:-1], r"'reward' has shape \(6,\), expected \(7,\)"),

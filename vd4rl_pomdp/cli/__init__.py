@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import sys
 from collections.abc import Sequence
 
@@ -24,7 +25,11 @@ COMMANDS: Table = {
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vd4rl-pomdp`."""
     words = list(sys.argv[1:] if arguments is None else arguments)
+    for stream in (sys.stdout, sys.stderr):
+        if isinstance(stream, io.TextIOWrapper):
+            stream.reconfigure(errors="backslashreplace")  # of what a terminal cannot show, the number
     try:
+        _refuse_undecodable(words)
         run_stage(words)
     except UserError as error:
         print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
@@ -40,3 +45,12 @@ def main(arguments: Sequence[str] | None = None) -> None:
     except OSError as error:
         print(f"error: {disk_error(error.filename, error)}", file=sys.stderr)
         sys.exit(2)
+
+
+def _refuse_undecodable(words: Sequence[str]) -> None:
+    """Names and paths go into files and pages, which are UTF-8."""
+    for word in words:
+        try:
+            word.encode()
+        except UnicodeEncodeError:
+            raise UserError(f"{word!a} is not UTF-8: use another name") from None

@@ -22,7 +22,7 @@ from vd4rl_pomdp.runs.folder import jsonable, read_json, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
 from vd4rl_pomdp.runs.workers import count_workers, run_jobs
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, QUALITIES, Quality, get_task
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, MOST_EPISODES, QUALITIES, Quality, get_task
 
 Policy = Actor | Ladder | None
 """Who acts in a shard: an actor, a ladder of them, or nobody (random actions)."""
@@ -102,7 +102,7 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
 def _check(config: CollectConfig) -> None:
     """Refuse settings that make no set."""
     get_task(config.task)
-    refuse_outside(config, episodes=1, episodes_per_shard=1, seed=(0, MAX_SEED), workers=0)
+    refuse_outside(config, episodes=(1, MOST_EPISODES), episodes_per_shard=1, seed=(0, MAX_SEED), workers=0)
     if config.quality not in QUALITIES:
         raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(QUALITIES)}")
     if config.quality == "medium_expert" and config.episodes < 2:

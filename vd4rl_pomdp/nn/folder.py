@@ -2,19 +2,19 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 
-from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.corruptions import CorruptionConfig, make_corruption
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE
-from vd4rl_pomdp.runs.folder import replacing_file, write_json
+from vd4rl_pomdp.runs.folder import read_json, replacing_file, write_json
+from vd4rl_pomdp.runs.reading import build, read_tensors
 
 
 @dataclass(frozen=True)
@@ -58,8 +58,7 @@ def load_encoder(
     Raises:
         UserError: the folder is missing, damaged, pickled, or of another task or image size.
     """
-    config = _read_config(folder)
-    encoder_config, card = EncoderConfig(**config["encoder"]), EncoderCard(**config["pretrain"])
+    encoder_config, card = _read_config(folder)
     if action_dim is not None and encoder_config.action_dim != action_dim:
         raise UserError(
             f"{folder}: this encoder was pretrained on {card.task} with {encoder_config.action_dim} action dimensions, "
@@ -77,11 +76,11 @@ def load_encoder(
         )
     try:
         encoder = Encoder(encoder_config)
-        CorruptionConfig(**card.corruption)
+        make_corruption(build(CorruptionConfig, card.corruption))
     except (TypeError, RuntimeError, ValueError) as error:
         raise UserError(f"{folder}/config.json: names no encoder ({_first_line(error)}); pretrain it again") from error
     try:
-        encoder.load_state_dict(load_file(folder / "model.safetensors"))
+        encoder.load_state_dict(read_tensors(folder / "model.safetensors"))
     except (OSError, SafetensorError, RuntimeError) as error:
         reason = _first_line(error)
         raise UserError(f"{folder}/model.safetensors: cannot be read ({reason}); pretrain the encoder again") from error
@@ -92,15 +91,14 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0]
 
 
-def _read_config(folder: Path) -> dict[str, Any]:
+def _read_config(folder: Path) -> tuple[EncoderConfig, EncoderCard]:
     pickles = [p.name for p in folder.glob("*") if p.suffix in (".pt", ".pth", ".pkl", ".bin", ".ckpt")]
     if pickles and not (folder / "model.safetensors").exists():
         raise UserError(f"{folder}: {pickles[0]} is a pickle, which can run code; only model.safetensors is read")
     try:
-        config = json.loads((folder / "config.json").read_text())
-        EncoderConfig(**config["encoder"]), EncoderCard(**config["pretrain"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        config = read_json(folder / "config.json")
+        return build(EncoderConfig, config["encoder"]), build(EncoderCard, config["pretrain"])
+    except (ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{folder}: not an encoder folder (config.json: {error}); `vd4rl-pomdp pretrain` writes one as RUN/encoder"
         ) from error
-    return config

@@ -10,11 +10,12 @@ from typing import Any
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load_file, save_file
+from safetensors.torch import save_file
 from torch import Tensor
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.folder import newest, replacing
+from vd4rl_pomdp.runs.reading import parse_json, read_tensors, regular
 
 State = dict[str, Any]
 """Nested dicts with str or int keys, lists, tensors, and JSON scalars."""
@@ -36,7 +37,7 @@ def load_checkpoint(folder: Path) -> State | None:
     if whole is None:
         return None
     with _readable(whole):
-        return _join(json.loads((whole / "state.json").read_text()), load_file(whole / "state.safetensors"))
+        return _join(parse_json(regular(whole / "state.json").read_text()), read_tensors(whole / "state.safetensors"))
 
 
 def restore_checkpoint(folder: Path, restore: Callable[[State], None]) -> None:
@@ -52,7 +53,7 @@ def _readable(folder: Path) -> Iterator[None]:
     """Whatever a checkpoint that is damaged or of another run leads to becomes a sentence."""
     try:
         yield
-    except (OSError, SafetensorError, ValueError, KeyError, TypeError, RuntimeError) as error:
+    except (OSError, SafetensorError, ValueError, KeyError, TypeError, AttributeError, RuntimeError) as error:
         raise UserError(
             f"{folder}: this checkpoint is damaged or of another format or config "
             f"({str(error).splitlines()[0]}); remove it to start the run again"

@@ -17,6 +17,7 @@ from typing import Any
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.provenance import command, git_commit, machine, versions
+from vd4rl_pomdp.runs.reading import parse_json, regular
 
 _RUNTIME_FIELDS = {"out", "device", "workers", "wandb", "resume_every"}
 """Config fields that do not change a result, so that a run may go on with other ones."""
@@ -81,7 +82,9 @@ def jsonable(value: Any) -> Any:
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object; raises UserError if it is missing or damaged."""
     try:
-        value = json.loads(path.read_text())
+        value = parse_json(regular(path).read_text())
+    except UserError:
+        raise
     except (OSError, ValueError) as error:
         raise UserError(f"{path}: cannot be read as JSON ({error})") from error
     if not isinstance(value, dict):
