@@ -29,12 +29,14 @@ from vd4rl_pomdp.types import Windows
 
 SHIFT_STREAM, BATCH_STREAM = 1, 2
 """Numbers that keep the seeded streams of a run apart; the corruption's stream is the seed itself."""
+DECIDE_MEMORY = ("batch_size", "window", "feature_dim", "hidden_dim", "head_dim", "codes")
+"""Settings that the memory of a training hangs on."""
 
 
 def pretrain(config: PretrainConfig) -> RunFolder:
     """Run the stage, or go on with it, and write `out/encoder`; returns the run's folder."""
     check(config)
-    with telling_memory(config, "batch_size", "window", "feature_dim", "hidden_dim"):
+    with telling_memory(config, *DECIDE_MEMORY):
         return _pretrain(config)
 
 
@@ -161,14 +163,14 @@ def require_batch(objective: Objective, device: torch.device, config: Any) -> No
     Args:
         objective: what will be trained.
         device: where.
-        config: a stage's settings; its `batch_size`, `window`, `feature_dim` and `hidden_dim` decide.
+        config: a stage's settings, `DECIDE_MEMORY` among them.
     """
     shape = objective.encoder.config
     stack = torch.zeros(1, shape.channels, shape.size, shape.size, dtype=torch.uint8)
     rows = config.batch_size * config.window
     with autocast(stack.device, config.precision):
         needed = rows * (stack.nbytes + bytes_kept(objective.encoder.frame, stack)) + bytes_of_parameters(objective)
-    require_memory(needed, device, config, "batch_size", "window", "feature_dim", "hidden_dim")
+    require_memory(needed, device, config, *DECIDE_MEMORY)
 
 
 def _build(dataset: Dataset, config: PretrainConfig) -> Objective:

@@ -1,11 +1,12 @@
 """Every bad input ends in one line and exit code 2: try it, over all commands, all flags and all files.
 
-    python scripts/bad_input.py [--only WORD ...] [--list]
+    python scripts/bad_input.py [--only NAME ...] [--every N] [--list]
 
 A bad input is one thing wrong in an otherwise valid command line (`bad_input_flags`, generated from the commands'
-config classes) or in one file that a command reads (`bad_input_files`, generated from a small valid set, runs and
-reports). Each runs in a process of its own, in a copy of those files, within limits of time and memory. It passes if the
-exit code is 2, stderr is one line that begins with `error: `, and no file has changed, appeared or gone.
+config classes) or in one file that a command reads (`bad_input_files`, generated from small valid sets, runs and
+reports). Each runs in a process of its own, in a copy of those files, within limits of time and memory. It passes if
+the exit code is 2, stderr is one line that begins with `error: `, and no file has changed, appeared or gone. Single
+keys of JSON files are spoilt without knowing who reads them: there exit code 0 passes, too.
 """
 
 from __future__ import annotations
@@ -48,14 +49,15 @@ def main() -> None:
     """Run the cases that the arguments choose and print what failed and a table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--only", nargs="*", default=[""], help="cases whose name begins with one of these words")
+    parser.add_argument("--every", type=int, default=1, help="of these, only one in so many")
     parser.add_argument("--list", action="store_true", help="print the cases' names only")
     chosen = parser.parse_args()
     with tempfile.TemporaryDirectory(prefix="bad-input-") as folder:
         root = Path(folder)
         os.environ["VD4RL_POMDP_CACHE"] = str(root / "cache")
-        if not chosen.list:
-            make_world(root / "world")
-        cases = [case for case in all_cases() if title(case).startswith(tuple(chosen.only))]
+        make_world(root / "world")
+        cases = [case for case in all_cases(root / "world") if title(case).startswith(tuple(chosen.only))]
+        cases = cases[:: chosen.every]
         if chosen.list:
             print(*map(title, cases), sep="\n")
             return
@@ -81,9 +83,9 @@ def make_world(folder: Path) -> None:
         importlib.import_module(module)
 
 
-def all_cases() -> Iterator[Case]:
+def all_cases(world: Path) -> Iterator[Case]:
     """Every case, but for those that are no bad input."""
-    for case in chain(flag_cases(), file_cases()):
+    for case in chain(flag_cases(), file_cases(world)):
         if not any(fnmatchcase(title(case), pattern) for pattern in FINE):
             yield case
 
@@ -105,7 +107,7 @@ def try_case(case: Case, root: Path) -> str:
         code, err = _run(case.words, root)
         after = _contents(folder)
     changed = sorted(name for name in before.keys() | after.keys() if before.get(name) != after.get(name))
-    return _problem(code, err, changed)
+    return "" if case.may_pass and code == 0 else _problem(code, err, changed)
 
 
 def _problem(code: int, err: str, changed: list[str]) -> str:

@@ -8,7 +8,10 @@ import json
 import os
 import shutil
 from collections.abc import Callable, Iterator
+from functools import partial
+from itertools import islice
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from bad_input_flags import ENCODER, MAZE, NAVIGATED, RUN, SET, SMOKE, Case
@@ -31,6 +34,7 @@ def build_world(folder: Path) -> None:
             collect(config, length=ROWS)
             for words in _stages():
                 run_stage(words)
+        shutil.copytree(Path(__file__).parents[1] / "results" / "datasets", "reports/sets")
         _unfinished()
         _policy_run(Path("runs/policy"))
         _foreign()
@@ -43,6 +47,7 @@ def _stages() -> Iterator[list[str]]:
     yield ["pretrain", "--data", SET, "--out", "runs/pretrained", *SMOKE]
     yield ["finetune", "--encoder", ENCODER, "--data", SET, "--out", RUN, *SMOKE, "--workers", "1"]
     yield ["navigation", "train", "--data", MAZE, "--out", NAVIGATED, *SMOKE]
+    yield ["navigation", "report", NAVIGATED, "--out", "reports/navigation", "--no-pictures"]
 
 
 def _unfinished() -> None:
@@ -50,6 +55,7 @@ def _unfinished() -> None:
     for finished, cut in (("pretrained", "pretraining"), ("finetuned", "finetuning"), ("navigated", "navigating")):
         folder = Path("runs-cut") / cut
         shutil.copytree(Path("runs") / finished, folder)
+        shutil.rmtree(Path("runs") / finished / "checkpoint")  # which nobody reads; cases copy all files
         (folder / "timing.json").unlink()
         record = json.loads((folder / "config.json").read_text())
         record["config"]["out"] = str(folder)
@@ -158,12 +164,29 @@ READERS: list[tuple[str, list[str], list[str]]] = [
         [NAVIGATED, "--out", "new", "--no-pictures"],
         [f"{NAVIGATED}/{name}" for name in ("config.json", "results.json", "timing.json", "machine.json")],
     ),
+    (
+        "navigation report",
+        ["reports/navigation", "--out", "new", "--no-pictures"],
+        ["reports/navigation/rows.csv", "reports/navigation/runs.csv"],
+    ),
+    (
+        "data table",
+        ["--out", "reports/sets", "--tasks", "walker_walk", "--qualities", "random"],
+        [f"reports/sets/{name}" for name in ("returns.csv", "costs.csv", "actors.json")],
+    ),
 ]
 """Command, words that read some files, and those files."""
 
 _LOG = "the log decides nothing, and a kill may cut it"
 FINE: dict[str, str] = {
+    "policy train | target_entropy | below": "an entropy may be negative",
+    "policy train | stop_at | below": "a return may be",
+    "demo | out | a foreign folder": "a folder of runs may hold other things",
     "sweep | out | a foreign folder": "a folder of runs may hold other things",
+    "data table | out | a foreign folder": "its own names are checked file by file",
+    "report | out | a foreign folder": "its own names are checked file by file",
+    "theory | out | a foreign folder": "its own names are checked file by file",
+    "evaluate | out | a dangling link": "the link's target is made, as by any program",
     "pretrain | data/*/1_walker_walk_random.hdf5 | missing": "a set of fewer shards is a set",
     "* | */metrics.jsonl | missing": _LOG,
     "* | */metrics.jsonl | empty": _LOG,
@@ -173,21 +196,19 @@ FINE: dict[str, str] = {
 """Patterns of titles that are no bad input, and why."""
 
 
-def file_cases() -> Iterator[Case]:
-    """Every file that a command reads, damaged in every way."""
+def file_cases(world: Path) -> Iterator[Case]:
+    """Every file that a command reads, damaged in every way; `world` holds the valid ones."""
     for command, words, files in READERS:
         for file in files:
             path = Path(file)
-            kinds = {**ANY, **BY_SUFFIX[path.suffix]}
-            for kind, damage in kinds.items():
-                yield Case(command, file, kind, [*command.split(), *words], _bind(damage, path))
+            for kind, damage in {**ANY, **BY_SUFFIX[path.suffix]}.items():
+                yield Case(command, file, kind, [*command.split(), *words], partial(damage, path))
+            if path.suffix == ".json":
+                for kind, damage in _each_place(json.loads((world / file).read_text())):
+                    yield Case(command, file, kind, [*command.split(), *words], partial(damage, path), may_pass=True)
 
 
 Damage = Callable[[Path], None]
-
-
-def _bind(damage: Damage, path: Path) -> Callable[[], None]:
-    return lambda: damage(path)
 
 
 def _to_folder(path: Path) -> None:
@@ -220,37 +241,39 @@ def _text(text: str) -> Damage:
     return lambda path: path.write_text(text) and None
 
 
-def _edit_json(change: Callable[[dict], object]) -> Damage:
-    def damage(path: Path) -> None:
-        value = json.loads(path.read_text())
-        change(value)
-        path.write_text(json.dumps(value))
-
-    return damage
+PLACES = 20
+"""Keys of one file that are spoilt, at most: the tree of a checkpoint has thousands alike."""
 
 
-def _places(value: object, place: tuple = ()) -> Iterator[tuple]:
-    """Keys of a JSON object and of the objects in it."""
+def _each_place(value: dict[str, Any]) -> Iterator[tuple[str, Damage]]:
+    """For each key of a JSON object and of the objects in it: without it, and with a value of another type."""
+    for place in islice(_places(value), PLACES):
+        name = ".".join(place)
+        yield f"without {name}", _edit_json(place, lambda inner, key: inner.pop(key))
+        yield f"{name} of another type", _edit_json(place, lambda inner, key: inner.update({key: _other(inner[key])}))
+
+
+def _places(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
     if isinstance(value, dict):
         for key, inner in value.items():
             yield (*place, key)
             yield from _places(inner, (*place, key))
 
 
-def _each_place(new: Callable[[object], object]) -> Callable[[dict, int], bool]:
-    """Change the n-th place of an object."""
+def _other(value: Any) -> Any:
+    """A value of another JSON type."""
+    return ["x"] if isinstance(value, str | dict) else "x"
 
-    def change(value: dict, number: int) -> bool:
-        places = list(_places(value))
-        if number >= len(places):
-            return False
-        *outer, key = places[number]
-        for name in outer:
-            value = value[name]
-        value[key] = new(value[key])
-        return True
 
-    return change
+def _edit_json(place: tuple[str, ...], change: Callable[[dict[str, Any], str], object]) -> Damage:
+    def damage(path: Path) -> None:
+        value = inner = json.loads(path.read_text())
+        for key in place[:-1]:
+            inner = inner[key]
+        change(inner, place[-1])
+        path.write_text(json.dumps(value))
+
+    return damage
 
 
 NESTED = "[" * 100_000 + "]" * 100_000
@@ -439,11 +462,6 @@ def _hdf5() -> dict[str, Damage]:
     for label, text in {"a list": "[]", "nested deeply": NESTED, "garbage": "{nonsense"}.items():
         kinds[f"attributes: {label}"] = _edit_hdf5(lambda file, text=text: file.attrs.update(vd4rl_pomdp=text))
     return kinds
-
-
-def _json_places() -> dict[str, Damage]:
-    """For each of the first places: without it, and with another type there."""
-    return {}
 
 
 BY_SUFFIX: dict[str, dict[str, Damage]] = {

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import MISSING, dataclass, fields
+from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from types import NoneType, UnionType
 from typing import Any, Literal, get_args, get_origin, get_type_hints
@@ -28,6 +28,8 @@ class Case:
     words: Words
     spoil: Callable[[], None] | None = None
     """What makes the files bad, in the folder where the command runs."""
+    may_pass: bool = False
+    """Whether nobody may read what is bad: then exit code 0 is right, too."""
 
 
 NAMES = [name for name, entry in COMMANDS.items() if not isinstance(entry, Mapping)] + [
@@ -123,6 +125,7 @@ def flag_cases() -> Iterator[Case]:
             yield from _of_field(command, field.name, hints[field.name])
         for name in LARGE.get(command, ()):
             yield _changed(command, name, "beyond the machine", [str(HUGE)])
+    yield from _unread()
 
 
 def _unknown_commands() -> Iterator[Case]:
@@ -143,6 +146,44 @@ def _whole_lines(command: str, config: type) -> Iterator[Case]:
     yield Case(command, "(all flags)", "a lone dash", [*words, *VALID[command], "-"])
     if not any(_is_positional(h) and _core(h)[1] for h in get_type_hints(config, include_extras=True).values()):
         yield Case(command, "(all flags)", "one word more", [*words, *VALID[command], "word", "word"])
+
+
+def _unread() -> Iterator[Case]:
+    """Every method and algorithm with every option that it does not read."""
+    from finetune.algorithms import ALGORITHMS
+    from finetune.algorithms import OPTIONS as OF_ALGORITHMS
+    from finetune.config import PRESETS as FINETUNE
+    from pretrain.config import PRESETS as PRETRAIN
+    from pretrain.objectives import METHODS, unread_options
+
+    for method in METHODS:
+        unread = unread_options(replace(PRETRAIN["smoke"], method=method))
+        yield from (_chosen("pretrain", PRETRAIN["smoke"], ["--method", method], name) for name in sorted(unread))
+    for method in ("ah", "fj+a", "no_history", "random", "supervised+a"):
+        for name in ("literal_future", "n"):
+            yield _chosen("navigation train", PRETRAIN["smoke"], ["--method", method], name)
+    for name, algorithm in ALGORITHMS.items():
+        for option in sorted(OF_ALGORITHMS.difference(algorithm.options)):
+            yield _chosen("finetune", FINETUNE["smoke"], ["--algorithm", name], option)
+    for method, line in {"acro": "--literal-future", "curl": "--max-k 2", "bc mik+a": "--codes 3"}.items():
+        more = ["--methods", *method.split(), f"--pretrain={line}", "--dry-run"]
+        yield Case("sweep", "pretrain", f"{line} for {method}", ["sweep", *VALID["sweep"], *more])
+    for methods, line in {
+        "acro": "--foo",
+        "random acro": "--steps 3",
+        "bc": "--alpha 1",
+        "drq_bc": "--views 2",
+    }.items():
+        more = ["--methods", *methods.split(), f"--finetune={line}", "--dry-run"]
+        yield Case("sweep", "finetune", f"{line} for {methods}", ["sweep", *VALID["sweep"], *more])
+
+
+def _chosen(command: str, default: Any, choice: Words, name: str) -> Case:
+    """A line with an option set to something else than its default, for a method that does not read it."""
+    value = getattr(default, name)
+    other = {"frame_encoder": "drq", "action_target": "mse"}.get(name) or str((value or 0) + 1)
+    flag = [f"--{'no-' if value else ''}{name.replace('_', '-')}"] if isinstance(value, bool) else [_flag(name), other]
+    return Case(command, name, f"unread by {choice[1]}", [*command.split(), *VALID[command], *choice, *flag])
 
 
 def _of_field(command: str, name: str, hint: Any) -> Iterator[Case]:

@@ -1,3 +1,4 @@
+import os
 import shlex
 import subprocess
 import sys
@@ -24,6 +25,9 @@ def test_every_command_has_help(words, capsys):
     assert words[-1] in capsys.readouterr().out
 
 
+SWEPT = ["--data", "x", "--out", "y", "--dry-run"]
+
+
 @pytest.mark.parametrize(
     ("words", "message"),
     [
@@ -48,6 +52,25 @@ def test_every_command_has_help(words, capsys):
         (["theory", "--out", "file/below"], "file/below: cannot be used (not a directory)"),
         (["data", "card", "nowhere"], "nowhere"),
         (["pretrain", "--data", "x"], "Missing from vd4rl-pomdp pretrain: --out"),
+        (["pretrain"], "Missing from vd4rl-pomdp pretrain: --data PATH"),
+        (["finetune"], "--encoder"),
+        (["navigation", "train"], "--data"),
+        (["navigation", "collect"], "--maze"),
+        (["pretrain", "--data", "", "--out", "y"], "--data names nothing"),
+        (["pretrain", "--data=", "--out", "y"], "--data= names nothing"),
+        (["pretrain", "--data", "x", "--out", os.fsdecode(b"\xff")], "'\\udcff' is not UTF-8"),
+        (["evaluate", ""], "the first word names nothing"),
+        (["sweep", "--data", "x", "--out", "y", "--methods"], "--methods names nothing"),
+        (["sweep", "--data", "x", "--out", "y", "--dry-run", "--preset", "foo"], "unknown preset 'foo'"),
+        (["sweep", "--data", "x", "--out", "y", "--dry-run", "--finetune=--foo"], "--foo"),
+        (["sweep", "--data", "x", "--out", "y", "--dry-run", "--seeds", "0", "-1"], "--seed is -1"),
+        (["sweep", *SWEPT, "--methods", "random", "acro", "--pretrain=--codes 3"], "--codes is not read by random"),
+        (
+            ["sweep", *SWEPT, "--methods", "acro", "bc", "--finetune=--alpha 1"],
+            "--alpha is not read by the algorithm bc",
+        ),
+        (["sweep", *SWEPT, "--methods", "acro", "drq_bc", "--finetune=--views 2"], "--views is not read by"),
+        (["navigation", "grid", "--seeds", "-1", "--dry-run"], "--seeds is -1"),
         (["pretrain", "--data", "x", "--out", "y", "--steps", "many"], "--steps: invalid literal"),
         (["finetune", "--encoder", "a", "--data", "b", "--out", "c", "--veiws", "3"], "Perhaps you meant: --views"),
     ],
@@ -68,6 +91,16 @@ def test_a_slip_is_one_line_and_exit_code_2(words, message, capsys, tmp_path, mo
 def test_help_needs_neither_numpy_nor_torch():
     code = "import sys, vd4rl_pomdp.cli; sys.exit(bool({'numpy', 'torch'} & set(sys.modules)))"
     assert subprocess.run([sys.executable, "-c", code]).returncode == 0
+
+
+def test_a_terminal_that_is_not_utf_8_is_shown_what_it_can():
+    line = [sys.executable, "-m", "vd4rl_pomdp.cli"]
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    shown = subprocess.run([*line, "theory", "--help"], capture_output=True, env=environment)
+    assert (shown.returncode, shown.stderr) == (0, b"")
+    refused = subprocess.run([*line, "data", "check", "ζ"], capture_output=True, env=environment)
+    assert (refused.returncode, refused.stderr.count(b"\n")) == (2, 1)
+    assert refused.stderr.startswith(b"error: \\u03b6: no such folder")
 
 
 def test_without_words_the_commands_are_listed(capsys):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import errno
 from collections.abc import Iterable
 from pathlib import Path
+from stat import S_ISDIR
 from typing import Any
 
 
@@ -44,6 +45,22 @@ def refuse_unread(config: Any, default: Any, names: Iterable[str], reader: str) 
     for name in sorted(names):
         if getattr(config, name) != getattr(default, name):
             raise UserError(f"{flag_of(name)} is not read by {reader}: leave it out")
+
+
+def refuse_no_folder(path: Path) -> None:
+    """Raise UserError unless `path` is a folder or can become one: said before the work whose result it is to hold."""
+    for place in (path, *path.parents):
+        try:
+            mode = place.stat().st_mode
+        except FileNotFoundError:
+            if not place.is_symlink():
+                continue
+            mode = 0
+        except OSError as error:
+            raise disk_error(path, error) from error
+        if not S_ISDIR(mode):
+            raise UserError(f"{path}: {place} is no folder; choose another --out")
+        return
 
 
 def disk_error(path: Path | str | None, error: OSError) -> UserError:

@@ -14,7 +14,7 @@ from pretrain.navigation.data import open_data
 from pretrain.navigation.measure import measure, write_trajectory
 from pretrain.navigation.trainer import Trainer, make_objective, network_of
 from pretrain.objectives import INVERSE, get_method, unread_options
-from pretrain.train import require_batch
+from pretrain.train import DECIDE_MEMORY, require_batch
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside, refuse_unread
 from vd4rl_pomdp.experiments.navigation.grid import REFERENCES, UNTRAINED
@@ -35,7 +35,7 @@ STAGE = "navigation"
 def train(config: NavigationConfig) -> RunFolder:
     """Run the stage, or go on with it; returns the run's folder."""
     _check(config)
-    with telling_memory(config, "batch_size", "window", "feature_dim", "hidden_dim"):
+    with telling_memory(config, *DECIDE_MEMORY):
         return _train(config)
 
 

@@ -98,7 +98,6 @@ def _provide(file: RemoteFile, destination: Path, endpoint: str, verify: bool, b
     if _is_complete(file, target, verify):
         return
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
         twins = (other.target(destination) for other in manifest() if other.sha256 == file.sha256)
         twin = next((path for path in twins if path != target and _is_complete(file, path, verify)), None)
         if twin:
@@ -118,6 +117,7 @@ def _is_complete(file: RemoteFile, path: Path, verify: bool) -> bool:
 
 def _link(source: Path, target: Path) -> None:
     """Give an existing file a second name: a hard link, a symbolic one, or where neither works a copy."""
+    target.parent.mkdir(parents=True, exist_ok=True)
     with replacing_file(target) as fresh:
         fresh.unlink(missing_ok=True)
         try:
@@ -169,6 +169,7 @@ def _receive(url: str, part: Path, offset: int) -> Iterator[int]:
         response.raise_for_status()
         resumed = response.status_code == 206
         done = offset if resumed else 0
+        part.parent.mkdir(parents=True, exist_ok=True)
         with part.open("ab" if resumed else "wb") as file:
             for block in response.iter_content(_BLOCK):
                 file.write(block)

@@ -21,6 +21,7 @@ from safetensors.numpy import save_file
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.folder import replacing_file
+from vd4rl_pomdp.runs.reading import parse_json, regular
 from vd4rl_pomdp.tasks import TASKS, Task, get_task
 
 LOG_STD_RANGE = (-20.0, 2.0)
@@ -174,9 +175,11 @@ def read_ladder(path: Path, task: Task | None = None) -> Ladder:
 
 def _read(path: Path, task: Task | None) -> tuple[dict[str, np.ndarray], dict[str, Any], str]:
     try:
-        with safe_open(path, framework="np") as file:
-            card = dict(json.loads((file.metadata() or {}).get("card", "none")))
+        with safe_open(regular(path), framework="np") as file:
+            card = dict(parse_json((file.metadata() or {}).get("card", "none")))
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+    except UserError:
+        raise
     except (OSError, SafetensorError, ValueError, TypeError) as error:
         raise UserError(f"{path}: not an actor file ({error}); {_REMEDY}") from error
     if task is not None and card.get("task") != task.name:

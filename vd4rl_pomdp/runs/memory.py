@@ -37,7 +37,7 @@ def require_memory(needed: float, device: torch.device, config: Any, *names: str
     if needed > have:
         raise UserError(
             f"{_named(config, names)} takes {needed / 1e9:,.0f} GB of memory, and there are {have / 1e9:,.0f} GB: "
-            f"lower {flag_of(names[0])}"
+            f"{_remedy(names)}"
         )
 
 
@@ -48,7 +48,7 @@ def require_disk(needed: float, path: Path, config: Any, *names: str) -> None:
     if needed > free:
         raise UserError(
             f"{_named(config, names)} takes {needed / 1e9:,.1f} GB on the disk of {path}, and {free / 1e9:,.1f} GB are "
-            f"free: lower {flag_of(names[0])} or free some space"
+            f"free: {_remedy(names)} or free some space"
         )
 
 
@@ -60,7 +60,7 @@ def telling_memory(config: Any, *names: str) -> Iterator[None]:
     except (MemoryError, RuntimeError) as error:
         if not _ran_out(error):
             raise
-        raise UserError(f"out of memory with {_named(config, names)}: lower {flag_of(names[0])}") from error
+        raise UserError(f"out of memory with {_named(config, names)}: {_remedy(names)}") from error
 
 
 def _ran_out(error: Exception) -> bool:
@@ -70,6 +70,10 @@ def _ran_out(error: Exception) -> bool:
 
 def _named(config: Any, names: tuple[str, ...]) -> str:
     return ", ".join(f"{flag_of(name)} {getattr(config, name)}" for name in names)
+
+
+def _remedy(names: tuple[str, ...]) -> str:
+    return "lower one of them" if len(names) > 1 else "lower it"
 
 
 def bytes_of_parameters(module: nn.Module) -> int:

@@ -5,12 +5,12 @@ from __future__ import annotations
 import json
 from pathlib import Path
 from types import UnionType
-from typing import Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
-
-import torch
-from torch import Tensor
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
 
 from vd4rl_pomdp.errors import UserError
+
+if TYPE_CHECKING:
+    from torch import Tensor
 
 T = TypeVar("T")
 
@@ -55,6 +55,7 @@ def read_tensors(path: Path) -> dict[str, Tensor]:
     Raises:
         OSError, SafetensorError: the file cannot be read or is no such file.
     """
+    import torch
     from safetensors.torch import load_file
 
     tensors = load_file(regular(path))
