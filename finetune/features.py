@@ -17,6 +17,7 @@ from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.runs.device import Precision, autocast
 from vd4rl_pomdp.runs.folder import read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.runs.reading import regular
 from vd4rl_pomdp.types import Batch
 
 CHUNK = 128
@@ -109,7 +110,7 @@ class FeatureFile:
         self._path.unlink(missing_ok=True)
 
     def _description(self) -> dict[str, str]:
-        with self._path.open("rb") as file:
+        with regular(self._path).open("rb") as file:
             return self._inputs | {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
 
 

@@ -9,14 +9,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from finetune.algorithms import Algorithm, get_algorithm
-from finetune.config import FinetuneConfig
+from finetune.algorithms import OPTIONS, Algorithm, get_algorithm
+from finetune.config import PRESETS, FinetuneConfig
 from finetune.end_to_end import EndToEnd
 from finetune.features import STAGE, ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.envs.parity import render_info
-from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
+from vd4rl_pomdp.errors import MAX_SEED, refuse_number, refuse_outside, refuse_unread
 from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, read_rows, rows_of
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import CONFIG, EncoderCard, copy_encoder, encoder_hash, load_encoder, save_encoder
@@ -26,29 +26,32 @@ from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.folder import read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.loop import Loop, training
+from vd4rl_pomdp.runs.memory import require_disk, require_memory, telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.tasks import FRAME_SIZE, get_task
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, FRAME_SIZE, MOST_EPISODES, get_task
 
 
 def finetune(config: FinetuneConfig) -> RunFolder:
     """Run the stage, or go on with it; writes the policy and `episodes.csv` into the run's folder."""
-    get_algorithm(config.algorithm)
-    refuse_outside(
-        config, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, gamma=(0, 1), n_step=1,
-        alpha=0, views=0, shift=(0, FRAME_SIZE - 1), eval_every=1, eval_episodes=1, eval_length=1, log_every=1,
-        checkpoint_every=1, workers=0,
-    )  # fmt: skip
+    check(config)
     refuse_inside(config.out)
+    with telling_memory(config, "views", "batch_size", "hidden_dim"):
+        return _finetune(config)
+
+
+def _finetune(config: FinetuneConfig) -> RunFolder:
     device = pick_device(config.device)
     dataset = open_dataset(config.data)
     dataset.require_transitions()
     encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frames.shape[-1])
     if card.end_to_end:
+        check(config, card.end_to_end)
         config = replace(config, algorithm=card.end_to_end, views=0)
     if encoder.reads_state:
         dataset.states()
+    _require_room(config, dataset, encoder, device)
     card = replace(card, quality=dataset.quality or card.quality)  # the policy's set names its rows
     inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
     with RunFolder(config.out, STAGE, config, inputs) as run:
@@ -58,6 +61,34 @@ def finetune(config: FinetuneConfig) -> RunFolder:
             dataset.to(device)
             _trainer(config, dataset, encoder.to(device), card, run).run(run)
     return run
+
+
+def check(config: FinetuneConfig, end_to_end: str = "") -> None:
+    """Refuse settings that cannot work or that nothing reads, before anything is read or written.
+
+    Args:
+        config: the run's settings.
+        end_to_end: the algorithm that the method brings along, if it has no frozen stage.
+    """
+    refuse_outside(
+        config, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, gamma=(0, 1), n_step=1,
+        alpha=0, views=0, shift=(0, FRAME_SIZE - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
+        eval_length=(1, EPISODE_TRANSITIONS), log_every=1, checkpoint_every=1, workers=0,
+    )  # fmt: skip
+    algorithm = end_to_end or config.algorithm
+    unread = {*OPTIONS.difference(get_algorithm(algorithm).options), *(("views",) if end_to_end else ())}
+    refuse_unread(config, PRESETS[config.preset], unread, f"the algorithm {algorithm}")
+
+
+def _require_room(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, device: torch.device) -> None:
+    """Refuse what plainly exceeds the memory or the disk: all views' features, or one batch through the networks."""
+    longest = int((dataset.episode_end - dataset.episode_start).max()) - 1
+    refuse_number("n_step", config.n_step, 1, max(longest, FinetuneConfig.n_step))
+    features = config.views * dataset.num_rows * encoder.dim * 2
+    require_memory(features, device, config, "views")
+    require_disk(features, config.out, config, "views")
+    row, weights = 2 * encoder.dim + 4 * config.hidden_dim, 15 * config.hidden_dim**2  # of float32 numbers
+    require_memory(4 * (config.batch_size * row + weights), device, config, "batch_size", "hidden_dim")
 
 
 def _trainer(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: EncoderCard, run: RunFolder) -> Trainer:

@@ -7,19 +7,20 @@ from typing import Any
 
 import torch
 
-from pretrain.config import PretrainConfig
-from pretrain.objectives import build_objective, get_method
+from pretrain.config import PRESETS, PretrainConfig
+from pretrain.objectives import build_objective, get_method, unread_options
 from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption
 from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
-from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
-from vd4rl_pomdp.nn.action_target import make_action_target
-from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside, refuse_unread
+from vd4rl_pomdp.nn.action_target import check_action_target, make_action_target
+from vd4rl_pomdp.nn.encoder import MAX_LAYERS, Encoder
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
 from vd4rl_pomdp.nn.frame import check_frame_encoder
-from vd4rl_pomdp.objective import Objective
+from vd4rl_pomdp.objective import Objective, check_gap
 from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.folder import jsonable
 from vd4rl_pomdp.runs.loop import training
+from vd4rl_pomdp.runs.memory import bytes_kept, bytes_of_parameters, require_memory, telling_memory
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
@@ -29,18 +30,27 @@ from vd4rl_pomdp.tasks import FRAME_SIZE, get_task
 from vd4rl_pomdp.types import Windows
 
 STAGE = "pretrain"
+DECIDE_MEMORY = ("batch_size", "window", "feature_dim", "hidden_dim", "head_dim", "codes")
+"""Settings that the memory of a training hangs on."""
 
 
 def pretrain(config: PretrainConfig) -> RunFolder:
     """Run the stage, or go on with it, and write `out/encoder`; returns the run's folder."""
-    method = get_method(config.method)
-    _check(config)
+    check(config)
     refuse_inside(config.out)
+    with telling_memory(config, *DECIDE_MEMORY):
+        return _pretrain(config)
+
+
+def _pretrain(config: PretrainConfig) -> RunFolder:
+    method = get_method(config.method)
     dataset = open_dataset(config.data)
     task = _task_of(dataset, config)
     seed_networks(config.seed, STAGE)
     objective = _build(dataset, config)
     device = pick_device(config.device)
+    if method.trained:
+        require_batch(objective, device, config)
     with RunFolder(config.out, STAGE, replace(config, task=task), {"data": dataset.fingerprint}) as run:
         if not run.finished:
             trainer = Trainer(objective.to(device), dataset.to(device), config)
@@ -110,15 +120,37 @@ def corruption_of(config: CorruptionConfig) -> CorruptionConfig:
     return CorruptionConfig(**{f.name: getattr(config, f.name) for f in fields(CorruptionConfig)})
 
 
-def _check(config: PretrainConfig) -> None:
-    """Refuse settings that cannot work, before anything is read or written."""
+def check(config: PretrainConfig) -> None:
+    """Refuse settings that cannot work or that nothing reads, before anything is read or written."""
+    get_method(config.method)
     refuse_outside(
         config, seed=(0, MAX_SEED), steps=0, batch_size=1, window=2, learning_rate=0, shift=(0, FRAME_SIZE - 1),
-        feature_dim=1, hidden_dim=1, gru_layers=1, head_dim=1, m=0, n=0, history_window=0, max_k=1, codes=1,
-        homer_codes=0, self_prediction=0, l2_states=0, log_every=1, checkpoint_every=1,
+        feature_dim=1, hidden_dim=1, gru_layers=(1, MAX_LAYERS), head_dim=1, m=0, n=0, history_window=0, max_k=1,
+        codes=1, homer_codes=0, self_prediction=0, l2_states=0, log_every=1, checkpoint_every=1,
     )  # fmt: skip
     check_frame_encoder(config.frame_encoder)
+    check_action_target(config.action_target)
+    unread = unread_options(config)
+    refuse_unread(config, PRESETS[config.preset], unread, config.method)
+    if "max_k" not in unread:
+        check_gap(config.max_k, config.window)
     check_corruption(config)
+
+
+def require_batch(objective: Objective, device: torch.device, config: Any) -> None:
+    """Refuse a batch whose frames alone, once encoded, exceed the memory of a device.
+
+    Args:
+        objective: what will be trained.
+        device: where.
+        config: a stage's settings, `DECIDE_MEMORY` among them.
+    """
+    shape = objective.encoder.config
+    stack = torch.zeros(1, shape.channels, shape.size, shape.size, dtype=torch.uint8)
+    rows = config.batch_size * config.window
+    with autocast(stack.device, config.precision):
+        needed = rows * (stack.nbytes + bytes_kept(objective.encoder.frame, stack)) + bytes_of_parameters(objective)
+    require_memory(needed, device, config, *DECIDE_MEMORY)
 
 
 def _build(dataset: Dataset, config: PretrainConfig) -> Objective:

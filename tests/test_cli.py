@@ -1,3 +1,4 @@
+import os
 import shlex
 import subprocess
 import sys
@@ -22,6 +23,9 @@ def test_every_command_has_help(words, capsys):
         main([*words, "--help"])
     assert end.value.code in (0, None)
     assert words[-1] in capsys.readouterr().out
+
+
+SWEPT = ["--data", "x", "--out", "y", "--dry-run"]
 
 
 @pytest.mark.parametrize(
@@ -49,6 +53,25 @@ def test_every_command_has_help(words, capsys):
         (["data", "card", "nowhere"], "nowhere"),
         (["demo", "--preset", "huge"], "unknown preset 'huge': choose one of cpu, smoke"),
         (["pretrain", "--data", "x"], "Missing from vd4rl-pomdp pretrain: --out"),
+        (["pretrain"], "Missing from vd4rl-pomdp pretrain: --data PATH"),
+        (["finetune"], "--encoder"),
+        (["navigation", "train"], "--data"),
+        (["navigation", "collect"], "--maze"),
+        (["pretrain", "--data", "", "--out", "y"], "--data names nothing"),
+        (["pretrain", "--data=", "--out", "y"], "--data= names nothing"),
+        (["pretrain", "--data", "x", "--out", os.fsdecode(b"\xff")], "'\\udcff' is not UTF-8"),
+        (["evaluate", ""], "the first word names nothing"),
+        (["sweep", "--data", "x", "--out", "y", "--methods"], "--methods names nothing"),
+        (["sweep", "--data", "x", "--out", "y", "--dry-run", "--preset", "foo"], "unknown preset 'foo'"),
+        (["sweep", "--data", "x", "--out", "y", "--dry-run", "--finetune=--foo"], "--foo"),
+        (["sweep", "--data", "x", "--out", "y", "--dry-run", "--seeds", "0", "-1"], "--seed is -1"),
+        (["sweep", *SWEPT, "--methods", "random", "acro", "--pretrain=--codes 3"], "--codes is not read by random"),
+        (
+            ["sweep", *SWEPT, "--methods", "acro", "bc", "--finetune=--alpha 1"],
+            "--alpha is not read by the algorithm bc",
+        ),
+        (["sweep", *SWEPT, "--methods", "acro", "drq_bc", "--finetune=--views 2"], "--views is not read by"),
+        (["navigation", "grid", "--seeds", "-1", "--dry-run"], "--seeds is -1"),
         (["pretrain", "--data", "x", "--out", "y", "--steps", "many"], "--steps: invalid literal"),
         (["finetune", "--encoder", "a", "--data", "b", "--out", "c", "--veiws", "3"], "Perhaps you meant: --views"),
     ],
@@ -76,6 +99,16 @@ def test_the_package_is_the_program_and_its_help_needs_neither_numpy_nor_torch(p
     assert done.returncode == 0, done.stderr
     main(["--help"])
     assert done.stdout == capsys.readouterr().out
+
+
+def test_a_terminal_that_is_not_utf_8_is_shown_what_it_can():
+    line = [sys.executable, "-m", "vd4rl_pomdp.cli"]
+    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
+    shown = subprocess.run([*line, "theory", "--help"], capture_output=True, env=environment)
+    assert (shown.returncode, shown.stderr) == (0, b"")
+    refused = subprocess.run([*line, "data", "check", "ζ"], capture_output=True, env=environment)
+    assert (refused.returncode, refused.stderr.count(b"\n")) == (2, 1)
+    assert refused.stderr.startswith(b"error: \\u03b6: no such folder")
 
 
 def test_without_words_the_commands_are_listed(capsys):

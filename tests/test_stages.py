@@ -3,6 +3,7 @@
 import csv
 import hashlib
 import json
+import os
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -300,6 +301,9 @@ def test_an_evaluation_names_its_step_and_touches_no_other_file(encoder, data, t
     with pytest.raises(UserError, match="holds no evaluated run"):
         evaluate_run(encoder.parent, None, 1, 1)
     assert [row["step"] for row in evaluate_run(run.path, None, 1, 1)] == [2]
+    (run.path / "labels.json").write_text("{}")
+    with pytest.raises(UserError, match=r"labels\.json: has no 'method'"):
+        evaluate_run(run.path, None, 1, 1)
     thesis = tmp_path / "thesis.csv"
     thesis.write_text("a,b\n1,2\n")
     with pytest.raises(UserError, match="has no column 'method'"):
@@ -317,6 +321,39 @@ def test_a_line_that_was_cut_is_dropped_with_what_follows_the_checkpoint(tmp_pat
         read_rows(path)
     drop_rows_after(path, 1)
     assert [row["step"] for row in read_rows(path)] == [1]
+
+
+@pytest.mark.parametrize("damage", ["shape", "nan", "text", "pipe"])
+def test_features_that_a_cut_run_did_not_encode_are_refused(encoder, data, tmp_path, monkeypatch, damage):
+    config = smoke_finetune(encoder, data, tmp_path / "out")
+    with monkeypatch.context() as patch:
+        cut_at(patch, "finetune.train", 1)
+        with pytest.raises(CutError):
+            run_finetune(config)
+    path = config.out / "features.npy"
+    features = np.load(path)
+    path.unlink()
+    if damage == "pipe":
+        os.mkfifo(path)
+    elif damage == "text":
+        path.write_text("no features")
+    else:
+        np.save(path, features[:, :-1] if damage == "shape" else np.full_like(features, np.nan))
+    with pytest.raises(UserError, match=r"features\.npy: .* remove it"):
+        run_finetune(config)
+
+
+@pytest.mark.parametrize("cell", ["nan", "inf", "many", "9" * 200_000], ids=["nan", "inf", "word", "endless"])
+def test_a_damaged_table_of_episodes_is_named_and_kept(tmp_path, cell):
+    path = tmp_path / "episodes.csv"
+    row = dict.fromkeys(("method", "task", "quality", "corruption", "algorithm"), "x")
+    row |= dict.fromkeys(("seed", "episode", "episode_seed", "return", "length"), 1)
+    append_rows(path, [row | {"step": 1, "score": cell}])
+    before = path.read_bytes()
+    for read in (lambda: read_rows(path), lambda: drop_rows_after(path, 1)):
+        with pytest.raises(UserError, match=r"episodes\.csv: a row is not whole"):
+            read()
+    assert path.read_bytes() == before
 
 
 def test_an_encoder_of_another_image_size_is_refused(data, encoder, tmp_path):

@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 import errno
-import math
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from stat import S_ISDIR
 from typing import Any
 
 
@@ -19,6 +19,8 @@ class UserError(ValueError):
 
 MAX_SEED = 2**31 - 1
 """Largest seed that every random generator in use takes."""
+MOST = 10**9
+"""Largest number that any flag takes, unless it says otherwise."""
 
 
 def refuse_outside(config: Any, **ranges: float | tuple[float, float]) -> None:
@@ -28,11 +30,38 @@ def refuse_outside(config: Any, **ranges: float | tuple[float, float]) -> None:
             refuse_number(name, value, *(limits if isinstance(limits, tuple) else (limits,)))
 
 
-def refuse_number(name: str, value: float, low: float, high: float = math.inf) -> None:
+def refuse_number(name: str, value: float, low: float, high: float = MOST) -> None:
     """Raise UserError, naming the flag, for a number below `low`, above `high`, or NaN."""
     if not low <= value <= high:
-        most = "" if high == math.inf else f" and at most {high}"
-        raise UserError(f"--{name.replace('_', '-')} is {value}; it must be at least {low}{most}")
+        raise UserError(f"{flag_of(name)} is {value}; it must be at least {low} and at most {high}")
+
+
+def flag_of(name: str) -> str:
+    """The flag that sets a config's field."""
+    return f"--{name.replace('_', '-')}"
+
+
+def refuse_unread(config: Any, default: Any, names: Iterable[str], reader: str) -> None:
+    """Raise UserError for a field that differs from its default although nothing reads it: it would be a lie."""
+    for name in sorted(names):
+        if getattr(config, name) != getattr(default, name):
+            raise UserError(f"{flag_of(name)} is not read by {reader}: leave it out")
+
+
+def refuse_no_folder(path: Path) -> None:
+    """Raise UserError unless `path` is a folder or can become one: said before the work whose result it is to hold."""
+    for place in (path, *path.parents):
+        try:
+            mode = place.stat().st_mode
+        except FileNotFoundError:
+            if not place.is_symlink():
+                continue
+            mode = 0
+        except OSError as error:
+            raise disk_error(path, error) from error
+        if not S_ISDIR(mode):
+            raise UserError(f"{path}: {place} is no folder; choose another --out")
+        return
 
 
 def disk_error(path: Path | str | None, error: OSError) -> UserError:

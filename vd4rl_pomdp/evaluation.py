@@ -5,7 +5,8 @@ from __future__ import annotations
 import csv
 import io
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -21,17 +22,17 @@ from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import load_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy
 from vd4rl_pomdp.runs.folder import appending, read_json, write_csv
+from vd4rl_pomdp.runs.reading import regular
 from vd4rl_pomdp.runs.workers import run_jobs
-from vd4rl_pomdp.tasks import SCORE_DIVISOR, get_task
+from vd4rl_pomdp.tasks import MOST_EPISODES, SCORE_DIVISOR, get_task
 
 EVALUATION_SEED = 20_000
 """Evaluation episode i starts from environment seed EVALUATION_SEED + i, for every method and training seed."""
 FILM_EVERY = 4
 """Rows between two pictures of a film."""
-COLUMNS = (
-    *("method", "task", "quality", "corruption", "algorithm", "seed", "step"),
-    *("episode", "episode_seed", "return", "length", "score"),
-)
+LABELS = ("method", "task", "quality", "corruption", "algorithm", "seed")
+"""What names the rows of a run."""
+COLUMNS = (*LABELS, "step", "episode", "episode_seed", "return", "length", "score")
 
 
 class Agent:
@@ -135,20 +136,31 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     Raises:
         UserError: the file was not written by this package, or is damaged.
     """
-    if not path.is_file() or path.stat().st_size == 0:
+    if not regular(path).is_file() or path.stat().st_size == 0:
         return []
-    whole = ("seed", "step", "episode", "episode_seed", "length")
+    with _whole(path), path.open(newline="") as file:
+        return _parse(path, file)
+
+
+@contextmanager
+def _whole(path: Path) -> Iterator[None]:
+    """Whatever a damaged table leads to becomes a sentence."""
     try:
-        with path.open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            missing = [name for name in COLUMNS if name not in (reader.fieldnames or [])]
-            if missing:
-                raise UserError(f"{path}: has no column {missing[0]!r}; it was not written by this package")
-            return [row | {k: int(row[k]) for k in whole} | _scores(path, row) for row in reader]
+        yield
     except UserError:
         raise
-    except (ValueError, TypeError) as error:
+    except (ValueError, TypeError, csv.Error) as error:
         raise UserError(f"{path}: a row is not whole ({error}); remove it") from error
+
+
+def _parse(path: Path, lines: Iterable[str]) -> list[dict[str, Any]]:
+    """Rows of an `episodes.csv`, numbers parsed; raises ValueError, TypeError or csv.Error for a damaged one."""
+    reader = csv.DictReader(lines)
+    missing = [name for name in COLUMNS if name not in (reader.fieldnames or [])]
+    if missing:
+        raise UserError(f"{path}: has no column {missing[0]!r}; it was not written by this package")
+    whole = ("seed", "step", "episode", "episode_seed", "length")
+    return [row | {k: int(row[k]) for k in whole} | _scores(path, row) for row in reader]
 
 
 def _scores(path: Path, row: dict[str, str]) -> dict[str, float]:
@@ -166,9 +178,9 @@ def drop_rows_after(path: Path, step: int) -> None:
     """Forget evaluations that a cut run made after its last checkpoint, and a last line that is not whole."""
     if not path.exists():
         return
-    with path.open(newline="", encoding="utf-8") as file:
-        whole = file.read().rpartition("\n")[0]
-    kept = [row for row in csv.DictReader(io.StringIO(whole, newline="")) if int(row["step"]) <= step]
+    with _whole(path):
+        whole = regular(path).read_bytes().decode().rpartition("\n")[0]
+        kept = [row for row in _parse(path, io.StringIO(whole, newline="")) if row["step"] <= step] if whole else []
     if kept:
         write_csv(path, COLUMNS, kept)
     else:
@@ -226,11 +238,15 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     Raises:
         UserError: an unknown corruption, no episode, or a folder without an evaluated run.
     """
-    refuse_number("episodes", episodes, 1)
+    refuse_number("episodes", episodes, 1, MOST_EPISODES)
+    refuse_number("workers", workers, 0)
     evaluated = read_rows(run / "episodes.csv")
     if not evaluated:
         raise UserError(f"{run}: holds no evaluated run; name a folder that `vd4rl-pomdp finetune` wrote")
     labels = read_json(run / "labels.json")
+    missing = [name for name in LABELS if not isinstance(labels.get(name), str | int)]
+    if missing:
+        raise UserError(f"{run / 'labels.json'}: has no {missing[0]!r}; the command that made the run writes it anew")
     card = load_encoder(run / "encoder")[1]
     chosen = CorruptionConfig(**card.corruption) if corruption is None else CorruptionConfig(corruption)
     make_corruption(chosen)

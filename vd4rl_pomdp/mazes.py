@@ -12,6 +12,8 @@ import numpy as np
 
 from vd4rl_pomdp.errors import UserError
 
+MOST_STEPS = 1000
+"""Most simulator steps for one action: ten seconds."""
 PICTURE_SIZE = 100
 """Height and width of a picture."""
 FREE_CELLS = ((1, 1), (1, 2), (1, 3), (2, 3), (3, 3), (3, 2), (3, 1))

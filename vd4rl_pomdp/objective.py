@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor, nn
 
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.heads import PairHead, all_pairs, mlp
@@ -53,6 +54,12 @@ class InverseConfig:
     """Weight of ||sg(s_{t+k}) - g(s_t, k)||^2, with a 3-layer MLP of 512 units."""
     l2_states: float = 0.0
     """Weight of the squared norm of forward states; it decays linearly to zero over the training."""
+
+
+def check_gap(max_k: int, window: int) -> None:
+    """Raise UserError unless a window of `window` rows holds pairs of every gap up to `max_k`."""
+    if max_k >= window:
+        raise UserError(f"--max-k {max_k} needs windows of more than that many rows: raise --window or lower it")
 
 
 class InverseObjective(Objective):

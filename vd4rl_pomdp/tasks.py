@@ -12,6 +12,8 @@ FRAME_STACK = 3
 ACTION_REPEAT = 2
 EPISODE_TRANSITIONS = 500
 """Decisions an episode: 1000 simulator steps at action repeat 2; an episode has one row more."""
+MOST_EPISODES = 10**6
+"""Most episodes that any command makes or plays at once."""
 SCORE_DIVISOR = 10.0
 """V-D4RL's normalised score is return / 10."""
 Quality = Literal["random", "medium_replay", "medium", "medium_expert", "expert"]

@@ -18,6 +18,8 @@ class Algorithm(Protocol):
     """Trains a policy on batches of frozen representations."""
 
     policy: Policy
+    options: tuple[str, ...]
+    """Which of `OPTIONS` it reads; the others are refused."""
 
     def update(self, batch: FeatureBatch) -> dict[str, Tensor]:
         """One update; returns detached scalars."""
@@ -29,6 +31,8 @@ class Algorithm(Protocol):
         """Continue from `state_dict`."""
 
 
+OPTIONS = frozenset(("alpha", "gamma", "n_step"))
+"""Settings that not every algorithm reads."""
 ALGORITHMS = {"td3_bc": TD3BC, "drqv2_bc": DrQv2BC, "bc": BC}
 
 

@@ -16,6 +16,8 @@ from vd4rl_pomdp.nn.policy import Policy
 class BC:
     """See the module."""
 
+    options: tuple[str, ...] = ()
+
     def __init__(self, policy: Policy, config: FinetuneConfig, generator: torch.Generator) -> None:
         self.policy = policy
         self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=config.learning_rate, fused=True)

@@ -42,6 +42,7 @@ class TwinCritic(nn.Module):
 class TD3BC:
     """See the module."""
 
+    options: tuple[str, ...] = ("alpha", "gamma", "n_step")
     tau = 0.005
     policy_delay = 2
 

@@ -6,7 +6,6 @@ Numbers are rows of (measure, split, probe, rows, k, value), which is what `resu
 from __future__ import annotations
 
 import csv
-import json
 from collections import defaultdict
 from pathlib import Path
 from typing import Any
@@ -21,6 +20,7 @@ from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.experiments.navigation.grid import UNTRAINED
 from vd4rl_pomdp.runs.device import autocast
 from vd4rl_pomdp.runs.folder import replacing_file
+from vd4rl_pomdp.runs.metrics import read_metrics
 
 TRAJECTORY_ROWS = 200
 """Rows of the held-out trajectory whose estimated states are kept for a figure."""
@@ -105,8 +105,7 @@ def _loss_rows(split: str, logs: dict[str, float]) -> list[dict[str, Any]]:
 
 def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]:
     """Means of the logged intervals that end in the last `average_last` steps."""
-    logged = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
-    last = [row for row in logged if row["step"] > config.steps - config.average_last]
+    last = [row for row in read_metrics(path) if row["step"] > config.steps - config.average_last]
     values: dict[str, list[float]] = defaultdict(list)
     for row in last:
         for name, value in row.items():

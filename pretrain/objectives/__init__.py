@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import sys
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
@@ -20,11 +20,19 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE
-from vd4rl_pomdp.objective import Objective
+from vd4rl_pomdp.objective import InverseConfig, Objective
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 
 ENTRY_POINTS = "vd4rl_pomdp.methods"
 """Group of entry points under which a package offers methods; each names a `Method`."""
+INVERSE = (*(field.name for field in fields(InverseConfig)), "action_target", "codes")
+"""Settings that all inverse models read."""
+MEMORY = ("m", "hidden_dim", "gru_layers", "history_window")
+"""Settings that an encoder with a memory reads."""
+PIXELS = ("frame_encoder", "feature_dim")
+"""Settings that an encoder of pixels reads."""
+OPTIONS = frozenset((*INVERSE, *MEMORY, *PIXELS, "n", "literal_future", "homer_codes"))
+"""Settings that not every method reads."""
 
 
 @dataclass(frozen=True)
@@ -44,6 +52,8 @@ class Method:
     """Fine-tuning algorithm that trains the encoder, too; empty for frozen encoders."""
     reads_state: bool = False
     """Whether it is given the simulator state in place of pixels."""
+    options: tuple[str, ...] = INVERSE
+    """Which of `OPTIONS` it reads, besides those of its encoder; the others are refused."""
 
 
 def _masked(encoder: Encoder, target: ActionTarget, config: PretrainConfig) -> Objective:
@@ -62,23 +72,25 @@ def _homer(encoder: Encoder, target: ActionTarget, config: PretrainConfig) -> Ob
     return HOMER(encoder, config.homer_codes, config.seed)
 
 
+_MASKED = (*INVERSE, "n", "hidden_dim", "gru_layers")
+"""What MIK reads, its backward GRU included."""
 METHODS: dict[str, Method] = {
     "no_history": Method(AllHistory),
     "ah": Method(AllHistory, "gru"),
     "ah+a": Method(AllHistory, "gru", use_actions=True),
     "fj": Method(ForwardJump, "gru", past=8),
     "fj+a": Method(ForwardJump, "gru", use_actions=True, past=8),
-    "mik": Method(_masked, "gru"),
-    "mik+a": Method(_masked, "gru", use_actions=True),
+    "mik": Method(_masked, "gru", options=_MASKED),
+    "mik+a": Method(_masked, "gru", use_actions=True, options=(*_MASKED, "literal_future")),
     "acro": Method(ACRO),
-    "one_step_inverse": Method(OneStepInverse),
-    "curl": Method(_curl),
-    "driml": Method(_driml),
-    "homer": Method(_homer),
-    "random": Method(Untrained, trained=False),
-    "bc": Method(Untrained, trained=False, end_to_end="bc"),
-    "drq_bc": Method(Untrained, trained=False, end_to_end="drqv2_bc"),
-    "state": Method(Untrained, trained=False, reads_state=True),
+    "one_step_inverse": Method(OneStepInverse, options=tuple(name for name in INVERSE if name != "max_k")),
+    "curl": Method(_curl, options=()),
+    "driml": Method(_driml, options=("max_k",)),
+    "homer": Method(_homer, options=("homer_codes",)),
+    "random": Method(Untrained, trained=False, options=()),
+    "bc": Method(Untrained, trained=False, end_to_end="bc", options=()),
+    "drq_bc": Method(Untrained, trained=False, end_to_end="drqv2_bc", options=()),
+    "state": Method(Untrained, trained=False, reads_state=True, options=()),
 }
 
 
@@ -123,6 +135,23 @@ def get_method(name: str) -> Method:
     return METHODS[name]
 
 
+def memory_of(config: PretrainConfig) -> str:
+    """Memory of a config's encoder, gru or none; a memory for a method that can have none raises UserError."""
+    method = get_method(config.method)
+    history = method.history if config.history == "method" else config.history
+    if history != "none" and (method.end_to_end or method.reads_state):
+        raise UserError(f"{config.method} has no memory: --history {history} is for pretrained methods")
+    return history
+
+
+def unread_options(config: PretrainConfig) -> set[str]:
+    """Those of `OPTIONS` that a config's method and encoder do not read."""
+    method = get_method(config.method)
+    read = {*method.options, *(() if memory_of(config) == "none" else MEMORY)}
+    read |= set() if method.reads_state else set(PIXELS)
+    return set(OPTIONS) - (read if config.action_target in ("kmeans", "bins") else read - {"codes"})
+
+
 def build_objective(
     config: PretrainConfig,
     action: Tensor,
@@ -140,10 +169,7 @@ def build_objective(
         observation: channels and size of an observation, for methods that read pixels.
     """
     method = get_method(config.method)
-    history = method.history if config.history == "method" else config.history
     past = method.past if config.m is None else config.m
-    if history != "none" and (method.end_to_end or method.reads_state):
-        raise UserError(f"{config.method} has no memory: --history {history} is for pretrained methods")
     channels, size = observation
     shape: dict[str, Any] = {"frame_encoder": config.frame_encoder, "channels": channels, "size": size}
     if method.reads_state:
@@ -152,7 +178,7 @@ def build_objective(
         EncoderConfig(
             action_dim=action.shape[1],
             feature_dim=config.feature_dim,
-            history=history,
+            history=memory_of(config),
             use_actions=method.use_actions,
             hidden_dim=config.hidden_dim,
             gru_layers=config.gru_layers,

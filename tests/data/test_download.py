@@ -181,8 +181,29 @@ def test_a_dead_mirror_is_told_with_advice(mirror, tmp_path):
     with pytest.raises(UserError, match=r"cannot be fetched \(status 503\); check the network .*--endpoint"):
         fetch(mirror, tmp_path)
     assert len(mirror.requests) == 5
-    with pytest.raises(UserError, match=r"cannot be fetched \(ConnectionError\)"):
-        download("walker_walk", "expert", tmp_path, endpoint="http://127.0.0.1:9")
+
+
+@pytest.mark.parametrize("endpoint", ["http://127.0.0.1:9", "http://", "http://[", "https://nobody.invalid"])
+def test_where_nobody_is_nothing_is_waited_for(tmp_path, monkeypatch, endpoint):
+    monkeypatch.setattr(module.time, "sleep", lambda _: pytest.fail("waited"))
+    monkeypatch.setenv("NO_PROXY", "*")
+    with pytest.raises(UserError, match=r"cannot be fetched .*choose another --endpoint"):
+        download("walker_walk", "expert", tmp_path, endpoint=endpoint)
+    assert names(tmp_path) == []
+
+
+def test_where_the_mirror_has_answered_its_absence_is_waited_out(mirror, tmp_path, monkeypatch):
+    path = f"{EXPERT}/0_a_expert.hdf5"
+    mirror.cuts[path] = 1
+    receive, calls = module._receive, []
+
+    def unplugged(url, part, offset):
+        calls.append(offset)
+        yield from receive("http://127.0.0.1:9/x" if len(calls) in (2, 3) else url, part, offset)
+
+    monkeypatch.setattr(module, "_receive", unplugged)
+    fetch(mirror, tmp_path)
+    assert calls[:4] == [0, 1000, 1000, 1000]
 
 
 def test_a_missing_file_is_told_at_once(mirror, tmp_path):

@@ -1,4 +1,5 @@
 import errno
+import os
 from pathlib import Path
 
 import h5py
@@ -6,7 +7,7 @@ import numpy as np
 import pytest
 
 from tests.helpers_data import fake_rows, write_fake_set
-from vd4rl_pomdp.data.format import read_attributes, read_frames, read_shard, shard_paths, write_shard
+from vd4rl_pomdp.data.format import read_attributes, read_dtypes, read_frames, read_shard, shard_paths, write_shard
 from vd4rl_pomdp.errors import UserError
 
 
@@ -132,9 +133,11 @@ def with_value(index, value):
     [
         ("reward", lambda v: None, r"has no 'reward'"),
         ("observation", lambda v: None, r"has no 'observation'"),
-        ("action", with_value((2, 1), np.nan), r"'action' is not finite in row 2 \(1 such rows\)"),
-        ("reward", with_value(slice(3, 5), np.inf), r"'reward' is not finite in row 3 \(2 such rows\)"),
-        ("discount", with_value(0, np.nan), r"'discount' is not finite in row 0"),
+        ("action", with_value((2, 1), np.nan), r"'action' is not finite as float32 in row 2 \(1 such rows\)"),
+        ("reward", with_value(slice(3, 5), np.inf), r"'reward' is not finite as float32 in row 3 \(2 such rows\)"),
+        ("discount", with_value(0, np.nan), r"'discount' is not finite as float32 in row 0"),
+        ("action", lambda v: with_value((2, 1), 1e300)(v.astype(float)), r"'action' is not finite as float32 in row 2"),
+        ("reward", with_value(4, -1e300), r"'reward' is not finite as float32 in row 4"),
         ("action", lambda v: v.astype(int), r"'action' is int64"),
         ("action", lambda v: v[:, 0], r"'action' has shape \(7,\)"),
         ("reward", lambda v: v[:-1], r"'reward' has shape \(6,\), expected \(7,\)"),
@@ -182,7 +185,40 @@ def test_a_key_that_is_no_array_is_named(shard):
         read_shard(shard)
 
 
-@pytest.mark.parametrize("stored", ["[1]", "{", 5])
+def outside(file: h5py.File, folder: Path, kind: str, value: np.ndarray) -> None:
+    """Keep a key's values in another file."""
+    with h5py.File(folder / "other.h5", "w") as other:
+        other["reward"] = value
+    if kind == "link":
+        file["reward"] = h5py.ExternalLink(folder / "other.h5", "reward")
+    elif kind == "storage":
+        value.tofile(folder / "other.bin")
+        file.create_dataset("reward", value.shape, value.dtype, external=[(folder / "other.bin", 0, value.nbytes)])
+    else:
+        layout = h5py.VirtualLayout(value.shape, value.dtype)
+        layout[...] = h5py.VirtualSource(folder / "other.h5", "reward", value.shape)
+        file.create_virtual_dataset("reward", layout)
+
+
+@pytest.mark.parametrize("kind", ["link", "storage", "virtual"])
+def test_values_in_other_files_are_not_followed(shard, tmp_path, kind):
+    with h5py.File(shard, "a") as file:
+        value = file["reward"][()]
+        del file["reward"]
+        outside(file, tmp_path, kind, value)
+        np.testing.assert_array_equal(file["reward"], value)
+    for read in (read_shard, read_dtypes):
+        with pytest.raises(UserError, match="'reward' lies in another file, which is not followed"):
+            read(shard)
+
+
+def test_a_pipe_is_no_shard(tmp_path):
+    os.mkfifo(tmp_path / "0_fake.hdf5")
+    with pytest.raises(UserError, match=r"0_fake\.hdf5: is no regular file"):
+        read_shard(tmp_path / "0_fake.hdf5")
+
+
+@pytest.mark.parametrize("stored", ["[1]", "{", 5, '{"task": ' + "[" * 100_000])
 def test_attributes_that_are_no_json_object_are_refused(shard, stored):
     with h5py.File(shard, "a") as file:
         file.attrs["vd4rl_pomdp"] = stored

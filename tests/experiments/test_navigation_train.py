@@ -210,7 +210,7 @@ def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
         ({"window": 41}, r"episode 0 has 40 rows, fewer than the window of 41"),
         ({"frame_encoder": "mixer", "picture": "grey50", "burn_in": 20}, "--burn-in 20 leaves no row"),
         ({"frame_encoder": "vit"}, "unknown frame encoder 'vit'"),
-        ({"method": "ah+a", "literal_future": True}, r"--literal-future is for mik\+a, not for ah\+a"),
+        ({"method": "ah+a", "literal_future": True}, r"--literal-future is not read by ah\+a"),
         ({"checkpoint_every": 3}, "no multiple of --log-every"),
         ({"steps": 0}, "--steps is 0"),
         ({"seed": -1}, "--seed is -1"),

@@ -30,6 +30,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # of what a terminal cannot show, the number
     try:
+        _refuse_undecodable(words)
         with interrupt.handled(program=True):
             run_stage(words)
     except UserError as error:
@@ -55,3 +56,12 @@ def _say_ended(how: str, kept: str) -> None:
     """One line for a signal's end; what was `kept` is where a training loop stood."""
     where = f"{kept}, and the same command goes on from there" if kept else "the same command does what is left"
     print(f"{how}: {where}", file=sys.stderr)
+
+
+def _refuse_undecodable(words: Sequence[str]) -> None:
+    """Names and paths go into files and pages, which are UTF-8."""
+    for word in words:
+        try:
+            word.encode()
+        except UnicodeEncodeError:
+            raise UserError(f"{word!a} is not UTF-8: use another name") from None

@@ -6,14 +6,15 @@ import contextlib
 import io
 import json
 import re
-from dataclasses import replace
+from dataclasses import fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
 import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, flag_of
 from vd4rl_pomdp.runs.folder import flatten
 
 _LONGEST_LIST = 6
@@ -25,11 +26,24 @@ def parse(config: Any, words: Arguments, program: str, default: Any = None) -> A
     shown = io.StringIO()
     try:
         with contextlib.redirect_stderr(shown):
-            return tyro.cli(config, args=words, prog=program, description=config.__doc__, **options)
+            parsed = tyro.cli(config, args=words, prog=program, description=config.__doc__, **options)
     except SystemExit as end:
         if end.code in (0, None):
             raise
         raise UserError(_one_line(shown.getvalue(), program)) from None
+    _refuse_empty(parsed, words)
+    return parsed
+
+
+def _refuse_empty(config: Any, words: Arguments) -> None:
+    """Refuse a flag that names nothing: an empty list, or an empty word where the default is none."""
+    for field in fields(config):
+        if getattr(config, field.name) == []:
+            raise UserError(f"{flag_of(field.name)} names nothing: give at least one or leave it out")
+    free = {flag_of(field.name) for field in fields(config) if field.default == ""}
+    for flag, word in pairwise(["", *words]):
+        if (word == "" and flag not in free) or (word.startswith("--") and word[-1] == "=" and word[:-1] not in free):
+            raise UserError(f"{word or flag or 'the first word'} names nothing: give a value or leave it out")
 
 
 def _one_line(box: str, program: str) -> str:
@@ -42,7 +56,7 @@ def _one_line(box: str, program: str) -> str:
 def with_presets(config: type, presets: dict[str, Any], words: Arguments, program: str, flag: str = "--preset") -> Any:
     """Parse a stage's config one of whose flags, `--preset`, chooses the defaults of all others."""
     name = next(iter(presets))
-    for word, following in zip(words, [*words[1:], ""], strict=True):
+    for word, following in pairwise([*words, ""]):
         if word == flag:
             name = following
         elif word.startswith(f"{flag}="):

@@ -4,26 +4,41 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command, run_stage, run_stages
 from vd4rl_pomdp.cli.parsing import parse, show, with_presets
 
+if TYPE_CHECKING:
+    from finetune.config import FinetuneConfig
+    from pretrain.config import PretrainConfig
+
+
+def _pretrain_config(words: Arguments, program: str) -> PretrainConfig:
+    from pretrain.config import PRESETS, PretrainConfig
+
+    return with_presets(PretrainConfig, PRESETS, words, program)
+
 
 def _pretrain(words: Arguments, program: str) -> None:
-    from pretrain.config import PRESETS, PretrainConfig
     from pretrain.train import pretrain
 
-    run = pretrain(with_presets(PretrainConfig, PRESETS, words, program))
+    run = pretrain(_pretrain_config(words, program))
     print(f"encoder: {run.path / 'encoder'}")
 
 
-def _finetune(words: Arguments, program: str) -> None:
+def _finetune_config(words: Arguments, program: str) -> FinetuneConfig:
     from finetune.config import PRESETS, FinetuneConfig
+
+    return with_presets(FinetuneConfig, PRESETS, words, program)
+
+
+def _finetune(words: Arguments, program: str) -> None:
     from finetune.train import finetune
 
-    run = finetune(with_presets(FinetuneConfig, PRESETS, words, program))
+    run = finetune(_finetune_config(words, program))
     print(f"episodes: {run.path / 'episodes.csv'}")
 
 
@@ -93,25 +108,24 @@ def _sweep(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.runs.sweep import sweep_runs
 
     command = parse(SweepCommand, words, program)
-    _check_names(command)
+    runs = list(sweep_runs(command))
+    _check(runs)
     refuse_kept(command.out)
-    for run in sweep_runs(command):
+    for run in runs:
         run_stages(run, command.dry_run)
 
 
-def _check_names(sweep: SweepCommand) -> None:
-    """Find a misspelt name before the first run, not after the hours that the runs before it take."""
-    from finetune.algorithms import get_algorithm
+def _check(runs: list[list[Arguments]]) -> None:
+    """Find what a stage will refuse before the first run, not after the hours that the runs before it take."""
+    from finetune.train import check as check_finetune
     from pretrain.objectives import get_method
-    from vd4rl_pomdp.corruptions import make_corruption
+    from pretrain.train import check as check_pretrain
 
-    for check, names in (
-        (get_method, sweep.methods),
-        (make_corruption, sweep.corruptions),
-        (get_algorithm, sweep.algorithms),
-    ):
-        for name in names:
-            check(name)
+    for (_, *first), *others in runs:
+        config = _pretrain_config(first, "vd4rl-pomdp pretrain")
+        check_pretrain(config)
+        for _, *words in others:
+            check_finetune(_finetune_config(words, "vd4rl-pomdp finetune"), get_method(config.method).end_to_end)
 
 
 @dataclass(frozen=True)

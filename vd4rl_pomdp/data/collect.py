@@ -25,7 +25,15 @@ from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
 from vd4rl_pomdp.runs.workers import count_workers, run_jobs
 from vd4rl_pomdp.seeding import stream_seed
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, NOISY_QUALITIES, SET_QUALITIES, NoisyQuality, Quality, get_task
+from vd4rl_pomdp.tasks import (
+    EPISODE_TRANSITIONS,
+    MOST_EPISODES,
+    NOISY_QUALITIES,
+    SET_QUALITIES,
+    NoisyQuality,
+    Quality,
+    get_task,
+)
 
 Policy = Actor | Ladder | None
 """Who acts in a shard: an actor, a ladder of them, or nobody (random actions)."""
@@ -148,7 +156,7 @@ def collect_shards(
 def _check(config: CollectConfig) -> None:
     """Refuse settings that make no set."""
     get_task(config.task)
-    refuse_outside(config, episodes=1, episodes_per_shard=1, seed=(0, MAX_SEED), workers=0)
+    refuse_outside(config, episodes=(1, MOST_EPISODES), episodes_per_shard=1, seed=(0, MAX_SEED), workers=0)
     refuse_outside(config, action_noise=(0, MAX_NOISE))
     if config.quality not in SET_QUALITIES:
         raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(SET_QUALITIES)}")

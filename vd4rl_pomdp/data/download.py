@@ -16,6 +16,7 @@ from pathlib import Path
 import requests
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
+from urllib3.exceptions import NewConnectionError
 
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.folder import replacing_file
@@ -99,7 +100,6 @@ def _provide(file: RemoteFile, destination: Path, endpoint: str, verify: bool, b
     if _is_complete(file, target, verify):
         return
     try:
-        target.parent.mkdir(parents=True, exist_ok=True)
         twins = (other.target(destination) for other in manifest() if other.sha256 == file.sha256)
         twin = next((path for path in twins if path != target and _is_complete(file, path, verify)), None)
         if twin:
@@ -119,6 +119,7 @@ def _is_complete(file: RemoteFile, path: Path, verify: bool) -> bool:
 
 def _link(source: Path, target: Path) -> None:
     """Give an existing file a second name: a hard link, a symbolic one, or where neither works a copy."""
+    target.parent.mkdir(parents=True, exist_ok=True)
     with replacing_file(target) as fresh:
         fresh.unlink(missing_ok=True)
         try:
@@ -133,13 +134,16 @@ def _link(source: Path, target: Path) -> None:
 def _fetch(file: RemoteFile, target: Path, url: str, bar: Progress) -> None:
     part = target.with_name(f"{target.name}.part")
     row = bar.add_task(file.path.split("/")[-1], total=file.size)
-    failures, furthest, problem = 0, _size(part), ""
+    start = furthest = _size(part)
+    failures, problem = 0, ""
     while _size(part) < file.size:
         try:
             for done in _receive(url, part, _size(part)):
                 bar.update(row, completed=done)
         except requests.RequestException as error:
             problem = _describe(error)
+            if furthest == _size(part) == start and _is_nobody(error):
+                failures = _ATTEMPTS
         if _size(part) > furthest:
             failures, furthest = 0, _size(part)
             continue
@@ -167,6 +171,7 @@ def _receive(url: str, part: Path, offset: int) -> Iterator[int]:
         response.raise_for_status()
         resumed = response.status_code == 206
         done = offset if resumed else 0
+        part.parent.mkdir(parents=True, exist_ok=True)
         with part.open("ab" if resumed else "wb") as file:
             for block in response.iter_content(_BLOCK):
                 file.write(block)
@@ -176,6 +181,13 @@ def _receive(url: str, part: Path, offset: int) -> Iterator[int]:
 
 def _size(path: Path) -> int:
     return path.stat().st_size if path.exists() else 0
+
+
+def _is_nobody(error: requests.RequestException) -> bool:
+    """Whether there is no mirror at an address, so that waiting for it is in vain."""
+    if isinstance(error, requests.exceptions.InvalidURL | requests.exceptions.SSLError):
+        return True
+    return bool(error.args) and isinstance(getattr(error.args[0], "reason", None), NewConnectionError)
 
 
 def _describe(error: requests.RequestException) -> str:

@@ -23,6 +23,7 @@ import numpy as np
 
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.folder import write_bytes
+from vd4rl_pomdp.runs.reading import parse_json, regular
 from vd4rl_pomdp.tasks import FRAME_SIZE
 from vd4rl_pomdp.types import StepType
 
@@ -35,6 +36,8 @@ _OPTIONAL = "physics"
 _WRITTEN = {FRAMES_KEY: "uint8", "action": "float32", "step_type": "int64"}
 _ATTRIBUTE = "vd4rl_pomdp"
 _BLOCK_ROWS = 1024
+_LARGEST = np.finfo(np.float32).max
+"""What is larger, or not a number, would be infinite or none where it is used."""
 _REPAIR = "download or collect it again"
 
 
@@ -105,7 +108,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
     """What `write_shard` kept with a shard; empty for a published one."""
     with _open(path) as file:
         stored = file.attrs.get(_ATTRIBUTE, "{}")
-        attributes = json.loads(stored) if isinstance(stored, str) else None
+        attributes = parse_json(stored) if isinstance(stored, str) else None
         if not isinstance(attributes, dict):
             raise UserError(f"{path}: its attribute {_ATTRIBUTE!r} is no JSON object; {_REPAIR}")
         return attributes
@@ -173,7 +176,7 @@ def read_some_frames(path: Path, rows: np.ndarray) -> np.ndarray:
 def _open(path: Path) -> Iterator[h5py.File]:
     """An open shard; whatever HDF5 cannot read becomes a sentence."""
     try:
-        with h5py.File(path, "r") as file:
+        with h5py.File(regular(path), "r") as file:
             yield file
     except UserError:
         raise
@@ -190,11 +193,22 @@ def _one_line(error: Exception) -> str:
 def _present(path: Path, file: h5py.File) -> list[str]:
     """The format's keys in a file; a missing one is an error, apart from physics."""
     keys = [FRAMES_KEY, *_ROW_KEYS]
-    wanted = [key for key in keys if key != _OPTIONAL or key in file]
+    wanted = [key for key in keys if key != _OPTIONAL or file.get(key, getlink=True) is not None]
+    elsewhere = [key for key in wanted if _is_elsewhere(file, key)]
+    if elsewhere:
+        raise UserError(f"{path}: {elsewhere[0]!r} lies in another file, which is not followed; {_REPAIR}")
     missing = [key for key in wanted if not isinstance(file.get(key), h5py.Dataset)]
     if missing:
         raise UserError(f"{path}: has no {missing[0]!r}, so it is no V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
     return wanted
+
+
+def _is_elsewhere(file: h5py.File, key: str) -> bool:
+    """Whether a key's values are kept in other files, which could be any file of the machine."""
+    if isinstance(file.get(key, getlink=True), h5py.ExternalLink):
+        return True
+    stored = file.get(key)
+    return isinstance(stored, h5py.Dataset) and (stored.external is not None or stored.is_virtual)
 
 
 def _validate(path: Path, key: str, value: np.ndarray, count: int) -> None:
@@ -208,6 +222,6 @@ def _validate(path: Path, key: str, value: np.ndarray, count: int) -> None:
         return
     if value.dtype.kind != "f":
         raise UserError(f"{path}: {key!r} is {value.dtype}, expected floating point; {_REPAIR}")
-    bad = np.flatnonzero(~np.isfinite(value.reshape(count, -1)).all(1))
+    bad = np.flatnonzero(~(np.abs(value.reshape(count, -1)) <= _LARGEST).all(1))
     if len(bad):
-        raise UserError(f"{path}: {key!r} is not finite in row {bad[0]} ({len(bad)} such rows); {_REPAIR}")
+        raise UserError(f"{path}: {key!r} is not finite as float32 in row {bad[0]} ({len(bad)} such rows); {_REPAIR}")

@@ -20,15 +20,15 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
 from vd4rl_pomdp.data.episodes import join_shards
 from vd4rl_pomdp.data.format import read_attributes, read_frames, read_rows, shard_paths
 from vd4rl_pomdp.errors import UserError, disk_error
-from vd4rl_pomdp.runs.folder import read_bytes
 from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 from vd4rl_pomdp.tasks import FRAME_SIZE
 
 _VERSION = 2
@@ -62,12 +62,15 @@ class Store:
 
     def array(self, key: str) -> np.ndarray:
         """Rows of `action` (N, A) float32, `reward` or `discount` (N,) float64, or `step_type` (N,) uint8."""
+        return self._load(f"{key}.npy")
+
+    def _load(self, name: str, mode: Literal["r"] | None = None) -> np.ndarray:
         try:
-            return np.load(self.folder / f"{key}.npy")
+            return np.load(self.folder / name, mmap_mode=mode)
         except PermissionError as error:
-            raise disk_error(self.folder / f"{key}.npy", error) from error
-        except (OSError, ValueError) as error:
-            raise self.damaged(f"{key}.npy") from error
+            raise disk_error(self.folder / name, error) from error
+        except (OSError, ValueError, EOFError) as error:
+            raise self.damaged(name) from error
 
     def damaged(self, name: str) -> UserError:
         """A sentence for a file that has changed since it was decoded."""
@@ -75,8 +78,7 @@ class Store:
 
     def physics(self) -> np.ndarray | None:
         """(N, P) float64 simulator states, mapped read-only; None if the set has none."""
-        path = self.folder / "physics.npy"
-        return np.load(path, mmap_mode="r") if path.name in self.meta["files"] else None
+        return self._load("physics.npy", "r") if "physics.npy" in self.meta["files"] else None
 
 
 def default_cache() -> Path:
@@ -121,12 +123,12 @@ def _key(shards: Sequence[Path]) -> str:
 def _read_meta(folder: Path) -> dict[str, Any] | None:
     """The folder's meta.json; None unless it is whole and every file is there in its full size."""
     try:
-        meta = json.loads(read_bytes(folder / _META))
+        meta = parse_json(read_bytes(folder / _META))
+        files = [(folder / name, file["bytes"]) for name, file in meta["files"].items()]
     except UserError:
         raise
-    except (FileNotFoundError, ValueError):
+    except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError):
         return None
-    files = [(folder / name, file["bytes"]) for name, file in meta["files"].items()]
     return meta if all(path.is_file() and path.stat().st_size == size for path, size in files) else None
 
 

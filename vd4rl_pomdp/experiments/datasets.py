@@ -23,7 +23,7 @@ from vd4rl_pomdp.policies.actor import ships
 from vd4rl_pomdp.runs.folder import read_json, write_csv, write_json
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, SET_QUALITIES, get_task
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, MOST_EPISODES, SET_QUALITIES, get_task
 
 EPISODES = 200
 CORES = 2
@@ -51,6 +51,7 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
         UserError: an unknown task or quality, no episode to time, or a damaged file in the folder.
     """
     _check(tasks, qualities, timed_episodes)
+    refuse_number("workers", workers, 0)
     refuse_foreign(out, "table of sets", "returns.csv", "sets.csv")
     out.mkdir(parents=True, exist_ok=True)
     returns, costs = _read(out / "returns.csv", RETURNS), _read(out / "costs.csv", COSTS)
@@ -82,7 +83,7 @@ def _check(tasks: Sequence[str], qualities: Sequence[str], timed_episodes: int) 
     unknown = sorted(set(qualities) - set(SET_QUALITIES))
     if unknown:
         raise UserError(f"unknown quality {unknown[0]!r}: choose from {', '.join(SET_QUALITIES)}")
-    refuse_number("timed_episodes", timed_episodes, 1)
+    refuse_number("timed_episodes", timed_episodes, 1, MOST_EPISODES)
     for task in tasks:
         get_task(task)
 

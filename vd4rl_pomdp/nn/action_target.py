@@ -72,6 +72,12 @@ class MSETarget(nn.Module):
 ACTION_TARGETS = ("kmeans", "bins", "mse", "mse_l2")
 
 
+def check_action_target(name: str) -> None:
+    """Raise UserError, listing the choices, for an unknown name."""
+    if name not in ACTION_TARGETS:
+        raise UserError(f"unknown action target {name!r}: choose one of {', '.join(ACTION_TARGETS)}")
+
+
 def make_action_target(name: str, actions: np.ndarray, codes: int, seed: int) -> KMeansTarget | BinsTarget | MSETarget:
     """Build an action target.
 
@@ -81,8 +87,7 @@ def make_action_target(name: str, actions: np.ndarray, codes: int, seed: int) ->
         codes: K-means centres, or bins per dimension.
         seed: the run's seed, which K-means starts from.
     """
-    if name not in ACTION_TARGETS:
-        raise UserError(f"unknown action target {name!r}: choose one of {', '.join(ACTION_TARGETS)}")
+    check_action_target(name)
     if name == "kmeans":
         return KMeansTarget(actions, codes, seed)
     if name == "bins":

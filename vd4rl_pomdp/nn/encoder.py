@@ -16,6 +16,9 @@ from vd4rl_pomdp.nn.sequence import run_gru
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.types import Windows
 
+MAX_LAYERS = 64
+"""Most layers of a GRU."""
+
 
 @dataclass(frozen=True)
 class EncoderConfig:

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors.torch import save
 
-from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.corruptions import CorruptionConfig, make_corruption
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE
-from vd4rl_pomdp.runs.folder import read_bytes, write_bytes, write_json
+from vd4rl_pomdp.runs.folder import write_bytes, write_json
+from vd4rl_pomdp.runs.reading import build, parse_json, read_bytes, read_tensors
 
 WEIGHTS, CONFIG = "model.safetensors", "config.json"
 
@@ -82,8 +82,7 @@ def load_encoder(
         UserError: the folder is missing, damaged, pickled, or of another task or image size.
     """
     folder = Path(folder)
-    config = _read_config(folder)
-    encoder_config, card = EncoderConfig(**config["encoder"]), EncoderCard(**config["pretrain"])
+    encoder_config, card = _read_config(folder)
     if action_dim is not None and encoder_config.action_dim != action_dim:
         raise UserError(
             f"{folder}: this encoder was pretrained on {card.task} with {encoder_config.action_dim} action dimensions, "
@@ -101,11 +100,11 @@ def load_encoder(
         )
     try:
         encoder = Encoder(encoder_config)
-        CorruptionConfig(**card.corruption)
+        make_corruption(build(CorruptionConfig, card.corruption))
     except (TypeError, RuntimeError, ValueError) as error:
         raise UserError(f"{folder}/config.json: names no encoder ({_first_line(error)}); pretrain it again") from error
     try:
-        encoder.load_state_dict(load(read_bytes(folder / WEIGHTS)))
+        encoder.load_state_dict(read_tensors(folder / WEIGHTS))
     except (FileNotFoundError, SafetensorError, RuntimeError) as error:
         reason = _first_line(error)
         raise UserError(f"{folder}/model.safetensors: cannot be read ({reason}); pretrain the encoder again") from error
@@ -116,17 +115,16 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0]
 
 
-def _read_config(folder: Path) -> dict[str, Any]:
+def _read_config(folder: Path) -> tuple[EncoderConfig, EncoderCard]:
     pickles = [p.name for p in folder.glob("*") if p.suffix in (".pt", ".pth", ".pkl", ".bin", ".ckpt")]
     if pickles and not (folder / "model.safetensors").exists():
         raise UserError(f"{folder}: {pickles[0]} is a pickle, which can run code; only model.safetensors is read")
     try:
-        config = json.loads(read_bytes(folder / CONFIG))
-        EncoderConfig(**config["encoder"]), EncoderCard(**config["pretrain"])
+        config = parse_json(read_bytes(folder / CONFIG))
+        return build(EncoderConfig, config["encoder"]), build(EncoderCard, config["pretrain"])
     except UserError:
         raise
     except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
         raise UserError(
             f"{folder}: not an encoder folder (config.json: {error}); `vd4rl-pomdp pretrain` writes one as RUN/encoder"
         ) from error
-    return config

@@ -6,12 +6,13 @@ from pathlib import Path
 
 import torch
 from safetensors import SafetensorError
-from safetensors.torch import load, save
+from safetensors.torch import save
 from torch import Tensor, nn
 
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.nn.heads import mlp
-from vd4rl_pomdp.runs.folder import read_bytes, read_json, write_bytes, write_json
+from vd4rl_pomdp.runs.folder import read_json, write_bytes, write_json
+from vd4rl_pomdp.runs.reading import read_tensors
 
 
 class Standardise(nn.Module):
@@ -72,7 +73,7 @@ def load_policy(folder: Path) -> Policy:
     """Read a policy folder; raises UserError if it is missing or damaged."""
     try:
         policy = Policy(**read_json(folder / "config.json"))
-        policy.load_state_dict(load(read_bytes(folder / "model.safetensors")))
+        policy.load_state_dict(read_tensors(folder / "model.safetensors"))
     except (FileNotFoundError, SafetensorError, RuntimeError, TypeError) as error:
         reason = str(error).splitlines()[0]
         raise UserError(

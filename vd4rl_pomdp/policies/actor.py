@@ -20,7 +20,8 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.runs.folder import read_bytes, write_bytes
+from vd4rl_pomdp.runs.folder import write_bytes
+from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 from vd4rl_pomdp.tasks import TASKS, Task, get_task
 
 LOG_STD_RANGE = (-20.0, 2.0)
@@ -177,7 +178,7 @@ def _read(path: Path, task: Task | None) -> tuple[dict[str, np.ndarray], dict[st
     try:
         sha256 = hashlib.sha256(read_bytes(path)).hexdigest()
         with safe_open(path, framework="np") as file:
-            card = dict(json.loads((file.metadata() or {}).get("card", "none")))
+            card = dict(parse_json((file.metadata() or {}).get("card", "none")))
             weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
     except UserError:
         raise

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import shutil
 from collections.abc import Iterator
 from importlib.metadata import version
@@ -16,11 +17,12 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_no_folder
 from vd4rl_pomdp.policies.actor import Actor, Ladder, read_actor, read_ladder
 from vd4rl_pomdp.policies.state_env import StateEnv
 from vd4rl_pomdp.runs.folder import read_json, write_bytes
 from vd4rl_pomdp.runs.outputs import refuse_foreign, refuse_inside
+from vd4rl_pomdp.runs.reading import regular
 from vd4rl_pomdp.tasks import Task, get_task
 
 CARD_EPISODES = 20
@@ -52,10 +54,15 @@ def read_curve(run: Path) -> list[tuple[int, float]]:
     """Learning curve of a run: (decisions, mean return) rows; raises UserError if it is damaged."""
     steps, mean = CURVE_COLUMNS
     try:
-        with (run / "curve.csv").open(newline="", encoding="utf-8") as file:
-            return [(int(row[steps]), float(row[mean])) for row in csv.DictReader(file)]
-    except (KeyError, TypeError, ValueError) as error:
+        with regular(run / "curve.csv").open(newline="", encoding="utf-8") as file:
+            curve = [(int(row[steps]), float(row[mean])) for row in csv.DictReader(file)]
+    except UserError:
+        raise
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
         raise UserError(f"{run / 'curve.csv'}: is no learning curve ({error}); take another copy of the run") from error
+    if not all(math.isfinite(mean) for _, mean in curve):
+        raise UserError(f"{run / 'curve.csv'}: a return in it is not finite; take another copy of the run")
+    return curve
 
 
 def snapshot_path(run: Path, decisions: int) -> Path:
@@ -78,8 +85,9 @@ def export_run(run: Path, out: Path) -> dict[str, Path]:
     """
     if not (run / "curve.csv").exists() or not (run / "config.json").exists():
         raise UserError(f"{run}: is not the folder of a policy run with a snapshot; `policy train` makes one")
+    refuse_no_folder(out)
     config = read_json(run / "config.json")
-    task = get_task(config.get("task", ""))
+    task = get_task(str(config.get("task")))
     if out.resolve() != run.resolve():
         _refuse_other(out, task)
     curve = read_curve(run)

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
+from vd4rl_pomdp.errors import MAX_SEED, MOST, UserError, refuse_outside
 from vd4rl_pomdp.policies import learner
 from vd4rl_pomdp.policies.actor import Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
@@ -34,12 +34,16 @@ from vd4rl_pomdp.policies.export import (
 from vd4rl_pomdp.runs import FORMAT, interrupt
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 from vd4rl_pomdp.runs.folder import holds_anything, jsonable, read_json, write_csv, write_json
+from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import Owner, owned
-from vd4rl_pomdp.tasks import get_task
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, MOST_EPISODES, get_task
 
 if TYPE_CHECKING:
     from sbx import SAC
+
+MOST_ENVS = 1000
+"""Most environments of a run, which live in one process."""
 
 
 def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None] | None = None) -> dict[str, Path]:
@@ -103,9 +107,14 @@ def decisions_made(run: Path) -> int:
 def _check(config: PolicyConfig) -> dict[str, Any]:
     """Settings to keep in config.json; raises UserError if the folder holds others (a run's length may change)."""
     refuse_outside(
-        config, seed=(0, MAX_SEED), decisions=1, learning_rate=0, hidden=1, n_step=1, envs=1, batch_size=1,
-        temperature=0, temperature_rate=0, replay_size=1, eval_every=1, eval_episodes=1, refill=0, critic_warmup=0,
+        config, seed=(0, MAX_SEED), decisions=1, learning_rate=0, hidden=1, n_step=(1, EPISODE_TRANSITIONS),
+        envs=(1, MOST_ENVS), updates_per_decision=0, batch_size=1, temperature=0, temperature_rate=0,
+        target_entropy=(-MOST, MOST), replay_size=1, eval_every=1, eval_episodes=(1, MOST_EPISODES),
+        stop_at=(-MOST, MOST), refill=0, critic_warmup=0,
     )  # fmt: skip
+    state = get_task(config.task).state_dim  # of float32 numbers, as the weights are
+    require_memory(8 * state * config.replay_size, CPU, config, "replay_size")
+    require_memory(4 * (15 * config.hidden**2 + config.batch_size * config.hidden), CPU, config, "hidden", "batch_size")
     settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in ("out", "decisions", "stop_at")}
     settings |= {"format": FORMAT}
     path = config.out / "config.json"

@@ -26,7 +26,8 @@ from torch import Tensor
 
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.runs import FORMAT
-from vd4rl_pomdp.runs.folder import read_bytes, synchronise
+from vd4rl_pomdp.runs.folder import synchronise
+from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 
 KEPT = 2
 """Checkpoints that are kept: a damaged newest one costs the steps since the one before."""
@@ -119,7 +120,7 @@ class Checkpoints:
     def _read(self, step: int) -> Checkpoint:
         path = self._folder / str(step)
         try:
-            manifest = json.loads(read_bytes(path / _MANIFEST))
+            manifest = parse_json(read_bytes(path / _MANIFEST))
             stored, seconds, hashes = manifest["format"], float(manifest["seconds"]), dict(manifest["sha256"])
             files = {name: read_bytes(path / name) for name in hashes}
         except (FileNotFoundError, KeyError, TypeError, ValueError) as error:

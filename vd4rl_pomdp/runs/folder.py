@@ -10,7 +10,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.errors import UserError, disk_error, disk_errors
+from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 
 
 def jsonable(value: Any) -> Any:
@@ -25,7 +26,9 @@ def jsonable(value: Any) -> Any:
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object; raises UserError if it is missing, not readable or damaged."""
     try:
-        value = json.loads(read_bytes(path))
+        value = parse_json(read_bytes(path))
+    except UserError:
+        raise
     except (FileNotFoundError, ValueError) as error:
         raise UserError(f"{path}: cannot be read as JSON ({error})") from error
     if not isinstance(value, dict):
@@ -45,19 +48,6 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-
-
-def read_bytes(path: Path) -> bytes:
-    """A file's content. A missing one raises FileNotFoundError, one that the system withholds UserError.
-
-    Whoever reads on can then take every other trouble for damage.
-    """
-    try:
-        return path.read_bytes()
-    except FileNotFoundError:
-        raise
-    except OSError as error:
-        raise disk_error(path, error) from error
 
 
 def write_bytes(path: Path, content: bytes) -> None:

@@ -9,7 +9,8 @@ from pathlib import Path
 from typing import Any, Literal
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.runs.folder import appending, read_bytes, write_bytes
+from vd4rl_pomdp.runs.folder import appending, write_bytes
+from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 
 WandbMode = Literal["off", "offline", "online"]
 
@@ -48,9 +49,18 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
     if not path.exists():
         return []
     try:
-        return [json.loads(line) for line in read_bytes(path).decode().rpartition("\n")[0].splitlines()]
+        return [_row(line) for line in read_bytes(path).decode().rpartition("\n")[0].splitlines()]
+    except UserError:
+        raise
     except ValueError as error:
-        raise UserError(f"{path}: a line is not JSON ({error})") from error
+        raise UserError(f"{path}: a line is damaged ({error}); remove the line") from error
+
+
+def _row(line: str) -> dict[str, float]:
+    row = parse_json(line)
+    if not isinstance(row, dict) or "step" not in row or not all(isinstance(v, int | float) for v in row.values()):
+        raise ValueError("it holds no numbers with their step")
+    return row
 
 
 def _start_wandb(mode: WandbMode, folder: Path, config: dict[str, Any]) -> Any:

@@ -16,11 +16,13 @@ import numpy as np
 
 from vd4rl_pomdp.data.collect import Shard, claim_set, collect_shards, episode_seed
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
-from vd4rl_pomdp.mazes import get_maze
+from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, get_maze
 from vd4rl_pomdp.runs.folder import jsonable
+from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.provenance import versions
+from vd4rl_pomdp.tasks import MOST_EPISODES
 from vd4rl_pomdp.types import StepType
 
 _RUNTIME_FIELDS = ("out", "workers", "preset")
@@ -97,9 +99,11 @@ def drive(maze: str, rows: int, action_repeat: int = 5, noise: float = 0.5, seed
 def _check(config: CollectConfig) -> None:
     get_maze(config.maze)
     refuse_outside(
-        config, trajectories=1, trajectory_rows=2, action_repeat=1, noise=0, seed=(0, MAX_SEED),
-        trajectories_per_shard=1, workers=0,
+        config, trajectories=(1, MOST_EPISODES), trajectory_rows=2, action_repeat=(1, MOST_STEPS), noise=0,
+        seed=(0, MAX_SEED), trajectories_per_shard=1, workers=0,
     )  # fmt: skip
+    rows = config.trajectory_rows * min(config.trajectories, config.trajectories_per_shard)
+    require_memory(rows * 3 * PICTURE_SIZE**2, CPU, config, "trajectory_rows", "trajectories_per_shard")
 
 
 def _plan(config: CollectConfig) -> Iterator[tuple[Path, range]]:

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_number
 from vd4rl_pomdp.experiments.navigation.collect import PRESETS
 from vd4rl_pomdp.mazes import get_maze
 
@@ -82,6 +82,8 @@ def grid_commands(
         raise UserError(f"unknown preset {preset!r}: choose one of {', '.join(PRESETS)}")
     for maze in mazes:
         get_maze(maze)
+    for seed in seeds:
+        refuse_number("seeds", seed, 0, MAX_SEED)
     for seed in seeds:
         for cell in GRIDS[grid](mazes):
             yield cell.words(preset, data, runs, seed)

@@ -14,11 +14,13 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
-from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_no_folder, refuse_outside
 from vd4rl_pomdp.experiments.navigation.planner import Planner
+from vd4rl_pomdp.mazes import MOST_STEPS
 from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.runs.reading import regular
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
@@ -103,7 +105,9 @@ class PilotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
 def train_policy(config: MazePolicyConfig) -> Actor:
     """Train and write the actor; its card says how many goals it reaches in 20 episodes."""
-    refuse_outside(config, decisions=1, action_repeat=1, seed=(0, MAX_SEED))
+    refuse_outside(config, decisions=1, action_repeat=(1, MOST_STEPS), seed=(0, MAX_SEED))
+    refuse_no_folder(config.out.parent)
+    regular(config.out)
     refuse_inside(config.out)
     try:
         from stable_baselines3 import PPO

@@ -1,0 +1,254 @@
+"""Bad command lines, made from the commands' own config classes: every flag of every command in every bad way."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import MISSING, dataclass, fields, replace
+from pathlib import Path
+from types import NoneType, UnionType
+from typing import Any, Literal, get_args, get_origin, get_type_hints
+from unittest import mock
+
+import tyro
+
+from vd4rl_pomdp.cli import COMMANDS, main
+
+Words = list[str]
+
+
+@dataclass(frozen=True)
+class Case:
+    """One bad input: a command line, in a folder of valid files of which some may be spoilt first."""
+
+    command: str
+    subject: str
+    """The flag or the file that is bad."""
+    kind: str
+    words: Words
+    spoil: Callable[[], None] | None = None
+    """What makes the files bad, in the folder where the command runs."""
+    may_pass: bool = False
+    """Whether nobody may read what is bad: then exit code 0 is right, too."""
+
+
+NAMES = [name for name, entry in COMMANDS.items() if not isinstance(entry, Mapping)] + [
+    f"{group} {name}" for group, entry in COMMANDS.items() if isinstance(entry, Mapping) for name in entry
+]
+"""Every command."""
+SET, MAZE, ENCODER = "data/walker_walk/random", "data/no_curtain", "runs/pretrained/encoder"
+RUN, NAVIGATED = "runs/finetuned", "runs/navigated"
+SMOKE = ["--preset", "smoke"]
+VALID: dict[str, Words] = {
+    "demo": [],
+    "data collect": ["--task", "walker_walk", "--quality", "random", "--episodes", "1", "--out", "new"],
+    "data download": [
+        *("--task", "walker_walk", "--quality", "expert", "--out", "new", "--endpoint", "http://127.0.0.1:9"),
+    ],
+    "data card": [SET],
+    "data table": ["--out", "new", "--tasks", "walker_walk", "--qualities", "random"],
+    "data check": [SET],
+    "data parity": [SET],
+    "policy train": ["--task", "walker_walk", "--out", "new", "--decisions", "10"],
+    "policy export": ["runs/policy", "--out", "new"],
+    "pretrain": ["--data", SET, "--out", "new", *SMOKE],
+    "finetune": ["--encoder", ENCODER, "--data", SET, "--out", "new", *SMOKE, "--workers", "1"],
+    "evaluate": [RUN, "--episodes", "1", "--workers", "1"],
+    "navigation collect": ["--maze", "no_curtain", "--out", "new", *SMOKE],
+    "navigation train": ["--data", MAZE, "--out", "new", *SMOKE],
+    "navigation policy": ["--out", "new"],
+    "navigation grid": ["--out", "new", "--preset", "smoke", "--mazes", "no_curtain"],
+    "navigation report": [NAVIGATED, "--out", "new", "--no-pictures"],
+    "sweep": ["--data", SET, "--out", "new", *SMOKE],
+    "report": ["runs", "--out", "new"],
+    "theory": [],
+    "bench": ["--quick"],
+}
+"""Words after each command's name that are right, with files of the folder in which cases run."""
+
+TEXTS = {"nonsense": "@@", "other letters": "ζ", "not UTF-8": os.fsdecode(b"a\xff"), "a newline": "a\nb"}
+WHOLE = {"empty": "", "nonsense": "many", "a fraction": "1.5", "nan": "nan", "below": "-7", "huge": str(10**30)}
+NUMBERS = {"empty": "", "nonsense": "much", "nan": "nan", "inf": "inf", "below": "-7", "huge": "1e300"}
+INPUTS = {
+    "empty": "",
+    "missing": "nowhere",
+    "below a file": "file/below",
+    "a foreign file": "file",
+    "an empty folder": "empty",
+    "a foreign folder": "foreign",
+    "a pipe": "pipe",
+    "a dangling link": "dangling",
+    "a link to itself": "loop",
+    "a device": "/dev/zero",
+    "a name too long": "n" * 300,
+    "not UTF-8": os.fsdecode(b"a\xff"),
+}
+OUTPUTS = {k: v for k, v in INPUTS.items() if k not in ("missing", "an empty folder")}
+HUGE = 10**9
+LARGE = {
+    "pretrain": ("batch_size", "window", "feature_dim", "hidden_dim", "gru_layers", "head_dim", "max_k", "codes"),
+    "finetune": ("batch_size", "hidden_dim", "n_step", "views", "eval_length"),
+    "navigation train": ("batch_size", "window", "feature_dim", "hidden_dim", "gru_layers", "head_dim", "codes"),
+    "navigation collect": ("trajectory_rows", "trajectories", "action_repeat"),
+    "data collect": ("episodes",),
+    "policy train": ("replay_size", "hidden", "envs"),
+}
+"""Flags for which 10^9 is within the range but beyond any machine."""
+
+
+class _CaughtError(Exception):
+    """Carries a command's config class and defaults out of its parsing."""
+
+
+def config_of(command: str) -> tuple[type, Any]:
+    """The config class that a command parses its words into, and its defaults if they are not the class's own."""
+
+    def stop(config: type, **options: Any) -> None:
+        raise _CaughtError(config, options.get("default"))
+
+    with mock.patch("vd4rl_pomdp.cli.parsing.tyro.cli", stop):
+        try:
+            main([*command.split(), "--help"])
+        except _CaughtError as caught:
+            return caught.args
+    raise AssertionError(f"{command} parses nothing")
+
+
+def flag_cases() -> Iterator[Case]:
+    """Every flag of every command in every bad way, and what is wrong with whole command lines."""
+    yield from _unknown_commands()
+    for command in NAMES:
+        config, _ = config_of(command)
+        hints = get_type_hints(config, include_extras=True)
+        yield from _whole_lines(command, config)
+        for field in fields(config):
+            yield from _of_field(command, field.name, hints[field.name])
+        for name in LARGE.get(command, ()):
+            yield _changed(command, name, "beyond the machine", [str(HUGE)])
+    yield from _unread()
+
+
+def _unknown_commands() -> Iterator[Case]:
+    for kind, word in TEXTS.items():
+        yield Case("(none)", "the command", kind, [word])
+        for group in (name for name, entry in COMMANDS.items() if isinstance(entry, Mapping)):
+            yield Case(group, "the command", kind, [group, word])
+
+
+def _whole_lines(command: str, config: type) -> Iterator[Case]:
+    words = command.split()
+    required = [f.name for f in fields(config) if f.default is MISSING and f.default_factory is MISSING]
+    if required:
+        yield Case(command, "(all flags)", "bare", words)
+    for name in required:
+        yield Case(command, name, "left out", [*words, *_without(VALID[command], name, command)])
+    yield Case(command, "(all flags)", "an unknown flag", [*words, *VALID[command], "--no-such-flag", "1"])
+    yield Case(command, "(all flags)", "a lone dash", [*words, *VALID[command], "-"])
+    if not any(_is_positional(h) and _core(h)[1] for h in get_type_hints(config, include_extras=True).values()):
+        yield Case(command, "(all flags)", "one word more", [*words, *VALID[command], "word", "word"])
+
+
+def _unread() -> Iterator[Case]:
+    """Every method and algorithm with every option that it does not read."""
+    from finetune.algorithms import ALGORITHMS
+    from finetune.algorithms import OPTIONS as OF_ALGORITHMS
+    from finetune.config import PRESETS as FINETUNE
+    from pretrain.config import PRESETS as PRETRAIN
+    from pretrain.objectives import METHODS, unread_options
+
+    for method in METHODS:
+        unread = unread_options(replace(PRETRAIN["smoke"], method=method))
+        yield from (_chosen("pretrain", PRETRAIN["smoke"], ["--method", method], name) for name in sorted(unread))
+    for method in ("ah", "fj+a", "no_history", "random", "supervised+a"):
+        for name in ("literal_future", "n"):
+            yield _chosen("navigation train", PRETRAIN["smoke"], ["--method", method], name)
+    for name, algorithm in ALGORITHMS.items():
+        for option in sorted(OF_ALGORITHMS.difference(algorithm.options)):
+            yield _chosen("finetune", FINETUNE["smoke"], ["--algorithm", name], option)
+    for method, line in {"acro": "--literal-future", "curl": "--max-k 2", "bc mik+a": "--codes 3"}.items():
+        more = ["--methods", *method.split(), f"--pretrain={line}", "--dry-run"]
+        yield Case("sweep", "pretrain", f"{line} for {method}", ["sweep", *VALID["sweep"], *more])
+    for methods, line in {
+        "acro": "--foo",
+        "random acro": "--steps 3",
+        "bc": "--alpha 1",
+        "drq_bc": "--views 2",
+    }.items():
+        more = ["--methods", *methods.split(), f"--finetune={line}", "--dry-run"]
+        yield Case("sweep", "finetune", f"{line} for {methods}", ["sweep", *VALID["sweep"], *more])
+
+
+def _chosen(command: str, default: Any, choice: Words, name: str) -> Case:
+    """A line with an option set to something else than its default, for a method that does not read it."""
+    value = getattr(default, name)
+    other = {"frame_encoder": "drq", "action_target": "mse"}.get(name) or str((value or 0) + 1)
+    flag = [f"--{'no-' if value else ''}{name.replace('_', '-')}"] if isinstance(value, bool) else [_flag(name), other]
+    return Case(command, name, f"unread by {choice[1]}", [*command.split(), *VALID[command], *choice, *flag])
+
+
+def _of_field(command: str, name: str, hint: Any) -> Iterator[Case]:
+    kind, many = _core(hint)
+    if many and not _is_positional(hint):
+        yield _changed(command, name, "no value", [])
+    elif kind is bool:
+        yield _changed(command, name, "a value", ["maybe"])
+    elif not _is_positional(hint):
+        yield Case(command, name, "no value", [*command.split(), *_without(VALID[command], name, command), _flag(name)])
+    for label, value in _bad_values(name, kind).items():
+        yield _changed(command, name, label, [value], _is_positional(hint))
+
+
+def _bad_values(name: str, kind: Any) -> dict[str, str]:
+    if kind is bool:
+        return {}
+    if kind is int:
+        return WHOLE
+    if kind is float:
+        return NUMBERS
+    if kind is Path:
+        return OUTPUTS if name == "out" else INPUTS
+    return TEXTS if name in MAY_BE_EMPTY else {"empty": "", **TEXTS}
+
+
+MAY_BE_EMPTY = ("task", "pretrain", "finetune")
+"""Texts whose default is empty."""
+
+
+def _core(hint: Any) -> tuple[Any, bool]:
+    """The type of one value, and whether the flag takes a list of them."""
+    if hasattr(hint, "__metadata__"):
+        hint = hint.__origin__
+    if get_origin(hint) is UnionType or isinstance(hint, UnionType):
+        hint = next(part for part in get_args(hint) if part is not NoneType)
+    if get_origin(hint) is list:
+        return _core(get_args(hint)[0])[0], True
+    return (str if get_origin(hint) is Literal else hint), False
+
+
+def _is_positional(hint: Any) -> bool:
+    return any(tyro.conf.Positional is marker or "Positional" in repr(marker) for marker in _metadata(hint))
+
+
+def _metadata(hint: Any) -> tuple[Any, ...]:
+    return getattr(hint, "__metadata__", ())
+
+
+def _flag(name: str) -> str:
+    return f"--{name.replace('_', '-')}"
+
+
+def _without(words: Words, name: str, command: str) -> Words:
+    """Valid words without a flag and its values, or without the positional word in front."""
+    if _flag(name) not in words:
+        hints = get_type_hints(config_of(command)[0], include_extras=True)
+        return words[1:] if _is_positional(hints[name]) else words
+    start = words.index(_flag(name))
+    stop = next((i for i in range(start + 1, len(words)) if words[i].startswith("--")), len(words))
+    return words[:start] + words[stop:]
+
+
+def _changed(command: str, name: str, kind: str, values: Words, positional: bool = False) -> Case:
+    """The valid line with other values of one flag."""
+    rest = _without(VALID[command], name, command)
+    changed = [*values, *rest] if positional else [*rest, _flag(name), *values]
+    return Case(command, name, kind, [*command.split(), *changed])

@@ -1,0 +1,78 @@
+"""Read files that may be anything: what a damaged one leads to is an error that can be told, never a hang."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from types import UnionType
+from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
+
+from vd4rl_pomdp.errors import UserError, disk_error
+
+if TYPE_CHECKING:
+    from torch import Tensor
+
+T = TypeVar("T")
+
+
+def regular(path: Path) -> Path:
+    """`path` itself; raises UserError for a pipe or a device, which may have no end, and for a folder."""
+    if path.exists() and not path.is_file():
+        raise UserError(f"{path}: is no regular file but a folder, a pipe or a device; remove it or name another")
+    return path
+
+
+def read_bytes(path: Path) -> bytes:
+    """A file's content. A missing one raises FileNotFoundError, one that the system withholds UserError.
+
+    Whoever reads on can then take every other trouble for damage.
+    """
+    try:
+        return regular(path).read_bytes()
+    except FileNotFoundError:
+        raise
+    except OSError as error:
+        raise disk_error(path, error) from error
+
+
+def parse_json(text: str | bytes) -> Any:
+    """`json.loads` whose every failure is a ValueError."""
+    try:
+        return json.loads(text)
+    except RecursionError as error:
+        raise ValueError("it is nested too deeply") from error
+
+
+def build(kind: type[T], values: Any) -> T:
+    """An instance of a dataclass from JSON values; wrong names, or a value of another type, raise TypeError."""
+    made = kind(**values)
+    for name, hint in get_type_hints(kind).items():
+        if not _fits(getattr(made, name), hint):
+            raise TypeError(f"{name} is {getattr(made, name)!r}")
+    return made
+
+
+def _fits(value: Any, hint: Any) -> bool:
+    if get_origin(hint) in (Union, UnionType):
+        return any(_fits(value, part) for part in get_args(hint))
+    if get_origin(hint) is Literal:
+        return value in get_args(hint)
+    if isinstance(value, bool):
+        return hint is bool
+    return isinstance(value, int | float) if hint is float else isinstance(value, get_origin(hint) or hint)
+
+
+def read_tensors(path: Path) -> dict[str, Tensor]:
+    """Tensors of a safetensors file; a number that is not finite raises UserError.
+
+    Raises:
+        FileNotFoundError, SafetensorError: the file is missing or no such file.
+    """
+    import torch
+    from safetensors.torch import load
+
+    tensors = load(read_bytes(path))
+    bad = next((n for n, v in tensors.items() if v.is_floating_point() and not torch.isfinite(v).all()), None)
+    if bad is not None:
+        raise UserError(f"{path}: {bad!r} is not finite, so the file is damaged; take another copy or train again")
+    return tensors
