@@ -54,8 +54,8 @@ def read_bytes(path: Path) -> bytes:
     """
     try:
         return path.read_bytes()
-    except FileNotFoundError:
-        raise
+    except (FileNotFoundError, NotADirectoryError) as error:
+        raise FileNotFoundError(*error.args, str(path)) from error
     except OSError as error:
         raise disk_error(path, error) from error
 
