@@ -179,6 +179,9 @@ READERS: list[tuple[str, list[str], list[str]]] = [
 
 _LOG = "the log decides nothing, and a kill may cut it"
 FINE: dict[str, str] = {
+    "policy export | */snapshots/* | missing": "a run keeps what snapshots it has",
+    "policy export | */snapshots/* | a dangling link": "likewise",
+    "policy export | */config.json | *seed*": "nothing reads it, and an export takes longer than the limit",
     "policy train | target_entropy | below": "an entropy may be negative",
     "policy train | stop_at | below": "a return may be",
     "demo | out | a foreign folder": "a folder of runs may hold other things",
@@ -187,7 +190,9 @@ FINE: dict[str, str] = {
     "report | out | a foreign folder": "its own names are checked file by file",
     "theory | out | a foreign folder": "its own names are checked file by file",
     "evaluate | out | a dangling link": "the link's target is made, as by any program",
-    "pretrain | data/*/1_walker_walk_random.hdf5 | missing": "a set of fewer shards is a set",
+    "* | data/*.hdf5 | missing": "a set of fewer shards is a set",
+    "data card | */provenance.json | no key": "what it does not say is left out of the card",
+    "navigation report | out | a foreign folder": "its own names are checked file by file",
     "* | */metrics.jsonl | missing": _LOG,
     "* | */metrics.jsonl | empty": _LOG,
     "* | */metrics.jsonl | truncated": _LOG,

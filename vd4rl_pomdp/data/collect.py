@@ -19,10 +19,11 @@ from vd4rl_pomdp.data.format import PLAN, RECORD, write_shard
 from vd4rl_pomdp.errors import MAX_SEED, UserError, disk_error, refuse_outside
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.folder import jsonable, read_json, write_json
+from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
 from vd4rl_pomdp.runs.workers import count_workers, run_jobs
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, MOST_EPISODES, QUALITIES, Quality, get_task
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, FRAME_SIZE, MOST_EPISODES, QUALITIES, Quality, get_task
 
 Policy = Actor | Ladder | None
 """Who acts in a shard: an actor, a ladder of them, or nobody (random actions)."""
@@ -103,6 +104,8 @@ def _check(config: CollectConfig) -> None:
     """Refuse settings that make no set."""
     get_task(config.task)
     refuse_outside(config, episodes=(1, MOST_EPISODES), episodes_per_shard=1, seed=(0, MAX_SEED), workers=0)
+    shard = min(config.episodes, config.episodes_per_shard) * (EPISODE_TRANSITIONS + 1)
+    require_memory(shard * 3 * FRAME_SIZE**2, CPU, config, "episodes", "episodes_per_shard")
     if config.quality not in QUALITIES:
         raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(QUALITIES)}")
     if config.quality == "medium_expert" and config.episodes < 2:

@@ -76,8 +76,9 @@ def load_encoder(
         )
     try:
         encoder = Encoder(encoder_config)
+        _ = card.corruption["corruption"]
         make_corruption(build(CorruptionConfig, card.corruption))
-    except (TypeError, RuntimeError, ValueError) as error:
+    except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise UserError(f"{folder}/config.json: names no encoder ({_first_line(error)}); pretrain it again") from error
     try:
         encoder.load_state_dict(read_tensors(folder / "model.safetensors"))
