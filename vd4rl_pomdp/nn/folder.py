@@ -76,8 +76,7 @@ def load_encoder(
         )
     try:
         encoder = Encoder(encoder_config)
-        _ = card.corruption["corruption"]
-        make_corruption(build(CorruptionConfig, card.corruption))
+        make_corruption(build(CorruptionConfig, {"corruption": card.corruption["corruption"], **card.corruption}))
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise UserError(f"{folder}/config.json: names no encoder ({_first_line(error)}); pretrain it again") from error
     try:

@@ -35,7 +35,7 @@ class RunFolder:
         file = self.path / "config.json"
         if file.exists():
             stored = read_json(file)
-            old = stored.get("config", {})
+            old = stored["config"] if isinstance(stored.get("config"), dict) else {}
             keys = (set(old) | set(config)) - _RUNTIME_FIELDS
             differing = sorted(k for k in keys if old.get(k) != config.get(k))
             if stored.get("stage") != stage or differing:
