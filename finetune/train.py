@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shutil
+from collections import Counter
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -17,8 +18,8 @@ from finetune.features import BATCH_STREAM, ExactSampler, FeatureSampler, Frozen
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.envs.parity import render_info
-from vd4rl_pomdp.errors import MAX_SEED, refuse_number, refuse_outside, refuse_unread
-from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, rows_of
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_number, refuse_outside, refuse_unread
+from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, read_rows, rows_of
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import EncoderCard, load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
@@ -145,6 +146,7 @@ class Trainer:
         config = self.config
         restore_checkpoint(run.checkpoint, self._restore)
         drop_rows_after(run.path / "episodes.csv", self.step)
+        self._require_evaluations(run.path / "episodes.csv")
         before = self.seconds
         log = MetricsLog(run.path / "metrics.jsonl", self.step, config.wandb, jsonable(asdict(config)))
         title = f"finetune {config.algorithm} on {self.card.method}"
@@ -167,6 +169,17 @@ class Trainer:
         (run.path / "features.npy").unlink(missing_ok=True)
         write_json(run.path / "render.json", render_info(self.card.task))
         run.finish(run.seconds(before), updates=self.step)
+
+    def _require_evaluations(self, path: Path) -> None:
+        """Raise UserError if rows of an evaluation before the checkpoint are gone: the run would end without them."""
+        config, found = self.config, Counter(row["step"] for row in read_rows(path))
+        due = {
+            *range(config.eval_every, self.step + 1, config.eval_every),
+            *([self.step] if self.step == config.updates else []),
+        }
+        missing = sorted(step for step in due if found[step] < config.eval_episodes)
+        if missing:
+            raise UserError(f"{path}: lacks the evaluation at update {missing[0]}; restore it or start another run")
 
     def _evaluate(self, run: RunFolder) -> float:
         """Evaluate the present policy, append its rows, keep a film of the last; returns the mean score."""

@@ -179,6 +179,8 @@ READERS: list[tuple[str, list[str], list[str]]] = [
 
 _LOG = "the log decides nothing, and a kill may cut it"
 FINE: dict[str, str] = {
+    "finetune | */features.npy | missing": "the set is encoded anew",
+    "finetune | */features.npy | a dangling link": "the set is encoded anew",
     "policy export | */snapshots/* | missing": "a run keeps what snapshots it has",
     "policy export | */snapshots/* | a dangling link": "likewise",
     "policy export | */config.json | *seed*": "nothing reads it, and an export takes longer than the limit",

@@ -59,7 +59,7 @@ def load_runs(paths: list[Path]) -> list[Run]:
         if not path.exists():
             raise UserError(f"{path}: no such folder")
         folders += sorted(p.parent for p in path.rglob("config.json") if _is_run(p))
-    runs = [_load(folder) for folder in dict.fromkeys(folders)]
+    runs = [_read(folder) for folder in dict.fromkeys(folders)]
     if not runs:
         raise UserError(f"{paths[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl)")
     _refuse_twins(runs)
@@ -70,8 +70,18 @@ def _is_run(config: Path) -> bool:
     return "stage" in read_json(config)
 
 
+def _read(folder: Path) -> Run:
+    """`_load`, with a sentence for files of a run that are JSON but not what a run writes."""
+    try:
+        return _load(folder)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{folder}: its files are damaged ({error}); take another copy, or leave it out") from error
+
+
 def _load(folder: Path) -> Run:
     record = read_json(folder / "config.json")
+    if not isinstance(record["config"], dict):
+        raise TypeError("config.json holds no settings")
     timing = folder / "timing.json"
     return Run(
         path=folder,
