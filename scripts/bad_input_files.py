@@ -179,6 +179,13 @@ READERS: list[tuple[str, list[str], list[str]]] = [
 
 _LOG = "the log decides nothing, and a kill may cut it"
 FINE: dict[str, str] = {
+    "report | */timing.json | missing": "a run that is not finished has none",
+    "report | */timing.json | a dangling link": "a run that is not finished has none",
+    "report | */probe.json | missing": "a set without states gives none",
+    "report | */probe.json | a dangling link": "a set without states gives none",
+    "report | */probe.json | no key": "a set without states gives none",
+    "report | */film.npz | missing": "the report goes without",
+    "report | */film.npz | a dangling link": "the report goes without",
     "finetune | */features.npy | missing": "the set is encoded anew",
     "finetune | */features.npy | a dangling link": "the set is encoded anew",
     "policy export | */snapshots/* | missing": "a run keeps what snapshots it has",

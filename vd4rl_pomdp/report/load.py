@@ -13,7 +13,10 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import read_rows
 from vd4rl_pomdp.runs.folder import read_json
 from vd4rl_pomdp.runs.metrics import read_metrics
+from vd4rl_pomdp.runs.reading import regular
 
+FILM = {"clean": 4, "corrupted": 4, "return": 1}
+"""Arrays of a film and their axes."""
 IDENTITY = ("task", "quality", "corruption", "algorithm", "method", "seed")
 
 
@@ -44,9 +47,14 @@ class Run:
         if not path.exists():
             return None
         try:
-            with np.load(path) as file:
-                return dict(file)
-        except (OSError, ValueError, EOFError, BadZipFile) as error:
+            with np.load(regular(path)) as file:
+                film = dict(file)
+            if [film[name].ndim for name in FILM] != list(FILM.values()):
+                raise ValueError("its arrays have other shapes")
+            return film
+        except UserError:
+            raise
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
             raise UserError(f"{path}: cannot be read ({error}); remove it, and the report goes without") from error
 
 
@@ -63,6 +71,8 @@ def load_runs(paths: list[Path]) -> list[Run]:
     if not runs:
         raise UserError(f"{paths[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl)")
     _refuse_twins(runs)
+    for run in runs:
+        run.film()  # a damaged one is told before anything is written
     return runs
 
 
@@ -80,7 +90,7 @@ def _read(folder: Path) -> Run:
 
 def _load(folder: Path) -> Run:
     record = read_json(folder / "config.json")
-    if not isinstance(record["config"], dict):
+    if not isinstance(record["config"], dict) or "seed" not in record["config"]:
         raise TypeError("config.json holds no settings")
     timing = folder / "timing.json"
     return Run(
@@ -89,7 +99,7 @@ def _load(folder: Path) -> Run:
         record=record,
         rows=read_rows(folder / "episodes.csv"),
         metrics=read_metrics(folder / "metrics.jsonl"),
-        seconds=read_json(timing)["seconds"] if timing.exists() else None,
+        seconds=_number(read_json(timing)["seconds"]) if timing.exists() else None,
         representation=_representation(folder),
     )
 
@@ -100,11 +110,17 @@ def _representation(folder: Path) -> dict[str, float | None]:
         for path in (folder / "encoder" / "config.json", folder / "probe.json", folder / "pretrain_timing.json")
     )
     return {
-        "action_loss": card.get("pretrain", {}).get("action_loss"),
-        "probe_pose": probe.get("probe_pose"),
-        "probe_velocity": probe.get("probe_velocity"),
-        "pretrain_seconds": timing.get("seconds"),
+        "action_loss": _number(card.get("pretrain", {}).get("action_loss")),
+        "probe_pose": _number(probe.get("probe_pose")),
+        "probe_velocity": _number(probe.get("probe_velocity")),
+        "pretrain_seconds": _number(timing.get("seconds")),
     }
+
+
+def _number(value: Any) -> float | None:
+    if value is not None and not isinstance(value, int | float):
+        raise TypeError(f"{value!r} is no number")
+    return value
 
 
 def _refuse_twins(runs: list[Run]) -> None:
