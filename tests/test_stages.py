@@ -336,6 +336,20 @@ def test_features_that_are_a_pipe_are_refused(encoder, data, tmp_path, monkeypat
         run_finetune(config)
 
 
+def test_a_cut_run_whose_evaluations_are_gone_does_not_go_on(encoder, data, tmp_path, monkeypatch):
+    config = smoke_finetune(encoder, data, tmp_path / "out", eval_every=10, checkpoint_every=10, eval_length=2)
+    with monkeypatch.context() as patch:
+        cut_at(patch, "finetune.train", 3)
+        with pytest.raises(CutError):
+            run_finetune(config)
+    rows = (config.out / "episodes.csv").read_text().splitlines(keepends=True)
+    (config.out / "episodes.csv").write_text("".join(rows[:2]))
+    with pytest.raises(UserError, match=r"episodes\.csv: lacks the evaluation at update 20"):
+        run_finetune(config)
+    (config.out / "episodes.csv").write_text("".join(rows))
+    assert run_finetune(config).finished
+
+
 @pytest.mark.parametrize("cell", ["nan", "inf", "many", "9" * 200_000], ids=["nan", "inf", "word", "endless"])
 def test_a_damaged_table_of_episodes_is_named_and_kept(tmp_path, cell):
     path = tmp_path / "episodes.csv"
