@@ -1,27 +1,36 @@
-"""Visibility proofs: what an inverse model's predictions depend on, by gradients, against what it declares.
+"""Visibility proofs: what an inverse model's predictions depend on, against what it declares.
 
 A prediction that sees the action it is asked for, or less than it claims, gives numbers that mean something else than
-its name. Gradients of every logit with respect to every observation and action show both, in float64 on small windows.
+its name. Two proofs show both, in float64 on small windows: gradients of every logit with respect to every observation
+and action, and the logits that differ when one of these takes another value. The second also finds what gradients do
+not pass: detached copies, rounded and compared values.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 
 import torch
+from torch import Tensor
 
 from vd4rl_pomdp.objective import InverseObjective
 from vd4rl_pomdp.types import Windows
 
 Seen = tuple[set[int], set[int]]
 """Observation rows j (of o_j) and action indices j (of a_j)."""
+Pair = tuple[int, int, int]
+"""(window, t, k)."""
 
 
-def wrong_pairs(objective: InverseObjective, lengths: Sequence[int], rows: int = 6) -> list[tuple[int, int, int]]:
+def wrong_pairs(objective: InverseObjective, lengths: Sequence[int], rows: int = 6) -> list[Pair]:
     """Pairs whose prediction depends on other rows or actions than `objective.visible` declares.
 
+    A pair holds if the prediction has a gradient to all that is declared, changes with all of it, and neither has a
+    gradient to anything else nor changes with it.
+
     Args:
-        objective: a small one (few units, few features): the proof takes a backward pass for every pair.
+        objective: a small one (few features, few units, but some 30 in the head: of very few, all may be rectified to
+            zero at a pair); the proof takes a backward pass for every pair. It is changed to float64.
         lengths: real rows of each window of the batch; the first ends inside its episode, the others at an end.
         rows: rows T of the windows, padding included.
 
@@ -29,12 +38,13 @@ def wrong_pairs(objective: InverseObjective, lengths: Sequence[int], rows: int =
         (window, t, k) of every pair that is wrong; empty if all hold.
 
     Raises:
-        ValueError: a window's predictions depend on another window of the batch.
+        ValueError: a window's predictions depend on another window of the batch, or differ from call to call.
     """
+    felt = response(objective, lengths, rows)
     return [
         (b, t, k)
         for (b, t, k), seen in dependence(objective, lengths, rows).items()
-        if seen != declared(objective, t, k, lengths[b], last_action=b == 0)
+        if not seen == felt[b, t, k] == declared(objective, t, k, lengths[b], last_action=b == 0)
     ]
 
 
@@ -44,23 +54,54 @@ def declared(objective: InverseObjective, t: int, k: int, length: int, last_acti
     return rows, {a for a in actions if a < length - 1 or last_action}
 
 
-def dependence(objective: InverseObjective, lengths: Sequence[int], rows: int = 6) -> dict[tuple[int, int, int], Seen]:
+def dependence(objective: InverseObjective, lengths: Sequence[int], rows: int = 6) -> dict[Pair, Seen]:
     """(window, t, k) -> what the prediction has a gradient to, for all real pairs; see `wrong_pairs`."""
     objective = objective.double()
-    window, obs, actions = _differentiable_window(objective, lengths, rows)
-    logits = objective.action_logits(window)
+    obs, actions = (x.requires_grad_() for x in _inputs(objective, lengths, rows, seed=0))
+    logits = objective.action_logits(_window(obs, actions, lengths))
     weights = torch.randn(logits.shape[-1], generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     found = {}
-    for p, (t, k) in enumerate(objective.pairs(rows).tolist()):
-        for b, length in enumerate(lengths):
-            if t + k < length:
-                value = (logits[b, p] * weights).sum()
-                grads = torch.autograd.grad(value, (obs, actions), retain_graph=True, allow_unused=True)
-                found[b, t, k] = (_rows_with_gradient(grads[0], b), _rows_with_gradient(grads[1], b))
+    for p, (b, t, k) in _real_pairs(objective, lengths, rows):
+        value = (logits[b, p] * weights).sum()
+        grads = torch.autograd.grad(value, (obs, actions), retain_graph=True, allow_unused=True)
+        found[b, t, k] = (_rows_with_gradient(grads[0], b), _rows_with_gradient(grads[1], b))
     return found
 
 
-def _rows_with_gradient(grad: torch.Tensor | None, window: int) -> set[int]:
+@torch.no_grad()
+def response(objective: InverseObjective, lengths: Sequence[int], rows: int = 6) -> dict[Pair, Seen]:
+    """(window, t, k) -> what the prediction changes with, for all real pairs; see `wrong_pairs`."""
+    objective = objective.double()
+    (obs, actions), (new_obs, new_actions) = (_inputs(objective, lengths, rows, seed) for seed in (0, 2))
+    plain = objective.action_logits(_window(obs, actions, lengths))
+
+    def changed(obs: Tensor, actions: Tensor) -> Tensor:
+        return (objective.action_logits(_window(obs, actions, lengths)) != plain).any(-1)
+
+    if changed(obs, actions).any():
+        raise ValueError("predictions differ from call to call: put the objective into eval mode")
+    for b in range(len(lengths)):
+        touched = changed(_exchange(obs, new_obs, 0, b), _exchange(actions, new_actions, 0, b))
+        if touched[torch.arange(len(lengths)) != b].any():
+            raise ValueError("a prediction depends on another window of its batch")
+    found: dict[Pair, Seen] = {pair: (set(), set()) for _, pair in _real_pairs(objective, lengths, rows)}
+    for row in range(rows):
+        by_obs = changed(_exchange(obs, new_obs, 1, row), actions)
+        by_action = changed(obs, _exchange(actions, new_actions, 1, row))
+        for p, pair in _real_pairs(objective, lengths, rows):
+            for touched, seen in zip((by_obs, by_action), found[pair], strict=True):
+                if touched[pair[0], p]:
+                    seen.add(row)
+    return found
+
+
+def _real_pairs(objective: InverseObjective, lengths: Sequence[int], rows: int) -> Iterator[tuple[int, Pair]]:
+    """Place among the logits and (window, t, k) of every pair that lies within its window's real rows."""
+    for p, (t, k) in enumerate(objective.pairs(rows).tolist()):
+        yield from ((p, (b, t, k)) for b, length in enumerate(lengths) if t + k < length)
+
+
+def _rows_with_gradient(grad: Tensor | None, window: int) -> set[int]:
     if grad is None:
         return set()
     touched = grad.flatten(2).abs().amax(2) > 0
@@ -69,19 +110,25 @@ def _rows_with_gradient(grad: torch.Tensor | None, window: int) -> set[int]:
     return set(torch.nonzero(touched[window])[:, 0].tolist())
 
 
-def _differentiable_window(
-    objective: InverseObjective, lengths: Sequence[int], rows: int
-) -> tuple[Windows, torch.Tensor, torch.Tensor]:
-    """A random window whose observations and actions a_0..a_{T-1} carry gradients."""
+def _exchange(values: Tensor, others: Tensor, axis: int, place: int) -> Tensor:
+    """Copy of `values` whose slice at one place of an axis is that of `others`."""
+    return values.index_copy(axis, torch.tensor([place]), others.narrow(axis, place, 1))
+
+
+def _inputs(objective: InverseObjective, lengths: Sequence[int], rows: int, seed: int) -> tuple[Tensor, Tensor]:
+    """Random observations (B, T, C, S, S) and actions a_0..a_{T-1} (B, T, A), padding included, float64."""
     shape = objective.encoder.config
-    g = torch.Generator().manual_seed(0)
+    g = torch.Generator().manual_seed(seed)
     size = (len(lengths), rows, shape.channels, shape.size, shape.size)
-    obs = (torch.rand(size, generator=g, dtype=torch.float64) * 255).requires_grad_()
-    actions = torch.rand(*size[:2], shape.action_dim, generator=g, dtype=torch.float64).sub(0.5).requires_grad_()
-    length = torch.tensor(lengths)
+    obs = torch.rand(size, generator=g, dtype=torch.float64) * 255
+    return obs, torch.rand(*size[:2], shape.action_dim, generator=g, dtype=torch.float64) - 0.5
+
+
+def _window(obs: Tensor, actions: Tensor, lengths: Sequence[int]) -> Windows:
+    """Windows of observations and actions; the first ends inside its episode, the others at an end."""
+    rows, length = obs.shape[1], torch.tensor(lengths)
     has_action = torch.arange(rows) < length[:, None] - 1
     has_action[0] = torch.arange(rows) < length[0]
     action = actions * has_action[..., None]
     prev_action = torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], 1)
-    key = torch.zeros(size[:2], dtype=torch.int64)
-    return Windows(obs, prev_action, action, has_action, length, key), obs, actions
+    return Windows(obs, prev_action, action, has_action, length, torch.zeros(obs.shape[:2], dtype=torch.int64))

@@ -1,5 +1,6 @@
 """The baselines on finite problems whose answers are known."""
 
+import copy
 import math
 
 import pytest
@@ -68,6 +69,22 @@ def test_homers_classifier_is_the_bayes_posterior(codes: int):
                 torch.testing.assert_close(found, posterior, atol=0.08, rtol=0)
 
 
+def test_homers_imposters_are_uniform_over_the_batchs_next_states():
+    objective, given = HOMER(encoder(), 0, seed=0), []
+    window, _ = finite_windows(4, 3, 0.0, torch.Generator().manual_seed(0))
+    window = window.replace(obs=torch.randint(0, 256, window.obs.shape, dtype=torch.uint8))
+    real = objective.logits
+    objective.logits = lambda *both: (given.append(both), real(*both))[1]
+    for _ in range(200):
+        objective.loss(window, 0.0)
+    following = given[0][2]
+    assert len(following) == 8
+    assert all(torch.equal(a, b) for a, b in zip(given[0][:2], given[1][:2], strict=True)), "the same (o_t, a_t)"
+    drawn = torch.stack([(other[2][:, None] == following[None]).all(-1).int() for other in given[1::2]])
+    assert (drawn.sum(2) == 1).all(), "each is one of them"
+    assert ((drawn.float().mean(0) - 1 / 8).abs() < 0.11).all()
+
+
 def test_info_nce_of_independent_views_is_log_n_and_of_equal_views_far_less():
     g = torch.Generator().manual_seed(0)
     n, last = 32, {}
@@ -111,6 +128,27 @@ def test_driml_reaches_the_loss_of_the_true_density_ratio_and_needs_the_action()
     assert train(blind, 400, 0.0, batch, rows) > copies + 0.5 * math.log(2)
 
 
+@pytest.mark.parametrize("seed", range(4))
+def test_drimls_anchors_are_a_state_and_the_action_taken_in_it(seed: int):
+    """psi(s_t, a_t) against phi(s_{t+k}): in windows of T rows, a_0..a_{T-1-k} count and the later ones do not."""
+    rows, objective = 4, DRIML(encoder(), 3, seed)
+    window, _ = finite_windows(8, rows, 0.0, torch.Generator().manual_seed(0))
+    plain, logs = copy.deepcopy(objective).loss(window, 0.0)
+    counts = []
+    for t in range(rows):
+        other = window.replace(action=window.action.clone())
+        other.action[:, t] = torch.linspace(-3, 3, 8)[:, None]
+        counts.append(copy.deepcopy(objective).loss(other, 0.0)[0].item() != plain.item())
+    assert counts == [t + logs["k"].item() < rows for t in range(rows)]
+
+
+def test_driml_draws_every_gap_equally_often():
+    objective, (window, _) = DRIML(encoder(), 3, 0), finite_windows(2, 4, 0.0, torch.Generator().manual_seed(0))
+    with torch.no_grad():
+        drawn = torch.stack([objective.loss(window, 0.0)[1]["k"] for _ in range(300)])
+    assert torch.bincount(drawn.long(), minlength=4).tolist() == pytest.approx([0, 100, 100, 100], abs=30)
+
+
 def test_driml_scores_places_against_the_same_place():
     torch.manual_seed(0)
     objective = DRIML(Encoder(EncoderConfig(1, "nature", 8)), 1, seed=0)
@@ -134,6 +172,25 @@ def test_curls_momentum_encoder_follows_slowly_and_takes_no_gradient():
     objective.after_step()
     for before, after in zip(slow, objective.momentum_encoder.parameters(), strict=True):
         torch.testing.assert_close(after - before, torch.full_like(before, 0.05))
+
+
+def test_curl_compares_two_shifts_the_second_by_the_momentum_encoder():
+    torch.manual_seed(0)
+    objective = CURL(Encoder(EncoderConfig(1, "nature", 8)), seed=0)
+    window, _ = finite_windows(4, 2, 0.0, torch.Generator().manual_seed(0))
+    window = window.replace(obs=torch.randint(0, 256, (4, 2, 9, 84, 84), dtype=torch.uint8))
+    seen = {}
+    for name in ("encoder", "momentum_encoder"):
+        frame = getattr(objective, name).frame
+        frame.register_forward_pre_hook(lambda module, given, name=name: seen.update({name: given[0].clone()}))
+    objective.loss(window, 0.0)
+    for one, other in (
+        (seen["encoder"], seen["momentum_encoder"]),
+        *((window.obs, shifted) for shifted in seen.values()),
+    ):
+        same = (one == other).flatten(2).float().mean(2)
+        assert (same < 0.05).float().mean() > 0.8, "few rows are shifted alike, or not at all"
+        assert (one.flatten(2).float().mean(2) - other.flatten(2).float().mean(2)).abs().max() < 2, "one observation"
 
 
 def test_curl_tells_states_apart_up_to_their_copies():

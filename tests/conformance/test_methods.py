@@ -122,6 +122,37 @@ def test_options_add_their_terms(method: str):
     assert plain.head.k is not None
 
 
+@pytest.mark.parametrize("method", INVERSE)
+def test_the_loss_is_that_of_the_first_action_after_each_pairs_earlier_state(method: str):
+    """-log P(a_t | ...), averaged over all real pairs (t, t+k) of the batch: here one by one, and for each k."""
+    objective, window = build(method), batch()
+    logits = objective.action_logits(window)
+    alone: dict[int, list[torch.Tensor]] = {}
+    for p, (t, k) in enumerate(objective.pairs(ROWS).tolist()):
+        for b, length in enumerate(window.length.tolist()):
+            if t + k < length:
+                alone.setdefault(k, []).append(objective.target.loss(logits[b, p], window.action[b, t]))
+    loss, logs = objective.loss(window, 0.0)
+    torch.testing.assert_close(loss, torch.stack([value for values in alone.values() for value in values]).mean())
+    for k, values in alone.items():
+        torch.testing.assert_close(logs[f"loss_k{k:02d}"], torch.stack(values).mean().detach())
+
+
+def test_self_prediction_moves_the_prediction_and_never_its_target():
+    """||sg(s_{t+k}) - g(s_t, k)||^2: a window's last state is nothing but a target, so no gradient may reach it."""
+    objective, window = build("mik+a", self_prediction=1.0), batch((ROWS, ROWS))
+    past, future = (x.detach().requires_grad_() for x in objective.representations(window))
+    loss, logs = objective.loss_of(past, future, window, 0.0)
+    loss.backward()
+    assert (past.grad.abs().amax((0, 2)) > 0).tolist() == [True] * (ROWS - 1) + [False]
+
+    errors = []
+    for t, k in objective.pairs(ROWS).tolist():
+        asked = torch.cat([past[:, t], torch.full((2, 1), k / objective.config.max_k)], dim=-1)
+        errors.append((objective.predictor(asked) - past[:, t + k]).square().mean())
+    torch.testing.assert_close(logs["self_prediction"], torch.stack(errors).mean().detach())
+
+
 def test_inverse_methods_are_those_of_the_papers():
     expected = {"no_history", "ah", "ah+a", "fj", "fj+a", "mik", "mik+a", "acro", "one_step_inverse"}
     assert set(INVERSE) == expected

@@ -1,27 +1,33 @@
-"""What an action logit depends on is exactly what its objective declares: shown by gradients, for every method."""
+"""What an action logit depends on is exactly what its objective declares: shown for every method, in two ways.
 
+By gradients, and by changing one input at a time. Pictures are small and encoded without convolutions, but where frame
+encoders are the question.
+"""
+
+from collections.abc import Callable
 from dataclasses import replace
 
-import numpy as np
 import pytest
 import torch
 
 from pretrain.config import PRESETS
 from pretrain.objectives import METHODS, build_objective
-from tests.conformance.test_methods import batch
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.objective import InverseObjective
-from vd4rl_pomdp.visibility import declared, dependence, wrong_pairs
+from vd4rl_pomdp.types import Windows
+from vd4rl_pomdp.visibility import declared, dependence, response, wrong_pairs
 
 ROWS, MAX_K, ACTIONS = 6, 4, 2
 
 
 def inverse(method: str, **changes: object) -> InverseObjective:
     torch.manual_seed(0)
-    config = replace(PRESETS["smoke"], method=method, max_k=MAX_K, feature_dim=6, hidden_dim=5, head_dim=8, **changes)
+    small = {"max_k": MAX_K, "feature_dim": 6, "hidden_dim": 5, "head_dim": 32, "frame_encoder": "flat"}
+    config = replace(PRESETS["smoke"], method=method, **(small | changes))
     actions = torch.rand(50, ACTIONS) * 2 - 1
     target = make_action_target("kmeans", actions.numpy(), 4, 0)
-    objective = build_objective(config, actions, target).double()
+    picture = (3, 2) if config.frame_encoder == "flat" else (9, 84)
+    objective = build_objective(config, actions, target, observation=picture).double()
     assert isinstance(objective, InverseObjective)
     return objective
 
@@ -131,9 +137,82 @@ def test_more_mutants_are_caught():
         wrong_pairs(across, [ROWS, ROWS])
 
 
-def test_losses_per_k_average_to_the_loss():
-    objective = inverse("acro").float()
-    loss, logs = objective.loss(batch((ROWS, ROWS)), 0.0)
-    counts = np.array([ROWS - k for k in range(1, MAX_K + 1)])
-    per_k = np.array([float(logs[f"loss_k{k:02d}"]) for k in range(1, MAX_K + 1)])
-    assert np.average(per_k, weights=counts) == pytest.approx(loss.item(), rel=1e-6)
+@pytest.mark.parametrize("name", ["drq", "nature", "small"])
+def test_frame_encoders_mix_no_rows(name: str):
+    assert wrong_pairs(inverse("mik+a", frame_encoder=name, max_k=1), [4, 4, 3], rows=4) == []
+
+
+M, N = 2, 1
+PAPERS: dict[str, Callable[[int, int, int], tuple]] = {
+    "no_history": lambda t, k, end: ({t, t + k}, set()),
+    "acro": lambda t, k, end: ({t, t + k}, set()),
+    "one_step_inverse": lambda t, k, end: ({t, t + 1}, set()),
+    "ah": lambda t, k, end: (set(range(t + k + 1)), set()),
+    "ah+a": lambda t, k, end: (set(range(t + k + 1)), set(range(t + k))),
+    "fj": lambda t, k, end: (window(t) | window(t + k), set()),
+    "fj+a": lambda t, k, end: (window(t) | window(t + k), window(t) - {t} | window(t + k) - {t + k}),
+    "mik": lambda t, k, end: (window(t) | set(range(t + k, min(end, t + k + N + 1))), set()),
+    "mik+a": lambda t, k, end: (
+        window(t) | set(range(t + k, min(end, t + k + N + 1))),
+        window(t) - {t} | set(range(t + k, min(end, t + k + N + 1))),
+    ),
+}
+"""What the paper's Table 1 conditions on: rows j of o_j, indices j of a_j, for a past of m and a future of n rows."""
+
+
+def window(row: int) -> set[int]:
+    return set(range(max(0, row - M), row + 1))
+
+
+@pytest.mark.parametrize("method", INVERSE)
+def test_declarations_and_predictions_are_those_of_the_papers_table(method: str):
+    bounded = {"fj": {"m": M}, "mik": {"m": M, "n": N}}.get(method.removesuffix("+a"), {})
+    objective = inverse(method, **bounded)
+    for (_, t, k), seen in response(objective, [ROWS]).items():
+        assert seen == declared(objective, t, k, ROWS, True) == PAPERS[method](t, k, ROWS), (t, k)
+
+
+def leak(objective: InverseObjective, what: Callable[[Windows], torch.Tensor]) -> None:
+    """Add something (B, T, 1) to the past representations."""
+    real = objective.representations
+    objective.representations = lambda w: ((both := real(w))[0] + what(w), both[1])
+
+
+@pytest.mark.parametrize(
+    "what",
+    [
+        lambda w: w.action.detach().mean(-1, keepdim=True),
+        lambda w: (w.action[..., :1] > 0).double(),
+        lambda w: w.obs.flatten(2)[..., :1].round().roll(-1, 1),
+    ],
+    ids=["detached action", "compared action", "rounded next picture"],
+)
+def test_leaks_that_gradients_do_not_pass_are_caught(what: Callable[[Windows], torch.Tensor]):
+    objective = inverse("mik+a")
+    leak(objective, what)
+    blind = dependence(objective, [ROWS])
+    assert all(seen == declared(objective, t, k, ROWS, True) for (_, t, k), seen in blind.items())
+    assert wrong_pairs(objective, [ROWS])
+
+
+def test_a_detached_leak_between_windows_is_caught():
+    objective = inverse("acro")
+    leak(objective, lambda w: w.action.detach().mean((0, 1)).mean() + torch.zeros(()))
+    with pytest.raises(ValueError, match="another window"):
+        response(objective, [ROWS, ROWS])
+
+
+def test_a_declared_row_that_no_gradient_reaches_is_caught():
+    objective = inverse("ah")
+    encode = objective.encoder.from_features
+    objective.encoder.from_features = lambda f, a: encode(torch.cat([f[:, :1].detach(), f[:, 1:]], 1), a)
+    assert response(objective, [ROWS]) == response(inverse("ah"), [ROWS])
+    assert wrong_pairs(objective, [ROWS])
+
+
+def test_predictions_that_draw_are_refused_until_they_repeat():
+    objective = inverse("acro")
+    objective.head.rest.insert(0, torch.nn.Dropout(0.5))
+    with pytest.raises(ValueError, match="put the objective into eval mode"):
+        wrong_pairs(objective, [ROWS])
+    assert wrong_pairs(objective.eval(), [ROWS]) == []

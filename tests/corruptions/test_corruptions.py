@@ -3,6 +3,7 @@ import pytest
 import torch
 
 from tests.helpers_data import fake_rows
+from vd4rl_pomdp import _shift
 from vd4rl_pomdp._shift import shift_by_index, shift_by_lines
 from vd4rl_pomdp.augmentation import random_shift
 from vd4rl_pomdp.corruptions import (
@@ -55,6 +56,16 @@ def test_patch_zeroes_one_square_of_the_stated_size_in_every_frame():
     assert (columns == 16).all()
     assert torch.equal(out[out != 0], obs[out != 0])
     assert len(torch.unique(hidden.view(64 * 3, -1).int().argmax(1))) > 100
+
+
+def test_a_patch_is_anywhere_it_fits_in_equally_often():
+    """Five places from top to bottom, five from left to right: 25 squares, each as likely as the others."""
+    frames = torch.full((2000, 9, 20, 20), 255, dtype=torch.uint8)
+    hidden = (make_corruption("patch")(frames, torch.arange(2000)).view(6000, 3, 20, 20) == 0).all(1)
+    top, left = hidden.any(2).int().argmax(1), hidden.any(1).int().argmax(1)
+    counts = (5 * top + left).bincount(minlength=25)
+    assert len(counts) == 25
+    assert ((counts - 240) ** 2 / 240).sum() < 60  # chi-square, 24 degrees of freedom: 99.99% quantile is 58
 
 
 def test_shared_patches_are_at_the_same_place_in_all_frames_of_a_stack():
@@ -164,3 +175,14 @@ def test_observing_rows_equals_shifting_then_corrupting_their_stacks(dataset, na
         for _ in range(2):
             expected = apart(random_shift(dataset.stacks(rows), key, pad).clone(), dataset.keys(rows))
             assert torch.equal(together.observe(rows, key), expected)
+
+
+@pytest.mark.parametrize("name", CORRUPTIONS)
+def test_a_device_that_shifts_otherwise_makes_the_same_observations(dataset, monkeypatch, name):
+    """On a GPU whole stacks are read and shifted by index."""
+    rows, seen = torch.arange(dataset.num_rows).view(2, -1), []
+    for by_lines in (True, False):
+        if not by_lines:
+            monkeypatch.setattr(_shift, "by_lines", lambda images, pad: False)
+        seen.append(View(dataset, CorruptionConfig(name), 4).observe(rows).clone())
+    assert torch.equal(*seen)

@@ -45,6 +45,16 @@ def whole(tmp_path_factory):
     return out
 
 
+def test_every_episode_has_its_own_start_and_its_own_actions(whole):
+    shards = [read_shard(path) for path in shard_paths(whole)]
+    states, actions = (
+        np.concatenate([shard[key] for shard in shards]).reshape(3, LENGTH + 1, -1) for key in ("physics", "action")
+    )
+    for one, other in ((0, 1), (1, 2), (0, 2)):
+        assert np.abs(states[one, 0] - states[other, 0]).max() > 0.01
+        assert np.abs(actions[one, 1:] - actions[other, 1:]).min() > 0
+
+
 def test_shards_hold_v_d4rls_keys_and_the_simulator_state(whole):
     assert sorted(p.name for p in whole.glob("*.hdf5")) == ["0_walker_walk_random.hdf5", "1_walker_walk_random.hdf5"]
     with h5py.File(whole / "0_walker_walk_random.hdf5") as file:

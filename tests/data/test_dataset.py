@@ -83,6 +83,20 @@ def test_stored_discounts_are_multiplied_and_may_be_zero(tmp_path):
     np.testing.assert_allclose(batch.reward, [0.0001, 0.0012, 0.0023, 0.003], rtol=1e-5)
 
 
+def test_nothing_is_paid_for_an_episodes_first_row_whatever_it_stores(tmp_path):
+    returns, rewards = [], []
+    for name, stored in (("plain", 0.0), ("odd", 100.0)):
+        rows = fake_rows((5, 3))
+        rows["reward"][[0, 5]] = stored
+        (tmp_path / name).mkdir()
+        write_shard(tmp_path / name / "0_a.hdf5", rows, {})
+        dataset = open_dataset(tmp_path / name, tmp_path / "cache")
+        returns.append(dataset.returns.tolist())
+        rewards.append(dataset.transitions(range(6), n_step=3).reward.tolist())
+    assert returns[0] == returns[1]
+    assert rewards[0] == rewards[1]
+
+
 def test_an_episodes_last_row_has_no_return(dataset):
     reward, discount, successor = dataset.n_step_returns(torch.tensor([4, 3]), n_step=3, gamma=0.9)
     assert reward.tolist() == [0.0, pytest.approx(0.003)]

@@ -87,6 +87,16 @@ def test_noise_repeat_and_seed_change_the_set(maze_set, tmp_path):
     assert len(set(firsts)) == 4
 
 
+def test_every_trajectory_has_noise_of_its_own(tmp_path):
+    """Under noise that drowns the planner, actions are the noise's signs."""
+    collect(small(tmp_path / "set", trajectories=3, noise=1e4))
+    dataset = open_dataset(tmp_path / "set", tmp_path, frame_size=100)
+    actions = dataset.action.view(3, 30, 2)[:, 1:]
+    assert (actions.abs() == 1).all()
+    for one, other in ((0, 1), (1, 2), (0, 2)):
+        assert 0.2 < (actions[one] == actions[other]).float().mean() < 0.8
+
+
 def test_the_planner_reaches_goals_everywhere():
     from vd4rl_pomdp.experiments.navigation.planner import Planner
 

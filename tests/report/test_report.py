@@ -65,6 +65,7 @@ def test_iqm_drops_the_outer_quarters():
     assert stats.iqm(np.array([0.0, 1.0, 2.0, 100.0])) == pytest.approx(1.5)
     # five runs: the middle 2.5 are 0.75 of the 2nd, the 3rd, 0.75 of the 4th
     assert stats.iqm(np.array([10.0, 1.0, 2.0, 3.0, -50.0])) == pytest.approx((0.75 * 1 + 2 + 0.75 * 3) / 2.5)
+    assert stats.iqm(np.array([-50.0, 1.0, 2.0, 9.0, 10.0])) == pytest.approx((0.75 * 1 + 2 + 0.75 * 9) / 2.5)
     assert stats.iqm(np.array([[1.0], [2.0]])).tolist() == [1.0, 2.0]
 
 
@@ -85,6 +86,12 @@ def test_the_bootstrap_covers_a_known_mean_and_keeps_tasks_apart():
     low, high = stats.bootstrap_interval([np.full(4, 0.0), np.full(4, 100.0)], stats.mean, rng, 500)
     assert low == high == 50.0
     assert stats.bootstrap_interval([np.array([1.0])], stats.mean, rng) is None
+
+
+def test_the_bootstrap_of_a_mean_is_as_wide_as_its_standard_error():
+    scores = np.arange(100) % 2.0  # a standard deviation of a half
+    low, high = stats.bootstrap_interval([scores], stats.mean, np.random.default_rng(0))
+    assert (low, high) == pytest.approx((0.5 - 1.96 * 0.05, 0.5 + 1.96 * 0.05), abs=0.006)
 
 
 def test_a_report_counts_seeds_not_episodes(tmp_path):

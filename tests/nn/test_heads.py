@@ -1,0 +1,81 @@
+"""Heads and action targets give what their formulas say."""
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from vd4rl_pomdp.nn.action_target import BinsTarget, KMeansTarget, MSETarget
+from vd4rl_pomdp.nn.heads import PairHead, all_pairs
+
+ROWS, MAX_K = 5, 3
+
+
+def head(k_embedding: bool = True) -> PairHead:
+    torch.manual_seed(0)
+    return PairHead(4, 6, MAX_K, 2, 8, k_embedding)
+
+
+def test_all_pairs_are_those_within_the_window_up_to_the_largest_gap():
+    expected = {(t, k) for t in range(ROWS) for k in range(1, ROWS) if t + k < ROWS and k <= MAX_K}
+    pairs = [tuple(pair) for pair in all_pairs(ROWS, MAX_K).tolist()]
+    assert set(pairs) == expected
+    assert len(pairs) == len(expected)
+
+
+def test_a_pairs_output_is_that_of_its_two_rows_and_its_gap_alone():
+    net, past, future = head(), torch.randn(3, ROWS, 4), torch.randn(3, ROWS, 6)
+    pairs = all_pairs(ROWS, MAX_K)
+    out = net(past, future, pairs)
+    for p, (t, k) in enumerate(pairs.tolist()):
+        alone = net.rest(net.past(past[:, t]) + net.future(future[:, t + k]) + net.k.weight[k])
+        torch.testing.assert_close(out[:, p], alone)
+
+
+def test_the_head_tells_gaps_apart_if_and_only_if_it_is_told_them():
+    """On states that are all alike, nothing but k can make a difference."""
+    alike = torch.ones(1, ROWS, 4), torch.ones(1, ROWS, 6)
+    pairs = all_pairs(ROWS, MAX_K)
+    for told in (True, False):
+        out = head(told)(*alike, pairs)[0]
+        same = torch.isclose(out[:, None], out[None]).all(-1)
+        assert torch.equal(same, (pairs[:, None, 1] == pairs[None, :, 1]) if told else torch.ones_like(same))
+
+
+def test_k_means_asks_for_the_nearest_centre():
+    generator = torch.Generator().manual_seed(0)
+    spots = torch.tensor([[-0.8, -0.8], [0.8, -0.8], [0.0, 0.8]])
+    actions = spots.repeat(50, 1) + 0.05 * torch.randn(150, 2, generator=generator)
+    target = KMeansTarget(actions.numpy(), 3, seed=0)
+    found = torch.cdist(spots, target.centers)
+    assert found.min(1).values.max() < 0.05, "the centres are those of the three heaps"
+    code = found.argmin(1).repeat(50)
+    sure = 50.0 * F.one_hot(code, 3)
+    assert target.loss(sure, actions).max() < 1e-6, "who names the own heap is right"
+    assert target.loss(-sure, actions).min() > 10
+    torch.testing.assert_close(target.loss(torch.zeros(150, 3), actions), torch.full((150,), 3.0).log())
+
+
+def test_bins_are_equal_shares_of_each_dimension():
+    target = BinsTarget(2, 4)
+    action = torch.tensor([[-1.0, -0.51], [-0.49, 0.01], [0.49, 0.51], [1.0, 3.0]])
+    code = torch.tensor([[0, 0], [1, 2], [2, 3], [3, 3]])
+    sure = 50.0 * F.one_hot(code, 4).flatten(1)
+    assert target.loss(sure, action).max() < 1e-6
+    half = sure.clone()
+    half[:, 4:] = 0  # the second dimension is guessed
+    torch.testing.assert_close(target.loss(half, action), torch.full((4,), 4.0).log() / 2)
+
+
+@pytest.mark.parametrize("scale", [0.5, 2.0])
+def test_squared_errors_are_means_over_dimensions_and_normalised_ones_know_no_lengths(scale: float):
+    prediction, action = torch.tensor([[3.0, 4.0]]), torch.tensor([[0.0, 1.0]])
+    assert MSETarget(2, normalise=False).loss(prediction, action).item() == pytest.approx((9 + 9) / 2)
+    normalised = MSETarget(2, normalise=True).loss(scale * prediction, 3 * scale * action).item()
+    assert normalised == pytest.approx(1 - 4 / 5), "of unit vectors: (2 - 2 cos) / 2"
+
+
+def test_a_seed_fixes_the_codes():
+    actions = torch.rand(300, 4, generator=torch.Generator().manual_seed(0)).numpy()  # one heap: many ways to cut it
+    first, second = (KMeansTarget(actions, 8, seed=1).centers for _ in range(2))
+    assert torch.equal(first, second)
+    assert not torch.equal(first, KMeansTarget(actions, 8, seed=2).centers)

@@ -1,0 +1,50 @@
+"""The training loop hands an objective what it needs: observations as the agent sees them, and its own step."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+import torch
+
+from baselines import CURL
+from pretrain.config import PRESETS
+from pretrain.train import Trainer
+from tests.helpers_data import write_fake_set
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.nn import Encoder, EncoderConfig
+
+
+@pytest.fixture
+def trainer(tmp_path) -> Trainer:
+    dataset = open_dataset(write_fake_set(tmp_path / "set", [20, 25]), tmp_path / "cache")
+    torch.manual_seed(0)
+    encoder = Encoder(EncoderConfig(6, "nature", 8))
+    config = replace(PRESETS["smoke"], method="curl", data=Path(), out=Path(), corruption="patch", learning_rate=1e-2)
+    return Trainer(CURL(encoder, 0), dataset, config)
+
+
+def test_curls_momentum_encoder_follows_the_encoder_at_every_step_of_a_training(trainer: Trainer):
+    objective = trainer.objective
+    for _ in range(2):
+        old = [p.clone() for p in objective.momentum_encoder.parameters()]
+        trainer.update()
+        for was, slow, fast in zip(
+            old, objective.momentum_encoder.parameters(), objective.encoder.parameters(), strict=True
+        ):
+            torch.testing.assert_close(slow, was.lerp(fast, 0.05))
+            assert not torch.equal(slow, was)
+
+
+def test_an_objective_is_told_how_much_of_the_training_is_done(trainer: Trainer):
+    told, loss = [], trainer.objective.loss
+    trainer.objective.loss = lambda window, progress: (told.append(progress), loss(window, progress))[1]
+    for _ in range(3):
+        trainer.update()
+    assert told == [0.0, 1 / 20, 2 / 20]
+
+
+def test_an_objective_sees_patches_and_rows_of_one_episode(trainer: Trainer):
+    window = trainer.batch()
+    hidden = (window.obs.view(2, 8, 3, 3, 84, 84) == 0).all(3)
+    assert (hidden.flatten(3).sum(3) >= 16 * 16).all()
+    assert (window.key.diff(dim=1) == 1).all()

@@ -1,0 +1,74 @@
+"""Tables of a handful of rows whose entries can be worked out by hand."""
+
+from typing import Any
+
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.report import tables
+
+SCORES = {
+    # (method, task): {seed: scores of the last evaluation's two episodes}
+    ("acro", "walker_walk"): {0: (10.0, 30.0), 1: (40.0, 40.0)},  # seeds: 20, 40
+    ("acro", "cheetah_run"): {0: (60.0, 60.0), 1: (80.0, 80.0)},
+    ("mik", "walker_walk"): {0: (20.0, 20.0), 1: (30.0, 30.0)},
+    ("mik", "cheetah_run"): {0: (90.0, 90.0), 1: (0.0, 0.0)},
+}
+
+
+def rows() -> list[dict[str, Any]]:
+    """Two evaluations of every run: at step 5 all score 99, at step 10 as above."""
+    return [
+        {
+            "method": method,
+            "task": task,
+            "quality": "expert",
+            "corruption": "patch",
+            "algorithm": "td3_bc",
+            "variant": "",
+        }
+        | {"seed": seed, "step": step, "episode": episode, "score": 99.0 if step == 5 else score}
+        for (method, task), seeds in SCORES.items()
+        for seed, scores in seeds.items()
+        for step in (5, 10)
+        for episode, score in enumerate(scores)
+    ]
+
+
+def of(table: list[dict[str, Any]], **place: Any) -> list[dict[str, Any]]:
+    return [row for row in table if all(row[name] == value for name, value in place.items())]
+
+
+def test_a_summary_is_of_the_last_evaluation_and_names_the_best_beside_it():
+    (row,) = of(tables.summary(rows(), []), method="acro", task="walker_walk")
+    assert (row["step"], row["score"], row["seeds"], row["episodes"]) == (10, 30.0, 2, 4)
+    assert (row["best_step"], row["best_score"], row["few_seeds"]) == (5, 99.0, True)
+    assert (row["low"], row["high"]) == (20.0, 40.0)
+
+
+def test_curves_show_mean_and_range_over_seeds_at_every_evaluation():
+    found = of(tables.curves(rows()), method="acro", task="walker_walk")
+    shown = [(row["step"], row["score"], row["low"], row["high"], row["seeds"]) for row in found]
+    assert shown == [(5, 99.0, 99.0, 99.0, 2), (10, 30.0, 20.0, 40.0, 2)]
+
+
+def test_aggregates_are_over_the_runs_of_all_tasks_at_their_end():
+    (row,) = of(tables.aggregate(rows(), []), method="acro")
+    assert row["iqm"] == pytest.approx((40 + 60) / 2), "the middle half of 20, 40, 60, 80"
+    assert row["optimality_gap"] == pytest.approx(50.0)
+    assert (row["tasks"], row["seeds"]) == (2, 2)
+
+
+def test_profiles_are_shares_of_runs_above_a_score():
+    found = of(tables.profiles(rows(), np.array([0.0, 30.0, 60.0])), method="mik")
+    assert [row["share"] for row in found] == [0.75, 0.25, 0.25], "runs end at 20, 30, 90 and 0"
+
+
+def test_improvement_compares_runs_of_one_task_and_averages_over_tasks():
+    (row,) = of(tables.improvement(rows()), method="acro", other="mik")
+    walker = np.mean([0.5, 0.0, 1.0, 1.0])  # 20 and 40 against 20 and 30
+    cheetah = np.mean([0.0, 1.0, 0.0, 1.0])  # 60 and 80 against 90 and 0
+    assert row["probability"] == pytest.approx((walker + cheetah) / 2)
+    assert row["tasks"] == 2
+    (other,) = of(tables.improvement(rows()), method="mik", other="acro")
+    assert row["probability"] + other["probability"] == pytest.approx(1.0)

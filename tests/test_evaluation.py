@@ -1,0 +1,114 @@
+"""An evaluated agent sees, remembers and is paid what an episode gives, on a scripted environment."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.nn.test_encoder import CARD
+from vd4rl_pomdp import evaluation
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.envs.corrupted import Observation
+from vd4rl_pomdp.envs.dmc import Row
+from vd4rl_pomdp.evaluation import EVALUATION_SEED, EpisodeJob, evaluate, rows_of
+from vd4rl_pomdp.nn import Encoder, EncoderConfig, save_encoder
+from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.types import StepType, Windows
+
+LENGTH, REWARDS = 5, (1.0, 0.5, 0.25, 2.0, 8.0)
+
+
+class ScriptedEnv:
+    """Random pictures by seed, whatever is done; what is clean is white."""
+
+    def __init__(self, *arguments: object) -> None:
+        self.seeds: list[tuple[int, int, int]] = []
+        self.seen: list[list[torch.Tensor]] = []
+        self.done: list[list[np.ndarray]] = []
+
+    def reset(self, environment_seed: int, corruption_seed: int, episode: int) -> Observation:
+        self.seeds.append((environment_seed, corruption_seed, episode))
+        self._random = torch.Generator().manual_seed(environment_seed)
+        self.seen.append([])
+        self.done.append([])
+        return self._show(0.0, StepType.FIRST)
+
+    def step(self, action: np.ndarray) -> Observation:
+        self.done[-1].append(action.copy())
+        t = len(self.done[-1])
+        return self._show(REWARDS[t - 1], StepType.LAST if t == LENGTH else StepType.MID)
+
+    def _show(self, reward: float, step_type: StepType) -> Observation:
+        obs = torch.randint(0, 256, (9, 84, 84), generator=self._random, dtype=torch.uint8)
+        self.seen[-1].append(obs)
+        row = Row(None, np.zeros(24, np.float32), np.zeros(18), reward, 1.0, step_type)
+        return Observation(obs, torch.full_like(obs, 255), row)
+
+
+@pytest.fixture
+def world(monkeypatch) -> list[ScriptedEnv]:
+    """Takes the place of the environments; holds those that were made."""
+    made: list[ScriptedEnv] = []
+    monkeypatch.setattr(evaluation, "CorruptedEnv", lambda *a: (made.append(ScriptedEnv()), made[-1])[1])
+    monkeypatch.setattr(evaluation, "_ENVIRONMENTS", {})
+    monkeypatch.setattr(evaluation, "_AGENTS", {})
+    return made
+
+
+@pytest.fixture
+def agent(tmp_path) -> tuple[Encoder, Policy]:
+    torch.manual_seed(0)
+    encoder = Encoder(EncoderConfig(6, "nature", 16, "gru", use_actions=True, hidden_dim=8)).eval()
+    policy = Policy(8, 6, 8).eval()
+    with torch.no_grad():
+        policy.net[-1].weight.mul_(5)
+    save_encoder(tmp_path / "encoder", encoder, CARD)
+    policy.save(tmp_path / "policy")
+    return encoder, policy
+
+
+def play(folder: Path, *episodes: int) -> list[evaluation.Episode]:
+    places = folder / "encoder", folder / "policy"
+    jobs = [EpisodeJob(*places, 0, "walker_walk", CorruptionConfig("patch"), e, film=False) for e in episodes]
+    return evaluate(jobs, workers=1)
+
+
+def test_actions_are_the_policys_on_what_was_seen_and_done_in_the_episode(world, agent, tmp_path):
+    """Streamed in evaluation, they are those of the whole window as training would encode it."""
+    play(tmp_path, 0, 1)
+    encoder, policy = agent
+    for seen, done in zip(world[0].seen, world[0].done, strict=True):
+        action = torch.from_numpy(np.stack(done))[None]
+        window = Windows(
+            obs=torch.stack(seen[:LENGTH])[None],
+            prev_action=torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], 1),
+            action=action,
+            has_action=torch.ones(1, LENGTH, dtype=torch.bool),
+            length=torch.tensor([LENGTH]),
+            key=torch.zeros(1, LENGTH, dtype=torch.int64),
+        )
+        with torch.no_grad():
+            torch.testing.assert_close(policy(encoder.encode(window)), action, atol=1e-5, rtol=1e-4)
+    assert np.abs(np.diff(world[0].done, axis=1)).max() > 1e-3, "the policy reads something"
+
+
+def test_an_episode_does_not_depend_on_those_before_it(world, agent, tmp_path, monkeypatch):
+    play(tmp_path, 0, 1)
+    monkeypatch.setattr(evaluation, "_ENVIRONMENTS", {})
+    play(tmp_path, 1)
+    np.testing.assert_array_equal(world[0].done[1], world[1].done[0])
+
+
+def test_episode_i_has_the_environment_seed_20000_plus_i_and_its_own_corruption(world, agent, tmp_path):
+    play(tmp_path, 0, 3)
+    assert world[0].seeds == [(20_000, 20_000, 0), (20_003, 20_000, 3)]
+    labels = dict.fromkeys(("method", "task"), "x")
+    assert [row["episode_seed"] for row in rows_of(play(tmp_path, 3), labels)] == [EVALUATION_SEED + 3]
+
+
+def test_a_return_is_the_sum_of_all_rewards_and_a_score_a_tenth_of_it(world, agent, tmp_path):
+    (episode,) = play(tmp_path, 0)
+    assert (episode.total, episode.length) == (sum(REWARDS), LENGTH)
+    (row,) = rows_of([episode], {})
+    assert (row["return"], row["score"], row["length"]) == (11.75, 1.175, LENGTH)
