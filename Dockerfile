@@ -3,7 +3,7 @@
 # `docker run --rm -v "$PWD:/study" vd4rl-pomdp demo` writes into the present folder.
 FROM debian:bookworm-slim
 RUN apt-get update \
-    && apt-get install -y --no-install-recommends python3 python3-venv libegl1 libgl1-mesa-dri \
+    && apt-get install -y --no-install-recommends python3 python3-venv libegl1 libgl1 libgl1-mesa-dri \
     && rm -rf /var/lib/apt/lists/* \
     && python3 -m venv /opt/venv
 ENV PATH=/opt/venv/bin:$PATH MUJOCO_GL=egl LP_NUM_THREADS=1

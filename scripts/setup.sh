@@ -8,7 +8,7 @@ PYTHON="${PYTHON:-python3}"
 VENV=.venv
 STAMP="$VENV/.installed"
 export MUJOCO_GL="${MUJOCO_GL:-egl}"
-RENDER_PACKAGES=(libegl1 libgl1-mesa-dri)
+RENDER_PACKAGES=(libegl1 libgl1 libgl1-mesa-dri)
 if [ "$MUJOCO_GL" = osmesa ]; then
     RENDER_PACKAGES=(libosmesa6)
 fi

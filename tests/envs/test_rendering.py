@@ -113,8 +113,21 @@ def test_tried_versions_pass(version):
     rendering.check_mujoco(version)
 
 
-def test_a_machine_without_opengl_gets_a_sentence():
-    code = "import os; os.environ['MUJOCO_GL'] = 'nothing'; import vd4rl_pomdp.envs.dmc"
-    error = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=False).stderr
-    assert "UserError: cannot render with MUJOCO_GL=nothing" in error.splitlines()[-1]
-    assert "libegl1" in error.splitlines()[-1]
+def last_line(code: str) -> str:
+    command = [sys.executable, "-c", f"{code}; import vd4rl_pomdp.envs.dmc"]
+    return subprocess.run(command, capture_output=True, text=True, check=False).stderr.splitlines()[-1]
+
+
+def test_a_machine_without_opengl_gets_a_sentence(tmp_path):
+    line = last_line("import os; os.environ['MUJOCO_GL'] = 'nothing'")
+    assert "UserError: cannot render with MUJOCO_GL=nothing" in line
+    assert "libegl1" in line
+    (tmp_path / "mujoco.py").write_text("import ctypes\nraise ctypes.ArgumentError('no glGetError')")  # without libgl1
+    line = last_line(f"import sys; sys.path.insert(0, {str(tmp_path)!r})")
+    assert "UserError: cannot render with MUJOCO_GL=" in line
+    assert "libgl1 " in line
+
+
+def test_a_machine_without_dm_control_is_told_how_to_install_it():
+    line = last_line("import sys; sys.modules['dm_control'] = None")
+    assert line.endswith("UserError: dm-control is not installed: `pip install --no-deps dm-control==1.0.44`")

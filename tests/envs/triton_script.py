@@ -9,7 +9,8 @@ import gymnasium
 import vd4rl_pomdp.envs  # noqa: F401 (registers the ids)
 from vd4rl_pomdp.runs.workers import run_jobs
 
-NAMES = ["vd4rl_pomdp/WalkerWalk-v0", "vd4rl_pomdp/MazeOneCurtain-v0", "vd4rl_pomdp/MazeFirstPerson-v0"]
+NAMES = ["vd4rl_pomdp/WalkerWalk-v0", "vd4rl_pomdp/MazeOneCurtain-v0"]
+"""One for each of two workers: only the first in a process tells anything."""
 
 
 def render_then_optimise(name: str) -> bool:
@@ -22,7 +23,7 @@ def render_then_optimise(name: str) -> bool:
 
 def environments() -> None:
     assert all(run_jobs(render_then_optimise, NAMES, workers=2)), "in spawned workers"
-    assert all(map(render_then_optimise, NAMES))
+    assert render_then_optimise(NAMES[0])
 
 
 def stages() -> None:

@@ -67,7 +67,7 @@ def make(**arguments):
 def test_the_environment_passes_gymnasiums_checker():
     env = make(render_mode="ansi")
     with warnings.catch_warnings():
-        warnings.simplefilter("error")
+        warnings.simplefilter("error", UserWarning)  # Gymnasium's kind
         check_env(env.unwrapped)
 
 

@@ -9,6 +9,7 @@ This module alone imports mujoco and dm_control: whatever must happen before Ope
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import hashlib
 import os
 from functools import cache
@@ -28,7 +29,7 @@ def gl_error(error: Exception) -> UserError:
     """A sentence for a machine on which no OpenGL context can be made."""
     return UserError(
         f"cannot render with MUJOCO_GL={os.environ['MUJOCO_GL']} ({str(error).splitlines()[0]}): install Debian's "
-        "libegl1 and libgl1-mesa-dri for MUJOCO_GL=egl, or libosmesa6 for MUJOCO_GL=osmesa"
+        "libegl1, libgl1 and libgl1-mesa-dri for MUJOCO_GL=egl, or libosmesa6 for MUJOCO_GL=osmesa"
     )
 
 
@@ -40,7 +41,7 @@ with contextlib.suppress(ImportError):  # not every PyTorch brings it
 try:  # both load the OpenGL library that MUJOCO_GL names, and fail in many ways where it is missing
     import mujoco
     from dm_control import suite
-except (ImportError, AttributeError, RuntimeError) as _error:
+except (ImportError, AttributeError, RuntimeError, ctypes.ArgumentError) as _error:
     if getattr(_error, "name", None) == "dm_control":
         raise UserError("dm-control is not installed: `pip install --no-deps dm-control==1.0.44`") from _error
     raise gl_error(_error) from _error
