@@ -26,6 +26,7 @@ from vd4rl_pomdp.nn.folder import load_encoder
 from vd4rl_pomdp.nn.policy import load_policy
 from vd4rl_pomdp.policies.actor import Actor, load_actor
 from vd4rl_pomdp.runs.folder import read_json, write_csv
+from vd4rl_pomdp.runs.outputs import refuse_inside
 
 SPANS = ((0, 10), (10, 50), (50, None))
 
@@ -65,6 +66,7 @@ def main(config: Config) -> None:
     """Play all episodes and write the table."""
     if not config.runs:
         raise UserError("no runs given; name fine-tuning run folders")
+    refuse_inside(config.out)
     rows: list[dict[str, Any]] = []
     for run in config.runs:
         labels = read_json(run / "labels.json")

@@ -2,10 +2,12 @@ import importlib
 from pathlib import Path
 
 import numpy as np
+import pytest
 import torch
 
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import Agent
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.policy import Policy
@@ -36,3 +38,11 @@ def test_the_expert_acts_first_and_the_policy_remembers_its_actions(monkeypatch)
         now = watched.step(action)
     assert not np.allclose(executed[59], expert.act(now.row.state))
     assert result["reward"] == round(float(watched.step(executed[59]).row.reward), 4)
+
+
+def test_the_comparison_writes_over_no_run(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    script = importlib.import_module("hand_over")
+    (tmp_path / "config.json").write_text('{"stage": "finetune"}')
+    with pytest.raises(UserError, match=r"lies inside .* which holds a run"):
+        script.main(script.Config((tmp_path,), out=tmp_path / "episodes.csv"))
