@@ -8,6 +8,7 @@ rendering.
 from __future__ import annotations
 
 import csv
+import math
 import tempfile
 import time
 from collections.abc import Sequence
@@ -23,6 +24,7 @@ from vd4rl_pomdp.policies.actor import ships
 from vd4rl_pomdp.runs.folder import read_json, write_csv, write_json
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
+from vd4rl_pomdp.runs.reading import regular
 from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, MOST_EPISODES, SET_QUALITIES, get_task
 
 EPISODES = 200
@@ -30,6 +32,7 @@ CORES = 2
 Row = dict[str, Any]
 RETURNS = ("task", "quality", "episode", "return")
 COSTS = ("task", "episodes", "rows", "cpu_seconds", "commit")
+_WORDS = ("task", "quality", "commit")
 SETS = ("task", "quality", "episodes", "mean", "min", "max", "seconds_100k")
 
 
@@ -116,8 +119,18 @@ def _cost(task: str, episodes: int) -> Row:
 def _read(path: Path, columns: Sequence[str]) -> list[Row]:
     if not path.exists():
         return []
-    with path.open(newline="", encoding="utf-8") as file:
-        reader = csv.DictReader(file)
-        if tuple(reader.fieldnames or ()) != columns:
-            raise UserError(f"{path}: has other columns than {', '.join(columns)}; remove it or choose another --out")
-        return list(reader)
+    try:
+        with regular(path).open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            if tuple(reader.fieldnames or ()) != columns:
+                raise UserError(
+                    f"{path}: has other columns than {', '.join(columns)}; remove it or choose another --out"
+                )
+            rows = list(reader)
+        if not all(math.isfinite(float(row[name])) for row in rows for name in columns if name not in _WORDS):
+            raise ValueError("a number is not finite")
+    except UserError:
+        raise
+    except (ValueError, TypeError, csv.Error) as error:
+        raise UserError(f"{path}: is damaged ({error}); remove it or choose another --out") from error
+    return rows

@@ -15,6 +15,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.grid import Cell
 from vd4rl_pomdp.runs.folder import read_json, write_csv
 from vd4rl_pomdp.runs.metrics import read_metrics
+from vd4rl_pomdp.runs.reading import regular
 from vd4rl_pomdp.runs.settings import settings_of
 
 ROWS, RUNS, TRAJECTORIES = "rows.csv", "runs.csv", "trajectories"
@@ -191,7 +192,9 @@ def _is_navigation(folder: Path) -> bool:
 def _read_run(folder: Path) -> Run:
     try:
         return _run_of(folder)
-    except (KeyError, TypeError) as error:
+    except UserError:
+        raise
+    except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{folder}: its results are damaged ({error}); train it again") from error
 
 
@@ -233,7 +236,7 @@ def _value(row: dict[str, Any]) -> Value:
 def _from_csv(source: Path) -> list[Run]:
     try:
         return _runs_of(source)
-    except (KeyError, TypeError, ValueError) as error:
+    except (KeyError, TypeError, ValueError, csv.Error) as error:
         if isinstance(error, UserError):
             raise
         raise UserError(f"{source}: {ROWS} and {RUNS} do not fit together ({error}); make the report anew") from error
@@ -260,7 +263,7 @@ def _identity(row: dict[str, str]) -> tuple[str, ...]:
 
 def _read(path: Path) -> list[dict[str, str]]:
     try:
-        with path.open(newline="", encoding="utf-8") as file:
+        with regular(path).open(newline="", encoding="utf-8") as file:
             return list(csv.DictReader(file))
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); it is written by the report") from error
