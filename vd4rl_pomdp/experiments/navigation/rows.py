@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import math
 import shutil
 from collections.abc import Iterable
 from dataclasses import dataclass
@@ -168,7 +169,7 @@ def _from_csv(source: Path) -> list[Run]:
 def _runs_of(source: Path) -> list[Run]:
     values: dict[tuple[str, ...], dict[Value, float]] = {}
     for row in _read(source / ROWS):
-        values.setdefault(_identity(row), {})[_value(row)] = float(row["value"])
+        values.setdefault(_identity(row), {})[_value(row)] = _finite(row["value"])
     runs = []
     for row in _read(source / RUNS):
         flags = {name: row[name] == "1" for name in ("self_prediction", "exogenous", "literal_future")}
@@ -180,13 +181,21 @@ def _runs_of(source: Path) -> list[Run]:
     return runs
 
 
+def _finite(text: str) -> float:
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"{text} is no result")
+    return number
+
+
 def _identity(row: dict[str, str]) -> tuple[str, ...]:
     return tuple(row[name] for name in _IDENTITY)
 
 
 def _read(path: Path) -> list[dict[str, str]]:
     try:
-        with regular(path).open(newline="") as file:
-            return list(csv.DictReader(file))
+        text = regular(path).read_text()
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); it is written by the report") from error
+    if not text.endswith("\n"):
+        raise UserError(f"{path}: is cut in its last line; make the report anew")
+    return list(csv.DictReader(text.splitlines()))
