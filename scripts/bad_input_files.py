@@ -179,6 +179,11 @@ READERS: list[tuple[str, list[str], list[str]]] = [
 
 _LOG = "the log decides nothing, and a kill may cut it"
 FINE: dict[str, str] = {
+    "data table | */returns.csv | missing": "its episodes are played anew",
+    "data table | */returns.csv | a dangling link": "its episodes are played anew",
+    "navigation report | */runs.csv | a word for a number": "the last column is a command",
+    "navigation report | */runs.csv | nan": "the last column is a command",
+    "navigation report | */runs.csv | inf": "the last column is a command",
     "report | */timing.json | missing": "a run that is not finished has none",
     "report | */timing.json | a dangling link": "a run that is not finished has none",
     "report | */probe.json | missing": "a set without states gives none",

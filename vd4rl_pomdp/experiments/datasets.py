@@ -64,7 +64,8 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
             continue
         config = CollectConfig(task, quality, Path(), EPISODES, workers=workers)  # type: ignore[arg-type]
         name, hashes = f"{task} {quality}", actor_hashes(config)
-        if actors.get(name) != hashes:
+        known = any((row["task"], row["quality"]) == (task, quality) for row in returns)
+        if actors.get(name) != hashes or not known:
             played = enumerate(replay_returns(config))
             returns = [row for row in returns if (row["task"], row["quality"]) != (task, quality)]
             returns += [{"task": task, "quality": quality, "episode": i, "return": repr(v)} for i, v in played]

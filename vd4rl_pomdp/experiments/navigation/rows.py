@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import io
 import math
 import shlex
 import shutil
@@ -257,13 +258,21 @@ def _runs_of(source: Path) -> list[Run]:
     return runs
 
 
+def _finite(text: str) -> float:
+    if not math.isfinite(number := float(text)):
+        raise ValueError(f"{text} is no result")
+    return number
+
+
 def _identity(row: dict[str, str]) -> tuple[str, ...]:
     return tuple(row[name] for name in _IDENTITY)
 
 
 def _read(path: Path) -> list[dict[str, str]]:
     try:
-        with regular(path).open(newline="", encoding="utf-8") as file:
-            return list(csv.DictReader(file))
+        text = regular(path).read_bytes().decode()
     except OSError as error:
         raise UserError(f"{path}: cannot be read ({error.strerror}); it is written by the report") from error
+    if not text.endswith("\n"):
+        raise UserError(f"{path}: is cut in its last line; make the report anew")
+    return list(csv.DictReader(io.StringIO(text, newline="")))
