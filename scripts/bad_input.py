@@ -36,7 +36,7 @@ from bad_input_flags import Case, flag_cases
 
 from vd4rl_pomdp.cli import main as program
 
-TIME_LIMIT_S = 20
+TIME_LIMIT_S = 60
 SHARED = ("pretrain.train", "pretrain.navigation.train", "finetune.train", "vd4rl_pomdp.report", "sklearn.cluster")
 """Modules that most cases import: once, in this process."""
 ECHO = ("$ vd4rl-pomdp ", "vd4rl-pomdp ")

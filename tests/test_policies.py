@@ -1,4 +1,5 @@
 import json
+import signal
 import sys
 from importlib.metadata import version
 from pathlib import Path
@@ -312,3 +313,40 @@ def test_what_is_no_run_cannot_be_exported(tmp_path):
     with pytest.raises(UserError, match="not the folder of a policy run"):
         export_run(tmp_path, tmp_path / "out")
     assert not (tmp_path / "out").exists()
+
+
+def test_a_signal_keeps_the_decisions_made_and_one_process_owns_the_run(configure, tmp_path, monkeypatch):
+    from vd4rl_pomdp.policies import learner
+    from vd4rl_pomdp.policies.export import read_curve
+    from vd4rl_pomdp.policies.state_env import StateEnv
+    from vd4rl_pomdp.policies.train import decisions_made, train_policy
+    from vd4rl_pomdp.runs.interrupt import Terminated
+    from vd4rl_pomdp.runs.ownership import owned
+
+    monkeypatch.setattr(learner, "RANDOM_DECISIONS", 1_000)  # no update is compiled
+    step, calls = StateEnv.step, []
+
+    def signalled(self, action):
+        calls.append(1)
+        if len(calls) == 10:
+            signal.raise_signal(signal.SIGTERM)
+        return step(self, action)
+
+    config = configure(tmp_path / "run", decisions=80)
+    with monkeypatch.context() as patch:
+        patch.setattr(StateEnv, "step", signalled)
+        with pytest.raises(Terminated) as end:
+            train_policy(config)
+    done = decisions_made(config.out)
+    assert 0 < done < 40
+    assert end.value.reason == f"{config.out} keeps {done} decisions"
+    with owned(config.out), pytest.raises(UserError, match="run: is in use by process"):
+        train_policy(config)
+    train_policy(config)
+    steps = [step for step, _ in read_curve(config.out)]
+    assert steps[0] == done + 40
+    assert steps[-1] >= 80
+    stored = json.loads((config.out / "config.json").read_text())
+    (config.out / "config.json").write_text(json.dumps(stored | {"format": 1}))
+    with pytest.raises(UserError, match="holds a run of format 1, this version writes format"):
+        train_policy(config)

@@ -138,7 +138,7 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
     """
     if not regular(path).is_file() or path.stat().st_size == 0:
         return []
-    with _whole(path), path.open(newline="") as file:
+    with _whole(path), path.open(newline="", encoding="utf-8") as file:
         return _parse(path, file)
 
 

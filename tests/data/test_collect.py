@@ -239,7 +239,7 @@ def test_a_full_disk_leaves_nothing_half_written_and_the_collection_goes_on(whol
 
 
 def test_a_full_disk_at_the_start_is_a_sentence(tmp_path, monkeypatch):
-    def full(path, data):
+    def full(path, data, **options):
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(Path, "write_text", full)

@@ -88,7 +88,11 @@ def test_an_interrupted_run_ends_like_an_uninterrupted_one(maze_set, tmp_path, m
     with pytest.raises(KeyboardInterrupt):
         train(smoke(maze_set, tmp_path / "cut"))
     monkeypatch.setattr(Trainer, "update", update)
+    manifest = tmp_path / "cut" / "checkpoints" / "4" / "manifest.json"
+    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"seconds": 1000.0}))
     train(smoke(maze_set, tmp_path / "cut"))
+    timing = json.loads((tmp_path / "cut" / "timing.json").read_text())
+    assert timing["total_seconds"] >= timing["seconds"] >= 1000
     for name in ("metrics.jsonl", "trajectory.csv", "encoder/model.safetensors"):
         assert (whole.path / name).read_bytes() == (tmp_path / "cut" / name).read_bytes(), name
     assert results(whole.path) == results(tmp_path / "cut")

@@ -107,7 +107,7 @@ def test_an_encoder_card_of_nonsense_is_one_line(tmp_path, part, field, value):
     config = json.loads((tmp_path / "config.json").read_text())
     config[part][field] = value
     (tmp_path / "config.json").write_text(json.dumps(config))
-    with pytest.raises(UserError, match=r"config\.json: names no encoder") as caught:
+    with pytest.raises(UserError, match=r"(names no|not an) encoder") as caught:
         load_encoder(tmp_path)
     assert "\n" not in str(caught.value)
     (tmp_path / "config.json").write_bytes(b"\x80\x04")

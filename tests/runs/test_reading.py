@@ -51,7 +51,7 @@ def test_values_have_the_declared_types():
 @pytest.mark.parametrize("line", ["[]", '{"loss": 1.0}', '{"step": "1"}', NESTED, "nonsense"], ids=range(5))
 def test_a_damaged_line_of_metrics_is_named(tmp_path, line):
     (tmp_path / "metrics.jsonl").write_text(f'{{"step": 1, "loss": 0.5}}\n{line}\n')
-    with pytest.raises(UserError, match=r"metrics\.jsonl: a line is damaged"):
+    with pytest.raises(UserError, match=r"metrics\.jsonl: a line is not JSON of numbers"):
         read_metrics(tmp_path / "metrics.jsonl")
 
 

@@ -167,6 +167,8 @@ def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, str]:
     record = path / RECORD
     if record.exists():
         provenance = read_json(record)
+        if not all(isinstance(provenance.get(name, {}), dict) for name in ("render", "versions")):
+            raise UserError(f"{record}: is damaged; remove it, and the card goes without it")
         rendered = provenance.get("render", {})
         facts["rendered by"] = ", ".join(str(rendered[k]) for k in ("gl_vendor", "gl_renderer") if k in rendered)
         facts["canary frames"] = rendered.get("canary")

@@ -19,6 +19,7 @@ from vd4rl_pomdp.data.format import PLAN, RECORD, write_shard
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.folder import holds_anything, jsonable, read_json, write_json
+from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.progress import ProgressLine
@@ -27,6 +28,7 @@ from vd4rl_pomdp.runs.workers import count_workers, run_jobs
 from vd4rl_pomdp.seeding import stream_seed
 from vd4rl_pomdp.tasks import (
     EPISODE_TRANSITIONS,
+    FRAME_SIZE,
     MOST_EPISODES,
     NOISY_QUALITIES,
     SET_QUALITIES,
@@ -158,6 +160,8 @@ def _check(config: CollectConfig) -> None:
     get_task(config.task)
     refuse_outside(config, episodes=(1, MOST_EPISODES), episodes_per_shard=1, seed=(0, MAX_SEED), workers=0)
     refuse_outside(config, action_noise=(0, MAX_NOISE))
+    shard = min(config.episodes, config.episodes_per_shard) * (EPISODE_TRANSITIONS + 1)
+    require_memory(shard * 3 * FRAME_SIZE**2, CPU, config, "episodes", "episodes_per_shard")
     if config.quality not in SET_QUALITIES:
         raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(SET_QUALITIES)}")
     base = _base(config)

@@ -100,8 +100,8 @@ def load_encoder(
         )
     try:
         encoder = Encoder(encoder_config)
-        make_corruption(build(CorruptionConfig, card.corruption))
-    except (TypeError, RuntimeError, ValueError) as error:
+        make_corruption(build(CorruptionConfig, {"corruption": card.corruption["corruption"], **card.corruption}))
+    except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise UserError(f"{folder}/config.json: names no encoder ({_first_line(error)}); pretrain it again") from error
     try:
         encoder.load_state_dict(read_tensors(folder / WEIGHTS))

@@ -195,10 +195,11 @@ def _try(path: Path, actor: Actor, task: Task | None) -> None:
     if task is None:
         return
     try:
-        action = actor.act(np.zeros(task.state_dim, np.float32), np.random.default_rng(0))
-    except (KeyError, ValueError) as error:
+        finite = all(np.isfinite(value).all() for value in actor.weights.values())
+        action = actor.act(np.zeros(task.state_dim, np.float32), np.random.default_rng(0)) if finite else None
+    except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path}: its weights form no actor of {task.name} ({error}); {_REMEDY}") from error
-    if action.shape != (task.action_dim,) or not all(np.isfinite(value).all() for value in actor.weights.values()):
+    if action is None or action.shape != (task.action_dim,):
         raise UserError(f"{path}: its weights form no actor of {task.name}; {_REMEDY}")
 
 

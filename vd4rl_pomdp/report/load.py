@@ -15,11 +15,14 @@ from vd4rl_pomdp.evaluation import read_rows
 from vd4rl_pomdp.report.variants import Parts, Settings, differences, read_settings
 from vd4rl_pomdp.runs.folder import read_json
 from vd4rl_pomdp.runs.metrics import read_metrics
+from vd4rl_pomdp.runs.reading import regular
 
 LABELS = ("task", "quality", "corruption", "algorithm", "method", "seed")
 """What names a run's rows."""
 IDENTITY = ("task", "quality", "corruption", "algorithm", "method", "variant", "seed")
 """What tells a run's rows from all others of a report."""
+FILM = {"clean": 4, "corrupted": 4, "return": 1}
+"""Arrays of a film and their axes."""
 
 
 @dataclass(frozen=True)
@@ -75,9 +78,14 @@ class Run:
         if not path.exists():
             return None
         try:
-            with np.load(path) as file:
-                return dict(file)
-        except (OSError, ValueError, EOFError, BadZipFile) as error:
+            with np.load(regular(path)) as file:
+                film = dict(file)
+            if [film[name].ndim for name in FILM] != list(FILM.values()):
+                raise ValueError("its arrays have other shapes")
+            return film
+        except UserError:
+            raise
+        except (OSError, ValueError, KeyError, EOFError, BadZipFile) as error:
             raise UserError(f"{path}: cannot be read ({error}); remove it, and the report goes without") from error
 
 
@@ -90,11 +98,13 @@ def load_runs(paths: list[Path]) -> list[Run]:
         if not path.exists():
             raise UserError(f"{path}: no such folder")
         folders += sorted(p.parent for p in path.rglob("config.json") if _is_run(p))
-    runs = [_load(folder) for folder in dict.fromkeys(folders)]
+    runs = [_read(folder) for folder in dict.fromkeys(folders)]
     if not runs:
         raise UserError(f"{paths[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl)")
     named = [_with_parts(run, parts) for run, parts in zip(runs, compare(runs), strict=True)]
     _refuse_twins(named)
+    for run in named:
+        run.film()  # a damaged one is told before anything is written
     return named
 
 
@@ -125,10 +135,18 @@ def _is_run(config: Path) -> bool:
     return "stage" in read_json(config)
 
 
+def _read(folder: Path) -> Run:
+    """`_load`, with a sentence for files of a run that are JSON but not what a run writes."""
+    try:
+        return _load(folder)
+    except (KeyError, TypeError, AttributeError) as error:
+        raise UserError(f"{folder}: its files are damaged ({error}); take another copy, or leave it out") from error
+
+
 def _load(folder: Path) -> Run:
     record = read_json(folder / "config.json")
-    if not isinstance(record.get("config"), dict):
-        raise UserError(f"{folder / 'config.json'}: holds no config; remove the run or start it anew")
+    if not isinstance(record["config"], dict) or "seed" not in record["config"]:
+        raise TypeError("config.json holds no settings")
     rows = read_rows(folder / "episodes.csv")
     card = _card(folder)
     timing = folder / "timing.json"
@@ -140,7 +158,7 @@ def _load(folder: Path) -> Run:
         settings=read_settings(record, card if record["stage"] == "finetune" else {}),
         rows=rows,
         metrics=read_metrics(folder / "metrics.jsonl"),
-        seconds=read_json(timing)["seconds"] if timing.exists() else None,
+        seconds=_number(read_json(timing)["seconds"]) if timing.exists() else None,
         representation=_representation(folder, card),
     )
 
@@ -172,11 +190,17 @@ def _representation(folder: Path, card: dict[str, Any]) -> dict[str, float | Non
         read_json(path) if path.exists() else {} for path in (folder / "probe.json", folder / "pretrain_timing.json")
     )
     return {
-        "action_loss": card.get("action_loss"),
-        "probe_pose": probe.get("probe_pose"),
-        "probe_velocity": probe.get("probe_velocity"),
-        "pretrain_seconds": timing.get("seconds"),
+        "action_loss": _number(card.get("action_loss")),
+        "probe_pose": _number(probe.get("probe_pose")),
+        "probe_velocity": _number(probe.get("probe_velocity")),
+        "pretrain_seconds": _number(timing.get("seconds")),
     }
+
+
+def _number(value: Any) -> float | None:
+    if value is not None and not isinstance(value, int | float):
+        raise TypeError(f"{value!r} is no number")
+    return value
 
 
 def _refuse_twins(runs: list[Run]) -> None:

@@ -27,7 +27,7 @@ def memory_of(device: torch.device) -> int:
     if device.type == "cuda":
         return torch.cuda.get_device_properties(device).total_memory
     whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
-    limit = _LIMIT.read_text().strip() if _LIMIT.exists() else "max"
+    limit = _LIMIT.read_text(encoding="utf-8").strip() if _LIMIT.exists() else "max"
     return min(whole, int(limit)) if limit.isdigit() else whole
 
 

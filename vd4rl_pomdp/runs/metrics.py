@@ -53,7 +53,7 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
     except UserError:
         raise
     except ValueError as error:
-        raise UserError(f"{path}: a line is damaged ({error}); remove the line") from error
+        raise UserError(f"{path}: a line is not JSON of numbers ({error}); remove the line") from error
 
 
 def _row(line: str) -> dict[str, float]:

@@ -31,6 +31,8 @@ def read_bytes(path: Path) -> bytes:
         return regular(path).read_bytes()
     except FileNotFoundError:
         raise
+    except NotADirectoryError as error:
+        raise FileNotFoundError(error.errno, error.strerror, str(path)) from error
     except OSError as error:
         raise disk_error(path, error) from error
 

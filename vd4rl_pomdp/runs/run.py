@@ -61,13 +61,13 @@ class RunFolder:
                 f"{self.path}: holds a run of format {stored.get('format', 1)}, this version writes format {FORMAT} "
                 "and cannot go on with it; choose another --out"
             )
-        old = stored.get("config", {})
+        old, inputs = (part if isinstance(part := stored.get(name), dict) else {} for name in ("config", "inputs"))
         keys = (set(old) | set(self.config)) - RUNTIME_FIELDS
         differing = sorted(k for k in keys if old.get(k) != self.config.get(k))
         if stored["stage"] != self._stage or differing:
             what = ", ".join(differing) or f"stage {stored['stage']}"
             raise UserError(f"{self.path}: holds a run with another config ({what}); choose another --out or remove it")
-        self._check_inputs(stored.get("inputs", {}))
+        self._check_inputs(inputs)
 
     def _check_inputs(self, old: dict[str, str]) -> None:
         for name, now in self.inputs.items():

@@ -8,7 +8,6 @@ import multiprocessing.connection
 import os
 import threading
 import traceback
-import weakref
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
@@ -35,8 +34,9 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
     if workers <= 1 or len(jobs) <= 1:
         yield from map(function, jobs)
         return
-    crew = _Crew(function, min(workers, len(jobs)))
+    crew = _Crew()
     try:
+        crew.start(function, min(workers, len(jobs)))
         yield from crew.results(jobs)
     finally:
         crew.end()
@@ -56,9 +56,12 @@ class _Crew:
     when they are killed; pipes need neither.
     """
 
-    def __init__(self, function: Callable[[Any], Any], size: int) -> None:
+    def __init__(self) -> None:
         self._workers: dict[Connection, Any] = {}
         _CREWS.add(self)
+
+    def start(self, function: Callable[[Any], Any], size: int) -> None:
+        """Start the processes, which do `function`."""
         context = multiprocessing.get_context("spawn")
         resource_tracker.ensure_running()  # unblocks signals where it is started later
         for _ in range(size):
@@ -120,7 +123,7 @@ class _Crew:
         _CREWS.discard(self)
 
 
-_CREWS: weakref.WeakSet[_Crew] = weakref.WeakSet()
+_CREWS: set[_Crew] = set()
 
 
 @atexit.register
