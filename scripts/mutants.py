@@ -60,7 +60,7 @@ class Mutant:
 
     def apply(self, tree: Path) -> str:
         """Text of its file with the edit; raises ValueError if the old text is not there exactly once."""
-        text = (tree / self.file).read_text()
+        text = (tree / self.file).read_text(encoding="utf-8")
         if (count := text.count(self.old)) != 1:
             raise ValueError(f"{LIST.name}: {self.name!r}: its old text is in {self.file} {count} times, not once")
         return text.replace(self.old, self.new)
@@ -68,7 +68,7 @@ class Mutant:
 
 def load_mutants(path: Path = LIST) -> list[Mutant]:
     """All mutants, in order."""
-    sections = tomllib.loads(path.read_text())
+    sections = tomllib.loads(path.read_text(encoding="utf-8"))
     return [
         Mutant(section, **(entry | {"tests": tuple(entry["tests"])}))
         for section, entries in sections.items()
@@ -100,7 +100,7 @@ def first_failure(root: Path, edits: dict[str, str], tests: tuple[str, ...], lim
         tree, log = Path(scratch, "tree"), Path(scratch, "log")
         copy_tree(root, tree)
         for name, text in edits.items():
-            (tree / name).write_text(text)
+            (tree / name).write_text(text, encoding="utf-8")
         words = ["-x", "-q", "--tb=no", "-rfE", "-p", "no:cacheprovider", f"--basetemp={scratch}/pytest", *tests]
         process = _CONTEXT.Process(target=_run_pytest, args=(words, tree, log))
         process.start()
@@ -108,7 +108,7 @@ def first_failure(root: Path, edits: dict[str, str], tests: tuple[str, ...], lim
         if process.exitcode is None:
             _kill(process)
             return f"the time limit of {limit:g} s"
-        return _read_failure(log.read_text(), process.exitcode)
+        return _read_failure(log.read_text(encoding="utf-8"), process.exitcode)
 
 
 def _run_pytest(words: list[str], tree: Path, log: Path) -> NoReturn:
@@ -119,7 +119,7 @@ def _run_pytest(words: list[str], tree: Path, log: Path) -> NoReturn:
     os.environ |= settings
     sys.dont_write_bytecode = True
     sys.path.insert(0, str(tree))
-    with log.open("w") as file:
+    with log.open("w", encoding="utf-8") as file:
         os.dup2(file.fileno(), 1)
         os.dup2(file.fileno(), 2)
     import pytest
@@ -205,7 +205,7 @@ def main() -> int:
     if words.only:
         print(_COLUMNS, *(row(*one) for one in tried), sep="\n")
     else:
-        PAGE.write_text(page(tried))
+        PAGE.write_text(page(tried), encoding="utf-8")
     return int(any(verdict == SURVIVED for _, verdict in tried))
 
 
