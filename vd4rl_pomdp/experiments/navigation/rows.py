@@ -258,12 +258,6 @@ def _runs_of(source: Path) -> list[Run]:
     return runs
 
 
-def _finite(text: str) -> float:
-    if not math.isfinite(number := float(text)):
-        raise ValueError(f"{text} is no result")
-    return number
-
-
 def _identity(row: dict[str, str]) -> tuple[str, ...]:
     return tuple(row[name] for name in _IDENTITY)
 
