@@ -16,6 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from finetune.algorithms import Algorithm
 from finetune.config import FinetuneConfig
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.encoder import Encoder
@@ -26,7 +27,7 @@ from vd4rl_pomdp.types import Transitions
 class EndToEnd:
     """An algorithm together with the encoder that its first loss trains."""
 
-    def __init__(self, algorithm: Any, encoder: Encoder, config: FinetuneConfig) -> None:
+    def __init__(self, algorithm: Algorithm, encoder: Encoder, config: FinetuneConfig) -> None:
         self.algorithm, self.encoder, self.config = algorithm, encoder.train().requires_grad_(True), config
         self.policy = algorithm.policy
         self.optimiser = torch.optim.Adam(encoder.parameters(), lr=config.learning_rate)
@@ -38,15 +39,16 @@ class EndToEnd:
             z = self.encoder.frame(batch.obs).float()
             with torch.no_grad():
                 next_z = self.encoder.frame(batch.next_obs).float()
-        self.optimiser.zero_grad(set_to_none=True)
-        metrics = self.algorithm.update(FeatureBatch(z, batch.action, batch.reward, batch.discount, next_z))
-        self.optimiser.step()
-        return metrics
+        features = FeatureBatch(z, batch.action, batch.reward, batch.discount, next_z)
+        return self.algorithm.update(features, self.optimiser)
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on."""
-        parts = {"algorithm": self.algorithm, "encoder": self.encoder, "optimiser": self.optimiser}
-        return {name: part.state_dict() for name, part in parts.items()}
+        return {
+            "algorithm": self.algorithm.state_dict(),
+            "encoder": self.encoder.state_dict(),
+            "optimiser": self.optimiser.state_dict(),
+        }
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""

@@ -2,33 +2,29 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
 
+from finetune.algorithms.algorithm import Algorithm, Loss
 from finetune.config import FinetuneConfig
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.policy import Policy
 
 
-class BC:
+class BC(Algorithm):
     """See the module."""
-
-    options: tuple[str, ...] = ()
 
     def __init__(self, policy: Policy, config: FinetuneConfig, generator: torch.Generator) -> None:
         self.policy = policy
         self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=config.learning_rate, fused=True)
 
-    def update(self, batch: FeatureBatch) -> dict[str, Tensor]:
-        """One step; returns detached scalars."""
+    def losses(self, batch: FeatureBatch) -> Iterator[Loss]:
+        """See the module."""
         loss = F.mse_loss(self.policy(batch.z), batch.action)
-        self.optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        self.optimiser.step()
-        return {"bc_loss": loss.detach()}
+        yield Loss(loss, self.optimiser, {"bc_loss": loss.detach()})
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on."""

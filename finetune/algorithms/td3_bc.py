@@ -11,12 +11,14 @@ Differences: states are frozen representations, standardised like the authors' s
 from __future__ import annotations
 
 import copy
+from collections.abc import Iterator
 from typing import Any
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from finetune.algorithms.algorithm import Algorithm, Loss
 from finetune.config import FinetuneConfig
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.heads import mlp
@@ -39,7 +41,7 @@ class TwinCritic(nn.Module):
         return self.first(both)[:, 0], self.second(both)[:, 0]
 
 
-class TD3BC:
+class TD3BC(Algorithm):
     """See the module."""
 
     options: tuple[str, ...] = ("alpha", "gamma", "n_step")
@@ -56,26 +58,22 @@ class TD3BC:
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.learning_rate, fused=True)
         self.updates = 0
 
-    def update(self, batch: FeatureBatch) -> dict[str, Tensor]:
-        """One critic step, and every other time one actor step; returns detached scalars."""
+    def losses(self, batch: FeatureBatch) -> Iterator[Loss]:
+        """The critics', and every other time the actor's."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
-        metrics = self._update_critic(z, batch, next_z)
+        yield self._critic_loss(z, batch, next_z)
         self.updates += 1
         if self.updates % self.policy_delay == 0:
-            metrics |= self._update_policy(z.detach(), batch.action)
+            yield self._policy_loss(z.detach(), batch.action)
             self._move_targets()
-        return metrics
 
-    def _update_critic(self, z: Tensor, batch: FeatureBatch, next_z: Tensor) -> dict[str, Tensor]:
+    def _critic_loss(self, z: Tensor, batch: FeatureBatch, next_z: Tensor) -> Loss:
         with torch.no_grad():
             value = torch.minimum(*self.target_critic(next_z, self._next_action(next_z)))
             target = batch.reward + self.config.gamma * batch.discount * value
         first, second = self.critic(z, batch.action)
         loss = F.mse_loss(first, target) + F.mse_loss(second, target)
-        self.critic_optimiser.zero_grad(set_to_none=True)
-        loss.backward()
-        self.critic_optimiser.step()
-        return {"critic_loss": loss.detach(), "q": first.detach().mean()}
+        return Loss(loss, self.critic_optimiser, {"critic_loss": loss.detach(), "q": first.detach().mean()})
 
     def _next_action(self, next_z: Tensor) -> Tensor:
         """Action of the target policy, smoothed by clipped noise."""
@@ -93,16 +91,13 @@ class TD3BC:
         """The action that the actor's loss is about."""
         return self.policy.from_standardised(z)
 
-    def _update_policy(self, z: Tensor, action: Tensor) -> dict[str, Tensor]:
+    def _policy_loss(self, z: Tensor, action: Tensor) -> Loss:
         chosen = self._policy_action(z)
         value = self._policy_value(z, chosen)
         weight = self.config.alpha / value.abs().mean().detach()
         cloning = F.mse_loss(chosen, action)
         loss = cloning - weight * value.mean()
-        self.policy_optimiser.zero_grad(set_to_none=True)
-        loss.backward(inputs=list(self.policy.net.parameters()))
-        self.policy_optimiser.step()
-        return {"actor_loss": loss.detach(), "bc_loss": cloning.detach()}
+        return Loss(loss, self.policy_optimiser, {"actor_loss": loss.detach(), "bc_loss": cloning.detach()})
 
     @torch.no_grad()
     def _move_targets(self) -> None:

@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from finetune.algorithms import ALGORITHMS, drqv2_bc, td3_bc
+from finetune.algorithms import ALGORITHMS, Loss, drqv2_bc, td3_bc
 from finetune.algorithms.bc import BC
 from finetune.algorithms.drqv2_bc import DrQv2BC
 from finetune.algorithms.td3_bc import TD3BC
@@ -151,3 +151,39 @@ def test_policies_read_standardised_representations():
     policy, given = make(BC).policy, batch()
     mean, std = given.z.mean(0), given.z.std(0, correction=0)
     torch.testing.assert_close(policy(given.z), policy.from_standardised((given.z - mean) / std), atol=1e-3, rtol=1e-3)
+
+
+@pytest.mark.parametrize("kind", [BC, TD3BC, DrQv2BC])
+def test_an_encoder_is_trained_by_the_first_loss_and_by_no_other(kind):
+    """V-D4RL's references train the encoder by the critic's loss (bc: by cloning); the actor's gradient stops at z."""
+    torch.manual_seed(0)
+    encoder, given = torch.nn.Linear(DIM, DIM), batch()
+    optimiser = torch.optim.SGD(encoder.parameters(), lr=1.0)
+    algorithm, twin = (make(kind, learning_rate=0.0) for _ in range(2))
+    alone = next(twin.losses(replace(given, z=encoder(given.z)))).value
+    expected = torch.autograd.grad(alone, list(encoder.parameters()))
+    before = [p.clone() for p in encoder.parameters()]
+    for number in range(2):  # the second update of TD3+BC trains the actor, too
+        moved = encoder.weight.clone()
+        algorithm.update(replace(given, z=encoder(given.z)), optimiser)
+        assert not torch.equal(encoder.weight, moved)
+        if number == 0:
+            for old, now, grad in zip(before, encoder.parameters(), expected, strict=True):
+                torch.testing.assert_close(now, old - grad)
+
+
+def test_an_update_steps_along_each_loss_before_the_next_is_computed():
+    """What an algorithm of one's own may count on."""
+    weight = torch.nn.Parameter(torch.zeros(()))
+    steps = torch.optim.SGD([weight], lr=1.0)
+    seen = []
+
+    class Twice(BC):
+        def losses(self, batch):
+            for _ in range(2):
+                seen.append(weight.item())
+                yield Loss(weight * 1.0, steps, {f"loss{len(seen)}": weight.detach().clone()})
+
+    algorithm = make(Twice)
+    assert [v.item() for v in algorithm.update(batch()).values()] == [0.0, -1.0]
+    assert seen == [0.0, -1.0]

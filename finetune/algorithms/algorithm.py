@@ -1,0 +1,72 @@
+"""What a fine-tuning algorithm is: losses in order, each with the optimiser that follows its gradient."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Iterator
+from typing import Any, NamedTuple
+
+from torch import Tensor
+from torch.optim import Optimizer
+
+from finetune.features import FeatureBatch
+from vd4rl_pomdp.nn.policy import Policy
+
+
+class Loss(NamedTuple):
+    """One loss of an update."""
+
+    value: Tensor
+    """Scalar."""
+    optimiser: Optimizer
+    """What steps along its gradient; no other parameter takes any."""
+    logs: dict[str, Tensor]
+    """Detached scalars."""
+
+
+class Algorithm(ABC):
+    """Trains a policy on batches of representations."""
+
+    policy: Policy
+    options: tuple[str, ...] = ()
+    """Which of `OPTIONS` it reads; the others are refused."""
+
+    @abstractmethod
+    def losses(self, batch: FeatureBatch) -> Iterator[Loss]:
+        """The losses of one update; a step is made along each before the next is computed.
+
+        The first is the one that trains the encoder, where there is no frozen stage: its gradient reaches `batch.z`.
+        """
+
+    def update(self, batch: FeatureBatch, encoder: Optimizer | None = None) -> dict[str, Tensor]:
+        """One update.
+
+        Args:
+            batch: transitions of representations.
+            encoder: optimiser of what computed `batch.z`, if that is trained too.
+
+        Returns:
+            Detached scalars of all losses.
+        """
+        logs: dict[str, Tensor] = {}
+        for loss in self.losses(batch):
+            _step(loss.value, [loss.optimiser] if encoder is None else [loss.optimiser, encoder])
+            logs |= loss.logs
+            encoder = None
+        return logs
+
+    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on, targets and optimisers included."""
+
+    @abstractmethod
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+
+
+def _step(loss: Tensor, optimisers: list[Optimizer]) -> None:
+    for optimiser in optimisers:
+        optimiser.zero_grad(set_to_none=True)
+    loss.backward(inputs=[p for optimiser in optimisers for group in optimiser.param_groups for p in group["params"]])
+    for optimiser in optimisers:
+        optimiser.step()
