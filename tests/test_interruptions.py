@@ -154,10 +154,10 @@ def test_a_disk_that_is_full_from_the_start_leaves_a_folder_that_goes_on(data, t
     config = smoke_pretrain(data, tmp_path / "run", method="no_history")
     write = Path.write_text
 
-    def full(path: Path, content: str, *arguments: Any) -> int:
+    def full(path: Path, content: str, **options: Any) -> int:
         if path.name == name:
             raise OSError(errno.ENOSPC, "No space left on device")
-        return write(path, content, *arguments)
+        return write(path, content, **options)
 
     with monkeypatch.context() as patch:
         patch.setattr(Path, "write_text", full)
