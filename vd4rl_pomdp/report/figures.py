@@ -81,11 +81,11 @@ def _style(number: int) -> dict[str, Any]:
     return {"color": COLOURS[number % len(COLOURS)], "linestyle": dashes}
 
 
-def loss_figure(series: list[tuple[str, list[dict[str, float]]]]) -> str:
-    """Pretraining action loss against steps, one line a run; those of one method look alike."""
+def loss_figure(series: list[tuple[str, list[dict[str, float]]]], methods: list[str]) -> str:
+    """Pretraining action loss against steps, one line a run; those of a method look as in the other figures."""
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     axes = figure.subplots()
-    methods = list(dict.fromkeys(name for name, _ in series))
+    methods = list(dict.fromkeys([*methods, *(name for name, _ in series)]))
     for number, (name, metrics) in enumerate(series):
         steps = [row["step"] for row in metrics if "action_loss" in row]
         values = [row["action_loss"] for row in metrics if "action_loss" in row]

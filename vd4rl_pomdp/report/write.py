@@ -119,7 +119,7 @@ def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]], study:
             (name, figures.profile_figure(part, names, _partial(made["aggregate"], name)))
             for name, part in _by(made["profiles"], "corruption")
         ],
-        losses=[(name, figures.loss_figure(series)) for name, series in pretraining.items()],
+        losses=[(name, figures.loss_figure(series, names)) for name, series in pretraining.items()],
         films=_films(runs),
         published=_published(rows),
         theory=section(study) if study else None,
