@@ -16,7 +16,7 @@ from finetune.end_to_end import EndToEnd
 from finetune.features import STAGE, ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
-from vd4rl_pomdp.envs.parity import render_info
+from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_number, refuse_outside, refuse_unread
 from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, read_rows, rows_of
 from vd4rl_pomdp.nn.encoder import Encoder

@@ -175,11 +175,12 @@ def test_a_run_that_another_process_writes_is_refused_by_every_stage(stage, tmp_
 
 def test_a_set_that_another_process_collects_is_refused(tmp_path):
     from vd4rl_pomdp.data import collect
-    from vd4rl_pomdp.experiments.navigation import collect as navigation
+    from vd4rl_pomdp.navigation.collect import collect as collect_maze
+    from vd4rl_pomdp.navigation.config import PRESETS
 
     configs = [
         (collect.collect, collect.CollectConfig("walker_walk", "random", tmp_path / "set", workers=1)),
-        (navigation.collect, replace(navigation.PRESETS["smoke"], maze="no_curtain", out=tmp_path / "set", workers=1)),
+        (collect_maze, replace(PRESETS["smoke"], maze="no_curtain", out=tmp_path / "set", workers=1)),
     ]
     for run, config in configs:
         with owned(tmp_path / "set"), pytest.raises(UserError, match="set: is in use by process"):

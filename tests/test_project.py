@@ -4,6 +4,7 @@ import ast
 import re
 import subprocess
 import tomllib
+from collections.abc import Iterable, Iterator
 from importlib.metadata import requires
 from pathlib import Path
 
@@ -20,34 +21,85 @@ MAY_IMPORT = {
     "pretrain": {"pretrain", "baselines", "vd4rl_pomdp"},
     "finetune": {"finetune", "vd4rl_pomdp"},
 }
-DISPATCHERS = (
-    "vd4rl_pomdp/cli/stages.py",
-    "vd4rl_pomdp/cli/navigation.py",
-    "vd4rl_pomdp/experiments/bench/training.py",
-    "vd4rl_pomdp/experiments/bench/memory.py",
-)
-"""Files that call the stages and import them inside functions only."""
+MAY_CALL_STAGES = ("vd4rl_pomdp/cli/", "vd4rl_pomdp/experiments/bench/")
+"""Folders whose functions call the stages, and import them there: what is not called is not loaded."""
+JUDGES = "vd4rl_pomdp.experiments"
+"""What judges runs: the command line alone imports it."""
+JUDGES_MAZES_BY = ("errors", "experiments.navigation", "mazes", "navigation.config", "navigation.methods")
+JUDGES_MAZES_BY += ("report.stats", "runs", "text")
+"""What the navigation tables are made with: files, names and settings; no data, no environment and no network."""
 
 
-def imports(tree: ast.AST) -> set[str]:
+def everywhere(tree: ast.AST) -> set[str]:
+    """Names of the modules that a module imports, whenever it does."""
+    return _names(ast.walk(tree))
+
+
+def at_load(tree: ast.AST) -> set[str]:
+    """Names of the modules that are imported with a module: in no function, and not for types alone."""
+    return _names(_outside_functions(tree))
+
+
+def _outside_functions(tree: ast.AST) -> Iterator[ast.AST]:
+    for node in ast.iter_child_nodes(tree):
+        yield node
+        types_alone = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
+        if not types_alone and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
+            yield from _outside_functions(node)
+
+
+def _names(nodes: Iterable[ast.AST]) -> set[str]:
     names = set()
-    for node in ast.walk(tree):
+    for node in nodes:
         if isinstance(node, ast.ImportFrom) and node.module:
-            names.add(node.module.split(".")[0])
+            names |= {f"{node.module}.{alias.name}" for alias in node.names}
         elif isinstance(node, ast.Import):
-            names |= {alias.name.split(".")[0] for alias in node.names}
+            names |= {alias.name for alias in node.names}
     return names
+
+
+def importers(of: str) -> list[str]:
+    """Files outside a package, given by its dotted name, that import it."""
+    inside = of.replace(".", "/") + "/"
+    names = {path.relative_to(ROOT).as_posix(): everywhere(ast.parse(path.read_text())) for path in SOURCES}
+    return [
+        file for file in names if not file.startswith(inside) and any(f"{n}.".startswith(f"{of}.") for n in names[file])
+    ]
 
 
 def test_layers_import_only_what_is_below_them():
     wrong = []
     for path in SOURCES:
-        name = path.relative_to(ROOT).as_posix()
-        tree = ast.parse(path.read_text())
-        if name in DISPATCHERS:
-            tree = ast.Module([n for n in tree.body if isinstance(n, ast.Import | ast.ImportFrom)], [])
-        outside = (imports(tree) & set(PACKAGES)) - MAY_IMPORT[name.split("/")[0]]
-        wrong += [f"{name} imports {other}" for other in sorted(outside)]
+        name, tree = path.relative_to(ROOT).as_posix(), ast.parse(path.read_text())
+        imported = at_load(tree) if name.startswith(MAY_CALL_STAGES) else everywhere(tree)
+        packages = {module.split(".")[0] for module in imported} & set(PACKAGES)
+        wrong += [f"{name} imports {other}" for other in sorted(packages - MAY_IMPORT[name.split("/")[0]])]
+    assert wrong == []
+
+
+def test_an_import_counts_unless_it_waits_for_a_call_or_is_for_types():
+    source = "import a\nif b: import c\nif TYPE_CHECKING: import d\nclass E:\n    from f import g\n"
+    tree = ast.parse(source + "    def h(self):\n        import i\n")
+    assert at_load(tree) == {"a", "c", "f.g"}
+    assert everywhere(tree) == {"a", "c", "d", "f.g", "i"}
+
+
+def test_what_judges_runs_is_imported_by_the_command_line_alone():
+    assert [name for name in importers(JUDGES) if not name.startswith("vd4rl_pomdp/cli/")] == []
+
+
+def test_environments_know_nothing_of_data():
+    assert [name for name in importers("vd4rl_pomdp.data") if name.startswith("vd4rl_pomdp/envs/")] == []
+
+
+def test_the_navigation_tables_are_made_from_files():
+    allowed = tuple(f"vd4rl_pomdp.{name}." for name in JUDGES_MAZES_BY)
+    wrong = []
+    for path in (ROOT / "vd4rl_pomdp" / "experiments" / "navigation").glob("*.py"):
+        ours = {
+            f"{n}." for n in everywhere(ast.parse(path.read_text())) if n.split(".")[0] in (*PACKAGES, "torch", "h5py")
+        }
+        wrong += [f"{path.name} imports {name}" for name in sorted(ours) if not name.startswith(allowed)]
     assert wrong == []
 
 
@@ -143,7 +195,7 @@ def test_every_flag_of_the_navigation_page_exists():
 
     from pretrain.navigation.config import NavigationConfig
     from vd4rl_pomdp.cli.navigation import GridCommand
-    from vd4rl_pomdp.experiments.navigation.collect import CollectConfig
+    from vd4rl_pomdp.navigation.config import CollectConfig
 
     configs = (NavigationConfig, CollectConfig, GridCommand)
     flags = {f.name.replace("_", "-") for config in configs for f in fields(config)}

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any, Literal
 
 from pretrain.config import PretrainConfig
-from vd4rl_pomdp.experiments.navigation.observations import Picture
+from vd4rl_pomdp.navigation.observations import Picture
 from vd4rl_pomdp.objective import InverseConfig
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode

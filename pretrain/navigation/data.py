@@ -8,9 +8,9 @@ from torch import Tensor
 from pretrain.navigation.config import NavigationConfig
 from pretrain.navigation.probe import TrueStates
 from vd4rl_pomdp.data import Dataset, View
-from vd4rl_pomdp.experiments.navigation.exogenous import ExogenousNoise
-from vd4rl_pomdp.experiments.navigation.observations import MazeView, open_maze_set
 from vd4rl_pomdp.mazes import MazeSpec
+from vd4rl_pomdp.navigation.exogenous import ExogenousNoise
+from vd4rl_pomdp.navigation.observations import MazeView, open_maze_set
 from vd4rl_pomdp.types import Windows
 
 HELD_OUT = 10

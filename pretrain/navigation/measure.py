@@ -17,7 +17,7 @@ from pretrain.navigation.config import NavigationConfig
 from pretrain.navigation.probe import ErrorSums, StateProbe, refit
 from pretrain.navigation.trainer import Trainer
 from vd4rl_pomdp.data import Dataset
-from vd4rl_pomdp.experiments.navigation.grid import UNTRAINED
+from vd4rl_pomdp.navigation.methods import UNTRAINED
 from vd4rl_pomdp.runs.device import autocast
 from vd4rl_pomdp.runs.folder import replacing_file
 from vd4rl_pomdp.runs.metrics import read_metrics

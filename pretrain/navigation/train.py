@@ -17,8 +17,8 @@ from pretrain.objectives import INVERSE, get_method, unread_options
 from pretrain.train import DECIDE_MEMORY, require_batch
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside, refuse_unread
-from vd4rl_pomdp.experiments.navigation.grid import REFERENCES, UNTRAINED
-from vd4rl_pomdp.experiments.navigation.observations import SHAPES
+from vd4rl_pomdp.navigation.methods import REFERENCES, UNTRAINED
+from vd4rl_pomdp.navigation.observations import SHAPES
 from vd4rl_pomdp.nn.action_target import check_action_target
 from vd4rl_pomdp.nn.encoder import MAX_LAYERS
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder

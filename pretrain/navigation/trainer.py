@@ -13,8 +13,8 @@ from pretrain.navigation.data import MazeData
 from pretrain.navigation.probe import ErrorSums, StateProbe
 from pretrain.objectives import build_objective
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, REFERENCES, SUPERVISED
-from vd4rl_pomdp.experiments.navigation.observations import SHAPES
+from vd4rl_pomdp.navigation.methods import METHOD_NAMES, REFERENCES, SUPERVISED
+from vd4rl_pomdp.navigation.observations import SHAPES
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.objective import InverseObjective
 from vd4rl_pomdp.runs.device import autocast
@@ -23,8 +23,6 @@ from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import stream_generator
 from vd4rl_pomdp.types import Windows
 
-METHOD_NAMES = (*OBJECTIVES, *REFERENCES)
-"""The paper's objectives, the floor and the ceilings."""
 _NETWORK_OF = dict(zip(REFERENCES, ("mik+a", "ah", "ah+a"), strict=True))
 _SUPERVISED_RATE = 0.5
 """Share of the learning rate that supervised references take: at the whole one, two of three seeds predict the mean."""

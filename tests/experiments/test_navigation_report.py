@@ -5,23 +5,17 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import claims, judge, paper_number, verdict_lines
-from vd4rl_pomdp.experiments.navigation.grid import (
-    OBJECTIVES,
-    REFERENCES,
-    Cell,
-    cell_of,
-    evidence,
-    grid_commands,
-    paper_rows,
-)
+from vd4rl_pomdp.experiments.navigation.grid import Cell, cell_of, evidence, grid_commands, paper_rows
 from vd4rl_pomdp.experiments.navigation.report import write_report
 from vd4rl_pomdp.experiments.navigation.rows import load_runs
 from vd4rl_pomdp.mazes import FREE_CELLS, MAZES
+from vd4rl_pomdp.navigation.methods import METHOD_NAMES, OBJECTIVES
 
 ROOT = Path(__file__).parents[2]
 STATE = ("state_error", "held_out", "refit", "all", 0)
@@ -102,7 +96,7 @@ def verdicts_of(runs: Path) -> str:
 
 
 def test_the_report_shows_means_seeds_and_the_papers_numbers(runs, tmp_path):
-    page = write_report([runs], tmp_path / "out", pictures=False).read_text()
+    page = write_report([runs], tmp_path / "out").read_text()
     numbers = {
         (row["table"], row["view"][:8], row["row"], row["maze"]): row
         for row in csv.DictReader((tmp_path / "out" / "tables.csv").open())
@@ -118,8 +112,8 @@ def test_the_report_shows_means_seeds_and_the_papers_numbers(runs, tmp_path):
 
 
 def test_the_report_made_from_its_own_rows_is_the_same(runs, tmp_path):
-    first = write_report([runs], tmp_path / "first", pictures=False)
-    again = write_report([tmp_path / "first"], tmp_path / "again", pictures=False)
+    first = write_report([runs], tmp_path / "first")
+    again = write_report([tmp_path / "first"], tmp_path / "again")
     assert first.read_text() == again.read_text()
     for name in ("rows.csv", "runs.csv", "tables.csv"):
         assert (first.parent / name).read_bytes() == (again.parent / name).read_bytes()
@@ -128,7 +122,7 @@ def test_the_report_made_from_its_own_rows_is_the_same(runs, tmp_path):
 
 def test_damaged_reports_and_runs_are_named(runs, tmp_path):
     whole = tmp_path / "whole"
-    write_report([runs], whole, pictures=False)
+    write_report([runs], whole)
     lines = (whole / "rows.csv").read_text().splitlines(keepends=True)
     for damaged in (lines[:5], [*lines[:4], lines[4].replace("80", "eighty")], ["a,b\n", "1,2\n"]):
         (whole / "rows.csv").write_text("".join(damaged))
@@ -181,14 +175,14 @@ def test_the_committed_rows_make_a_report(folder):
 
 
 def test_missing_cells_seeds_and_unfinished_runs_are_shown(runs, tmp_path, monkeypatch):
-    assert "no run (" not in write_report([runs], tmp_path / "whole", pictures=False).read_text()
+    assert "no run (" not in write_report([runs], tmp_path / "whole").read_text()
     write_run(tmp_path / "runs", Cell("no_curtain", "no_history"), 0, 50.0)
     (runs / "three_curtains" / "mik-K15" / "seed1" / "timing.json").unlink()
     (runs / "three_curtains" / "mik-K15" / "seed1" / "metrics.jsonl").write_text('{"step": 40}\n')
     config = json.loads((runs / "three_curtains" / "mik-K15" / "seed1" / "config.json").read_text())
     config["config"]["steps"] = 2500
     (runs / "three_curtains" / "mik-K15" / "seed1" / "config.json").write_text(json.dumps(config))
-    page = write_report([runs], tmp_path / "out", pictures=False).read_text()
+    page = write_report([runs], tmp_path / "out").read_text()
     assert f"`{runs}/three_curtains/mik-K15/seed1` at 40 of 2500 steps." in page
     line = next(line for line in page.splitlines() if line.startswith("| MIK, K=15 |"))
     assert "n=2 of 3 (13.1)" in line
@@ -208,15 +202,15 @@ def test_a_navigation_report_writes_over_nothing_but_an_earlier_one(runs, tmp_pa
     run = runs / "three_curtains" / "mik-K15" / "seed0"
     for out in (tmp_path / "mine", runs, run, run / "report"):
         with pytest.raises(UserError, match="choose another --out"):
-            write_report([runs], out, pictures=False)
+            write_report([runs], out)
     assert (tmp_path / "mine" / "README.md").read_text() == "mine"
-    first = write_report([runs], tmp_path / "out", pictures=False).read_text()
-    assert write_report([tmp_path / "out"], tmp_path / "out", pictures=False).read_text() == first
+    first = write_report([runs], tmp_path / "out").read_text()
+    assert write_report([tmp_path / "out"], tmp_path / "out").read_text() == first
 
 
 @pytest.mark.parametrize("value", ["nan", "inf"])
 def test_a_result_that_is_no_number_is_refused(runs, tmp_path, value):
-    write_report([runs], tmp_path / "out", pictures=False)
+    write_report([runs], tmp_path / "out")
     lines = (tmp_path / "out" / "rows.csv").read_text().splitlines(keepends=True)
     lines[4] = lines[4].rpartition(",")[0] + f",{value}\n"
     (tmp_path / "out" / "rows.csv").write_text("".join(lines))
@@ -251,7 +245,7 @@ def test_claims_are_judged_by_means_and_seed_by_seed(runs):
 
 
 def test_the_page_says_which_statements_hold_and_what_the_paper_has(runs, tmp_path):
-    page = write_report([runs], tmp_path / "out", pictures=False).read_text()
+    page = write_report([runs], tmp_path / "out").read_text()
     rows = {line.split(" | ")[1]: line for line in page.splitlines() if line.startswith("| three_curtains | ")}
     assert rows["no_history's velocity error, of mik+a's >= 3 x"].endswith(
         "| 81.0 / 21.0 | **yes** | 3 of 3 | 91.9 / 5.7: yes |"
@@ -284,7 +278,7 @@ def test_which_way_round_a_relation_is():
 def test_the_grid_has_every_cell_and_its_commands_parse(capsys):
     cells = evidence()
     assert len(cells) == len(set(cells)) == 2 * (10 + 3)
-    assert {c.method for c in cells if c.max_k == 15} == {*OBJECTIVES, *REFERENCES}
+    assert {c.method for c in cells if c.max_k == 15} == set(METHOD_NAMES)
     commands = list(grid_commands("evidence", ("no_curtain",), (0, 1, 2), "cpu", Path("d"), Path("r")))
     assert len(commands) == 39
     assert len({tuple(words) for words in commands}) == 39
@@ -312,26 +306,27 @@ def test_what_cannot_be_reported_is_named(runs, tmp_path):
     (tmp_path / "empty").mkdir()
     for source, message in (("nowhere", "no such folder"), ("empty", "holds no finished run")):
         with pytest.raises(UserError, match=message):
-            write_report([tmp_path / source], tmp_path / "out", pictures=False)
+            write_report([tmp_path / source], tmp_path / "out")
     write_run(tmp_path / "other", Cell("three_curtains", "mik"), 0, 99.0)
     with pytest.raises(UserError, match="twice with other results"):
-        write_report([runs, tmp_path / "other"], tmp_path / "out", pictures=False)
+        write_report([runs, tmp_path / "other"], tmp_path / "out")
     config = next((tmp_path / "other").rglob("config.json"))
     record = json.loads(config.read_text())
     record["config"] |= {"preset": "paper", "seed": 7}
     config.write_text(json.dumps(record))
     with pytest.raises(UserError, match="different presets"):
-        write_report([runs, tmp_path / "other"], tmp_path / "out", pictures=False)
+        write_report([runs, tmp_path / "other"], tmp_path / "out")
 
 
-def test_sample_observations_are_of_different_moments_and_mazes(tmp_path):
-    from vd4rl_pomdp.experiments.navigation.figures import _drive, sample_observations
-
-    drives = [_drive(maze) for maze in MAZES]
-    assert all(len({picture.tobytes() for picture in drive}) > 1 for drive in drives)
-    assert len({np.stack(drive).tobytes() for drive in drives}) == 4
-    sample_observations(tmp_path / "observations.png")
-    assert (tmp_path / "observations.png").stat().st_size > 20_000
+def test_sample_observations_are_drawn_where_they_are_asked_for(runs, tmp_path):
+    rng = np.random.default_rng(0)
+    samples = {name: rng.integers(0, 256, (2, 3, 9, 9), np.uint8) for name in ("a maze", "with noise, dark")}
+    shown = "![Sample observations](figures/observations.png)"
+    assert shown not in write_report([runs], tmp_path / "out").read_text()
+    assert not (tmp_path / "out" / "figures" / "observations.png").exists()
+    assert shown in write_report([runs], tmp_path / "out", lambda: samples).read_text()
+    with Image.open(tmp_path / "out" / "figures" / "observations.png") as picture:
+        assert len(np.unique(np.asarray(picture).reshape(-1, 4), axis=0)) > 4 * 81
 
 
 @pytest.mark.parametrize(

@@ -129,7 +129,7 @@ class ParityCommand:
 
 
 def _parity(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.envs.parity import check_parity
+    from vd4rl_pomdp.data.parity import check_parity
 
     command = parse(ParityCommand, words, program)
     result = check_parity(command.path)

@@ -12,7 +12,8 @@ from vd4rl_pomdp.cli.parsing import parse, with_presets
 
 
 def _collect(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.experiments.navigation.collect import PRESETS, CollectConfig, collect
+    from vd4rl_pomdp.navigation.collect import collect
+    from vd4rl_pomdp.navigation.config import PRESETS, CollectConfig
 
     config = with_presets(CollectConfig, PRESETS, words, program)
     print(f"{len(collect(config))} shards in {config.out}")
@@ -27,7 +28,7 @@ def _train(words: Arguments, program: str) -> None:
 
 
 def _policy(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.experiments.navigation.policy import MazePolicyConfig, train_policy
+    from vd4rl_pomdp.navigation.policy import MazePolicyConfig, train_policy
 
     config = parse(MazePolicyConfig, words, program)
     card = train_policy(config).card
@@ -48,9 +49,11 @@ class ReportCommand:
 
 def _report(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.experiments.navigation.report import write_report
+    from vd4rl_pomdp.navigation.samples import sample_observations
 
     command = parse(ReportCommand, words, program)
-    print(f"report: {write_report(command.runs, command.out, command.pictures)}")
+    samples = sample_observations if command.pictures else None
+    print(f"report: {write_report(command.runs, command.out, samples)}")
 
 
 @dataclass(frozen=True)

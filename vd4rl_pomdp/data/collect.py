@@ -348,7 +348,7 @@ class _Record:
         """Write the set's record, unless it has one and nothing was added."""
         if not self._parts and self._path.exists():
             return
-        from vd4rl_pomdp.envs.parity import render_info
+        from vd4rl_pomdp.data.parity import render_info
 
         seconds, frames = (sum(part[i] for part in self._parts.values()) for i in (0, 1))
         facts = {"seconds": round(seconds, 1), "frames": int(frames), "workers": count_workers(workers)}

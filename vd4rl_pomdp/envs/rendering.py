@@ -47,7 +47,6 @@ except (ImportError, AttributeError, RuntimeError, ctypes.ArgumentError) as _err
     raise gl_error(_error) from _error
 
 __all__ = [
-    "ASSETS",
     "Render",
     "check_mujoco",
     "frame",
@@ -61,7 +60,7 @@ __all__ = [
 ]
 
 Render = Literal["fast", "exact"]
-ASSETS = Path(__file__).parent / "assets"
+_SKYBOX = Path(__file__).parent / "assets" / "skybox.npz"
 TRIED_MUJOCO = ((3, 3), (3, 12))
 """Lowest version and first version not supported: from 3.12 on floor textures are anchored elsewhere."""
 _FAST_SHADOW_SIZE = 512
@@ -119,7 +118,7 @@ def frame(physics: Any) -> np.ndarray:
 @cache
 def _sky() -> np.ndarray:
     """Bytes of the skybox texture of mujoco 3.1.6: 11,520,000 uint8 (six faces of 800x800 RGB)."""
-    with np.load(ASSETS / "skybox.npz") as file:
+    with np.load(_SKYBOX) as file:
         return file["sky"]
 
 

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from vd4rl_pomdp.data.parity import canary_frames, compare
 from vd4rl_pomdp.envs.dmc import PixelEnv
-from vd4rl_pomdp.envs.parity import canary_frames, compare
 from vd4rl_pomdp.experiments.bench.timing import rate
 from vd4rl_pomdp.mazes import PICTURE_SIZE
 from vd4rl_pomdp.runs.workers import run_jobs

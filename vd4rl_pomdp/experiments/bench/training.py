@@ -108,13 +108,14 @@ def maze_training() -> dict[str, float]:
     from pretrain.navigation.config import PRESETS
     from pretrain.navigation.data import MazeData
     from pretrain.navigation.trainer import Trainer, make_objective
-    from vd4rl_pomdp.experiments.navigation import collect
-    from vd4rl_pomdp.experiments.navigation.observations import open_maze_set
+    from vd4rl_pomdp.navigation.collect import collect
+    from vd4rl_pomdp.navigation.config import PRESETS as SETS
+    from vd4rl_pomdp.navigation.observations import open_maze_set
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         shape = {"maze": "no_curtain", "out": folder / "set", "workers": 1}
-        collect.collect(replace(collect.PRESETS["smoke"], **shape))  # type: ignore[arg-type]
+        collect(replace(SETS["smoke"], **shape))  # type: ignore[arg-type]
         config = replace(PRESETS["cpu"], data=folder / "set", out=folder)
         data = MazeData(*open_maze_set(folder / "set", folder / "cache"), config, None)
         device = pick_device("auto")

@@ -1,1 +1,1 @@
-"""The paper's navigation experiment (section 4.1): four mazes, their data, exogenous noise, and its tables."""
+"""The paper's navigation tables: which runs make them, and what finished runs say. Reads files only."""

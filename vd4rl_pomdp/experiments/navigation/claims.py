@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from vd4rl_pomdp.experiments.navigation.grid import SUPERVISED, UNTRAINED, Cell, paper_rows
+from vd4rl_pomdp.experiments.navigation.grid import Cell, paper_rows
 from vd4rl_pomdp.experiments.navigation.rows import Run, Value
 from vd4rl_pomdp.mazes import MAZES
+from vd4rl_pomdp.navigation.methods import SUPERVISED, UNTRAINED
 
 RECURRENT = ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
 NEAR_ZERO = 5.0

@@ -3,19 +3,20 @@
 from __future__ import annotations
 
 import csv
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from vd4rl_pomdp.experiments.navigation.claims import paper_number
-from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, REFERENCES, Cell
+from vd4rl_pomdp.experiments.navigation.grid import Cell
 from vd4rl_pomdp.experiments.navigation.rows import Run, Value, is_missing
 from vd4rl_pomdp.mazes import FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
+from vd4rl_pomdp.navigation.methods import OBJECTIVES, REFERENCES
 
 _ESTIMATE = "#d55e00"
 _VARIANTS = {
@@ -28,8 +29,6 @@ _OFFSETS, _WIDTH = (-0.27, 0.0, 0.27), 0.25
 _SEED: dict[str, Any] = {"color": "black", "linestyle": "", "marker": ".", "markersize": 3}
 _MARK: dict[str, Any] = {"color": "#e69f00", "linestyle": "", "marker": "_", "markersize": 9, "markeredgewidth": 2.5}
 _NO_RUN: dict[str, Any] = {"color": "#999999", "linestyle": "", "marker": "x", "markersize": 4}
-_SAMPLES = 6
-_FIRST_ROW, _ROW_STEP = 20, 12
 
 
 def accuracy_bars(runs: list[Run], value: Value, path: Path) -> None:
@@ -124,29 +123,14 @@ def draw_maze(axes: Any, maze: MazeSpec) -> None:
     axes.set(xlim=(-HALF_SIZE, HALF_SIZE), ylim=(-HALF_SIZE, HALF_SIZE), aspect="equal")
 
 
-def sample_observations(path: Path) -> None:
-    """Pictures along a drive through each maze; below them grey ones and ones with exogenous noise."""
-    from vd4rl_pomdp.experiments.navigation.exogenous import PHOTOGRAPHS, ExogenousNoise
-    from vd4rl_pomdp.experiments.navigation.observations import to_grey50
-
-    drives = {maze: _drive(maze) for maze in MAZES}
-    pictures = torch.from_numpy(drives["three_curtains"])
-    noise = ExogenousNoise(PHOTOGRAPHS, 0.5, 0)
-    drives["three_curtains, grey50"] = to_grey50(pictures).expand(-1, 3, -1, -1).numpy()
-    drives["three_curtains, exogenous"] = noise(pictures, torch.arange(len(pictures))).numpy()
-    figure = Figure(figsize=(1.5 * _SAMPLES + 1.6, 1.55 * len(drives)), layout="constrained")
-    panels = figure.subplots(len(drives), _SAMPLES)
-    for row, (name, drive) in zip(panels, drives.items(), strict=True):
-        for axes, picture in zip(row, drive, strict=True):
+def sample_observations(samples: Mapping[str, np.ndarray], path: Path) -> None:
+    """A row of pictures for each name: (n, 3, H, W) uint8, as many for all."""
+    columns = max(map(len, samples.values()))
+    figure = Figure(figsize=(1.5 * columns + 1.6, 1.55 * len(samples)), layout="constrained")
+    panels = figure.subplots(len(samples), columns)
+    for row, (name, pictures) in zip(panels, samples.items(), strict=True):
+        for axes, picture in zip(row, pictures, strict=True):
             axes.imshow(picture.transpose(1, 2, 0), interpolation="nearest")
             axes.set(xticks=[], yticks=[])
         row[0].set_ylabel(name.replace(", ", "\n"), fontsize=8)
     figure.savefig(path, dpi=100, metadata={"Software": None})
-
-
-def _drive(maze: str) -> np.ndarray:
-    """Some pictures of a drive: (_SAMPLES, 3, 100, 100) uint8."""
-    from vd4rl_pomdp.experiments.navigation.collect import drive
-
-    count = _FIRST_ROW + _ROW_STEP * (_SAMPLES - 1) + 1
-    return drive(maze, rows=count)["observation"][_FIRST_ROW::_ROW_STEP]

@@ -8,16 +8,12 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_number
-from vd4rl_pomdp.experiments.navigation.collect import PRESETS
 from vd4rl_pomdp.mazes import get_maze
+from vd4rl_pomdp.navigation.config import PRESETS
+from vd4rl_pomdp.navigation.methods import OBJECTIVES, SUPERVISED, UNTRAINED
 
 PAPER = Path(__file__).parent / "paper.csv"
 """The paper's numbers: one line a table row, one column a maze."""
-OBJECTIVES = ("no_history", "ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
-UNTRAINED = "random"
-SUPERVISED = ("supervised", "supervised+a")
-REFERENCES = (UNTRAINED, *SUPERVISED)
-"""What a table is read against: mik+a's network untrained; ah's and ah+a's trained on the true states themselves."""
 EVIDENCE_MAZES = ("no_curtain", "three_curtains")
 
 

@@ -8,7 +8,7 @@ OUT/figures/      accuracy.png, trajectories.png, observations.png
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import groupby
 from pathlib import Path
@@ -18,10 +18,11 @@ import numpy as np
 
 from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import paper_number, verdict_lines
-from vd4rl_pomdp.experiments.navigation.collect import PRESETS
-from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES, REFERENCES, UNTRAINED, Cell, cell_of, paper_rows
+from vd4rl_pomdp.experiments.navigation.grid import Cell, cell_of, paper_rows
 from vd4rl_pomdp.experiments.navigation.rows import ROWS, Run, Value, is_missing, load_runs, save_runs, unfinished_runs
 from vd4rl_pomdp.mazes import MAZES
+from vd4rl_pomdp.navigation.config import PRESETS
+from vd4rl_pomdp.navigation.methods import METHOD_NAMES, OBJECTIVES, REFERENCES, UNTRAINED
 from vd4rl_pomdp.report.stats import bootstrap_interval, mean
 from vd4rl_pomdp.runs.folder import write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
@@ -99,13 +100,17 @@ class Table:
         return [row for row in self.rows if any(len(e.numbers) or e.paper is not None for e in row[1])]
 
 
-def write_report(sources: Sequence[Path], out: Path, pictures: bool = True) -> Path:
+Samples = Callable[[], Mapping[str, np.ndarray]]
+"""Draws sample observations: (n, 3, H, W) uint8 by name."""
+
+
+def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = None) -> Path:
     """Write the report of all runs in `sources` to `out`; returns the page.
 
     Args:
         sources: run folders, folders of them, or a folder that this function wrote.
         out: where to.
-        pictures: whether to draw sample observations, which needs OpenGL.
+        samples: draws the sample observations, which needs OpenGL; None leaves them out.
     """
     refuse_foreign(out, "navigation report", ROWS)
     runs, unfinished = load_runs(sources), unfinished_runs(sources)
@@ -114,12 +119,12 @@ def write_report(sources: Sequence[Path], out: Path, pictures: bool = True) -> P
     value = ("state_error", "held_out", "refit", "all", 0)
     figures.accuracy_bars(runs, value, out / "figures" / "accuracy.png")
     drawn = figures.trajectories(runs, out / "figures" / "trajectories.png")
-    if pictures:
-        figures.sample_observations(out / "figures" / "observations.png")
+    if samples is not None:
+        figures.sample_observations(samples(), out / "figures" / "observations.png")
     tables = make_tables(runs)
     _write_tables(tables, out / "tables.csv")
     page = out / "README.md"
-    write_text(page, "\n".join(_page(runs, unfinished, tables, drawn, pictures)) + "\n")
+    write_text(page, "\n".join(_page(runs, unfinished, tables, drawn, samples is not None)) + "\n")
     return page
 
 
@@ -168,7 +173,7 @@ def _hidden_table(runs: list[Run]) -> Table:
     """Errors on hidden steps alone."""
     mazes = tuple(maze for maze, spec in MAZES.items() if spec.curtains)
     rows = []
-    for method in (*OBJECTIVES, *REFERENCES):
+    for method in METHOD_NAMES:
         for component in ("position", "velocity"):
             value: Value = (f"{component}_error", "held_out", "refit", "hidden", 0)
             rows.append((f"{method}, {component}", [_entry(Cell(maze, method), value, runs) for maze in mazes]))

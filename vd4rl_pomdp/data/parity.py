@@ -8,12 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data.dataset import open_dataset
 from vd4rl_pomdp.envs.dmc import PixelEnv, start_from
-from vd4rl_pomdp.envs.rendering import ASSETS, Render, frame, frames_hash, gl_strings, mujoco
+from vd4rl_pomdp.envs.rendering import Render, frame, frames_hash, gl_strings, mujoco
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import TASKS
 
+GOLDEN = Path(__file__).parent / "golden.npz"
 MAX_MEAN_DIFFERENCE = 0.25
 """Largest mean absolute difference (of 255) that counts as the same pixels.
 
@@ -100,5 +101,5 @@ def _show_golden_states(env: PixelEnv) -> np.ndarray:
 @cache
 def _golden() -> dict[str, np.ndarray]:
     """`<task>/physics` states and the `<task>/frames` that mujoco 3.1.6 shows for them."""
-    with np.load(ASSETS / "golden.npz") as file:
+    with np.load(GOLDEN) as file:
         return dict(file)

@@ -7,8 +7,7 @@ import torch
 from PIL import Image
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.experiments.navigation.exogenous import POOL, ExogenousNoise, load_pool
-from vd4rl_pomdp.experiments.navigation.observations import to_grey50
+from vd4rl_pomdp.navigation.exogenous import POOL, ExogenousNoise, load_pool
 
 
 @pytest.fixture(scope="module")
@@ -112,10 +111,3 @@ def test_folders_without_usable_images_are_named(tmp_path, name, content, messag
     with pytest.raises(UserError, match=message) as caught:
         load_pool(str(tmp_path), 0)
     assert len(str(caught.value).splitlines()) == 1
-
-
-def test_grey_quarters_are_area_averages_of_the_luminance():
-    pictures = torch.randint(0, 256, (3, 3, 100, 100), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
-    luma = (pictures.double() * torch.tensor([0.299, 0.587, 0.114])[:, None, None]).sum(1)
-    expected = luma.view(3, 50, 2, 50, 2).mean((2, 4))
-    assert (to_grey50(pictures)[:, 0].double() - expected).abs().max() <= 0.51

@@ -12,7 +12,8 @@ from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.envs.maze import MazeEnv
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.experiments.navigation.collect import PRESETS, CollectConfig, collect
+from vd4rl_pomdp.navigation.collect import collect
+from vd4rl_pomdp.navigation.config import PRESETS, CollectConfig
 
 
 def small(out: Path, **changes: object) -> CollectConfig:
@@ -97,22 +98,6 @@ def test_every_trajectory_has_noise_of_its_own(tmp_path):
         assert 0.2 < (actions[one] == actions[other]).float().mean() < 0.8
 
 
-def test_the_planner_reaches_goals_everywhere():
-    from vd4rl_pomdp.experiments.navigation.planner import Planner
-
-    env = MazeEnv("no_curtain", 5, pixels=False)
-    planner = Planner(env)
-    _, info = env.reset(seed=0)
-    reached, places = 0, []
-    for _ in range(600):
-        _, reward, _, _, info = env.step(planner.act(info["state"], info["goal"]))
-        reached += int(reward)
-        places.append(info["state"][:2])
-    assert reached > 20
-    cells = {tuple(env.maze.cell_xy_to_rowcol(place)) for place in places}
-    assert len(cells) == 7, "all cells of the U were visited"
-
-
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
@@ -134,18 +119,6 @@ def test_another_collection_is_refused(maze_set):
         collect(small(maze_set, noise=0.2))
 
 
-def test_the_shipped_first_person_policy_reaches_goals_and_an_idle_one_does_not():
-    from vd4rl_pomdp.experiments.navigation.policy import SHIPPED, goals_reached
-    from vd4rl_pomdp.policies.actor import read_actor
-
-    actor = read_actor(SHIPPED)
-    assert actor.card["algorithm"] == "PPO"
-    reached = goals_reached(actor, actor.card["action_repeat"], 3)
-    idle = replace(actor, weights={name: value * 0 for name, value in actor.weights.items()})
-    assert reached >= 12
-    assert goals_reached(idle, actor.card["action_repeat"], 3) < reached / 3
-
-
 def test_first_person_data_holds_headings_and_moves(tmp_path):
     collect(small(tmp_path / "set", maze="first_person", trajectories=1, trajectory_rows=120))
     dataset = open_dataset(tmp_path / "set", tmp_path / "cache", frame_size=100)
@@ -153,23 +126,3 @@ def test_first_person_data_holds_headings_and_moves(tmp_path):
     assert np.ptp(dataset.physics[:, 2]) > 1
     assert np.ptp(dataset.physics[:, :2], axis=0).max() > 1
     assert len({frame.numpy().tobytes() for frame in dataset.frames}) > 100
-
-
-def test_a_policy_of_no_decisions_is_refused(tmp_path):
-    from vd4rl_pomdp.experiments.navigation.policy import MazePolicyConfig, train_policy
-
-    with pytest.raises(UserError, match="--decisions is 0"):
-        train_policy(MazePolicyConfig(tmp_path / "actor.safetensors", decisions=0))
-
-
-def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
-    from vd4rl_pomdp.experiments.navigation.policy import MazePolicyConfig, train_policy
-    from vd4rl_pomdp.policies.actor import read_actor
-
-    trained = train_policy(MazePolicyConfig(tmp_path / "actor.safetensors", decisions=2048))
-    stored = read_actor(tmp_path / "actor.safetensors")
-    seen = np.array([0.3, -0.2, 1.0, 0.1], np.float32)
-    np.testing.assert_array_equal(stored.act(seen), trained.act(seen))
-    assert stored.card["decisions"] == 2048
-    spread = [stored.act(seen, np.random.default_rng(i)) for i in range(50)]
-    assert np.std(spread, axis=0).min() > 0.1

@@ -10,8 +10,8 @@ from torch import Tensor
 
 from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.experiments.navigation.exogenous import ExogenousNoise
 from vd4rl_pomdp.mazes import MAZES, PICTURE_SIZE, MazeSpec
+from vd4rl_pomdp.navigation.exogenous import ExogenousNoise
 
 Picture = Literal["rgb100", "grey50"]
 SHAPES: dict[Picture, tuple[int, int]] = {"rgb100": (3, PICTURE_SIZE), "grey50": (1, PICTURE_SIZE // 2)}

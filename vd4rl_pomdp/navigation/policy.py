@@ -15,8 +15,8 @@ import gymnasium
 import numpy as np
 
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_no_folder, refuse_outside
-from vd4rl_pomdp.experiments.navigation.planner import Planner
 from vd4rl_pomdp.mazes import MOST_STEPS
+from vd4rl_pomdp.navigation.planner import Planner
 from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.progress import ProgressLine

@@ -11,12 +11,12 @@ from pretrain.navigation.config import PRESETS, NavigationConfig, command_of
 from pretrain.navigation.data import MazeData, open_data
 from pretrain.navigation.probe import ErrorSums, StateProbe, TrueStates, refit
 from pretrain.navigation.train import train
-from pretrain.navigation.trainer import METHOD_NAMES, Trainer, learning_rate, make_objective
+from pretrain.navigation.trainer import Trainer, learning_rate, make_objective
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.experiments.navigation.grid import OBJECTIVES
-from vd4rl_pomdp.experiments.navigation.observations import open_maze_set
 from vd4rl_pomdp.mazes import MAZES
+from vd4rl_pomdp.navigation.methods import METHOD_NAMES, OBJECTIVES
+from vd4rl_pomdp.navigation.observations import open_maze_set
 from vd4rl_pomdp.nn import load_encoder
 
 
@@ -193,7 +193,7 @@ def test_the_learning_rate_rises_then_falls():
 
 
 def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
-    from vd4rl_pomdp.experiments.navigation.exogenous import ExogenousNoise
+    from vd4rl_pomdp.navigation.exogenous import ExogenousNoise
 
     noise = ExogenousNoise("photographs", 0.5, 0)
     for picture, size in (("grey50", 50), ("rgb100", 100)):

@@ -8,7 +8,7 @@ after an interruption and ends in the same files.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -17,6 +17,7 @@ import numpy as np
 from vd4rl_pomdp.data.collect import Shard, claim_set, collect_shards, episode_seed
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
 from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, get_maze
+from vd4rl_pomdp.navigation.config import CollectConfig
 from vd4rl_pomdp.runs.folder import jsonable
 from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
@@ -26,41 +27,6 @@ from vd4rl_pomdp.tasks import MOST_EPISODES
 from vd4rl_pomdp.types import StepType
 
 _RUNTIME_FIELDS = ("out", "workers", "preset")
-
-
-@dataclass(frozen=True)
-class CollectConfig:
-    """Settings of `vd4rl-pomdp navigation collect`."""
-
-    maze: str
-    """no_curtain, one_curtain, three_curtains or first_person."""
-    out: Path
-    """Folder of the set."""
-    preset: str = "paper"
-    """paper, cpu or smoke: the defaults of all other settings."""
-    trajectories: int = 500
-    """Trajectories in all; the last tenth is held out from training."""
-    trajectory_rows: int = 1000
-    """Rows of each trajectory."""
-    action_repeat: int = 1
-    """Simulator steps of 0.01 s for one action (D4RL's is 1)."""
-    noise: float = 0.5
-    """Standard deviation of the Gaussian noise on actions in [-1, 1]."""
-    seed: int = 0
-    """Seed of starts, goals and noise."""
-    workers: int = 0
-    """Processes that simulate and draw; 0 uses every core."""
-    trajectories_per_shard: int = 5
-    """Trajectories in a shard."""
-
-
-_CPU = CollectConfig("", Path(), preset="cpu", trajectories=100, action_repeat=5)
-PRESETS = {
-    "paper": CollectConfig("", Path()),
-    "cpu": _CPU,
-    "smoke": replace(_CPU, preset="smoke", trajectories=10, trajectory_rows=120),
-}
-"""Defaults by preset: 500k rows as in the paper, 100k rows whose actions move the mass visibly, and 1,200 rows."""
 
 
 @dataclass(frozen=True)
@@ -148,8 +114,8 @@ _ENVIRONMENTS: dict[tuple[str, int], Any] = {}
 def _environment(maze: str, action_repeat: int) -> tuple[Any, Callable[[np.ndarray, np.ndarray], np.ndarray]]:
     """The process's environment and policy for these arguments: one GL context serves all its trajectories."""
     from vd4rl_pomdp.envs.maze import MazeEnv
-    from vd4rl_pomdp.experiments.navigation.planner import Planner
-    from vd4rl_pomdp.experiments.navigation.policy import FirstPersonPilot
+    from vd4rl_pomdp.navigation.planner import Planner
+    from vd4rl_pomdp.navigation.policy import FirstPersonPilot
 
     if (maze, action_repeat) not in _ENVIRONMENTS:
         env = MazeEnv(maze, action_repeat)

@@ -3,7 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from vd4rl_pomdp.experiments.navigation.collect import PRESETS, collect
+from vd4rl_pomdp.navigation.collect import collect
+from vd4rl_pomdp.navigation.config import PRESETS
 
 
 @pytest.fixture(scope="session")

@@ -1,0 +1,100 @@
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.data import parity
+from vd4rl_pomdp.data.parity import canary_frames, check_parity, compare, render_info
+from vd4rl_pomdp.envs import rendering
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import TASKS
+
+
+@pytest.fixture(scope="module")
+def exact():
+    return {task: canary_frames(task) for task in TASKS}
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_the_environment_shows_the_golden_frames(exact, task):
+    result = compare(exact[task], parity._golden()[f"{task}/frames"])
+    assert result["equal"]
+    assert result["mean_difference"] < 0.05
+    assert result["share_off_by_8"] < 0.002
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_fast_rendering_differs_by_less_than_a_twentieth_of_a_grey_level(exact, task):
+    fast = canary_frames(task, "fast")
+    difference = np.abs(fast.astype(int) - exact[task]).mean()
+    assert 0 < difference < 0.05
+
+
+@pytest.fixture
+def unrepaired(monkeypatch):
+    """Environments with the sky of the installed mujoco."""
+    monkeypatch.setattr(rendering, "prepare", lambda physics, render: None)
+
+
+@pytest.mark.usefixtures("unrepaired")
+def test_the_canary_fails_without_the_old_sky():
+    result = check_parity()
+    assert not result["equal"]
+    assert not result["canary"]["walker_walk"]["equal"]
+    assert not result["canary"]["cheetah_run"]["equal"]
+
+
+def test_render_info_names_versions_and_what_rendered(exact):
+    info = render_info()
+    assert info["canary"] == rendering.frames_hash(exact["walker_walk"])
+    assert info["gl_vendor"]
+    assert info["gl_renderer"]
+    assert info["mujoco"].startswith("3.")
+
+
+class FakeSet:
+    """What parity reads of a data set."""
+
+    def __init__(self, task, frames):
+        self.task, self.num_rows, self.frames = task, len(frames), self
+        self._frames = frames
+
+    def numpy(self):
+        return self._frames
+
+
+@pytest.fixture(scope="module", params=["walker_walk", "cheetah_run"])
+def own_frames(request):
+    return request.param, parity._wandering_frames(request.param, 40)
+
+
+def background(monkeypatch, task, data, rendered):
+    monkeypatch.setattr(parity, "open_dataset", lambda path: FakeSet(task, data))
+    monkeypatch.setattr(parity, "_wandering_frames", lambda task: rendered)
+    return parity._compare_background("somewhere")
+
+
+def test_the_background_of_our_own_frames_is_equal(monkeypatch, own_frames):
+    task, frames = own_frames
+    result = background(monkeypatch, task, frames[:30], frames[10:])
+    assert result["equal"]
+    assert result["static_pixels"] > 1000
+
+
+def test_the_background_of_frames_under_another_sky_differs(monkeypatch, own_frames):
+    task, frames = own_frames
+    with monkeypatch.context() as patch:
+        patch.setattr(rendering, "prepare", lambda physics, render: None)
+        others = parity._wandering_frames(task, 40)
+    assert not background(monkeypatch, task, others, frames)["equal"]
+
+
+def test_a_different_background_fails_the_verdict_although_the_canaries_pass(monkeypatch):
+    monkeypatch.setattr(parity, "_compare_background", lambda path: {"equal": False})
+    result = check_parity("somewhere")
+    assert all(canary["equal"] for canary in result["canary"].values())
+    assert not result["equal"]
+
+
+def test_a_set_of_an_unknown_task_is_refused(monkeypatch):
+    monkeypatch.setattr(parity, "open_dataset", lambda path: FakeSet(None, np.zeros((2, 3, 84, 84), np.uint8)))
+    with pytest.raises(UserError, match="cannot tell the task"):
+        parity._compare_background("somewhere")

@@ -1,0 +1,32 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.navigation.policy import SHIPPED, MazePolicyConfig, goals_reached, train_policy
+from vd4rl_pomdp.policies.actor import read_actor
+
+
+def test_the_shipped_first_person_policy_reaches_goals_and_an_idle_one_does_not():
+    actor = read_actor(SHIPPED)
+    assert actor.card["algorithm"] == "PPO"
+    reached = goals_reached(actor, actor.card["action_repeat"], 3)
+    idle = replace(actor, weights={name: value * 0 for name, value in actor.weights.items()})
+    assert reached >= 12
+    assert goals_reached(idle, actor.card["action_repeat"], 3) < reached / 3
+
+
+def test_a_policy_of_no_decisions_is_refused(tmp_path):
+    with pytest.raises(UserError, match="--decisions is 0"):
+        train_policy(MazePolicyConfig(tmp_path / "actor.safetensors", decisions=0))
+
+
+def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
+    trained = train_policy(MazePolicyConfig(tmp_path / "actor.safetensors", decisions=2048))
+    stored = read_actor(tmp_path / "actor.safetensors")
+    seen = np.array([0.3, -0.2, 1.0, 0.1], np.float32)
+    np.testing.assert_array_equal(stored.act(seen), trained.act(seen))
+    assert stored.card["decisions"] == 2048
+    spread = [stored.act(seen, np.random.default_rng(i)) for i in range(50)]
+    assert np.std(spread, axis=0).min() > 0.1

@@ -1,0 +1,41 @@
+"""Settings of `vd4rl-pomdp navigation collect` and its presets."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+
+@dataclass(frozen=True)
+class CollectConfig:
+    """Settings of `vd4rl-pomdp navigation collect`."""
+
+    maze: str
+    """no_curtain, one_curtain, three_curtains or first_person."""
+    out: Path
+    """Folder of the set."""
+    preset: str = "paper"
+    """paper, cpu or smoke: the defaults of all other settings."""
+    trajectories: int = 500
+    """Trajectories in all; the last tenth is held out from training."""
+    trajectory_rows: int = 1000
+    """Rows of each trajectory."""
+    action_repeat: int = 1
+    """Simulator steps of 0.01 s for one action (D4RL's is 1)."""
+    noise: float = 0.5
+    """Standard deviation of the Gaussian noise on actions in [-1, 1]."""
+    seed: int = 0
+    """Seed of starts, goals and noise."""
+    workers: int = 0
+    """Processes that simulate and draw; 0 uses every core."""
+    trajectories_per_shard: int = 5
+    """Trajectories in a shard."""
+
+
+_CPU = CollectConfig("", Path(), preset="cpu", trajectories=100, action_repeat=5)
+PRESETS = {
+    "paper": CollectConfig("", Path()),
+    "cpu": _CPU,
+    "smoke": replace(_CPU, preset="smoke", trajectories=10, trajectory_rows=120),
+}
+"""Defaults by preset: 500k rows as in the paper, 100k rows whose actions move the mass visibly, and 1,200 rows."""
