@@ -2,7 +2,7 @@
 
 A stream's seed comes from numpy's `SeedSequence`, its name being the spawn key, so no two streams of a run meet, nor
 those of two runs with different seeds. Sets are the exception: their episodes are keyed by (seed, episode), see
-`data.collect`, and evaluation starts from fixed seeds, see `evaluation`.
+`episode_seed`, and evaluation starts from fixed seeds, see `evaluation`.
 """
 
 from __future__ import annotations
@@ -35,3 +35,9 @@ def stream_generator(seed: int, *name: str | int) -> torch.Generator:
 def seed_networks(seed: int, stage: str) -> None:
     """Seed torch's global generator, which only the initialisation of networks uses; every other draw has a stream."""
     torch.manual_seed(stream_seed(seed, stage, "networks"))
+
+
+def episode_seed(seed: int, episode: int) -> int:
+    """Environment seed of an episode of a set."""
+    digest = hashlib.blake2b(f"{seed}/{episode}".encode(), digest_size=4).digest()
+    return int.from_bytes(digest, "little") & 0x7FFFFFFF

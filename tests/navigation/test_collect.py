@@ -7,8 +7,7 @@ import h5py
 import numpy as np
 import pytest
 
-from vd4rl_pomdp.data import collect as shards
-from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data import open_dataset, shards
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.envs.maze import MazeEnv
 from vd4rl_pomdp.errors import UserError

@@ -6,26 +6,24 @@ on after an interruption and ends in the same files.
 
 from __future__ import annotations
 
-import hashlib
-import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 
-from vd4rl_pomdp.data.format import PLAN, RECORD, write_shard
+from vd4rl_pomdp.data.shards import Shard, claim_set, collect_shards
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
-from vd4rl_pomdp.runs.folder import holds_anything, jsonable, read_json, write_json
+from vd4rl_pomdp.runs.folder import jsonable
 from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.progress import ProgressLine
-from vd4rl_pomdp.runs.provenance import command, git_commit, versions
-from vd4rl_pomdp.runs.workers import count_workers, run_jobs
-from vd4rl_pomdp.seeding import stream_seed
+from vd4rl_pomdp.runs.provenance import versions
+from vd4rl_pomdp.runs.workers import run_jobs
+from vd4rl_pomdp.seeding import episode_seed, stream_seed
 from vd4rl_pomdp.tasks import (
     EPISODE_TRANSITIONS,
     FRAME_SIZE,
@@ -39,8 +37,6 @@ from vd4rl_pomdp.tasks import (
 
 Policy = Actor | Ladder | None
 """Who acts in a shard: an actor, a ladder of them, or nobody (random actions)."""
-Rows = dict[str, np.ndarray]
-"""An episode's rows, by key."""
 _RUNTIME_FIELDS = ("out", "workers")
 MAX_NOISE = 2.0
 """Actions lie in [-1, 1]: noise beyond this leaves nothing of them."""
@@ -116,45 +112,6 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
     return [shard.path for shard in shards]
 
 
-@dataclass(frozen=True)
-class Shard:
-    """One shard to write."""
-
-    path: Path
-    jobs: list[Any]
-    """Its episodes."""
-    attributes: dict[str, Any]
-
-
-def collect_shards(
-    out: Path, shards: list[Shard], roll_out: Callable[[Any], Rows], workers: int, title: tuple[str, str]
-) -> None:
-    """Write the shards that are missing, then the set's record.
-
-    Args:
-        out: folder of the set, which this process owns.
-        shards: all shards of the set.
-        roll_out: plays a job; its rows by key.
-        workers: processes, 0 for every core.
-        title: what is going on, and the unit of a job.
-    """
-    record = _Record(out)
-    with ProgressLine(title[0], sum(len(shard.jobs) for shard in shards), title[1]) as progress:
-        for shard in shards:
-            if shard.path.exists():
-                progress.advance(len(shard.jobs))
-                continue
-            started, frames, rollouts = time.monotonic(), 0, []
-            for rollout in run_jobs(roll_out, shard.jobs, workers):
-                rollouts.append(rollout)
-                frames += len(rollout["reward"])
-                speed = frames / (time.monotonic() - started)
-                progress.advance(1, ret=float(rollout["reward"].sum()), frames_per_s=speed)
-            record.note(shard.path, time.monotonic() - started, frames)
-            write_shard(shard.path, join_rollouts(rollouts), shard.attributes)
-    record.write(workers)
-
-
 def _check(config: CollectConfig) -> None:
     """Refuse settings that make no set."""
     get_task(config.task)
@@ -215,12 +172,6 @@ def replay_returns(config: CollectConfig) -> list[float]:
             returns.append(float(rollout["reward"].sum()))
             progress.advance(1, ret=returns[-1])
     return returns
-
-
-def episode_seed(seed: int, episode: int) -> int:
-    """Environment seed of an episode of a set."""
-    digest = hashlib.blake2b(f"{seed}/{episode}".encode(), digest_size=4).digest()
-    return int.from_bytes(digest, "little") & 0x7FFFFFFF
 
 
 def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Policy]]:
@@ -294,11 +245,6 @@ def _environment(*arguments: Any) -> Any:
     return _ENVIRONMENTS[arguments]
 
 
-def join_rollouts(rollouts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Rows of several episodes, in order."""
-    return {key: np.concatenate([rollout[key] for rollout in rollouts]) for key in rollouts[0]}
-
-
 def _attributes(config: CollectConfig, path: Path, policy: Policy) -> dict[str, Any]:
     return {
         "task": config.task,
@@ -316,42 +262,3 @@ def _claim(config: CollectConfig, actors: list[str]) -> None:
     settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS}
     settings["actors"] = actors
     claim_set(config.out, settings)
-
-
-def claim_set(out: Path, settings: dict[str, Any]) -> None:
-    """Write collection.json, or check that the folder holds the same collection."""
-    path = out / PLAN
-    if path.exists():
-        stored = read_json(path)
-        differing = sorted(k for k in settings if stored.get(k) != settings[k])
-        if differing:
-            raise UserError(f"{out}: holds a set collected with another {', '.join(differing)}; choose another --out")
-        return
-    if holds_anything(out):
-        raise UserError(f"{out}: is not empty and holds no collected set; choose another --out")
-    write_json(path, settings)
-
-
-class _Record:
-    """What a repeated collection would not reproduce: seconds and frames, over all its parts, and where it ran."""
-
-    def __init__(self, out: Path) -> None:
-        self._path, self._parts_path = out / RECORD, out / ".parts.json"
-        self._parts: dict[str, list[float]] = read_json(self._parts_path) if self._parts_path.exists() else {}
-
-    def note(self, shard: Path, seconds: float, frames: int) -> None:
-        """Remember a shard's part, just before it is written, until the set is whole."""
-        self._parts[shard.name] = [round(seconds, 1), frames]
-        write_json(self._parts_path, self._parts)
-
-    def write(self, workers: int) -> None:
-        """Write the set's record, unless it has one and nothing was added."""
-        if not self._parts and self._path.exists():
-            return
-        from vd4rl_pomdp.data.parity import render_info
-
-        seconds, frames = (sum(part[i] for part in self._parts.values()) for i in (0, 1))
-        facts = {"seconds": round(seconds, 1), "frames": int(frames), "workers": count_workers(workers)}
-        origin = {"command": command(), "git_commit": git_commit(), "versions": versions()}
-        write_json(self._path, facts | origin | {"render": render_info()})
-        self._parts_path.unlink(missing_ok=True)

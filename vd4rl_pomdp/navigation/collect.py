@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.data.collect import Shard, claim_set, collect_shards, episode_seed
+from vd4rl_pomdp.data.shards import Shard, claim_set, collect_shards
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
 from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, get_maze
 from vd4rl_pomdp.navigation.config import CollectConfig
@@ -23,6 +23,7 @@ from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.provenance import versions
+from vd4rl_pomdp.seeding import episode_seed
 from vd4rl_pomdp.tasks import MOST_EPISODES
 from vd4rl_pomdp.types import StepType
 
