@@ -33,7 +33,7 @@ class Objective(nn.Module, ABC):
             progress: share of the training that is done, 0 to 1, for schedules.
 
         Returns:
-            A scalar to minimise, and detached scalars to log.
+            A scalar to minimise, and detached scalars to log: itself as `loss`, and whatever else tells how it goes.
         """
 
     def after_step(self) -> None:

@@ -46,6 +46,7 @@ def test_loss_is_a_finite_scalar_that_moves_every_part_of_the_encoder(method: st
     assert loss.shape == ()
     assert torch.isfinite(loss)
     assert all(value.numel() == 1 and not value.requires_grad for value in logs.values())
+    assert torch.equal(logs["loss"], loss.detach())
     loss.backward()
     still = [n for n, p in objective.encoder.named_parameters() if p.grad is None or not p.grad.any()]
     assert still == []
