@@ -3,21 +3,31 @@
 from __future__ import annotations
 
 import contextlib
+import hashlib
 import io
 import json
 import os
 import shutil
+from collections import deque
 from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from functools import partial
 from itertools import islice
 from pathlib import Path
 from typing import Any
+from unittest import mock
 
 import numpy as np
 from bad_input_flags import ENCODER, MAZE, NAVIGATED, RUN, SET, SMOKE, Case
 
 ROWS, EPISODES = 20, 4
 """Rows of an episode of the small set, and its episodes."""
+CUT: dict[str, tuple[str, list[str]]] = {
+    "pretrain": ("runs-cut/pretraining", ["--data", SET, *SMOKE]),
+    "finetune": ("runs-cut/finetuning", ["--encoder", ENCODER, "--data", SET, *SMOKE, "--workers", "1"]),
+    "navigation train": ("runs-cut/navigating", ["--data", MAZE, *SMOKE]),
+}
+"""For each stage a run that was cut, and the words that go on with it, but for --out."""
 
 
 def build_world(folder: Path) -> None:
@@ -32,8 +42,9 @@ def build_world(folder: Path) -> None:
         with contextlib.redirect_stderr(io.StringIO()), contextlib.redirect_stdout(io.StringIO()):
             config = CollectConfig("walker_walk", "random", Path(SET), EPISODES, workers=1, episodes_per_shard=2)
             collect(config, length=ROWS)
-            for words in _stages():
-                run_stage(words)
+            with _keeping_all():
+                for words in _stages():
+                    run_stage(words)
         shutil.copytree(Path(__file__).parents[1] / "results" / "datasets", "reports/sets")
         _unfinished()
         _policy_run(Path("runs/policy"))
@@ -48,21 +59,34 @@ def _stages() -> Iterator[list[str]]:
     yield ["finetune", "--encoder", ENCODER, "--data", SET, "--out", RUN, *SMOKE, "--workers", "1"]
     yield ["navigation", "train", "--data", MAZE, "--out", NAVIGATED, *SMOKE]
     yield ["navigation", "report", NAVIGATED, "--out", "reports/navigation", "--no-pictures"]
+    yield ["theory", "--out", "reports/theory"]
+
+
+@contextmanager
+def _keeping_all() -> Iterator[None]:
+    """Within, a run that ends keeps what it needs only to go on: two checkpoints and its features."""
+    from finetune.features import FeatureFile
+    from vd4rl_pomdp.runs.checkpoint import KEPT, Checkpoints
+
+    prune = Checkpoints.prune
+    with (
+        mock.patch.object(Checkpoints, "prune", lambda self, _: prune(self, KEPT)),
+        mock.patch.object(FeatureFile, "remove"),
+    ):
+        yield
 
 
 def _unfinished() -> None:
-    """Runs that were cut after their last checkpoint."""
-    for finished, cut in (("pretrained", "pretraining"), ("finetuned", "finetuning"), ("navigated", "navigating")):
-        folder = Path("runs-cut") / cut
-        shutil.copytree(Path("runs") / finished, folder)
-        shutil.rmtree(Path("runs") / finished / "checkpoint")  # which nobody reads; cases copy all files
-        (folder / "timing.json").unlink()
-        record = json.loads((folder / "config.json").read_text())
-        record["config"]["out"] = str(folder)
-        (folder / "config.json").write_text(json.dumps(record))
+    """Runs that were cut after their last checkpoint; the finished ones lose what they have no use for."""
+    for finished, (cut, _) in zip(("pretrained", "finetuned", "navigated"), CUT.values(), strict=True):
+        folder = Path("runs") / finished
+        shutil.copytree(folder, cut)
+        Path(cut, "timing.json").unlink()
+        shutil.rmtree(folder / "checkpoints")
+    for name in ("features.npy", "features.json"):
+        Path(RUN, name).unlink()
     shutil.rmtree("runs-cut/pretraining/encoder")
-    (Path("runs-cut/navigating") / "results.json").unlink()
-    np.save("runs-cut/finetuning/features.npy", np.zeros((1, ROWS * EPISODES + EPISODES, 32), np.float16))
+    Path("runs-cut/navigating/results.json").unlink()
 
 
 def _policy_run(folder: Path) -> None:
@@ -105,28 +129,18 @@ READERS: list[tuple[str, list[str], list[str]]] = [
     ("policy export", ["runs/policy", "--out", "new"], ["runs/policy/snapshots/00010000.safetensors"]),
     ("pretrain", ["--data", SET, "--out", "new", *SMOKE], [f"{SET}/1_walker_walk_random.hdf5"]),
     (
-        "pretrain",
-        ["--data", SET, "--out", "runs-cut/pretraining", *SMOKE],
-        [
-            f"runs-cut/pretraining/{name}"
-            for name in ("config.json", "metrics.jsonl", "checkpoint/state.json", "checkpoint/state.safetensors")
-        ],
-    ),
-    (
         "finetune",
         ["--encoder", ENCODER, "--data", SET, "--out", "new", *SMOKE, "--workers", "1"],
         [f"{ENCODER}/config.json", f"{ENCODER}/model.safetensors"],
     ),
+    *(
+        (command, [*words, "--out", folder], [f"{folder}/config.json", f"{folder}/metrics.jsonl"])
+        for command, (folder, words) in CUT.items()
+    ),
     (
         "finetune",
-        ["--encoder", ENCODER, "--data", SET, "--out", "runs-cut/finetuning", *SMOKE, "--workers", "1"],
-        [
-            f"runs-cut/finetuning/{name}"
-            for name in (
-                *("config.json", "metrics.jsonl", "checkpoint/state.json", "checkpoint/state.safetensors"),
-                *("episodes.csv", "features.npy"),
-            )
-        ],
+        [*CUT["finetune"][1], "--out", "runs-cut/finetuning"],
+        [f"runs-cut/finetuning/{name}" for name in ("episodes.csv", "features.npy", "features.json")],
     ),
     (
         "evaluate",
@@ -146,23 +160,20 @@ READERS: list[tuple[str, list[str], list[str]]] = [
             f"{RUN}/{name}"
             for name in (
                 *("config.json", "metrics.jsonl", "timing.json", "probe.json", "film.npz", "episodes.csv"),
-                "encoder/config.json",
+                *("encoder/config.json", "pretrain_timing.json"),
             )
         ],
     ),
+    ("report", ["runs", "reports/theory", "--out", "new"], ["reports/theory/theory.json"]),
+    ("report", ["runs-cut/finetuning", "--out", "new"], ["runs-cut/finetuning/labels.json"]),
     ("navigation train", ["--data", MAZE, "--out", "new", *SMOKE], [f"{MAZE}/0_no_curtain.hdf5"]),
-    (
-        "navigation train",
-        ["--data", MAZE, "--out", "runs-cut/navigating", *SMOKE],
-        [
-            f"runs-cut/navigating/{name}"
-            for name in ("config.json", "metrics.jsonl", "checkpoint/state.json", "checkpoint/state.safetensors")
-        ],
-    ),
     (
         "navigation report",
         [NAVIGATED, "--out", "new", "--no-pictures"],
-        [f"{NAVIGATED}/{name}" for name in ("config.json", "results.json", "timing.json", "machine.json")],
+        [
+            f"{NAVIGATED}/{name}"
+            for name in ("config.json", "results.json", "timing.json", "machine.json", "trajectory.csv")
+        ],
     ),
     (
         "navigation report",
@@ -189,10 +200,18 @@ FINE: dict[str, str] = {
     "report | */probe.json | missing": "a set without states gives none",
     "report | */probe.json | a dangling link": "a set without states gives none",
     "report | */probe.json | no key": "a set without states gives none",
+    "report | */pretrain_timing.json | missing": "an encoder of other origin has none",
+    "report | */pretrain_timing.json | a dangling link": "likewise",
+    "report | */pretrain_timing.json | no key": "what it does not say is left out of the report",
+    "report | */theory.json | missing": "the report goes without its section",
+    "report | */theory.json | a dangling link": "likewise",
+    **{
+        f"finetune | */features.npy | {kind}": "features that are not what was written are made anew"
+        for kind in ("missing", "empty", "truncated", "garbage", "a dangling link", "another *", "objects", "nan")
+    },
+    **{f"finetune | */features.json | {kind}": "likewise" for kind in ("missing", "a dangling link", "no key")},
     "report | */film.npz | missing": "the report goes without",
     "report | */film.npz | a dangling link": "the report goes without",
-    "finetune | */features.npy | missing": "the set is encoded anew",
-    "finetune | */features.npy | a dangling link": "the set is encoded anew",
     "policy export | */snapshots/* | missing": "a run keeps what snapshots it has",
     "policy export | */snapshots/* | a dangling link": "likewise",
     "policy export | */config.json | *seed*": "nothing reads it, and an export takes longer than the limit",
@@ -200,13 +219,9 @@ FINE: dict[str, str] = {
     "policy train | stop_at | below": "a return may be",
     "demo | out | a foreign folder": "a folder of runs may hold other things",
     "sweep | out | a foreign folder": "a folder of runs may hold other things",
-    "data table | out | a foreign folder": "its own names are checked file by file",
-    "report | out | a foreign folder": "its own names are checked file by file",
-    "theory | out | a foreign folder": "its own names are checked file by file",
     "evaluate | out | a dangling link": "the link's target is made, as by any program",
     "* | data/*.hdf5 | missing": "a set of fewer shards is a set",
     "data card | */provenance.json | no key": "what it does not say is left out of the card",
-    "navigation report | out | a foreign folder": "its own names are checked file by file",
     "* | */metrics.jsonl | missing": _LOG,
     "* | */metrics.jsonl | empty": _LOG,
     "* | */metrics.jsonl | truncated": _LOG,
@@ -225,6 +240,50 @@ def file_cases(world: Path) -> Iterator[Case]:
             if path.suffix == ".json":
                 for kind, damage in _each_place(json.loads((world / file).read_text())):
                     yield Case(command, file, kind, [*command.split(), *words], partial(damage, path), may_pass=True)
+    for command in CUT:
+        yield from _checkpoint_cases(command, world)
+    yield from _lock_cases()
+
+
+def _lock_cases() -> Iterator[Case]:
+    """What may lie in a run where its lock and its owner's name will be: no lock stays shut without an owner."""
+    folder, words = CUT["pretrain"]
+    for name in (".lock", ".owner.json"):
+        path = Path(folder, name)
+        for kind, damage in {**ANY, **(JSON if path.suffix else {})}.items():
+            if kind not in ("missing", "truncated"):
+                line = ["pretrain", *words, "--out", folder]
+                yield Case("pretrain", str(path), kind, line, partial(_made_then, damage, path), may_pass=True)
+
+
+def _made_then(damage: Damage, path: Path) -> None:
+    path.touch()
+    damage(path)
+
+
+def _checkpoint_cases(command: str, world: Path) -> Iterator[Case]:
+    """The newest checkpoint of a cut run, damaged beside an older one, damaged alone, and of another run."""
+    folder, more = CUT[command]
+    words = [*command.split(), *more, "--out", folder]
+    step = max(int(path.name) for path in (world / folder / "checkpoints").iterdir())
+    for name in ("manifest.json", "state.json", "state.safetensors"):
+        path = Path(folder, "checkpoints", str(step), name)
+        for kind, damage in ANY.items():
+            goes_on = kind not in ("a folder", "a pipe")
+            yield Case(command, str(path), f"{kind}, beside an older one", words, partial(damage, path), warns=goes_on)
+        for kind, damage in (ANY | (JSON if name == "manifest.json" else {})).items():
+            yield Case(command, str(path), f"{kind}, alone", words, partial(_alone, damage, path))
+        of_keys = _each_place(json.loads((world / path).read_text())) if path.suffix == ".json" else ()
+        if name == "manifest.json":
+            for kind, damage in of_keys:
+                yield Case(command, str(path), f"{kind}, alone", words, partial(_alone, damage, path))
+            continue
+        for kind, damage in BY_SUFFIX[path.suffix].items():
+            if kind not in ("nan", "inf"):  # with its hash a run has written it, and its end says that it diverged
+                yield Case(command, str(path), f"{kind}, with its hash", words, partial(_signed, damage, path))
+        for kind, damage in of_keys:
+            title = f"{kind}, with its hash"
+            yield Case(command, str(path), title, words, partial(_signed, damage, path), may_pass=True)
 
 
 Damage = Callable[[Path], None]
@@ -243,6 +302,22 @@ def _to_pipe(path: Path) -> None:
 def _to_dangling_link(path: Path) -> None:
     path.unlink()
     path.symlink_to("nothing-there")
+
+
+def _alone(damage: Damage, path: Path) -> None:
+    """Damage a checkpoint and drop the older one."""
+    for other in set(path.parents[1].iterdir()) - {path.parent}:
+        shutil.rmtree(other)
+    damage(path)
+
+
+def _signed(damage: Damage, path: Path) -> None:
+    """Damage a checkpoint as if another run had written it so."""
+    damage(path)
+    manifest = path.with_name("manifest.json")
+    record = json.loads(manifest.read_text())
+    record["sha256"][path.name] = hashlib.sha256(path.read_bytes()).hexdigest()
+    manifest.write_text(json.dumps(record))
 
 
 ANY: dict[str, Damage] = {
@@ -265,18 +340,22 @@ PLACES = 20
 
 
 def _each_place(value: dict[str, Any]) -> Iterator[tuple[str, Damage]]:
-    """For each key of a JSON object and of the objects in it: without it, and with a value of another type."""
+    """For each key of a JSON object, then of the objects in it: without it, and with a value of another type."""
     for place in islice(_places(value), PLACES):
         name = ".".join(place)
         yield f"without {name}", _edit_json(place, lambda inner, key: inner.pop(key))
         yield f"{name} of another type", _edit_json(place, lambda inner, key: inner.update({key: _other(inner[key])}))
 
 
-def _places(value: Any, place: tuple[str, ...] = ()) -> Iterator[tuple[str, ...]]:
-    if isinstance(value, dict):
-        for key, inner in value.items():
-            yield (*place, key)
-            yield from _places(inner, (*place, key))
+def _places(value: dict[str, Any]) -> Iterator[tuple[str, ...]]:
+    """Keys with those above them, the outermost first."""
+    waiting: deque[tuple[tuple[str, ...], Any]] = deque([((), value)])
+    while waiting:
+        place, inner = waiting.popleft()
+        if place:
+            yield place
+        if isinstance(inner, dict):
+            waiting += [((*place, key), deeper) for key, deeper in inner.items()]
 
 
 def _other(value: Any) -> Any:

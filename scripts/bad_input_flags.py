@@ -30,6 +30,8 @@ class Case:
     """What makes the files bad, in the folder where the command runs."""
     may_pass: bool = False
     """Whether nobody may read what is bad: then exit code 0 is right, too."""
+    warns: bool = False
+    """Whether the command goes on without what is bad: exit code 0 and one line of warning are right, nothing else."""
 
 
 NAMES = [name for name, entry in COMMANDS.items() if not isinstance(entry, Mapping)] + [

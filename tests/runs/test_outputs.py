@@ -61,6 +61,8 @@ def test_folders_that_are_kept_foreign_or_inside_others_are_refused(kept, tmp_pa
     (tmp_path / "link").symlink_to(kept["a run"])
     with pytest.raises(UserError, match="lies inside"):
         refuse_inside(tmp_path / "link" / "new")
+    (tmp_path / "loop").symlink_to("loop")
+    refuse_inside(tmp_path / "loop" / "new")  # is inside nothing that is kept; writing there says what is wrong
     papers = fill(tmp_path / "papers", thesis__tex="words")
     with pytest.raises(UserError, match="is not empty and holds no report"):
         refuse_foreign(papers, "report", "summary.csv")

@@ -106,16 +106,19 @@ def test_the_page_about_runs_has_the_same_section(shown, tmp_path):
 
 
 def test_studies_that_cannot_be_reported_are_one_line(shown, tmp_path):
-    _, folder = shown
+    study, folder = shown
     run = write_run(tmp_path / "runs/acro", "acro", 0, {10: [50.0]})
     for name in ("one", "two"):
         (tmp_path / name).mkdir()
         (tmp_path / name / "theory.json").write_text((folder / "theory.json").read_text())
     with pytest.raises(UserError, match="two studies of the theory"):
         write_report([tmp_path], tmp_path / "out")
-    (tmp_path / "one" / "theory.json").write_text('{"tables": {}}')
-    with pytest.raises(UserError, match=r"has no 'counterexample'; write it again: vd4rl-pomdp theory --out"):
-        write_report([run, tmp_path / "one"], tmp_path / "out")
+    for damage in ({"printed": {}}, {"counterexample": ["of another type"]}):
+        (tmp_path / "one" / "theory.json").write_text(json.dumps(study | damage))
+        with pytest.raises(
+            UserError, match=r"is no whole study \(.*\); write it again: vd4rl-pomdp theory --out .*one"
+        ):
+            write_report([run, tmp_path / "one"], tmp_path / "out")
     (tmp_path / "one" / "theory.json").write_text("{")
     with pytest.raises(UserError, match="cannot be read as JSON"):
         write_report([run, tmp_path / "one"], tmp_path / "out")

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from jinja2 import UndefinedError
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from rich.console import Console
@@ -23,7 +24,6 @@ Row = dict[str, Any]
 FILE = "theory.json"
 COLUMNS = {"correct": "correct classifier", "complete": "complete state", "discards": "discards noise"}
 LABEL: dict[str, Any] = {"fontsize": 7, "ha": "center", "va": "center", "zorder": 3}
-KEYS = ("counterexample", "tables", "disagreements", "comparisons", "worlds", "states", "transitions", "diagrams")
 
 
 def write_theory(study: Row, out: Path) -> Path:
@@ -33,23 +33,26 @@ def write_theory(study: Row, out: Path) -> Path:
     return out / "index.html"
 
 
-def load_study(paths: list[Path]) -> Row | None:
-    """The study that `write_theory` left at or below some paths, if there is one."""
+def load_section(paths: list[Path]) -> str | None:
+    """The section about the study that `write_theory` left at or below some paths, if there is one."""
     files = sorted(set(chain.from_iterable(path.rglob(FILE) for path in paths)))
     if len(files) > 1:
         raise UserError(f"{files[0]} and {files[1]}: two studies of the theory; report one of them")
     for file in files:
         study = read_json(file)
-        missing = [key for key in KEYS if key not in study]
-        if missing:
-            raise UserError(f"{file}: has no {missing[0]!r}; write it again: vd4rl-pomdp theory --out {file.parent}")
-        return study
+        try:
+            return section(study)
+        except (LookupError, TypeError, ValueError, AttributeError, UndefinedError) as error:
+            raise UserError(
+                f"{file}: is no whole study ({type(error).__name__}: {error}); write it again: vd4rl-pomdp theory "
+                f"--out {file.parent}"
+            ) from error
     return None
 
 
-def section(study: Row) -> Row:
-    """What the template of the section shows."""
-    return {
+def section(study: Row) -> str:
+    """The section about a study, in HTML."""
+    shown = {
         "study": study,
         "columns": COLUMNS,
         "table": table_rows(study),
@@ -57,6 +60,7 @@ def section(study: Row) -> Row:
         "forced": to_svg(forced_figure(study)),
         "entropies": to_svg(entropy_figure(study["comparisons"])),
     }
+    return render("theory_section.html", theory=shown)
 
 
 def table_rows(study: Row) -> list[Row]:

@@ -20,7 +20,7 @@ from vd4rl_pomdp.report.gaps import MISSING, find_gaps
 from vd4rl_pomdp.report.load import Run, compare, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.templates import render
-from vd4rl_pomdp.report.theory import load_study, section
+from vd4rl_pomdp.report.theory import load_section
 from vd4rl_pomdp.runs.folder import write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.text import write_text
@@ -39,7 +39,7 @@ def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
         UserError: there is nothing to report, a file is damaged, or `out` holds anything but an earlier report.
     """
     refuse_foreign(out, "report", f"{_MARK}.csv")
-    runs, study = load_runs(paths), load_study(paths)
+    runs = load_runs(paths)
     rows = [row for run in runs for row in run.rows]
     if not rows:
         raise UserError(f"{paths[0]}: holds no evaluated run yet; `vd4rl-pomdp finetune` evaluates")
@@ -54,7 +54,7 @@ def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
         "profiles": tables.profiles(final, np.linspace(0, 100, 101)),
         "missing": gaps,
     }
-    page = _render(runs, rows, made, study)
+    page = _render(runs, rows, made, load_section(paths))
     out.mkdir(parents=True, exist_ok=True)
     for name, table in made.items():
         path = out / f"{name}.csv"
@@ -91,7 +91,7 @@ def _terminal_table(setting: str, rows: list[Row]) -> Table:
     return table
 
 
-def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]], study: Row | None) -> str:
+def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]], theory: str | None) -> str:
     names = list(dict.fromkeys(map(tables.label, (*made[_MARK], *rows))))
     pretraining: dict[str, list[tuple[str, list[dict[str, float]]]]] = {}
     for run in runs:
@@ -122,7 +122,7 @@ def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]], study:
         losses=[(name, figures.loss_figure(series, names)) for name, series in pretraining.items()],
         films=_films(runs),
         published=_published(rows),
-        theory=section(study) if study else None,
+        theory=theory,
         runs=[_facts(run) for run in runs],
     )
 

@@ -6,6 +6,7 @@ A run, a policy, an encoder and a data set own their folders. Every command asks
 from __future__ import annotations
 
 import json
+import os
 from pathlib import Path
 
 import h5py
@@ -19,7 +20,7 @@ _ROWS = {FRAMES_KEY, "action", "reward", "step_type"}
 
 def refuse_inside(out: Path) -> None:
     """Raise UserError if a file or folder to write lies inside a run, a policy, an encoder or a data set."""
-    for folder in out.resolve().parents:
+    for folder in Path(os.path.realpath(out)).parents:  # unlike resolve, takes a link to itself as it is
         if what := kept_in(folder):
             raise UserError(f"{out}: lies inside {folder}, which holds {what}; choose another --out")
 
