@@ -144,7 +144,7 @@ def test_bad_input_is_one_line(tmp_path):
     with pytest.raises(UserError, match="two runs of one method"):
         write_report([tmp_path / "a", tmp_path / "b"], tmp_path / "out")
     (tmp_path / "a" / "metrics.jsonl").write_text("{\n")
-    with pytest.raises(UserError, match="a line is damaged"):
+    with pytest.raises(UserError, match="a line is not JSON of numbers"):
         write_report([tmp_path / "a"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
