@@ -18,7 +18,7 @@ from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_number, refuse_outside, refuse_unread
-from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, read_rows, rows_of
+from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, read_rows, rows_of, rows_until
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import CONFIG, EncoderCard, copy_encoder, encoder_hash, load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
@@ -161,7 +161,7 @@ class Trainer:
 
     def _require_evaluations(self, path: Path) -> None:
         """Raise UserError if rows of an evaluation before the newest are gone: the run would end without them."""
-        found = Counter(row["step"] for row in read_rows(path))
+        found = Counter(row["step"] for row in rows_until(path, self.step))
         due = range(self.config.eval_every, self.step, self.config.eval_every)
         missing = [step for step in due if found[step] < self.config.eval_episodes]
         if missing:
@@ -170,8 +170,8 @@ class Trainer:
     def _lacks_evaluation(self, run: RunFolder, loop: Loop) -> bool:
         """Whether the run was cut between a checkpoint and its evaluation; rows that count no more are dropped."""
         rows = run.path / "episodes.csv"
-        drop_rows_after(rows, self.step)
         self._require_evaluations(rows)
+        drop_rows_after(rows, self.step)
         if not self.step or not loop.due(self.config.eval_every):
             return False
         if sum(row["step"] == self.step for row in read_rows(rows)) == self.config.eval_episodes:

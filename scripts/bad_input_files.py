@@ -192,6 +192,8 @@ _LOG = "the log decides nothing, and a kill may cut it"
 FINE: dict[str, str] = {
     "data table | */returns.csv | missing": "its episodes are played anew",
     "data table | */returns.csv | a dangling link": "its episodes are played anew",
+    "data table | */costs.csv | missing": "they are measured anew",
+    "data table | */costs.csv | a dangling link": "they are measured anew",
     "navigation report | */runs.csv | a word for a number": "the last column is a command",
     "navigation report | */runs.csv | nan": "the last column is a command",
     "navigation report | */runs.csv | inf": "the last column is a command",
@@ -203,6 +205,14 @@ FINE: dict[str, str] = {
     "report | */pretrain_timing.json | missing": "an encoder of other origin has none",
     "report | */pretrain_timing.json | a dangling link": "likewise",
     "report | */pretrain_timing.json | no key": "what it does not say is left out of the report",
+    **{
+        f"report | runs/finetuned/encoder/config.json | {kind}": "the rows name their run; the rest is left out"
+        for kind in ("missing", "a dangling link")
+    },
+    **{
+        f"navigation report | */trajectory.csv | {kind}": "without pictures nothing reads it, it is copied as it is"
+        for kind in ("empty", "truncated", "garbage", *("without *", "a short row", "a word*", "nan", "inf", "an*"))
+    },
     "report | */theory.json | missing": "the report goes without its section",
     "report | */theory.json | a dangling link": "likewise",
     **{

@@ -178,13 +178,19 @@ def drop_rows_after(path: Path, step: int) -> None:
     """Forget evaluations that a cut run made after its last checkpoint, and a last line that is not whole."""
     if not path.exists():
         return
-    with _whole(path):
-        whole = regular(path).read_bytes().decode().rpartition("\n")[0]
-        kept = [row for row in _parse(path, io.StringIO(whole, newline="")) if row["step"] <= step] if whole else []
-    if kept:
+    if kept := rows_until(path, step):
         write_csv(path, COLUMNS, kept)
     else:
         path.unlink()
+
+
+def rows_until(path: Path, step: int) -> list[dict[str, Any]]:
+    """Rows of the evaluations up to a step, none if there is no file; a last line that is not whole is left out."""
+    if not path.exists():
+        return []
+    with _whole(path):
+        whole = regular(path).read_bytes().decode().rpartition("\n")[0]
+        return [row for row in _parse(path, io.StringIO(whole, newline="")) if row["step"] <= step] if whole else []
 
 
 _AGENTS: dict[tuple, Agent] = {}

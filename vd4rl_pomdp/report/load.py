@@ -147,6 +147,8 @@ def _load(folder: Path) -> Run:
     record = read_json(folder / "config.json")
     if not isinstance(record["config"], dict) or "seed" not in record["config"]:
         raise TypeError("config.json holds no settings")
+    if not isinstance(record["stage"], str):
+        raise TypeError(f"its stage is {record['stage']!r}")
     rows = read_rows(folder / "episodes.csv")
     card = _card(folder)
     timing = folder / "timing.json"

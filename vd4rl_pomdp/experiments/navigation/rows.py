@@ -16,7 +16,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.grid import Cell
 from vd4rl_pomdp.runs.folder import read_json, write_csv
 from vd4rl_pomdp.runs.metrics import read_metrics
-from vd4rl_pomdp.runs.reading import regular
+from vd4rl_pomdp.runs.reading import build, regular
 from vd4rl_pomdp.runs.settings import settings_of
 
 ROWS, RUNS, TRAJECTORIES = "rows.csv", "runs.csv", "trajectories"
@@ -202,14 +202,17 @@ def _read_run(folder: Path) -> Run:
 def _run_of(folder: Path) -> Run:
     record, results = read_json(folder / "config.json"), read_json(folder / "results.json")
     config, timing, machine = record["config"], read_json(folder / "timing.json"), read_json(folder / "machine.json")
-    cell = Cell(
-        maze=results["maze"],
-        method=config["method"],
-        max_k=config["max_k"],
-        self_prediction=config["self_prediction"] > 0,
-        exogenous=config["exogenous"] != "none",
-        literal_future=config["literal_future"],
-    )
+    named = {
+        "maze": results["maze"],
+        **{name: config[name] for name in ("method", "max_k", "literal_future")},
+        "self_prediction": config["self_prediction"] > 0,
+        "exogenous": config["exogenous"] != "none",
+    }
+    cell = build(Cell, named)
+    if not isinstance(config["preset"], str):
+        raise TypeError(f"its preset is {config['preset']!r}")
+    if not all(isinstance(timing[name], int | float) for name in ("steps", "seconds")):
+        raise TypeError("timing.json holds no numbers")
     facts = {
         "steps": timing["steps"],
         "seconds": timing["seconds"],
@@ -221,6 +224,8 @@ def _run_of(folder: Path) -> Run:
     }
     values = {_value(row): _finite(folder / "results.json", row, f"{row['value']:.6g}") for row in results["rows"]}
     trajectory = folder / "trajectory.csv"
+    if not trajectory.is_file():
+        raise UserError(f"{trajectory}: is missing or no file; train it again")
     return Run(cell, config["preset"], config["seed"], values, {k: str(v) for k, v in facts.items()}, trajectory)
 
 
