@@ -229,6 +229,7 @@ FINE: dict[str, str] = {
     "policy train | stop_at | below": "a return may be",
     "demo | out | a foreign folder": "a folder of runs may hold other things",
     "sweep | out | a foreign folder": "a folder of runs may hold other things",
+    "navigation grid | out | a foreign folder": "a folder of runs may hold other things",
     "evaluate | out | a dangling link": "the link's target is made, as by any program",
     "* | data/*.hdf5 | missing": "a set of fewer shards is a set",
     "data card | */provenance.json | no key": "what it does not say is left out of the card",

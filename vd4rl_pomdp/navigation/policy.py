@@ -20,7 +20,6 @@ from vd4rl_pomdp.navigation.planner import Planner
 from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.progress import ProgressLine
-from vd4rl_pomdp.runs.reading import regular
 
 if TYPE_CHECKING:
     from stable_baselines3 import PPO
@@ -103,12 +102,21 @@ class PilotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return features(self._env.state, self._planner.waypoint(self._env.state[:2], self._env.goal))
 
 
+def _refuse_other(path: Path) -> None:
+    """Raise UserError for a file to write that is there and holds anything but an earlier actor."""
+    if path.exists() or path.is_symlink():
+        try:
+            read_actor(path)
+        except UserError as error:
+            raise UserError(f"{path}: is there already and holds no actor; choose another --out") from error
+
+
 def train_policy(config: MazePolicyConfig) -> Actor:
     """Train and write the actor; its card says how many goals it reaches in 20 episodes."""
     refuse_outside(config, decisions=1, action_repeat=(1, MOST_STEPS), seed=(0, MAX_SEED))
     refuse_no_folder(config.out.parent)
-    regular(config.out)
     refuse_inside(config.out)
+    _refuse_other(config.out)
     try:
         from stable_baselines3 import PPO
         from stable_baselines3.common.callbacks import BaseCallback
