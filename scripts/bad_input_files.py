@@ -194,6 +194,12 @@ FINE: dict[str, str] = {
     "data table | */returns.csv | a dangling link": "its episodes are played anew",
     "data table | */costs.csv | missing": "they are measured anew",
     "data table | */costs.csv | a dangling link": "they are measured anew",
+    **{f"data table | */costs.csv | {kind}": "the last column is a commit" for kind in ("a word*", "nan", "inf")},
+    **{
+        f"data table | */actors.json | {kind}": "sets whose actors are not known are played anew"
+        for kind in ("missing", "a dangling link", "no key")
+    },
+    "report | runs-cut/finetuning/labels.json | *": "a run that has rows is named by them",
     "navigation report | */runs.csv | a word for a number": "the last column is a command",
     "navigation report | */runs.csv | nan": "the last column is a command",
     "navigation report | */runs.csv | inf": "the last column is a command",
