@@ -430,3 +430,6 @@ def test_labels_and_cards_that_are_not_whole_are_named(tmp_path):
     (run / "encoder" / "config.json").write_text("{}")
     with pytest.raises(UserError, match="does not say how the encoder was pretrained"):
         write_report([run], tmp_path / "out")
+    (run / "encoder" / "config.json").write_text('{"pretrain": {"corruption": ["patch"]}}')
+    with pytest.raises(UserError, match=r"a: its files are damaged"):
+        write_report([run], tmp_path / "out")

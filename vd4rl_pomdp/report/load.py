@@ -139,7 +139,9 @@ def _read(folder: Path) -> Run:
     """`_load`, with a sentence for files of a run that are JSON but not what a run writes."""
     try:
         return _load(folder)
-    except (KeyError, TypeError, AttributeError) as error:
+    except UserError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
         raise UserError(f"{folder}: its files are damaged ({error}); take another copy, or leave it out") from error
 
 
