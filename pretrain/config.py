@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal
 
@@ -98,8 +98,3 @@ PRESETS = {
     ),
 }
 """Defaults by preset: `paper` is the full setting, `cpu` fits two cores, `smoke` shows in seconds that all works."""
-
-
-def with_preset(name: str, **changes: object) -> PretrainConfig:
-    """A preset's config with some fields changed."""
-    return replace(PRESETS[name], **changes)  # type: ignore[arg-type]
