@@ -8,7 +8,7 @@ from typing import Any
 import torch
 
 from pretrain.config import PRESETS, PretrainConfig
-from pretrain.objectives import build_objective, get_method, unread_options
+from pretrain.objectives import METHODS, build_objective, unread_options
 from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption
 from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside, refuse_unread
@@ -43,7 +43,7 @@ def pretrain(config: PretrainConfig) -> RunFolder:
 
 
 def _pretrain(config: PretrainConfig) -> RunFolder:
-    method = get_method(config.method)
+    method = METHODS.named(config.method)
     dataset = open_dataset(config.data)
     task = _task_of(dataset, config)
     seed_networks(config.seed, STAGE)
@@ -122,7 +122,7 @@ def corruption_of(config: CorruptionConfig) -> CorruptionConfig:
 
 def check(config: PretrainConfig) -> None:
     """Refuse settings that cannot work or that nothing reads, before anything is read or written."""
-    get_method(config.method)
+    METHODS.named(config.method)
     refuse_outside(
         config, seed=(0, MAX_SEED), steps=0, batch_size=1, window=2, learning_rate=0, shift=(0, FRAME_SIZE - 1),
         feature_dim=1, hidden_dim=1, gru_layers=(1, MAX_LAYERS), head_dim=1, m=0, n=0, history_window=0, max_k=1,
@@ -156,7 +156,7 @@ def require_batch(objective: Objective, device: torch.device, config: Any) -> No
 def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
     actions = dataset.action_after(dataset.transition_rows)
     target = make_action_target(config.action_target, actions.numpy(), config.codes, config.seed)
-    state_dim = dataset.states().shape[1] if get_method(config.method).reads_state else 0
+    state_dim = dataset.states().shape[1] if METHODS.named(config.method).reads_state else 0
     objective = build_objective(config, actions, target, state_dim)
     dataset.num_windows(config.window)
     return objective
@@ -186,7 +186,7 @@ def _card(config: PretrainConfig, task: str, dataset: Dataset, run: RunFolder) -
         seed=config.seed,
         steps=config.steps,
         preset=config.preset,
-        end_to_end=get_method(config.method).end_to_end,
+        end_to_end=METHODS.named(config.method).end_to_end,
         action_loss=_last_action_loss(run),
         data=dataset.fingerprint,
         settings=settings_of(jsonable(asdict(replace(config, task=task)))),

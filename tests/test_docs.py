@@ -12,7 +12,7 @@ import tyro
 
 from finetune.algorithms import get_algorithm
 from pretrain.config import PRESETS
-from pretrain.objectives import ENTRY_POINTS, METHODS, Method, get_method
+from pretrain.objectives import METHODS, Method
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
@@ -72,7 +72,7 @@ class ParsedError(Exception):
 
 @pytest.fixture(autouse=True)
 def _registries():
-    with patch.dict(METHODS), patch.dict(STAGES):
+    with METHODS.isolated(), patch.dict(STAGES):
         yield
 
 
@@ -102,7 +102,7 @@ def test_every_command_has_flags_and_values_that_exist(page, line, monkeypatch):
         raise ParsedError
 
     monkeypatch.setattr(tyro, "cli", parse_alone)
-    METHODS["past_to_frame"] = Method(METHODS["acro"].build)
+    METHODS.register("past_to_frame", Method(METHODS["acro"].build))
     words = shlex.split(re.split(r" [>|] ", line)[0].replace("[SET]", "SET"))
     with pytest.raises(ParsedError):
         main(words[1:] if words[0] == "vd4rl-pomdp" else words[2:])
@@ -110,8 +110,8 @@ def test_every_command_has_flags_and_values_that_exist(page, line, monkeypatch):
 
 
 CHECKS = {
-    "method": get_method,
-    "methods": get_method,
+    "method": METHODS.named,
+    "methods": METHODS.named,
     "corruption": make_corruption,
     "corruptions": make_corruption,
     "algorithm": get_algorithm,
@@ -192,4 +192,4 @@ def check_results(page: str, names: dict) -> None:
 
 def test_toml_blocks_are_read_and_name_what_exists():
     (block,) = [code for page in PAGES for code in blocks(page, "toml")]
-    assert list(tomllib.loads(block)["project"]["entry-points"]) == [ENTRY_POINTS]
+    assert list(tomllib.loads(block)["project"]["entry-points"]) == [METHODS.group]

@@ -6,17 +6,14 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
-from importlib.metadata import EntryPoint
 from pathlib import Path
 
 import pytest
 import torch
 
-import pretrain.objectives
 from pretrain.config import PRESETS
-from pretrain.objectives import METHODS, Method, build_objective, get_method, register_method
+from pretrain.objectives import METHODS, build_objective
 from tests.helpers_data import write_fake_set
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.visibility import wrong_pairs
 
@@ -48,9 +45,9 @@ def test_the_example_runs_through_every_stage(script, tmp_path):
 
 
 @pytest.fixture
-def registry(monkeypatch):
-    monkeypatch.setattr(pretrain.objectives, "METHODS", dict(METHODS))
-    monkeypatch.setattr(pretrain.objectives, "_broken", {})
+def registry():
+    with METHODS.isolated():
+        yield
 
 
 def test_the_example_sees_what_it_declares(script, registry):
@@ -63,41 +60,3 @@ def test_the_example_sees_what_it_declares(script, registry):
     assert wrong_pairs(objective, [6, 6, 4]) == []
     objective.visible = lambda t, k, rows: ({t, t + k}, set())
     assert wrong_pairs(objective, [6])
-
-
-def test_an_entry_point_offers_a_method(registry, monkeypatch):
-    entry = EntryPoint("theirs", "tests.test_own_method:THEIRS", "vd4rl_pomdp.methods")
-    monkeypatch.setattr(pretrain.objectives, "entry_points", lambda group: [entry])
-    assert get_method("theirs") is THEIRS
-    assert get_method("theirs") is THEIRS, "asking again registers nothing twice"
-
-
-@pytest.mark.parametrize(
-    ("value", "reason"),
-    [
-        ("no_such_package:METHOD", "no_such_package:METHOD: ModuleNotFoundError"),
-        ("tests.test_own_method:NOWHERE", "AttributeError"),
-        ("tests.test_own_method:PAGE", "Path, not a pretrain.objectives.Method"),
-    ],
-)
-def test_a_method_that_cannot_be_loaded_is_named_once_and_left_out(registry, monkeypatch, capsys, value, reason):
-    offered = [
-        EntryPoint("broken", value, "vd4rl_pomdp.methods"),
-        EntryPoint("theirs", "tests.test_own_method:THEIRS", "vd4rl_pomdp.methods"),
-    ]
-    monkeypatch.setattr(pretrain.objectives, "entry_points", lambda group: offered)
-    assert get_method("acro") is METHODS["acro"]
-    assert get_method("theirs") is THEIRS
-    (line,) = capsys.readouterr().err.splitlines()
-    assert line.startswith("warning: method 'broken' cannot be loaded")
-    assert reason in line
-    with pytest.raises(UserError, match="'broken' cannot be loaded"):
-        get_method("broken")
-
-
-def test_a_taken_name_is_refused(registry):
-    with pytest.raises(UserError, match="'acro' exists already"):
-        register_method("acro", THEIRS)
-
-
-THEIRS = Method(METHODS["acro"].build)

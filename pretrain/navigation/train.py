@@ -13,7 +13,7 @@ from pretrain.navigation.config import PRESETS, NavigationConfig, command_of
 from pretrain.navigation.data import open_data
 from pretrain.navigation.measure import measure, write_trajectory
 from pretrain.navigation.trainer import STAGE, Trainer, make_objective, network_of
-from pretrain.objectives import INVERSE, get_method, unread_options
+from pretrain.objectives import INVERSE, METHODS, unread_options
 from pretrain.train import DECIDE_MEMORY, require_batch
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside, refuse_unread
@@ -80,7 +80,7 @@ def _conclude(run: RunFolder, trainer: Trainer) -> None:
 
 def _check(config: NavigationConfig) -> None:
     """Refuse settings that cannot work or that nothing reads, before anything is read or written."""
-    get_method(network_of(config.method))
+    METHODS.named(network_of(config.method))
     refuse_outside(
         config, seed=(0, MAX_SEED), steps=1, batch_size=1, window=2, max_k=1, codes=1, m=0, n=0, burn_in=0,
         average_last=1, log_every=1, checkpoint_every=1, evaluation_windows=1, refit_windows=1, refit_steps=1,

@@ -1,11 +1,9 @@
-"""Every pretraining method by name. A method is one file and one entry here, or `register_method` from anywhere."""
+"""Every pretraining method by name. A method is one file and one entry here, or `METHODS.register` from anywhere."""
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Callable
 from dataclasses import dataclass, fields
-from importlib.metadata import EntryPoint, entry_points
 from typing import Any
 
 from torch import Tensor
@@ -21,10 +19,9 @@ from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE
 from vd4rl_pomdp.objective import InverseConfig, Objective
+from vd4rl_pomdp.registry import Registry
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 
-ENTRY_POINTS = "vd4rl_pomdp.methods"
-"""Group of entry points under which a package offers methods; each names a `Method`."""
 INVERSE = (*(field.name for field in fields(InverseConfig)), "action_target", "codes")
 """Settings that all inverse models read."""
 MEMORY = ("m", "hidden_dim", "gru_layers", "history_window")
@@ -74,7 +71,7 @@ def _homer(encoder: Encoder, target: ActionTarget, config: PretrainConfig) -> Ob
 
 _MASKED = (*INVERSE, "n", "hidden_dim", "gru_layers")
 """What MIK reads, its backward GRU included."""
-METHODS: dict[str, Method] = {
+_OWN = {
     "no_history": Method(AllHistory),
     "ah": Method(AllHistory, "gru"),
     "ah+a": Method(AllHistory, "gru", use_actions=True),
@@ -92,52 +89,15 @@ METHODS: dict[str, Method] = {
     "drq_bc": Method(Untrained, trained=False, end_to_end="drqv2_bc", options=()),
     "state": Method(Untrained, trained=False, reads_state=True, options=()),
 }
-
-
-def register_method(name: str, method: Method) -> None:
-    """Add a method of one's own; a name that is taken raises UserError."""
-    if name in METHODS:
-        raise UserError(f"a method called {name!r} exists already: choose another name")
-    METHODS[name] = method
-
-
-_broken: dict[str, str] = {}
-"""Methods that an installed package offers and that cannot be loaded, and why."""
-
-
-def _load_plugins() -> None:
-    """Register the methods that installed packages offer; one that cannot be loaded is told of once, and left out."""
-    for entry in entry_points(group=ENTRY_POINTS):
-        if entry.name not in METHODS and entry.name not in _broken:
-            try:
-                register_method(entry.name, _load(entry))
-            except Exception as error:  # other people's code may raise anything
-                _broken[entry.name] = f"{entry.value}: {type(error).__name__}: {' '.join(str(error).split())}"
-                print(f"warning: method {entry.name!r} cannot be loaded ({_broken[entry.name]})", file=sys.stderr)
-
-
-def _load(entry: EntryPoint) -> Method:
-    method = entry.load()
-    if not isinstance(method, Method):
-        raise TypeError(f"is a {type(method).__name__}, not a pretrain.objectives.Method")
-    return method
-
-
-def get_method(name: str) -> Method:
-    """The method called `name`; raises UserError listing the choices."""
-    _load_plugins()
-    if name in _broken:
-        raise UserError(
-            f"method {name!r} cannot be loaded ({_broken[name]}): mend or remove the package that offers it"
-        )
-    if name not in METHODS:
-        raise UserError(f"unknown method {name!r}: choose one of {', '.join(METHODS)}")
-    return METHODS[name]
+METHODS: Registry[Method] = Registry(
+    "method", _OWN, lambda part: isinstance(part, Method), "a pretrain.objectives.Method"
+)
+"""All methods. Packages offer theirs in the group of entry points `vd4rl_pomdp.methods`; each names a `Method`."""
 
 
 def memory_of(config: PretrainConfig) -> str:
     """Memory of a config's encoder, gru or none; a memory for a method that can have none raises UserError."""
-    method = get_method(config.method)
+    method = METHODS.named(config.method)
     history = method.history if config.history == "method" else config.history
     if history != "none" and (method.end_to_end or method.reads_state):
         raise UserError(f"{config.method} has no memory: --history {history} is for pretrained methods")
@@ -146,7 +106,7 @@ def memory_of(config: PretrainConfig) -> str:
 
 def unread_options(config: PretrainConfig) -> set[str]:
     """Those of `OPTIONS` that a config's method and encoder do not read."""
-    method = get_method(config.method)
+    method = METHODS.named(config.method)
     read = {*method.options, *(() if memory_of(config) == "none" else MEMORY)}
     read |= set() if method.reads_state else set(PIXELS)
     return set(OPTIONS) - (read if config.action_target in ("kmeans", "bins") else read - {"codes"})
@@ -168,7 +128,7 @@ def build_objective(
         state_dim: width of the simulator state, for methods that read it.
         observation: channels and size of an observation, for methods that read pixels.
     """
-    method = get_method(config.method)
+    method = METHODS.named(config.method)
     past = method.past if config.m is None else config.m
     channels, size = observation
     shape: dict[str, Any] = {"frame_encoder": config.frame_encoder, "channels": channels, "size": size}

@@ -118,14 +118,14 @@ def _sweep(words: Arguments, program: str) -> None:
 def _check(runs: list[list[Arguments]]) -> None:
     """Find what a stage will refuse before the first run, not after the hours that the runs before it take."""
     from finetune.train import check as check_finetune
-    from pretrain.objectives import get_method
+    from pretrain.objectives import METHODS
     from pretrain.train import check as check_pretrain
 
     for (_, *first), *others in runs:
         config = _pretrain_config(first, "vd4rl-pomdp pretrain")
         check_pretrain(config)
         for _, *words in others:
-            check_finetune(_finetune_config(words, "vd4rl-pomdp finetune"), get_method(config.method).end_to_end)
+            check_finetune(_finetune_config(words, "vd4rl-pomdp finetune"), METHODS.named(config.method).end_to_end)
 
 
 @dataclass(frozen=True)

@@ -1,0 +1,106 @@
+"""Parts of one's own, by call and by entry point; what an installed package breaks, breaks nothing else."""
+
+from importlib.metadata import EntryPoint
+
+import pytest
+
+import vd4rl_pomdp.registry
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.registry import REGISTRIES, Registry, origins
+
+THEIRS, PAGE = "theirs", 3
+
+
+@pytest.fixture
+def registry(monkeypatch):
+    monkeypatch.setattr(vd4rl_pomdp.registry, "REGISTRIES", {})
+    return Registry("frame encoder", {"own": "ours", "own+a": "ours, too"}, lambda p: isinstance(p, str), "a string")
+
+
+def offer(monkeypatch, **values: str) -> None:
+    entries = [EntryPoint(name, value, "vd4rl_pomdp.frame_encoders") for name, value in values.items()]
+    monkeypatch.setattr(vd4rl_pomdp.registry, "entry_points", lambda group: [e for e in entries if e.group == group])
+
+
+def test_all_kinds_have_a_registry():
+    import pretrain.objectives
+
+    assert REGISTRIES["method"] is pretrain.objectives.METHODS
+
+
+def test_a_call_adds_a_part(registry):
+    registry.register("mine", "my own")
+    assert registry.named("mine") == registry["mine"] == "my own"
+    assert list(registry) == ["own", "own+a", "mine"]
+
+
+def test_what_a_block_registers_is_forgotten_after_it(registry):
+    with registry.isolated():
+        registry.register("mine", "my own")
+        assert "mine" in registry
+    assert "mine" not in registry
+    assert registry.origin("mine") == ""
+
+
+def test_an_unknown_name_is_told_the_choices(registry):
+    with pytest.raises(UserError, match="unknown frame encoder 'owl': choose one of own, own\\+a"):
+        registry.named("owl")
+
+
+def test_a_taken_name_is_refused(registry):
+    with pytest.raises(UserError, match="a frame encoder called 'own' exists already"):
+        registry.register("own", "mine")
+
+
+def test_a_part_of_another_kind_is_refused(registry):
+    with pytest.raises(UserError, match="frame encoder 'three' is a int, not a string"):
+        registry.register("three", 3)
+
+
+def test_an_entry_point_offers_a_part(registry, monkeypatch):
+    offer(monkeypatch, theirs="tests.test_registry:THEIRS")
+    assert registry.named("theirs") == "theirs"
+    assert len(registry) == len(list(registry)) == 3, "loaded once"
+
+
+def test_a_package_and_its_version_are_the_origin_of_what_it_offers(registry, monkeypatch):
+    from importlib.metadata import entry_points
+
+    script = next(e for e in entry_points(group="console_scripts") if e.dist.name == "pytest")
+    offered = EntryPoint("theirs", "tests.test_registry:THEIRS", registry.group)._for(script.dist)
+    monkeypatch.setattr(vd4rl_pomdp.registry, "entry_points", lambda group: [offered])
+    assert registry.origin("theirs") == f"pytest {pytest.__version__}"
+    assert registry.origin("own") == ""
+
+
+@pytest.mark.parametrize(
+    ("value", "reason"),
+    [
+        ("no_such_package:METHOD", "no_such_package:METHOD: ModuleNotFoundError"),
+        ("tests.test_registry:NOWHERE", "AttributeError"),
+        ("tests.test_registry:PAGE", "is a int, not a string"),
+    ],
+)
+def test_a_part_that_cannot_be_loaded_is_named_once_and_left_out(registry, monkeypatch, capsys, value, reason):
+    offer(monkeypatch, broken=value, theirs="tests.test_registry:THEIRS")
+    assert registry.named("own") == "ours"
+    assert registry.named("theirs") == "theirs"
+    (line,) = capsys.readouterr().err.splitlines()
+    assert line.startswith("warning: frame encoder 'broken' cannot be loaded")
+    assert reason in line
+    assert "broken" not in registry
+    with pytest.raises(UserError, match="'broken' cannot be loaded"):
+        registry.named("broken")
+
+
+def test_settings_name_their_parts_and_where_these_come_from(registry, monkeypatch):
+    offer(monkeypatch, theirs="tests.test_registry:THEIRS")
+    registry.register("mine", "my own")
+    by_call, offered = "registered by a call", "an installed package"
+    assert origins({"frame_encoder": "own", "steps": 3}) == {}
+    assert origins({"frame_encoder": "mine"}) == {"frame_encoder mine": by_call}
+    assert origins({"frame_encoder": "mine+theirs"}) == {
+        "frame_encoder mine": by_call,
+        "frame_encoder theirs": offered,
+    }
+    assert origins({"frame_encoder": "own+a"}) == {}

@@ -1,0 +1,120 @@
+"""Parts by name: the package's own, those added by a call, and those that installed packages offer as entry points."""
+
+from __future__ import annotations
+
+import sys
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from importlib.metadata import EntryPoint, entry_points
+from typing import Any, Generic, TypeVar
+
+from vd4rl_pomdp.errors import UserError
+
+Part = TypeVar("Part")
+REGISTRIES: dict[str, Registry[Any]] = {}
+"""Every registry by its kind, in the order in which they were made."""
+
+
+class Registry(Mapping[str, Part], Generic[Part]):
+    """All parts of one kind; reading it loads what installed packages offer, once."""
+
+    def __init__(self, kind: str, own: Mapping[str, Part], fits: Callable[[Any], bool], expected: str) -> None:
+        """See the class.
+
+        Args:
+            kind: what a part is called in messages, `frame encoder`; its plural with underscores names the group of
+                entry points, `vd4rl_pomdp.frame_encoders`, and it is the setting that names a part, `frame_encoder`.
+            own: the package's parts by name.
+            fits: whether an object is a part of this kind.
+            expected: what such an object is, for messages.
+        """
+        self.kind, self.setting = kind, kind.replace(" ", "_")
+        self.group = f"vd4rl_pomdp.{self.setting}s"
+        self.broken: dict[str, str] = {}
+        """Offered parts that cannot be loaded, and why."""
+        self._parts = dict(own)
+        self._origins: dict[str, str] = {}
+        self._fits, self._expected = fits, expected
+        self._loaded = False
+        REGISTRIES[self.setting] = self
+
+    def register(self, name: str, part: Part) -> None:
+        """Add a part of one's own; a name that is taken, or a part of another kind, raises UserError."""
+        self._add(name, part, "registered by a call")
+
+    @contextmanager
+    def isolated(self) -> Iterator[None]:
+        """Within the block parts may be registered; after it they are forgotten, as tests want it."""
+        parts, origins = dict(self._parts), dict(self._origins)
+        try:
+            yield
+        finally:
+            self._parts, self._origins = parts, origins
+
+    def named(self, name: str) -> Part:
+        """The part called `name`; raises UserError listing the choices, or saying why it cannot be loaded."""
+        self._load_offered()
+        if name in self.broken:
+            raise UserError(
+                f"{self.kind} {name!r} cannot be loaded ({self.broken[name]}): mend or remove what offers it"
+            )
+        if name not in self._parts:
+            raise UserError(f"unknown {self.kind} {name!r}: choose one of {', '.join(self._parts)}")
+        return self._parts[name]
+
+    def origin(self, name: str) -> str:
+        """Where a part comes from: a package and its version, a call, or "" for this package's own."""
+        self._load_offered()
+        return self._origins.get(name, "")
+
+    def __getitem__(self, name: str) -> Part:
+        self._load_offered()
+        return self._parts[name]
+
+    def __iter__(self) -> Iterator[str]:
+        self._load_offered()
+        return iter(tuple(self._parts))
+
+    def __len__(self) -> int:
+        self._load_offered()
+        return len(self._parts)
+
+    def _add(self, name: str, part: Any, origin: str) -> None:
+        if name in self._parts:
+            raise UserError(f"a {self.kind} called {name!r} exists already: choose another name")
+        if not self._fits(part):
+            raise UserError(f"{self.kind} {name!r} is a {type(part).__name__}, not {self._expected}")
+        self._parts[name], self._origins[name] = part, origin
+
+    def _load_offered(self) -> None:
+        """Add what installed packages offer; what cannot be loaded is told of once, and left out."""
+        if self._loaded:
+            return
+        self._loaded = True  # first: a package may look into this registry while it is loaded
+        for entry in entry_points(group=self.group):
+            try:
+                self._add(entry.name, entry.load(), _package_of(entry))
+            except Exception as error:  # other people's code may raise anything
+                reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
+                self.broken[entry.name] = f"{entry.value}: {' '.join(reason.split())}"
+                warning = f"warning: {self.kind} {entry.name!r} cannot be loaded ({self.broken[entry.name]})"
+                print(warning, file=sys.stderr)
+
+
+def _package_of(entry: EntryPoint) -> str:
+    return f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "an installed package"
+
+
+def origins(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Where the parts come from that settings name and that are not this package's own: {"method mine": "its 1.2"}.
+
+    Args:
+        settings: a stage's settings by name; those that name parts are called as the registries' `setting`.
+    """
+    found = {}
+    for setting, registry in REGISTRIES.items():
+        value = settings.get(setting, "")
+        for name in [value] if value in registry else value.split("+"):
+            if name in registry and (origin := registry.origin(name)):
+                found[f"{setting} {name}"] = origin
+    return found
