@@ -2,8 +2,8 @@
 
 from baselines.acro import ACRO
 from baselines.curl import CURL
-from baselines.driml import DRIML
-from baselines.homer import HOMER
+from baselines.driml import DRIML, DRIMLOptions
+from baselines.homer import HOMER, HOMEROptions
 from baselines.one_step_inverse import OneStepInverse
 
-__all__ = ["ACRO", "CURL", "DRIML", "HOMER", "OneStepInverse"]
+__all__ = ["ACRO", "CURL", "DRIML", "HOMER", "DRIMLOptions", "HOMEROptions", "OneStepInverse"]

@@ -24,10 +24,12 @@ import torch
 from torch import Tensor, nn
 
 from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.contrastive import info_nce
 from vd4rl_pomdp.nn.draws import Draws
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.objective import Objective
+from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.types import Windows
 
 MOMENTUM = 0.05
@@ -37,7 +39,7 @@ MOMENTUM = 0.05
 class CURL(Objective):
     """Instance discrimination with a momentum encoder."""
 
-    def __init__(self, encoder: Encoder, seed: int) -> None:
+    def __init__(self, encoder: Encoder, target: ActionTarget, options: Options, seed: int) -> None:
         super().__init__()
         self.encoder = encoder
         self.momentum_encoder = copy.deepcopy(encoder).requires_grad_(False)

@@ -17,16 +17,21 @@ Differences:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.contrastive import info_nce
 from vd4rl_pomdp.nn.draws import Draws
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import FrameEncoder
 from vd4rl_pomdp.nn.heads import mlp
 from vd4rl_pomdp.objective import Objective
+from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.types import Windows
 
 PLACES = 7
@@ -34,13 +39,23 @@ PLACES = 7
 SCORE_DIM = 64
 
 
+@dataclass(frozen=True)
+class DRIMLOptions(Options):
+    """Options of DRIML."""
+
+    max_k: int = 15
+    """Largest gap K between the two states; k is drawn from 1..K for every batch."""
+
+    limits: ClassVar[Limits] = {"max_k": 1}
+
+
 class DRIML(Objective):
     """Action-conditioned InfoNCE across k steps, on local and global features."""
 
-    def __init__(self, encoder: Encoder, max_k: int, seed: int) -> None:
+    def __init__(self, encoder: Encoder, target: ActionTarget, options: DRIMLOptions, seed: int) -> None:
         super().__init__()
         self.encoder = encoder
-        self.max_k = max_k
+        self.max_k = options.max_k
         channels, actions = self._frame.map_shape[0], encoder.config.action_dim
         widths = {"global": encoder.dim, "local": channels}
         self.anchors = nn.ModuleDict({n: mlp(w + actions, 256, SCORE_DIM, layers=1) for n, w in widths.items()})

@@ -17,14 +17,19 @@ Differences:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.draws import Draws
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.heads import mlp
 from vd4rl_pomdp.objective import Objective
+from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.types import Windows
 
 
@@ -47,13 +52,23 @@ class Bottleneck(nn.Module):
         return self.embedding(hard + soft - soft.detach())
 
 
+@dataclass(frozen=True)
+class HOMEROptions(Options):
+    """Options of HOMER."""
+
+    homer_codes: int = 0
+    """Codes of its discrete bottleneck; 0 for none."""
+
+    limits: ClassVar[Limits] = {"homer_codes": 0}
+
+
 class HOMER(Objective):
     """Real or imposter (o_t, a_t, o_{t+1})."""
 
-    def __init__(self, encoder: Encoder, codes: int, seed: int) -> None:
+    def __init__(self, encoder: Encoder, target: ActionTarget, options: HOMEROptions, seed: int) -> None:
         super().__init__()
         self.encoder = encoder
-        self.bottleneck = Bottleneck(encoder.dim, codes, seed) if codes else nn.Identity()
+        self.bottleneck = Bottleneck(encoder.dim, options.homer_codes, seed) if options.homer_codes else nn.Identity()
         self.classifier = mlp(2 * encoder.dim + encoder.config.action_dim, 256, 1)
         self.draws = Draws(seed, "homer", "imposters")
 

@@ -11,15 +11,8 @@ Differences:
 
 from __future__ import annotations
 
-from dataclasses import replace
-
-from vd4rl_pomdp.nn.action_target import ActionTarget
-from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.objective import InverseConfig, StateInverse
+from vd4rl_pomdp.objective import StateInverse
 
 
 class OneStepInverse(StateInverse):
-    """Inverse model on consecutive states, whatever `max_k` is configured."""
-
-    def __init__(self, encoder: Encoder, target: ActionTarget, config: InverseConfig) -> None:
-        super().__init__(encoder, target, replace(config, max_k=1))
+    """Inverse model on consecutive states: its options have no K, so that K is 1."""

@@ -2,27 +2,33 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Annotated, Any, ClassVar
 
+import tyro
+
+from finetune.algorithms import ALGORITHMS
+from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
+from vd4rl_pomdp.options import NO_OPTIONS, Options, StageConfig, all_options
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, FRAME_SIZE, MOST_EPISODES
 
 
 @dataclass(frozen=True, kw_only=True)
-class FinetuneConfig:
+class FinetuneConfig(StageConfig):
     """Settings of `vd4rl-pomdp finetune`."""
 
-    encoder: Path
+    encoder: Path = Path()
     """Encoder folder, RUN/encoder of a pretraining run; it stays frozen. Its corruption is used here too."""
-    data: Path
+    data: Path = Path()
     """Folder of the data set."""
-    out: Path
+    out: Path = Path()
     """Run folder; the same command continues a run that was cut."""
     algorithm: str = "td3_bc"
-    """td3_bc, drqv2_bc or bc; the references bc and drq_bc bring their own."""
-    preset: str = "paper"
-    """paper, cpu or smoke: the defaults of all other settings."""
+    """Algorithm, `vd4rl-pomdp list` shows all; the references bc and drq_bc bring their own."""
     seed: int = 0
     """Seed of the networks, the views and the batches."""
     updates: int = 500_000
@@ -33,12 +39,6 @@ class FinetuneConfig:
     """Units of each of the two hidden layers of actor and critics."""
     learning_rate: float = 3e-4
     """Adam's learning rate."""
-    gamma: float = 0.99
-    """Discount of a decision."""
-    n_step: int = 3
-    """Steps of the n-step return."""
-    alpha: float = 2.5
-    """Weight of the critic against behaviour cloning (TD3+BC's alpha)."""
     views: int = 4
     """Draws of corruption and shift under which the set is encoded once; 0 encodes every batch anew."""
     shift: int = 4
@@ -56,40 +56,43 @@ class FinetuneConfig:
     device: str = "auto"
     """auto, cpu or cuda."""
     log_every: int = 500
-    """Updates between two rows of metrics."""
+    """Updates that a row of metrics averages over."""
     checkpoint_every: int = 5_000
     """Updates between two checkpoints."""
     wandb: WandbMode = "off"
     """Mirror metrics to wandb: off, offline or online."""
+    options: Annotated[Options, tyro.conf.arg(name="algorithm")] = NO_OPTIONS
+    """What the chosen algorithm can be told."""
 
+    choosers: ClassVar[tuple[str, ...]] = ("algorithm",)
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "paper": {},
+        "cpu": {"updates": 50_000, "hidden_dim": 256, "precision": "bf16", "eval_every": 25_000},
+        "smoke": {
+            "updates": 40,
+            "batch_size": 16,
+            "hidden_dim": 32,
+            "views": 1,
+            "eval_every": 20,
+            "eval_episodes": 1,
+            "eval_length": 5,
+            "log_every": 10,
+            "checkpoint_every": 20,
+        },
+    }
+    """`paper` is the full setting, `cpu` fits two cores, `smoke` shows in seconds that all works."""
 
-_UNSET = Path()
-PRESETS = {
-    "paper": FinetuneConfig(encoder=_UNSET, data=_UNSET, out=_UNSET),
-    "cpu": FinetuneConfig(
-        encoder=_UNSET,
-        data=_UNSET,
-        out=_UNSET,
-        preset="cpu",
-        updates=50_000,
-        hidden_dim=256,
-        precision="bf16",
-        eval_every=25_000,
-    ),
-    "smoke": FinetuneConfig(
-        encoder=_UNSET,
-        data=_UNSET,
-        out=_UNSET,
-        preset="smoke",
-        updates=40,
-        batch_size=16,
-        hidden_dim=32,
-        views=1,
-        eval_every=20,
-        eval_episodes=1,
-        eval_length=5,
-        log_every=10,
-        checkpoint_every=20,
-    ),
-}
-"""Defaults by preset: `paper` is the full setting, `cpu` fits two cores, `smoke` shows in seconds that all works."""
+    @classmethod
+    def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
+        """Options of the algorithm."""
+        return {"options": ALGORITHMS.named(values["algorithm"]).options.fill(values)}
+
+    def check(self) -> None:
+        """Refuse settings that cannot work, before anything is read or written."""
+        refuse_outside(
+            self, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, views=0,
+            shift=(0, FRAME_SIZE - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
+            eval_length=(1, EPISODE_TRANSITIONS), log_every=1, checkpoint_every=1, workers=0,
+        )  # fmt: skip
+        for options in all_options(self):
+            options.check()

@@ -10,14 +10,14 @@ from typing import Any
 import numpy as np
 import torch
 
-from finetune.algorithms import OPTIONS, Algorithm, get_algorithm
-from finetune.config import PRESETS, FinetuneConfig
+from finetune.algorithms import ALGORITHMS, Algorithm, ReturnOptions
+from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd
 from finetune.features import STAGE, ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.data.parity import render_info
-from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_number, refuse_outside, refuse_unread
+from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, read_rows, rows_of, rows_until
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import CONFIG, EncoderCard, copy_encoder, encoder_hash, load_encoder, save_encoder
@@ -31,12 +31,12 @@ from vd4rl_pomdp.runs.memory import require_disk, require_memory, telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, FRAME_SIZE, MOST_EPISODES, get_task
+from vd4rl_pomdp.tasks import get_task
 
 
 def finetune(config: FinetuneConfig) -> RunFolder:
     """Run the stage, or go on with it; writes the policy and `episodes.csv` into the run's folder."""
-    check(config)
+    config.check()
     refuse_inside(config.out)
     with telling_memory(config, "views", "batch_size", "hidden_dim"):
         return _finetune(config)
@@ -48,8 +48,7 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     dataset.require_transitions()
     encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frames.shape[-1])
     if card.end_to_end:
-        check(config, card.end_to_end)
-        config = replace(config, algorithm=card.end_to_end, views=0)
+        config = end_to_end(config, card.end_to_end)
     if encoder.reads_state:
         dataset.states()
     _require_room(config, dataset, encoder, device)
@@ -64,27 +63,21 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     return run
 
 
-def check(config: FinetuneConfig, end_to_end: str = "") -> None:
-    """Refuse settings that cannot work or that nothing reads, before anything is read or written.
+def end_to_end(config: FinetuneConfig, algorithm: str) -> FinetuneConfig:
+    """The settings for a method that has no frozen stage, and brings its algorithm along.
 
-    Args:
-        config: the run's settings.
-        end_to_end: the algorithm that the method brings along, if it has no frozen stage.
+    Raises:
+        UserError: a setting that was not the default is not read.
     """
-    refuse_outside(
-        config, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, gamma=(0, 1), n_step=1,
-        alpha=0, views=0, shift=(0, FRAME_SIZE - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
-        eval_length=(1, EPISODE_TRANSITIONS), log_every=1, checkpoint_every=1, workers=0,
-    )  # fmt: skip
-    algorithm = end_to_end or config.algorithm
-    unread = {*OPTIONS.difference(get_algorithm(algorithm).options), *(("views",) if end_to_end else ())}
-    refuse_unread(config, PRESETS[config.preset], unread, f"the algorithm {algorithm}")
+    if config.views != config.usual()["views"]:
+        raise UserError(f"--views is not read by the algorithm {algorithm}, which trains the encoder: leave it out")
+    return config.altered(algorithm=algorithm, views=0)
 
 
 def _require_room(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, device: torch.device) -> None:
     """Refuse what plainly exceeds the memory or the disk: all views' features, or one batch through the networks."""
     longest = int((dataset.episode_end - dataset.episode_start).max()) - 1
-    refuse_number("n_step", config.n_step, 1, max(longest, FinetuneConfig.n_step))
+    refuse_number("n_step", _returns(config).n_step, 1, max(longest, ReturnOptions.n_step))
     features = config.views * dataset.num_rows * encoder.dim * 2
     require_memory(features, device, config, "views")
     require_disk(features, config.out, config, "views")
@@ -92,26 +85,32 @@ def _require_room(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, de
     require_memory(4 * (config.batch_size * row + weights), device, config, "batch_size", "hidden_dim")
 
 
+def _returns(config: FinetuneConfig) -> ReturnOptions:
+    """How returns are summed, also for an algorithm that does not look at them."""
+    return config.options if isinstance(config.options, ReturnOptions) else ReturnOptions()
+
+
 def _trainer(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: EncoderCard, run: RunFolder) -> Trainer:
     """What a run trains and on which batches: cached features, features encoded anew, or pixels."""
     seed_networks(config.seed, STAGE)
     policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(dataset.t.device)
     generator = stream_generator(config.seed, STAGE, "batches")
-    corruption = CorruptionConfig(**card.corruption)
+    corruption, returns = CorruptionConfig.fill(card.corruption), _returns(config)
     frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed)
     sampler: FeatureSampler | ExactSampler | TransitionSampler
     if card.end_to_end:
         view = View(dataset, corruption, config.shift, config.seed, STAGE)
-        sampler = TransitionSampler(view, config.batch_size, generator, config.n_step, config.gamma)
+        sampler = TransitionSampler(view, config.batch_size, generator, returns.n_step, returns.gamma)
     elif config.views:
         features = encode_views(frozen, config.views, FeatureFile(run.path, run.inputs))
         policy.standardise.fit(features)
         _probe(features, dataset, run)
-        sampler = FeatureSampler(dataset, features, config.batch_size, config.n_step, config.gamma, generator)
+        sampler = FeatureSampler(dataset, features, config.batch_size, returns.n_step, returns.gamma, generator)
     else:
-        sampler = ExactSampler(frozen, config.batch_size, config.n_step, config.gamma, generator)
+        sampler = ExactSampler(frozen, config.batch_size, returns.n_step, returns.gamma, generator)
         policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(4)]))
-    algorithm = get_algorithm(config.algorithm)(policy, config, stream_generator(config.seed, STAGE, "noise"))
+    noise = stream_generator(config.seed, STAGE, "noise")
+    algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, noise)
     return Trainer(EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, config, card)
 
 
@@ -190,7 +189,7 @@ class Trainer:
         self.algorithm.policy.save(run.path / "policy")
         if isinstance(self.algorithm, EndToEnd):
             save_encoder(run.path / "encoder", self.algorithm.encoder, self.card)
-        corruption = CorruptionConfig(**self.card.corruption)
+        corruption = CorruptionConfig.fill(self.card.corruption)
         jobs = [
             EpisodeJob(
                 encoder=run.path / "encoder",

@@ -1,33 +1,61 @@
-"""Settings of the pretraining stage and its presets."""
+"""Settings of the pretraining stage and its presets; what it shares with training on mazes."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
+from typing import Annotated, Any, ClassVar, Literal
 
-from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.objective import InverseConfig
+import tyro
+
+from pretrain.objectives import METHODS, Method
+from vd4rl_pomdp.corruptions import NO_CORRUPTION, CorruptionConfig
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
+from vd4rl_pomdp.nn.encoder import MAX_LAYERS
+from vd4rl_pomdp.nn.frame import FRAME_ENCODERS
+from vd4rl_pomdp.options import NO_OPTIONS, Limits, Options, StageConfig, all_options
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
+from vd4rl_pomdp.tasks import FRAME_SIZE
+
+
+@dataclass(frozen=True)
+class MemoryOptions(Options):
+    """Options of encoders with a memory."""
+
+    hidden_dim: int = 256
+    """Units of each GRU layer."""
+    gru_layers: int = 1
+    """Layers of the GRU."""
+    m: int | None = None
+    """Rows before t that a state is computed from; None: what the method has (fj and fj+a 8, the others all)."""
+
+    limits: ClassVar[Limits] = {"hidden_dim": 1, "gru_layers": (1, MAX_LAYERS), "m": 0}
+
+
+@dataclass(frozen=True)
+class StreamOptions(MemoryOptions):
+    """Options of encoders with a memory that are kept to read episodes."""
+
+    history_window: int = 0
+    """After pretraining, compute states from the last this many rows; 0: as in training."""
+
+    limits: ClassVar[Limits] = {"history_window": 0}
 
 
 @dataclass(frozen=True, kw_only=True)
-class PretrainConfig(CorruptionConfig, InverseConfig):
-    """Settings of `vd4rl-pomdp pretrain`."""
+class TrainingConfig(StageConfig):
+    """Settings of every training of an objective."""
 
-    data: Path
+    data: Path = Path()
     """Folder of the data set."""
-    out: Path
+    out: Path = Path()
     """Run folder; the same command continues a run that was cut."""
     method: str = "mik+a"
-    """Objective to train; see the documentation for the list."""
-    preset: str = "paper"
-    """paper, cpu or smoke: the defaults of all other settings."""
-    task: str = ""
-    """The set's task, where neither its shards nor its folder's name tell."""
+    """Objective to train; `vd4rl-pomdp list` shows all."""
     seed: int = 0
-    """Seed of the networks, the batches and the corruption."""
+    """Seed of everything that is drawn: networks, batches, corruption, exogenous noise."""
     steps: int = 50_000
     """Gradient steps."""
     batch_size: int = 16
@@ -36,65 +64,104 @@ class PretrainConfig(CorruptionConfig, InverseConfig):
     """Rows of a window."""
     learning_rate: float = 3e-4
     """Adam's learning rate."""
-    shift: int = 4
-    """Random shift in pixels, one for each window."""
     frame_encoder: str = "drq"
-    """Frame encoder: drq, or nature at a fraction of the cost."""
-    feature_dim: int = 256
-    """Width of the frame encoder's output."""
-    history: Literal["method", "none", "gru"] = "method"
-    """Memory of the encoder: what the method has, none, or a GRU over the past (also for memoryless baselines)."""
-    hidden_dim: int = 256
-    """Units of the GRU."""
-    gru_layers: int = 1
-    """Layers of the GRU."""
-    m: int | None = None
-    """Rows before t that a state is computed from; None: what the method has (fj and fj+a 8, the others all)."""
-    n: int | None = None
-    """mik and mik+a: rows after t+k that the future encoder reads; None: all to the window's end."""
-    history_window: int = 0
-    """After pretraining, compute states from the last this many rows; 0: as in training."""
-    literal_future: bool = False
-    """mik+a only: give the future encoder a_{t+k-1}, as the paper's formula reads literally (a leak at k = 1)."""
-    action_target: str = "kmeans"
-    """What the action head predicts: kmeans, bins, mse or mse_l2."""
-    codes: int = 20
-    """K-means codes, or bins for each action dimension."""
-    homer_codes: int = 0
-    """homer only: codes of its discrete bottleneck; 0 for none."""
+    """Frame encoder: drq, nature (a fraction of its cost), small or mixer (MLP-Mixer)."""
     precision: Precision = "fp32"
     """fp32, or bf16 autocast."""
     device: str = "auto"
     """auto, cpu or cuda."""
     log_every: int = 50
-    """Steps between two rows of metrics."""
+    """Steps that a row of metrics averages over."""
     checkpoint_every: int = 500
     """Steps between two checkpoints."""
     wandb: WandbMode = "off"
     """Mirror metrics to wandb: off, offline or online."""
+    options: Annotated[Options, tyro.conf.arg(name="method")] = NO_OPTIONS
+    """What the chosen method can be told."""
+    memory: Options = NO_OPTIONS
+    """The encoder's memory, where it has one."""
+    frame: Annotated[Options, tyro.conf.arg(name="frame-encoder")] = NO_OPTIONS
+    """What the chosen frame encoder can be told."""
+
+    choosers: ClassVar[tuple[str, ...]] = ("method", "frame_encoder", "action_target")
+
+    def check(self) -> None:
+        """Refuse settings that cannot work, before anything is read or written."""
+        refuse_outside(
+            self, seed=(0, MAX_SEED), steps=0, batch_size=1, window=2, learning_rate=0, log_every=1, checkpoint_every=1
+        )
+        for options in all_options(self):
+            options.check()
+        if (gap := getattr(self.options, "max_k", 0)) >= self.window:
+            raise UserError(f"--max-k {gap} needs windows of more than that many rows: raise --window or lower it")
 
 
-_UNSET = Path()
-PRESETS = {
-    "paper": PretrainConfig(data=_UNSET, out=_UNSET),
-    "cpu": PretrainConfig(
-        data=_UNSET, out=_UNSET, preset="cpu", steps=3_000, batch_size=8, frame_encoder="nature", precision="bf16"
-    ),
-    "smoke": PretrainConfig(
-        data=_UNSET,
-        out=_UNSET,
-        preset="smoke",
-        steps=20,
-        batch_size=2,
-        window=8,
-        max_k=3,
-        frame_encoder="nature",
-        feature_dim=32,
-        hidden_dim=32,
-        head_dim=32,
-        codes=4,
-        log_every=5,
-        checkpoint_every=10,
-    ),
-}
-"""Defaults by preset: `paper` is the full setting, `cpu` fits two cores, `smoke` shows in seconds that all works."""
+@dataclass(frozen=True, kw_only=True)
+class PretrainConfig(TrainingConfig):
+    """Settings of `vd4rl-pomdp pretrain`."""
+
+    task: str = ""
+    """The set's task, where neither its shards nor its folder's name tell."""
+    shift: int = 4
+    """Random shift in pixels, one for each window."""
+    history: Literal["method", "gru"] = "method"
+    """Memory of the encoder: what the method has, or a GRU over the past also for methods that have none."""
+    corruption: CorruptionConfig = NO_CORRUPTION
+    """What makes the observations partial."""
+
+    choosers: ClassVar[tuple[str, ...]] = (*TrainingConfig.choosers, "history", "corruption")
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "paper": {},
+        "cpu": {"steps": 3_000, "batch_size": 8, "frame_encoder": "nature", "precision": "bf16"},
+        "smoke": {
+            "steps": 20,
+            "batch_size": 2,
+            "window": 8,
+            "max_k": 3,
+            "frame_encoder": "nature",
+            "feature_dim": 32,
+            "hidden_dim": 32,
+            "head_dim": 32,
+            "codes": 4,
+            "log_every": 5,
+            "checkpoint_every": 10,
+        },
+    }
+    """`paper` is the full setting, `cpu` fits two cores, `smoke` shows in seconds that all works."""
+
+    @classmethod
+    def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
+        """Options of method, memory, frame encoder and corruption."""
+        method = METHODS.named(values["method"])
+        recurrent = memory_of(values["method"], method, values["history"]) == "gru"
+        return {
+            "options": method.options.fill(values),
+            "memory": (StreamOptions if recurrent else Options).fill(values),
+            "frame": frame_options(method, values),
+            "corruption": CorruptionConfig.fill(values),
+        }
+
+    def check(self) -> None:
+        """Refuse settings that cannot work, before anything is read or written."""
+        super().check()
+        refuse_outside(self, shift=(0, FRAME_SIZE - 1))
+        usual = self.defaults(self.preset)["frame_encoder"]
+        if METHODS.named(self.method).reads_state and self.frame_encoder != usual:
+            raise UserError(f"--frame-encoder is not read by the method {self.method}: leave it out")
+
+
+def memory_of(name: str, method: Method, history: str) -> str:
+    """Memory of a method's encoder, gru or none; one that it cannot have raises UserError."""
+    if history not in ("method", "gru"):
+        raise UserError(f"--history is {history!r}: choose one of method, gru")
+    if history == "method":
+        return method.history
+    if method.end_to_end or method.reads_state:
+        raise UserError(f"{name} has no memory: --history {history} is for pretrained methods")
+    return history
+
+
+def frame_options(method: Method, values: Mapping[str, Any]) -> Options:
+    """Options of the frame encoder that values name; none for a method that reads no pixels."""
+    kind = FRAME_ENCODERS.named(values["frame_encoder"]).options
+    return Options() if method.reads_state else kind.fill(values)

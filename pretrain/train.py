@@ -2,21 +2,21 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, fields, replace
+from dataclasses import replace
 from typing import Any
 
 import torch
 
-from pretrain.config import PRESETS, PretrainConfig
-from pretrain.objectives import METHODS, build_objective, unread_options
-from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption
+from pretrain.build import build_objective, build_target
+from pretrain.config import PretrainConfig, StreamOptions
+from pretrain.objectives import METHODS
+from vd4rl_pomdp.corruptions import check_corruption
 from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
-from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside, refuse_unread
-from vd4rl_pomdp.nn.action_target import check_action_target, make_action_target
-from vd4rl_pomdp.nn.encoder import MAX_LAYERS, Encoder
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
-from vd4rl_pomdp.nn.frame import check_frame_encoder
-from vd4rl_pomdp.objective import Objective, check_gap
+from vd4rl_pomdp.objective import Objective
+from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.folder import jsonable
 from vd4rl_pomdp.runs.loop import training
@@ -26,7 +26,7 @@ from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.tasks import FRAME_SIZE, get_task
+from vd4rl_pomdp.tasks import get_task
 from vd4rl_pomdp.types import Windows
 
 STAGE = "pretrain"
@@ -67,7 +67,7 @@ class Trainer:
     def __init__(self, objective: Objective, dataset: Dataset, config: PretrainConfig) -> None:
         self.objective, self.dataset, self.config = objective, dataset, config
         self.device = dataset.t.device
-        view = View(dataset, corruption_of(config), config.shift, config.seed, STAGE)
+        view = View(dataset, config.corruption, config.shift, config.seed, STAGE)
         batches = stream_generator(config.seed, STAGE, "batches")
         self.sampler = WindowSampler(view, config.batch_size, config.window, batches)
         self.optimiser = torch.optim.Adam(objective.parameters(), lr=config.learning_rate)
@@ -115,26 +115,10 @@ class Trainer:
         self.sampler.load_state_dict(state["sampler"])
 
 
-def corruption_of(config: CorruptionConfig) -> CorruptionConfig:
-    """The corruption's fields alone."""
-    return CorruptionConfig(**{f.name: getattr(config, f.name) for f in fields(CorruptionConfig)})
-
-
 def check(config: PretrainConfig) -> None:
-    """Refuse settings that cannot work or that nothing reads, before anything is read or written."""
-    METHODS.named(config.method)
-    refuse_outside(
-        config, seed=(0, MAX_SEED), steps=0, batch_size=1, window=2, learning_rate=0, shift=(0, FRAME_SIZE - 1),
-        feature_dim=1, hidden_dim=1, gru_layers=(1, MAX_LAYERS), head_dim=1, m=0, n=0, history_window=0, max_k=1,
-        codes=1, homer_codes=0, self_prediction=0, l2_states=0, log_every=1, checkpoint_every=1,
-    )  # fmt: skip
-    check_frame_encoder(config.frame_encoder)
-    check_action_target(config.action_target)
-    unread = unread_options(config)
-    refuse_unread(config, PRESETS[config.preset], unread, config.method)
-    if "max_k" not in unread:
-        check_gap(config.max_k, config.window)
-    check_corruption(config)
+    """Refuse settings that cannot work, before anything is read or written."""
+    config.check()
+    check_corruption(config.corruption)
 
 
 def require_batch(objective: Objective, device: torch.device, config: Any) -> None:
@@ -154,10 +138,9 @@ def require_batch(objective: Objective, device: torch.device, config: Any) -> No
 
 
 def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
-    actions = dataset.action_after(dataset.transition_rows)
-    target = make_action_target(config.action_target, actions.numpy(), config.codes, config.seed)
+    target = build_target(config, dataset.action_after(dataset.transition_rows).numpy())
     state_dim = dataset.states().shape[1] if METHODS.named(config.method).reads_state else 0
-    objective = build_objective(config, actions, target, state_dim)
+    objective = build_objective(config, dataset.action_dim, target, state_dim)
     dataset.num_windows(config.window)
     return objective
 
@@ -182,14 +165,14 @@ def _card(config: PretrainConfig, task: str, dataset: Dataset, run: RunFolder) -
         method=config.method,
         task=task,
         quality=dataset.quality or "unknown",
-        corruption=asdict(corruption_of(config)),
+        corruption=flat(config.corruption),
         seed=config.seed,
         steps=config.steps,
         preset=config.preset,
         end_to_end=METHODS.named(config.method).end_to_end,
         action_loss=_last_action_loss(run),
         data=dataset.fingerprint,
-        settings=settings_of(jsonable(asdict(replace(config, task=task)))),
+        settings=settings_of(jsonable(flat(replace(config, task=task)))),
     )
 
 
@@ -200,6 +183,6 @@ def _last_action_loss(run: RunFolder) -> float | None:
 
 
 def _with_history_window(encoder: Encoder, config: PretrainConfig) -> Encoder:
-    if config.history_window:
-        encoder.config = replace(encoder.config, history_window=config.history_window)
+    if isinstance(config.memory, StreamOptions) and config.memory.history_window:
+        encoder.config = replace(encoder.config, history_window=config.memory.history_window)
     return encoder

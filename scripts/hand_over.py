@@ -72,7 +72,7 @@ def main(config: Config) -> None:
         labels = read_json(run / "labels.json")
         encoder, card = load_encoder(run / "encoder")
         agent, expert = Agent(encoder, load_policy(run / "policy")), load_actor(card.task, "expert")
-        env = CorruptedEnv(card.task, CorruptionConfig(**card.corruption))
+        env = CorruptedEnv(card.task, CorruptionConfig.of(**card.corruption))
         for after in config.after:
             for episode in range(config.episodes):
                 row = labels | {"after": after, "episode": episode}

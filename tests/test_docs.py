@@ -3,7 +3,6 @@
 import re
 import shlex
 import tomllib
-from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
 
@@ -11,7 +10,7 @@ import pytest
 import tyro
 
 from finetune.algorithms import get_algorithm
-from pretrain.config import PRESETS
+from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS, Method
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
@@ -147,7 +146,7 @@ def study(tmp_path, monkeypatch) -> Path:
 @pytest.fixture
 def encoder(study) -> None:
     data, out = Path("data/walker_walk/expert"), Path("runs/mik+a/pretrain")
-    run_pretrain(replace(PRESETS["smoke"], data=data, out=out, method="mik+a", corruption="patch+zero_frames"))
+    run_pretrain(PretrainConfig.of("smoke", data=data, out=out, method="mik+a", corruption="patch+zero_frames"))
 
 
 def small(words: list[str]) -> list[str]:

@@ -70,7 +70,7 @@ def agent(tmp_path) -> tuple[Encoder, Policy]:
 
 def play(folder: Path, *episodes: int) -> list[evaluation.Episode]:
     places = folder / "encoder", folder / "policy"
-    jobs = [EpisodeJob(*places, 0, "walker_walk", CorruptionConfig("patch"), e, film=False) for e in episodes]
+    jobs = [EpisodeJob(*places, 0, "walker_walk", CorruptionConfig.of("patch"), e, film=False) for e in episodes]
     return evaluate(jobs, workers=1)
 
 

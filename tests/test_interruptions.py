@@ -18,7 +18,7 @@ import pretrain.navigation.trainer
 import pretrain.train
 from finetune.algorithms import bc
 from finetune.train import finetune as run_finetune
-from pretrain.navigation.config import PRESETS as MAZE_PRESETS
+from pretrain.navigation.config import NavigationConfig
 from pretrain.navigation.train import train as run_navigation
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
@@ -80,7 +80,7 @@ Stage = tuple[Callable[[Any], Any], Callable[[Path], Any], Any]
 def stage(request) -> Stage:
     if request.param == "navigation":
         given = {"steps": 8, "log_every": 4, "checkpoint_every": 4, "precision": "fp32"}
-        config = replace(MAZE_PRESETS["smoke"], data=request.getfixturevalue("maze"), **given)
+        config = NavigationConfig.of("smoke", data=request.getfixturevalue("maze"), **given)
         return run_navigation, lambda out: replace(config, out=out), pretrain.navigation.trainer.Trainer
     data = request.getfixturevalue("data")
     if request.param == "pretrain":

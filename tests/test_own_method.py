@@ -5,14 +5,14 @@ import os
 import re
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from pretrain.config import PRESETS
-from pretrain.objectives import METHODS, build_objective
+from pretrain.build import build_objective
+from pretrain.config import PretrainConfig
+from pretrain.objectives import METHODS
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.visibility import wrong_pairs
@@ -54,9 +54,9 @@ def test_the_example_sees_what_it_declares(script, registry):
     namespace = {"__name__": "my_method"}
     exec(compile(script.read_text(), str(script), "exec"), namespace)
     torch.manual_seed(0)
-    config = replace(PRESETS["smoke"], method="past_to_frame", feature_dim=6, hidden_dim=5, head_dim=8)
+    config = PretrainConfig.of("smoke", method="past_to_frame", feature_dim=6, hidden_dim=5, head_dim=8)
     target = make_action_target("mse", torch.zeros(1, 2).numpy(), 4, 0)
-    objective = build_objective(config, torch.zeros(1, 2), target)
+    objective = build_objective(config, 2, target)
     assert wrong_pairs(objective, [6, 6, 4]) == []
     objective.visible = lambda t, k, rows: ({t, t + k}, set())
     assert wrong_pairs(objective, [6])

@@ -55,7 +55,7 @@ def test_generators_and_networks_begin_at_their_streams():
 
 @pytest.mark.parametrize("name", [("curl", "shift"), ("driml", "k"), ("homer", "imposters")])
 def test_an_objectives_own_draws_are_not_those_of_the_corruption(name):
-    corruption = BatchCorruption(CorruptionConfig("patch"), 0, "pretrain")
+    corruption = BatchCorruption(CorruptionConfig.of("patch"), 0, "pretrain")
     assert not set(Draws(0, *name).keys(64).tolist()) & set(corruption.keys(torch.arange(64)).tolist())
 
 
@@ -63,7 +63,7 @@ def test_a_row_looks_the_same_to_all_stages_under_emission_alone():
     rows = torch.arange(16)
     for mode, same in (("emission", True), ("resample", False)):
         stages = [
-            BatchCorruption(CorruptionConfig("patch", mode), 5, *name) for name in (["pretrain"], ["finetune", 1])
+            BatchCorruption(CorruptionConfig.of("patch", mode), 5, *name) for name in (["pretrain"], ["finetune", 1])
         ]
         keys = [stage.keys(rows).tolist() for stage in stages]
         assert (keys[0] == keys[1]) == same

@@ -5,7 +5,6 @@ import hashlib
 import json
 import os
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -74,7 +73,7 @@ def cut_at(monkeypatch, number: int) -> None:
 
 
 def smoke_pretrain(data: Path, out: Path, **changes: object) -> pretrain.config.PretrainConfig:
-    return replace(pretrain.config.PRESETS["smoke"], data=data, out=out, corruption="patch+zero_frames", **changes)
+    return pretrain.config.PretrainConfig.of("smoke", data=data, out=out, corruption="patch+zero_frames", **changes)
 
 
 @pytest.mark.parametrize("method", [name for name, method in METHODS.items() if method.trained])
@@ -110,7 +109,7 @@ def test_an_encoder_tells_how_it_was_pretrained_and_an_older_one_still_loads(enc
 
 
 def smoke_finetune(encoder: Path, data: Path, out: Path, **changes: object) -> finetune.config.FinetuneConfig:
-    return replace(finetune.config.PRESETS["smoke"], encoder=encoder, data=data, out=out, workers=1, **changes)
+    return finetune.config.FinetuneConfig.of("smoke", encoder=encoder, data=data, out=out, workers=1, **changes)
 
 
 def finetune_cut_and_whole(monkeypatch, encoder: Path, data: Path, out: Path, **changes: object) -> Path:
@@ -158,7 +157,7 @@ def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_th
         run_pretrain(smoke_pretrain(with_states, tmp_path / "s", method="state")).path / "encoder"
     )
     dataset = open_dataset(with_states)
-    frozen = FrozenEncoder(encoder, dataset, CorruptionConfig("patch"), 4, "fp32", 0)
+    frozen = FrozenEncoder(encoder, dataset, CorruptionConfig.of("patch"), 4, "fp32", 0)
     z = frozen.episode(1, frozen.view(0)).numpy()
     rows = slice(int(dataset.episode_start[1]), int(dataset.episode_end[1]))
     assert z.shape == (25, 17)
@@ -382,7 +381,7 @@ def test_td3_bc_finds_the_better_action_and_bc_the_common_one():
     chosen = {}
     for name, build in ALGORITHMS.items():
         torch.manual_seed(0)
-        config = replace(finetune.config.PRESETS["smoke"], hidden_dim=32, learning_rate=3e-3, alpha=25.0)
+        config = finetune.config.FinetuneConfig.of("smoke", hidden_dim=32, learning_rate=3e-3, alpha=25.0)
         policy = Policy(2, 1, 32)
         algorithm = build(policy, config, torch.Generator().manual_seed(0))
         action = torch.where(torch.arange(64) % 4 == 0, 0.5, -0.5)[:, None]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from stat import S_ISDIR
@@ -39,13 +39,6 @@ def refuse_number(name: str, value: float, low: float, high: float = MOST) -> No
 def flag_of(name: str) -> str:
     """The flag that sets a config's field."""
     return f"--{name.replace('_', '-')}"
-
-
-def refuse_unread(config: Any, default: Any, names: Iterable[str], reader: str) -> None:
-    """Raise UserError for a field that differs from its default although nothing reads it: it would be a lie."""
-    for name in sorted(names):
-        if getattr(config, name) != getattr(default, name):
-            raise UserError(f"{flag_of(name)} is not read by {reader}: leave it out")
 
 
 def refuse_no_folder(path: Path) -> None:

@@ -254,7 +254,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     if missing:
         raise UserError(f"{run / 'labels.json'}: has no {missing[0]!r}; the command that made the run writes it anew")
     card = load_encoder(run / "encoder")[1]
-    chosen = CorruptionConfig(**card.corruption) if corruption is None else CorruptionConfig(corruption)
+    chosen = CorruptionConfig.fill(card.corruption) if corruption is None else CorruptionConfig.of(corruption)
     make_corruption(chosen)
     jobs = [
         EpisodeJob(run / "encoder", run / "policy", 0, card.task, chosen, episode, film=False)

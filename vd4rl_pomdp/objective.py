@@ -7,20 +7,22 @@ logging, no environment. A method of one's own subclasses `Objective`, or `Inver
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import Any, ClassVar, Self
 
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.nn.action_target import ActionTarget
+from vd4rl_pomdp.nn.action_target import ActionTarget, target_options
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.heads import PairHead, all_pairs, mlp
+from vd4rl_pomdp.options import NO_OPTIONS, Limits, Options
 from vd4rl_pomdp.types import Windows
 
 
 class Objective(nn.Module, ABC):
-    """Trains an encoder on windows."""
+    """Trains an encoder on windows. A method makes it with (encoder, target, options, seed)."""
 
     encoder: Encoder
 
@@ -41,11 +43,13 @@ class Objective(nn.Module, ABC):
 
 
 @dataclass(frozen=True)
-class InverseConfig:
-    """Options that every inverse model has."""
+class ActionOptions(Options):
+    """Options of every objective that predicts actions."""
 
-    max_k: int = 15
-    """Largest gap K between the two states of a pair; every k in 1..K is trained."""
+    action_target: str = "kmeans"
+    """What the action head predicts: kmeans, bins, mse or mse_l2."""
+    target: Options = NO_OPTIONS
+    """Options of the action target."""
     k_embedding: bool = True
     """Whether the action head is told k."""
     head_dim: int = 256
@@ -55,23 +59,47 @@ class InverseConfig:
     l2_states: float = 0.0
     """Weight of the squared norm of forward states; it decays linearly to zero over the training."""
 
+    limits: ClassVar[Limits] = {"head_dim": 1, "self_prediction": 0, "l2_states": 0}
 
-def check_gap(max_k: int, window: int) -> None:
-    """Raise UserError unless a window of `window` rows holds pairs of every gap up to `max_k`."""
-    if max_k >= window:
-        raise UserError(f"--max-k {max_k} needs windows of more than that many rows: raise --window or lower it")
+    @property
+    def largest_gap(self) -> int:
+        """K: every gap k in 1..K between the two states of a pair is trained."""
+        return 1
+
+    @classmethod
+    def fill(cls, values: Mapping[str, Any]) -> Self:
+        """Options with those of the action target that the values name."""
+        kind = target_options(values.get("action_target", cls.action_target))
+        return super().fill({**values, "target": kind.fill(values)})
+
+
+@dataclass(frozen=True)
+class InverseOptions(ActionOptions):
+    """Options of multi-step inverse models."""
+
+    max_k: int = 15
+    """Largest gap K between the two states of a pair; every k in 1..K is trained."""
+
+    limits: ClassVar[Limits] = {"max_k": 1}
+
+    @property
+    def largest_gap(self) -> int:
+        """K."""
+        return self.max_k
 
 
 class InverseObjective(Objective):
     """Predicts a_t from a representation of the past at t and one of what is seen at t+k, for every k up to K."""
 
-    def __init__(self, encoder: Encoder, future_dim: int, target: ActionTarget, config: InverseConfig) -> None:
+    def __init__(self, encoder: Encoder, future_dim: int, target: ActionTarget, options: ActionOptions) -> None:
         super().__init__()
         self.encoder = encoder
-        self.config = config
+        self.options = options
         self.target = target
-        self.head = PairHead(encoder.dim, future_dim, config.max_k, target.outputs, config.head_dim, config.k_embedding)
-        self.predictor = mlp(encoder.dim + 1, 512, encoder.dim, layers=3) if config.self_prediction else None
+        self.head = PairHead(
+            encoder.dim, future_dim, options.largest_gap, target.outputs, options.head_dim, options.k_embedding
+        )
+        self.predictor = mlp(encoder.dim + 1, 512, encoder.dim, layers=3) if options.self_prediction else None
 
     @abstractmethod
     def representations(self, window: Windows) -> tuple[Tensor, Tensor]:
@@ -95,7 +123,7 @@ class InverseObjective(Objective):
 
     def pairs(self, rows: int) -> Tensor:
         """The (t, k) that are scored in a window of `rows` rows: (P, 2) int64."""
-        return all_pairs(rows, self.config.max_k)
+        return all_pairs(rows, self.options.largest_gap)
 
     def action_logits(self, window: Windows) -> Tensor:
         """Predictions for every pair: (B, P, target.outputs)."""
@@ -118,15 +146,15 @@ class InverseObjective(Objective):
         logs = {"action_loss": total.detach()} | self._per_k(losses.detach() * real, real, pairs)
         if self.predictor is not None:
             term = self._self_prediction(past, pairs, real)
-            total, logs["self_prediction"] = total + self.config.self_prediction * term, term.detach()
-        if self.config.l2_states:
+            total, logs["self_prediction"] = total + self.options.self_prediction * term, term.detach()
+        if self.options.l2_states:
             term = _mean_over(window.real, past.square().mean(-1))
-            total, logs["l2_states"] = total + self.config.l2_states * (1 - progress) * term, term.detach()
+            total, logs["l2_states"] = total + self.options.l2_states * (1 - progress) * term, term.detach()
         logs["loss"] = total.detach()
         return total, logs
 
     def _per_k(self, losses: Tensor, real: Tensor, pairs: Tensor) -> dict[str, Tensor]:
-        sums = losses.new_zeros(2, self.config.max_k + 1)
+        sums = losses.new_zeros(2, self.options.largest_gap + 1)
         sums.index_add_(1, pairs[:, 1], torch.stack([losses.sum(0), real.sum(0)]))
         means = sums[0] / sums[1].clamp(min=1)
         return {f"loss_k{k:02d}": means[k] for k in range(1, int(pairs[:, 1].max()) + 1)}
@@ -134,7 +162,7 @@ class InverseObjective(Objective):
     def _self_prediction(self, past: Tensor, pairs: Tensor, real: Tensor) -> Tensor:
         assert self.predictor is not None
         t, k = pairs.unbind(1)
-        gap = (k / self.config.max_k).to(past).expand(past.shape[0], -1)[..., None]
+        gap = (k / self.options.largest_gap).to(past).expand(past.shape[0], -1)[..., None]
         predicted = self.predictor(torch.cat([past[:, t], gap], dim=-1))
         error = (predicted - past[:, t + k].detach()).square().mean(-1)
         return (error * real).sum() / real.sum()
@@ -146,8 +174,8 @@ class StateInverse(InverseObjective):
     P(a_t | s_t, s_{t+k}): memoryless states give ACRO, states of a GRU over the whole past AH, over m rows FJ.
     """
 
-    def __init__(self, encoder: Encoder, target: ActionTarget, config: InverseConfig) -> None:
-        super().__init__(encoder, encoder.dim, target, config)
+    def __init__(self, encoder: Encoder, target: ActionTarget, options: ActionOptions, seed: int) -> None:
+        super().__init__(encoder, encoder.dim, target, options)
 
     def representations(self, window: Windows) -> tuple[Tensor, Tensor]:
         """The same states (B, T, D) for both ends of a pair."""

@@ -113,7 +113,7 @@ def origins(settings: Mapping[str, Any]) -> dict[str, str]:
     """
     found = {}
     for setting, registry in REGISTRIES.items():
-        value = settings.get(setting, "")
+        value = str(settings.get(setting, ""))
         for name in [value] if value in registry else value.split("+"):
             if name in registry and (origin := registry.origin(name)):
                 found[f"{setting} {name}"] = origin

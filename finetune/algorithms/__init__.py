@@ -2,21 +2,18 @@
 
 from __future__ import annotations
 
-from finetune.algorithms.algorithm import Algorithm, Loss
+from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
 from finetune.algorithms.bc import BC
 from finetune.algorithms.drqv2_bc import DrQv2BC
-from finetune.algorithms.td3_bc import TD3BC
-from vd4rl_pomdp.errors import UserError
+from finetune.algorithms.td3_bc import TD3BC, TD3BCOptions
+from vd4rl_pomdp.registry import Registry
 
-__all__ = ["ALGORITHMS", "BC", "OPTIONS", "TD3BC", "Algorithm", "DrQv2BC", "Loss", "get_algorithm"]
+__all__ = ["ALGORITHMS", "BC", "TD3BC", "Algorithm", "DrQv2BC", "Loss", "ReturnOptions", "TD3BCOptions"]
 
-OPTIONS = frozenset(("alpha", "gamma", "n_step"))
-"""Settings that not every algorithm reads."""
-ALGORITHMS = {"td3_bc": TD3BC, "drqv2_bc": DrQv2BC, "bc": BC}
-
-
-def get_algorithm(name: str) -> type[TD3BC] | type[BC]:
-    """The algorithm called `name`; raises UserError listing the choices."""
-    if name not in ALGORITHMS:
-        raise UserError(f"unknown algorithm {name!r}: choose one of {', '.join(ALGORITHMS)}")
-    return ALGORITHMS[name]  # type: ignore[return-value]
+ALGORITHMS: Registry[type[Algorithm]] = Registry(
+    "algorithm",
+    {"td3_bc": TD3BC, "drqv2_bc": DrQv2BC, "bc": BC},
+    lambda part: isinstance(part, type) and issubclass(part, Algorithm),
+    "a class of finetune.algorithms.Algorithm",
+)
+"""All algorithms. Packages offer theirs in the group of entry points `vd4rl_pomdp.algorithms`; each names a class."""

@@ -4,13 +4,28 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator
-from typing import Any, NamedTuple
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
 
+import torch
 from torch import Tensor
 from torch.optim import Optimizer
 
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.options import Limits, Options
+
+
+@dataclass(frozen=True)
+class ReturnOptions(Options):
+    """Options of algorithms that estimate returns."""
+
+    gamma: float = 0.99
+    """Discount of a decision."""
+    n_step: int = 3
+    """Steps of the n-step return."""
+
+    limits: ClassVar[Limits] = {"gamma": (0, 1), "n_step": 1}
 
 
 class Loss(NamedTuple):
@@ -28,8 +43,21 @@ class Algorithm(ABC):
     """Trains a policy on batches of representations."""
 
     policy: Policy
-    options: tuple[str, ...] = ()
-    """Which of `OPTIONS` it reads; the others are refused."""
+    options: type[Options] = Options
+    """Class of its options."""
+    summary: str = ""
+    """One line that says what it is."""
+
+    @abstractmethod
+    def __init__(self, policy: Policy, options: Any, learning_rate: float, generator: torch.Generator) -> None:
+        """Set up the training of a policy.
+
+        Args:
+            policy: what is trained; its device is where everything else belongs.
+            options: an instance of the class's `options`.
+            learning_rate: of all optimisers.
+            generator: what random numbers are drawn from.
+        """
 
     @abstractmethod
     def losses(self, batch: FeatureBatch) -> Iterator[Loss]:

@@ -9,17 +9,19 @@ import torch
 import torch.nn.functional as F
 
 from finetune.algorithms.algorithm import Algorithm, Loss
-from finetune.config import FinetuneConfig
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.options import Options
 
 
 class BC(Algorithm):
     """See the module."""
 
-    def __init__(self, policy: Policy, config: FinetuneConfig, generator: torch.Generator) -> None:
+    summary = "behaviour cloning, which uses no reward"
+
+    def __init__(self, policy: Policy, options: Options, learning_rate: float, generator: torch.Generator) -> None:
         self.policy = policy
-        self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=config.learning_rate, fused=True)
+        self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=learning_rate, fused=True)
 
     def losses(self, batch: FeatureBatch) -> Iterator[Loss]:
         """See the module."""

@@ -24,6 +24,7 @@ NOISE_START, NOISE_END, NOISE_UPDATES = 1.0, 0.1, 250_000
 class DrQv2BC(TD3BC):
     """See the module."""
 
+    summary = "the update of V-D4RL's baseline: no target actor, scheduled noise"
     tau = 0.01
     policy_delay = 1
 

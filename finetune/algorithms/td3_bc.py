@@ -12,19 +12,30 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterator
-from typing import Any
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from finetune.algorithms.algorithm import Algorithm, Loss
-from finetune.config import FinetuneConfig
+from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.heads import mlp
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.options import Limits, Options
 
 TARGET_NOISE, NOISE_CLIP = 0.2, 0.5
+
+
+@dataclass(frozen=True)
+class TD3BCOptions(ReturnOptions):
+    """Options of TD3+BC."""
+
+    alpha: float = 2.5
+    """Weight of the critic against behaviour cloning."""
+
+    limits: ClassVar[Limits] = {"alpha": 0}
 
 
 class TwinCritic(nn.Module):
@@ -44,18 +55,19 @@ class TwinCritic(nn.Module):
 class TD3BC(Algorithm):
     """See the module."""
 
-    options: tuple[str, ...] = ("alpha", "gamma", "n_step")
+    options: type[Options] = TD3BCOptions
+    summary = "TD3 with a behaviour cloning term"
     tau = 0.005
     policy_delay = 2
 
-    def __init__(self, policy: Policy, config: FinetuneConfig, generator: torch.Generator) -> None:
-        self.policy, self.config, self.generator = policy, config, generator
+    def __init__(self, policy: Policy, options: TD3BCOptions, learning_rate: float, generator: torch.Generator) -> None:
+        self.policy, self.settings, self.generator = policy, options, generator
         shape = policy.shape
         device = policy.standardise.mean.device
         self.critic = TwinCritic(shape["dim"], shape["action_dim"], shape["hidden"]).to(device)
         self.target_policy, self.target_critic = copy.deepcopy(policy), copy.deepcopy(self.critic)
-        self.policy_optimiser = torch.optim.Adam(policy.net.parameters(), lr=config.learning_rate, fused=True)
-        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=config.learning_rate, fused=True)
+        self.policy_optimiser = torch.optim.Adam(policy.net.parameters(), lr=learning_rate, fused=True)
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=learning_rate, fused=True)
         self.updates = 0
 
     def losses(self, batch: FeatureBatch) -> Iterator[Loss]:
@@ -70,7 +82,7 @@ class TD3BC(Algorithm):
     def _critic_loss(self, z: Tensor, batch: FeatureBatch, next_z: Tensor) -> Loss:
         with torch.no_grad():
             value = torch.minimum(*self.target_critic(next_z, self._next_action(next_z)))
-            target = batch.reward + self.config.gamma * batch.discount * value
+            target = batch.reward + self.settings.gamma * batch.discount * value
         first, second = self.critic(z, batch.action)
         loss = F.mse_loss(first, target) + F.mse_loss(second, target)
         return Loss(loss, self.critic_optimiser, {"critic_loss": loss.detach(), "q": first.detach().mean()})
@@ -94,7 +106,7 @@ class TD3BC(Algorithm):
     def _policy_loss(self, z: Tensor, action: Tensor) -> Loss:
         chosen = self._policy_action(z)
         value = self._policy_value(z, chosen)
-        weight = self.config.alpha / value.abs().mean().detach()
+        weight = self.settings.alpha / value.abs().mean().detach()
         cloning = F.mse_loss(chosen, action)
         loss = cloning - weight * value.mean()
         return Loss(loss, self.policy_optimiser, {"actor_loss": loss.detach(), "bc_loss": cloning.detach()})

@@ -2,99 +2,28 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, fields
-from pathlib import Path
-from typing import Any, Literal
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, ClassVar, Literal
 
-from pretrain.config import PretrainConfig
-from vd4rl_pomdp.navigation.observations import Picture
-from vd4rl_pomdp.objective import InverseConfig
-from vd4rl_pomdp.runs.device import Precision
-from vd4rl_pomdp.runs.metrics import WandbMode
+from pretrain.config import MemoryOptions, TrainingConfig, frame_options
+from pretrain.objectives import METHODS
+from vd4rl_pomdp.errors import UserError, flag_of, refuse_outside
+from vd4rl_pomdp.navigation.methods import REFERENCES
+from vd4rl_pomdp.navigation.observations import SHAPES, Picture
+from vd4rl_pomdp.options import NO_OPTIONS, Limits, Options, flat
 
-
-@dataclass(frozen=True, kw_only=True)
-class NavigationConfig(InverseConfig):
-    """Settings of `vd4rl-pomdp navigation train`."""
-
-    data: Path
-    """Folder of a maze's data."""
-    out: Path
-    """Run folder; the same command continues a run that was cut."""
-    method: str = "mik+a"
-    """no_history, ah, ah+a, fj, fj+a, mik, mik+a, another method that predicts actions, random (mik+a, untrained), or
-    supervised and supervised+a (the networks of ah and ah+a, trained on the true states)."""
-    preset: str = "paper"
-    """paper, cpu or smoke: the defaults of all other settings."""
-    seed: int = 0
-    """Seed of the networks, the batches and the exogenous noise."""
-    steps: int = 200_000
-    """Gradient steps."""
-    average_last: int = 10_000
-    """Last steps over which the reported training metrics are averaged."""
-    batch_size: int = 16
-    """Windows in a batch."""
-    window: int = 64
-    """Rows of a window."""
-    learning_rate: float = 1e-4
-    """Adam's learning rate, the probe's included."""
-    schedule: Literal["constant", "cosine"] = "constant"
-    """Learning rate after the warm-up: constant, or a half cosine down to zero."""
-    warm_up: int = 0
-    """Steps in which the learning rate rises linearly."""
-    picture: Picture = "rgb100"
-    """rgb100: pictures as stored; grey50: their luminance, averaged over 2x2 pixels."""
-    exogenous: str = "none"
-    """Images added to every picture: none, photographs, or a folder of CIFAR-10's files or of PNG and JPEG files."""
-    exogenous_weight: float = 0.5
-    """What the added images are multiplied by."""
-    frame_encoder: str = "mixer"
-    """Frame encoder: mixer (MLP-Mixer), small, nature or drq."""
-    feature_dim: int = 256
-    """Width of the frame encoder's output."""
-    hidden_dim: int = 256
-    """Units of each GRU layer."""
-    gru_layers: int = 2
-    """Layers of each GRU."""
-    m: int | None = None
-    """Rows before t that a state is computed from; None: what the method has (fj and fj+a 8, the others all)."""
-    n: int | None = None
-    """mik and mik+a: rows after t+k that the future encoder reads; None: all to the window's end."""
-    literal_future: bool = False
-    """mik+a only: give the future encoder a_{t+k-1}, as the paper's formula reads literally (a leak at k = 1)."""
-    action_target: str = "kmeans"
-    """What the action head predicts: kmeans, bins, mse or mse_l2."""
-    codes: int = 20
-    """K-means codes, or bins for each action dimension."""
-    burn_in: int = 10
-    """First rows of a window on which no state error is counted."""
-    evaluation_windows: int = 256
-    """Held-out windows to evaluate on."""
-    refit_windows: int = 1024
-    """Training windows whose frozen states the probe is refitted on."""
-    refit_steps: int = 4_000
-    """Gradient steps of that probe."""
-    precision: Precision = "fp32"
-    """fp32, or bf16 autocast."""
-    device: str = "auto"
-    """auto, cpu or cuda."""
-    log_every: int = 100
-    """Steps that a row of metrics averages over."""
-    checkpoint_every: int = 1_000
-    """Steps between two checkpoints, a multiple of --log-every."""
-    wandb: WandbMode = "off"
-    """Mirror metrics to wandb: off, offline or online."""
-
-    def objective_config(self, method: str) -> PretrainConfig:
-        """The same settings as those of an objective of `pretrain`."""
-        shared = {f.name: getattr(self, f.name) for f in fields(PretrainConfig) if hasattr(self, f.name)}
-        return PretrainConfig(**(shared | {"method": method}))
-
-
-_UNSET = Path()
+_PAPER: dict[str, Any] = {
+    "steps": 200_000,
+    "window": 64,
+    "learning_rate": 1e-4,
+    "l2_states": 1e-3,
+    "frame_encoder": "mixer",
+    "gru_layers": 2,
+    "log_every": 100,
+    "checkpoint_every": 1_000,
+}
 _CPU: dict[str, Any] = {
-    "data": _UNSET,
-    "out": _UNSET,
     "steps": 2_500,
     "average_last": 200,
     "window": 40,
@@ -105,7 +34,6 @@ _CPU: dict[str, Any] = {
     "frame_encoder": "small",
     "feature_dim": 128,
     "hidden_dim": 128,
-    "gru_layers": 1,
     "precision": "bf16",
     "log_every": 50,
     "checkpoint_every": 250,
@@ -128,21 +56,108 @@ _SMOKE: dict[str, Any] = {
     "log_every": 5,
     "checkpoint_every": 10,
 }
-PRESETS = {
-    "paper": NavigationConfig(data=_UNSET, out=_UNSET, l2_states=1e-3),
-    "cpu": NavigationConfig(**_CPU, preset="cpu"),
-    "smoke": NavigationConfig(**(_CPU | _SMOKE), preset="smoke"),
-}
-"""Defaults by preset: the paper's setting for a GPU, one for two cores, and one that takes seconds."""
+_NETWORK_OF = dict(zip(REFERENCES, ("mik+a", "ah", "ah+a"), strict=True))
+
+
+def network_of(method: str) -> str:
+    """The objective whose network a method has: its own, unless it is a reference."""
+    return _NETWORK_OF.get(method, method)
+
+
+@dataclass(frozen=True)
+class ReferenceOptions(Options):
+    """Options of the references, which train no inverse model."""
+
+    max_k: int = 15
+    """The K of the objectives that it is compared with: it changes nothing but the cell of a table."""
+
+    limits: ClassVar[Limits] = {"max_k": 1}
+
+
+@dataclass(frozen=True)
+class NoiseOptions(Options):
+    """Options of exogenous noise."""
+
+    exogenous_weight: float = 0.5
+    """What the added images are multiplied by."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class NavigationConfig(TrainingConfig):
+    """Settings of `vd4rl-pomdp navigation train`.
+
+    Methods are no_history, ah, ah+a, fj, fj+a, mik, mik+a, others that predict actions, random (mik+a, untrained), and
+    supervised and supervised+a (the networks of ah and ah+a, trained on the true states).
+    """
+
+    average_last: int = 10_000
+    """Last steps over which the reported training metrics are averaged."""
+    schedule: Literal["constant", "cosine"] = "constant"
+    """Learning rate after the warm-up: constant, or a half cosine down to zero."""
+    warm_up: int = 0
+    """Steps in which the learning rate rises linearly."""
+    picture: Picture = "rgb100"
+    """rgb100: pictures as stored; grey50: their luminance, averaged over 2x2 pixels."""
+    exogenous: str = "none"
+    """Images added to every picture: none, photographs, or a folder of CIFAR-10's files or of PNG and JPEG files."""
+    noise: Options = NO_OPTIONS
+    """How the images are added."""
+    burn_in: int = 10
+    """First rows of a window on which no state error is counted."""
+    evaluation_windows: int = 256
+    """Held-out windows to evaluate on."""
+    refit_windows: int = 1024
+    """Training windows whose frozen states the probe is refitted on."""
+    refit_steps: int = 4_000
+    """Gradient steps of that probe."""
+
+    choosers: ClassVar[tuple[str, ...]] = (*TrainingConfig.choosers, "exogenous")
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"paper": _PAPER, "cpu": _CPU, "smoke": _CPU | _SMOKE}
+    """The paper's setting for a GPU, one for two cores, and one that takes seconds."""
+
+    @classmethod
+    def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
+        """Options of method, memory, frame encoder and noise."""
+        method = METHODS.named(network_of(values["method"]))
+        reference = values["method"] in REFERENCES
+        return {
+            "options": (ReferenceOptions if reference else method.options).fill(values),
+            "memory": (MemoryOptions if method.history == "gru" else Options).fill(values),
+            "frame": frame_options(method, values),
+            "noise": (Options if values["exogenous"] == "none" else NoiseOptions).fill(values),
+        }
+
+    def trained(self) -> TrainingConfig:
+        """The same settings for the objective whose network a method has: its own, unless it is a reference."""
+        if self.method not in REFERENCES:
+            return self
+        method = network_of(self.method)
+        values = self.defaults(self.preset) | flat(self)
+        return replace(self, method=method, options=METHODS.named(method).options.fill(values))
+
+    def check(self) -> None:
+        """Refuse settings that cannot work, before anything is read or written."""
+        super().check()
+        refuse_outside(
+            self, steps=1, burn_in=0, average_last=1, evaluation_windows=1, refit_windows=1, refit_steps=1, warm_up=0
+        )
+        if self.picture not in SHAPES:
+            raise UserError(f"unknown picture {self.picture!r}: choose one of {', '.join(SHAPES)}")
+        if self.burn_in >= self.window:
+            raise UserError(f"--burn-in {self.burn_in} leaves no row of a window of {self.window}: lower it")
+        if self.checkpoint_every % self.log_every:
+            raise UserError(
+                f"--checkpoint-every {self.checkpoint_every} is no multiple of --log-every {self.log_every}: change one"
+            )
 
 
 def command_of(config: NavigationConfig) -> list[str]:
     """Words of the command that trains with a config: the preset, and every flag that differs from it."""
     words = ["vd4rl-pomdp", "navigation", "train", "--preset", config.preset]
-    for field in fields(config):
-        value, default = getattr(config, field.name), getattr(PRESETS[config.preset], field.name)
-        flag = field.name.replace("_", "-")
-        if value == default or field.name in ("preset", "device", "wandb"):
+    usual = config.usual() | config.defaults(config.preset)
+    for name, value in flat(config).items():
+        if name in ("preset", "device", "wandb") or value == usual.get(name):
             continue
-        words += [f"--{'' if value else 'no-'}{flag}"] if isinstance(value, bool) else [f"--{flag}", str(value)]
+        flag = flag_of(name)
+        words += [f"--{'' if value else 'no-'}{flag[2:]}"] if isinstance(value, bool) else [flag, str(value)]
     return words

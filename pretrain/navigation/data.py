@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from pretrain.navigation.config import NavigationConfig
+from pretrain.navigation.config import NavigationConfig, NoiseOptions
 from pretrain.navigation.probe import TrueStates
 from vd4rl_pomdp.data import Dataset, View
 from vd4rl_pomdp.mazes import MazeSpec
@@ -20,8 +20,8 @@ HELD_OUT = 10
 def open_data(config: NavigationConfig) -> MazeData:
     """The set that a config names, with its exogenous noise, on the CPU."""
     noise = None
-    if config.exogenous != "none":
-        noise = ExogenousNoise(config.exogenous, config.exogenous_weight, config.seed)
+    if isinstance(config.noise, NoiseOptions):
+        noise = ExogenousNoise(config.exogenous, config.noise.exogenous_weight, config.seed)
     return MazeData(*open_maze_set(config.data), config, noise)
 
 

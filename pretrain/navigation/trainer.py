@@ -8,14 +8,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pretrain.build import build_objective, build_target
 from pretrain.navigation.config import NavigationConfig
 from pretrain.navigation.data import MazeData
 from pretrain.navigation.probe import ErrorSums, StateProbe
-from pretrain.objectives import build_objective
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.navigation.methods import METHOD_NAMES, REFERENCES, SUPERVISED
+from vd4rl_pomdp.navigation.methods import METHOD_NAMES, SUPERVISED
 from vd4rl_pomdp.navigation.observations import SHAPES
-from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.objective import InverseObjective
 from vd4rl_pomdp.runs.device import autocast
 from vd4rl_pomdp.runs.loop import training
@@ -23,26 +22,19 @@ from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import stream_generator
 from vd4rl_pomdp.types import Windows
 
-_NETWORK_OF = dict(zip(REFERENCES, ("mik+a", "ah", "ah+a"), strict=True))
 _SUPERVISED_RATE = 0.5
 """Share of the learning rate that supervised references take: at the whole one, two of three seeds predict the mean."""
 STAGE = "navigation"
 
 
-def network_of(method: str) -> str:
-    """The objective whose network a method has: its own, unless it is a reference."""
-    return _NETWORK_OF.get(method, method)
-
-
 def make_objective(data: MazeData, config: NavigationConfig) -> InverseObjective:
     """The objective of a config on a maze's data, on the CPU."""
-    method = network_of(config.method)
-    target = make_action_target(config.action_target, data.training_actions.numpy(), config.codes, config.seed)
-    objective = build_objective(
-        config.objective_config(method), data.training_actions, target, observation=SHAPES[config.picture]
-    )
-    if not isinstance(objective, InverseObjective):
-        raise UserError(f"{method} predicts no actions: choose one of {', '.join(METHOD_NAMES)}")
+    trained = config.trained()
+    target = build_target(trained, data.training_actions.numpy())
+    if target is None:
+        raise UserError(f"{trained.method} predicts no actions: choose one of {', '.join(METHOD_NAMES)}")
+    objective = build_objective(trained, data.training_actions.shape[1], target, observation=SHAPES[config.picture])
+    assert isinstance(objective, InverseObjective)
     return objective
 
 

@@ -19,12 +19,12 @@ from __future__ import annotations
 
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.objective import InverseConfig, StateInverse
+from vd4rl_pomdp.objective import ActionOptions, StateInverse
 
 
 class ForwardJump(StateInverse):
     """FJ (a GRU over m+1 observations) and FJ+A (that reads actions, too)."""
 
-    def __init__(self, encoder: Encoder, target: ActionTarget, config: InverseConfig) -> None:
-        super().__init__(encoder, target, config)
+    def __init__(self, encoder: Encoder, target: ActionTarget, options: ActionOptions, seed: int) -> None:
+        super().__init__(encoder, target, options, seed)
         assert encoder.config.history_window > 0, "a forward jump needs a bounded past"

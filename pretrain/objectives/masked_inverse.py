@@ -18,32 +18,47 @@ Differences and readings:
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 import torch
 from torch import Tensor, nn
 
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.sequence import run_gru_backward, run_gru_over_next
-from vd4rl_pomdp.objective import InverseConfig, InverseObjective
+from vd4rl_pomdp.objective import InverseObjective, InverseOptions
+from vd4rl_pomdp.options import Limits
 from vd4rl_pomdp.types import Windows
+
+
+@dataclass(frozen=True)
+class MaskedOptions(InverseOptions):
+    """Options of MIK."""
+
+    n: int | None = None
+    """Rows after t+k that the future encoder reads; None: all to the window's end."""
+
+    limits: ClassVar[Limits] = {"n": 0}
+
+
+@dataclass(frozen=True)
+class MaskedActionOptions(MaskedOptions):
+    """Options of MIK+A."""
+
+    literal_future: bool = False
+    """Give the future encoder a_{t+k-1}, as the paper's formula reads literally (a leak at k = 1)."""
 
 
 class MaskedInverse(InverseObjective):
     """MIK (an encoder that reads observations only) and MIK+A (one that reads actions too)."""
 
-    def __init__(
-        self,
-        encoder: Encoder,
-        target: ActionTarget,
-        config: InverseConfig,
-        literal_future: bool = False,
-        n: int | None = None,
-    ) -> None:
+    def __init__(self, encoder: Encoder, target: ActionTarget, options: MaskedOptions, seed: int) -> None:
         shape = encoder.config
-        super().__init__(encoder, shape.hidden_dim, target, config)
+        super().__init__(encoder, shape.hidden_dim, target, options)
         self.use_actions = shape.use_actions
-        self.literal_future = literal_future
-        self.n = n
+        self.literal_future = isinstance(options, MaskedActionOptions) and options.literal_future
+        self.n = options.n
         inputs = shape.feature_dim + (shape.action_dim + 1 if self.use_actions else 0)
         self.backward_gru = nn.GRU(inputs, shape.hidden_dim, shape.gru_layers, batch_first=True)
 

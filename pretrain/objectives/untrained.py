@@ -12,14 +12,15 @@ from torch import Tensor
 
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.objective import InverseConfig, Objective
+from vd4rl_pomdp.objective import Objective
+from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.types import Windows
 
 
 class Untrained(Objective):
     """Trains nothing."""
 
-    def __init__(self, encoder: Encoder, target: ActionTarget, config: InverseConfig) -> None:
+    def __init__(self, encoder: Encoder, target: ActionTarget, options: Options, seed: int) -> None:
         super().__init__()
         self.encoder = encoder
 

@@ -1,14 +1,14 @@
 """Every method of the registry keeps the contracts: losses, gradients, state, padding, streaming, resumption."""
 
 import copy
-from dataclasses import replace
 
 import pytest
 import torch
 
-from pretrain.config import PRESETS
-from pretrain.objectives import METHODS, build_objective
-from vd4rl_pomdp.nn.action_target import ACTION_TARGETS, make_action_target
+from pretrain.build import build_objective, build_target
+from pretrain.config import PretrainConfig
+from pretrain.objectives import METHODS
+from vd4rl_pomdp.nn.action_target import ACTION_TARGETS
 from vd4rl_pomdp.objective import InverseObjective, Objective
 from vd4rl_pomdp.types import Windows
 
@@ -19,10 +19,10 @@ TRAINED = [name for name, method in METHODS.items() if method.trained]
 def build(method: str, **changes: object) -> Objective:
     torch.manual_seed(0)
     small = {"max_k": 3, "feature_dim": 8, "hidden_dim": 7, "head_dim": 8}
-    config = replace(PRESETS["smoke"], method=method, **(small | changes))
+    config = PretrainConfig.of("smoke", method=method, **changes).with_known(**(small | changes))
     actions = torch.rand(50, ACTIONS) * 2 - 1
-    target = make_action_target(config.action_target, actions.numpy(), 4, 0)
-    return build_objective(config, actions, target, state_dim=5)
+    target = build_target(config, actions.numpy())
+    return build_objective(config, actions.shape[1], target, state_dim=5)
 
 
 def batch(lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0, state: bool = False) -> Windows:
@@ -149,7 +149,7 @@ def test_self_prediction_moves_the_prediction_and_never_its_target():
 
     errors = []
     for t, k in objective.pairs(ROWS).tolist():
-        asked = torch.cat([past[:, t], torch.full((2, 1), k / objective.config.max_k)], dim=-1)
+        asked = torch.cat([past[:, t], torch.full((2, 1), k / objective.options.max_k)], dim=-1)
         errors.append((objective.predictor(asked) - past[:, t + k]).square().mean())
     torch.testing.assert_close(logs["self_prediction"], torch.stack(errors).mean().detach())
 

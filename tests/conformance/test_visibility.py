@@ -5,14 +5,13 @@ encoders are the question.
 """
 
 from collections.abc import Callable
-from dataclasses import replace
 
 import pytest
 import torch
 
-from pretrain.config import PRESETS
-from pretrain.objectives import METHODS, build_objective
-from vd4rl_pomdp.nn.action_target import make_action_target
+from pretrain.build import build_objective, build_target
+from pretrain.config import PretrainConfig
+from pretrain.objectives import METHODS
 from vd4rl_pomdp.objective import InverseObjective
 from vd4rl_pomdp.types import Windows
 from vd4rl_pomdp.visibility import declared, dependence, response, wrong_pairs
@@ -22,12 +21,13 @@ ROWS, MAX_K, ACTIONS = 6, 4, 2
 
 def inverse(method: str, **changes: object) -> InverseObjective:
     torch.manual_seed(0)
-    small = {"max_k": MAX_K, "feature_dim": 6, "hidden_dim": 5, "head_dim": 32, "frame_encoder": "flat"}
-    config = replace(PRESETS["smoke"], method=method, **(small | changes))
+    small = {"max_k": MAX_K, "feature_dim": 6, "hidden_dim": 5, "head_dim": 32}
+    config = PretrainConfig.of("smoke", method=method, **({"frame_encoder": "flat"} | changes))
+    config = config.with_known(**(small | changes))
     actions = torch.rand(50, ACTIONS) * 2 - 1
-    target = make_action_target("kmeans", actions.numpy(), 4, 0)
+    target = build_target(config, actions.numpy())
     picture = (3, 2) if config.frame_encoder == "flat" else (9, 84)
-    objective = build_objective(config, actions, target, observation=picture).double()
+    objective = build_objective(config, actions.shape[1], target, observation=picture).double()
     assert isinstance(objective, InverseObjective)
     return objective
 

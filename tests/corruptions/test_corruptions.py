@@ -69,7 +69,7 @@ def test_a_patch_is_anywhere_it_fits_in_equally_often():
 
 
 def test_shared_patches_are_at_the_same_place_in_all_frames_of_a_stack():
-    out = make_corruption(CorruptionConfig("patch", patch_shared=True))(stacks(), torch.arange(64))
+    out = make_corruption(CorruptionConfig.of("patch", patch_shared=True))(stacks(), torch.arange(64))
     hidden = (out.view(64, 3, 3, 84, 84) == 0).all(2)
     assert torch.equal(hidden[:, 0], hidden[:, 1])
     apart = make_corruption("patch")(stacks(), torch.arange(64))
@@ -99,15 +99,15 @@ def test_equal_keys_give_equal_masks_whatever_the_batch(name: str):
 def test_resample_draws_anew_and_emission_never_does():
     obs, row_key = stacks(4), torch.arange(4)
     for mode, same in (("resample", False), ("emission", True)):
-        corruption = BatchCorruption(CorruptionConfig("patch", mode), seed=0)
+        corruption = BatchCorruption(CorruptionConfig.of("patch", mode), seed=0)
         assert torch.equal(corruption(obs.clone(), row_key), corruption(obs.clone(), row_key)) == same
-    a, b = (BatchCorruption(CorruptionConfig("patch"), seed=3) for _ in range(2))
+    a, b = (BatchCorruption(CorruptionConfig.of("patch"), seed=3) for _ in range(2))
     assert torch.equal(a(obs.clone(), row_key), b(obs.clone(), row_key))
 
 
 def test_emission_of_a_batch_equals_the_environments_draw():
     obs, row_key = stacks(4), torch.tensor([5, 6, 1 << 20, (1 << 20) + 1])
-    batch = BatchCorruption(CorruptionConfig("patch+zero_frames", "emission"), seed=7)(obs, row_key)
+    batch = BatchCorruption(CorruptionConfig.of("patch+zero_frames", "emission"), seed=7)(obs, row_key)
     environment = make_corruption("patch+zero_frames")
     seed = stream_seed(7, "corruption", "emission")
     single = torch.cat([environment(obs[i : i + 1], derive_keys(seed, row_key[i : i + 1])) for i in range(4)])
@@ -128,9 +128,11 @@ def test_unknown_and_impossible_corruptions_are_refused():
     with pytest.raises(UserError, match=r"unknown corruption 'zero_frames\+patch'"):
         make_corruption("zero_frames+patch")
     with pytest.raises(UserError, match="--patch-size"):
-        make_corruption(CorruptionConfig("patch", patch_size=85))(stacks(1), torch.zeros(1, dtype=torch.int64))
+        make_corruption(CorruptionConfig.of("patch", patch_size=85))(stacks(1), torch.zeros(1, dtype=torch.int64))
     with pytest.raises(UserError, match="--zeroed-frames"):
-        make_corruption(CorruptionConfig("zero_frames", zeroed_frames=4))(stacks(1), torch.zeros(1, dtype=torch.int64))
+        make_corruption(CorruptionConfig.of("zero_frames", zeroed_frames=4))(
+            stacks(1), torch.zeros(1, dtype=torch.int64)
+        )
 
 
 def test_random_shift_equals_padding_and_cropping():
@@ -168,7 +170,8 @@ def test_shifting_some_of_the_images_by_lines_leaves_out_the_others():
 @pytest.mark.parametrize("mode", ["resample", "emission"])
 @pytest.mark.parametrize("zeroed", [1, 2, 3])
 def test_observing_rows_equals_shifting_then_corrupting_their_stacks(dataset, name, mode, zeroed):
-    config = CorruptionConfig(name, mode, patch_fill=7, patch_count=2, zeroed_frames=zeroed)
+    chosen = {"corruption": name, "corruption_mode": mode, "patch_fill": 7, "patch_count": 2, "zeroed_frames": zeroed}
+    config = CorruptionConfig.fill(chosen)
     rows, key = torch.arange(dataset.num_rows).view(2, -1), torch.tensor([5, 6])
     for pad in (0, 4):
         apart, together = BatchCorruption(config, 1, "a"), View(dataset, config, pad, 1, "a")
@@ -184,5 +187,5 @@ def test_a_device_that_shifts_otherwise_makes_the_same_observations(dataset, mon
     for by_lines in (True, False):
         if not by_lines:
             monkeypatch.setattr(_shift, "by_lines", lambda images, pad: False)
-        seen.append(View(dataset, CorruptionConfig(name), 4).observe(rows).clone())
+        seen.append(View(dataset, CorruptionConfig.of(name), 4).observe(rows).clone())
     assert torch.equal(*seen)

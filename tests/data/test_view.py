@@ -29,7 +29,7 @@ MAKE = {
 @pytest.mark.parametrize("kind", MAKE)
 def test_a_samplers_state_is_all_that_its_next_batches_depend_on(dataset, kind):
     def sampler():
-        return MAKE[kind](View(dataset, CorruptionConfig("patch+zero_frames"), 4, 3, "test"))
+        return MAKE[kind](View(dataset, CorruptionConfig.of("patch+zero_frames"), 4, 3, "test"))
 
     first, second = sampler(), sampler()
     for _ in range(3):
@@ -43,7 +43,7 @@ def test_a_samplers_state_is_all_that_its_next_batches_depend_on(dataset, kind):
 
 def test_views_of_different_names_draw_apart_and_of_one_name_alike(dataset):
     rows = torch.arange(8)
-    config = CorruptionConfig("patch+zero_frames")
+    config = CorruptionConfig.of("patch+zero_frames")
     seen = [View(dataset, config, 4, 0, *name).observe(rows) for name in (["a"], ["a"], ["b"], ["a", 1])]
     assert torch.equal(seen[0], seen[1])
     assert not torch.equal(seen[0], seen[2])

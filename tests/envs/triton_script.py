@@ -1,7 +1,6 @@
 """What `test_triton` runs: every stage in one process, as the demo does, and environments before an optimiser."""
 
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import gymnasium
@@ -31,17 +30,17 @@ def stages() -> None:
 
     data = Path("data/walker_walk/random")
     collect(CollectConfig("walker_walk", "random", data, episodes=2, workers=1), length=40)
-    from pretrain.config import PRESETS
+    from pretrain.config import PretrainConfig
     from pretrain.train import pretrain
 
-    encoder = pretrain(replace(PRESETS["smoke"], data=data, out=Path("pretrain"))).path / "encoder"
-    from finetune.config import PRESETS as FINETUNE_PRESETS
+    encoder = pretrain(PretrainConfig.of("smoke", data=data, out=Path("pretrain"))).path / "encoder"
+    from finetune.config import FinetuneConfig
     from finetune.train import finetune
     from vd4rl_pomdp.corruptions import CorruptionConfig
     from vd4rl_pomdp.evaluation import EpisodeJob, evaluate
 
     shape = {"eval_episodes": 2, "eval_length": 4, "workers": 1}
-    finetune(replace(FINETUNE_PRESETS["smoke"], encoder=encoder, data=data, out=Path("finetune"), **shape))
+    finetune(FinetuneConfig.of("smoke", encoder=encoder, data=data, out=Path("finetune"), **shape))
     job = EpisodeJob(encoder, Path("finetune/policy"), 0, "walker_walk", CorruptionConfig(), 0, film=False, length=4)
     assert evaluate([job], workers=1)[0].length == 4
 

@@ -282,15 +282,15 @@ def test_the_grid_has_every_cell_and_its_commands_parse(capsys):
     commands = list(grid_commands("evidence", ("no_curtain",), (0, 1, 2), "cpu", Path("d"), Path("r")))
     assert len(commands) == 39
     assert len({tuple(words) for words in commands}) == 39
-    from pretrain.navigation.config import PRESETS, NavigationConfig
-    from vd4rl_pomdp.cli.parsing import with_presets
+    from pretrain.navigation.config import NavigationConfig
+    from vd4rl_pomdp.cli.parsing import parse_stage
 
     literal = next(words for words in commands if "--literal-future" in words)
-    config = with_presets(NavigationConfig, PRESETS, literal[2:], "x")
-    assert (config.literal_future, config.max_k, config.preset) == (True, 1, "cpu")
+    config = parse_stage(NavigationConfig, literal[2:], "x")
+    assert (config.options.literal_future, config.options.max_k, config.preset) == (True, 1, "cpu")
     options = Cell("no_curtain", "ah", self_prediction=True, exogenous=True)
-    config = with_presets(NavigationConfig, PRESETS, options.words("cpu", Path("d"), Path("r"), 4)[2:], "x")
-    assert (config.self_prediction, config.exogenous, config.seed) == (1.0, "photographs", 4)
+    config = parse_stage(NavigationConfig, options.words("cpu", Path("d"), Path("r"), 4)[2:], "x")
+    assert (config.options.self_prediction, config.exogenous, config.seed) == (1.0, "photographs", 4)
     main(["navigation", "grid", "--dry-run", "--seeds", "0", "--mazes", "no_curtain"])
     assert len(capsys.readouterr().out.splitlines()) == 13
 

@@ -11,7 +11,6 @@ from finetune.algorithms import ALGORITHMS, Loss, drqv2_bc, td3_bc
 from finetune.algorithms.bc import BC
 from finetune.algorithms.drqv2_bc import DrQv2BC
 from finetune.algorithms.td3_bc import TD3BC
-from finetune.config import PRESETS
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.policy import Policy
 
@@ -21,10 +20,10 @@ DIM, ACTIONS, SIZE = 3, 2, 32
 def make(kind: type, learning_rate: float = 1e-3, seed: int = 0) -> TD3BC:
     """An algorithm whose targets are far from its networks and whose features need to be standardised."""
     torch.manual_seed(seed)
-    config = replace(PRESETS["smoke"], learning_rate=learning_rate, gamma=0.9, alpha=1.5)
+    options = kind.options.fill({"gamma": 0.9, "alpha": 1.5})
     policy = Policy(DIM, ACTIONS, 16)
     policy.standardise.fit(batch().z)
-    algorithm = kind(policy, config, torch.Generator().manual_seed(seed))
+    algorithm = kind(policy, options, learning_rate, torch.Generator().manual_seed(seed))
     if isinstance(algorithm, TD3BC):
         with torch.no_grad():
             for target in (algorithm.target_policy.net, algorithm.target_critic):

@@ -57,7 +57,7 @@ def frozen(dataset: Dataset, corruption: CorruptionConfig, shift: int) -> Frozen
 
 
 def views_of(tmp_path, corruption: str, mode: str, shift: int) -> torch.Tensor:
-    made = frozen(noise_set(tmp_path / "set"), CorruptionConfig(corruption, mode), shift)
+    made = frozen(noise_set(tmp_path / "set"), CorruptionConfig.of(corruption, mode), shift)
     return encode_views(made, 2, FeatureFile(tmp_path, {}))
 
 

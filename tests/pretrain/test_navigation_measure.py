@@ -1,12 +1,11 @@
 """What is held out stays held out: changing one part's true states changes that part's errors and nothing else."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
-from pretrain.navigation.config import PRESETS
+from pretrain.navigation.config import NavigationConfig
 from pretrain.navigation.data import open_data
 from pretrain.navigation.measure import evaluate, refitted_errors
 from pretrain.navigation.trainer import Trainer, make_objective
@@ -15,7 +14,7 @@ from pretrain.navigation.trainer import Trainer, make_objective
 @pytest.fixture
 def trainer(maze_set: Path, tmp_path_factory, monkeypatch) -> Trainer:
     monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path_factory.getbasetemp() / "maze-cache"))
-    config = replace(PRESETS["smoke"], data=maze_set, out=Path(), refit_steps=20, precision="fp32")
+    config = NavigationConfig.of("smoke", data=maze_set, out=Path(), refit_steps=20, precision="fp32")
     torch.manual_seed(0)
     data = open_data(config)
     return Trainer(make_objective(data, config), data.on(torch.device("cpu")), config)

@@ -1,13 +1,12 @@
 import json
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
 
-from pretrain.navigation.config import PRESETS, NavigationConfig, command_of
+from pretrain.navigation.config import NavigationConfig, command_of
 from pretrain.navigation.data import MazeData, open_data
 from pretrain.navigation.probe import ErrorSums, StateProbe, TrueStates, refit
 from pretrain.navigation.train import train
@@ -29,7 +28,7 @@ def _cache(tmp_path_factory, monkeypatch):
 
 def smoke(data: Path, out: Path, **changes: object) -> NavigationConfig:
     given = {"data": data, "out": out, "steps": 8, "log_every": 2, "checkpoint_every": 4, "precision": "fp32"}
-    return replace(PRESETS["smoke"], **(given | changes))
+    return NavigationConfig.of("smoke", **(given | changes))
 
 
 def trainer_of(config: NavigationConfig) -> Trainer:
@@ -183,13 +182,13 @@ def test_a_refitted_probe_reads_what_is_there_and_nothing_else():
 
 
 def test_the_learning_rate_rises_then_falls():
-    config = replace(PRESETS["cpu"], steps=1000, warm_up=100)
+    config = NavigationConfig.of("cpu", steps=1000, warm_up=100)
     rates = [learning_rate(config, step) for step in range(1000)]
     assert rates[0] == pytest.approx(config.learning_rate / 100)
     assert int(np.argmax(rates)) in (99, 100)
     assert rates[-1] < 1e-5
-    assert {learning_rate(PRESETS["paper"], step) for step in (0, 10, 10**5)} == {1e-4}
-    assert learning_rate(replace(PRESETS["paper"], method="supervised"), 0) == pytest.approx(5e-5)
+    assert {learning_rate(NavigationConfig.of("paper"), step) for step in (0, 10, 10**5)} == {1e-4}
+    assert learning_rate(NavigationConfig.of("paper", method="supervised"), 0) == pytest.approx(5e-5)
 
 
 def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
@@ -214,7 +213,7 @@ def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
         ({"window": 41}, r"episode 0 has 40 rows, fewer than the window of 41"),
         ({"frame_encoder": "mixer", "picture": "grey50", "burn_in": 20}, "--burn-in 20 leaves no row"),
         ({"frame_encoder": "vit"}, "unknown frame encoder 'vit'"),
-        ({"method": "ah+a", "literal_future": True}, r"--literal-future is not read by ah\+a"),
+        ({"method": "ah+a", "literal_future": True}, r"--literal-future is not read by the method ah\+a"),
         ({"checkpoint_every": 3}, "no multiple of --log-every"),
         ({"steps": 0}, "--steps is 0"),
         ({"seed": -1}, "--seed is -1"),
@@ -261,23 +260,26 @@ def test_true_states_of_first_person_leave_out_the_heading():
 
 
 def test_the_mixer_refuses_sizes_it_cannot_cut():
-    from vd4rl_pomdp.nn.frame import make_frame_encoder
+    from vd4rl_pomdp.nn.frame import FrameOptions, make_frame_encoder
 
-    assert make_frame_encoder("mixer", 3, 100, 16)(torch.zeros(2, 3, 100, 100, dtype=torch.uint8)).shape == (2, 16)
+    assert make_frame_encoder("mixer", 3, 100, FrameOptions(16))(
+        torch.zeros(2, 3, 100, 100, dtype=torch.uint8)
+    ).shape == (2, 16)
     with pytest.raises(UserError, match="84 is no multiple"):
-        make_frame_encoder("mixer", 9, 84, 16)
+        make_frame_encoder("mixer", 9, 84, FrameOptions(16))
 
 
 def test_the_mixer_has_the_papers_shape():
-    from vd4rl_pomdp.nn.frame import MixerLayer, make_frame_encoder
+    from vd4rl_pomdp.nn.frame import FrameOptions, MixerLayer, make_frame_encoder
 
-    encoder = make_frame_encoder("mixer", 3, 100, 256)
+    encoder = make_frame_encoder("mixer", 3, 100, FrameOptions())
     layers = [m for m in encoder.modules() if isinstance(m, MixerLayer)]
     assert len(layers) == 8
     assert layers[0].over_patches[0].in_features == 100
-    paper = PRESETS["paper"]
-    assert (paper.gru_layers, paper.hidden_dim, paper.batch_size, paper.window) == (2, 256, 16, 64)
-    assert (paper.steps, paper.average_last, paper.learning_rate, paper.codes) == (200_000, 10_000, 1e-4, 20)
+    paper = NavigationConfig.of("paper")
+    assert (paper.memory.gru_layers, paper.memory.hidden_dim, paper.batch_size, paper.window) == (2, 256, 16, 64)
+    assert (paper.steps, paper.average_last, paper.learning_rate) == (200_000, 10_000, 1e-4)
+    assert paper.options.target.codes == 20
     assert re.fullmatch("mixer", paper.frame_encoder)
 
 
@@ -293,13 +295,13 @@ def test_streaming_and_windows_agree_for_the_mazes_encoders(maze_set, tmp_path, 
 
 
 def test_the_command_that_a_run_names_has_its_config(maze_set, tmp_path):
-    from vd4rl_pomdp.cli.parsing import with_presets
+    from vd4rl_pomdp.cli.parsing import parse_stage
 
     for config in (
         smoke(maze_set, tmp_path / "a run", method="fj+a", m=3, self_prediction=0.5, k_embedding=False),
-        replace(PRESETS["cpu"], data=maze_set, out=tmp_path, literal_future=True, seed=4, max_k=1),
-        replace(PRESETS["paper"], data=maze_set, out=tmp_path),
+        NavigationConfig.of("cpu", data=maze_set, out=tmp_path, literal_future=True, seed=4, max_k=1),
+        NavigationConfig.of("paper", data=maze_set, out=tmp_path),
     ):
         words = command_of(config)
         assert words[:3] == ["vd4rl-pomdp", "navigation", "train"]
-        assert with_presets(NavigationConfig, PRESETS, words[3:], "x") == config
+        assert parse_stage(NavigationConfig, words[3:], "x") == config

@@ -1,113 +1,159 @@
-"""A setting that a method does not read is refused: a run must not claim what it did not do."""
-
-from dataclasses import fields, replace
+"""Options belong to the parts that read them: what the chosen ones do not read is refused, so that no run claims it."""
 
 import pytest
 
-import finetune.config
-import pretrain.navigation.config
-from finetune.train import check as check_finetuning
-from pretrain.config import PRESETS, PretrainConfig
-from pretrain.navigation.train import _check as check_navigation
-from pretrain.objectives import METHODS, OPTIONS, unread_options
-from pretrain.train import check
+from finetune.config import FinetuneConfig
+from finetune.train import end_to_end
+from pretrain.config import PretrainConfig
+from pretrain.navigation.config import NavigationConfig
+from pretrain.objectives import METHODS
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.objective import InverseConfig
-
-SMOKE, NAVIGATION = PRESETS["smoke"], pretrain.navigation.config.PRESETS["smoke"]
-FINETUNING = finetune.config.PRESETS["smoke"]
+from vd4rl_pomdp.options import flat, option_names
 
 
 @pytest.mark.parametrize(
-    ("method", "changes"),
+    ("settings", "reader"),
     [
-        ("acro", {"literal_future": True}),
-        ("mik", {"literal_future": True}),
-        ("acro", {"m": 3}),
-        ("acro", {"gru_layers": 2}),
-        ("ah", {"n": 3}),
-        ("mik+a", {"homer_codes": 8}),
-        ("one_step_inverse", {"max_k": 2}),
-        ("curl", {"action_target": "mse"}),
-        ("driml", {"self_prediction": 1.0}),
-        ("bc", {"k_embedding": False}),
-        ("state", {"frame_encoder": "drq"}),
-        ("mik+a", {"action_target": "mse", "codes": 7}),
+        ({"method": "acro", "literal_future": True}, "the method acro"),
+        ({"method": "mik", "literal_future": True}, "the method mik"),
+        ({"method": "acro", "m": 3}, "what is chosen .method acro, .*history method, corruption none."),
+        ({"method": "acro", "gru_layers": 2}, "what is chosen .method acro"),
+        ({"method": "ah", "n": 3}, "the method ah"),
+        ({"method": "mik+a", "homer_codes": 8}, "the method mik.a"),
+        ({"method": "one_step_inverse", "max_k": 2}, "the method one_step_inverse"),
+        ({"method": "curl", "action_target": "mse"}, "the method curl"),
+        ({"method": "curl", "codes": 3}, "the method curl"),
+        ({"method": "driml", "self_prediction": 1.0}, "the method driml"),
+        ({"method": "bc", "k_embedding": False}, "the method bc"),
+        ({"method": "state", "feature_dim": 3}, "what is chosen .method state"),
+        ({"method": "mik+a", "codes": 7, "action_target": "mse"}, "what is chosen .*action target mse"),
+        ({"patch_size": 8}, "the corruption none"),
+        ({"corruption": "patch", "zeroed_frames": 1}, "the corruption patch"),
+        ({"no_such_setting": 1}, "what is chosen"),
     ],
 )
-def test_what_a_method_does_not_read_is_refused(method, changes):
-    flag = max(changes).replace("_", "-")
-    with pytest.raises(UserError, match=rf"--{flag} is not read by {method.replace('+', '.')}: leave it out"):
-        check(replace(SMOKE, method=method, **changes))
+def test_what_the_chosen_parts_do_not_read_is_refused(settings, reader):
+    name = next(name for name in settings if name not in PretrainConfig.choosers or name == "action_target")
+    with pytest.raises(UserError, match=f"--{name.replace('_', '-')} is not read by {reader}.*: leave it out"):
+        PretrainConfig.of("smoke", **settings).check()
+
+
+def test_the_states_frame_encoder_cannot_be_chosen():
+    with pytest.raises(UserError, match="--frame-encoder is not read by the method state"):
+        PretrainConfig.of("smoke", method="state", frame_encoder="drq").check()
 
 
 @pytest.mark.parametrize(
-    ("method", "changes"),
+    "settings",
     [
-        ("mik+a", {"literal_future": True, "n": 2, "m": 3, "gru_layers": 2, "codes": 7}),
-        ("acro", {"history": "gru", "m": 3, "hidden_dim": 16}),
-        ("fj", {"m": 3, "history_window": 2}),
-        ("homer", {"homer_codes": 8}),
-        ("driml", {"max_k": 2}),
-        ("curl", {"window": 3}),  # which is shorter than the default K that it does not read
-        ("random", {"steps": 7, "batch_size": 3, "corruption": "patch", "patch_size": 8}),
-        ("bc", {"feature_dim": 16}),
+        {"method": "mik+a", "literal_future": True, "n": 2, "m": 3, "gru_layers": 2, "codes": 7},
+        {"method": "acro", "history": "gru", "m": 3, "hidden_dim": 16},
+        {"method": "fj", "m": 3, "history_window": 2},
+        {"method": "homer", "homer_codes": 8},
+        {"method": "driml", "max_k": 2},
+        {"method": "curl", "window": 3},  # which is shorter than the default K of other methods
+        {"method": "random", "steps": 7, "batch_size": 3, "corruption": "patch", "patch_size": 8},
+        {"method": "bc", "feature_dim": 16},
+        {"corruption": "patch+zero_frames", "corruption_mode": "emission", "patch_shared": True, "zeroed_frames": 1},
     ],
 )
-def test_what_a_method_reads_is_taken(method, changes):
-    check(replace(SMOKE, method=method, **changes))
+def test_what_the_chosen_parts_read_is_taken(settings):
+    config = PretrainConfig.of("smoke", **settings)
+    config.check()
+    assert flat(config) | settings == flat(config)
 
 
-@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("preset", PretrainConfig.presets)
 @pytest.mark.parametrize("method", METHODS)
 def test_a_presets_own_defaults_are_never_refused(method, preset):
-    check(replace(PRESETS[preset], method=method))
+    PretrainConfig.of(preset, method=method).check()
 
 
-def test_options_are_settings_and_every_inverse_setting_is_one():
-    assert (
-        {field.name for field in fields(InverseConfig)} <= OPTIONS <= {field.name for field in fields(PretrainConfig)}
-    )
-    read = {name for method in METHODS for name in OPTIONS - unread_options(replace(SMOKE, method=method))}
-    assert read == OPTIONS, "an option that no method reads"
+def test_a_preset_decides_options_of_whatever_part_has_them():
+    smoke, paper = (PretrainConfig.of(preset, method="driml") for preset in ("smoke", "paper"))
+    assert (smoke.options.max_k, paper.options.max_k) == (3, 15)
+    assert set(PretrainConfig.presets["smoke"]) <= {*flat(PretrainConfig()), *option_names()}
+
+
+@pytest.mark.parametrize("kind", [PretrainConfig, NavigationConfig, FinetuneConfig])
+def test_an_unknown_preset_is_told_the_choices(kind):
+    with pytest.raises(UserError, match="unknown preset 'large': choose one of paper, cpu, smoke"):
+        kind.of("large")
+
+
+def test_other_parts_keep_what_was_told_and_take_their_own_defaults():
+    config = PretrainConfig.of("smoke", method="mik+a", max_k=2, corruption="patch", patch_size=8, seed=3)
+    other = config.altered(method="driml")
+    assert other == PretrainConfig.of("smoke", method="driml", max_k=2, corruption="patch", patch_size=8, seed=3)
+    with pytest.raises(UserError, match="--max-k is not read by the method curl"):
+        config.altered(method="curl")
 
 
 @pytest.mark.parametrize(("max_k", "window"), [(8, 8), (31, 8)])
 def test_a_gap_beyond_the_window_is_refused(max_k, window):
     with pytest.raises(UserError, match=f"--max-k {max_k} needs windows of more"):
-        check(replace(SMOKE, max_k=max_k, window=window))
+        PretrainConfig.of("smoke", max_k=max_k, window=window).check()
 
 
 @pytest.mark.parametrize(
-    ("changes", "flag"),
+    ("settings", "message"),
+    [
+        ({"max_k": 0}, "--max-k is 0"),
+        ({"method": "driml", "max_k": 0}, "--max-k is 0"),
+        ({"codes": 0}, "--codes is 0"),
+        ({"n": -1}, "--n is -1"),
+        ({"m": -1}, "--m is -1"),
+        ({"hidden_dim": 0}, "--hidden-dim is 0"),
+        ({"feature_dim": 0}, "--feature-dim is 0"),
+        ({"self_prediction": float("nan")}, "--self-prediction is nan"),
+        ({"corruption": "patch", "patch_fill": 256}, "--patch-fill is 256"),
+        ({"corruption": "zero_frames", "zeroed_frames": 0}, "--zeroed-frames is 0"),
+        ({"method": "homer", "homer_codes": -1}, "--homer-codes is -1"),
+        ({"action_target": "ordinal"}, "unknown action target 'ordinal'"),
+        ({"frame_encoder": "vit"}, "unknown frame encoder 'vit'"),
+        ({"method": "mik", "history": "none"}, "--history is 'none': choose one of method, gru"),
+        ({"method": "bc", "history": "gru"}, "bc has no memory"),
+    ],
+)
+def test_values_that_cannot_work_are_refused(settings, message):
+    with pytest.raises(UserError, match=message):
+        PretrainConfig.of("smoke", **settings).check()
+
+
+@pytest.mark.parametrize(
+    ("settings", "flag"),
     [
         ({"method": "ah+a", "literal_future": True}, "literal-future"),
         ({"method": "no_history", "m": 3}, "m"),
         ({"method": "supervised", "self_prediction": 1.0}, "self-prediction"),
         ({"method": "random", "n": 3}, "n"),
         ({"exogenous_weight": 0.2}, "exogenous-weight"),
+        ({"history_window": 3}, "history-window"),
     ],
 )
-def test_what_a_navigation_run_does_not_read_is_refused(changes, flag):
+def test_what_a_navigation_run_does_not_read_is_refused(settings, flag):
     with pytest.raises(UserError, match=f"--{flag} is not read by"):
-        check_navigation(replace(NAVIGATION, **changes))
+        NavigationConfig.of("smoke", **settings)
 
 
 @pytest.mark.parametrize("method", ["random", "supervised+a", "mik+a", "fj", "no_history"])
 def test_the_grids_settings_are_read(method):
-    check_navigation(replace(NAVIGATION, method=method, max_k=15))
+    NavigationConfig.of("smoke", method=method, max_k=15).check()
 
 
 @pytest.mark.parametrize("name", ["alpha", "gamma", "n_step"])
 def test_cloning_reads_no_option_of_the_critic(name):
-    changed = replace(FINETUNING, **{name: 1})
-    check_finetuning(changed)
-    check_finetuning(replace(changed, algorithm="drqv2_bc"))
-    for config, end_to_end in ((replace(changed, algorithm="bc"), ""), (changed, "bc")):
+    given = {name: 1}
+    FinetuneConfig.of("smoke", **given).check()
+    config = FinetuneConfig.of("smoke", algorithm="drqv2_bc", **given)
+    for refused in (
+        lambda: FinetuneConfig.of("smoke", algorithm="bc", **given),
+        lambda: end_to_end(config, "bc"),
+    ):
         with pytest.raises(UserError, match=f"--{name.replace('_', '-')} is not read by the algorithm bc"):
-            check_finetuning(config, end_to_end)
+            refused()
 
 
 def test_an_encoder_that_is_trained_has_no_views():
     with pytest.raises(UserError, match="--views is not read by the algorithm drqv2_bc"):
-        check_finetuning(replace(FINETUNING, views=3), "drqv2_bc")
+        end_to_end(FinetuneConfig.of("smoke", views=3), "drqv2_bc")

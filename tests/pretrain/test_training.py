@@ -1,13 +1,12 @@
 """The training loop hands an objective what it needs: observations as the agent sees them, and its own step."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 import torch
 
 from baselines import CURL
-from pretrain.config import PRESETS
+from pretrain.config import PretrainConfig
 from pretrain.train import Trainer
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.data import open_dataset
@@ -19,8 +18,8 @@ def trainer(tmp_path) -> Trainer:
     dataset = open_dataset(write_fake_set(tmp_path / "set", [20, 25]), tmp_path / "cache")
     torch.manual_seed(0)
     encoder = Encoder(EncoderConfig(6, "nature", 8))
-    config = replace(PRESETS["smoke"], method="curl", data=Path(), out=Path(), corruption="patch", learning_rate=1e-2)
-    return Trainer(CURL(encoder, 0), dataset, config)
+    config = PretrainConfig.of("smoke", method="curl", data=Path(), out=Path(), corruption="patch", learning_rate=1e-2)
+    return Trainer(CURL(encoder, None, config.options, 0), dataset, config)
 
 
 def test_curls_momentum_encoder_follows_the_encoder_at_every_step_of_a_training(trainer: Trainer):

@@ -1,6 +1,6 @@
 """What exceeds a machine is said in one line that names the flags, before anything is done where it can be known."""
 
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -87,7 +87,7 @@ def data(tmp_path, monkeypatch) -> Path:
 
 @pytest.mark.parametrize("changes", [{"batch_size": 200_000, "window": 16}, {"hidden_dim": 10**6}, {"head_dim": 10**9}])
 def test_a_pretraining_beyond_the_machine_leaves_no_run(data, tmp_path, changes):
-    config = replace(pretrain.config.PRESETS["smoke"], data=data, out=tmp_path / "out", **changes)
+    config = pretrain.config.PretrainConfig.of("smoke", data=data, out=tmp_path / "out", **changes)
     flag, value = next((name.replace("_", "-"), number) for name, number in changes.items())
     with pytest.raises(UserError, match=rf"memory.*--{flag} {value}|--{flag} {value}.*memory"):
         run_pretrain(config)
@@ -96,9 +96,9 @@ def test_a_pretraining_beyond_the_machine_leaves_no_run(data, tmp_path, changes)
 
 @pytest.mark.parametrize("name", ["views", "batch_size", "hidden_dim"])
 def test_a_finetuning_beyond_the_machine_leaves_no_run(data, tmp_path, name):
-    made = run_pretrain(replace(pretrain.config.PRESETS["smoke"], data=data, out=tmp_path / "made", method="random"))
-    smoke = finetune.config.PRESETS["smoke"]
-    config = replace(smoke, encoder=made.path / "encoder", data=data, out=tmp_path / "out", **{name: 10**9})
+    made = run_pretrain(pretrain.config.PretrainConfig.of("smoke", data=data, out=tmp_path / "made", method="random"))
+    given = {"encoder": made.path / "encoder", "data": data, "out": tmp_path / "out"}
+    config = finetune.config.FinetuneConfig.of("smoke", **given, **{name: 10**9})
     with pytest.raises(UserError, match=rf"--{name.replace('_', '-')} 1000000000.* takes .* GB of memory"):
         run_finetune(config)
     assert not config.out.exists()

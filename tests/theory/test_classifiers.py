@@ -1,11 +1,9 @@
-from dataclasses import replace
-
 import pytest
 import torch
 from hypothesis import HealthCheck, assume, given, settings
 
-from pretrain.config import PRESETS
-from pretrain.objectives import METHODS, build_objective
+from pretrain.build import build_objective
+from pretrain.config import PretrainConfig
 from tests.theory.random_worlds import worlds
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.theory.classifiers import Memory, compare
@@ -93,9 +91,9 @@ def test_views_are_what_the_learned_objectives_declare(name):
     method, literal = name.removesuffix(" literal"), name.endswith(" literal")
     m, n, rows = 2, 1, 7
     actions = torch.rand(30, 2)
-    changes = {"m": m if METHODS[method].history == "gru" and not method.startswith("ah") else None}
-    config = replace(PRESETS["smoke"], method=method, n=n, literal_future=literal, max_k=4, **changes)
-    objective = build_objective(config, actions, make_action_target("kmeans", actions.numpy(), 3, 0))
+    config = PretrainConfig.of("smoke", method=method, max_k=4).with_known(n=n, literal_future=literal)
+    config = config if method.startswith("ah") else config.with_known(m=m)
+    objective = build_objective(config, actions.shape[1], make_action_target("kmeans", actions.numpy(), 3, 0))
     for t, k in objective.pairs(rows).tolist():
         observations, acted = objective.visible(t, k, rows)
         declared = {("o", j) for j in observations} | {("a", j) for j in acted}

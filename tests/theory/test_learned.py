@@ -5,7 +5,6 @@ the tolerance means that an objective does not use what it may see, one below it
 """
 
 import random
-from dataclasses import replace
 from fractions import Fraction
 from itertools import product
 
@@ -13,7 +12,7 @@ import numpy as np
 import pytest
 import torch
 
-from pretrain.config import PRESETS
+from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.nn.action_target import make_action_target
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
@@ -67,9 +66,10 @@ def build(world: World, method: str, max_k: int, m: int = M, hidden: int = 32) -
         size=1,
     )
     literal = method.endswith("literal")
-    config = replace(PRESETS["smoke"], method=name, max_k=max_k, head_dim=max(48, hidden), literal_future=literal)
+    config = PretrainConfig.of("smoke", method=name, max_k=max_k, head_dim=max(48, hidden))
+    options = config.with_known(literal_future=literal).options
     target = make_action_target("kmeans", np.eye(count, dtype=np.float32), count, 0)
-    objective = spec.build(Encoder(shape), target, config)
+    objective = spec.build(Encoder(shape), target, options, 0)
     assert isinstance(objective, InverseObjective)
     return objective
 

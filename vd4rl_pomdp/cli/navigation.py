@@ -8,7 +8,7 @@ from pathlib import Path
 import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command, run_stages
-from vd4rl_pomdp.cli.parsing import parse, with_presets
+from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
 
 
 def _collect(words: Arguments, program: str) -> None:
@@ -20,10 +20,10 @@ def _collect(words: Arguments, program: str) -> None:
 
 
 def _train(words: Arguments, program: str) -> None:
-    from pretrain.navigation.config import PRESETS, NavigationConfig
+    from pretrain.navigation.config import NavigationConfig
     from pretrain.navigation.train import train
 
-    run = train(with_presets(NavigationConfig, PRESETS, words, program))
+    run = train(parse_stage(NavigationConfig, words, program))
     print(f"results: {run.path / 'results.json'}")
 
 

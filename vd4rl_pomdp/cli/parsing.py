@@ -9,15 +9,19 @@ import re
 from dataclasses import fields, replace
 from itertools import pairwise
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments
 from vd4rl_pomdp.errors import UserError, flag_of
+from vd4rl_pomdp.options import StageConfig, option_names
 from vd4rl_pomdp.runs.folder import flatten
 
 _LONGEST_LIST = 6
+_FLAT = (tyro.conf.OmitArgPrefixes,)
+"""Options are nested in Python, their flags are not."""
+Stage = TypeVar("Stage", bound=StageConfig)
 
 
 def parse(config: Any, words: Arguments, program: str, default: Any = None) -> Any:
@@ -26,7 +30,7 @@ def parse(config: Any, words: Arguments, program: str, default: Any = None) -> A
     shown = io.StringIO()
     try:
         with contextlib.redirect_stderr(shown):
-            parsed = tyro.cli(config, args=words, prog=program, description=config.__doc__, **options)
+            parsed = tyro.cli(config, args=words, prog=program, description=config.__doc__, config=_FLAT, **options)
     except SystemExit as end:
         if end.code in (0, None):
             raise
@@ -53,14 +57,38 @@ def _one_line(box: str, program: str) -> str:
     return f"{' '.join(text.split())} (see `{program} --help`)"
 
 
-def with_presets(config: type, presets: dict[str, Any], words: Arguments, program: str, flag: str = "--preset") -> Any:
-    """Parse a stage's config one of whose flags, `--preset`, chooses the defaults of all others."""
-    name = next(iter(presets))
+def parse_stage(config: type[Stage], words: Arguments, program: str) -> Stage:
+    """Parse a stage's config: preset, method and the like decide which flags there are, and their defaults."""
+    chosen = {name: value for name in (*config.choosers, "preset") if (value := _chosen(words, name)) is not None}
+    required = {f.name: tyro.MISSING for f in fields(config) if f.default == Path()}
+    default = config.of(**chosen, **required)
+    _refuse_unread(default, words)
+    parsed = parse(config, words, program, default)
+    parsed.check()
+    return parsed
+
+
+def _refuse_unread(default: StageConfig, words: Arguments) -> None:
+    """Name who does not read a flag, where it is one of a part that was not chosen."""
+    flags = (word.partition("=")[0][2:].replace("-", "_") for word in words if word.startswith("--"))
+    names = (flag.removeprefix("no_") for flag in flags)
+    optional = option_names()
+    default.check_read((name for name in names if name in optional), default)
+
+
+def _chosen(words: Arguments, name: str) -> str | None:
+    """The value that a command line gives a flag, the last if there are several."""
+    value = None
     for word, following in pairwise([*words, ""]):
-        if word == flag:
-            name = following
-        elif word.startswith(f"{flag}="):
-            name = word.partition("=")[2]
+        flag, equals, text = word.partition("=")
+        if flag.replace("_", "-") == flag_of(name):
+            value = text if equals else following
+    return value
+
+
+def with_presets(config: type, presets: dict[str, Any], words: Arguments, program: str, flag: str = "--preset") -> Any:
+    """Parse a config one of whose flags, `--preset`, chooses the defaults of all others."""
+    name = _chosen(words, flag.removeprefix("--")) or next(iter(presets))
     if name not in presets:
         raise UserError(f"unknown {flag.removeprefix('--')} {name!r}: choose one of {', '.join(presets)}")
     default = presets[name]

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING
 import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command, run_stage, run_stages
-from vd4rl_pomdp.cli.parsing import parse, show, with_presets
+from vd4rl_pomdp.cli.parsing import parse, parse_stage, show
 
 if TYPE_CHECKING:
     from finetune.config import FinetuneConfig
@@ -17,9 +17,9 @@ if TYPE_CHECKING:
 
 
 def _pretrain_config(words: Arguments, program: str) -> PretrainConfig:
-    from pretrain.config import PRESETS, PretrainConfig
+    from pretrain.config import PretrainConfig
 
-    return with_presets(PretrainConfig, PRESETS, words, program)
+    return parse_stage(PretrainConfig, words, program)
 
 
 def _pretrain(words: Arguments, program: str) -> None:
@@ -30,9 +30,9 @@ def _pretrain(words: Arguments, program: str) -> None:
 
 
 def _finetune_config(words: Arguments, program: str) -> FinetuneConfig:
-    from finetune.config import PRESETS, FinetuneConfig
+    from finetune.config import FinetuneConfig
 
-    return with_presets(FinetuneConfig, PRESETS, words, program)
+    return parse_stage(FinetuneConfig, words, program)
 
 
 def _finetune(words: Arguments, program: str) -> None:
@@ -117,15 +117,17 @@ def _sweep(words: Arguments, program: str) -> None:
 
 def _check(runs: list[list[Arguments]]) -> None:
     """Find what a stage will refuse before the first run, not after the hours that the runs before it take."""
-    from finetune.train import check as check_finetune
+    from finetune.train import end_to_end
     from pretrain.objectives import METHODS
-    from pretrain.train import check as check_pretrain
+    from pretrain.train import check
 
     for (_, *first), *others in runs:
         config = _pretrain_config(first, "vd4rl-pomdp pretrain")
-        check_pretrain(config)
+        check(config)
         for _, *words in others:
-            check_finetune(_finetune_config(words, "vd4rl-pomdp finetune"), METHODS.named(config.method).end_to_end)
+            finetuning = _finetune_config(words, "vd4rl-pomdp finetune")
+            if algorithm := METHODS.named(config.method).end_to_end:
+                end_to_end(finetuning, algorithm)
 
 
 @dataclass(frozen=True)

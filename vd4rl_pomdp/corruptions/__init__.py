@@ -2,19 +2,23 @@
 
 from vd4rl_pomdp.corruptions.corruption import (
     CORRUPTIONS,
+    NO_CORRUPTION,
     STAGES,
     BatchCorruption,
     Corruption,
     CorruptionConfig,
     Patch,
     Stage,
+    ZeroFrames,
     check_corruption,
+    corruption_settings,
     make_corruption,
 )
 from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_integers
 
 __all__ = [
     "CORRUPTIONS",
+    "NO_CORRUPTION",
     "STAGES",
     "BatchCorruption",
     "Corruption",
@@ -22,7 +26,9 @@ __all__ = [
     "KeyStream",
     "Patch",
     "Stage",
+    "ZeroFrames",
     "check_corruption",
+    "corruption_settings",
     "derive_keys",
     "draw_integers",
     "make_corruption",

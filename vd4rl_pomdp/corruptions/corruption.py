@@ -6,14 +6,17 @@ A corruption is a pure function of a batch of frame stacks and their keys. The s
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Literal, Protocol
+from collections.abc import Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Literal, Protocol, Self
 
 import torch
 from torch import Tensor
 
 from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_integers, draw_numbered, hash_keys
-from vd4rl_pomdp.errors import UserError, refuse_outside
+from vd4rl_pomdp.errors import UserError, flag_of
+from vd4rl_pomdp.options import Limits, Options, flat
+from vd4rl_pomdp.registry import Registry
 from vd4rl_pomdp.seeding import stream_seed
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 
@@ -22,7 +25,7 @@ _CHANNELS = 3
 
 
 class Stage(Protocol):
-    """One step of a corruption, applied to the frames that are not zeroed."""
+    """One step of a corruption, applied to the frames that are not zeroed; a dataclass of its own options."""
 
     def __call__(self, frames: Tensor, key: Tensor, number: Tensor) -> None:
         """Change frames in place.
@@ -43,43 +46,9 @@ def _assign(target: Tensor, index: tuple[Tensor, ...], value: int) -> None:
 
 
 @dataclass(frozen=True)
-class Patch:
-    """Squares of every frame, at uniformly random places, take the value `fill`."""
+class Patch(Options):
+    """Squares of every frame, at uniformly random places, take one value."""
 
-    size: int = 16
-    """Side in pixels."""
-    count: int = 1
-    """Squares a frame."""
-    fill: int = 0
-    """Value of the covered pixels, 0 to 255."""
-    shared: bool = False
-    """Whether the frames of a stack share their squares."""
-
-    def __call__(self, frames: Tensor, key: Tensor, number: Tensor) -> None:
-        """See `Stage`."""
-        n, k, _, height, width = frames.shape
-        if self.size > min(height, width):
-            raise UserError(
-                f"patch size {self.size} exceeds the image ({height}x{width}): choose a smaller --patch-size"
-            )
-        square = torch.arange(self.count, device=key.device)
-        draw = (0 if self.shared else number[..., None] * self.count) + square.expand(n, k, self.count)
-        top = draw_numbered(key, height - self.size + 1, draw)
-        left = draw_numbered(hash_keys(key), width - self.size + 1, draw)
-        squares = frames.unfold(3, self.size, 1).unfold(4, self.size, 1)
-        sample = torch.arange(n, device=key.device)[:, None, None]
-        frame = torch.arange(k, device=key.device)[:, None]
-        _assign(squares.movedim(2, 4), (sample, frame, top, left), self.fill)
-
-
-@dataclass(frozen=True)
-class CorruptionConfig:
-    """Which corruption, and its fields."""
-
-    corruption: str = "none"
-    """none, patch, zero_frames or patch+zero_frames."""
-    corruption_mode: Mode = "resample"
-    """resample: drawn anew whenever a row enters a batch, as in the paper; emission: a row always looks the same."""
     patch_size: int = 16
     """Side of a patch in pixels."""
     patch_count: int = 1
@@ -88,19 +57,114 @@ class CorruptionConfig:
     """Pixel value inside a patch."""
     patch_shared: bool = False
     """Whether the frames of a stack share their patches."""
+
+    limits: ClassVar[Limits] = {"patch_size": 1, "patch_count": 1, "patch_fill": (0, 255)}
+
+    def __call__(self, frames: Tensor, key: Tensor, number: Tensor) -> None:
+        """See `Stage`."""
+        n, k, _, height, width = frames.shape
+        if self.patch_size > min(height, width):
+            raise UserError(
+                f"patch size {self.patch_size} exceeds the image ({height}x{width}): choose a smaller --patch-size"
+            )
+        square = torch.arange(self.patch_count, device=key.device)
+        draw = (0 if self.patch_shared else number[..., None] * self.patch_count) + square.expand(
+            n, k, self.patch_count
+        )
+        top = draw_numbered(key, height - self.patch_size + 1, draw)
+        left = draw_numbered(hash_keys(key), width - self.patch_size + 1, draw)
+        squares = frames.unfold(3, self.patch_size, 1).unfold(4, self.patch_size, 1)
+        sample = torch.arange(n, device=key.device)[:, None, None]
+        frame = torch.arange(k, device=key.device)[:, None]
+        _assign(squares.movedim(2, 4), (sample, frame, top, left), self.patch_fill)
+
+
+@dataclass(frozen=True)
+class ZeroFrames(Options):
+    """Frames of every stack, chosen uniformly, become 0, the newest perhaps among them."""
+
     zeroed_frames: int = 2
-    """Frames of a stack that `zero_frames` blanks."""
+    """Frames of a stack that are blanked."""
+
+    limits: ClassVar[Limits] = {"zeroed_frames": 1}
 
 
-def _patch(config: CorruptionConfig) -> Stage:
-    return Patch(config.patch_size, config.patch_count, config.patch_fill, config.patch_shared)
+ZERO_FRAMES = "zero_frames"
+"""It drops whole frames, which no stage sees any more: it may only end a corruption's name."""
 
 
-STAGES = {"patch": _patch}
-"""Every stage by name. A corruption's name joins its stages with `+`, in the order they are applied; zero_frames, which
-drops whole frames, may end it."""
+def _is_stage(part: Any) -> bool:
+    return isinstance(part, type) and issubclass(part, Options) and any("__call__" in vars(c) for c in part.__mro__)
+
+
+STAGES: Registry[type[Options]] = Registry(
+    "corruption",
+    {"patch": Patch, ZERO_FRAMES: ZeroFrames},
+    _is_stage,
+    "a class of vd4rl_pomdp.options.Options with the method of a Stage",
+)
+"""Every stage by name: a dataclass of its options that is a `Stage`. A corruption's name joins its stages with `+`, in
+the order in which they are applied. Packages offer theirs in the group of entry points `vd4rl_pomdp.corruptions`."""
 CORRUPTIONS = ("none", "patch", "zero_frames", "patch+zero_frames")
 """The benchmark's settings."""
+
+
+def _kinds(corruption: str) -> list[type[Options]]:
+    """Classes of a corruption's stages; an unknown name raises UserError."""
+    names = [] if corruption == "none" else corruption.split("+")
+    if any(name not in STAGES and name not in STAGES.broken for name in names) or ZERO_FRAMES in names[:-1]:
+        own = [name for name in STAGES if STAGES.origin(name)]
+        raise UserError(f"unknown corruption {corruption!r}: choose one of {', '.join([*CORRUPTIONS, *own])}")
+    return [STAGES.named(name) for name in names]
+
+
+@dataclass(frozen=True)
+class CorruptionConfig(Options):
+    """Which corruption, and its stages with their options; `of` makes one from names and values."""
+
+    corruption: str = "none"
+    """none, patch, zero_frames or patch+zero_frames."""
+    corruption_mode: Mode = "resample"
+    """resample: drawn anew whenever a row enters a batch, as in the paper; emission: a row always looks the same."""
+    stages: tuple[Options, ...] = ()
+    """One for every part of the name."""
+
+    @classmethod
+    def of(cls, corruption: str = "none", corruption_mode: Mode = "resample", **options: Any) -> Self:
+        """A corruption by name.
+
+        Args:
+            corruption: names of stages, joined by `+`.
+            corruption_mode: see the field.
+            options: values of the stages' options by name.
+
+        Raises:
+            UserError: an unknown name, or an option that no stage reads.
+        """
+        config = cls.fill({"corruption": corruption, "corruption_mode": corruption_mode} | options)
+        for name in options.keys() - flat(config).keys():
+            raise UserError(f"{flag_of(name)} is not read by the corruption {corruption}: leave it out")
+        return config
+
+    @classmethod
+    def fill(cls, values: Mapping[str, Any]) -> Self:
+        """The corruption that many values name, with its stages' options among them."""
+        stages = tuple(kind.fill(values) for kind in _kinds(values.get("corruption", "none")))
+        return cls(**{name: values[name] for name in _OWN if name in values}, stages=stages)
+
+    def check(self) -> None:
+        """Raise UserError for a field out of range."""
+        for stage in self.stages:
+            stage.check()
+
+
+_OWN = ("corruption", "corruption_mode")
+NO_CORRUPTION = CorruptionConfig()
+
+
+def corruption_settings() -> set[str]:
+    """Names of all settings that say how observations are corrupted."""
+    return {*_OWN, *(field.name for kind in STAGES.values() for field in fields(kind))}
 
 
 class Corruption:
@@ -159,17 +223,14 @@ class Corruption:
 
 
 def make_corruption(config: CorruptionConfig | str) -> Corruption:
-    """Build a corruption from its config, or from its name with default fields; an unknown name or a field
+    """Build a corruption from its config, or from its name with default options; an unknown name or a field
     out of range raises UserError."""
     if isinstance(config, str):
-        config = CorruptionConfig(config)
-    names = [] if config.corruption == "none" else config.corruption.split("+")
-    zeroes = names[-1:] == ["zero_frames"]
-    stages = names[:-1] if zeroes else names
-    if any(name not in STAGES for name in stages):
-        raise UserError(f"unknown corruption {config.corruption!r}: choose one of {', '.join(CORRUPTIONS)}")
-    refuse_outside(config, patch_size=1, patch_count=1, patch_fill=(0, 255), zeroed_frames=1)
-    return Corruption(config.corruption, [STAGES[name](config) for name in stages], config.zeroed_frames * zeroes)
+        config = CorruptionConfig.of(config)
+    config.check()
+    zeroed = sum(stage.zeroed_frames for stage in config.stages if isinstance(stage, ZeroFrames))
+    stages = [stage for stage in config.stages if not isinstance(stage, ZeroFrames)]
+    return Corruption(config.corruption, stages, zeroed)  # type: ignore[arg-type]
 
 
 def check_corruption(config: CorruptionConfig) -> None:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import sys
-from dataclasses import fields
 from typing import Any
 
 import gymnasium
@@ -12,7 +11,6 @@ import numpy as np
 from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
 from vd4rl_pomdp.envs.rendering import Render
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import ACTION_REPEAT, FRAME_SIZE, FRAME_STACK
 
 Info = dict[str, Any]
@@ -23,8 +21,8 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     Observations: (9, 84, 84) uint8, three frames, oldest first. Actions: (A,) float32 in [-1, 1]. `info` holds `clean`,
     the observation before corruption, and `physics`, the (P,) float64 simulator state. A seed fixes the initial states
-    and corruptions of all episodes that follow it. `corruption_fields` are those of CorruptionConfig; a field that does
-    not exist or fit raises UserError.
+    and corruptions of all episodes that follow it. `corruption_fields` are the corruption's mode and options;
+    one that does not exist or fit raises UserError.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's own name and type)
@@ -76,12 +74,8 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return step.obs.numpy(), {"clean": clean, "physics": step.row.physics}
 
 
-def _config(corruption: str, settings: Info) -> CorruptionConfig:
+def _config(corruption: str, options: Info) -> CorruptionConfig:
     """The corruption that `gymnasium.make` was asked for."""
-    known = [f.name for f in fields(CorruptionConfig)]
-    unknown = sorted(set(settings) - set(known))
-    if unknown:
-        raise UserError(f"unknown argument {unknown[0]!r}: choose one of {', '.join(known)}")
-    config = CorruptionConfig(corruption, **settings)
+    config = CorruptionConfig.of(corruption, **options)
     check_corruption(config)
     return config

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import Protocol
+from dataclasses import dataclass
+from typing import ClassVar, Protocol
 
 import numpy as np
 import torch
@@ -10,6 +11,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.seeding import stream_seed
 
 
@@ -72,10 +74,21 @@ class MSETarget(nn.Module):
 ACTION_TARGETS = ("kmeans", "bins", "mse", "mse_l2")
 
 
-def check_action_target(name: str) -> None:
-    """Raise UserError, listing the choices, for an unknown name."""
+@dataclass(frozen=True)
+class CodeOptions(Options):
+    """Options of the targets that predict one of a number of codes."""
+
+    codes: int = 20
+    """K-means codes, or bins for each action dimension."""
+
+    limits: ClassVar[Limits] = {"codes": 1}
+
+
+def target_options(name: str) -> type[Options]:
+    """Class of a target's options; an unknown name raises UserError listing the choices."""
     if name not in ACTION_TARGETS:
         raise UserError(f"unknown action target {name!r}: choose one of {', '.join(ACTION_TARGETS)}")
+    return CodeOptions if name in ("kmeans", "bins") else Options
 
 
 def make_action_target(name: str, actions: np.ndarray, codes: int, seed: int) -> KMeansTarget | BinsTarget | MSETarget:
@@ -87,7 +100,6 @@ def make_action_target(name: str, actions: np.ndarray, codes: int, seed: int) ->
         codes: K-means centres, or bins per dimension.
         seed: the run's seed, which K-means starts from.
     """
-    check_action_target(name)
     if name == "kmeans":
         return KMeansTarget(actions, codes, seed)
     if name == "bins":

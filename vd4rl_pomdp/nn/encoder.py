@@ -5,13 +5,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
-from typing import NamedTuple
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.nn.frame import STATE, FrameEncoder, StateFrame, make_frame_encoder
+from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, STATE, FrameEncoder, StateFrame, make_frame_encoder
 from vd4rl_pomdp.nn.sequence import run_gru
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.types import Windows
@@ -39,6 +39,8 @@ class EncoderConfig:
     """Channels of an observation."""
     size: int = FRAME_SIZE
     """Height and width of an observation."""
+    frame_options: dict[str, Any] = field(default_factory=dict)
+    """What else the frame encoder was told, by name."""
 
 
 class StreamState(NamedTuple):
@@ -60,7 +62,9 @@ class Encoder(nn.Module):
             config = self.config = replace(config, feature_dim=config.channels)
             self.frame: FrameEncoder | StateFrame = StateFrame()
         else:
-            self.frame = make_frame_encoder(config.frame_encoder, config.channels, config.size, config.feature_dim)
+            told = {"feature_dim": config.feature_dim} | config.frame_options
+            options = FRAME_ENCODERS.named(config.frame_encoder).options.fill(told)
+            self.frame = make_frame_encoder(config.frame_encoder, config.channels, config.size, options)
         inputs = config.feature_dim + (config.action_dim if config.use_actions else 0)
         self.gru = (
             nn.GRU(inputs, config.hidden_dim, config.gru_layers, batch_first=True) if config.history == "gru" else None

@@ -28,7 +28,7 @@ class EncoderCard:
     task: str
     quality: str
     corruption: dict[str, Any]
-    """The corruption it was pretrained under, as the fields of CorruptionConfig."""
+    """The corruption it was pretrained under, as the settings of CorruptionConfig."""
     seed: int
     steps: int
     preset: str
@@ -100,7 +100,7 @@ def load_encoder(
         )
     try:
         encoder = Encoder(encoder_config)
-        make_corruption(build(CorruptionConfig, {"corruption": card.corruption["corruption"], **card.corruption}))
+        make_corruption(CorruptionConfig.fill({"corruption": card.corruption["corruption"], **card.corruption}))
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise UserError(f"{folder}/config.json: names no encoder ({_first_line(error)}); pretrain it again") from error
     try:

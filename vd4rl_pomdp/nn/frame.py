@@ -3,11 +3,37 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.options import Limits, Options
+from vd4rl_pomdp.registry import Registry
+
+
+@dataclass(frozen=True)
+class FrameOptions(Options):
+    """Options of every frame encoder."""
+
+    feature_dim: int = 256
+    """Width of the frame encoder's output."""
+
+    limits: ClassVar[Limits] = {"feature_dim": 1}
+
+
+@dataclass(frozen=True)
+class FrameEncoderPart:
+    """How to build what comes before a frame encoder's last layer."""
+
+    build: Callable[[int, int, Any], nn.Module]
+    """From channels and size of a picture, and options: a module (N, C, size, size) -> (N, C', H', W'), of pixels in
+    [-0.5, 0.5]; a linear layer, a layer norm and a tanh follow."""
+    options: type[FrameOptions] = FrameOptions
+    """Class of its options."""
 
 
 class FrameEncoder(nn.Module):
@@ -16,7 +42,7 @@ class FrameEncoder(nn.Module):
     Shapes: (..., C, size, size) uint8 or float in 0..255 -> (..., feature_dim) float32.
     """
 
-    def __init__(self, convolutions: nn.Sequential, channels: int, size: int, feature_dim: int) -> None:
+    def __init__(self, convolutions: nn.Module, channels: int, size: int, feature_dim: int) -> None:
         super().__init__()
         self.convolutions = convolutions
         with torch.no_grad():
@@ -49,7 +75,7 @@ def _as_image(obs: Tensor, dtype: torch.dtype) -> Tensor:
     return pixels.mul_(1 / 255).sub_(0.5)
 
 
-def _drq(channels: int, size: int) -> nn.Sequential:
+def _drq(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     """Four 3x3 convolutions of 32 channels, the first with stride 2 (Kostrikov et al. 2020; used by V-D4RL)."""
     layers: list[nn.Module] = [nn.Conv2d(channels, 32, 3, stride=2), nn.ReLU()]
     for _ in range(3):
@@ -57,7 +83,7 @@ def _drq(channels: int, size: int) -> nn.Sequential:
     return nn.Sequential(*layers)
 
 
-def _nature(channels: int, size: int) -> nn.Sequential:
+def _nature(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     """Three strided convolutions (Mnih et al. 2015): a fraction of DrQ's cost."""
     return nn.Sequential(
         nn.Conv2d(channels, 32, 8, stride=4),
@@ -69,7 +95,7 @@ def _nature(channels: int, size: int) -> nn.Sequential:
     )
 
 
-def _small(channels: int, size: int) -> nn.Sequential:
+def _small(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     """Three strided convolutions of 16 to 32 channels, for grey 50x50 pictures on a CPU."""
     return nn.Sequential(
         nn.Conv2d(channels, 16, 5, stride=2),
@@ -113,7 +139,7 @@ class _Patches(nn.Module):
         return x.flatten(2).transpose(1, 2)
 
 
-def _mixer(channels: int, size: int) -> nn.Sequential:
+def _mixer(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     """MLP-Mixer of 8 layers on patches of 10x10 pixels (the paper's navigation encoder)."""
     if size % _PATCH:
         raise UserError(
@@ -125,12 +151,24 @@ def _mixer(channels: int, size: int) -> nn.Sequential:
     return nn.Sequential(patches, _Patches(), *layers, nn.LayerNorm(_MIXER_DIM), _Pool())
 
 
-def _flat(channels: int, size: int) -> nn.Sequential:
+def _flat(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     """No convolution: for observations that are a handful of numbers, as in finite worlds."""
     return nn.Sequential()
 
 
-FRAME_ENCODERS = {"drq": _drq, "nature": _nature, "small": _small, "mixer": _mixer, "flat": _flat}
+FRAME_ENCODERS: Registry[FrameEncoderPart] = Registry(
+    "frame encoder",
+    {
+        "drq": FrameEncoderPart(_drq),
+        "nature": FrameEncoderPart(_nature),
+        "small": FrameEncoderPart(_small),
+        "mixer": FrameEncoderPart(_mixer),
+        "flat": FrameEncoderPart(_flat),
+    },
+    lambda part: isinstance(part, FrameEncoderPart),
+    "a vd4rl_pomdp.nn.frame.FrameEncoderPart",
+)
+"""All frame encoders. Packages offer theirs in the group of entry points `vd4rl_pomdp.frame_encoders`."""
 
 
 class StateFrame(nn.Module):
@@ -150,15 +188,9 @@ STATE = "state"
 """Frame encoder of the `state` reference."""
 
 
-def check_frame_encoder(name: str) -> None:
-    """Raise UserError, listing the choices, for an unknown name."""
-    if name not in FRAME_ENCODERS:
-        raise UserError(f"unknown frame encoder {name!r}: choose one of {', '.join(FRAME_ENCODERS)}")
-
-
-def make_frame_encoder(name: str, channels: int, size: int, feature_dim: int) -> FrameEncoder:
+def make_frame_encoder(name: str, channels: int, size: int, options: FrameOptions) -> FrameEncoder:
     """Build a frame encoder by name; an unknown name raises UserError listing the choices."""
-    check_frame_encoder(name)
-    return FrameEncoder(FRAME_ENCODERS[name](channels, size), channels, size, feature_dim).to(
+    maps = FRAME_ENCODERS.named(name).build(channels, size, options)
+    return FrameEncoder(maps, channels, size, options.feature_dim).to(
         memory_format=torch.channels_last  # type: ignore[call-overload]
     )

@@ -7,10 +7,9 @@ run has its own config, its encoder's, and the data of both.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from dataclasses import fields
 from typing import Any
 
-from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.corruptions import corruption_settings
 from vd4rl_pomdp.runs.settings import settings_of
 
 Settings = dict[str, str]
@@ -22,7 +21,6 @@ UNKNOWN = "pretraining"
 """Stands in the settings of a run whose encoder does not say how it was pretrained."""
 _NOT_RECORDED = "not recorded"
 _PRESETS = ("preset", "pretraining preset")
-_CORRUPTION = frozenset(field.name for field in fields(CorruptionConfig))
 _DATA = ("data", "pretraining data")
 _LABELS = ("method", "task", "quality")
 """Fields that name a run's rows; they are no settings."""
@@ -68,9 +66,12 @@ def differences(settings: list[Settings], corruption: list[str], place: list[tup
         place: where each run stands (task, quality, corruption): sets are told apart within one place.
         brief: whether a preset stands for all the settings that it decides.
     """
+    of_corruption = corruption_settings()
     columns = (
-        _by_scope(settings, [None] * len(settings), lambda name: name not in _CORRUPTION and name not in _DATA, brief),
-        _by_scope(settings, corruption, _CORRUPTION.__contains__, brief),
+        _by_scope(
+            settings, [None] * len(settings), lambda name: name not in of_corruption and name not in _DATA, brief
+        ),
+        _by_scope(settings, corruption, of_corruption.__contains__, brief),
         _by_scope(settings, place, _DATA.__contains__, brief),
     )
     return list(zip(*columns, strict=True))
@@ -99,12 +100,12 @@ def _name(settings: list[Settings], wanted: Callable[[str], bool], brief: bool) 
 
 
 def _value(settings: Settings, name: str) -> str:
-    """A value in words; none where an encoder does not say how it was pretrained."""
+    """A value in words; none where nothing read the setting, or an encoder does not say how it was pretrained."""
     if name in settings:
         return settings[name]
     if name in _DATA:
         return _NOT_RECORDED
-    return "" if UNKNOWN in settings or name == UNKNOWN else "unset"
+    return ""
 
 
 def _differs(settings: list[Settings], name: str) -> bool:

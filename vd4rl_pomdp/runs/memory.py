@@ -13,6 +13,7 @@ import torch
 from torch import Tensor, nn
 
 from vd4rl_pomdp.errors import UserError, flag_of
+from vd4rl_pomdp.options import flat
 
 _OUT = ("DefaultCPUAllocator", "not enough memory", "Storage size calculation overflowed", "out of memory")
 """What torch says on a CPU, where it has no exception of its own for it."""
@@ -69,7 +70,8 @@ def _ran_out(error: Exception) -> bool:
 
 
 def _named(config: Any, names: tuple[str, ...]) -> str:
-    return ", ".join(f"{flag_of(name)} {getattr(config, name)}" for name in names)
+    settings = flat(config)
+    return ", ".join(f"{flag_of(name)} {settings[name]}" for name in names if name in settings)
 
 
 def _remedy(names: tuple[str, ...]) -> str:

@@ -9,12 +9,13 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from contextlib import ExitStack
-from dataclasses import asdict
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.registry import origins
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, State, fitting, pack, unpack
 from vd4rl_pomdp.runs.folder import holds_anything, jsonable, read_json, write_json
@@ -39,7 +40,7 @@ class RunFolder:
             UserError: the folder holds something else, or a run with other settings, inputs or of another format.
         """
         self.path = path
-        self.config: dict[str, Any] = jsonable(asdict(config))
+        self.config: dict[str, Any] = jsonable(flat(config))
         self.inputs = inputs
         self._stage = stage
         self._checkpoints = Checkpoints(path)
@@ -62,8 +63,8 @@ class RunFolder:
                 "and cannot go on with it; choose another --out"
             )
         old, inputs = (part if isinstance(part := stored.get(name), dict) else {} for name in ("config", "inputs"))
-        keys = (set(old) | set(self.config)) - RUNTIME_FIELDS
-        differing = sorted(k for k in keys if old.get(k) != self.config.get(k))
+        keys = set(self.config) - RUNTIME_FIELDS  # an earlier version recorded options that nothing read, too
+        differing = sorted(k for k in keys if old.get(k) != self.config[k])
         if stored["stage"] != self._stage or differing:
             what = ", ".join(differing) or f"stage {stored['stage']}"
             raise UserError(f"{self.path}: holds a run with another config ({what}); choose another --out or remove it")
@@ -92,6 +93,7 @@ class RunFolder:
         if not (self.path / "config.json").exists():
             record = {"format": FORMAT, "stage": self._stage, "config": self.config, "inputs": self.inputs}
             origin = {"versions": versions(), "git_commit": git_commit(), "command": command()}
+            origin |= {"plugins": origins(self.config)}
             write_json(self.path / "config.json", record | origin)
         if not (self.path / "machine.json").exists():
             write_json(self.path / "machine.json", machine())

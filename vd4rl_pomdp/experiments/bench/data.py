@@ -62,7 +62,7 @@ def sampling(dataset: Dataset, repeats: int) -> dict[str, float]:
         target.copy_(dataset.frames[start : start + len(target)])
 
     def see(name: str) -> Callable[[], Any]:
-        view = View(dataset, CorruptionConfig(name), shift=4)
+        view = View(dataset, CorruptionConfig.of(name), shift=4)
         return lambda: view.observe(rows())
 
     target = torch.empty(2 * BATCH * FRAME_STACK, *dataset.frames.shape[1:], dtype=torch.uint8)

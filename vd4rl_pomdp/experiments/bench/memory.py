@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -30,12 +29,11 @@ def memory(folder: Path, frame_bytes: int) -> dict[str, float]:
 
 def make_trainer(dataset: Dataset, config: PretrainConfig) -> Trainer:
     """A trainer of the config's objective, its codebook fitted on a few actions."""
-    from pretrain.objectives import build_objective
+    from pretrain.build import build_objective, build_target
     from pretrain.train import Trainer
-    from vd4rl_pomdp.nn.action_target import make_action_target
 
-    target = make_action_target("kmeans", dataset.action[:2000].numpy(), config.codes, 0)
-    objective = build_objective(config, dataset.action, target)
+    target = build_target(config, dataset.action[:2000].numpy())
+    objective = build_objective(config, dataset.action_dim, target)
     return Trainer(objective.to(dataset.t.device), dataset, config)
 
 
@@ -46,10 +44,10 @@ def touch(frames: torch.Tensor) -> None:
 
 def _train_a_little(folder: Path) -> tuple[int, int]:
     """Peak resident bytes of a process that reads the whole set and trains, and how many of them it does not share."""
-    from pretrain.config import PRESETS
+    from pretrain.config import PretrainConfig
 
     dataset = open_dataset(folder / "set", folder / "cache")
-    config = replace(PRESETS["cpu"], data=folder, out=folder, corruption="patch+zero_frames")
+    config = PretrainConfig.of("cpu", data=folder, out=folder, corruption="patch+zero_frames")
     trainer = make_trainer(dataset, config)
     for _ in range(STEPS):
         trainer.update()

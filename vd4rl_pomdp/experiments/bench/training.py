@@ -22,15 +22,14 @@ HISTORY_WINDOW = 32
 
 def pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
     """Share of a step that the batch (sampling, corruption, shift) and the optimiser take, and bf16 against fp32."""
-    from pretrain.config import PRESETS
+    from pretrain.config import PretrainConfig
 
     device = pick_device("auto")
     results: dict[str, Any] = {"device": str(device)}
     steps: dict[str, float] = {}
     for precision in ("fp32", "bf16"):
-        config = replace(
-            PRESETS["paper"], data=folder, out=folder, batch_size=8, corruption="patch+zero_frames", precision=precision
-        )
+        given = {"data": folder, "out": folder, "batch_size": 8, "precision": precision}
+        config = PretrainConfig.of("paper", corruption="patch+zero_frames", **given)
         trainer = make_trainer(dataset, config)
         steps[precision], batch, optimiser = alternating(
             max(3, repeats // 3), trainer.update, trainer.batch, trainer.optimiser.step
@@ -42,18 +41,18 @@ def pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
 
 def methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
     """Step time and frames/s of every method in the cpu preset, and what doubling K costs MIK+A."""
-    from pretrain.config import PRESETS
+    from pretrain.config import PretrainConfig
     from pretrain.objectives import METHODS
 
     trained = [name for name, method in METHODS.items() if method.trained]
-    config = replace(PRESETS["cpu"], data=folder, out=folder, corruption="patch+zero_frames")
+    config = PretrainConfig.of("cpu", data=folder, out=folder, corruption="patch+zero_frames")
     results: dict[str, Any] = {}
     for name in trained:
-        trainer = make_trainer(dataset, replace(config, method=name))
+        trainer = make_trainer(dataset, config.altered(method=name))
         seconds = seconds_of(trainer.update, max(3, repeats // 3))
         frames = config.batch_size * config.window / seconds
         results[name] = {"step_ms": seconds * 1e3, "frames_per_s": frames}
-    narrow, wide = (make_trainer(dataset, replace(config, max_k=k)).update for k in (15, 30))
+    narrow, wide = (make_trainer(dataset, config.altered(max_k=k)).update for k in (15, 30))
     once, twice = alternating(repeats, narrow, wide)
     return results | {"k_30_over_k_15": twice / once}
 
@@ -78,18 +77,19 @@ def _updates_per_s(
 ) -> dict[str, float]:
     """Rates of many cached updates in a row, as in training, and of as few exact ones as count both kinds of update."""
     from finetune.algorithms import TD3BC
-    from finetune.config import PRESETS
+    from finetune.config import FinetuneConfig
     from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder
     from vd4rl_pomdp.nn.policy import Policy
 
-    config = PRESETS["cpu"]
+    config = FinetuneConfig.of("cpu")
     device = dataset.t.device
     encoder = Encoder(encoder_config).eval().to(device)
-    corruption = CorruptionConfig("patch+zero_frames")
+    corruption = CorruptionConfig.of("patch+zero_frames")
     frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, precision, 0)
     features = torch.randn(1, dataset.num_rows, encoder.dim, dtype=torch.float16, device=device)
     generator = torch.Generator().manual_seed(0)
-    algorithm = TD3BC(Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(device), config, generator)
+    policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(device)
+    algorithm = TD3BC(policy, config.options, config.learning_rate, generator)  # type: ignore[arg-type]
 
     def train(sampler: FeatureSampler | ExactSampler, updates: int) -> None:
         for _ in range(updates):
@@ -105,7 +105,7 @@ def _updates_per_s(
 
 def maze_training() -> dict[str, float]:
     """Steps/s of `navigation train --preset cpu`, and the share of a step that sampling and the optimiser take."""
-    from pretrain.navigation.config import PRESETS
+    from pretrain.navigation.config import NavigationConfig
     from pretrain.navigation.data import MazeData
     from pretrain.navigation.trainer import Trainer, make_objective
     from vd4rl_pomdp.navigation.collect import collect
@@ -116,7 +116,7 @@ def maze_training() -> dict[str, float]:
         folder = Path(name)
         shape = {"maze": "no_curtain", "out": folder / "set", "workers": 1}
         collect(replace(SETS["smoke"], **shape))  # type: ignore[arg-type]
-        config = replace(PRESETS["cpu"], data=folder / "set", out=folder)
+        config = NavigationConfig.of("cpu", data=folder / "set", out=folder)
         data = MazeData(*open_maze_set(folder / "set", folder / "cache"), config, None)
         device = pick_device("auto")
         trainer = Trainer(make_objective(data, config).to(device), data.on(device), config)

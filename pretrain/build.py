@@ -1,0 +1,76 @@
+"""From a training's settings to its objective."""
+
+from __future__ import annotations
+
+from dataclasses import asdict
+from typing import Any
+
+import numpy as np
+
+from pretrain.config import MemoryOptions, TrainingConfig
+from pretrain.objectives import METHODS, Method
+from vd4rl_pomdp.nn.action_target import ActionTarget, make_action_target
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.nn.frame import STATE
+from vd4rl_pomdp.objective import ActionOptions, Objective
+from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
+
+
+def build_target(config: TrainingConfig, actions: np.ndarray) -> ActionTarget | None:
+    """What the action head of a config's method predicts, None for a method that has none.
+
+    Args:
+        config: the run's settings.
+        actions: (N, A) float32 training actions.
+    """
+    options = config.options
+    if not isinstance(options, ActionOptions):
+        return None
+    return make_action_target(options.action_target, actions, flat(options).get("codes", 0), config.seed)
+
+
+def build_objective(
+    config: TrainingConfig,
+    action_dim: int,
+    target: ActionTarget | None,
+    state_dim: int = 0,
+    observation: tuple[int, int] = (3 * FRAME_STACK, FRAME_SIZE),
+) -> Objective:
+    """Build the objective of a config.
+
+    Args:
+        config: the run's settings.
+        action_dim: width of actions.
+        target: from `build_target`.
+        state_dim: width of the simulator state, for methods that read it.
+        observation: channels and size of an observation, for methods that read pixels.
+    """
+    method = METHODS.named(config.method)
+    channels, size = (state_dim, 1) if method.reads_state else observation
+    frame = asdict(config.frame)
+    encoder = EncoderConfig(
+        action_dim=action_dim,
+        frame_encoder=STATE if method.reads_state else config.frame_encoder,
+        feature_dim=frame.pop("feature_dim", channels),
+        frame_options=frame,
+        channels=channels,
+        size=size,
+        **_memory(config, method),
+    )
+    return method.build(Encoder(encoder), target, config.options, config.seed)
+
+
+def _memory(config: TrainingConfig, method: Method) -> dict[str, Any]:
+    """What an encoder's config says of its memory."""
+    memory = config.memory
+    if not isinstance(memory, MemoryOptions):
+        return {}
+    past = method.past if memory.m is None else memory.m
+    return {
+        "history": "gru",
+        "use_actions": method.use_actions,
+        "hidden_dim": memory.hidden_dim,
+        "gru_layers": memory.gru_layers,
+        "history_window": 0 if past is None else past + 1,
+    }

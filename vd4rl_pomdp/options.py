@@ -1,0 +1,162 @@
+"""Settings of a stage: its own, and the options of the parts that were chosen by name.
+
+Every method, corruption, fine-tuning algorithm and frame encoder names a dataclass of its options. In Python they are
+nested in the stage's config; on the command line and in records all settings stand in one list by their names.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Self
+
+from vd4rl_pomdp.errors import UserError, flag_of, refuse_outside
+from vd4rl_pomdp.registry import REGISTRIES
+
+Limits = Mapping[str, float | tuple[float, float]]
+"""Lowest, or lowest and highest, value of numbers by name."""
+
+
+@dataclass(frozen=True)
+class Options:
+    """Options of a part that has none. Subclasses add fields with a default and a docstring, which become flags."""
+
+    limits: ClassVar[Limits] = {}
+    """What the numbers among a class's own fields may be."""
+
+    @classmethod
+    def fill(cls, values: Mapping[str, Any]) -> Self:
+        """Options with those of many values that they have a field for, and their own defaults."""
+        return cls(**{field.name: values[field.name] for field in fields(cls) if field.name in values})
+
+    def check(self) -> None:
+        """Raise UserError for a value that cannot work."""
+        for kind in type(self).__mro__:
+            refuse_outside(self, **vars(kind).get("limits", {}))
+
+
+NO_OPTIONS = Options()
+
+
+def flat(config: Any) -> dict[str, Any]:
+    """All settings of a config by name, its options' included."""
+    found: dict[str, Any] = {}
+    for field in fields(config):
+        value = getattr(config, field.name)
+        nested = options_in(value)
+        if nested is None:
+            found[field.name] = value
+        for options in nested or ():
+            found |= flat(options)
+    return found
+
+
+def options_in(value: Any) -> tuple[Options, ...] | None:
+    """The options that a field holds; None for a field that is a setting itself."""
+    if isinstance(value, Options):
+        return (value,)
+    return value if isinstance(value, tuple) and all(isinstance(part, Options) for part in value) else None
+
+
+def all_options(config: Any) -> Iterator[Options]:
+    """All options in a config, outer ones first."""
+    for field in fields(config):
+        for options in options_in(getattr(config, field.name)) or ():
+            yield options
+            yield from all_options(options)
+
+
+@dataclass(frozen=True, kw_only=True)
+class StageConfig:
+    """Settings of a stage; `of` makes them from names and values."""
+
+    preset: str = "paper"
+    """paper, cpu or smoke: the defaults of all other settings."""
+
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {"paper": {}}
+    """Values by setting, by preset; an option is taken where the chosen parts have it."""
+    choosers: ClassVar[tuple[str, ...]] = ()
+    """Settings that choose parts, and with them which options there are."""
+
+    @classmethod
+    def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
+        """Options of the chosen parts, by the field that holds them, taking what `values` has for them."""
+        return {}
+
+    @classmethod
+    def of(cls, preset: str = "paper", **settings: Any) -> Self:
+        """Settings of the stage.
+
+        Args:
+            preset: what decides the defaults.
+            settings: values by name, of the stage's own settings and of the chosen parts' options.
+
+        Raises:
+            UserError: an unknown preset or part, or a setting that nothing reads.
+        """
+        values = cls.defaults(preset) | settings
+        parts = cls.parts(values)
+        own = {field.name for field in fields(cls)} - parts.keys()
+        config = cls(**({name: values[name] for name in own} | parts))
+        cls.check_read(settings, config)
+        return config
+
+    @classmethod
+    def defaults(cls, preset: str) -> dict[str, Any]:
+        """Default values of a preset: the stage's own, and those that it has for options of parts."""
+        if preset not in cls.presets:
+            raise UserError(f"unknown preset {preset!r}: choose one of {', '.join(cls.presets)}")
+        return flat(cls()) | dict(cls.presets[preset]) | {"preset": preset}
+
+    @classmethod
+    def check_read(cls, names: Iterable[str], config: Any) -> None:
+        """Raise UserError for the first of some settings that a config has not: set, it would change nothing."""
+        known = flat(config)
+        for name in names:
+            if name not in known:
+                raise UserError(f"{flag_of(name)} is not read by {_reader(cls.choosers, name, known)}: leave it out")
+
+    def altered(self, **changes: Any) -> Self:
+        """The same with other settings, perhaps other parts; what differs from the preset's defaults is kept.
+
+        Raises:
+            UserError: a setting that was not the default is not read by what is now chosen.
+        """
+        usual = self.usual()
+        told = {name: value for name, value in flat(self).items() if value != usual.get(name)}
+        return type(self).of(**({"preset": self.preset} | self._chosen() | told | changes))
+
+    def with_known(self, **settings: Any) -> Self:
+        """The same with those of some settings that it has: sizes, say, for whatever parts are chosen."""
+        known = flat(self)
+        return self.altered(**{name: value for name, value in settings.items() if name in known})
+
+    def usual(self) -> dict[str, Any]:
+        """What the settings would be if nothing had been chosen but preset and parts."""
+        return flat(type(self).of(self.preset, **self._chosen()))
+
+    def _chosen(self) -> dict[str, Any]:
+        """The parts, other than those that another part's options name."""
+        own = flat(type(self)())
+        return {name: value for name, value in flat(self).items() if name in self.choosers and name in own}
+
+
+def option_names() -> set[str]:
+    """Names of the options of all parts that there are."""
+    kinds, found = [Options], set[str]()
+    while kinds:
+        kind = kinds.pop()
+        kinds += kind.__subclasses__()
+        found |= {field.name for field in fields(kind)}
+    return found
+
+
+def _reader(choosers: Iterable[str], name: str, values: Mapping[str, Any]) -> str:
+    """What would read a setting if it were chosen otherwise: the one part, or all that was chosen."""
+    for setting in choosers:
+        parts: Mapping[str, Any] = REGISTRIES.get(setting, {})
+        readers = [key for key, part in parts.items() if name in flat(getattr(part, "options", part).fill({}))]
+        if readers and values[setting] not in readers:
+            return f"the {REGISTRIES[setting].kind} {values[setting]}"
+    chosen = (f"{setting.replace('_', ' ')} {values[setting]}" for setting in choosers if setting in values)
+    return f"what is chosen ({', '.join(chosen)})"
