@@ -136,8 +136,6 @@ class Trainer:
         self.algorithm, self.sampler = algorithm, sampler
         self.config, self.card = config, card
         self.step = 0
-        self.metrics: dict[str, torch.Tensor] = {}
-        """The newest value of each: an actor is not updated at every step."""
 
     def run(self, run: RunFolder) -> None:
         """Train to the end, from the newest checkpoint if there is one."""
@@ -147,10 +145,10 @@ class Trainer:
             if self._lacks_evaluation(run, loop):
                 self._evaluate(run, loop)
             while self.step < config.updates:
-                self.metrics |= self.algorithm.update(self.sampler.sample())  # type: ignore[arg-type]
+                loop.add(self.algorithm.update(self.sampler.sample()))  # type: ignore[arg-type]
                 self.step += 1
                 if loop.due(config.log_every):
-                    loop.log({name: float(value) for name, value in self.metrics.items()})
+                    loop.log()
                 evaluates = loop.due(config.eval_every)
                 loop.step_done(save=evaluates or self.step % config.checkpoint_every == 0)
                 if evaluates:
@@ -214,12 +212,12 @@ class Trainer:
 
     def state(self) -> dict[str, Any]:
         """Everything needed to go on to the bit."""
-        state = {"step": self.step, "algorithm": self.algorithm.state_dict()}
-        return state | {"metrics": self.metrics, "sampler": self.sampler.state_dict()}
+        parts = {"algorithm": self.algorithm.state_dict(), "sampler": self.sampler.state_dict()}
+        return {"step": self.step} | parts
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from `state`."""
-        self.step, self.metrics = state["step"], state["metrics"]
+        self.step = state["step"]
         self.algorithm.load_state_dict(state["algorithm"])
         self.sampler.load_state_dict(state["sampler"])
 

@@ -25,6 +25,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import append_rows, drop_rows_after, evaluate_run, read_rows
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
+from vd4rl_pomdp.runs.metrics import read_metrics
 
 VARYING = ("timing.json", "pretrain_timing.json", "machine.json", "manifest.json")
 
@@ -285,10 +286,11 @@ def test_a_checkpoint_of_another_config_is_one_line(encoder, data, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_metrics_between_two_actor_steps_survive_a_cut(encoder, data, tmp_path, monkeypatch):
-    """The actor learns at every other update: a row right after a resumption shows its last value all the same."""
-    changes = {"updates": 6, "log_every": 1, "checkpoint_every": 2, "eval_every": 6, "batch_size": 4, "eval_length": 2}
-    finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
+def test_a_row_lacks_what_no_step_since_the_row_before_gave(encoder, data, tmp_path, monkeypatch):
+    """The actor learns at every other update only; also where a run is cut in between."""
+    changes = {"updates": 6, "log_every": 1, "checkpoint_every": 1, "eval_every": 6, "batch_size": 4, "eval_length": 2}
+    whole = finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
+    assert ["actor_loss" in row for row in read_metrics(whole / "metrics.jsonl")] == [False, True] * 3
 
 
 def test_an_evaluation_names_its_step_and_touches_no_other_file(encoder, data, tmp_path):

@@ -81,7 +81,7 @@ class NavigationConfig(InverseConfig):
     log_every: int = 100
     """Steps that a row of metrics averages over."""
     checkpoint_every: int = 1_000
-    """Steps between two checkpoints, a multiple of --log-every."""
+    """Steps between two checkpoints."""
     wandb: WandbMode = "off"
     """Mirror metrics to wandb: off, offline or online."""
 

@@ -94,10 +94,6 @@ def _check(config: NavigationConfig) -> None:
     refuse_unread(config, PRESETS[config.preset], _unread(config), config.method)
     if config.burn_in >= config.window:
         raise UserError(f"--burn-in {config.burn_in} leaves no row of a window of {config.window}: lower it")
-    if config.checkpoint_every % config.log_every:
-        raise UserError(
-            f"--checkpoint-every {config.checkpoint_every} is no multiple of --log-every {config.log_every}: change one"
-        )
     check_gap(config.max_k, config.window)
 
 
