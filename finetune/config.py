@@ -20,7 +20,7 @@ class FinetuneConfig:
     out: Path
     """Run folder; the same command continues a run that was cut."""
     algorithm: str = "td3_bc"
-    """td3_bc, drqv2_bc or bc; the references bc and drq_bc bring their own."""
+    """td3_bc, drqv2_bc, iql or bc; the references bc and drq_bc bring their own."""
     preset: str = "paper"
     """paper, cpu or smoke: the defaults of all other settings."""
     seed: int = 0
@@ -39,6 +39,10 @@ class FinetuneConfig:
     """Steps of the n-step return."""
     alpha: float = 2.5
     """Weight of the critic against behaviour cloning (TD3+BC's alpha)."""
+    expectile: float = 0.7
+    """IQL's expectile, from 0 to 1: 0.5 values a state by the mean of its actions, more by the better ones."""
+    temperature: float = 3.0
+    """IQL's inverse temperature beta: an action is cloned by the weight exp(beta advantage)."""
     views: int = 4
     """Draws of corruption and shift under which the set is encoded once; 0 encodes every batch anew."""
     shift: int = 4

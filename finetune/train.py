@@ -1,4 +1,4 @@
-"""The fine-tuning loop: frozen encoder, cached features, TD3+BC, evaluation; resumable to the bit on a CPU."""
+"""The fine-tuning loop: frozen encoder, cached features, an algorithm, evaluation; resumable to the bit on a CPU."""
 
 from __future__ import annotations
 
@@ -73,8 +73,9 @@ def check(config: FinetuneConfig, end_to_end: str = "") -> None:
     """
     refuse_outside(
         config, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, gamma=(0, 1), n_step=1,
-        alpha=0, views=0, shift=(0, FRAME_SIZE - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
-        eval_length=(1, EPISODE_TRANSITIONS), log_every=1, checkpoint_every=1, workers=0,
+        alpha=0, expectile=(0, 1), temperature=0, views=0, shift=(0, FRAME_SIZE - 1), eval_every=1,
+        eval_episodes=(1, MOST_EPISODES), eval_length=(1, EPISODE_TRANSITIONS), log_every=1, checkpoint_every=1,
+        workers=0,
     )  # fmt: skip
     algorithm = end_to_end or config.algorithm
     unread = {*OPTIONS.difference(get_algorithm(algorithm).options), *(("views",) if end_to_end else ())}

@@ -127,7 +127,7 @@ def finetune_cut_and_whole(monkeypatch, encoder: Path, data: Path, out: Path, **
     return whole.path
 
 
-@pytest.mark.parametrize(("algorithm", "views"), [("td3_bc", 2), ("drqv2_bc", 1), ("bc", 1), ("td3_bc", 0)])
+@pytest.mark.parametrize(("algorithm", "views"), [("td3_bc", 2), ("drqv2_bc", 1), ("iql", 1), ("bc", 1), ("td3_bc", 0)])
 def test_finetuning_resumes_to_the_bit(encoder, data, tmp_path, monkeypatch, algorithm, views):
     changes = {"algorithm": algorithm, "views": views, "eval_length": 2, "updates": 30, "eval_every": 15}
     changes |= {"checkpoint_every": 10, "batch_size": 4}
@@ -222,7 +222,7 @@ BELOW_IN_BOTH = {
 }
 BELOW_IN_FINETUNING = {
     **{"updates": 0, "gamma": 1.5, "n_step": 0, "alpha": -1.0, "views": -1, "eval_every": 0, "eval_episodes": 0},
-    **{"eval_length": -1, "hidden_dim": 0},
+    **{"eval_length": -1, "hidden_dim": 0, "expectile": 1.1, "temperature": -1.0},
 }
 
 
@@ -375,8 +375,8 @@ def test_an_encoder_of_another_image_size_is_refused(data, encoder, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_td3_bc_finds_the_better_action_and_bc_the_common_one():
-    """One state, two actions: the rarer one is paid. TD3+BC must lean to it, BC to their mean."""
+def test_what_reads_rewards_finds_the_better_action_and_bc_the_common_one():
+    """One state, two actions: the rarer one is paid. TD3+BC, DrQ-v2+BC and IQL must lean to it, BC to their mean."""
     from finetune.algorithms import ALGORITHMS
     from finetune.features import FeatureBatch
     from vd4rl_pomdp.nn.policy import Policy
@@ -384,7 +384,7 @@ def test_td3_bc_finds_the_better_action_and_bc_the_common_one():
     chosen = {}
     for name, build in ALGORITHMS.items():
         torch.manual_seed(0)
-        config = replace(finetune.config.PRESETS["smoke"], hidden_dim=32, learning_rate=3e-3, alpha=25.0)
+        config = replace(finetune.config.PRESETS["smoke"], updates=300, learning_rate=3e-3, alpha=25.0)
         policy = Policy(2, 1, 32)
         algorithm = build(policy, config, torch.Generator().manual_seed(0))
         action = torch.where(torch.arange(64) % 4 == 0, 0.5, -0.5)[:, None]
@@ -397,6 +397,7 @@ def test_td3_bc_finds_the_better_action_and_bc_the_common_one():
     assert chosen["bc"] == pytest.approx(-0.25, abs=0.02)
     assert chosen["td3_bc"] > 0.2
     assert chosen["drqv2_bc"] > 0.2
+    assert chosen["iql"] > 0.1
 
 
 def test_policy_statistics_are_those_of_the_features():

@@ -56,12 +56,17 @@ class Algorithm(ABC):
         return logs
 
     @abstractmethod
-    def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on, targets and optimisers included."""
+    def parts(self) -> dict[str, Any]:
+        """Networks, targets and optimisers by name: what has a state of its own. The target of `x` is `target_x`."""
 
-    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on: the state of all parts, and what a subclass adds."""
+        return {name: part.state_dict() for name, part in self.parts().items()}
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
+        for name, part in self.parts().items():
+            part.load_state_dict(state[name])
 
 
 def _step(loss: Tensor, optimisers: list[Optimizer]) -> None:

@@ -26,11 +26,6 @@ class BC(Algorithm):
         loss = F.mse_loss(self.policy(batch.z), batch.action)
         yield Loss(loss, self.optimiser, {"bc_loss": loss.detach()})
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on."""
-        return {"policy": self.policy.state_dict(), "optimiser": self.optimiser.state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
-        self.policy.load_state_dict(state["policy"])
-        self.optimiser.load_state_dict(state["optimiser"])
+    def parts(self) -> dict[str, Any]:
+        """The policy and its optimiser."""
+        return {"policy": self.policy, "optimiser": self.optimiser}

@@ -108,6 +108,20 @@ def test_cloning_reads_no_option_of_the_critic(name):
             check_finetuning(config, end_to_end)
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "reads"),
+    [("td3_bc", ["alpha"]), ("drqv2_bc", ["alpha"]), ("iql", ["expectile", "temperature"]), ("bc", [])],
+)
+def test_an_algorithm_reads_its_own_options_only(algorithm, reads):
+    for name in ("alpha", "expectile", "temperature"):
+        changed = replace(FINETUNING, algorithm=algorithm, **{name: 0.5})
+        if name in reads:
+            check_finetuning(changed)
+        else:
+            with pytest.raises(UserError, match=f"--{name} is not read by the algorithm {algorithm}"):
+                check_finetuning(changed)
+
+
 def test_an_encoder_that_is_trained_has_no_views():
     with pytest.raises(UserError, match="--views is not read by the algorithm drqv2_bc"):
         check_finetuning(replace(FINETUNING, views=3), "drqv2_bc")
