@@ -1,4 +1,4 @@
-"""The fine-tuning loop: frozen encoder, cached features, TD3+BC, evaluation; resumable to the bit on a CPU."""
+"""The fine-tuning loop: frozen encoder, cached features, an algorithm, evaluation; resumable to the bit on a CPU."""
 
 from __future__ import annotations
 
@@ -110,7 +110,7 @@ def _trainer(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: E
         sampler = ExactSampler(frozen, config.batch_size, returns.n_step, returns.gamma, generator)
         policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(4)]))
     noise = stream_generator(config.seed, STAGE, "noise")
-    algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, noise)
+    algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
     return Trainer(EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, config, card)
 
 
@@ -135,8 +135,6 @@ class Trainer:
         self.algorithm, self.sampler = algorithm, sampler
         self.config, self.card = config, card
         self.step = 0
-        self.metrics: dict[str, torch.Tensor] = {}
-        """The newest value of each: an actor is not updated at every step."""
 
     def run(self, run: RunFolder) -> None:
         """Train to the end, from the newest checkpoint if there is one."""
@@ -146,10 +144,10 @@ class Trainer:
             if self._lacks_evaluation(run, loop):
                 self._evaluate(run, loop)
             while self.step < config.updates:
-                self.metrics |= self.algorithm.update(self.sampler.sample())  # type: ignore[arg-type]
+                loop.add(self.algorithm.update(self.sampler.sample()))  # type: ignore[arg-type]
                 self.step += 1
                 if loop.due(config.log_every):
-                    loop.log({name: float(value) for name, value in self.metrics.items()})
+                    loop.log()
                 evaluates = loop.due(config.eval_every)
                 loop.step_done(save=evaluates or self.step % config.checkpoint_every == 0)
                 if evaluates:
@@ -213,12 +211,12 @@ class Trainer:
 
     def state(self) -> dict[str, Any]:
         """Everything needed to go on to the bit."""
-        state = {"step": self.step, "algorithm": self.algorithm.state_dict()}
-        return state | {"metrics": self.metrics, "sampler": self.sampler.state_dict()}
+        parts = {"algorithm": self.algorithm.state_dict(), "sampler": self.sampler.state_dict()}
+        return {"step": self.step} | parts
 
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from `state`."""
-        self.step, self.metrics = state["step"], state["metrics"]
+        self.step = state["step"]
         self.algorithm.load_state_dict(state["algorithm"])
         self.sampler.load_state_dict(state["sampler"])
 

@@ -93,9 +93,9 @@ class Trainer:
         """Train up to `steps`, from the newest checkpoint if there is one."""
         with training(run, self, f"pretrain {self.config.method}", steps) as loop:
             while self.step < steps:
-                logs = self.update()
+                loop.add(self.update())
                 if loop.due(self.config.log_every):
-                    loop.log({name: float(value) for name, value in logs.items()}, "loss")
+                    loop.log("loss")
                 loop.step_done(save=loop.due(self.config.checkpoint_every))
 
     def state(self) -> dict[str, Any]:
@@ -177,6 +177,7 @@ def _card(config: PretrainConfig, task: str, dataset: Dataset, run: RunFolder) -
 
 
 def _last_action_loss(run: RunFolder) -> float | None:
+    """Mean of the last tenth of the rows that have one; each row is a mean, and all count the same."""
     rows = read_metrics(run.path / "metrics.jsonl")
     losses = [row["action_loss"] for row in rows if "action_loss" in row]
     return sum(last) / len(last) if (last := losses[-max(1, len(losses) // 10) :]) else None

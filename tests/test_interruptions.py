@@ -16,9 +16,10 @@ import torch
 import finetune.train
 import pretrain.navigation.trainer
 import pretrain.train
-from finetune.algorithms import bc
+from finetune.algorithms import bc, td3_bc
 from finetune.train import finetune as run_finetune
 from pretrain.navigation.config import NavigationConfig
+from pretrain.navigation.probe import COMPONENTS
 from pretrain.navigation.train import train as run_navigation
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
@@ -28,6 +29,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import read_rows
 from vd4rl_pomdp.runs.folder import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
+from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.ownership import owned
 
 FINETUNE = {"updates": 12, "eval_every": 6, "checkpoint_every": 4, "batch_size": 4, "eval_length": 2, "log_every": 3}
@@ -119,6 +121,66 @@ def test_a_signal_keeps_the_running_step_and_the_run_ends_as_if_nothing_had_been
     assert not list((tmp_path / "cut").glob(".*"))
     run(config(tmp_path / "cut"))
     assert contents(tmp_path / "cut") == whole
+
+
+def rows_of_means(steps: list[dict[str, torch.Tensor]], every: int) -> list[dict[str, float]]:
+    """Means of each scalar over the steps that gave it, of every so many steps and of what is left at the end."""
+    rows = []
+    for start in range(0, len(steps), every):
+        part = steps[start : start + every]
+        given = {name: [logs[name].item() for logs in part if name in logs] for logs in part for name in logs}
+        means = {name: sum(values) / len(values) for name, values in given.items()}
+        rows.append({"step": start + len(part)} | means)
+    return rows
+
+
+@pytest.mark.parametrize("cut", [False, True])
+def test_rows_are_means_over_the_steps_since_the_row_before(stage, tmp_path, monkeypatch, cut):
+    """Also if a signal ends the run between two rows, at a step that has no checkpoint of its own."""
+    run, config, learner = stage
+    config = replace(config(tmp_path / "run"), log_every=4, checkpoint_every=3)
+    if learner is bc.BC:
+        config, learner = replace(config, algorithm="td3_bc"), td3_bc.TD3BC
+    update, steps = learner.update, []
+
+    def watched(self, *arguments):
+        if cut and len(steps) == 4:
+            signal.raise_signal(signal.SIGTERM)
+        given = update(self, *arguments)
+        steps.append(given[0] if isinstance(given, tuple) else given)
+        return given
+
+    monkeypatch.setattr(learner, "update", watched)
+    if cut:
+        with pytest.raises(Terminated):
+            run(config)
+        assert len(steps) == 5
+    run(config)
+    found = read_metrics(config.out / "metrics.jsonl")
+    expected = rows_of_means(steps, 4)
+    assert {name for logs in steps for name in logs} == {name for row in expected for name in row} - {"step"}
+    for row, means in zip(found, expected, strict=True):
+        assert {name: row[name] for name in means} == pytest.approx(means, rel=1e-5)
+        assert set(row) - set(means) <= {f"{what}{rows}" for what in COMPONENTS for rows in ("", "_hidden")}
+
+
+def test_one_step_whose_loss_is_no_number_ends_the_run(stage, tmp_path, monkeypatch):
+    """Although its row comes later, and the steps between are finite."""
+    run, config, learner = stage
+    update, calls = learner.update, []
+
+    def diverging(self, *arguments):
+        calls.append(1)
+        given = update(self, *arguments)
+        logs = given[0] if isinstance(given, tuple) else given
+        if len(calls) == 1:
+            logs[next(iter(logs))] = torch.tensor(float("nan"))
+        return given
+
+    monkeypatch.setattr(learner, "update", diverging)
+    with pytest.raises(FloatingPointError, match=r"is nan in the row of step [345]"):
+        run(config(tmp_path / "run"))
+    assert len(calls) > 1
 
 
 def fill_disk(monkeypatch, name: str, number: int) -> None:

@@ -24,6 +24,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import append_rows, drop_rows_after, evaluate_run, read_rows
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
+from vd4rl_pomdp.runs.metrics import read_metrics
 
 VARYING = ("timing.json", "pretrain_timing.json", "machine.json", "manifest.json")
 
@@ -125,7 +126,7 @@ def finetune_cut_and_whole(monkeypatch, encoder: Path, data: Path, out: Path, **
     return whole.path
 
 
-@pytest.mark.parametrize(("algorithm", "views"), [("td3_bc", 2), ("drqv2_bc", 1), ("bc", 1), ("td3_bc", 0)])
+@pytest.mark.parametrize(("algorithm", "views"), [("td3_bc", 2), ("drqv2_bc", 1), ("iql", 1), ("bc", 1), ("td3_bc", 0)])
 def test_finetuning_resumes_to_the_bit(encoder, data, tmp_path, monkeypatch, algorithm, views):
     changes = {"algorithm": algorithm, "views": views, "eval_length": 2, "updates": 30, "eval_every": 15}
     changes |= {"checkpoint_every": 10, "batch_size": 4}
@@ -220,7 +221,7 @@ BELOW_IN_BOTH = {
 }
 BELOW_IN_FINETUNING = {
     **{"updates": 0, "gamma": 1.5, "n_step": 0, "alpha": -1.0, "views": -1, "eval_every": 0, "eval_episodes": 0},
-    **{"eval_length": -1, "hidden_dim": 0},
+    **{"eval_length": -1, "hidden_dim": 0, "expectile": 1.1, "temperature": -1.0},
 }
 
 
@@ -284,10 +285,11 @@ def test_a_checkpoint_of_another_config_is_one_line(encoder, data, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_metrics_between_two_actor_steps_survive_a_cut(encoder, data, tmp_path, monkeypatch):
-    """The actor learns at every other update: a row right after a resumption shows its last value all the same."""
-    changes = {"updates": 6, "log_every": 1, "checkpoint_every": 2, "eval_every": 6, "batch_size": 4, "eval_length": 2}
-    finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
+def test_a_row_lacks_what_no_step_since_the_row_before_gave(encoder, data, tmp_path, monkeypatch):
+    """The actor learns at every other update only; also where a run is cut in between."""
+    changes = {"updates": 6, "log_every": 1, "checkpoint_every": 1, "eval_every": 6, "batch_size": 4, "eval_length": 2}
+    whole = finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
+    assert ["actor_loss" in row for row in read_metrics(whole / "metrics.jsonl")] == [False, True] * 3
 
 
 def test_an_evaluation_names_its_step_and_touches_no_other_file(encoder, data, tmp_path):
@@ -372,8 +374,8 @@ def test_an_encoder_of_another_image_size_is_refused(data, encoder, tmp_path):
     assert not (tmp_path / "run").exists()
 
 
-def test_td3_bc_finds_the_better_action_and_bc_the_common_one():
-    """One state, two actions: the rarer one is paid. TD3+BC must lean to it, BC to their mean."""
+def test_what_reads_rewards_finds_the_better_action_and_bc_the_common_one():
+    """One state, two actions: the rarer one is paid. TD3+BC, DrQ-v2+BC and IQL must lean to it, BC to their mean."""
     from finetune.algorithms import ALGORITHMS
     from finetune.features import FeatureBatch
     from vd4rl_pomdp.nn.policy import Policy
@@ -381,9 +383,8 @@ def test_td3_bc_finds_the_better_action_and_bc_the_common_one():
     chosen = {}
     for name, build in ALGORITHMS.items():
         torch.manual_seed(0)
-        config = finetune.config.FinetuneConfig.of("smoke", hidden_dim=32, learning_rate=3e-3, alpha=25.0)
-        policy = Policy(2, 1, 32)
-        algorithm = build(policy, config, torch.Generator().manual_seed(0))
+        policy, options = Policy(2, 1, 32), build.options.fill({"alpha": 25.0})
+        algorithm = build(policy, options, 3e-3, 300, torch.Generator().manual_seed(0))
         action = torch.where(torch.arange(64) % 4 == 0, 0.5, -0.5)[:, None]
         batch = FeatureBatch(
             torch.zeros(64, 2), action, (action[:, 0] > 0).float(), torch.zeros(64), torch.zeros(64, 2)
@@ -394,6 +395,7 @@ def test_td3_bc_finds_the_better_action_and_bc_the_common_one():
     assert chosen["bc"] == pytest.approx(-0.25, abs=0.02)
     assert chosen["td3_bc"] > 0.2
     assert chosen["drqv2_bc"] > 0.2
+    assert chosen["iql"] > 0.1
 
 
 def test_policy_statistics_are_those_of_the_features():

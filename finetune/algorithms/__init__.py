@@ -5,14 +5,26 @@ from __future__ import annotations
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
 from finetune.algorithms.bc import BC
 from finetune.algorithms.drqv2_bc import DrQv2BC
+from finetune.algorithms.iql import IQL, IQLOptions
 from finetune.algorithms.td3_bc import TD3BC, TD3BCOptions
 from vd4rl_pomdp.registry import Registry
 
-__all__ = ["ALGORITHMS", "BC", "TD3BC", "Algorithm", "DrQv2BC", "Loss", "ReturnOptions", "TD3BCOptions"]
+__all__ = [
+    "ALGORITHMS",
+    "BC",
+    "IQL",
+    "TD3BC",
+    "Algorithm",
+    "DrQv2BC",
+    "IQLOptions",
+    "Loss",
+    "ReturnOptions",
+    "TD3BCOptions",
+]
 
 ALGORITHMS: Registry[type[Algorithm]] = Registry(
     "algorithm",
-    {"td3_bc": TD3BC, "drqv2_bc": DrQv2BC, "bc": BC},
+    {"td3_bc": TD3BC, "drqv2_bc": DrQv2BC, "iql": IQL, "bc": BC},
     lambda part: isinstance(part, type) and issubclass(part, Algorithm),
     "a class of finetune.algorithms.Algorithm",
 )

@@ -49,13 +49,16 @@ class Algorithm(ABC):
     """One line that says what it is."""
 
     @abstractmethod
-    def __init__(self, policy: Policy, options: Any, learning_rate: float, generator: torch.Generator) -> None:
+    def __init__(
+        self, policy: Policy, options: Any, learning_rate: float, updates: int, generator: torch.Generator
+    ) -> None:
         """Set up the training of a policy.
 
         Args:
             policy: what is trained; its device is where everything else belongs.
             options: an instance of the class's `options`.
             learning_rate: of all optimisers.
+            updates: how many there will be, for schedules.
             generator: what random numbers are drawn from.
         """
 
@@ -84,12 +87,17 @@ class Algorithm(ABC):
         return logs
 
     @abstractmethod
-    def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on, targets and optimisers included."""
+    def parts(self) -> dict[str, Any]:
+        """Networks, targets and optimisers by name: what has a state of its own. The target of `x` is `target_x`."""
 
-    @abstractmethod
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on: the state of all parts, and what a subclass adds."""
+        return {name: part.state_dict() for name, part in self.parts().items()}
+
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
+        for name, part in self.parts().items():
+            part.load_state_dict(state[name])
 
 
 def _step(loss: Tensor, optimisers: list[Optimizer]) -> None:

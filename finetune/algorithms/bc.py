@@ -19,7 +19,9 @@ class BC(Algorithm):
 
     summary = "behaviour cloning, which uses no reward"
 
-    def __init__(self, policy: Policy, options: Options, learning_rate: float, generator: torch.Generator) -> None:
+    def __init__(
+        self, policy: Policy, options: Options, learning_rate: float, updates: int, generator: torch.Generator
+    ) -> None:
         self.policy = policy
         self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=learning_rate, fused=True)
 
@@ -28,11 +30,6 @@ class BC(Algorithm):
         loss = F.mse_loss(self.policy(batch.z), batch.action)
         yield Loss(loss, self.optimiser, {"bc_loss": loss.detach()})
 
-    def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on."""
-        return {"policy": self.policy.state_dict(), "optimiser": self.optimiser.state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
-        self.policy.load_state_dict(state["policy"])
-        self.optimiser.load_state_dict(state["optimiser"])
+    def parts(self) -> dict[str, Any]:
+        """The policy and its optimiser."""
+        return {"policy": self.policy, "optimiser": self.optimiser}

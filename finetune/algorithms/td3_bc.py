@@ -17,11 +17,11 @@ from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor, nn
+from torch import Tensor
 
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
+from finetune.algorithms.critic import TwinCritic, move_target
 from finetune.features import FeatureBatch
-from vd4rl_pomdp.nn.heads import mlp
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.options import Limits, Options
 
@@ -38,20 +38,6 @@ class TD3BCOptions(ReturnOptions):
     limits: ClassVar[Limits] = {"alpha": 0}
 
 
-class TwinCritic(nn.Module):
-    """Two independent Q functions: (B, D), (B, A) -> two (B,)."""
-
-    def __init__(self, dim: int, action_dim: int, hidden: int) -> None:
-        super().__init__()
-        self.first = mlp(dim + action_dim, hidden, 1)
-        self.second = mlp(dim + action_dim, hidden, 1)
-
-    def forward(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Both values."""
-        both = torch.cat([z, action], dim=-1)
-        return self.first(both)[:, 0], self.second(both)[:, 0]
-
-
 class TD3BC(Algorithm):
     """See the module."""
 
@@ -60,7 +46,9 @@ class TD3BC(Algorithm):
     tau = 0.005
     policy_delay = 2
 
-    def __init__(self, policy: Policy, options: TD3BCOptions, learning_rate: float, generator: torch.Generator) -> None:
+    def __init__(
+        self, policy: Policy, options: TD3BCOptions, learning_rate: float, updates: int, generator: torch.Generator
+    ) -> None:
         self.policy, self.settings, self.generator = policy, options, generator
         shape = policy.shape
         device = policy.standardise.mean.device
@@ -111,25 +99,22 @@ class TD3BC(Algorithm):
         loss = cloning - weight * value.mean()
         return Loss(loss, self.policy_optimiser, {"actor_loss": loss.detach(), "bc_loss": cloning.detach()})
 
-    @torch.no_grad()
     def _move_targets(self) -> None:
-        for online, target in ((self.critic, self.target_critic), (self.policy.net, self.target_policy.net)):
-            for a, b in zip(online.parameters(), target.parameters(), strict=True):
-                b.lerp_(a, self.tau)
+        move_target(self.target_critic, self.critic, self.tau)
+        move_target(self.target_policy.net, self.policy.net, self.tau)
 
     def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on: networks, targets, optimisers, counters."""
-        parts = {name: part.state_dict() for name, part in self._parts().items()}
-        return parts | {"updates": self.updates, "noise": self.generator.get_state()}
+        """Everything needed to go on."""
+        return super().state_dict() | {"updates": self.updates, "noise": self.generator.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
-        for name, part in self._parts().items():
-            part.load_state_dict(state[name])
+        super().load_state_dict(state)
         self.updates = state["updates"]
         self.generator.set_state(state["noise"])
 
-    def _parts(self) -> dict[str, Any]:
+    def parts(self) -> dict[str, Any]:
+        """Networks, targets and optimisers."""
         return {
             "policy": self.policy,
             "critic": self.critic,

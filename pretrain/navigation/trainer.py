@@ -49,7 +49,8 @@ class Trainer:
         parameters = [*objective.parameters(), *self.probe.parameters()]
         self.optimiser = torch.optim.Adam(parameters, lr=config.learning_rate)
         self.step = 0
-        self.interval = _Interval()
+        self.errors = ErrorSums()
+        """Since the last row of metrics."""
 
     def batch(self) -> Windows:
         """The next training windows."""
@@ -88,17 +89,18 @@ class Trainer:
         with training(run, self, f"{self.data.maze.name} {self.config.method}", steps) as loop:
             while self.step < steps:
                 logs, states = self.update()
-                self.interval.add(logs, states, self.config.burn_in)
+                loop.add(logs)
+                self.errors.add(*states, self.config.burn_in)
                 if loop.due(self.config.log_every):
-                    loop.log(self.interval.means(), "loss", "state")
-                    self.interval = _Interval()
+                    loop.log("loss", "state", **self.errors.percent())
+                    self.errors = ErrorSums()
                 loop.step_done(save=loop.due(self.config.checkpoint_every))
 
     def state(self) -> dict[str, Any]:
         """Everything needed to go on to the bit, also between two rows of metrics."""
         return {
             "step": self.step,
-            "interval": self.interval.state(),
+            "errors": self.errors.state(),
             "objective": self.objective.state_dict(),
             "probe": self.probe.state_dict(),
             "optimiser": self.optimiser.state_dict(),
@@ -108,40 +110,11 @@ class Trainer:
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from `state`."""
         self.step = state["step"]
-        self.interval.restore(state["interval"])
+        self.errors.restore(state["errors"])
         self.objective.load_state_dict(state["objective"])
         self.probe.load_state_dict(state["probe"])
         self.optimiser.load_state_dict(state["optimiser"])
         self.generator.set_state(state["batches"])
-
-
-class _Interval:
-    """Means over the steps since the last row of metrics."""
-
-    def __init__(self) -> None:
-        self._count = 0
-        self._sums: dict[str, Tensor] = {}
-        self._errors = ErrorSums()
-
-    def add(self, logs: dict[str, Tensor], states: tuple[Tensor, Tensor, Tensor], burn_in: int) -> None:
-        """Count a step's scalars and its (estimated, true, hidden) states."""
-        self._count += 1
-        self._errors.add(*states, burn_in)
-        for name, value in logs.items():
-            self._sums[name] = self._sums[name].to(value.device) + value if name in self._sums else value
-
-    def means(self) -> dict[str, float]:
-        """Means of the scalars, and errors in percent."""
-        return {name: float(value) / self._count for name, value in self._sums.items()} | self._errors.percent()
-
-    def state(self) -> dict[str, Any]:
-        """What `restore` takes."""
-        return {"count": self._count, "sums": self._sums, "errors": self._errors.state()}
-
-    def restore(self, state: dict[str, Any]) -> None:
-        """Go on counting."""
-        self._count, self._sums = state["count"], state["sums"]
-        self._errors.restore(state["errors"])
 
 
 def learning_rate(config: NavigationConfig, step: int) -> float:

@@ -1,15 +1,16 @@
 """Updates are what the papers' formulas say, on networks small enough to write the formulas out."""
 
-import copy
 from dataclasses import replace
 
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
 
-from finetune.algorithms import ALGORITHMS, Loss, drqv2_bc, td3_bc
+from finetune.algorithms import Loss, drqv2_bc, td3_bc
 from finetune.algorithms.bc import BC
 from finetune.algorithms.drqv2_bc import DrQv2BC
+from finetune.algorithms.iql import IQL, IQLOptions, expectile_loss
 from finetune.algorithms.td3_bc import TD3BC
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.policy import Policy
@@ -23,7 +24,7 @@ def make(kind: type, learning_rate: float = 1e-3, seed: int = 0) -> TD3BC:
     options = kind.options.fill({"gamma": 0.9, "alpha": 1.5})
     policy = Policy(DIM, ACTIONS, 16)
     policy.standardise.fit(batch().z)
-    algorithm = kind(policy, options, learning_rate, torch.Generator().manual_seed(seed))
+    algorithm = kind(policy, options, learning_rate, 40, torch.Generator().manual_seed(seed))
     if isinstance(algorithm, TD3BC):
         with torch.no_grad():
             for target in (algorithm.target_policy.net, algorithm.target_critic):
@@ -133,17 +134,156 @@ def test_cloning_is_the_squared_error_of_the_policys_action():
     assert algorithm.update(given)["bc_loss"].item() < expected
 
 
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name):
-    one, other = (make(ALGORITHMS[name], seed=seed) for seed in (0, 1))
-    for number in range(3):
-        one.update(batch(number))
-    other.load_state_dict(copy.deepcopy(one.state_dict()))
-    if name != "bc":
-        other.generator.set_state(one.generator.get_state())
-    for number in range(3, 6):
-        here, there = one.update(batch(number)), other.update(batch(number))
-        assert {k: v.item() for k, v in here.items()} == {k: v.item() for k, v in there.items()}
+def numbers(algorithm: IQL, given: FeatureBatch) -> dict[str, np.ndarray]:
+    """What IQL's equations are about: the values that its networks give to a batch."""
+    with torch.no_grad():
+        z, next_z = algorithm.policy.standardise(given.z), algorithm.policy.standardise(given.next_z)
+        found = {
+            "q": torch.stack(algorithm.critic(z, given.action)),
+            "target_q": torch.stack(algorithm.target_critic(z, given.action)),
+            "v": algorithm.value(z)[:, 0],
+            "next_v": algorithm.value(next_z)[:, 0],
+            "mean": algorithm.policy(given.z),
+            "std": algorithm.gaussian.log_std.exp(),
+        }
+    given_numbers = {"action": given.action, "reward": given.reward, "discount": given.discount}
+    return {name: value.double().numpy() for name, value in (found | given_numbers).items()}
+
+
+def make_iql(temperature: float = 3.0) -> tuple[IQL, FeatureBatch]:
+    """An IQL whose networks and deviations differ from their targets and from each other, and do not learn."""
+    algorithm = make(IQL, learning_rate=0.0)
+    algorithm.settings = replace(algorithm.settings, expectile=0.7, temperature=temperature)
+    with torch.no_grad():
+        for parameter in (*algorithm.target_critic.parameters(), *algorithm.gaussian.parameters()):
+            parameter.add_(0.5 * torch.randn_like(parameter))
+    algorithm.tau = 0.0
+    return algorithm, batch()
+
+
+def test_iqls_losses_are_those_of_the_papers_equations():
+    """Equations 5 (value), 6 (critics) and 7 (actor), with the smaller target value and the authors' clipped weight."""
+    algorithm, given = make_iql(temperature=8.0)
+    n = numbers(algorithm, given)
+    found = algorithm.update(given)
+    target = n["reward"] + 0.9 * n["discount"] * n["next_v"]
+    assert found["critic_loss"].item() == pytest.approx(((n["q"] - target) ** 2).mean(1).sum(), rel=1e-5)
+    error = n["target_q"].min(0) - n["v"]
+    value_loss = np.mean([(0.7 if u > 0 else 0.3) * u * u for u in error])
+    assert found["value_loss"].item() == pytest.approx(value_loss, rel=1e-5)
+    weight = np.minimum(np.exp(8.0 * error), 100.0)
+    assert 0 < (weight == 100.0).sum() < SIZE, "some weights are clipped"
+    density = np.exp(-((n["action"] - n["mean"]) ** 2) / (2 * n["std"] ** 2)) / (np.sqrt(2 * np.pi) * n["std"])
+    assert found["actor_loss"].item() == pytest.approx(-(weight * np.log(density.prod(1))).mean(), rel=1e-4)
+    assert found["weight"].item() == pytest.approx(weight.mean(), rel=1e-5)
+    assert found["advantage"].item() == pytest.approx(error.mean(), rel=1e-4)
+
+
+def test_iqls_actor_follows_the_weighted_likelihood_and_no_gradient_of_the_weight():
+    algorithm, given = make_iql()
+    n = numbers(algorithm, given)
+    algorithm.update(given)
+    weight = torch.tensor(np.minimum(np.exp(3.0 * (n["target_q"].min(0) - n["v"])), 100.0)).float()
+    log_std = algorithm.gaussian.log_std.detach().clone().requires_grad_()
+    error = (given.action - algorithm.policy(given.z)) / log_std.exp()
+    loss = (weight[:, None] * (error.square() / 2 + log_std)).sum(1).mean()
+    expected = torch.autograd.grad(loss, [*algorithm.policy.net.parameters(), log_std])
+    mine = [p.grad for p in (*algorithm.policy.net.parameters(), algorithm.gaussian.log_std)]
+    for one, other in zip(mine, expected, strict=True):
+        torch.testing.assert_close(one, other)
+    assert all(p.grad is None for p in algorithm.target_critic.parameters())
+
+
+def test_iqls_deviations_stay_within_the_authors_bounds():
+    algorithm, given = make_iql()
+    for given_log_std, bound in ((-9.0, -5.0), (9.0, 2.0)):
+        with torch.no_grad():
+            algorithm.gaussian.log_std.fill_(given_log_std)
+        likelihood = algorithm.gaussian(given.action, given.action)
+        torch.testing.assert_close(likelihood, torch.full((SIZE,), -ACTIONS * (bound + 0.5 * np.log(2 * np.pi))))
+
+
+def test_iqls_target_critic_creeps_before_the_value_reads_it():
+    """The authors' cycle is value, actor, critics, target: what follows the target's step is the value's."""
+    algorithm, given = make_iql()
+    algorithm.tau = 1.0
+    z = algorithm.policy.standardise(given.z)
+    with torch.no_grad():
+        error = torch.minimum(*algorithm.critic(z, given.action)) - algorithm.value(z)[:, 0]
+    assert algorithm.update(given)["advantage"].item() == pytest.approx(error.mean().item(), rel=1e-4)
+
+
+def test_an_expectile_of_a_half_is_mean_regression():
+    error = torch.linspace(-2, 3, 50)
+    assert expectile_loss(error, 0.5).item() == pytest.approx(0.5 * error.square().mean().item())
+    for expectile in (
+        0.1,
+        0.5,
+        0.9,
+    ):  # of 25% ones among zeros, m solves expectile 0.25 (1 - m) = (1 - expectile) 0.75 m
+        m = torch.tensor(0.25 * expectile / (0.25 * expectile + 0.75 * (1 - expectile)), requires_grad=True)
+        expectile_loss(torch.tensor([1.0, 0.0, 0.0, 0.0]) - m, expectile).backward()
+        assert m.grad.item() == pytest.approx(0.0, abs=1e-6)
+        assert expectile != 0.5 or m.item() == pytest.approx(0.25), "the mean"
+
+
+def test_iqls_actor_learns_ever_more_slowly():
+    algorithm = make(IQL)
+    rates = []
+    for updates in (0, 10, 20, 30, 40, 50):  # of 40
+        algorithm.updates = updates
+        algorithm.update(batch())
+        rates.append(algorithm.policy_optimiser.param_groups[0]["lr"] / 1e-3)
+    assert rates == pytest.approx([1.0, (1 + 0.5**0.5) / 2, 0.5, (1 - 0.5**0.5) / 2, 0.0, 0.0])
+    assert algorithm.critic_optimiser.param_groups[0]["lr"] == algorithm.value_optimiser.param_groups[0]["lr"] == 1e-3
+
+
+def test_iqls_fixed_point_on_a_bandit_is_known():
+    """One of four actions is paid: Q = r, V its expectile, and the policy the mean of the weighted actions."""
+    updates = 600
+    torch.manual_seed(0)
+    policy = Policy(2, 1, 32)
+    algorithm = IQL(policy, IQLOptions(), 1e-2, updates, torch.Generator())
+    algorithm.tau = 0.05
+    reward = (torch.arange(8) % 4 == 0).float()
+    given = FeatureBatch(torch.zeros(8, 2), reward[:, None] - 0.5, reward, torch.zeros(8), torch.zeros(8, 2))
+    for _ in range(updates):
+        found = algorithm.update(given)
+    v = 0.25 * 0.7 / (0.25 * 0.7 + 0.75 * 0.3)
+    paid, unpaid = 0.25 * np.exp(3 * (1 - v)), 0.75 * np.exp(-3 * v)
+    mean = 0.5 * (paid - unpaid) / (paid + unpaid)
+    std = np.sqrt((paid * (0.5 - mean) ** 2 + unpaid * (0.5 + mean) ** 2) / (paid + unpaid))
+    assert found["v"].item() == pytest.approx(v, abs=0.01)
+    assert policy(torch.zeros(1, 2)).item() == pytest.approx(mean, abs=0.02)
+    assert algorithm.gaussian.log_std.exp().item() == pytest.approx(std, abs=0.02)
+    assert mean > 0.3, "where cloning gives -0.25"
+
+
+def chain() -> FeatureBatch:
+    """Four places in a row, beyond whose right end is a reward; at each, three actions go left and one goes right."""
+    place = torch.arange(4).repeat_interleave(4)
+    right = torch.arange(16) % 4 == 0
+    following = torch.where(right, place + 1, place - 1)
+    paid = following == 4
+    places = torch.eye(4)
+    action = torch.where(right, 0.5, -0.5)[:, None]
+    return FeatureBatch(places[place], action, paid.float(), (~paid).float(), places[following.clamp(0, 3)])
+
+
+def test_iql_finds_the_way_that_few_go_and_cloning_follows_the_many():
+    """A reward three decisions away tells which of a mixed set's actions to clone, at every place."""
+    updates, given = 500, {"gamma": 0.9, "expectile": 0.9, "temperature": 30.0}
+    chosen = {}
+    for kind in (IQL, BC):
+        torch.manual_seed(0)
+        policy = Policy(4, 1, 32)
+        algorithm = kind(policy, kind.options.fill(given), 1e-2, updates, torch.Generator().manual_seed(0))
+        algorithm.tau = 0.05
+        for _ in range(updates):
+            algorithm.update(chain())
+        chosen[kind] = policy(torch.eye(4))[:, 0].tolist()
+    assert chosen[BC] == pytest.approx([-0.25] * 4, abs=0.05)
+    assert all(0.2 < action < 0.55 for action in chosen[IQL]), chosen[IQL]
 
 
 def test_policies_read_standardised_representations():
@@ -152,7 +292,7 @@ def test_policies_read_standardised_representations():
     torch.testing.assert_close(policy(given.z), policy.from_standardised((given.z - mean) / std), atol=1e-3, rtol=1e-3)
 
 
-@pytest.mark.parametrize("kind", [BC, TD3BC, DrQv2BC])
+@pytest.mark.parametrize("kind", [BC, TD3BC, DrQv2BC, IQL])
 def test_an_encoder_is_trained_by_the_first_loss_and_by_no_other(kind):
     """V-D4RL's references train the encoder by the critic's loss (bc: by cloning); the actor's gradient stops at z."""
     torch.manual_seed(0)

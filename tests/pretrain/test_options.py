@@ -154,6 +154,20 @@ def test_cloning_reads_no_option_of_the_critic(name):
             refused()
 
 
+@pytest.mark.parametrize(
+    ("algorithm", "reads"),
+    [("td3_bc", ["alpha"]), ("drqv2_bc", ["alpha"]), ("iql", ["expectile", "temperature"]), ("bc", [])],
+)
+def test_an_algorithm_reads_its_own_options_only(algorithm, reads):
+    for name in ("alpha", "expectile", "temperature"):
+        given = {"algorithm": algorithm, name: 0.5}
+        if name in reads:
+            assert flat(FinetuneConfig.of("smoke", **given))[name] == 0.5
+        else:
+            with pytest.raises(UserError, match=f"--{name} is not read by the algorithm {algorithm}"):
+                FinetuneConfig.of("smoke", **given)
+
+
 def test_an_encoder_that_is_trained_has_no_views():
     with pytest.raises(UserError, match="--views is not read by the algorithm drqv2_bc"):
         end_to_end(FinetuneConfig.of("smoke", views=3), "drqv2_bc")

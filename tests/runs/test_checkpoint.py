@@ -203,5 +203,5 @@ def test_metrics_after_the_checkpoint_are_dropped(tmp_path):
         {"step": 2, "loss": 1.0},
         {"step": 3, "loss": 9.0},
     ]
-    with pytest.raises(FloatingPointError, match="loss is nan at step 4"):
+    with pytest.raises(FloatingPointError, match="loss is nan in the row of step 4"):
         log.write(4, {"loss": float("nan")})

@@ -35,7 +35,10 @@ class EncoderCard:
     end_to_end: str = ""
     """Fine-tuning algorithm that trains the encoder, too; empty for a frozen encoder."""
     action_loss: float | None = None
-    """Mean over the last tenth of the pretraining's logged steps, for methods that predict actions."""
+    """For methods that predict actions: the mean of the last tenth of the pretraining's rows of metrics.
+
+    Each row is the mean over the steps since the row before; all count the same, also where they are of fewer steps.
+    """
     data: str = ""
     """Fingerprint of the set it was pretrained on."""
     settings: dict[str, Any] = field(default_factory=dict)

@@ -6,9 +6,11 @@ from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from typing import Protocol
 
+from torch import Tensor
+
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.checkpoint import State
-from vd4rl_pomdp.runs.metrics import MetricsLog
+from vd4rl_pomdp.runs.metrics import Means, MetricsLog
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.run import RunFolder
 
@@ -29,16 +31,26 @@ class Learner(Protocol):
 class Loop:
     """A learner on its way to its last step; made by `training`."""
 
-    def __init__(self, run: RunFolder, learner: Learner, total: int, log: MetricsLog, progress: ProgressLine) -> None:
-        self._run, self._learner, self._total = run, learner, total
+    def __init__(
+        self, run: RunFolder, learner: Learner, means: Means, total: int, log: MetricsLog, progress: ProgressLine
+    ) -> None:
+        self._run, self._learner, self._means, self._total = run, learner, means, total
         self._log, self._progress = log, progress
 
     def due(self, every: int) -> bool:
         """Whether the step just done is one of every so many, or the last."""
         return self._learner.step % every == 0 or self._learner.step == self._total
 
-    def log(self, row: dict[str, float], *shown: str) -> None:
-        """Write a row of metrics; the numbers named in `shown`, or all, stand in the progress line."""
+    def add(self, logs: dict[str, Tensor]) -> None:
+        """Count the scalars of the step just done for the next row of metrics."""
+        self._means.add(logs)
+
+    def log(self, *shown: str, **more: float) -> None:
+        """Write a row of metrics: means over the steps since the row before, and `more`.
+
+        The numbers named in `shown`, or all, stand in the progress line.
+        """
+        row = self._means.take() | more
         self._log.write(self._learner.step, row)
         self.show(**{name: row[name] for name in shown or row})
 
@@ -50,14 +62,21 @@ class Loop:
         """Count a step; save a checkpoint if it is time to, or if a signal asks for the end, which then comes."""
         self._progress.advance()
         if save or interrupt.asked():
-            self._run.save(self._learner.step, self._learner.state())
+            state = {"learner": self._learner.state(), "means": self._means.state_dict()}
+            self._run.save(self._learner.step, state)
         interrupt.check(f"{self._run.path} keeps step {self._learner.step}")
 
 
 @contextmanager
 def training(run: RunFolder, learner: Learner, title: str, total: int, unit: str = "steps") -> Iterator[Loop]:
     """Restore a learner from a run's newest checkpoint and open what its loop writes; signals wait for a step's end."""
-    run.restore(learner.restore)
+    means = Means()
+
+    def restore(state: State) -> None:
+        learner.restore(state["learner"])
+        means.load_state_dict(state["means"])
+
+    run.restore(restore)
     log = MetricsLog(run.path / "metrics.jsonl", learner.step, run.config["wandb"], run.config)
     with closing(log), ProgressLine(title, total, unit, learner.step) as progress, interrupt.deferred():
-        yield Loop(run, learner, total, log, progress)
+        yield Loop(run, learner, means, total, log, progress)

@@ -1,4 +1,7 @@
-"""metrics.jsonl: one JSON object a line, appended as a run goes; wandb may mirror it and can never stop a run."""
+"""metrics.jsonl: rows of means, one JSON object a line, appended as a run goes.
+
+wandb may mirror it and can never stop a run.
+"""
 
 from __future__ import annotations
 
@@ -8,11 +11,43 @@ import sys
 from pathlib import Path
 from typing import Any, Literal
 
+import torch
+from torch import Tensor
+
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.folder import appending, write_bytes
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 
 WandbMode = Literal["off", "offline", "online"]
+
+
+class Means:
+    """Means of scalars over the steps since the row before: of each over the steps that gave it."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, tuple[Tensor, int]] = {}
+        """Of each scalar: its sum, float32, where it was computed, and how many steps gave it."""
+
+    def add(self, logs: dict[str, Tensor]) -> None:
+        """Count a step's scalars, each a tensor of one element; a GPU is not waited for."""
+        for name, value in logs.items():
+            value = value.detach().float()
+            total, steps = self._sums.get(name) or (torch.zeros_like(value), 0)
+            self._sums[name] = total.to(value.device) + value, steps + 1
+
+    def take(self) -> dict[str, float]:
+        """The means, which begin anew."""
+        means = {name: float(total) / steps for name, (total, steps) in self._sums.items()}
+        self._sums = {}
+        return means
+
+    def state_dict(self) -> dict[str, tuple[Tensor, int]]:
+        """What `load_state_dict` takes."""
+        return dict(self._sums)
+
+    def load_state_dict(self, state: dict[str, tuple[Tensor, int]]) -> None:
+        """Go on counting from `state_dict`."""
+        self._sums = {name: (total, steps) for name, (total, steps) in state.items()}
 
 
 class MetricsLog:
@@ -28,7 +63,7 @@ class MetricsLog:
         """Append one row; a metric that is not a finite number raises FloatingPointError."""
         bad = [name for name, value in metrics.items() if not math.isfinite(value)]
         if bad:
-            raise FloatingPointError(f"{self._path.parent}: {bad[0]} is {metrics[bad[0]]} at step {step}")
+            raise FloatingPointError(f"{self._path.parent}: {bad[0]} is {metrics[bad[0]]} in the row of step {step}")
         with appending(self._path) as file:
             file.write(json.dumps({"step": step} | metrics) + "\n")
         if self._wandb is not None:

@@ -89,7 +89,7 @@ def _updates_per_s(
     features = torch.randn(1, dataset.num_rows, encoder.dim, dtype=torch.float16, device=device)
     generator = torch.Generator().manual_seed(0)
     policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(device)
-    algorithm = TD3BC(policy, config.options, config.learning_rate, generator)  # type: ignore[arg-type]
+    algorithm = TD3BC(policy, config.options, config.learning_rate, config.updates, generator)  # type: ignore[arg-type]
 
     def train(sampler: FeatureSampler | ExactSampler, updates: int) -> None:
         for _ in range(updates):

@@ -1,0 +1,29 @@
+"""What algorithms with critics share: two independent Q functions, and targets that creep behind them."""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor, nn
+
+from vd4rl_pomdp.nn.heads import mlp
+
+
+class TwinCritic(nn.Module):
+    """Two independent Q functions: (B, D), (B, A) -> two (B,)."""
+
+    def __init__(self, dim: int, action_dim: int, hidden: int) -> None:
+        super().__init__()
+        self.first = mlp(dim + action_dim, hidden, 1)
+        self.second = mlp(dim + action_dim, hidden, 1)
+
+    def forward(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Both values."""
+        both = torch.cat([z, action], dim=-1)
+        return self.first(both)[:, 0], self.second(both)[:, 0]
+
+
+@torch.no_grad()
+def move_target(target: nn.Module, online: nn.Module, tau: float) -> None:
+    """Move a target's parameters by the share `tau` of the way to those of its network."""
+    for a, b in zip(online.parameters(), target.parameters(), strict=True):
+        b.lerp_(a, tau)

@@ -1,0 +1,157 @@
+"""IQL: offline reinforcement learning with implicit Q-learning (Kostrikov et al. 2021, arXiv 2110.06169).
+
+    critics   y = r + gamma d V(z')
+    value     min  |expectile - 1(u < 0)| u^2,   u = min_i Q'_i(z, a) - V(z)
+    actor     max  min(exp(temperature u), 100) log pi(a | z)
+
+No action is asked for that the data lacks: V is an expectile of the values of the actions taken, and the actor clones
+those that are better. pi is a Gaussian around the policy's action, with one learnt standard deviation for each
+dimension of an action; the policy that is kept is its mean. The actor's learning rate falls to 0 along a cosine.
+
+Authors' code: github.com/ikostrikov/implicit_q_learning, as it is for locomotion.
+
+Differences: states are frozen representations, standardised; returns are n-step. The critics step first, since theirs
+is the loss that trains an encoder: the authors' cycle (value, actor, critics, targets) is entered at the critics, so
+that V(z') has learnt from the batches before only. Rewards are as stored: the authors scale those of locomotion so
+that the returns of a set span 1000, which the control suite's returns do by themselves. Initial weights are PyTorch's
+(theirs: orthogonal).
+"""
+
+from __future__ import annotations
+
+import copy
+import math
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
+from finetune.algorithms.critic import TwinCritic, move_target
+from finetune.features import FeatureBatch
+from vd4rl_pomdp.nn.heads import mlp
+from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.options import Limits, Options
+
+MOST_WEIGHT = 100.0
+LOG_STD_RANGE = -5.0, 2.0
+
+
+@dataclass(frozen=True)
+class IQLOptions(ReturnOptions):
+    """Options of IQL."""
+
+    expectile: float = 0.7
+    """IQL's expectile, from 0 to 1: 0.5 values a state by the mean of its actions, more by the better ones."""
+    temperature: float = 3.0
+    """IQL's inverse temperature beta: an action is cloned by the weight exp(beta advantage)."""
+
+    limits: ClassVar[Limits] = {"expectile": (0, 1), "temperature": 0}
+
+
+class Gaussian(nn.Module):
+    """Normal distribution around an action, of learnt standard deviations that depend on no state."""
+
+    def __init__(self, action_dim: int) -> None:
+        super().__init__()
+        self.log_std = nn.Parameter(torch.zeros(action_dim))
+
+    def forward(self, mean: Tensor, action: Tensor) -> Tensor:
+        """Log-likelihoods of actions: (B, A), (B, A) -> (B,)."""
+        std = self.log_std.clamp(*LOG_STD_RANGE).exp()
+        return torch.distributions.Normal(mean, std, validate_args=False).log_prob(action).sum(-1)
+
+
+class IQL(Algorithm):
+    """See the module."""
+
+    options: type[Options] = IQLOptions
+    summary = "implicit Q-learning: values of the actions taken, and a policy that clones the better ones"
+    tau = 0.005
+
+    def __init__(
+        self, policy: Policy, options: IQLOptions, learning_rate: float, updates: int, generator: torch.Generator
+    ) -> None:
+        self.policy, self.settings, self.learning_rate, self.total = policy, options, learning_rate, updates
+        dim, action_dim, hidden = (policy.shape[name] for name in ("dim", "action_dim", "hidden"))
+        device = policy.standardise.mean.device
+        self.critic = TwinCritic(dim, action_dim, hidden).to(device)
+        self.target_critic = copy.deepcopy(self.critic)
+        self.value = mlp(dim, hidden, 1).to(device)
+        self.gaussian = Gaussian(action_dim).to(device)
+        actor = [*policy.net.parameters(), *self.gaussian.parameters()]
+        self.policy_optimiser = torch.optim.Adam(actor, lr=learning_rate, fused=True)
+        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=learning_rate, fused=True)
+        self.value_optimiser = torch.optim.Adam(self.value.parameters(), lr=learning_rate, fused=True)
+        self.updates = 0
+
+    def losses(self, batch: FeatureBatch) -> Iterator[Loss]:
+        """The critics', the value's and the actor's."""
+        z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
+        yield self._critic_loss(z, batch, next_z)
+        move_target(self.target_critic, self.critic, self.tau)
+        z = z.detach()
+        with torch.no_grad():
+            q = torch.minimum(*self.target_critic(z, batch.action))
+        yield self._value_loss(z, q)
+        yield self._policy_loss(z, batch.action, q)
+        self.updates += 1
+
+    def _critic_loss(self, z: Tensor, batch: FeatureBatch, next_z: Tensor) -> Loss:
+        with torch.no_grad():
+            target = batch.reward + self.settings.gamma * batch.discount * self.value(next_z)[:, 0]
+        first, second = self.critic(z, batch.action)
+        loss = F.mse_loss(first, target) + F.mse_loss(second, target)
+        return Loss(loss, self.critic_optimiser, {"critic_loss": loss.detach(), "q": first.detach().mean()})
+
+    def _value_loss(self, z: Tensor, q: Tensor) -> Loss:
+        value = self.value(z)[:, 0]
+        loss = expectile_loss(q - value, self.settings.expectile)
+        return Loss(loss, self.value_optimiser, {"value_loss": loss.detach(), "v": value.detach().mean()})
+
+    def _policy_loss(self, z: Tensor, action: Tensor, q: Tensor) -> Loss:
+        for group in self.policy_optimiser.param_groups:
+            group["lr"] = self.policy_learning_rate
+        with torch.no_grad():
+            advantage = q - self.value(z)[:, 0]
+            weight = (self.settings.temperature * advantage).exp().clamp(max=MOST_WEIGHT)
+        chosen = self.policy.from_standardised(z)
+        loss = -(weight * self.gaussian(chosen, action)).mean()
+        logs = {"actor_loss": loss.detach(), "advantage": advantage.mean(), "weight": weight.mean()}
+        return Loss(loss, self.policy_optimiser, logs | {"bc_loss": F.mse_loss(chosen.detach(), action)})
+
+    @property
+    def policy_learning_rate(self) -> float:
+        """Learning rate of the actor, which falls to 0 along a cosine."""
+        done = min(1.0, self.updates / self.total)
+        return self.learning_rate * (1 + math.cos(math.pi * done)) / 2
+
+    def parts(self) -> dict[str, Any]:
+        """Networks, target and optimisers."""
+        return {
+            "policy": self.policy,
+            "gaussian": self.gaussian,
+            "critic": self.critic,
+            "target_critic": self.target_critic,
+            "value": self.value,
+            "policy_optimiser": self.policy_optimiser,
+            "critic_optimiser": self.critic_optimiser,
+            "value_optimiser": self.value_optimiser,
+        }
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on."""
+        return super().state_dict() | {"updates": self.updates}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        super().load_state_dict(state)
+        self.updates = state["updates"]
+
+
+def expectile_loss(error: Tensor, expectile: float) -> Tensor:
+    """Mean of |expectile - 1(u < 0)| u^2 over errors u: (B,) -> scalar; for 0.5 half the mean squared error."""
+    return ((expectile - (error < 0).float()).abs() * error.square()).mean()
