@@ -15,10 +15,11 @@ from vd4rl_pomdp.experiments.navigation.grid import Cell, cell_of, evidence, gri
 from vd4rl_pomdp.experiments.navigation.report import write_report
 from vd4rl_pomdp.experiments.navigation.rows import load_runs
 from vd4rl_pomdp.mazes import FREE_CELLS, MAZES
+from vd4rl_pomdp.navigation.measures import Measure, refitted_error
 from vd4rl_pomdp.navigation.methods import METHOD_NAMES, OBJECTIVES
 
 ROOT = Path(__file__).parents[2]
-STATE = ("state_error", "held_out", "refit", "all", 0)
+STATE = refitted_error("state")
 
 
 def write_run(base: Path, cell: Cell, seed: int, level: float) -> Path:
@@ -74,9 +75,9 @@ def runs(tmp_path) -> Path:
 def test_every_line_of_the_papers_tables_is_a_cell_with_its_own_number():
     for line in paper_rows():
         component = line["component"]
-        value = (component if component == "action_loss" else f"{component}_error", "training", "online", "all", 0)
+        name = component if component == "action_loss" else f"{component}_error"
         for maze in MAZES:
-            assert paper_number(cell_of(line, maze), value) == float(line[maze])
+            assert paper_number(cell_of(line, maze), Measure(name, "training", "online")) == float(line[maze])
     assert paper_number(Cell("no_curtain", "mik+a"), STATE) == 3.4
     assert paper_number(Cell("no_curtain", "mik+a", literal_future=True), STATE) is None
     assert paper_number(Cell("no_curtain", "random"), STATE) is None

@@ -7,8 +7,9 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from vd4rl_pomdp.experiments.navigation.grid import Cell, paper_rows
-from vd4rl_pomdp.experiments.navigation.rows import Run, Value
+from vd4rl_pomdp.experiments.navigation.rows import Run
 from vd4rl_pomdp.mazes import MAZES
+from vd4rl_pomdp.navigation.measures import Measure, held_out_loss, online_error, refitted_error
 from vd4rl_pomdp.navigation.methods import SUPERVISED, UNTRAINED
 
 RECURRENT = ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
@@ -22,10 +23,10 @@ class Claim:
     """`left` compared with `factor` times `right`; without a right side, with `factor` itself."""
 
     text: str
-    left: tuple[Cell, Value]
+    left: tuple[Cell, Measure]
     relation: str
     factor: float
-    right: tuple[Cell, Value] | None = None
+    right: tuple[Cell, Measure] | None = None
 
     def holds(self, left: float, right: float) -> bool:
         """Whether two numbers are in the relation."""
@@ -55,16 +56,11 @@ class Verdict:
 def claims(maze: str) -> list[Claim]:
     """The maturity gate, then the statements, of one maze."""
 
-    def error(component: str) -> Value:
-        return f"{component}_error", "held_out", "refit", "all", 0
-
-    def loss(k: int) -> Value:
-        return "action_loss", "held_out", "", "all", k
-
     best, best_1 = Cell(maze, "mik+a"), Cell(maze, "mik+a", 1)
     recorder, recorder_1 = Cell(maze, "ah+a"), Cell(maze, "ah+a", 1)
     literal = Cell(maze, "mik+a", 1, literal_future=True)
-    state, position, velocity = error("state"), error("position"), error("velocity")
+    state, position, velocity = (refitted_error(component) for component in ("state", "position", "velocity"))
+    loss = held_out_loss
     found = [
         Claim("gate: mik+a's action loss at k=1, of that at k=15", (best, loss(1)), "<=", 0.85, (best, loss(15))),
         Claim(
@@ -110,9 +106,9 @@ def judge(claim: Claim, runs: Sequence[Run]) -> Verdict:
     return Verdict(claim, means[0], means[1], len(seeds), holding, _paper_numbers(claim))
 
 
-def _by_seed(side: tuple[Cell, Value], runs: Sequence[Run]) -> dict[int, float]:
-    cell, value = side
-    return {run.seed: run.values[value] for run in runs if run.cell == cell and value in run.values}
+def _by_seed(side: tuple[Cell, Measure], runs: Sequence[Run]) -> dict[int, float]:
+    cell, measure = side
+    return {run.seed: run.values[measure] for run in runs if run.cell == cell and measure in run.values}
 
 
 def _paper_numbers(claim: Claim) -> tuple[float, float] | None:
@@ -121,11 +117,11 @@ def _paper_numbers(claim: Claim) -> tuple[float, float] | None:
     return None if left is None or right is None else (left, right)
 
 
-def paper_number(cell: Cell, value: Value) -> float | None:
+def paper_number(cell: Cell, measure: Measure) -> float | None:
     """The paper's number for a cell and a measure, where it has one."""
-    if cell.literal_future or value[4] != 0 or value[3] != "all":
+    if cell.literal_future or measure.k != 0 or measure.rows != "all":
         return None
-    component = value[0].removesuffix("_error")
+    component = measure.measure.removesuffix("_error")
     for row in paper_rows():
         name = row["objective"].lower().replace(" ", "_"), int(row["k_max"]), row["component"]
         options = row["self_prediction"] == "Y", row["exogenous"] == "Y"
@@ -138,7 +134,7 @@ def verdict_lines(runs: Sequence[Run]) -> list[str]:
     """A section of a page: all statements about the mazes of some runs, whether they hold, and the paper's numbers."""
     mazes = [maze for maze in MAZES if any(run.cell.maze == maze for run in runs)]
     verdicts = [(maze, judge(claim, runs)) for maze in mazes for claim in claims(maze)]
-    position: Value = ("position_error", "training", "online", "all", 0)
+    position = online_error("position")
     judged = [verdict for _, verdict in verdicts if verdict.seeds]
     lines = ["## Which statements hold", ""]
     recorder = ", ".join(f"{paper_number(Cell(maze, 'ah+a'), position):.1f} ({maze})" for maze in mazes)
@@ -160,7 +156,7 @@ def verdict_lines(runs: Sequence[Run]) -> list[str]:
 
 def _ceiling_lines(mazes: Sequence[str], runs: Sequence[Run]) -> list[str]:
     """What the same networks reach when they are trained on the true states, without and with past actions."""
-    position: Value = ("position_error", "held_out", "refit", "all", 0)
+    position = refitted_error("position")
     sides = [
         (maze, [_by_seed((Cell(maze, method), position), runs).values() for method in SUPERVISED]) for maze in mazes
     ]

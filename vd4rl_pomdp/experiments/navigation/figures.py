@@ -14,8 +14,9 @@ from matplotlib.patches import Rectangle
 
 from vd4rl_pomdp.experiments.navigation.claims import paper_number
 from vd4rl_pomdp.experiments.navigation.grid import Cell
-from vd4rl_pomdp.experiments.navigation.rows import Run, Value, is_missing
+from vd4rl_pomdp.experiments.navigation.rows import Run, is_missing
 from vd4rl_pomdp.mazes import FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
+from vd4rl_pomdp.navigation.measures import Measure, online_error
 from vd4rl_pomdp.navigation.methods import OBJECTIVES, REFERENCES
 
 _ESTIMATE = "#d55e00"
@@ -31,7 +32,7 @@ _MARK: dict[str, Any] = {"color": "#e69f00", "linestyle": "", "marker": "_", "ma
 _NO_RUN: dict[str, Any] = {"color": "#999999", "linestyle": "", "marker": "x", "markersize": 4}
 
 
-def accuracy_bars(runs: list[Run], value: Value, path: Path) -> None:
+def accuracy_bars(runs: list[Run], measure: Measure, path: Path) -> None:
     """State prediction accuracy, 100 - error, of every objective and maze beside the paper's, as in its bar plot."""
     mazes = [maze for maze in MAZES if any(run.cell.maze == maze for run in runs)]
     columns = min(2, len(mazes))
@@ -44,7 +45,7 @@ def accuracy_bars(runs: list[Run], value: Value, path: Path) -> None:
     for axes, maze in zip(panels.flat, mazes, strict=False):
         for place, method in enumerate(methods):
             for offset, (max_k, self_prediction, colour) in zip(_OFFSETS, _VARIANTS.values(), strict=True):
-                _bar(axes, place + offset, Cell(maze, method, max_k, self_prediction), runs, value, colour)
+                _bar(axes, place + offset, Cell(maze, method, max_k, self_prediction), runs, measure, colour)
         axes.set_title(maze, fontsize=10)
         axes.set_xticks(range(len(methods)), methods, rotation=40, ha="right", fontsize=8)
         axes.spines[["top", "right"]].set_visible(False)
@@ -59,14 +60,14 @@ def accuracy_bars(runs: list[Run], value: Value, path: Path) -> None:
     figure.savefig(path, dpi=130, metadata={"Software": None})
 
 
-def _bar(axes: Any, place: float, cell: Cell, runs: list[Run], value: Value, colour: str) -> None:
-    accuracy = [100 - run.values[value] for run in runs if run.cell == cell and value in run.values]
+def _bar(axes: Any, place: float, cell: Cell, runs: list[Run], measure: Measure, colour: str) -> None:
+    accuracy = [100 - run.values[measure] for run in runs if run.cell == cell and measure in run.values]
     if accuracy:
         axes.bar(place, np.mean(accuracy), _WIDTH, color=colour)
         axes.plot([place] * len(accuracy), accuracy, **_SEED)
     elif is_missing(cell, runs):
         axes.plot(place, 2, **_NO_RUN)
-    paper = paper_number(cell, ("state_error", "training", "online", "all", 0))
+    paper = paper_number(cell, online_error("state"))
     if paper is not None:
         axes.plot(place, 100 - paper, **_MARK)
 

@@ -19,9 +19,10 @@ import numpy as np
 from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import paper_number, verdict_lines
 from vd4rl_pomdp.experiments.navigation.grid import Cell, cell_of, paper_rows
-from vd4rl_pomdp.experiments.navigation.rows import ROWS, Run, Value, is_missing, load_runs, save_runs, unfinished_runs
+from vd4rl_pomdp.experiments.navigation.rows import ROWS, Run, is_missing, load_runs, save_runs, unfinished_runs
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.navigation.config import PRESETS
+from vd4rl_pomdp.navigation.measures import Measure, held_out_loss, refitted_error
 from vd4rl_pomdp.navigation.methods import METHOD_NAMES, OBJECTIVES, REFERENCES, UNTRAINED
 from vd4rl_pomdp.report.stats import bootstrap_interval, mean
 from vd4rl_pomdp.runs.folder import write_csv
@@ -54,7 +55,7 @@ class Entry:
     """One number of a table."""
 
     cell: Cell
-    value: Value
+    measure: Measure
     numbers: np.ndarray
     """(n,) one for each seed."""
     of: int
@@ -65,7 +66,7 @@ class Entry:
     @property
     def paper(self) -> float | None:
         """The paper's number."""
-        return paper_number(self.cell, self.value)
+        return paper_number(self.cell, self.measure)
 
     def text(self) -> str:
         """Mean, interval, seeds, and the paper's number in brackets; a run that is missing is said to be."""
@@ -116,8 +117,7 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
     runs, unfinished = load_runs(sources), unfinished_runs(sources)
     save_runs(runs, out)
     (out / "figures").mkdir(exist_ok=True)
-    value = ("state_error", "held_out", "refit", "all", 0)
-    figures.accuracy_bars(runs, value, out / "figures" / "accuracy.png")
+    figures.accuracy_bars(runs, refitted_error("state"), out / "figures" / "accuracy.png")
     drawn = figures.trajectories(runs, out / "figures" / "trajectories.png")
     if samples is not None:
         figures.sample_observations(samples(), out / "figures" / "observations.png")
@@ -143,11 +143,11 @@ def _paper_table(name: str, view: str, split: str, probe: str, runs: list[Run]) 
     for line in paper_rows():
         if line["table"] != name.removesuffix("_main"):
             continue
-        measure = line["component"] if name == "action_loss" else f"{line['component']}_error"
-        value: Value = measure, split, probe, "all", 0
+        component = line["component"] if name == "action_loss" else f"{line['component']}_error"
+        measure = Measure(component, split, probe)
         options = "".join(f", {o}" for o in ("self-prediction",) if line["self_prediction"] == "Y")
         label = f"{line['objective']}, K={line['k_max']}{options}"
-        rows.append((label, [_entry(cell_of(line, maze), value, runs) for maze in mazes]))
+        rows.append((label, [_entry(cell_of(line, maze), measure, runs) for maze in mazes]))
     return Table(name, view, mazes, rows)
 
 
@@ -157,15 +157,11 @@ def _references_table(runs: list[Run]) -> Table:
     rows = []
     for method in REFERENCES:
         for component in ("state", "position", "velocity"):
-            value: Value = (f"{component}_error", "held_out", "refit", "all", 0)
-            rows.append((f"{method}, {component}", [_entry(Cell(m, method), value, runs) for m in mazes]))
+            measure = refitted_error(component)
+            rows.append((f"{method}, {component}", [_entry(Cell(maze, method), measure, runs) for maze in mazes]))
     literal = [Cell(maze, "mik+a", 1, literal_future=True) for maze in mazes]
-    measures: dict[str, Value] = {
-        "state error": ("state_error", "held_out", "refit", "all", 0),
-        "action loss": ("action_loss", "held_out", "", "all", 0),
-    }
-    for name, value in measures.items():
-        rows.append((f"MIK+A, literal future, K=1, {name}", [_entry(cell, value, runs) for cell in literal]))
+    for name, measure in {"state error": refitted_error("state"), "action loss": held_out_loss()}.items():
+        rows.append((f"MIK+A, literal future, K=1, {name}", [_entry(cell, measure, runs) for cell in literal]))
     return Table("references", "held-out trajectories, probe refitted on frozen states", mazes, rows)
 
 
@@ -175,8 +171,8 @@ def _hidden_table(runs: list[Run]) -> Table:
     rows = []
     for method in METHOD_NAMES:
         for component in ("position", "velocity"):
-            value: Value = (f"{component}_error", "held_out", "refit", "hidden", 0)
-            rows.append((f"{method}, {component}", [_entry(Cell(maze, method), value, runs) for maze in mazes]))
+            measure = refitted_error(component, rows="hidden")
+            rows.append((f"{method}, {component}", [_entry(Cell(maze, method), measure, runs) for maze in mazes]))
     return Table("hidden", "held-out trajectories, probe refitted on frozen states", mazes, rows)
 
 
@@ -185,15 +181,14 @@ def _by_k_table(runs: list[Run]) -> Table:
     rows = []
     for method in OBJECTIVES:
         for k in (1, 5, 15):
-            value: Value = ("action_loss", "held_out", "", "all", k)
-            rows.append((f"{method}, k={k}", [_entry(Cell(maze, method), value, runs) for maze in MAZES]))
+            rows.append((f"{method}, k={k}", [_entry(Cell(maze, method), held_out_loss(k), runs) for maze in MAZES]))
     return Table("by_k", "held-out trajectories", tuple(MAZES), rows)
 
 
-def _entry(cell: Cell, value: Value, runs: list[Run]) -> Entry:
-    numbers = [run.values[value] for run in runs if run.cell == cell and value in run.values]
+def _entry(cell: Cell, measure: Measure, runs: list[Run]) -> Entry:
+    numbers = [run.values[measure] for run in runs if run.cell == cell and measure in run.values]
     seeds = {run.seed for run in runs if run.cell.maze == cell.maze}
-    return Entry(cell, value, np.array(numbers), len(seeds), is_missing(cell, runs))
+    return Entry(cell, measure, np.array(numbers), len(seeds), is_missing(cell, runs))
 
 
 _OWN_TITLES = {

@@ -14,16 +14,16 @@ from typing import Any
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.grid import Cell
+from vd4rl_pomdp.navigation.measures import Measure, measure_of, measure_rows
 from vd4rl_pomdp.runs.folder import read_json, write_csv
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.reading import build, regular
 from vd4rl_pomdp.runs.settings import settings_of
 
 ROWS, RUNS, TRAJECTORIES = "rows.csv", "runs.csv", "trajectories"
-Value = tuple[str, str, str, str, int]
-"""(measure, split, probe, rows, k), for instance ("state_error", "held_out", "refit", "all", 0)."""
+
 _IDENTITY = ("maze", "method", "max_k", "self_prediction", "exogenous", "literal_future", "preset", "seed")
-_MEASURED = ("measure", "split", "probe", "rows", "k", "value")
+_MEASURED = (*Measure._fields, "value")
 _FACTS = ("steps", "seconds", "set", "git_commit", "processor", "gpu", "command")
 
 
@@ -34,7 +34,7 @@ class Run:
     cell: Cell
     preset: str
     seed: int
-    values: dict[Value, float]
+    values: dict[Measure, float]
     facts: dict[str, str]
     """How it came about: steps, seconds, data, commit, machine, command."""
     trajectory: Path | None
@@ -168,11 +168,7 @@ def _refuse_mixtures(runs: Iterable[Run]) -> None:
 def save_runs(runs: list[Run], out: Path) -> None:
     """Write `rows.csv`, `runs.csv` and `trajectories/`, from which the report can be made again."""
     out.mkdir(parents=True, exist_ok=True)
-    rows = [
-        run.identity | dict(zip(_MEASURED, (*value, f"{number:.6g}"), strict=True))
-        for run in runs
-        for value, number in run.values.items()
-    ]
+    rows = [run.identity | row | {"value": f"{row['value']:.6g}"} for run in runs for row in measure_rows(run.values)]
     write_csv(out / ROWS, (*_IDENTITY, *_MEASURED), rows)
     write_csv(out / RUNS, (*_IDENTITY, *_FACTS), [run.identity | run.facts for run in runs])
     (out / TRAJECTORIES).mkdir(exist_ok=True)
@@ -222,7 +218,7 @@ def _run_of(folder: Path) -> Run:
         "gpu": machine["gpu"] or "",
         "command": results.get("command", record["command"]),
     }
-    values = {_value(row): _finite(folder / "results.json", row, f"{row['value']:.6g}") for row in results["rows"]}
+    values = {measure_of(row): _finite(folder / "results.json", row, f"{row['value']:.6g}") for row in results["rows"]}
     trajectory = folder / "trajectory.csv"
     if not trajectory.is_file():
         raise UserError(f"{trajectory}: is missing or no file; train it again")
@@ -235,10 +231,6 @@ def _finite(path: Path, row: dict[str, Any], value: str) -> float:
     return float(value)
 
 
-def _value(row: dict[str, Any]) -> Value:
-    return row["measure"], row["split"], row["probe"], row["rows"], int(row["k"])
-
-
 def _from_csv(source: Path) -> list[Run]:
     try:
         return _runs_of(source)
@@ -249,9 +241,9 @@ def _from_csv(source: Path) -> list[Run]:
 
 
 def _runs_of(source: Path) -> list[Run]:
-    values: dict[tuple[str, ...], dict[Value, float]] = {}
+    values: dict[tuple[str, ...], dict[Measure, float]] = {}
     for row in _read(source / ROWS):
-        values.setdefault(_identity(row), {})[_value(row)] = _finite(source / ROWS, row, row["value"])
+        values.setdefault(_identity(row), {})[measure_of(row)] = _finite(source / ROWS, row, row["value"])
     runs = []
     for row in _read(source / RUNS):
         flags = {name: row[name] == "1" for name in ("self_prediction", "exogenous", "literal_future")}
