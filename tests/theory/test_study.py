@@ -158,8 +158,8 @@ def test_the_documentation_shows_the_computed_numbers(shown):
     study, _ = shown
     text = (Path(__file__).parents[2] / "docs" / "theory.md").read_text()
     for row in table_rows(study):
-        cells = [f"{printed} / {' '.join(computed)}" for printed, *computed in row["cells"].values()]
-        assert f"| `{row['method']}` | {' | '.join(cells)} |" in text
+        entries = [f"{printed} / {' '.join(computed)}" for printed, *computed in row["entries"].values()]
+        assert f"| `{row['method']}` | {' | '.join(entries)} |" in text
     held = sum(row["assumptions_hold"] for row in study["disagreements"])
     assert f"All {len(study['disagreements'])} disagreements, {held} of them where the assumptions hold" in text
     code = re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]

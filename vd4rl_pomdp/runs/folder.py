@@ -13,6 +13,9 @@ from typing import Any
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 
+Row = dict[str, Any]
+"""One row of a table, its values by column."""
+
 
 def jsonable(value: Any) -> Any:
     """Config values as JSON: paths become strings, tuples become lists."""
@@ -42,7 +45,7 @@ def write_json(path: Path, value: Any) -> None:
         fresh.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
 
 
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
     """Write a CSV file, its header first, so that a reader sees it whole or not at all."""
     with replacing_file(path) as fresh, fresh.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
