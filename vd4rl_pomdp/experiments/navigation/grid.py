@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_number
-from vd4rl_pomdp.mazes import get_maze
+from vd4rl_pomdp.mazes import check_maze
 from vd4rl_pomdp.navigation.config import PRESETS
 from vd4rl_pomdp.navigation.methods import OBJECTIVES, SUPERVISED, UNTRAINED
 
@@ -79,7 +79,7 @@ def grid_commands(
     if preset not in PRESETS:
         raise UserError(f"unknown preset {preset!r}: choose one of {', '.join(PRESETS)}")
     for maze in mazes:
-        get_maze(maze)
+        check_maze(maze)
     for seed in seeds:
         refuse_number("seeds", seed, 0, MAX_SEED)
     for seed in seeds:
