@@ -20,7 +20,7 @@ from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.navigation.measures import Measure, measure_rows
 from vd4rl_pomdp.navigation.methods import UNTRAINED
 from vd4rl_pomdp.runs.device import autocast
-from vd4rl_pomdp.runs.folder import replacing_file
+from vd4rl_pomdp.runs.files import replacing_file
 from vd4rl_pomdp.runs.metrics import read_metrics
 
 TRAJECTORY_ROWS = 200

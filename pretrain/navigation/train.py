@@ -21,11 +21,11 @@ from vd4rl_pomdp.navigation.methods import REFERENCES, UNTRAINED
 from vd4rl_pomdp.navigation.observations import SHAPES
 from vd4rl_pomdp.nn.action_target import check_action_target
 from vd4rl_pomdp.nn.encoder import MAX_LAYERS
-from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
+from vd4rl_pomdp.nn.encoder_folder import EncoderCard, save_encoder
 from vd4rl_pomdp.nn.frame import check_frame_encoder
 from vd4rl_pomdp.objective import check_gap
 from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.folder import jsonable, write_json
+from vd4rl_pomdp.runs.files import jsonable, write_json
 from vd4rl_pomdp.runs.memory import telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder

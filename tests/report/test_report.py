@@ -19,7 +19,7 @@ from vd4rl_pomdp.report import stats, write_report
 from vd4rl_pomdp.report.gaps import find_gaps
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.tables import label
-from vd4rl_pomdp.runs.folder import read_json, write_json
+from vd4rl_pomdp.runs.files import read_json, write_json
 
 
 def write_run(

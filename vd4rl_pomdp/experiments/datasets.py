@@ -21,7 +21,7 @@ import numpy as np
 from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, replay_returns
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.policies.actor import ships
-from vd4rl_pomdp.runs.folder import read_json, write_csv, write_json
+from vd4rl_pomdp.runs.files import read_json, write_csv, write_json
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 from vd4rl_pomdp.runs.reading import regular

@@ -18,7 +18,7 @@ from vd4rl_pomdp.data.shards import Shard, claim_set, collect_shards
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
 from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, check_maze, get_maze
 from vd4rl_pomdp.navigation.config import CollectConfig
-from vd4rl_pomdp.runs.folder import jsonable
+from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import owned

@@ -20,7 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.runs.folder import write_bytes
+from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 from vd4rl_pomdp.tasks import TASKS, Task, get_task
 

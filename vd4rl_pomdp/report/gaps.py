@@ -6,7 +6,7 @@ from collections.abc import Iterable, Iterator
 from itertools import groupby
 
 from vd4rl_pomdp.report.load import LABELS, LoadedRun
-from vd4rl_pomdp.runs.folder import Row
+from vd4rl_pomdp.runs.files import Row
 
 Setting = tuple[str, str, str]
 """Task, quality and corruption: what methods are compared in."""

@@ -13,7 +13,7 @@ import numpy as np
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import read_rows
 from vd4rl_pomdp.report.variants import Parts, Settings, differences, read_settings
-from vd4rl_pomdp.runs.folder import Row, read_json
+from vd4rl_pomdp.runs.files import Row, read_json
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.reading import regular
 

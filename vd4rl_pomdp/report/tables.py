@@ -9,7 +9,7 @@ import numpy as np
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import CONDITION, condition_of, in_words
 from vd4rl_pomdp.report.load import IDENTITY, LoadedRun
-from vd4rl_pomdp.runs.folder import Row
+from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.tasks import SCORE_DIVISOR
 
 SERIES = ("corruption", "algorithm", "method", "variant")

@@ -17,7 +17,7 @@ from rich.table import Table
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.report.figures import COLOURS, to_svg
 from vd4rl_pomdp.report.templates import render
-from vd4rl_pomdp.runs.folder import Row, read_json, write_json
+from vd4rl_pomdp.runs.files import Row, read_json, write_json
 from vd4rl_pomdp.text import write_text
 
 Study = dict[str, Any]

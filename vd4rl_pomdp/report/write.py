@@ -20,7 +20,7 @@ from vd4rl_pomdp.report.load import LoadedRun, compare, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.report.theory import load_section
-from vd4rl_pomdp.runs.folder import Row, write_csv
+from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.text import write_text
 

@@ -26,7 +26,7 @@ from torch import Tensor
 
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.runs import FORMAT
-from vd4rl_pomdp.runs.folder import synchronise
+from vd4rl_pomdp.runs.files import synchronise
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 
 KEPT = 2

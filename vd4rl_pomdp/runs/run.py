@@ -17,7 +17,7 @@ from typing import Any, Self
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, State, fitting, pack, unpack
-from vd4rl_pomdp.runs.folder import holds_anything, jsonable, read_json, write_json
+from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_json
 from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.runs.provenance import command, git_commit, machine, versions
 from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS

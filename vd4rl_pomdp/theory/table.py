@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
 
-from vd4rl_pomdp.runs.folder import Row
+from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.theory.classifiers import Memory, compare
 from vd4rl_pomdp.theory.decodability import future_memory, past_memory
 from vd4rl_pomdp.theory.gallery import WORLDS, variants

@@ -32,7 +32,7 @@ from vd4rl_pomdp.navigation.config import PRESETS
 from vd4rl_pomdp.navigation.measures import Measure, held_out_loss, refitted_error
 from vd4rl_pomdp.navigation.methods import METHOD_NAMES, OBJECTIVES, REFERENCES, UNTRAINED
 from vd4rl_pomdp.report.stats import bootstrap_interval, mean
-from vd4rl_pomdp.runs.folder import write_csv
+from vd4rl_pomdp.runs.files import write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.text import code, code_block, markdown, write_text
 

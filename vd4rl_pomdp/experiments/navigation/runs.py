@@ -15,7 +15,7 @@ from typing import Any
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.grid import Condition
 from vd4rl_pomdp.navigation.measures import Measure, measure_of, measure_rows
-from vd4rl_pomdp.runs.folder import read_json, write_csv
+from vd4rl_pomdp.runs.files import read_json, write_csv
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.reading import build, regular
 from vd4rl_pomdp.runs.settings import settings_of
