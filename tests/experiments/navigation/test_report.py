@@ -18,7 +18,7 @@ from vd4rl_pomdp.mazes import FREE_CELLS, MAZES
 from vd4rl_pomdp.navigation.measures import Measure, refitted_error
 from vd4rl_pomdp.navigation.methods import METHOD_NAMES, OBJECTIVES
 
-ROOT = Path(__file__).parents[2]
+ROOT = Path(__file__).parents[3]
 STATE = refitted_error("state")
 
 
