@@ -1,4 +1,4 @@
-"""What a trained objective knows of the state: errors by split and probe, action losses, and one trajectory to draw.
+"""Measure a trained objective: state errors by split and probe, action losses, and one trajectory to draw.
 
 `results.json` keeps one row for each `Measure`: its fields and its value.
 """

@@ -1,4 +1,4 @@
-"""Files that are read and written whole, with the permissions that the umask leaves."""
+"""Read and write whole files, with the permissions that the umask leaves."""
 
 from __future__ import annotations
 
@@ -78,7 +78,7 @@ def replacing_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def appending(path: Path) -> Iterator[Any]:
-    """A text file to append lines to; what the system refuses becomes one sentence."""
+    """A text file to append lines to; raises UserError if the system refuses."""
     with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
         yield file
 
@@ -93,7 +93,7 @@ def synchronise(path: Path) -> None:
 
 
 def holds_anything(folder: Path) -> bool:
-    """Whether a folder exists and holds a file or folder that is not hidden; hidden ones are what a cut left there."""
+    """Whether a folder exists and holds a file or folder that is not hidden; hidden ones are left by cut commands."""
     with disk_errors(folder):
         return folder.is_dir() and any(not file.name.startswith(".") for file in folder.iterdir())
 
