@@ -1,7 +1,7 @@
 """The one exception that a user may see, and checks that raise it.
 
-A function's first word says when it raises UserError: `check_x` unless x is valid, `require_x` unless there is x or
-enough of it (memory, disk, rows), `refuse_x` if there is x. None of them changes anything, and none returns a result.
+A function's first word says when it raises UserError: `check_x` unless x is valid, `require_x` unless there is enough
+of x (memory, disk, rows), `refuse_x` for something named x that cannot be accepted. None of them changes anything.
 """
 
 from __future__ import annotations
