@@ -15,7 +15,7 @@ from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.data import Dataset, View
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.runs.device import Precision, autocast
-from vd4rl_pomdp.runs.folder import read_json, replacing_file, write_json
+from vd4rl_pomdp.runs.files import read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.reading import regular
 from vd4rl_pomdp.types import Batch

@@ -20,12 +20,12 @@ from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, read_rows, rows_of, rows_until
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.folder import CONFIG, EncoderCard, copy_encoder, encoder_hash, load_encoder, save_encoder
+from vd4rl_pomdp.nn.encoder_folder import CONFIG, EncoderCard, copy_encoder, encoder_hash, load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.probes import probe_state
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.folder import read_json, replacing_file, write_json
+from vd4rl_pomdp.runs.files import read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.loop import Loop, training
 from vd4rl_pomdp.runs.memory import require_disk, require_memory, telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside

@@ -14,11 +14,11 @@ from vd4rl_pomdp.corruptions import check_corruption
 from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
+from vd4rl_pomdp.nn.encoder_folder import EncoderCard, save_encoder
 from vd4rl_pomdp.objective import Objective
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.device import autocast, pick_device
-from vd4rl_pomdp.runs.folder import jsonable
+from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.loop import training
 from vd4rl_pomdp.runs.memory import bytes_kept, bytes_of_parameters, require_memory, telling_memory
 from vd4rl_pomdp.runs.metrics import read_metrics

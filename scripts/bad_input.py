@@ -3,12 +3,12 @@
     python scripts/bad_input.py [--only NAME ...] [--every N] [--list]
 
 A bad input is one thing wrong in an otherwise valid command line (`bad_input_flags`, generated from the commands'
-config classes) or in one file that a command reads (`bad_input_files`, generated from small valid sets, runs and
-reports). Each runs in a process of its own, in a copy of those files, within limits of time and memory. It passes if
-the exit code is 2, stderr is one line that begins with `error: `, and no file has changed, appeared or gone. Single
-keys of JSON files are spoilt without knowing who reads them: there exit code 0 passes, too. A newest checkpoint that
-is damaged beside a whole one must end in exit code 0 and one line of warning. What is no bad input after all is listed
-with its reason (`FINE` in `bad_input_files`) and not tried.
+config classes) or in one file that a command reads (`bad_input_files`, damaged by `bad_input_damage` in the valid files
+of `bad_input_world`). Each runs in a process of its own, in a copy of those files, within limits of time and memory.
+It passes if the exit code is 2, stderr is one line that begins with `error: `, and no file has changed, appeared or
+gone. Single keys of JSON files are spoilt without knowing who reads them: there exit code 0 passes, too. A newest
+checkpoint that is damaged beside a whole one must end in exit code 0 and one line of warning. What is no bad input
+after all is listed with its reason (`FINE` in `bad_input_files`) and not tried.
 """
 
 from __future__ import annotations
@@ -32,8 +32,9 @@ from pathlib import Path
 os.environ.setdefault("MUJOCO_GL", "egl")
 sys.path.insert(0, str(Path(__file__).parent))
 
-from bad_input_files import FINE, build_world, file_cases
+from bad_input_files import FINE, file_cases
 from bad_input_flags import Case, flag_cases
+from bad_input_world import build_world
 
 from vd4rl_pomdp.cli import main as program
 

@@ -22,10 +22,10 @@ from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import EVALUATION_SEED, Agent
-from vd4rl_pomdp.nn.folder import load_encoder
+from vd4rl_pomdp.nn.encoder_folder import load_encoder
 from vd4rl_pomdp.nn.policy import load_policy
 from vd4rl_pomdp.policies.actor import Actor, load_actor
-from vd4rl_pomdp.runs.folder import read_json, write_csv
+from vd4rl_pomdp.runs.files import read_json, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_inside
 
 SPANS = ((0, 10), (10, 50), (50, None))

@@ -24,7 +24,7 @@ PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 PROGRAMS = (["vd4rl-pomdp"], ["python", "my_method.py"])
 """What begins a command of ours; the second is the page's own example."""
 NOT_RUN = {
-    "make demo": "minutes of rendering and training; test_cli looks at its commands, the Dockerfile runs them",
+    "make demo": "minutes of rendering and training; tests/cli looks at its commands, the Dockerfile runs them",
     "make test": "runs these tests",
     "pip install": "fetches packages",
     "parallel": "not a program of ours",
@@ -33,7 +33,7 @@ NOT_RUN = {
     "vd4rl-pomdp data collect": "renders whole episodes; data/test_collect runs shorter ones",
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
-    "vd4rl-pomdp policy": "trains for hours; test_policies trains less",
+    "vd4rl-pomdp policy": "trains for hours; tests/policies trains less",
     "vd4rl-pomdp navigation": "trains for minutes to days; pretrain/test_navigation_train trains less",
     "vd4rl-pomdp pretrain --method": "test_stages runs every method in its smoke size",
     "vd4rl-pomdp finetune --encoder RUN": "as above",

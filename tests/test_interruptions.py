@@ -27,7 +27,7 @@ from tests.test_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import read_rows
-from vd4rl_pomdp.runs.folder import read_json
+from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.ownership import owned

@@ -25,8 +25,8 @@ MAY_CALL_STAGES = ("vd4rl_pomdp/cli/", "vd4rl_pomdp/experiments/bench/")
 """Folders whose functions call the stages, and import them there: what is not called is not loaded."""
 JUDGES = "vd4rl_pomdp.experiments"
 """What judges runs: the command line alone imports it."""
-JUDGES_MAZES_BY = ("errors", "experiments.navigation", "mazes", "navigation.config", "navigation.methods")
-JUDGES_MAZES_BY += ("report.stats", "runs", "text")
+JUDGES_MAZES_BY = ("errors", "experiments.navigation", "mazes", "navigation.config")
+JUDGES_MAZES_BY += ("navigation.measures", "navigation.methods", "report.stats", "runs", "text")
 """What the navigation tables are made with: files, names and settings; no data, no environment and no network."""
 
 

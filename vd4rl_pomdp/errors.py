@@ -1,4 +1,8 @@
-"""The one exception that a user may see."""
+"""The one exception that a user may see, and checks that raise it.
+
+A function's first word says when it raises UserError: `check_x` unless x is valid, `require_x` unless there is enough
+of x (memory, disk, rows), `refuse_x` for something named x that cannot be accepted. None of them changes anything.
+"""
 
 from __future__ import annotations
 
@@ -42,7 +46,7 @@ def flag_of(name: str) -> str:
 
 
 def refuse_no_folder(path: Path) -> None:
-    """Raise UserError unless `path` is a folder or can become one: said before the work whose result it is to hold."""
+    """Raise UserError unless `path` is a folder or can become one, before the work whose result goes there."""
     for place in (path, *path.parents):
         try:
             mode = place.stat().st_mode
@@ -71,7 +75,7 @@ def disk_error(path: Path | str | None, error: OSError) -> UserError:
 
 @contextmanager
 def disk_errors(path: Path) -> Iterator[None]:
-    """Whatever the system refuses within becomes one sentence about `path`."""
+    """Turn an OSError within the block into one sentence about `path`."""
     try:
         yield
     except OSError as error:

@@ -19,9 +19,9 @@ from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
 from vd4rl_pomdp.envs.rendering import Render
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.folder import load_encoder
+from vd4rl_pomdp.nn.encoder_folder import load_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy
-from vd4rl_pomdp.runs.folder import appending, read_json, write_csv
+from vd4rl_pomdp.runs.files import appending, read_json, write_csv
 from vd4rl_pomdp.runs.reading import regular
 from vd4rl_pomdp.runs.workers import run_jobs
 from vd4rl_pomdp.tasks import MOST_EPISODES, SCORE_DIVISOR, get_task

@@ -23,7 +23,7 @@ HALF_SIZE = 2.5
 BALL_RADIUS = 0.2
 """Radius of the ball that is drawn (PointMaze's site); the one that collides has a radius of 0.1."""
 _PARALLAX = 0.03
-"""What a curtain's edge may seem shifted by, seen from the camera."""
+"""Largest shift of a curtain's edge in the picture by perspective."""
 
 
 @dataclass(frozen=True)
@@ -86,3 +86,8 @@ def get_maze(name: str) -> MazeSpec:
     if name not in MAZES:
         raise UserError(f"unknown maze {name!r}: choose one of {', '.join(MAZES)}")
     return MAZES[name]
+
+
+def check_maze(name: str) -> None:
+    """Raise UserError unless a maze is called `name`."""
+    get_maze(name)

@@ -1,6 +1,6 @@
-"""What a trained objective knows of the state: errors by split and probe, action losses, and one trajectory to draw.
+"""Measure a trained objective: state errors by split and probe, action losses, and one trajectory to draw.
 
-Numbers are rows of (measure, split, probe, rows, k, value), which is what `results.json` keeps of a run.
+`results.json` keeps one row for each `Measure`: its fields and its value.
 """
 
 from __future__ import annotations
@@ -14,12 +14,13 @@ import torch
 from torch import Tensor
 
 from pretrain.navigation.config import NavigationConfig
-from pretrain.navigation.probe import ErrorSums, StateProbe, refit
+from pretrain.navigation.probe import COMPONENTS, ErrorSums, StateProbe, refit
 from pretrain.navigation.trainer import Trainer
 from vd4rl_pomdp.data import Dataset
+from vd4rl_pomdp.navigation.measures import Measure, measure_rows
 from vd4rl_pomdp.navigation.methods import UNTRAINED
 from vd4rl_pomdp.runs.device import autocast
-from vd4rl_pomdp.runs.folder import replacing_file
+from vd4rl_pomdp.runs.files import replacing_file
 from vd4rl_pomdp.runs.metrics import read_metrics
 
 TRAJECTORY_ROWS = 200
@@ -70,37 +71,34 @@ def refitted_errors(trainer: Trainer) -> tuple[StateProbe, dict[str, dict[str, f
 def measure(trainer: Trainer, log: Path) -> tuple[StateProbe, list[dict[str, Any]]]:
     """The probe refitted on frozen states, and all rows that `results.json` keeps; `log` is the run's metrics.jsonl."""
     probe, refitted = refitted_errors(trainer)
-    rows = [row for split, errors in refitted.items() for row in _error_rows(split, "refit", errors)]
+    values: dict[Measure, float] = {}
+    for split, errors in refitted.items():
+        values |= _errors(split, "refit", errors)
     if trainer.config.method == UNTRAINED:  # its online probe and its action head were never trained
-        return probe, rows
+        return probe, measure_rows(values)
     losses, online = evaluate(trainer)
     averages = _training_averages(log, trainer.config)
-    rows += _error_rows("held_out", "online", online) + _error_rows("training", "online", averages)
+    values |= _errors("held_out", "online", online) | _errors("training", "online", averages)
     if "action_loss" in losses:
-        rows += _loss_rows("training", averages) + _loss_rows("held_out", losses)
-    return probe, rows
+        values |= _losses("training", averages) | _losses("held_out", losses)
+    return probe, measure_rows(values)
 
 
-def _error_rows(split: str, probe: str, errors: dict[str, float]) -> list[dict[str, Any]]:
-    named = [name for name in errors if name.removesuffix("_hidden") in ("state", "position", "velocity")]
-    return [
-        {
-            "measure": f"{name.removesuffix('_hidden')}_error",
-            "split": split,
-            "probe": probe,
-            "rows": "hidden" if name.endswith("_hidden") else "all",
-            "k": 0,
-            "value": errors[name],
-        }
-        for name in named
-    ]
+def _errors(split: str, probe: str, logs: dict[str, float]) -> dict[Measure, float]:
+    """Errors among the numbers that are logged: `state`, `position`, `velocity`, and the same with `_hidden`."""
+    values = {}
+    for name, value in logs.items():
+        component = name.removesuffix("_hidden")
+        if component in COMPONENTS:
+            rows = "hidden" if name.endswith("_hidden") else "all"
+            values[Measure(f"{component}_error", split, probe, rows)] = value
+    return values
 
 
-def _loss_rows(split: str, logs: dict[str, float]) -> list[dict[str, Any]]:
+def _losses(split: str, logs: dict[str, float]) -> dict[Measure, float]:
     """Action losses in nats x 100, as in the paper's table: k = 0 stands for the mean over all pairs."""
     by_k = {0: logs["action_loss"]} | {int(n[6:]): v for n, v in logs.items() if n.startswith("loss_k")}
-    common = {"measure": "action_loss", "split": split, "probe": "", "rows": "all"}
-    return [common | {"k": k, "value": 100 * value} for k, value in by_k.items()]
+    return {Measure("action_loss", split, "", k=k): 100 * value for k, value in by_k.items()}
 
 
 def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]:

@@ -1,4 +1,4 @@
-"""What a representation says of the true state: an MLP trained beside it without gradients into it, or refitted after.
+"""State probes: an MLP estimates the true state from a representation, trained beside it or refitted on it frozen.
 
 States are the standardised position and velocity, (x, y, vx, vy). Errors are mean absolute errors in percent of a
 standard deviation, so predicting the mean gives some 80 to 100.
@@ -86,7 +86,7 @@ class ErrorSums:
         self._counts += weights.sum(1).double().cpu()
 
     def state(self) -> list[Tensor]:
-        """What `restore` takes."""
+        """The sums and counts, for `restore`."""
         return [self._sums, self._counts]
 
     def restore(self, state: list[Tensor]) -> None:

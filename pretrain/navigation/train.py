@@ -15,10 +15,10 @@ from pretrain.navigation.trainer import STAGE, Trainer, make_objective
 from pretrain.train import DECIDE_MEMORY, require_batch
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.navigation.methods import UNTRAINED
-from vd4rl_pomdp.nn.folder import EncoderCard, save_encoder
+from vd4rl_pomdp.nn.encoder_folder import EncoderCard, save_encoder
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.folder import jsonable, write_json
+from vd4rl_pomdp.runs.files import jsonable, write_json
 from vd4rl_pomdp.runs.memory import telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder

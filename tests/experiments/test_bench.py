@@ -2,7 +2,7 @@ import pytest
 
 from vd4rl_pomdp.experiments.bench import data, training
 from vd4rl_pomdp.experiments.bench.suite import GOALS
-from vd4rl_pomdp.runs.folder import flatten
+from vd4rl_pomdp.runs.files import flatten
 
 
 def test_a_set_smaller_than_the_usual_one_can_be_measured(tmp_path, monkeypatch):

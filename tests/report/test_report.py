@@ -19,7 +19,7 @@ from vd4rl_pomdp.report import stats, write_report
 from vd4rl_pomdp.report.gaps import find_gaps
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.tables import label
-from vd4rl_pomdp.runs.folder import read_json, write_json
+from vd4rl_pomdp.runs.files import read_json, write_json
 
 
 def write_run(
@@ -291,7 +291,7 @@ def test_missing_cells_and_seeds_are_shown_as_missing(tmp_path):
     with (tmp_path / "out" / "runs.csv").open() as file:
         states = {(r["quality"], r["method"], r["seed"]): r["state"] for r in csv.DictReader(file)}
     assert len(states) == 8
-    assert {place for place, state in states.items() if state == "missing"} == {
+    assert {setting for setting, state in states.items() if state == "missing"} == {
         ("expert", "mik+a", "2"),
         ("medium", "mik+a", "0"),
     }

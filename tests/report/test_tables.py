@@ -35,8 +35,8 @@ def rows() -> list[dict[str, Any]]:
     ]
 
 
-def of(table: list[dict[str, Any]], **place: Any) -> list[dict[str, Any]]:
-    return [row for row in table if all(row[name] == value for name, value in place.items())]
+def of(table: list[dict[str, Any]], **names: Any) -> list[dict[str, Any]]:
+    return [row for row in table if all(row[name] == value for name, value in names.items())]
 
 
 def test_a_summary_is_of_the_last_evaluation_and_names_the_best_beside_it():

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.runs import checkpoint, folder
+from vd4rl_pomdp.runs import checkpoint, files
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, fitting, pack, unpack
 from vd4rl_pomdp.runs.metrics import MetricsLog
 
@@ -185,7 +185,7 @@ def test_a_disk_that_is_really_full(tmp_path):
             kept.add(2, {"a": b"y" * 60_000}, 0.0)
         assert kept.newest().step == 1
         with pytest.raises(UserError, match="the disk is full"):
-            folder.write_json(disk / "large.json", "z" * 60_000)
+            files.write_json(disk / "large.json", "z" * 60_000)
         assert [path.name for path in disk.iterdir()] == ["run"]
     finally:
         subprocess.run(["umount", disk], check=True)

@@ -16,11 +16,11 @@ from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.format import read_rows
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
-from vd4rl_pomdp.nn.folder import EncoderCard, load_encoder, save_encoder
+from vd4rl_pomdp.nn.encoder_folder import EncoderCard, load_encoder, save_encoder
 from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.runs import ownership
 from vd4rl_pomdp.runs import run as module
-from vd4rl_pomdp.runs.folder import read_json, write_csv, write_json
+from vd4rl_pomdp.runs.files import read_json, write_csv, write_json
 from vd4rl_pomdp.runs.run import RunFolder
 
 

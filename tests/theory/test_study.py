@@ -28,7 +28,7 @@ def shown(tmp_path_factory):
     return json.loads(text.getvalue()), out
 
 
-def cell(study, world, method):
+def row_of(study, world, method):
     return next(row for row in study["tables"][world] if row["method"] == method)
 
 
@@ -45,8 +45,8 @@ def test_the_computed_table(shown):
     assert complete["echo"] == ["fj", "fj+a", "fj+a literal"]
     assert "mik+a" in complete["momentum"]
     assert not {"ah", "ah+a"} & set(complete["momentum"])
-    assert cell(study, "momentum", "mik+a")["discards"]
-    assert not cell(study, "counterexample", "fj")["discards"]
+    assert row_of(study, "momentum", "mik+a")["discards"]
+    assert not row_of(study, "counterexample", "fj")["discards"]
 
 
 def test_the_papers_equations_where_their_assumptions_hold(shown):
@@ -69,7 +69,7 @@ def test_disagreements_name_only_printed_claims_that_fail(shown):
         if title:
             column = next(c for c, t in table.TITLES.items() if t == title[1])
             assert table.printed(row["method"])[column]
-            assert not cell(study, row["world"], row["method"])[column]
+            assert not row_of(study, row["world"], row["method"])[column]
     assert any(row["assumptions_hold"] and row["method"] == "fj+a" for row in study["disagreements"])
     assert not [r for r in study["disagreements"] if r["world"] == "momentum" and r["method"] == "mik+a"]
 
@@ -158,8 +158,8 @@ def test_the_documentation_shows_the_computed_numbers(shown):
     study, _ = shown
     text = (Path(__file__).parents[2] / "docs" / "theory.md").read_text()
     for row in table_rows(study):
-        cells = [f"{printed} / {' '.join(computed)}" for printed, *computed in row["cells"].values()]
-        assert f"| `{row['method']}` | {' | '.join(cells)} |" in text
+        entries = [f"{printed} / {' '.join(computed)}" for printed, *computed in row["entries"].values()]
+        assert f"| `{row['method']}` | {' | '.join(entries)} |" in text
     held = sum(row["assumptions_hold"] for row in study["disagreements"])
     assert f"All {len(study['disagreements'])} disagreements, {held} of them where the assumptions hold" in text
     code = re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]

@@ -28,10 +28,10 @@ def _train(words: Arguments, program: str) -> None:
 
 
 def _policy(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.navigation.policy import MazePolicyConfig, train_policy
+    from vd4rl_pomdp.navigation.first_person import FirstPersonConfig, train_first_person
 
-    config = parse(MazePolicyConfig, words, program)
-    card = train_policy(config).card
+    config = parse(FirstPersonConfig, words, program)
+    card = train_first_person(config).card
     print(f"{config.out}: {card['goals_in_20_episodes']} goals in 20 episodes")
 
 

@@ -16,7 +16,7 @@ import tyro
 from vd4rl_pomdp.cli.dispatch import Arguments
 from vd4rl_pomdp.errors import UserError, flag_of
 from vd4rl_pomdp.options import StageConfig, option_names
-from vd4rl_pomdp.runs.folder import flatten
+from vd4rl_pomdp.runs.files import flatten
 
 _LONGEST_LIST = 6
 _FLAT = (tyro.conf.OmitArgPrefixes,)

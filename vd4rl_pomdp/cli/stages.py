@@ -116,7 +116,7 @@ def _sweep(words: Arguments, program: str) -> None:
 
 
 def _check(runs: list[list[Arguments]]) -> None:
-    """Find what a stage will refuse before the first run, not after the hours that the runs before it take."""
+    """Raise UserError for settings that a stage would refuse, before the first run and not hours later."""
     from finetune.train import end_to_end
     from pretrain.objectives import METHODS
     from pretrain.train import check

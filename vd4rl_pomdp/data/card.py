@@ -17,7 +17,7 @@ from vd4rl_pomdp.data.episodes import join_shards
 from vd4rl_pomdp.data.format import RECORD, read_attributes, read_rows, read_some_frames, shard_paths
 from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.errors import UserError, disk_error
-from vd4rl_pomdp.runs.folder import read_json
+from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.tasks import SCORE_DIVISOR
 from vd4rl_pomdp.text import code, markdown, plain, write_text
 from vd4rl_pomdp.types import StepType

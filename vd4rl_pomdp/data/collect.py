@@ -16,7 +16,7 @@ import numpy as np
 from vd4rl_pomdp.data.shards import Shard, claim_set, collect_shards
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
-from vd4rl_pomdp.runs.folder import jsonable
+from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import owned

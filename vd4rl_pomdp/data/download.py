@@ -19,7 +19,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from urllib3.exceptions import NewConnectionError
 
 from vd4rl_pomdp.errors import UserError, disk_error
-from vd4rl_pomdp.runs.folder import replacing_file
+from vd4rl_pomdp.runs.files import replacing_file
 from vd4rl_pomdp.runs.outputs import refuse_kept
 from vd4rl_pomdp.tasks import QUALITIES, get_task
 

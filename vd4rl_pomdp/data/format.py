@@ -22,7 +22,7 @@ import h5py
 import numpy as np
 
 from vd4rl_pomdp.errors import UserError, disk_error
-from vd4rl_pomdp.runs.folder import write_bytes
+from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.reading import parse_json, regular
 from vd4rl_pomdp.tasks import FRAME_SIZE
 from vd4rl_pomdp.types import StepType

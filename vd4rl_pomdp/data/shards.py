@@ -12,7 +12,7 @@ import numpy as np
 
 from vd4rl_pomdp.data.format import PLAN, RECORD, write_shard
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.runs.folder import holds_anything, read_json, write_json
+from vd4rl_pomdp.runs.files import holds_anything, read_json, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
 from vd4rl_pomdp.runs.workers import count_workers, run_jobs

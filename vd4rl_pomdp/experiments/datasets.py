@@ -14,14 +14,13 @@ import time
 from collections.abc import Sequence
 from itertools import product
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, replay_returns
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.policies.actor import ships
-from vd4rl_pomdp.runs.folder import read_json, write_csv, write_json
+from vd4rl_pomdp.runs.files import Row, read_json, write_csv, write_json
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 from vd4rl_pomdp.runs.reading import regular
@@ -29,7 +28,7 @@ from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, MOST_EPISODES, SET_QUALITIES,
 
 EPISODES = 200
 CORES = 2
-Row = dict[str, Any]
+
 RETURNS = ("task", "quality", "episode", "return")
 COSTS = ("task", "episodes", "rows", "cpu_seconds", "commit")
 _WORDS = ("task", "quality", "commit")
@@ -37,7 +36,7 @@ SETS = ("task", "quality", "episodes", "mean", "min", "max", "seconds_100k")
 
 
 def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_episodes: int, workers: int) -> list[Row]:
-    """Play and time the sets that are not in the table yet, or not by the actors that ship now, and write it anew.
+    """Play and time the sets that the table lacks, or has of other actors than those that ship now; write it again.
 
     Args:
         out: folder of `returns.csv` (one row an episode), `actors.json` (hashes of the actors behind each set),
@@ -84,6 +83,7 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
 
 
 def _check(tasks: Sequence[str], qualities: Sequence[str], timed_episodes: int) -> None:
+    """Raise UserError for an unknown task or quality, or for no episode to time."""
     unknown = sorted(set(qualities) - set(SET_QUALITIES))
     if unknown:
         raise UserError(f"unknown quality {unknown[0]!r}: choose from {', '.join(SET_QUALITIES)}")

@@ -16,9 +16,9 @@ import numpy as np
 
 from vd4rl_pomdp.data.shards import Shard, claim_set, collect_shards
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
-from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, get_maze
+from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, check_maze, get_maze
 from vd4rl_pomdp.navigation.config import CollectConfig
-from vd4rl_pomdp.runs.folder import jsonable
+from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import owned
@@ -59,12 +59,12 @@ def collect(config: CollectConfig) -> list[Path]:
 
 def drive(maze: str, rows: int, action_repeat: int = 5, noise: float = 0.5, seed: int = 0) -> dict[str, np.ndarray]:
     """Rows of one trajectory, by key, without writing anything."""
-    get_maze(maze)
+    check_maze(maze)
     return _roll_out(_Job(maze, 0, seed, rows, action_repeat, noise))
 
 
 def _check(config: CollectConfig) -> None:
-    get_maze(config.maze)
+    check_maze(config.maze)
     refuse_outside(
         config, trajectories=(1, MOST_EPISODES), trajectory_rows=2, action_repeat=(1, MOST_STEPS), noise=0,
         seed=(0, MAX_SEED), trajectories_per_shard=1, workers=0,
@@ -87,12 +87,12 @@ def _job(config: CollectConfig, trajectory: int) -> _Job:
 
 def _roll_out(job: _Job) -> dict[str, np.ndarray]:
     """Rows of one trajectory, by key."""
-    env, policy = _environment(job.maze, job.action_repeat)
+    env, act = _environment(job.maze, job.action_repeat)
     rng = np.random.default_rng([job.seed, job.trajectory])
     frame, info = env.reset(seed=episode_seed(job.seed, job.trajectory))
     rows: list[tuple[Any, ...]] = [(frame, np.zeros(2, np.float32), 0.0, info["state"])]
     while len(rows) < job.rows:
-        action = policy(info["state"], info["goal"]) + rng.normal(0, job.noise, 2)
+        action = act(info["state"], info["goal"]) + rng.normal(0, job.noise, 2)
         action = np.clip(action, -1, 1).astype(np.float32)
         frame, reward, _, _, info = env.step(action)
         rows.append((frame, action, reward, info["state"]))
@@ -113,15 +113,15 @@ _ENVIRONMENTS: dict[tuple[str, int], Any] = {}
 
 
 def _environment(maze: str, action_repeat: int) -> tuple[Any, Callable[[np.ndarray, np.ndarray], np.ndarray]]:
-    """The process's environment and policy for these arguments: one GL context serves all its trajectories."""
+    """The process's environment and controller for these arguments: one GL context serves all its trajectories."""
     from vd4rl_pomdp.envs.maze import MazeEnv
+    from vd4rl_pomdp.navigation.first_person import FirstPersonController
     from vd4rl_pomdp.navigation.planner import Planner
-    from vd4rl_pomdp.navigation.policy import FirstPersonPilot
 
     if (maze, action_repeat) not in _ENVIRONMENTS:
         env = MazeEnv(maze, action_repeat)
-        pilot = FirstPersonPilot(env) if env.maze_spec.first_person else Planner(env)
-        _ENVIRONMENTS[maze, action_repeat] = env, pilot.act
+        controller = FirstPersonController(env) if env.maze_spec.first_person else Planner(env)
+        _ENVIRONMENTS[maze, action_repeat] = env, controller.act
     return _ENVIRONMENTS[maze, action_repeat]
 
 

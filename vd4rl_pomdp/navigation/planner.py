@@ -11,6 +11,7 @@ from vd4rl_pomdp.envs.maze import MazeEnv
 POSITION_GAIN, VELOCITY_GAIN = 3.0, 0.6
 """Action for each unit of distance to the waypoint, and against each unit/s of velocity."""
 Cell = tuple[int, int]
+"""Row and column of a square of the maze's grid."""
 
 
 class Planner:
@@ -26,14 +27,14 @@ class Planner:
         """Action (2,) float64 for a (4,) state and a (2,) goal."""
         return POSITION_GAIN * (self.waypoint(state[:2], goal) - state[:2]) - VELOCITY_GAIN * state[2:]
 
-    def waypoint(self, place: np.ndarray, goal: np.ndarray) -> np.ndarray:
-        """Where to go straight from a (2,) place: to the goal if it is at most one cell away, else to the next cell."""
-        following, there = self._next[self._cell(goal)][self._cell(place)], self._cell(goal)
+    def waypoint(self, position: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """The point to head for from a (2,) position: the goal if it is at most one cell away, else the next cell."""
+        following, there = self._next[self._cell(goal)][self._cell(position)], self._cell(goal)
         return goal if following == there else self._maze.cell_rowcol_to_xy(np.array(following))
 
-    def distance(self, place: np.ndarray, goal: np.ndarray) -> float:
-        """Length of the way from a (2,) place to a goal over the waypoints."""
-        length, here = 0.0, place
+    def distance(self, position: np.ndarray, goal: np.ndarray) -> float:
+        """Length of the path over the waypoints from a (2,) position to a goal."""
+        length, here = 0.0, position
         while True:
             target = self.waypoint(here, goal)
             length += float(np.linalg.norm(target - here))
@@ -41,8 +42,8 @@ class Planner:
                 return length
             here = target
 
-    def _cell(self, place: np.ndarray) -> Cell:
-        row, column = self._maze.cell_xy_to_rowcol(place)
+    def _cell(self, position: np.ndarray) -> Cell:
+        row, column = self._maze.cell_xy_to_rowcol(position)
         return int(row), int(column)
 
     def _free_cells(self) -> list[Cell]:

@@ -11,7 +11,7 @@ from torch import Tensor, nn
 
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.nn.heads import mlp
-from vd4rl_pomdp.runs.folder import read_json, write_bytes, write_json
+from vd4rl_pomdp.runs.files import read_json, write_bytes, write_json
 from vd4rl_pomdp.runs.reading import read_tensors
 
 

@@ -20,7 +20,7 @@ from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
 from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.runs.folder import write_bytes
+from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 from vd4rl_pomdp.tasks import TASKS, Task, get_task
 
@@ -74,7 +74,7 @@ class Actor:
         return np.clip(scaled, -OBSERVATION_CLIP, OBSERVATION_CLIP)
 
     def _features(self, x: np.ndarray) -> np.ndarray:
-        """What the mean and the standard deviation are read from."""
+        """Inputs of the two last layers, for the mean and for the standard deviation."""
         if "embed.weight" not in self.weights:
             for layer in range(self._count("hidden.{}.weight")):
                 x = np.maximum(self._linear(f"hidden.{layer}", x), 0.0)
@@ -129,7 +129,7 @@ class Ladder:
         return [Actor({name: value[i] for name, value in stacked.items()}, self.card) for i in range(count)]
 
     def actor_at(self, progress: float) -> Actor | None:
-        """Who acted at a moment of the run up to the last rung.
+        """The actor at a moment of the training run, which ends at the last rung.
 
         Args:
             progress: moment as a share of the run, in [0, 1].
@@ -156,11 +156,16 @@ def _save(weights: dict[str, np.ndarray], card: dict[str, Any], path: Path) -> N
 def read_actor(path: Path, task: Task | None = None) -> Actor:
     """Read an actor file; raises UserError if it is missing, damaged, or made for another task than `task`.
 
-    A whole file is not enough: its weights must be finite and act on a state of the task.
+    Its weights must be finite and give an action for a state of the task.
     """
     actor = Actor(*_read(path, task))
-    _try(path, actor, task)
+    _check_weights(path, actor, task)
     return actor
+
+
+def check_actor(path: Path, task: Task | None = None) -> None:
+    """Raise UserError unless a file is an actor that `read_actor` can read."""
+    read_actor(path, task)
 
 
 def read_ladder(path: Path, task: Task | None = None) -> Ladder:
@@ -170,7 +175,7 @@ def read_ladder(path: Path, task: Task | None = None) -> Ladder:
     if not isinstance(steps, list) or any(len(value) != len(steps) for value in ladder.weights.values()):
         raise UserError(f"{path}: holds no ladder of actors; {_REMEDY}")
     for rung in ladder.rungs:
-        _try(path, rung, task)
+        _check_weights(path, rung, task)
     return ladder
 
 
@@ -189,8 +194,8 @@ def _read(path: Path, task: Task | None) -> tuple[dict[str, np.ndarray], dict[st
     return weights, card, sha256
 
 
-def _try(path: Path, actor: Actor, task: Task | None) -> None:
-    """Refuse weights that are not finite, or that make no action out of a state of their task (a maze's has none)."""
+def _check_weights(path: Path, actor: Actor, task: Task | None) -> None:
+    """Raise UserError unless the weights are finite and give an action for a state of the task; mazes are no tasks."""
     task = task or TASKS.get(actor.card.get("task", ""))
     if task is None:
         return

@@ -19,7 +19,7 @@ from vd4rl_pomdp.policies.actor import OBSERVATION_CLIP, Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
 from vd4rl_pomdp.policies.state_env import StateEnv
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, fitting
-from vd4rl_pomdp.runs.folder import write_bytes
+from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.reading import read_bytes
 from vd4rl_pomdp.tasks import Task
 

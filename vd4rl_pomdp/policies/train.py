@@ -33,7 +33,7 @@ from vd4rl_pomdp.policies.export import (
 )
 from vd4rl_pomdp.runs import FORMAT, interrupt
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
-from vd4rl_pomdp.runs.folder import holds_anything, jsonable, read_json, write_csv, write_json
+from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_csv, write_json
 from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import Owner, owned
@@ -60,9 +60,10 @@ def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None]
     refuse_inside(config.out)
     _check(config)
     with owned(config.out) as owner:
-        settings = _check(config)  # another process may have begun it since
+        _check_folder(config)  # another process may have begun it since
         model = learner.build(config, task)
-        write_json(config.out / "config.json", settings)
+        if not (config.out / "config.json").exists():
+            write_json(config.out / "config.json", _settings(config))
         _learn(model, config, owner, on_progress)
         return export_run(config.out, config.out)
 
@@ -104,8 +105,8 @@ def decisions_made(run: Path) -> int:
     return max(Checkpoints(run).steps(), default=0)
 
 
-def _check(config: PolicyConfig) -> dict[str, Any]:
-    """Settings to keep in config.json; raises UserError if the folder holds others (a run's length may change)."""
+def _check(config: PolicyConfig) -> None:
+    """Raise UserError for settings out of range, or that need too much memory, and for a folder of another run."""
     refuse_outside(
         config, seed=(0, MAX_SEED), decisions=1, learning_rate=0, hidden=1, n_step=(1, EPISODE_TRANSITIONS),
         envs=(1, MOST_ENVS), updates_per_decision=0, batch_size=1, temperature=0, temperature_rate=0,
@@ -115,9 +116,18 @@ def _check(config: PolicyConfig) -> dict[str, Any]:
     state = get_task(config.task).state_dim  # of float32 numbers, as the weights are
     require_memory(8 * state * config.replay_size, CPU, config, "replay_size")
     require_memory(4 * (15 * config.hidden**2 + config.batch_size * config.hidden), CPU, config, "hidden", "batch_size")
-    settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in ("out", "decisions", "stop_at")}
-    settings |= {"format": FORMAT}
-    path = config.out / "config.json"
+    _check_folder(config)
+
+
+def _settings(config: PolicyConfig) -> dict[str, Any]:
+    """What config.json keeps: all settings but the folder and the run's length, which may change."""
+    kept = {k: v for k, v in jsonable(asdict(config)).items() if k not in ("out", "decisions", "stop_at")}
+    return kept | {"format": FORMAT}
+
+
+def _check_folder(config: PolicyConfig) -> None:
+    """Raise UserError for a folder that holds a run with other settings, or something else."""
+    settings, path = _settings(config), config.out / "config.json"
     if path.exists():
         stored = read_json(path)
         if stored.get("format", 1) != FORMAT:
@@ -128,15 +138,15 @@ def _check(config: PolicyConfig) -> dict[str, Any]:
         differing = [k for k in settings if stored.get(k) != settings[k]]
         if differing:
             raise UserError(f"{config.out}: holds a run with another {', '.join(differing)}; choose another --out")
-        return stored
+        return
     if holds_anything(config.out):
         raise UserError(f"{config.out}: is not empty and holds no policy run; choose another --out")
     if config.start_from is not None:
         _check_start(config, config.start_from)
-    return settings
 
 
 def _check_start(config: PolicyConfig, start: Path) -> None:
+    """Raise UserError unless a folder holds a policy run of the task, with a curve that can be read."""
     missing = [name for name in PROGRESS if not (start / name).exists()]
     if missing:
         raise UserError(f"{start}: has no {' and no '.join(missing)}; --start-from takes the folder of a policy run")

@@ -1,85 +1,87 @@
-"""What a report has no final score for: every method, setting and seed that other runs of it have."""
+"""What a report has no final score for, although other runs suggest one: the gaps in methods, settings and seeds."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from itertools import groupby
-from typing import Any
 
-from vd4rl_pomdp.report.load import LABELS, Run
+from vd4rl_pomdp.report.load import LABELS, LoadedRun
+from vd4rl_pomdp.runs.files import Row
 
-Row = dict[str, Any]
-Place = tuple[str, str, str]
-"""Task, quality, corruption."""
+Setting = tuple[str, str, str]
+"""Task, quality and corruption: what methods are compared in."""
 MISSING = "missing"
-CELL = ("task", "quality", "corruption", "algorithm", "method", "variant")
+CONDITION = ("task", "quality", "corruption", "algorithm", "method", "variant")
+"""What all seeds of an experiment share: the columns that tell it from others."""
 
 
-def find_gaps(runs: list[Run]) -> list[Row]:
-    """One row for each run that is not there or not finished: CELL, seed and `state`.
+def find_gaps(runs: list[LoadedRun]) -> list[Row]:
+    """One row for each run that is missing or unfinished: CONDITION, seed and `state`.
 
-    A setting is to have every method, with every variant of it, and each of these every seed that it has of any.
+    Expected in a setting are all methods of the report with all their variants, each with every seed that any other
+    run has in that setting.
     """
     grid = [run for run in runs if run.stage == "finetune" and run.labels["task"]]
     rows = []
-    for place in dict.fromkeys(map(_place, grid)):
-        here = [run for run in grid if _place(run) == place]
-        for algorithm, method, variant in _expected(grid, place):
+    for setting in dict.fromkeys(map(_setting, grid)):
+        here = [run for run in grid if _setting(run) == setting]
+        for algorithm, method, variant in _expected(grid, setting):
             mine = {
                 run.labels["seed"]: run
                 for run in here
                 if (run.labels["algorithm"], run.labels["method"], run.variant) == (algorithm, method, variant)
             }
-            cell = dict(zip(CELL, (*place, algorithm, method, variant), strict=True))
+            condition = dict(zip(CONDITION, (*setting, algorithm, method, variant), strict=True))
             for seed in sorted({run.labels["seed"] for run in here}):
                 if seed not in mine or not (mine[seed].finished and mine[seed].rows):
-                    rows.append(cell | {"seed": seed, "state": _state(mine.get(seed))})
+                    rows.append(condition | {"seed": seed, "state": _state(mine.get(seed))})
     return rows
 
 
-def _place(run: Run) -> Place:
+def _setting(run: LoadedRun) -> Setting:
     task, quality, corruption = (run.labels[name] for name in LABELS[:3])
     return task, quality, corruption
 
 
-def _state(run: Run | None) -> str:
+def _state(run: LoadedRun | None) -> str:
     return MISSING if run is None or run.finished else run.progress
 
 
-def _expected(grid: list[Run], place: Place) -> Iterator[tuple[str, str, str]]:
-    """Algorithm, method and variant of every run that a setting is to have.
+def _expected(grid: list[LoadedRun], setting: Setting) -> Iterator[tuple[str, str, str]]:
+    """Algorithm, method and variant of every run that is expected in a setting.
 
-    What differs between fields of a corruption is asked for wherever that corruption is, other data nowhere else.
+    Variants by fields of a corruption are expected in all settings with that corruption, variants by data only where
+    they are found.
     """
     for algorithm, method in dict.fromkeys(map(_method, grid)):
         mine = [run for run in grid if _method(run) == (algorithm, method)]
-        for shared in _shared(mine, place):
-            alike = [run for run in mine if run.parts[0] == shared and run.labels["corruption"] == place[2]]
+        for shared in _shared(mine, setting):
+            alike = [run for run in mine if run.parts[0] == shared and run.labels["corruption"] == setting[2]]
             for fields in {run.parts[1]: None for run in alike} or [""]:
-                here = [run for run in alike if run.parts[1] == fields and _place(run) == place]
+                here = [run for run in alike if run.parts[1] == fields and _setting(run) == setting]
                 for data in {run.parts[2]: None for run in here} or [""]:
                     yield algorithm, method, ", ".join(filter(None, (shared, fields, data)))
 
 
-def _shared(mine: list[Run], place: Place) -> Iterable[str]:
-    """Variants of a method that a setting is to have: those of every setting that has one in common with it.
+def _shared(mine: list[LoadedRun], setting: Setting) -> Iterable[str]:
+    """Variants of a method that are expected in a setting: those of all settings that share a variant with it.
 
-    Settings of which each has its own, such as a budget for every task, ask for nothing of one another.
+    Where each setting has variants of its own, such as a budget for every task, nothing is missing.
     """
-    by_place: dict[Place, dict[str, None]] = {}
+    by_setting: dict[Setting, dict[str, None]] = {}
     for run in mine:
-        by_place.setdefault(_place(run), {})[run.parts[0]] = None
-    own = by_place.get(place)
-    wanted = [there for there in by_place.values() if own is None or own.keys() & there.keys()]
+        by_setting.setdefault(_setting(run), {})[run.parts[0]] = None
+    own = by_setting.get(setting)
+    wanted = [there for there in by_setting.values() if own is None or own.keys() & there.keys()]
     return {variant: None for there in wanted for variant in there}
 
 
-def _method(run: Run) -> tuple[str, str]:
+def _method(run: LoadedRun) -> tuple[str, str]:
     return run.labels["algorithm"], run.labels["method"]
 
 
 def in_words(gaps: list[Row]) -> str:
-    """Gaps of one cell: "seeds 1, 2 missing; seed 3 unfinished at 20 of 40 updates"."""
+    """Gaps of one condition: "seeds 1, 2 missing; seed 3 unfinished at 20 of 40 updates"."""
     sentences = []
     for state, members in groupby(sorted(gaps, key=lambda row: row["state"]), lambda row: row["state"]):
         seeds = [str(row["seed"]) for row in members]
@@ -87,6 +89,6 @@ def in_words(gaps: list[Row]) -> str:
     return "; ".join(sentences)
 
 
-def cell(row: Row) -> tuple[str, ...]:
-    """The cell that a row of a table or of `find_gaps` is about."""
-    return tuple(str(row[name]) for name in CELL)
+def condition_of(row: Row) -> tuple[str, ...]:
+    """The condition that a row of a table or of `find_gaps` is about."""
+    return tuple(str(row[name]) for name in CONDITION)

@@ -13,43 +13,43 @@ import numpy as np
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import read_rows
 from vd4rl_pomdp.report.variants import Parts, Settings, differences, read_settings
-from vd4rl_pomdp.runs.folder import read_json
+from vd4rl_pomdp.runs.files import Row, read_json
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.reading import regular
 
 LABELS = ("task", "quality", "corruption", "algorithm", "method", "seed")
-"""What names a run's rows."""
+"""Columns that a run's files name it by."""
 IDENTITY = ("task", "quality", "corruption", "algorithm", "method", "variant", "seed")
-"""What tells a run's rows from all others of a report."""
+"""Columns that tell a run's rows from all others of a report: LABELS, and its variant."""
 FILM = {"clean": 4, "corrupted": 4, "return": 1}
 """Arrays of a film and their axes."""
 
 
 @dataclass(frozen=True)
-class Run:
-    """One run's files, in memory."""
+class LoadedRun:
+    """A run of pretraining or fine-tuning, finished or not, as its folder tells it."""
 
     path: Path
     stage: str
     record: dict[str, Any]
     """config.json: stage, config, versions, git_commit, command, inputs."""
     labels: dict[str, Any]
-    """Values of LABELS; the task is empty while a run has not told it."""
+    """Values of LABELS; the task is empty until the run has opened its data."""
     settings: Settings
-    """All that could make it differ from other runs of its method, in words."""
-    rows: list[dict[str, Any]]
+    """All settings in which runs of its method may differ, in words."""
+    rows: list[Row]
     """Evaluation rows, numbers parsed, with the run's `variant`."""
     metrics: list[dict[str, float]]
     seconds: float | None
     """Wall-clock time; None while the run is unfinished."""
     representation: dict[str, float | None]
-    """What is known of its encoder: action_loss, probe_pose, probe_velocity, pretrain_seconds."""
+    """Measures of its encoder: action_loss, probe_pose, probe_velocity, pretrain_seconds."""
     parts: Parts = ("", "", "")
-    """What of its settings differs from other runs of its method, by the runs it is compared with."""
+    """Its settings that differ from those of other runs of its method, by the runs it is compared with."""
 
     @property
     def variant(self) -> str:
-        """What of its settings differs from other runs of its method: "max_k 1", or nothing."""
+        """Its settings that differ from those of other runs of its method: "max_k 1"; empty if none does."""
         return ", ".join(filter(None, self.parts))
 
     @property
@@ -73,7 +73,7 @@ class Run:
         return f"unfinished at {done} of {self.record['config'].get(unit, '?')} {unit}"
 
     def film(self) -> dict[str, np.ndarray] | None:
-        """Pictures of an evaluation episode, if the run kept them."""
+        """Pictures of an evaluation episode, if the run kept them; raises UserError for a damaged file."""
         path = self.path / "film.npz"
         if not path.exists():
             return None
@@ -89,8 +89,12 @@ class Run:
             raise UserError(f"{path}: cannot be read ({error}); remove it, and the report goes without") from error
 
 
-def load_runs(paths: list[Path]) -> list[Run]:
-    """Every run at or below the paths; none, or two with the same identity, raises UserError."""
+def load_runs(paths: list[Path]) -> list[LoadedRun]:
+    """Every run at or below the paths.
+
+    Raises:
+        UserError: there is no run, two have the same identity, or a file of one is damaged.
+    """
     if not paths:
         raise UserError("name at least one run folder, or a folder that contains some")
     folders: list[Path] = []
@@ -103,30 +107,35 @@ def load_runs(paths: list[Path]) -> list[Run]:
         raise UserError(f"{paths[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl)")
     named = [_with_parts(run, parts) for run, parts in zip(runs, compare(runs), strict=True)]
     _refuse_twins(named)
-    for run in named:
-        run.film()  # a damaged one is told before anything is written
+    _check_films(named)
     return named
 
 
-def compare(runs: list[Run], brief: bool = True) -> list[Parts]:
-    """What tells each run from others of its stage, method and algorithm."""
+def _check_films(runs: list[LoadedRun]) -> None:
+    """Raise UserError for a damaged film, before anything is written."""
+    for run in runs:
+        run.film()
+
+
+def compare(runs: list[LoadedRun], brief: bool = True) -> list[Parts]:
+    """The settings in which each run differs from others of its stage, method and algorithm."""
     parts: dict[Path, Parts] = {}
     for members in _groups(runs, lambda run: (run.stage, run.labels["method"], run.labels["algorithm"])):
         corruption = [str(run.labels["corruption"]) for run in members]
-        place = [tuple(run.labels[name] for name in ("task", "quality", "corruption")) for run in members]
-        words = differences([run.settings for run in members], corruption, place, brief)
+        setting = [tuple(run.labels[name] for name in ("task", "quality", "corruption")) for run in members]
+        words = differences([run.settings for run in members], corruption, setting, brief)
         parts |= dict(zip((run.path for run in members), words, strict=True))
     return [parts[run.path] for run in runs]
 
 
-def _groups(runs: Iterable[Run], key: Callable[[Run], Any]) -> list[list[Run]]:
-    groups: dict[Any, list[Run]] = {}
+def _groups(runs: Iterable[LoadedRun], key: Callable[[LoadedRun], Any]) -> list[list[LoadedRun]]:
+    groups: dict[Any, list[LoadedRun]] = {}
     for run in runs:
         groups.setdefault(key(run), []).append(run)
     return list(groups.values())
 
 
-def _with_parts(run: Run, parts: Parts) -> Run:
+def _with_parts(run: LoadedRun, parts: Parts) -> LoadedRun:
     named = replace(run, parts=parts)
     return replace(named, rows=[row | {"variant": named.variant} for row in run.rows])
 
@@ -135,8 +144,8 @@ def _is_run(config: Path) -> bool:
     return "stage" in read_json(config)
 
 
-def _read(folder: Path) -> Run:
-    """`_load`, with a sentence for files of a run that are JSON but not what a run writes."""
+def _read(folder: Path) -> LoadedRun:
+    """Load a run; raises UserError for files that are valid JSON, but not what a run writes."""
     try:
         return _load(folder)
     except UserError:
@@ -145,7 +154,7 @@ def _read(folder: Path) -> Run:
         raise UserError(f"{folder}: its files are damaged ({error}); take another copy, or leave it out") from error
 
 
-def _load(folder: Path) -> Run:
+def _load(folder: Path) -> LoadedRun:
     record = read_json(folder / "config.json")
     if not isinstance(record["config"], dict) or "seed" not in record["config"]:
         raise TypeError("config.json holds no settings")
@@ -154,7 +163,7 @@ def _load(folder: Path) -> Run:
     rows = read_rows(folder / "episodes.csv")
     card = _card(folder)
     timing = folder / "timing.json"
-    return Run(
+    return LoadedRun(
         path=folder,
         stage=record["stage"],
         record=record,
@@ -168,7 +177,7 @@ def _load(folder: Path) -> Run:
 
 
 def _card(folder: Path) -> dict[str, Any]:
-    """What a run's encoder says of its pretraining; nothing where there is none yet."""
+    """What a run's encoder says of its pretraining; empty where there is none yet."""
     path = folder / "encoder" / "config.json"
     card = read_json(path).get("pretrain") if path.exists() else {}
     if not isinstance(card, dict):
@@ -176,8 +185,8 @@ def _card(folder: Path) -> dict[str, Any]:
     return card
 
 
-def _labels(folder: Path, record: dict[str, Any], rows: list[dict[str, Any]], card: dict[str, Any]) -> dict[str, Any]:
-    """A run's names: from its rows, from its labels.json, or as far as its config tells."""
+def _labels(folder: Path, record: dict[str, Any], rows: list[Row], card: dict[str, Any]) -> dict[str, Any]:
+    """A run's labels: from its rows, from its labels.json, or else as many as its config tells."""
     path = folder / "labels.json"
     if rows or path.exists():
         known = rows[0] if rows else read_json(path)
@@ -207,7 +216,8 @@ def _number(value: Any) -> float | None:
     return value
 
 
-def _refuse_twins(runs: list[Run]) -> None:
+def _refuse_twins(runs: list[LoadedRun]) -> None:
+    """Raise UserError for two evaluated runs with the same identity."""
     seen: dict[tuple[str, ...], Path] = {}
     for run in runs:
         if not run.rows:

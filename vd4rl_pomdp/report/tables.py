@@ -3,16 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
 
 import numpy as np
 
 from vd4rl_pomdp.report import stats
-from vd4rl_pomdp.report.gaps import CELL, cell, in_words
-from vd4rl_pomdp.report.load import IDENTITY, Run
+from vd4rl_pomdp.report.gaps import CONDITION, condition_of, in_words
+from vd4rl_pomdp.report.load import IDENTITY, LoadedRun
+from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.tasks import SCORE_DIVISOR
 
-Row = dict[str, Any]
 SERIES = ("corruption", "algorithm", "method", "variant")
 REFERENCES = ("random", "bc", "drq_bc", "state")
 """Methods that are references: last in a table."""
@@ -26,10 +25,10 @@ def label(row: Row) -> str:
     return ", ".join(filter(None, (row["method"], "" if own else row["algorithm"], row["variant"])))
 
 
-def representations(runs: list[Run], gaps: list[Row]) -> list[Row]:
-    """One row for every evaluated run: what its encoder knows, what its policy reached, what both cost.
+def representations(runs: list[LoadedRun], gaps: list[Row]) -> list[Row]:
+    """One row for every evaluated run: its encoder's measures, its policy's score, and what both cost.
 
-    Runs that are missing or unfinished have their state, and no numbers.
+    Rows of missing or unfinished runs have a state but no numbers.
     """
     table = []
     for run in runs:
@@ -46,17 +45,17 @@ def representations(runs: list[Run], gaps: list[Row]) -> list[Row]:
 def improvement(rows: list[Row]) -> list[Row]:
     """Probability that a run of one method beats one of another on the same task, averaged over common tasks."""
     table = []
-    for setting, members in _grouped(rows, ("corruption",)):
+    for (corruption, *_), members in _grouped(rows, ("corruption",)):
         final: dict[str, dict[tuple, np.ndarray]] = {}
-        for (task, quality, *_), group in _grouped(members, CELL):
+        for (task, quality, *_), group in _grouped(members, CONDITION):
             final.setdefault(label(group[0]), {})[task, quality] = _final_scores(group)
         for name, scores in final.items():
             for other, others in final.items():
                 common = [task for task in scores if task in others]
                 if name != other and common:
                     chances = [stats.probability_of_improvement(scores[t], others[t]) for t in common]
-                    place = {"corruption": setting[0], "method": name, "other": other}
-                    table.append(place | {"probability": float(np.mean(chances)), "tasks": len(common)})
+                    names = {"corruption": corruption, "method": name, "other": other}
+                    table.append(names | {"probability": float(np.mean(chances)), "tasks": len(common)})
     return table
 
 
@@ -66,28 +65,28 @@ def profiles(rows: list[Row], thresholds: np.ndarray) -> list[Row]:
     for (corruption, *_), members in _grouped(rows, SERIES):
         strata = _strata(members)
         share = stats.performance_profile(np.concatenate(strata), thresholds)
-        place = {"corruption": corruption, "method": label(members[0])}
-        table += [place | {"threshold": float(t), "share": float(v)} for t, v in zip(thresholds, share, strict=True)]
+        names = {"corruption": corruption, "method": label(members[0])}
+        table += [names | {"threshold": float(t), "share": float(v)} for t, v in zip(thresholds, share, strict=True)]
     return table
 
 
 def summary(rows: list[Row], gaps: list[Row]) -> list[Row]:
-    """Final score of every cell: mean over seeds, 95% interval, n seeds, n episodes, best evaluation's mean.
+    """Final score of every condition: mean over seeds, 95% interval, n seeds, n episodes, best evaluation's mean.
 
-    `missing` tells which of its seeds are not there or not finished; a cell without any has no numbers.
+    `missing` names its seeds that are missing or unfinished; a condition without any finished seed has no numbers.
     """
     absent: dict[tuple[str, ...], list[Row]] = {}
     for gap in gaps:
-        absent.setdefault(cell(gap), []).append(gap)
+        absent.setdefault(condition_of(gap), []).append(gap)
     table = []
-    for group, members in _grouped(rows, CELL):
+    for group, members in _grouped(rows, CONDITION):
         curve = _by_step(members)
         final = max(curve)
         scores = _per_seed(curve[final])
         interval = stats.bootstrap_interval([scores], stats.mean, np.random.default_rng(0))
         best = max(curve, key=lambda step: _per_seed(curve[step]).mean())
         table.append(
-            dict(zip(CELL, group, strict=True))
+            dict(zip(CONDITION, group, strict=True))
             | {"step": final, "score": float(scores.mean())}
             | {"low": interval[0] if interval else None, "high": interval[1] if interval else None}
             | {"seeds": len(scores), "episodes": len(curve[final]), "few_seeds": len(scores) < stats.FEW_SEEDS}
@@ -96,7 +95,7 @@ def summary(rows: list[Row], gaps: list[Row]) -> list[Row]:
         )
     nothing = dict.fromkeys(_MEASURED) | {"seeds": 0, "episodes": 0}
     table += [
-        dict(zip(CELL, group, strict=True)) | nothing | {"missing": in_words(members)}
+        dict(zip(CONDITION, group, strict=True)) | nothing | {"missing": in_words(members)}
         for group, members in absent.items()
     ]
     return sorted(table, key=_table_order)
@@ -105,11 +104,11 @@ def summary(rows: list[Row], gaps: list[Row]) -> list[Row]:
 def curves(rows: list[Row]) -> list[Row]:
     """Mean over seeds, and their range, at every evaluation."""
     table = []
-    for group, members in _grouped(rows, CELL):
+    for group, members in _grouped(rows, CONDITION):
         for step, at_step in sorted(_by_step(members).items()):
             scores = _per_seed(at_step)
             table.append(
-                dict(zip(CELL, group, strict=True))
+                dict(zip(CONDITION, group, strict=True))
                 | {"step": step, "score": float(scores.mean())}
                 | {"low": float(scores.min()), "high": float(scores.max()), "seeds": len(scores)}
             )
@@ -117,13 +116,13 @@ def curves(rows: list[Row]) -> list[Row]:
 
 
 def aggregate(rows: list[Row], gaps: list[Row]) -> list[Row]:
-    """IQM and optimality gap over tasks and qualities for every method and setting, with stratified intervals.
+    """IQM and optimality gap over tasks and qualities for every method and corruption, with stratified intervals.
 
-    `of_tasks` is how many tasks and qualities there are under the corruption: with fewer, the row is another average.
-    A method without any has no numbers.
+    `of_tasks` is the number of tasks and qualities under the corruption: a row with fewer `tasks` cannot be compared
+    with the others. A method that has not been run has no numbers.
     """
     everything = _grouped([*rows, *gaps], ("corruption",))
-    places = {key[0]: len(_grouped(members, ("task", "quality"))) for key, members in everything}
+    of_tasks = {key[0]: len(_grouped(members, ("task", "quality"))) for key, members in everything}
     table, absent = [], dict.fromkeys(tuple(gap[name] for name in SERIES) for gap in gaps)
     for group, members in _grouped(rows, SERIES):
         absent.pop(group, None)
@@ -134,11 +133,11 @@ def aggregate(rows: list[Row], gaps: list[Row]) -> list[Row]:
             dict(zip(SERIES, group, strict=True))
             | {"iqm": float(stats.iqm(scores)), "optimality_gap": float(stats.optimality_gap(scores))}
             | {"low": interval[0] if interval else None, "high": interval[1] if interval else None}
-            | {"tasks": len(strata), "of_tasks": places[group[0]], "seeds": min(map(len, strata))}
+            | {"tasks": len(strata), "of_tasks": of_tasks[group[0]], "seeds": min(map(len, strata))}
         )
     nothing = dict.fromkeys(("iqm", "optimality_gap", "low", "high"))
     table += [
-        dict(zip(SERIES, group, strict=True)) | nothing | {"tasks": 0, "of_tasks": places[group[0]], "seeds": 0}
+        dict(zip(SERIES, group, strict=True)) | nothing | {"tasks": 0, "of_tasks": of_tasks[group[0]], "seeds": 0}
         for group in absent
     ]
     return sorted(table, key=_table_order)
@@ -152,10 +151,10 @@ _MEASURED = ("step", "score", "low", "high", "seeds", "episodes", "few_seeds", "
 
 
 def _table_order(row: Row) -> tuple:
-    """By place, references last, the highest first, and what is missing after what is there."""
-    place = tuple(row.get(name, "") for name in ("task", "quality", "corruption"))
+    """By setting, references last, the highest score first, and rows without a score at the end."""
+    setting = tuple(row.get(name, "") for name in ("task", "quality", "corruption"))
     score = row["iqm"] if "iqm" in row else row.get("score")
-    return *place, row["method"] in REFERENCES, np.inf if score is None else -float(score)
+    return *setting, row["method"] in REFERENCES, np.inf if score is None else -float(score)
 
 
 def _grouped(rows: list[Row], names: Iterable[str]) -> list[tuple[tuple, list[Row]]]:

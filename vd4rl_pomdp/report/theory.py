@@ -17,16 +17,17 @@ from rich.table import Table
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.report.figures import COLOURS, to_svg
 from vd4rl_pomdp.report.templates import render
-from vd4rl_pomdp.runs.folder import read_json, write_json
+from vd4rl_pomdp.runs.files import Row, read_json, write_json
 from vd4rl_pomdp.text import write_text
 
-Row = dict[str, Any]
+Study = dict[str, Any]
+"""What `theory.study.theory_study` returns."""
 FILE = "theory.json"
 COLUMNS = {"correct": "correct classifier", "complete": "complete state", "discards": "discards noise"}
 LABEL: dict[str, Any] = {"fontsize": 7, "ha": "center", "va": "center", "zorder": 3}
 
 
-def write_theory(study: Row, out: Path) -> Path:
+def write_theory(study: Study, out: Path) -> Path:
     """Write the study as a page and as JSON into a folder that exists; returns the page."""
     write_json(out / FILE, study)
     write_text(out / "index.html", render("theory.html", theory=section(study)))
@@ -50,7 +51,7 @@ def load_section(paths: list[Path]) -> str | None:
     return None
 
 
-def section(study: Row) -> str:
+def section(study: Study) -> str:
     """The section about a study, in HTML."""
     shown = {
         "study": study,
@@ -63,17 +64,17 @@ def section(study: Row) -> str:
     return render("theory_section.html", theory=shown)
 
 
-def table_rows(study: Row) -> list[Row]:
-    """Table 1 by method: for each column what is printed, then each world's entry.
+def table_rows(study: Study) -> list[Row]:
+    """Table 1 by method: for each column the printed entry, then each world's.
 
-    Entries are bracketed where the method's assumptions fail, so that the paper claims none.
+    Entries are bracketed where the method's assumptions fail, so that the paper claims nothing.
     """
     rows = []
-    for entries in zip(*study["tables"].values(), strict=True):
-        method = entries[0]["method"]
+    for worlds in zip(*study["tables"].values(), strict=True):
+        method = worlds[0]["method"]
         printed = study["printed"][method.removesuffix(" literal")]
-        cells = {column: [_mark(printed[column]), *(_entry(row, column) for row in entries)] for column in COLUMNS}
-        rows.append({"method": method, "cells": cells})
+        entries = {column: [_mark(printed[column]), *(_entry(row, column) for row in worlds)] for column in COLUMNS}
+        rows.append({"method": method, "entries": entries})
     return rows
 
 
@@ -86,7 +87,7 @@ def _mark(value: bool) -> str:
     return "yes" if value else "no"
 
 
-def print_theory(study: Row, console: Console | None = None) -> None:
+def print_theory(study: Study, console: Console | None = None) -> None:
     """The study's main tables on the terminal."""
     console = console or Console()
     appendix = study["counterexample"]["appendix"]
@@ -104,18 +105,18 @@ def print_theory(study: Row, console: Console | None = None) -> None:
         console.print(text, markup=False, highlight=False)
 
 
-def _terminal_table(study: Row) -> Table:
+def _terminal_table(study: Study) -> Table:
     worlds = ", ".join(study["tables"])
     title = f"Table 1: printed | computed on {worlds}; ( ) where a method's assumptions fail"
     table = Table(title=title, box=None, padding=(0, 2, 0, 0), title_justify="left")
     for title in ("method", *COLUMNS.values()):
         table.add_column(title, no_wrap=True)
     for row in table_rows(study):
-        table.add_row(row["method"], *(f"{printed} | {' '.join(found)}" for printed, *found in row["cells"].values()))
+        table.add_row(row["method"], *(f"{printed} | {' '.join(found)}" for printed, *found in row["entries"].values()))
     return table
 
 
-def diagram_figure(study: Row) -> Figure:
+def diagram_figure(study: Study) -> Figure:
     """The counterexample, one panel an objective: one colour for states that a coarsest partition merges.
 
     Arrows are transitions, labelled by their action.
@@ -126,11 +127,11 @@ def diagram_figure(study: Row) -> Figure:
     return figure
 
 
-def _draw(axes: Axes, diagram: Row, states: list, transitions: list) -> None:
-    places = [_place(x, b) for x, b in states]
+def _draw(axes: Axes, diagram: dict[str, Any], states: list, transitions: list) -> None:
+    positions = [_position(x, b) for x, b in states]
     for start, action, end in transitions:
-        _arrow(axes, places[start], places[end], action)
-    for (x, y), state, group in zip(places, states, diagram["classes"], strict=True):
+        _arrow(axes, positions[start], positions[end], action)
+    for (x, y), state, group in zip(positions, states, diagram["classes"], strict=True):
         axes.scatter([x], [y], s=480, color=COLOURS[group % len(COLOURS)], zorder=2)
         axes.text(x, y, f"{state[0]},{state[1]:+d}", color="white", ha="center", va="center", fontsize=8, zorder=3)
     axes.set_title(_title(diagram), fontsize=10)
@@ -138,11 +139,11 @@ def _draw(axes: Axes, diagram: Row, states: list, transitions: list) -> None:
     axes.axis("off")
 
 
-def _title(diagram: Row) -> str:
+def _title(diagram: dict[str, Any]) -> str:
     return f"{diagram['title']}\n{diagram['blocks']} codes; classes of states: {len(set(diagram['classes']))}"
 
 
-def _place(position: int, last: int) -> tuple[float, float]:
+def _position(position: int, last: int) -> tuple[float, float]:
     """States that +1 leads to sit on the outer ring, clockwise by s^A, the others within, beside their successors.
 
     (x, +1) leads to (x-1, -1) and back, so these two share an angle and no two arrows cross.
@@ -162,7 +163,7 @@ def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], act
     axes.text((x0 + x1) / 2 + out * dy, (y0 + y1) / 2 - out * dx, f"{action:+d}", color=colour, **LABEL)
 
 
-def forced_figure(study: Row) -> Figure:
+def forced_figure(study: Study) -> Figure:
     """For every two states, the share of pairs of their histories that the objective must tell apart."""
     names = [f"{x},{b:+d}" for x, b in study["states"]]
     figure = Figure(figsize=(9.6, 6.4), layout="constrained")

@@ -1,4 +1,4 @@
-"""What tells runs of one method apart: the settings that differ among them, in words beside the method's name.
+"""Variants of a method: the settings that differ among its runs, in words that stand beside the method's name.
 
 Runs are seeds of one experiment only if they agree in everything but seed, folders, device and logging. A fine-tuning
 run has its own config, its encoder's, and the data of both.
@@ -15,15 +15,15 @@ from vd4rl_pomdp.runs.settings import settings_of
 Settings = dict[str, str]
 """Values as words, by the name that is shown beside them."""
 Parts = tuple[str, str, str]
-"""What differs among all runs of a method, among those of one corruption, and among those of one set and corruption."""
+"""What differs among all runs of a method, among those of one corruption, and among those of one setting."""
 
 UNKNOWN = "pretraining"
-"""Stands in the settings of a run whose encoder does not say how it was pretrained."""
+"""Key in the settings of a run whose encoder does not say how it was pretrained."""
 _NOT_RECORDED = "not recorded"
 _PRESETS = ("preset", "pretraining preset")
 _DATA = ("data", "pretraining data")
 _LABELS = ("method", "task", "quality")
-"""Fields that name a run's rows; they are no settings."""
+"""Fields that are a run's labels, not its settings."""
 
 
 def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Settings:
@@ -57,14 +57,16 @@ def _words(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def differences(settings: list[Settings], corruption: list[str], place: list[tuple], brief: bool = True) -> list[Parts]:
+def differences(
+    settings: list[Settings], corruption: list[str], setting: list[tuple], brief: bool = True
+) -> list[Parts]:
     """Words for what differs among runs of one method, run by run.
 
     Args:
         settings: of the runs.
         corruption: the name of each run's corruption: other fields of it are told apart within one name.
-        place: where each run stands (task, quality, corruption): sets are told apart within one place.
-        brief: whether a preset stands for all the settings that it decides.
+        setting: task, quality and corruption of each run: data are told apart within one setting.
+        brief: whether a preset is named in place of the settings that it decides.
     """
     of_corruption = corruption_settings()
     columns = (
@@ -72,7 +74,7 @@ def differences(settings: list[Settings], corruption: list[str], place: list[tup
             settings, [None] * len(settings), lambda name: name not in of_corruption and name not in _DATA, brief
         ),
         _by_scope(settings, corruption, of_corruption.__contains__, brief),
-        _by_scope(settings, place, _DATA.__contains__, brief),
+        _by_scope(settings, setting, _DATA.__contains__, brief),
     )
     return list(zip(*columns, strict=True))
 

@@ -5,7 +5,6 @@ from __future__ import annotations
 import base64
 import json
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from rich.console import Console
@@ -17,15 +16,14 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import COLUMNS
 from vd4rl_pomdp.report import figures, tables
 from vd4rl_pomdp.report.gaps import MISSING, find_gaps
-from vd4rl_pomdp.report.load import Run, compare, load_runs
+from vd4rl_pomdp.report.load import LoadedRun, compare, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.report.theory import load_section
-from vd4rl_pomdp.runs.folder import write_csv
+from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.text import write_text
 
-Row = dict[str, Any]
 _MARK = "summary"
 """The table that is always there: its file tells a report's folder."""
 
@@ -86,12 +84,12 @@ def _terminal_table(setting: str, rows: list[Row]) -> Table:
     for row in rows:
         interval = f"{row['low']:.1f} - {row['high']:.1f}" if row["low"] is not None else "-"
         score = f"{row['score']:.1f}" if row["score"] is not None else MISSING
-        cells = (tables.label(row), score, interval, str(row["seeds"]), str(row["episodes"]))
-        table.add_row(*map(Text, (*cells, row["missing"]) if gaps else cells))
+        texts = (tables.label(row), score, interval, str(row["seeds"]), str(row["episodes"]))
+        table.add_row(*map(Text, (*texts, row["missing"]) if gaps else texts))
     return table
 
 
-def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]], theory: str | None) -> str:
+def _render(runs: list[LoadedRun], rows: list[Row], made: dict[str, list[Row]], theory: str | None) -> str:
     names = list(dict.fromkeys(map(tables.label, (*made[_MARK], *rows))))
     pretraining: dict[str, list[tuple[str, list[dict[str, float]]]]] = {}
     for run in runs:
@@ -127,7 +125,7 @@ def _render(runs: list[Run], rows: list[Row], made: dict[str, list[Row]], theory
     )
 
 
-def _has_losses(run: Run) -> bool:
+def _has_losses(run: LoadedRun) -> bool:
     return any("action_loss" in row for row in run.metrics)
 
 
@@ -155,7 +153,7 @@ def _partial(aggregate: list[Row], corruption: str) -> dict[str, str]:
     return {tables.label(row): f"{row['tasks']} of {row['of_tasks']} tasks" for row in mine}
 
 
-def _differing(runs: list[Run]) -> list[tuple[str, str]]:
+def _differing(runs: list[LoadedRun]) -> list[tuple[str, str]]:
     """Each method of which there are several variants, and all settings that differ, those of a preset included."""
     told = zip(runs, compare(runs, brief=False), strict=True)
     named = {
@@ -166,7 +164,7 @@ def _differing(runs: list[Run]) -> list[tuple[str, str]]:
     return list(named.items())
 
 
-def _row(run: Run) -> Row:
+def _row(run: LoadedRun) -> Row:
     return run.labels | {"variant": run.variant}
 
 
@@ -181,13 +179,13 @@ def _by_setting(rows: list[Row]) -> list[tuple[str, list[Row]]]:
     return list(groups.items())
 
 
-def _title(run: Run) -> str:
+def _title(run: LoadedRun) -> str:
     return f"{run.stage} {tables.label(_row(run))}, {_setting(run.labels)}, seed {run.labels['seed']}"
 
 
-def _films(runs: list[Run]) -> list[Row]:
+def _films(runs: list[LoadedRun]) -> list[Row]:
     """The film of the first seed of every method and setting."""
-    chosen: dict[tuple[str, ...], Run] = {}
+    chosen: dict[tuple[str, ...], LoadedRun] = {}
     for run in runs:
         if run.rows and (run.path / "film.npz").exists():
             chosen.setdefault(run.identity[:-1], run)
@@ -213,7 +211,7 @@ def _published(rows: list[Row]) -> list[dict[str, str]]:
     return [row for row in published_scores() if (row["env"], row["dataset"]) in wanted]
 
 
-def _facts(run: Run) -> dict[str, str]:
+def _facts(run: LoadedRun) -> dict[str, str]:
     return {
         "title": _title(run),
         "commit": run.record.get("git_commit", ""),

@@ -1,4 +1,4 @@
 """Run folders, checkpoints, metrics, progress and provenance."""
 
 FORMAT = 3
-"""Version of what run folders and checkpoints hold and of the random streams behind it: a run goes on under its own."""
+"""Version of the content of run folders and checkpoints and of the random streams; only runs of this one can go on."""

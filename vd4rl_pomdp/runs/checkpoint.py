@@ -4,8 +4,8 @@
                             state.json     nested state, whose tensors are in
                             state.safetensors
 
-A checkpoint is written under a hidden name, flushed to the disk, and renamed when it is whole. At whatever moment that
-is cut, the newest whole one is found again.
+A checkpoint is written under a hidden name, flushed to the disk, and renamed when it is whole: a process that is
+killed at any moment leaves the newest whole one as it was.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ from torch import Tensor
 
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.runs import FORMAT
-from vd4rl_pomdp.runs.folder import synchronise
+from vd4rl_pomdp.runs.files import synchronise
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 
 KEPT = 2
@@ -39,7 +39,7 @@ _TENSOR = "__tensor__"
 
 
 class _DamagedError(Exception):
-    """A checkpoint is not what was written."""
+    """A checkpoint's files are missing or differ from what was written."""
 
 
 @dataclass(frozen=True)
@@ -81,7 +81,7 @@ class Checkpoints:
             self.prune(KEPT)
 
     def newest(self) -> Checkpoint | None:
-        """The newest whole checkpoint, None for a run that has none; damaged ones go, at a line of warning each.
+        """The newest whole checkpoint, None for a run without any; damaged newer ones are removed with a warning each.
 
         Raises:
             UserError: there are some, but none is whole, or they are of another format, or not readable.
@@ -105,7 +105,7 @@ class Checkpoints:
         return None
 
     def prune(self, kept: int) -> None:
-        """Drop all but the newest ones, and what cut writes left."""
+        """Drop all but the newest `kept` checkpoints, and the remains of interrupted writes."""
         with disk_errors(self._folder):
             left = [path for path in self._folder.glob(".*.tmp")]
             for path in [*left, *(self._folder / str(step) for step in self.steps()[kept:])]:
@@ -153,7 +153,7 @@ def unpack(files: dict[str, bytes]) -> State:
 
 @contextmanager
 def fitting(checkpoint: Checkpoint) -> Iterator[None]:
-    """Whatever it leads to that a checkpoint is of another run becomes a sentence."""
+    """Turn the errors that a checkpoint of another run leads to within the block into one sentence."""
     try:
         yield
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:

@@ -15,7 +15,7 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.runs.folder import appending, write_bytes
+from vd4rl_pomdp.runs.files import appending, write_bytes
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 
 WandbMode = Literal["off", "offline", "online"]

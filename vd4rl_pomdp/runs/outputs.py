@@ -1,6 +1,6 @@
-"""Where a command may write: never over what another command keeps, nor inside it.
+"""Where a command may write: neither over another command's files nor into their folder.
 
-A run, a policy, an encoder and a data set own their folders. Every command asks here before its first file.
+A folder belongs to the run, policy, encoder or data set in it. Every command checks its --out here first.
 """
 
 from __future__ import annotations
@@ -82,7 +82,7 @@ def _is_shard(path: Path) -> bool:
 
 
 def _names(folder: Path) -> list[str]:
-    """Names in a folder, hidden ones left out; none where nothing can be listed: writing there says what is wrong."""
+    """Names in a folder, without hidden ones; empty if it cannot be listed, which writing there then reports."""
     try:
         return [path.name for path in folder.iterdir() if not path.name.startswith(".")]
     except OSError:

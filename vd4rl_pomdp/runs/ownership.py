@@ -22,7 +22,7 @@ from typing import Any
 from filelock import SoftFileLease, Timeout
 
 from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.runs.folder import write_json
+from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.runs.interrupt import handled
 
 LEASE_S = 60.0

@@ -1,4 +1,4 @@
-"""Read files that may be anything: what a damaged one leads to is an error that can be told, never a hang."""
+"""Read files that may hold anything: a damaged one ends in an error with a message, and no file makes a reader hang."""
 
 from __future__ import annotations
 
@@ -23,9 +23,9 @@ def regular(path: Path) -> Path:
 
 
 def read_bytes(path: Path) -> bytes:
-    """A file's content. A missing one raises FileNotFoundError, one that the system withholds UserError.
+    """A file's content; raises FileNotFoundError for a missing file, UserError for one that cannot be read.
 
-    Whoever reads on can then take every other trouble for damage.
+    An error while its content is parsed then means that the file is damaged.
     """
     try:
         return regular(path).read_bytes()
@@ -38,7 +38,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def parse_json(text: str | bytes) -> Any:
-    """`json.loads` whose every failure is a ValueError."""
+    """`json.loads`, with a ValueError for every failure."""
     try:
         return json.loads(text)
     except RecursionError as error:

@@ -18,7 +18,7 @@ from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.registry import origins
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, State, fitting, pack, unpack
-from vd4rl_pomdp.runs.folder import holds_anything, jsonable, read_json, write_json
+from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_json
 from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.runs.provenance import command, git_commit, machine, versions
 from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS
@@ -34,7 +34,7 @@ class RunFolder:
             path: the folder.
             stage: the stage's name.
             config: the stage's settings, a dataclass.
-            inputs: what the run reads, by name: the data's fingerprint, the encoder's hash.
+            inputs: hashes of what the run reads, by name: the data's fingerprint, the encoder's hash.
 
         Raises:
             UserError: the folder holds something else, or a run with other settings, inputs or of another format.
@@ -50,7 +50,7 @@ class RunFolder:
         self._check()
 
     def _check(self) -> None:
-        """Refuse what is not this run."""
+        """Raise UserError if the folder holds anything but this run."""
         file = self.path / "config.json"
         stored = read_json(file) if file.exists() else {}
         if "stage" not in stored:
@@ -71,6 +71,7 @@ class RunFolder:
         self._check_inputs(inputs)
 
     def _check_inputs(self, old: dict[str, str]) -> None:
+        """Raise UserError if data or encoder are others than those the run began with."""
         for name, now in self.inputs.items():
             if old.get(name) != now:
                 raise UserError(

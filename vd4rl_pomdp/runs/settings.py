@@ -1,4 +1,4 @@
-"""Which settings of a run can change its result: all but its seed, its folders, its device and its logging.
+"""The settings of a run: its config without seed, folders, device and logging.
 
 Runs are seeds of one experiment only if these agree.
 """
@@ -9,12 +9,12 @@ from collections.abc import Mapping
 from typing import Any
 
 RUNTIME_FIELDS = frozenset({"out", "device", "workers", "wandb", "data", "encoder"})
-"""Config fields that do not change a result, so that a run may go on with other ones; of data and encoder, which may be
-moved, the content is compared."""
+"""Config fields that do not change a result, so that a run may go on with other values; data and encoder may be moved,
+and are compared by content."""
 NO_SETTINGS = RUNTIME_FIELDS | {"seed", "log_every", "checkpoint_every"}
 """Config fields in which the seeds of one experiment may differ."""
 
 
 def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
-    """A stage's config, as JSON keeps it, without the fields that do not change a result."""
+    """A stage's config, as JSON keeps it, without NO_SETTINGS: the same for all seeds of an experiment."""
     return {name: value for name, value in config.items() if name not in NO_SETTINGS}

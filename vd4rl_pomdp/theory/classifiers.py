@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 from vd4rl_pomdp.theory.law import joint_law
-from vd4rl_pomdp.theory.views import View
+from vd4rl_pomdp.theory.views import ObjectiveView
 from vd4rl_pomdp.theory.world import World
 
 
@@ -42,12 +42,12 @@ class Comparison:
     """H(a_t | s_t, s_{t+k}), in nats."""
 
 
-def first_row(view: View, memory: Memory) -> int:
+def first_row(view: ObjectiveView, memory: Memory) -> int:
     """The t of a pair that has a whole past window: literal windows reach one action further back."""
     return memory.m + (1 if view.literal and not view.masked else 0)
 
 
-def compare(world: World, view: View, memory: Memory, k: int) -> Comparison:
+def compare(world: World, view: ObjectiveView, memory: Memory, k: int) -> Comparison:
     """Compare one objective's classifier at one k with those of the states, on every sequence of the world."""
     t = first_row(view, memory)
     rows = t + k + memory.n + 1

@@ -12,7 +12,7 @@ from typing import Any
 
 from vd4rl_pomdp.theory.decodability import future_memory, past_memory
 from vd4rl_pomdp.theory.gallery import counterexample
-from vd4rl_pomdp.theory.world import Action, State, World, diameter, period
+from vd4rl_pomdp.theory.world import Action, AgentState, World, diameter, period
 
 MAX_K = 10
 CLAIMED_EXAMPLES = 16368
@@ -21,7 +21,7 @@ CLAIMED_DIAMETER = 3
 CLAIMED_M = 3
 
 
-def inverse_examples(world: World, k: int) -> list[tuple[State, tuple[Action, ...], State]]:
+def inverse_examples(world: World, k: int) -> list[tuple[AgentState, tuple[Action, ...], AgentState]]:
     """Every (s_t, (a_t..a_{t+k-1}), s_{t+k})."""
     found = []
     for start in world.states:
@@ -33,9 +33,9 @@ def inverse_examples(world: World, k: int) -> list[tuple[State, tuple[Action, ..
     return found
 
 
-def first_actions(world: World, k: int) -> dict[tuple[State, State], Counter]:
+def first_actions(world: World, k: int) -> dict[tuple[AgentState, AgentState], Counter]:
     """How often each action comes first, for every pair of states that k actions connect."""
-    counts: dict[tuple[State, State], Counter] = {}
+    counts: dict[tuple[AgentState, AgentState], Counter] = {}
     for start, actions, end in inverse_examples(world, k):
         counts.setdefault((start, end), Counter())[actions[0]] += 1
     return counts

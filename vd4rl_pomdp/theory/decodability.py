@@ -9,9 +9,9 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from itertools import product
 
-from vd4rl_pomdp.theory.world import Pair, World
+from vd4rl_pomdp.theory.world import JointState, World
 
-Couple = tuple[Pair, Pair]
+Couple = tuple[JointState, JointState]
 
 
 def past_memory(world: World, actions: bool) -> int | None:

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from fractions import Fraction
 
-from vd4rl_pomdp.theory.world import Exogenous, Row, State, World, finite_world, with_noise, with_policy
+from vd4rl_pomdp.theory.world import AgentState, Distribution, Exogenous, World, finite_world, with_noise, with_policy
 
 BLANK = "blank"
 """Observation that shows nothing."""
 HALF = Fraction(1, 2)
-NOISE: dict[Exogenous, Row] = {"dark": {"dark": HALF, "light": HALF}, "light": {"light": Fraction(1)}}
+NOISE: dict[Exogenous, Distribution] = {"dark": {"dark": HALF, "light": HALF}, "light": {"light": Fraction(1)}}
 """A lamp, shown beside the observation, that goes on at a random time."""
 
 
@@ -72,7 +72,7 @@ def biased(world: World) -> World:
     """The world under a policy that depends on the state: state i takes action i (mod their number) more often."""
     count = len(world.actions)
 
-    def policy(state: State) -> dict:
+    def policy(state: AgentState) -> dict:
         liked = world.states.index(state) % count
         return {a: Fraction(2 if i == liked else 1, count + 1) for i, a in enumerate(world.actions)}
 

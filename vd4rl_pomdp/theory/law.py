@@ -42,13 +42,13 @@ class Law:
 
     def values(self, group: Iterable[Variable], rows: np.ndarray) -> list[tuple]:
         """Joint values of a group of variables, by row and in the order of `KINDS`, at some of the N rows."""
-        chosen = sorted(group, key=_place)
+        chosen = sorted(group, key=_order)
         columns = [[self.names[kind][c] for c in self.column((kind, j))[rows]] for kind, j in chosen]
         return list(zip(*columns, strict=True)) if columns else [()] * len(rows)
 
     def numbered(self, group: Iterable[Variable]) -> tuple[np.ndarray, np.ndarray]:
         """The number of the joint value of a group at each row, (N,) int64, and the first row that has each."""
-        return number_rows([self.column(v) for v in sorted(group, key=_place)])
+        return number_rows([self.column(v) for v in sorted(group, key=_order)])
 
     def given(self, group: Iterable[Variable], action: Variable) -> Conditional:
         """The conditional law of an action given a group of variables."""
@@ -112,12 +112,12 @@ class Conditional:
 
 def joint_law(world: World, variables: Iterable[Variable]) -> Law:
     """Exact joint law of some variables of a sequence that starts in the world's initial law."""
-    wanted = sorted(set(variables), key=_place)
+    wanted = sorted(set(variables), key=_order)
     rows = 1 + max(row for _, row in wanted)
     walk = _Walk(world, rows)
     for row in range(rows):
         kinds = {kind for kind, j in wanted if j == row}
-        walk.observe(kinds)
+        walk.keep(kinds)
         if row < rows - 1 or "a" in kinds:
             walk.act("a" in kinds)
     walk.forget_pair()
@@ -166,7 +166,7 @@ class _Walk:
         self.s, self.xi = np.divmod(initial.entries[0], self.noises)
         self.columns: list[np.ndarray] = []
 
-    def observe(self, kinds: set[str]) -> None:
+    def keep(self, kinds: set[str]) -> None:
         """Keep what is wanted of a row's s, xi and o."""
         self.columns += [self.s] * ("s" in kinds) + [self.xi] * ("xi" in kinds)
         if "o" in kinds:
@@ -219,6 +219,6 @@ def number_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return ids, first
 
 
-def _place(variable: Variable) -> tuple[int, int]:
+def _order(variable: Variable) -> tuple[int, int]:
     kind, row = variable
     return row, KINDS.index(kind)

@@ -21,19 +21,20 @@ DIAGRAMS = (
 
 def theory_study() -> dict[str, Any]:
     """Compute the counterexample's numbers, Table 1, the equations, all disagreements and the merged states."""
-    places = {name: table.setting(name) for name in WORLDS}
-    rows = [row for place in places.values() for row in table.comparisons(place)]
-    needs = [row for place in places.values() for row in table.representations(place)]
+    cases = {name: table.make_case(name) for name in WORLDS}
+    rows = [row for case in cases.values() for row in table.comparisons(case)]
+    needs = [row for case in cases.values() for row in table.representations(case)]
     tables = {
-        name: [table.cells(_of(rows, name), _of(needs, name), method) for method in table.METHODS] for name in places
+        name: [table.method_row(_of(rows, name), _of(needs, name), method) for method in table.METHODS]
+        for name in cases
     }
-    equations = table.check_equations(rows, {name: place.memory for name, place in places.items()})
-    world = places["counterexample"].worlds[False, False]
+    equations = table.compare_equations(rows, {name: case.memory for name, case in cases.items()})
+    world = cases["counterexample"].worlds[False, False]
     appendix, main_text = counterexample.study((-1, 1)), counterexample.study((0, 1))
     return {
         "counterexample": {"appendix": appendix, "main_text": main_text},
         "counterexample_differences": counterexample.differences(appendix, main_text),
-        "worlds": {name: table.describe(place) for name, place in places.items()},
+        "worlds": {name: table.describe(case) for name, case in cases.items()},
         "printed": table.PRINTED,
         "tables": tables,
         "equations": equations,
@@ -42,7 +43,7 @@ def theory_study() -> dict[str, Any]:
         "representations": needs,
         "states": [list(s) for s in world.states],  # type: ignore[call-overload]
         "transitions": [[world.states.index(s), a, world.states.index(end)] for (s, a), end in world.step.items()],
-        "diagrams": diagrams(places["counterexample"]),
+        "diagrams": diagrams(cases["counterexample"]),
     }
 
 
@@ -50,21 +51,21 @@ def _of(rows: list[dict[str, Any]], world: str) -> list[dict[str, Any]]:
     return [row for row in rows if row["world"] == world]
 
 
-def diagrams(place: table.Setting) -> list[dict[str, Any]]:
+def diagrams(case: table.Case) -> list[dict[str, Any]]:
     """For some objectives, the counterexample's states in classes that a coarsest partition cannot tell apart."""
-    world = place.worlds[False, False]
+    world = case.worlds[False, False]
     found = [
-        _diagram(f"{method}, k <= {max_k}", relation(world, VIEWS[method], place.memory, range(1, max_k + 1)))
+        _diagram(f"{method}, k <= {max_k}", relation(world, VIEWS[method], case.memory, range(1, max_k + 1)))
         for method, max_k in DIAGRAMS
     ]
-    states = state_relation(world, range(1, place.max_k + 1))
-    return [*found, _diagram(f"one encoder on true states, k <= {place.max_k}", states)]
+    states = state_relation(world, range(1, case.max_k + 1))
+    return [*found, _diagram(f"one encoder on true states, k <= {case.max_k}", states)]
 
 
 def _diagram(title: str, found: Relation) -> dict[str, Any]:
     blocks = found.coarsest()
-    places = {state: i for i, state in enumerate(found.world.states)}
-    shares = ((sorted(places[s] for s in pair), share) for pair, share in forced_shares(found).items())
+    index = {state: i for i, state in enumerate(found.world.states)}
+    shares = ((sorted(index[s] for s in pair), share) for pair, share in forced_shares(found).items())
     return {
         "title": title,
         "blocks": len(set(blocks.tolist())),

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable
 from dataclasses import asdict, dataclass
-from typing import Any
 
+from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.theory.classifiers import Memory, compare
 from vd4rl_pomdp.theory.decodability import future_memory, past_memory
 from vd4rl_pomdp.theory.gallery import WORLDS, variants
@@ -13,14 +13,15 @@ from vd4rl_pomdp.theory.partition import discards_noise, forced_shares, relation
 from vd4rl_pomdp.theory.views import VIEWS
 from vd4rl_pomdp.theory.world import World, diameter, period
 
-Cells = dict[str, bool]
+Properties = dict[str, bool]
+"""Which of COLUMNS hold for a method."""
 COLUMNS = ("correct", "complete", "discards")
 TITLES = {
     "correct": "correct Bayes-optimal classifier",
     "complete": "complete agent-centric state",
     "discards": "discards exogenous noise",
 }
-PRINTED: dict[str, Cells] = {
+PRINTED: dict[str, Properties] = {
     "ah": {"correct": False, "complete": False, "discards": True},
     "ah+a": {"correct": False, "complete": False, "discards": True},
     "fj": {"correct": True, "complete": False, "discards": True},
@@ -32,13 +33,13 @@ PRINTED: dict[str, Cells] = {
 METHODS = tuple(name for name in VIEWS if name != "no_history")
 
 
-def printed(method: str) -> Cells:
-    """The printed row of a method; a literal reading is judged by the same row."""
+def printed(method: str) -> Properties:
+    """The printed row of a method; a literal reading is compared with the same row."""
     return PRINTED[method.removesuffix(" literal")]
 
 
 @dataclass(frozen=True)
-class Setting:
+class Case:
     """One world with its variants, and the lengths its classifiers are computed with."""
 
     name: str
@@ -50,8 +51,8 @@ class Setting:
     """Largest k: the diameter, or m + 2 if that is more."""
 
 
-def setting(name: str) -> Setting:
-    """Measure one world of the gallery."""
+def make_case(name: str) -> Case:
+    """A world of the gallery as a case: its memory lengths and diameter are computed."""
     world = WORLDS[name]()
     m, reach = past_memory(world, actions=True), diameter(world)
     n = future_memory(world, actions=True)
@@ -59,19 +60,19 @@ def setting(name: str) -> Setting:
     assert m is not None
     assert n is not None
     assert reach is not None
-    return Setting(name, variants(world), Memory(m, n), reach, max(reach, m + 2))
+    return Case(name, variants(world), Memory(m, n), reach, max(reach, m + 2))
 
 
-def describe(place: Setting) -> dict[str, Any]:
+def describe(case: Case) -> Row:
     """A world's sizes, decodability with and without actions, diameter and period."""
-    world = place.worlds[False, False]
+    world = case.worlds[False, False]
     return {
         "states": len(world.states),
         "actions": len(world.actions),
-        "diameter": place.diameter,
+        "diameter": case.diameter,
         "period": period(world),
-        "max_k": place.max_k,
-        "m": place.memory.m,
+        "max_k": case.max_k,
+        "m": case.memory.m,
         "m_without_actions": past_memory(world, actions=False),
         "n": future_memory(world, actions=True),
         "n_literal": future_memory(world, actions=True, literal=True),
@@ -79,35 +80,35 @@ def describe(place: Setting) -> dict[str, Any]:
     }
 
 
-def comparisons(place: Setting) -> list[dict[str, Any]]:
+def comparisons(case: Case) -> list[Row]:
     """One row for every variant, method and k. With noise, k goes to the diameter only: sequences are many more."""
     rows = []
-    for (noise, biased), world in place.worlds.items():
+    for (noise, biased), world in case.worlds.items():
         for method in METHODS:
-            for k in range(1, (place.diameter if noise else place.max_k) + 1):
-                row = compare(world, VIEWS[method], place.memory, k)
-                label = {"world": place.name, "noise": noise, "state_dependent": biased, "method": method}
+            for k in range(1, (case.diameter if noise else case.max_k) + 1):
+                row = compare(world, VIEWS[method], case.memory, k)
+                label = {"world": case.name, "noise": noise, "state_dependent": biased, "method": method}
                 rows.append(label | asdict(row))
     return rows
 
 
-def representations(place: Setting) -> list[dict[str, Any]]:
+def representations(case: Case) -> list[Row]:
     """One row for every policy and method: which pairs of states are forced apart, and whether noise can be dropped.
 
-    For methods that see the whole history k goes to the diameter, for the others to the largest k as well.
+    k goes up to the diameter; methods that do not see the whole history have a second row where `max_k` is more.
     """
     rows = []
     for biased in (False, True):
-        world = place.worlds[False, biased]
+        world = case.worlds[False, biased]
         pairs = len(world.states) * (len(world.states) - 1) // 2
         for method in METHODS:
             whole = VIEWS[method].past == "all"
-            noisy = relation(place.worlds[True, biased], VIEWS[method], place.memory, range(1, place.diameter + 1))
-            for max_k in sorted({place.diameter, place.diameter if whole else place.max_k}):
-                found = relation(world, VIEWS[method], place.memory, range(1, max_k + 1))
+            noisy = relation(case.worlds[True, biased], VIEWS[method], case.memory, range(1, case.diameter + 1))
+            for max_k in sorted({case.diameter, case.diameter if whole else case.max_k}):
+                found = relation(world, VIEWS[method], case.memory, range(1, max_k + 1))
                 shares = forced_shares(found).values()
                 forced = sum(share == 1 for share in shares)
-                label = {"world": place.name, "state_dependent": biased, "method": method, "max_k": max_k}
+                label = {"world": case.name, "state_dependent": biased, "method": method, "max_k": max_k}
                 rows.append(
                     label
                     | {"forced": forced, "sometimes_forced": sum(share > 0 for share in shares), "pairs": pairs}
@@ -117,8 +118,8 @@ def representations(place: Setting) -> list[dict[str, Any]]:
     return rows
 
 
-def cells(rows: list[dict[str, Any]], needs: list[dict[str, Any]], method: str) -> dict[str, Any]:
-    """Table 1's row of one method on one world: true if it holds in every variant and at every k."""
+def method_row(rows: list[Row], needs: list[Row], method: str) -> Row:
+    """Table 1's row of one method on one world: a property is true if it holds in every variant and at every k."""
     mine = [row for row in rows if row["method"] == method]
     kept = [row for row in needs if row["method"] == method]
     largest = max(row["max_k"] for row in kept)
@@ -175,8 +176,8 @@ EQUATIONS = (
 FORMS = {"multi_step": "P(a_t | s_t, s_{t+k})", "one_step": "P(a_t | s_t, s_{t+1})", "certain": "1"}
 
 
-def check_equations(rows: list[dict[str, Any]], memories: dict[str, Memory]) -> list[dict[str, Any]]:
-    """For every equation and world: at which stated k it holds, at which not, and whether its assumptions do."""
+def compare_equations(rows: list[Row], memories: dict[str, Memory]) -> list[Row]:
+    """For every equation and world: at which of its k it holds or fails, and whether its assumptions are met."""
     found = []
     for equation in EQUATIONS:
         for world, memory in memories.items():
@@ -195,17 +196,17 @@ def check_equations(rows: list[dict[str, Any]], memories: dict[str, Memory]) -> 
     return found
 
 
-def disagreements(tables: dict[str, list[dict[str, Any]]], equations: list[dict[str, Any]]) -> list[dict[str, Any]]:
+def disagreements(tables: dict[str, list[Row]], equations: list[Row]) -> list[Row]:
     """Every printed yes and every equation that some world contradicts, and whether the assumptions hold there.
 
-    A printed no says that a property is not guaranteed, which a world that has it does not contradict.
+    A printed no says that a property is not guaranteed, so a world that has the property does not contradict it.
     """
     found = []
     for world, table in tables.items():
         for row in table:
             for column in COLUMNS:
                 if printed(row["method"])[column] and not row[column]:
-                    found.append(_cell_difference(world, row, column))
+                    found.append(_property_difference(world, row, column))
     for entry in equations:
         if entry["fails_k"]:
             text = f"the equation {FORMS[entry['form']]} for {entry['where']} fails at k = {_list(entry['fails_k'])}"
@@ -213,7 +214,7 @@ def disagreements(tables: dict[str, list[dict[str, Any]]], equations: list[dict[
     return found
 
 
-def _cell_difference(world: str, row: dict[str, Any], column: str) -> dict[str, Any]:
+def _property_difference(world: str, row: Row, column: str) -> Row:
     text = f"'{TITLES[column]}' is printed yes, computed no"
     detail = {
         "correct": f"wrong at k = {_list(row['wrong_k'])}",
@@ -223,7 +224,7 @@ def _cell_difference(world: str, row: dict[str, Any], column: str) -> dict[str, 
     return _difference(world, row["method"], text, row["decodes_past"] and row["decodes_end"], detail)
 
 
-def _difference(world: str, method: str, text: str, decodes: bool, detail: str) -> dict[str, Any]:
+def _difference(world: str, method: str, text: str, decodes: bool, detail: str) -> Row:
     return {"world": world, "method": method, "difference": text, "detail": detail, "assumptions_hold": decodes}
 
 

@@ -1,7 +1,7 @@
-"""What each inverse objective of the paper's Table 1 may see when it predicts a_t for the pair (t, t+k).
+"""Which variables each inverse objective of the paper's Table 1 sees when it predicts a_t for the pair (t, t+k).
 
-The learned objectives declare the same in `InverseObjective.visible`; a test holds the two together. Here the view is
-kept in its two halves, because a representation is a function of one of them.
+The learned objectives declare the same in `InverseObjective.visible`, and a test compares the two. Here a view has two
+parts, one for each of the two representations that the prediction is made from.
 """
 
 from __future__ import annotations
@@ -9,23 +9,22 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
-Variable = tuple[str, int]
-"""("o", j) or ("a", j): observation or action of row j."""
+from vd4rl_pomdp.theory.law import Variable
 
 
 @dataclass(frozen=True)
-class View:
-    """One objective's view of a sequence."""
+class ObjectiveView:
+    """The observations and actions of a sequence that one objective sees."""
 
     name: str
     past: Literal["none", "all", "window"]
-    """Rows before t (and before t+k, where the later state is one of the past, too): none, all, or m."""
+    """Rows before t that are seen (and before t+k, if the later representation is one of the past): none, all, or m."""
     actions: bool = False
     """Whether actions are seen."""
     masked: bool = False
-    """Whether the later state is one of the future from t+k on, computed by an encoder of its own."""
+    """Whether the later representation is one of the future from t+k on, by an encoder of its own."""
     literal: bool = False
-    """Whether rows carry the action before them even at a window's first row, as the paper's formulas read."""
+    """Whether a window's first row, too, comes with the action before it, as the paper's formulas read."""
 
     def start(self, t: int, m: int) -> frozenset[Variable]:
         """What the representation of row t is computed from."""
@@ -57,15 +56,15 @@ def _variables(rows: range, actions: range | tuple) -> frozenset[Variable]:
 VIEWS = {
     view.name: view
     for view in (
-        View("no_history", "none"),
-        View("ah", "all"),
-        View("ah+a", "all", actions=True),
-        View("fj", "window"),
-        View("fj+a", "window", actions=True),
-        View("fj+a literal", "window", actions=True, literal=True),
-        View("mik", "window", masked=True),
-        View("mik+a", "window", actions=True, masked=True),
-        View("mik+a literal", "window", actions=True, masked=True, literal=True),
+        ObjectiveView("no_history", "none"),
+        ObjectiveView("ah", "all"),
+        ObjectiveView("ah+a", "all", actions=True),
+        ObjectiveView("fj", "window"),
+        ObjectiveView("fj+a", "window", actions=True),
+        ObjectiveView("fj+a literal", "window", actions=True, literal=True),
+        ObjectiveView("mik", "window", masked=True),
+        ObjectiveView("mik+a", "window", actions=True, masked=True),
+        ObjectiveView("mik+a literal", "window", actions=True, masked=True, literal=True),
     )
 }
 """Every view by the name of its method; `literal` variants read the paper's formulas word for word."""

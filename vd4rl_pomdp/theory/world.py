@@ -21,13 +21,13 @@ from typing import Any
 
 from vd4rl_pomdp.errors import UserError
 
-State = Hashable
+AgentState = Hashable
 Exogenous = Hashable
 Action = Hashable
 Symbol = Hashable
-Pair = tuple[State, Exogenous]
-Row = dict[Any, Fraction]
-"""A probability distribution."""
+JointState = tuple[AgentState, Exogenous]
+Distribution = dict[Any, Fraction]
+"""Probabilities by outcome; they sum to 1."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,42 +35,42 @@ class World:
     """A checked finite world; build it with `finite_world`. Two worlds are equal if they are the same object."""
 
     name: str
-    states: tuple[State, ...]
+    states: tuple[AgentState, ...]
     exogenous: tuple[Exogenous, ...]
     actions: tuple[Action, ...]
-    initial: dict[Pair, Fraction]
+    initial: dict[JointState, Fraction]
     """Law of the pair at row 0 of a sequence."""
-    step: dict[tuple[State, Action], State]
-    drift: dict[Exogenous, Row]
-    emission: dict[Pair, Row]
-    policy: dict[State, Row]
+    step: dict[tuple[AgentState, Action], AgentState]
+    drift: dict[Exogenous, Distribution]
+    emission: dict[JointState, Distribution]
+    policy: dict[AgentState, Distribution]
 
     @property
     def symbols(self) -> tuple[Symbol, ...]:
         """Every observation that can be emitted, in a fixed order."""
         return tuple(dict.fromkeys(o for row in self.emission.values() for o in row))
 
-    def reachable(self) -> set[Pair]:
+    def reachable(self) -> set[JointState]:
         """Pairs that some sequence visits."""
         return _closure(self.initial, self._successors)
 
-    def _successors(self, pair: Pair) -> Iterable[Pair]:
+    def _successors(self, pair: JointState) -> Iterable[JointState]:
         state, noise = pair
         return ((self.step[state, a], other) for a in self.policy[state] for other in self.drift[noise])
 
 
 def finite_world(
     name: str,
-    states: Iterable[State],
+    states: Iterable[AgentState],
     exogenous: Iterable[Exogenous],
     actions: Iterable[Action],
-    step: Callable[[Any, Any], State],
+    step: Callable[[Any, Any], AgentState],
     drift: Callable[[Any], Mapping[Exogenous, Any]],
     emit: Callable[[Any, Any], Mapping[Symbol, Any]],
     policy: Callable[[Any, Any], Mapping[Action, Any]] | None = None,
-    initial: Mapping[Pair, Any] | None = None,
+    initial: Mapping[JointState, Any] | None = None,
 ) -> World:
-    """Tabulate and check a world; raises UserError for one that is none.
+    """Tabulate and check a world; raises UserError if it is not a world as the module describes.
 
     Args:
         name: how messages and tables call it.
@@ -104,7 +104,7 @@ def finite_world(
     return world
 
 
-def uniform(items: Iterable[Any]) -> Row:
+def uniform(items: Iterable[Any]) -> Distribution:
     """The uniform law on some items."""
     items = tuple(items)
     return {item: Fraction(1, len(items)) for item in items}
@@ -118,7 +118,7 @@ def with_policy(world: World, name: str, policy: Callable[[Any], Mapping[Action,
     return changed
 
 
-def with_noise(world: World, name: str, noise: Mapping[Exogenous, Row]) -> World:
+def with_noise(world: World, name: str, noise: Mapping[Exogenous, Distribution]) -> World:
     """The world with a second exogenous chain (a table of its transitions) that is shown beside every observation."""
     noise = {xi: _law(world.name, f"noise({xi})", row, noise) for xi, row in noise.items()}
     share = Fraction(1, len(noise))
@@ -134,11 +134,11 @@ def with_noise(world: World, name: str, noise: Mapping[Exogenous, Row]) -> World
     )
 
 
-def _product(one: Row, other: Row) -> Row:
+def _product(one: Distribution, other: Distribution) -> Distribution:
     return {(a, b): p * q for a, p in one.items() for b, q in other.items()}
 
 
-def _law(name: str, where: str, row: Mapping[Any, Any], allowed: Iterable[Any] | None) -> Row:
+def _law(name: str, where: str, row: Mapping[Any, Any], allowed: Iterable[Any] | None) -> Distribution:
     """A row of probabilities as fractions, without zeros."""
     law = {key: _fraction(name, where, value) for key, value in row.items()}
     if any(p < 0 for p in law.values()):
@@ -169,8 +169,8 @@ def _known(name: str, where: str, value: Any, allowed: Iterable[Any]) -> Any:
 
 
 def _agent_centric(
-    name: str, state: State, exogenous: tuple, actions: tuple, policy: Callable[[Any, Any], Mapping[Action, Any]]
-) -> Row:
+    name: str, state: AgentState, exogenous: tuple, actions: tuple, policy: Callable[[Any, Any], Mapping[Action, Any]]
+) -> Distribution:
     """The policy's row at one state, checked to be the same whatever the exogenous part."""
     rows = [_law(name, f"policy({state}, {xi})", policy(state, xi), actions) for xi in exogenous]
     for xi, row in zip(exogenous, rows, strict=True):
@@ -205,7 +205,7 @@ def _closure(start: Iterable[Any], successors: Callable[[Any], Iterable[Any]]) -
     return found
 
 
-def distances(world: World, start: State) -> dict[State, int]:
+def distances(world: World, start: AgentState) -> dict[AgentState, int]:
     """Fewest actions from a state to every state that can be reached from it."""
     found, level = {start: 0}, [start]
     while level:

@@ -14,7 +14,7 @@ from vd4rl_pomdp.experiments.bench.data import sampling, synthetic_set
 from vd4rl_pomdp.experiments.bench.drawing import collection, maze_pictures
 from vd4rl_pomdp.experiments.bench.memory import memory
 from vd4rl_pomdp.experiments.bench.training import finetuning, maze_training, methods, pretraining
-from vd4rl_pomdp.runs.folder import flatten
+from vd4rl_pomdp.runs.files import flatten
 from vd4rl_pomdp.runs.provenance import machine, versions
 
 GOALS: dict[str, tuple[str, float]] = {

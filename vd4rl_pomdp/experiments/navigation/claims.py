@@ -6,9 +6,10 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from vd4rl_pomdp.experiments.navigation.grid import Cell, paper_rows
-from vd4rl_pomdp.experiments.navigation.rows import Run, Value
+from vd4rl_pomdp.experiments.navigation.grid import Condition, paper_rows
+from vd4rl_pomdp.experiments.navigation.runs import NavigationRun
 from vd4rl_pomdp.mazes import MAZES
+from vd4rl_pomdp.navigation.measures import Measure, held_out_loss, online_error, refitted_error
 from vd4rl_pomdp.navigation.methods import SUPERVISED, UNTRAINED
 
 RECURRENT = ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
@@ -22,10 +23,10 @@ class Claim:
     """`left` compared with `factor` times `right`; without a right side, with `factor` itself."""
 
     text: str
-    left: tuple[Cell, Value]
+    left: tuple[Condition, Measure]
     relation: str
     factor: float
-    right: tuple[Cell, Value] | None = None
+    right: tuple[Condition, Measure] | None = None
 
     def holds(self, left: float, right: float) -> bool:
         """Whether two numbers are in the relation."""
@@ -55,20 +56,19 @@ class Verdict:
 def claims(maze: str) -> list[Claim]:
     """The maturity gate, then the statements, of one maze."""
 
-    def error(component: str) -> Value:
-        return f"{component}_error", "held_out", "refit", "all", 0
-
-    def loss(k: int) -> Value:
-        return "action_loss", "held_out", "", "all", k
-
-    best, best_1 = Cell(maze, "mik+a"), Cell(maze, "mik+a", 1)
-    recorder, recorder_1 = Cell(maze, "ah+a"), Cell(maze, "ah+a", 1)
-    literal = Cell(maze, "mik+a", 1, literal_future=True)
-    state, position, velocity = error("state"), error("position"), error("velocity")
+    best, best_1 = Condition(maze, "mik+a"), Condition(maze, "mik+a", 1)
+    recorder, recorder_1 = Condition(maze, "ah+a"), Condition(maze, "ah+a", 1)
+    literal = Condition(maze, "mik+a", 1, literal_future=True)
+    state, position, velocity = (refitted_error(component) for component in ("state", "position", "velocity"))
+    loss = held_out_loss
     found = [
         Claim("gate: mik+a's action loss at k=1, of that at k=15", (best, loss(1)), "<=", 0.85, (best, loss(15))),
         Claim(
-            "no_history's velocity error, of mik+a's", (Cell(maze, "no_history"), velocity), ">=", 3, (best, velocity)
+            "no_history's velocity error, of mik+a's",
+            (Condition(maze, "no_history"), velocity),
+            ">=",
+            3,
+            (best, velocity),
         ),
         Claim("K=1: ah+a's state error, of mik+a's", (recorder_1, state), ">=", 2, (best_1, state)),
         Claim("K=1: ah+a's action loss is near zero", (recorder_1, loss(0)), "<=", NEAR_ZERO),
@@ -83,15 +83,15 @@ def claims(maze: str) -> list[Claim]:
     ]
     if maze == "three_curtains":
         found += [
-            Claim("mik's velocity error, of mik+a's", (Cell(maze, "mik"), velocity), ">=", 1.5, (best, velocity)),
-            Claim("ah's state error, of mik+a's", (Cell(maze, "ah"), state), ">", 1, (best, state)),
+            Claim("mik's velocity error, of mik+a's", (Condition(maze, "mik"), velocity), ">=", 1.5, (best, velocity)),
+            Claim("ah's state error, of mik+a's", (Condition(maze, "ah"), state), ">", 1, (best, state)),
         ]
-    untrained = Cell(maze, UNTRAINED), position
+    untrained = Condition(maze, UNTRAINED), position
     for method in RECURRENT:
         found.append(
             Claim(
                 f"{method}'s position error, of the untrained one's",
-                (Cell(maze, method), position),
+                (Condition(maze, method), position),
                 "<",
                 0.5,
                 untrained,
@@ -100,7 +100,7 @@ def claims(maze: str) -> list[Claim]:
     return found
 
 
-def judge(claim: Claim, runs: Sequence[Run]) -> Verdict:
+def judge(claim: Claim, runs: Sequence[NavigationRun]) -> Verdict:
     """What the runs say of a claim, seeds paired; no seeds and NaN while a side has no run."""
     left = _by_seed(claim.left, runs)
     right = dict.fromkeys(left, 1.0) if claim.right is None else _by_seed(claim.right, runs)
@@ -110,9 +110,9 @@ def judge(claim: Claim, runs: Sequence[Run]) -> Verdict:
     return Verdict(claim, means[0], means[1], len(seeds), holding, _paper_numbers(claim))
 
 
-def _by_seed(side: tuple[Cell, Value], runs: Sequence[Run]) -> dict[int, float]:
-    cell, value = side
-    return {run.seed: run.values[value] for run in runs if run.cell == cell and value in run.values}
+def _by_seed(side: tuple[Condition, Measure], runs: Sequence[NavigationRun]) -> dict[int, float]:
+    condition, measure = side
+    return {run.seed: run.values[measure] for run in runs if run.condition == condition and measure in run.values}
 
 
 def _paper_numbers(claim: Claim) -> tuple[float, float] | None:
@@ -121,27 +121,30 @@ def _paper_numbers(claim: Claim) -> tuple[float, float] | None:
     return None if left is None or right is None else (left, right)
 
 
-def paper_number(cell: Cell, value: Value) -> float | None:
-    """The paper's number for a cell and a measure, where it has one."""
-    if cell.literal_future or value[4] != 0 or value[3] != "all":
+def paper_number(condition: Condition, measure: Measure) -> float | None:
+    """The paper's number for a condition and a measure, where it has one."""
+    if condition.literal_future or measure.k != 0 or measure.rows != "all":
         return None
-    component = value[0].removesuffix("_error")
+    component = measure.measure.removesuffix("_error")
     for row in paper_rows():
         name = row["objective"].lower().replace(" ", "_"), int(row["k_max"]), row["component"]
         options = row["self_prediction"] == "Y", row["exogenous"] == "Y"
-        if name == (cell.method, cell.max_k, component) and options == (cell.self_prediction, cell.exogenous):
-            return float(row[cell.maze])
+        if name == (condition.method, condition.max_k, component) and options == (
+            condition.self_prediction,
+            condition.exogenous,
+        ):
+            return float(row[condition.maze])
     return None
 
 
-def verdict_lines(runs: Sequence[Run]) -> list[str]:
+def verdict_lines(runs: Sequence[NavigationRun]) -> list[str]:
     """A section of a page: all statements about the mazes of some runs, whether they hold, and the paper's numbers."""
-    mazes = [maze for maze in MAZES if any(run.cell.maze == maze for run in runs)]
+    mazes = [maze for maze in MAZES if any(run.condition.maze == maze for run in runs)]
     verdicts = [(maze, judge(claim, runs)) for maze in mazes for claim in claims(maze)]
-    position: Value = ("position_error", "training", "online", "all", 0)
+    position = online_error("position")
     judged = [verdict for _, verdict in verdicts if verdict.seeds]
     lines = ["## Which statements hold", ""]
-    recorder = ", ".join(f"{paper_number(Cell(maze, 'ah+a'), position):.1f} ({maze})" for maze in mazes)
+    recorder = ", ".join(f"{paper_number(Condition(maze, 'ah+a'), position):.1f} ({maze})" for maze in mazes)
     return [
         *lines,
         f"{sum(v.holds for v in judged)} of {len(judged)} hold, {len(verdicts) - len(judged)} wait for runs.",
@@ -158,11 +161,12 @@ def verdict_lines(runs: Sequence[Run]) -> list[str]:
     ]
 
 
-def _ceiling_lines(mazes: Sequence[str], runs: Sequence[Run]) -> list[str]:
+def _ceiling_lines(mazes: Sequence[str], runs: Sequence[NavigationRun]) -> list[str]:
     """What the same networks reach when they are trained on the true states, without and with past actions."""
-    position: Value = ("position_error", "held_out", "refit", "all", 0)
+    position = refitted_error("position")
     sides = [
-        (maze, [_by_seed((Cell(maze, method), position), runs).values() for method in SUPERVISED]) for maze in mazes
+        (maze, [_by_seed((Condition(maze, method), position), runs).values() for method in SUPERVISED])
+        for maze in mazes
     ]
     reached = [
         f"{maze} {' and '.join(f'{sum(side) / len(side):.1f}' for side in pair)}" for maze, pair in sides if all(pair)
@@ -179,14 +183,18 @@ def _ceiling_lines(mazes: Sequence[str], runs: Sequence[Run]) -> list[str]:
 def _verdict_row(maze: str, verdict: Verdict) -> str:
     claim = verdict.claim
     bound = f"{claim.relation} {claim.factor:g}" + (" x" if claim.right else "")
-    cells = [maze, f"{claim.text} {bound}", "no run yet", "-", "-"]
+    columns = [maze, f"{claim.text} {bound}", "no run yet", "-", "-"]
     if verdict.seeds:
         answer = "**yes**" if verdict.holds else "**no**"
-        cells[2:] = [_sides(claim, verdict.left, verdict.right), answer, f"{verdict.seeds_holding} of {verdict.seeds}"]
+        columns[2:] = [
+            _sides(claim, verdict.left, verdict.right),
+            answer,
+            f"{verdict.seeds_holding} of {verdict.seeds}",
+        ]
     paper = "none"
     if verdict.paper:
         paper = f"{_sides(claim, *verdict.paper)}: {'yes' if claim.holds(*verdict.paper) else 'no'}"
-    return f"| {' | '.join([*cells, paper])} |"
+    return f"| {' | '.join([*columns, paper])} |"
 
 
 def _sides(claim: Claim, left: float, right: float) -> str:

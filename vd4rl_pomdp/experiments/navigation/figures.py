@@ -13,9 +13,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from vd4rl_pomdp.experiments.navigation.claims import paper_number
-from vd4rl_pomdp.experiments.navigation.grid import Cell
-from vd4rl_pomdp.experiments.navigation.rows import Run, Value, is_missing
+from vd4rl_pomdp.experiments.navigation.grid import Condition
+from vd4rl_pomdp.experiments.navigation.runs import NavigationRun, is_missing
 from vd4rl_pomdp.mazes import FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
+from vd4rl_pomdp.navigation.measures import Measure, online_error
 from vd4rl_pomdp.navigation.methods import OBJECTIVES, REFERENCES
 
 _ESTIMATE = "#d55e00"
@@ -31,20 +32,20 @@ _MARK: dict[str, Any] = {"color": "#e69f00", "linestyle": "", "marker": "_", "ma
 _NO_RUN: dict[str, Any] = {"color": "#999999", "linestyle": "", "marker": "x", "markersize": 4}
 
 
-def accuracy_bars(runs: list[Run], value: Value, path: Path) -> None:
+def accuracy_bars(runs: list[NavigationRun], measure: Measure, path: Path) -> None:
     """State prediction accuracy, 100 - error, of every objective and maze beside the paper's, as in its bar plot."""
-    mazes = [maze for maze in MAZES if any(run.cell.maze == maze for run in runs)]
+    mazes = [maze for maze in MAZES if any(run.condition.maze == maze for run in runs)]
     columns = min(2, len(mazes))
     rows = -(-len(mazes) // columns)
     figure = Figure(figsize=(1 + 5.2 * columns, 0.8 + 2.9 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
-    methods = [*OBJECTIVES, *(name for name in REFERENCES if any(run.cell.method == name for run in runs))]
+    methods = [*OBJECTIVES, *(name for name in REFERENCES if any(run.condition.method == name for run in runs))]
     for axes in panels.flat[len(mazes) :]:
         axes.set_axis_off()
     for axes, maze in zip(panels.flat, mazes, strict=False):
         for place, method in enumerate(methods):
             for offset, (max_k, self_prediction, colour) in zip(_OFFSETS, _VARIANTS.values(), strict=True):
-                _bar(axes, place + offset, Cell(maze, method, max_k, self_prediction), runs, value, colour)
+                _bar(axes, place + offset, Condition(maze, method, max_k, self_prediction), runs, measure, colour)
         axes.set_title(maze, fontsize=10)
         axes.set_xticks(range(len(methods)), methods, rotation=40, ha="right", fontsize=8)
         axes.spines[["top", "right"]].set_visible(False)
@@ -59,32 +60,36 @@ def accuracy_bars(runs: list[Run], value: Value, path: Path) -> None:
     figure.savefig(path, dpi=130, metadata={"Software": None})
 
 
-def _bar(axes: Any, place: float, cell: Cell, runs: list[Run], value: Value, colour: str) -> None:
-    accuracy = [100 - run.values[value] for run in runs if run.cell == cell and value in run.values]
+def _bar(
+    axes: Any, place: float, condition: Condition, runs: list[NavigationRun], measure: Measure, colour: str
+) -> None:
+    accuracy = [100 - run.values[measure] for run in runs if run.condition == condition and measure in run.values]
     if accuracy:
         axes.bar(place, np.mean(accuracy), _WIDTH, color=colour)
         axes.plot([place] * len(accuracy), accuracy, **_SEED)
-    elif is_missing(cell, runs):
+    elif is_missing(condition, runs):
         axes.plot(place, 2, **_NO_RUN)
-    paper = paper_number(cell, ("state_error", "training", "online", "all", 0))
+    paper = paper_number(condition, online_error("state"))
     if paper is not None:
         axes.plot(place, 100 - paper, **_MARK)
 
 
-def trajectories(runs: list[Run], path: Path, methods: tuple[str, ...] = ("mik+a", "ah+a", "no_history")) -> bool:
+def trajectories(
+    runs: list[NavigationRun], path: Path, methods: tuple[str, ...] = ("mik+a", "ah+a", "no_history")
+) -> bool:
     """A held-out trajectory over the maze with the refitted probe's estimates; False if no run has one."""
-    chosen = [_first(runs, Cell(maze, method)) for maze in MAZES for method in methods]
+    chosen = [_first(runs, Condition(maze, method)) for maze in MAZES for method in methods]
     found = [run for run in chosen if run is not None]
     if not found:
         return False
-    mazes = [maze for maze in MAZES if any(run.cell.maze == maze for run in found)]
-    methods = tuple(method for method in methods if any(run.cell.method == method for run in found))
+    mazes = [maze for maze in MAZES if any(run.condition.maze == maze for run in found)]
+    methods = tuple(method for method in methods if any(run.condition.method == method for run in found))
     figure = Figure(figsize=(3.2 * len(methods), 3.3 * len(mazes)), layout="constrained")
     panels = figure.subplots(len(mazes), len(methods), squeeze=False)
     for maze, row in zip(mazes, panels, strict=True):
         for method, axes in zip(methods, row, strict=True):
             axes.set_axis_off()
-            run = _first(found, Cell(maze, method))
+            run = _first(found, Condition(maze, method))
             if run is not None:
                 _draw_trajectory(axes, run)
             else:
@@ -93,19 +98,19 @@ def trajectories(runs: list[Run], path: Path, methods: tuple[str, ...] = ("mik+a
     return True
 
 
-def _first(runs: list[Run], cell: Cell) -> Run | None:
-    return next((run for run in runs if run.cell == cell and run.trajectory is not None), None)
+def _first(runs: list[NavigationRun], condition: Condition) -> NavigationRun | None:
+    return next((run for run in runs if run.condition == condition and run.trajectory is not None), None)
 
 
-def _draw_trajectory(axes: Any, run: Run, rows: int = 100) -> None:
+def _draw_trajectory(axes: Any, run: NavigationRun, rows: int = 100) -> None:
     assert run.trajectory is not None
     with run.trajectory.open(newline="", encoding="utf-8") as file:
         table = list(csv.DictReader(file))[:rows]
-    draw_maze(axes, MAZES[run.cell.maze])
+    draw_maze(axes, MAZES[run.condition.maze])
     for names, colour, label in ((("x", "y"), "black", "true"), (("estimated_x", "estimated_y"), _ESTIMATE, "probe")):
         points = np.array([[float(row[name]) for name in names] for row in table])
         axes.plot(*points.T, color=colour, lw=1, marker=".", markersize=2.5, label=label)
-    axes.set_title(f"{run.cell.maze}: {run.cell.method}", fontsize=9)
+    axes.set_title(f"{run.condition.maze}: {run.condition.method}", fontsize=9)
     axes.legend(fontsize=7, loc="center left", framealpha=0.9)
 
 

@@ -1,4 +1,4 @@
-"""Which runs make the paper's tables: cells as data, each with the command that computes it."""
+"""Which runs make the paper's tables: their conditions, and the command that trains each."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_number
-from vd4rl_pomdp.mazes import get_maze
+from vd4rl_pomdp.mazes import check_maze
 from vd4rl_pomdp.navigation.config import PRESETS
 from vd4rl_pomdp.navigation.methods import OBJECTIVES, SUPERVISED, UNTRAINED
 
@@ -18,8 +18,8 @@ EVIDENCE_MAZES = ("no_curtain", "three_curtains")
 
 
 @dataclass(frozen=True)
-class Cell:
-    """What one run trains, but for its seed and budget."""
+class Condition:
+    """What all seeds of an experiment share: what a run trains, without its seed and budget."""
 
     maze: str
     method: str
@@ -30,7 +30,7 @@ class Cell:
 
     @property
     def name(self) -> str:
-        """Folder of the cell's runs."""
+        """Folder of the condition's runs."""
         parts = [self.method, f"K{self.max_k}"]
         for flag, short in (("self_prediction", "sp"), ("exogenous", "exo"), ("literal_future", "literal")):
             parts += [short] if getattr(self, flag) else []
@@ -46,23 +46,25 @@ class Cell:
         return [*words, "--out", str(runs / self.name / f"seed{seed}")]
 
 
-def evidence(mazes: tuple[str, ...] = EVIDENCE_MAZES) -> list[Cell]:
+def evidence(mazes: tuple[str, ...] = EVIDENCE_MAZES) -> list[Condition]:
     """The first evidence: all objectives and references at K = 15, and what K = 1 does to those that read actions."""
-    cells = [Cell(maze, method) for maze in mazes for method in ("mik+a", "ah+a", "no_history", UNTRAINED)]
-    cells += [Cell(maze, method, 1) for maze in mazes for method in ("ah+a", "mik+a")]
-    cells += [Cell(maze, "mik+a", 1, literal_future=True) for maze in mazes]
-    return cells + [Cell(maze, method) for maze in mazes for method in ("mik", "ah", "fj+a", "fj", *SUPERVISED)]
+    conditions = [Condition(maze, method) for maze in mazes for method in ("mik+a", "ah+a", "no_history", UNTRAINED)]
+    conditions += [Condition(maze, method, 1) for maze in mazes for method in ("ah+a", "mik+a")]
+    conditions += [Condition(maze, "mik+a", 1, literal_future=True) for maze in mazes]
+    return conditions + [
+        Condition(maze, method) for maze in mazes for method in ("mik", "ah", "fj+a", "fj", *SUPERVISED)
+    ]
 
 
-def options(mazes: tuple[str, ...] = EVIDENCE_MAZES) -> list[Cell]:
+def options(mazes: tuple[str, ...] = EVIDENCE_MAZES) -> list[Condition]:
     """Self-prediction and exogenous noise, for all objectives."""
-    cells = [Cell(maze, method, self_prediction=True) for maze in mazes for method in reversed(OBJECTIVES)]
-    return cells + [Cell(maze, method, exogenous=True) for maze in mazes for method in reversed(OBJECTIVES)]
+    conditions = [Condition(maze, method, self_prediction=True) for maze in mazes for method in reversed(OBJECTIVES)]
+    return conditions + [Condition(maze, method, exogenous=True) for maze in mazes for method in reversed(OBJECTIVES)]
 
 
-def paper(mazes: tuple[str, ...]) -> list[Cell]:
-    """Every cell of the paper's tables."""
-    return list(dict.fromkeys(cell_of(row, maze) for maze in mazes for row in paper_rows()))
+def paper(mazes: tuple[str, ...]) -> list[Condition]:
+    """Every condition in the paper's tables."""
+    return list(dict.fromkeys(condition_of(row, maze) for maze in mazes for row in paper_rows()))
 
 
 GRIDS = {"evidence": evidence, "options": options, "paper": paper}
@@ -71,18 +73,18 @@ GRIDS = {"evidence": evidence, "options": options, "paper": paper}
 def grid_commands(
     grid: str, mazes: tuple[str, ...], seeds: tuple[int, ...], preset: str, data: Path, runs: Path
 ) -> Iterator[list[str]]:
-    """Words of all runs of a grid, seed by seed, so that every cell has its first seed early."""
+    """Words of all runs of a grid, seed by seed, so that every condition has its first seed early."""
     if grid not in GRIDS:
         raise UserError(f"unknown grid {grid!r}: choose one of {', '.join(GRIDS)}")
     if preset not in PRESETS:
         raise UserError(f"unknown preset {preset!r}: choose one of {', '.join(PRESETS)}")
     for maze in mazes:
-        get_maze(maze)
+        check_maze(maze)
     for seed in seeds:
         refuse_number("seeds", seed, 0, MAX_SEED)
     for seed in seeds:
-        for cell in GRIDS[grid](mazes):
-            yield cell.words(preset, data, runs, seed)
+        for condition in GRIDS[grid](mazes):
+            yield condition.words(preset, data, runs, seed)
 
 
 def paper_rows() -> list[dict[str, str]]:
@@ -91,7 +93,7 @@ def paper_rows() -> list[dict[str, str]]:
         return list(csv.DictReader(file))
 
 
-def cell_of(row: dict[str, str], maze: str) -> Cell:
-    """The cell that a line of the paper's tables is about."""
+def condition_of(row: dict[str, str], maze: str) -> Condition:
+    """The condition that a line of the paper's tables is about."""
     method = row["objective"].lower().replace(" ", "_")
-    return Cell(maze, method, int(row["k_max"]), row["self_prediction"] == "Y", row["exogenous"] == "Y")
+    return Condition(maze, method, int(row["k_max"]), row["self_prediction"] == "Y", row["exogenous"] == "Y")

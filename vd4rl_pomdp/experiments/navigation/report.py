@@ -1,8 +1,8 @@
 """The navigation report: the paper's tables from raw rows, each number beside the paper's, and what they say.
 
-OUT/README.md     tables, verdicts, figures, and the command of every cell
+OUT/README.md     tables, verdicts, figures, and the command of every condition
 OUT/rows.csv, runs.csv, trajectories/     raw numbers; `navigation report OUT` makes everything again from them
-OUT/tables.csv    every cell: mean, interval, seeds, the paper's number
+OUT/tables.csv    every number: mean, interval, seeds, the paper's number
 OUT/figures/      accuracy.png, trajectories.png, observations.png
 """
 
@@ -18,22 +18,30 @@ import numpy as np
 
 from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import paper_number, verdict_lines
-from vd4rl_pomdp.experiments.navigation.grid import Cell, cell_of, paper_rows
-from vd4rl_pomdp.experiments.navigation.rows import ROWS, Run, Value, is_missing, load_runs, save_runs, unfinished_runs
+from vd4rl_pomdp.experiments.navigation.grid import Condition, condition_of, paper_rows
+from vd4rl_pomdp.experiments.navigation.runs import (
+    ROWS,
+    NavigationRun,
+    is_missing,
+    load_runs,
+    save_runs,
+    unfinished_runs,
+)
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.navigation.config import PRESETS
+from vd4rl_pomdp.navigation.measures import Measure, held_out_loss, refitted_error
 from vd4rl_pomdp.navigation.methods import METHOD_NAMES, OBJECTIVES, REFERENCES, UNTRAINED
 from vd4rl_pomdp.report.stats import bootstrap_interval, mean
-from vd4rl_pomdp.runs.folder import write_csv
+from vd4rl_pomdp.runs.files import write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.text import code, code_block, markdown, write_text
 
-VIEWS = {
+PROTOCOLS = {
     "training averages, probe trained beside the model (the paper's way)": ("training", "online"),
     "held-out trajectories, probe refitted on frozen states": ("held_out", "refit"),
 }
-"""Where an error is measured, and by which probe."""
-_LOSS_VIEWS = {
+"""How an error is measured: the split and the probe."""
+_LOSS_PROTOCOLS = {
     "training averages (the paper's way)": ("training", ""),
     "held-out trajectories": ("held_out", ""),
 }
@@ -53,28 +61,28 @@ _MAIN_TEXT = ("no_curtain", "three_curtains")
 class Entry:
     """One number of a table."""
 
-    cell: Cell
-    value: Value
+    condition: Condition
+    measure: Measure
     numbers: np.ndarray
     """(n,) one for each seed."""
-    of: int
-    """Seeds that runs of the maze have, of whatever cell."""
+    of_seeds: int
+    """Seeds that the maze was trained with, under any condition."""
     missing: bool
-    """Whether other runs have its maze, and others what it trains."""
+    """Whether its maze has runs, and its condition has some in another maze, but it has none itself."""
 
     @property
     def paper(self) -> float | None:
         """The paper's number."""
-        return paper_number(self.cell, self.value)
+        return paper_number(self.condition, self.measure)
 
     def text(self) -> str:
-        """Mean, interval, seeds, and the paper's number in brackets; a run that is missing is said to be."""
+        """Mean, interval, seeds, and the paper's number in brackets; "no run" for one that is missing."""
         paper = "" if self.paper is None else f"({self.paper:.1f})"
         if not len(self.numbers):
             return f"no run {paper}".rstrip() if self.missing else paper
         interval = self.interval()
         spread = "" if interval is None else f" [{interval[0]:.1f}, {interval[1]:.1f}]"
-        seeds = f"n={len(self.numbers)}" + (f" of {self.of}" if len(self.numbers) < self.of else "")
+        seeds = f"n={len(self.numbers)}" + (f" of {self.of_seeds}" if len(self.numbers) < self.of_seeds else "")
         return f"**{self.numbers.mean():.1f}**{spread} {seeds} {paper}".rstrip()
 
     def interval(self) -> tuple[float, float] | None:
@@ -89,12 +97,12 @@ class Table:
     """Rows of entries, one column a maze."""
 
     name: str
-    view: str
+    protocol: str
     mazes: tuple[str, ...]
     rows: list[tuple[str, list[Entry]]]
 
     def lines(self) -> list[tuple[str, list[Entry]]]:
-        """Rows that a run or the paper has a number for; none if no run has."""
+        """Rows with a number of a run or of the paper; no rows at all if no run has a number."""
         if not any(len(entry.numbers) for _, entries in self.rows for entry in entries):
             return []
         return [row for row in self.rows if any(len(e.numbers) or e.paper is not None for e in row[1])]
@@ -116,8 +124,7 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
     runs, unfinished = load_runs(sources), unfinished_runs(sources)
     save_runs(runs, out)
     (out / "figures").mkdir(exist_ok=True)
-    value = ("state_error", "held_out", "refit", "all", 0)
-    figures.accuracy_bars(runs, value, out / "figures" / "accuracy.png")
+    figures.accuracy_bars(runs, refitted_error("state"), out / "figures" / "accuracy.png")
     drawn = figures.trajectories(runs, out / "figures" / "trajectories.png")
     if samples is not None:
         figures.sample_observations(samples(), out / "figures" / "observations.png")
@@ -128,72 +135,71 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
     return page
 
 
-def make_tables(runs: list[Run]) -> list[Table]:
+def make_tables(runs: list[NavigationRun]) -> list[Table]:
     """The paper's six tables (position and velocity are one of them), then three of our own."""
     tables = []
     for name in _TITLES:
-        for view, (split, probe) in (_LOSS_VIEWS if name == "action_loss" else VIEWS).items():
-            tables.append(_paper_table(name, view, split, probe, runs))
+        for protocol, (split, probe) in (_LOSS_PROTOCOLS if name == "action_loss" else PROTOCOLS).items():
+            tables.append(_paper_table(name, protocol, split, probe, runs))
     return [*tables, _references_table(runs), _hidden_table(runs), _by_k_table(runs)]
 
 
-def _paper_table(name: str, view: str, split: str, probe: str, runs: list[Run]) -> Table:
+def _paper_table(name: str, protocol: str, split: str, probe: str, runs: list[NavigationRun]) -> Table:
     mazes = _MAIN_TEXT if name == "exogenous_main" else tuple(MAZES)
     rows = []
     for line in paper_rows():
         if line["table"] != name.removesuffix("_main"):
             continue
-        measure = line["component"] if name == "action_loss" else f"{line['component']}_error"
-        value: Value = measure, split, probe, "all", 0
+        component = line["component"] if name == "action_loss" else f"{line['component']}_error"
+        measure = Measure(component, split, probe)
         options = "".join(f", {o}" for o in ("self-prediction",) if line["self_prediction"] == "Y")
         label = f"{line['objective']}, K={line['k_max']}{options}"
-        rows.append((label, [_entry(cell_of(line, maze), value, runs) for maze in mazes]))
-    return Table(name, view, mazes, rows)
+        rows.append((label, [_entry(condition_of(line, maze), measure, runs) for maze in mazes]))
+    return Table(name, protocol, mazes, rows)
 
 
-def _references_table(runs: list[Run]) -> Table:
+def _references_table(runs: list[NavigationRun]) -> Table:
     """What the paper does not show: the floor, the ceilings, and the literal future."""
     mazes = tuple(MAZES)
     rows = []
     for method in REFERENCES:
         for component in ("state", "position", "velocity"):
-            value: Value = (f"{component}_error", "held_out", "refit", "all", 0)
-            rows.append((f"{method}, {component}", [_entry(Cell(m, method), value, runs) for m in mazes]))
-    literal = [Cell(maze, "mik+a", 1, literal_future=True) for maze in mazes]
-    measures: dict[str, Value] = {
-        "state error": ("state_error", "held_out", "refit", "all", 0),
-        "action loss": ("action_loss", "held_out", "", "all", 0),
-    }
-    for name, value in measures.items():
-        rows.append((f"MIK+A, literal future, K=1, {name}", [_entry(cell, value, runs) for cell in literal]))
+            measure = refitted_error(component)
+            rows.append((f"{method}, {component}", [_entry(Condition(maze, method), measure, runs) for maze in mazes]))
+    literal = [Condition(maze, "mik+a", 1, literal_future=True) for maze in mazes]
+    for name, measure in {"state error": refitted_error("state"), "action loss": held_out_loss()}.items():
+        rows.append(
+            (f"MIK+A, literal future, K=1, {name}", [_entry(condition, measure, runs) for condition in literal])
+        )
     return Table("references", "held-out trajectories, probe refitted on frozen states", mazes, rows)
 
 
-def _hidden_table(runs: list[Run]) -> Table:
+def _hidden_table(runs: list[NavigationRun]) -> Table:
     """Errors on hidden steps alone."""
     mazes = tuple(maze for maze, spec in MAZES.items() if spec.curtains)
     rows = []
     for method in METHOD_NAMES:
         for component in ("position", "velocity"):
-            value: Value = (f"{component}_error", "held_out", "refit", "hidden", 0)
-            rows.append((f"{method}, {component}", [_entry(Cell(maze, method), value, runs) for maze in mazes]))
+            measure = refitted_error(component, rows="hidden")
+            rows.append((f"{method}, {component}", [_entry(Condition(maze, method), measure, runs) for maze in mazes]))
     return Table("hidden", "held-out trajectories, probe refitted on frozen states", mazes, rows)
 
 
-def _by_k_table(runs: list[Run]) -> Table:
+def _by_k_table(runs: list[NavigationRun]) -> Table:
     """Action losses at a small, a middle and the greatest k."""
     rows = []
     for method in OBJECTIVES:
         for k in (1, 5, 15):
-            value: Value = ("action_loss", "held_out", "", "all", k)
-            rows.append((f"{method}, k={k}", [_entry(Cell(maze, method), value, runs) for maze in MAZES]))
+            rows.append(
+                (f"{method}, k={k}", [_entry(Condition(maze, method), held_out_loss(k), runs) for maze in MAZES])
+            )
     return Table("by_k", "held-out trajectories", tuple(MAZES), rows)
 
 
-def _entry(cell: Cell, value: Value, runs: list[Run]) -> Entry:
-    numbers = [run.values[value] for run in runs if run.cell == cell and value in run.values]
-    seeds = {run.seed for run in runs if run.cell.maze == cell.maze}
-    return Entry(cell, value, np.array(numbers), len(seeds), is_missing(cell, runs))
+def _entry(condition: Condition, measure: Measure, runs: list[NavigationRun]) -> Entry:
+    numbers = [run.values[measure] for run in runs if run.condition == condition and measure in run.values]
+    seeds = {run.seed for run in runs if run.condition.maze == condition.maze}
+    return Entry(condition, measure, np.array(numbers), len(seeds), is_missing(condition, runs))
 
 
 _OWN_TITLES = {
@@ -204,7 +210,7 @@ _OWN_TITLES = {
 
 
 def _page(
-    runs: list[Run], unfinished: list[tuple[Path, str]], tables: list[Table], drawn: bool, pictures: bool
+    runs: list[NavigationRun], unfinished: list[tuple[Path, str]], tables: list[Table], drawn: bool, pictures: bool
 ) -> list[str]:
     preset, seeds = runs[0].preset, sorted({run.seed for run in runs})
     lines = ["# Navigation: what the objectives know of the state", ""]
@@ -225,16 +231,16 @@ def _page(
     ]
     lines += ["![True and estimated trajectories](figures/trajectories.png)", ""] if drawn else []
     lines += ["![Sample observations](figures/observations.png)", ""] if pictures else []
-    for name, views in groupby(tables, lambda table: table.name):
+    for name, variants in groupby(tables, lambda table: table.name):
         lines += [f"## {_TITLES.get(name) or _OWN_TITLES[name]}", ""]
-        for table in views:
+        for table in variants:
             lines += _markdown(table)
     return lines + _commands(runs)
 
 
-def _budget(runs: list[Run]) -> str:
+def _budget(runs: list[NavigationRun]) -> str:
     """What the runs cost, and where."""
-    trained = [run for run in runs if run.cell.method != UNTRAINED]
+    trained = [run for run in runs if run.condition.method != UNTRAINED]
     steps = " or ".join(f"{count:,}" for count in sorted({int(run.facts["steps"]) for run in trained}))
     minutes = [float(run.facts["seconds"]) / 60 for run in trained]
     machines = markdown("; ".join(sorted({run.facts["gpu"] or f"{run.facts['processor']}, no GPU" for run in runs})))
@@ -247,16 +253,16 @@ def _budget(runs: list[Run]) -> str:
 
 
 def _markdown(table: Table) -> list[str]:
-    """A table under its view; lines that neither a run nor the paper has a number for are left out."""
+    """A table under its protocol; lines that neither a run nor the paper has a number for are left out."""
     if not table.lines():
-        return [f"*{table.view}*: no run yet.", ""]
-    lines = [f"*{table.view}*", "", "| | " + " | ".join(table.mazes) + " |", "|---|" + "---|" * len(table.mazes)]
+        return [f"*{table.protocol}*: no run yet.", ""]
+    lines = [f"*{table.protocol}*", "", "| | " + " | ".join(table.mazes) + " |", "|---|" + "---|" * len(table.mazes)]
     for label, entries in table.lines():
         lines.append(f"| {label} | {' | '.join(entry.text() for entry in entries)} |")
     return [*lines, ""]
 
 
-def _commands(runs: list[Run]) -> list[str]:
+def _commands(runs: list[NavigationRun]) -> list[str]:
     """The command of every run behind the tables."""
     lines = [
         "## Commands",
@@ -265,7 +271,7 @@ def _commands(runs: list[Run]) -> list[str]:
         f"`vd4rl-pomdp navigation grid --grid paper --mazes {' '.join(MAZES)} --dry-run` prints those of every cell.",
     ]
     commands = []
-    for maze in dict.fromkeys(run.cell.maze for run in runs):
+    for maze in dict.fromkeys(run.condition.maze for run in runs):
         collect = f"vd4rl-pomdp navigation collect --preset {runs[0].preset} --maze {maze} --out data/{maze}"
         commands.append(collect)
     for run in runs:
@@ -289,7 +295,7 @@ def _csv_row(table: Table, label: str, maze: str, entry: Entry) -> dict[str, Any
     low, high = entry.interval() or ("", "")
     return {
         "table": table.name,
-        "view": table.view,
+        "view": table.protocol,
         "row": label,
         "maze": maze,
         "mean": f"{entry.numbers.mean():.4g}" if len(entry.numbers) else "",

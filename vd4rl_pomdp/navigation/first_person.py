@@ -1,7 +1,8 @@
-"""The policy that collects first-person data: PPO (stable-baselines3) on states, exported as a small file and shipped.
+"""The actor that collects first-person data: PPO (stable-baselines3) on states, exported as a small file and shipped.
 
-It is told the way: the next waypoint and its own velocity, both seen from its heading. The reward is the way it covers
-and 1 for a goal. PPO's Gaussian acts before a tanh, so that the exported actor (see `policies.actor`) is the policy.
+Its inputs are the next waypoint and its velocity, both relative to its heading. The reward is the distance by which
+it comes nearer to the goal, and 1 for reaching it. PPO's Gaussian is applied before a tanh, as in an actor's file
+(see `policies.actor`).
 """
 
 from __future__ import annotations
@@ -17,7 +18,7 @@ import numpy as np
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_no_folder, refuse_outside
 from vd4rl_pomdp.mazes import MOST_STEPS
 from vd4rl_pomdp.navigation.planner import Planner
-from vd4rl_pomdp.policies.actor import Actor, read_actor
+from vd4rl_pomdp.policies.actor import Actor, check_actor, read_actor
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.progress import ProgressLine
 
@@ -35,7 +36,7 @@ _PARALLEL = 8
 
 
 @dataclass(frozen=True)
-class MazePolicyConfig:
+class FirstPersonConfig:
     """Settings of `vd4rl-pomdp navigation policy`."""
 
     out: Path
@@ -49,15 +50,15 @@ class MazePolicyConfig:
 
 
 def features(state: np.ndarray, waypoint: np.ndarray) -> np.ndarray:
-    """What the policy sees of a (6,) state: (4,) float32, waypoint and velocity in the frame of its heading."""
+    """The actor's inputs for a (6,) state: (4,) float32, waypoint and velocity in the frame of its heading."""
     ahead = np.array([np.cos(state[2]), np.sin(state[2])])
     left = np.array([-ahead[1], ahead[0]])
     way = waypoint - state[:2]
     return np.array([way @ ahead, way @ left, state[3:5] @ ahead, state[3:5] @ left], np.float32)
 
 
-class FirstPersonPilot:
-    """The shipped policy's mean action for a state and a goal."""
+class FirstPersonController:
+    """Drives to the environment's goal by the mean action of an actor, the shipped one by default."""
 
     def __init__(self, env: MazeEnv, actor: Actor | None = None) -> None:
         self._planner = Planner(env)
@@ -68,8 +69,8 @@ class FirstPersonPilot:
         return self._actor.act(features(state, self._planner.waypoint(state[:2], goal)))
 
 
-class PilotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """The first-person maze as PPO sees it."""
+class FirstPersonEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """The first-person maze as a task on states, for PPO."""
 
     def __init__(self, action_repeat: int) -> None:
         from vd4rl_pomdp.envs.maze import MazeEnv
@@ -87,32 +88,32 @@ class PilotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         super().reset(seed=seed)
         self._env.reset(seed=seed)
         self._steps = 0
-        return self._see(), {}
+        return self._features(), {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
-        """Apply tanh(action); the reward is the way covered, and 1 for a goal."""
+        """Apply tanh(action); the reward is the distance covered towards the goal, and 1 for reaching it."""
         goal = self._env.goal
         before = self._planner.distance(self._env.state[:2], goal)
         _, reached, *_ = self._env.step(np.tanh(action))
         covered = before - self._planner.distance(self._env.state[:2], goal)
         self._steps += 1
-        return self._see(), covered + reached, False, self._steps == _EPISODE, {}
+        return self._features(), covered + reached, False, self._steps == _EPISODE, {}
 
-    def _see(self) -> np.ndarray:
+    def _features(self) -> np.ndarray:
         return features(self._env.state, self._planner.waypoint(self._env.state[:2], self._env.goal))
 
 
 def _refuse_other(path: Path) -> None:
-    """Raise UserError for a file to write that is there and holds anything but an earlier actor."""
+    """Raise UserError for a file to write that exists and holds anything but an earlier actor."""
     if path.exists() or path.is_symlink():
         try:
-            read_actor(path)
+            check_actor(path)
         except UserError as error:
             raise UserError(f"{path}: is there already and holds no actor; choose another --out") from error
 
 
-def train_policy(config: MazePolicyConfig) -> Actor:
-    """Train and write the actor; its card says how many goals it reaches in 20 episodes."""
+def train_first_person(config: FirstPersonConfig) -> Actor:
+    """Train and write the actor; its card holds the number of goals that it reaches in 20 episodes."""
     refuse_outside(config, decisions=1, action_repeat=(1, MOST_STEPS), seed=(0, MAX_SEED))
     refuse_no_folder(config.out.parent)
     refuse_inside(config.out)
@@ -134,7 +135,7 @@ def train_policy(config: MazePolicyConfig) -> Actor:
             progress.advance(_PARALLEL)
             return True
 
-    environments = DummyVecEnv([lambda: PilotEnv(config.action_repeat) for _ in range(_PARALLEL)])
+    environments = DummyVecEnv([lambda: FirstPersonEnv(config.action_repeat) for _ in range(_PARALLEL)])
     model = PPO(
         "MlpPolicy",
         environments,
@@ -159,17 +160,17 @@ def goals_reached(actor: Actor, action_repeat: int, episodes: int) -> int:
     from vd4rl_pomdp.envs.maze import MazeEnv
 
     env = MazeEnv("first_person", action_repeat, pixels=False)
-    pilot, reached = FirstPersonPilot(env, actor), 0
+    controller, reached = FirstPersonController(env, actor), 0
     for episode in range(episodes):
         _, info = env.reset(seed=10_000 + episode)
         for _ in range(_EPISODE):
-            _, reward, _, _, info = env.step(pilot.act(info["state"], info["goal"]))
+            _, reward, _, _, info = env.step(controller.act(info["state"], info["goal"]))
             reached += int(reward)
     return reached
 
 
-def _export(model: PPO, config: MazePolicyConfig) -> Actor:
-    """PPO's actor as plain matrices; its spread does not depend on the state."""
+def _export(model: PPO, config: FirstPersonConfig) -> Actor:
+    """PPO's actor as plain matrices; its standard deviation does not depend on the state."""
     policy: Any = model.policy
     layers = [module for module in policy.mlp_extractor.policy_net if hasattr(module, "weight")]
     weights = {f"hidden.{i}": layer for i, layer in enumerate(layers)} | {"mean": policy.action_net}

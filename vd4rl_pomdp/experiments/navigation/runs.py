@@ -1,4 +1,4 @@
-"""Raw numbers of navigation runs: read from run folders or from CSV files written before, kept as CSV files."""
+"""Finished navigation runs: read from run folders or from a report's CSV files, and written as CSV files."""
 
 from __future__ import annotations
 
@@ -13,45 +13,45 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.experiments.navigation.grid import Cell
-from vd4rl_pomdp.runs.folder import read_json, write_csv
+from vd4rl_pomdp.experiments.navigation.grid import Condition
+from vd4rl_pomdp.navigation.measures import Measure, measure_of, measure_rows
+from vd4rl_pomdp.runs.files import read_json, write_csv
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.reading import build, regular
 from vd4rl_pomdp.runs.settings import settings_of
 
 ROWS, RUNS, TRAJECTORIES = "rows.csv", "runs.csv", "trajectories"
-Value = tuple[str, str, str, str, int]
-"""(measure, split, probe, rows, k), for instance ("state_error", "held_out", "refit", "all", 0)."""
+
 _IDENTITY = ("maze", "method", "max_k", "self_prediction", "exogenous", "literal_future", "preset", "seed")
-_MEASURED = ("measure", "split", "probe", "rows", "k", "value")
+_MEASURED = (*Measure._fields, "value")
 _FACTS = ("steps", "seconds", "set", "git_commit", "processor", "gpu", "command")
 
 
 @dataclass(frozen=True)
-class Run:
+class NavigationRun:
     """One finished run."""
 
-    cell: Cell
+    condition: Condition
     preset: str
     seed: int
-    values: dict[Value, float]
+    values: dict[Measure, float]
     facts: dict[str, str]
-    """How it came about: steps, seconds, data, commit, machine, command."""
+    """Its provenance: steps, seconds, data, commit, machine, command."""
     trajectory: Path | None
     """A held-out trajectory with estimated states."""
 
     @property
     def identity(self) -> dict[str, Any]:
         """What tells this run from others."""
-        shape = {name: getattr(self.cell, name) for name in _IDENTITY[:6]}
-        return {k: int(v) if isinstance(v, bool) else v for k, v in shape.items()} | {
+        fields = {name: getattr(self.condition, name) for name in _IDENTITY[:6]}
+        return {k: int(v) if isinstance(v, bool) else v for k, v in fields.items()} | {
             "preset": self.preset,
             "seed": self.seed,
         }
 
     @property
     def settings(self) -> dict[str, str]:
-        """Steps, data, and every flag of its command that neither names its cell nor leaves results as they are."""
+        """Steps, data, and the flags of its command that change results and are no part of its condition."""
         facts = {name: self.facts[name] for name in ("steps", "set")}
         named = {*_IDENTITY[1:3], "literal_future", "preset"}
         return facts | settings_of(
@@ -61,7 +61,7 @@ class Run:
     @property
     def file_name(self) -> str:
         """Name of its trajectory beside the CSV files."""
-        return f"{self.cell.name.replace('/', '-')}-seed{self.seed}.csv"
+        return f"{self.condition.name.replace('/', '-')}-seed{self.seed}.csv"
 
 
 def flags_of(command: str) -> dict[str, str]:
@@ -95,14 +95,14 @@ def _number(word: str) -> str:
         return word
 
 
-def load_runs(sources: Iterable[Path]) -> list[Run]:
+def load_runs(sources: Iterable[Path]) -> list[NavigationRun]:
     """Finished runs of all sources: run folders, folders that hold some, or folders with `rows.csv` and `runs.csv`.
 
     Raises:
         UserError: there is no source, one is missing, damaged or holds nothing, the same run comes with two results,
-            seeds of one cell differ in their steps, data or settings, or a value is not finite.
+            seeds of one condition differ in their steps, data or settings, or a value is not finite.
     """
-    runs: dict[tuple[Any, ...], Run] = {}
+    runs: dict[tuple[Any, ...], NavigationRun] = {}
     for source in sources:
         if not source.exists():
             raise UserError(f"{source}: no such folder; name runs of `vd4rl-pomdp navigation train`")
@@ -113,7 +113,7 @@ def load_runs(sources: Iterable[Path]) -> list[Run]:
             key = tuple(run.identity.values())
             if key in runs and runs[key].values != run.values:
                 raise UserError(
-                    f"{source}: {run.cell.name} seed {run.seed} is there twice with other results; keep one"
+                    f"{source}: {run.condition.name} seed {run.seed} is there twice with other results; keep one"
                 )
             runs.setdefault(key, run)
     if not runs:
@@ -125,23 +125,23 @@ def load_runs(sources: Iterable[Path]) -> list[Run]:
     return sorted(runs.values(), key=lambda run: tuple(run.identity.values()))
 
 
-def is_missing(cell: Cell, runs: Iterable[Run]) -> bool:
-    """Whether no run has a cell, though others are in its maze and others are like it in another maze."""
-    cells = {run.cell for run in runs}
+def is_missing(condition: Condition, runs: Iterable[NavigationRun]) -> bool:
+    """Whether a condition has no run, although its maze has runs and the same condition has some in another maze."""
+    conditions = {run.condition for run in runs}
     return (
-        cell not in cells
-        and any(other.maze == cell.maze for other in cells)
-        and any(replace(other, maze=cell.maze) == cell for other in cells)
+        condition not in conditions
+        and any(other.maze == condition.maze for other in conditions)
+        and any(replace(other, maze=condition.maze) == condition for other in conditions)
     )
 
 
 def unfinished_runs(sources: Iterable[Path]) -> list[tuple[Path, str]]:
-    """Runs below the sources that have not come to their end, and how far they are: "at 10 of 30 steps"."""
-    configs = {path for source in sources for path in source.rglob("config.json") if _is_cut(path.parent)}
+    """Unfinished runs at or below the sources, and how far each is: "at 10 of 30 steps"."""
+    configs = {path for source in sources for path in source.rglob("config.json") if _is_unfinished(path.parent)}
     return [(path.parent, _progress(path.parent)) for path in sorted(configs)]
 
 
-def _is_cut(folder: Path) -> bool:
+def _is_unfinished(folder: Path) -> bool:
     return not (folder / "timing.json").exists() and read_json(folder / "config.json").get("stage") == "navigation"
 
 
@@ -150,29 +150,25 @@ def _progress(folder: Path) -> str:
     return f"at {done} of {read_json(folder / 'config.json').get('config', {}).get('steps', '?')} steps"
 
 
-def _refuse_mixtures(runs: Iterable[Run]) -> None:
-    """Seeds of one cell make a mean only if they had the same budget, data and settings."""
-    first: dict[Cell, Run] = {}
+def _refuse_mixtures(runs: Iterable[NavigationRun]) -> None:
+    """Seeds of one condition make a mean only if they had the same budget, data and settings."""
+    first: dict[Condition, NavigationRun] = {}
     for run in runs:
-        other = first.setdefault(run.cell, run)
+        other = first.setdefault(run.condition, run)
         mine, others = run.settings, other.settings
         for name in dict.fromkeys((*others, *mine)):
             values = [settings.get(name, "the preset's") for settings in (others, mine)]
             if values[0] != values[1]:
                 raise UserError(
-                    f"{run.cell.name}: seeds {other.seed} and {run.seed} differ in their {name} ({', '.join(values)}) "
-                    "and make no mean; report them apart"
+                    f"{run.condition.name}: seeds {other.seed} and {run.seed} differ in their {name} "
+                    f"({', '.join(values)}) and make no mean; report them apart"
                 )
 
 
-def save_runs(runs: list[Run], out: Path) -> None:
+def save_runs(runs: list[NavigationRun], out: Path) -> None:
     """Write `rows.csv`, `runs.csv` and `trajectories/`, from which the report can be made again."""
     out.mkdir(parents=True, exist_ok=True)
-    rows = [
-        run.identity | dict(zip(_MEASURED, (*value, f"{number:.6g}"), strict=True))
-        for run in runs
-        for value, number in run.values.items()
-    ]
+    rows = [run.identity | row | {"value": f"{row['value']:.6g}"} for run in runs for row in measure_rows(run.values)]
     write_csv(out / ROWS, (*_IDENTITY, *_MEASURED), rows)
     write_csv(out / RUNS, (*_IDENTITY, *_FACTS), [run.identity | run.facts for run in runs])
     (out / TRAJECTORIES).mkdir(exist_ok=True)
@@ -182,7 +178,7 @@ def save_runs(runs: list[Run], out: Path) -> None:
             shutil.copyfile(run.trajectory, target)
 
 
-def _from_folders(source: Path) -> list[Run]:
+def _from_folders(source: Path) -> list[NavigationRun]:
     return [_read_run(path.parent) for path in sorted(source.rglob("timing.json")) if _is_navigation(path.parent)]
 
 
@@ -190,7 +186,7 @@ def _is_navigation(folder: Path) -> bool:
     return (folder / "results.json").exists() and read_json(folder / "config.json").get("stage") == "navigation"
 
 
-def _read_run(folder: Path) -> Run:
+def _read_run(folder: Path) -> NavigationRun:
     try:
         return _run_of(folder)
     except UserError:
@@ -199,7 +195,7 @@ def _read_run(folder: Path) -> Run:
         raise UserError(f"{folder}: its results are damaged ({error}); train it again") from error
 
 
-def _run_of(folder: Path) -> Run:
+def _run_of(folder: Path) -> NavigationRun:
     record, results = read_json(folder / "config.json"), read_json(folder / "results.json")
     config, timing, machine = record["config"], read_json(folder / "timing.json"), read_json(folder / "machine.json")
     named = {
@@ -208,7 +204,7 @@ def _run_of(folder: Path) -> Run:
         "self_prediction": config["self_prediction"] > 0,
         "exogenous": config["exogenous"] != "none",
     }
-    cell = build(Cell, named)
+    condition = build(Condition, named)
     if not isinstance(config["preset"], str):
         raise TypeError(f"its preset is {config['preset']!r}")
     if not all(isinstance(timing[name], int | float) for name in ("steps", "seconds")):
@@ -222,11 +218,13 @@ def _run_of(folder: Path) -> Run:
         "gpu": machine["gpu"] or "",
         "command": results.get("command", record["command"]),
     }
-    values = {_value(row): _finite(folder / "results.json", row, f"{row['value']:.6g}") for row in results["rows"]}
+    values = {measure_of(row): _finite(folder / "results.json", row, f"{row['value']:.6g}") for row in results["rows"]}
     trajectory = folder / "trajectory.csv"
     if not trajectory.is_file():
         raise UserError(f"{trajectory}: is missing or no file; train it again")
-    return Run(cell, config["preset"], config["seed"], values, {k: str(v) for k, v in facts.items()}, trajectory)
+    return NavigationRun(
+        condition, config["preset"], config["seed"], values, {k: str(v) for k, v in facts.items()}, trajectory
+    )
 
 
 def _finite(path: Path, row: dict[str, Any], value: str) -> float:
@@ -235,11 +233,7 @@ def _finite(path: Path, row: dict[str, Any], value: str) -> float:
     return float(value)
 
 
-def _value(row: dict[str, Any]) -> Value:
-    return row["measure"], row["split"], row["probe"], row["rows"], int(row["k"])
-
-
-def _from_csv(source: Path) -> list[Run]:
+def _from_csv(source: Path) -> list[NavigationRun]:
     try:
         return _runs_of(source)
     except (KeyError, TypeError, ValueError, csv.Error) as error:
@@ -248,18 +242,18 @@ def _from_csv(source: Path) -> list[Run]:
         raise UserError(f"{source}: {ROWS} and {RUNS} do not fit together ({error}); make the report anew") from error
 
 
-def _runs_of(source: Path) -> list[Run]:
-    values: dict[tuple[str, ...], dict[Value, float]] = {}
+def _runs_of(source: Path) -> list[NavigationRun]:
+    values: dict[tuple[str, ...], dict[Measure, float]] = {}
     for row in _read(source / ROWS):
-        values.setdefault(_identity(row), {})[_value(row)] = _finite(source / ROWS, row, row["value"])
+        values.setdefault(_identity(row), {})[measure_of(row)] = _finite(source / ROWS, row, row["value"])
     runs = []
     for row in _read(source / RUNS):
         flags = {name: row[name] == "1" for name in ("self_prediction", "exogenous", "literal_future")}
-        cell = Cell(row["maze"], row["method"], int(row["max_k"]), **flags)
+        condition = Condition(row["maze"], row["method"], int(row["max_k"]), **flags)
         facts = {name: row[name] for name in _FACTS}
-        run = Run(cell, row["preset"], int(row["seed"]), values[_identity(row)], facts, None)
+        run = NavigationRun(condition, row["preset"], int(row["seed"]), values[_identity(row)], facts, None)
         trajectory = source / TRAJECTORIES / run.file_name
-        runs.append(Run(cell, run.preset, run.seed, run.values, facts, trajectory if trajectory.exists() else None))
+        runs.append(replace(run, trajectory=trajectory) if trajectory.exists() else run)
     return runs
 
 

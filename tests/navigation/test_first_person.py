@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.navigation.policy import SHIPPED, MazePolicyConfig, goals_reached, train_policy
+from vd4rl_pomdp.navigation.first_person import SHIPPED, FirstPersonConfig, goals_reached, train_first_person
 from vd4rl_pomdp.policies.actor import read_actor
 
 
@@ -19,11 +19,11 @@ def test_the_shipped_first_person_policy_reaches_goals_and_an_idle_one_does_not(
 
 def test_a_policy_of_no_decisions_is_refused(tmp_path):
     with pytest.raises(UserError, match="--decisions is 0"):
-        train_policy(MazePolicyConfig(tmp_path / "actor.safetensors", decisions=0))
+        train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", decisions=0))
 
 
 def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
-    trained = train_policy(MazePolicyConfig(tmp_path / "actor.safetensors", decisions=2048))
+    trained = train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", decisions=2048))
     stored = read_actor(tmp_path / "actor.safetensors")
     seen = np.array([0.3, -0.2, 1.0, 0.1], np.float32)
     np.testing.assert_array_equal(stored.act(seen), trained.act(seen))
@@ -42,5 +42,5 @@ def test_a_policy_replaces_nothing_but_a_policy(tmp_path, kind):
     else:
         out.symlink_to("nothing" if kind == "dangling link" else out.name)
     with pytest.raises(UserError, match=r"actor\.safetensors: is there already and holds no actor"):
-        train_policy(MazePolicyConfig(out, decisions=1))
+        train_first_person(FirstPersonConfig(out, decisions=1))
     assert kind != "file" or out.read_text() == "mine\n"

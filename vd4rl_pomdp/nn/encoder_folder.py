@@ -14,7 +14,7 @@ from vd4rl_pomdp.corruptions import CorruptionConfig, make_corruption
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE
-from vd4rl_pomdp.runs.folder import write_bytes, write_json
+from vd4rl_pomdp.runs.files import write_bytes, write_json
 from vd4rl_pomdp.runs.reading import build, parse_json, read_bytes, read_tensors
 
 WEIGHTS, CONFIG = "model.safetensors", "config.json"
@@ -42,7 +42,7 @@ class EncoderCard:
     data: str = ""
     """Fingerprint of the set it was pretrained on."""
     settings: dict[str, Any] = field(default_factory=dict)
-    """What the pretraining was told but for seed, folders, device and logging; empty if it was not recorded."""
+    """The pretraining's settings without seed, folders, device and logging; empty if they were not recorded."""
 
 
 def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard) -> None:
@@ -55,7 +55,7 @@ def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard) -> None:
 
 
 def copy_encoder(source: Path, target: Path) -> None:
-    """Copy an encoder folder; the copy is one only when it is whole."""
+    """Copy an encoder folder, its config.json last: without it a copy is no encoder folder."""
     with disk_errors(target):
         target.mkdir(parents=True, exist_ok=True)
     for name in (WEIGHTS, CONFIG):
@@ -103,7 +103,7 @@ def load_encoder(
         )
     try:
         encoder = Encoder(encoder_config)
-        make_corruption(CorruptionConfig.fill({"corruption": card.corruption["corruption"], **card.corruption}))
+        _check_corruption(card)
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise UserError(f"{folder}/config.json: names no encoder ({_first_line(error)}); pretrain it again") from error
     try:
@@ -112,6 +112,15 @@ def load_encoder(
         reason = _first_line(error)
         raise UserError(f"{folder}/model.safetensors: cannot be read ({reason}); pretrain the encoder again") from error
     return encoder.eval().requires_grad_(False), card
+
+
+def _check_corruption(card: EncoderCard) -> None:
+    """Raise KeyError, TypeError or ValueError unless a card names a corruption."""
+    config = CorruptionConfig.fill({"corruption": card.corruption["corruption"], **card.corruption})
+    build(CorruptionConfig, {"corruption": config.corruption, "corruption_mode": config.corruption_mode})
+    for stage in config.stages:
+        build(type(stage), asdict(stage))
+    make_corruption(config)
 
 
 def _first_line(error: Exception) -> str:

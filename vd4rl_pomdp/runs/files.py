@@ -1,4 +1,4 @@
-"""Files that are read and written whole, with the permissions that the umask leaves."""
+"""Read and write whole files, with the permissions that the umask leaves."""
 
 from __future__ import annotations
 
@@ -12,6 +12,9 @@ from typing import Any
 
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
+
+Row = dict[str, Any]
+"""One row of a table, its values by column."""
 
 
 def jsonable(value: Any) -> Any:
@@ -42,7 +45,7 @@ def write_json(path: Path, value: Any) -> None:
         fresh.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
 
 
-def write_csv(path: Path, columns: Sequence[str], rows: Iterable[dict[str, Any]]) -> None:
+def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
     """Write a CSV file, its header first, so that a reader sees it whole or not at all."""
     with replacing_file(path) as fresh, fresh.open("w", newline="", encoding="utf-8") as file:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
@@ -75,7 +78,7 @@ def replacing_file(path: Path) -> Iterator[Path]:
 
 @contextmanager
 def appending(path: Path) -> Iterator[Any]:
-    """A text file to append lines to; what the system refuses becomes one sentence."""
+    """A text file to append lines to; raises UserError if the system refuses."""
     with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
         yield file
 
@@ -90,7 +93,7 @@ def synchronise(path: Path) -> None:
 
 
 def holds_anything(folder: Path) -> bool:
-    """Whether a folder exists and holds a file or folder that is not hidden; hidden ones are what a cut left there."""
+    """Whether a folder exists and holds a file or folder that is not hidden; hidden ones are left by cut commands."""
     with disk_errors(folder):
         return folder.is_dir() and any(not file.name.startswith(".") for file in folder.iterdir())
 

@@ -11,30 +11,31 @@ from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import claims, judge, paper_number, verdict_lines
-from vd4rl_pomdp.experiments.navigation.grid import Cell, cell_of, evidence, grid_commands, paper_rows
+from vd4rl_pomdp.experiments.navigation.grid import Condition, condition_of, evidence, grid_commands, paper_rows
 from vd4rl_pomdp.experiments.navigation.report import write_report
-from vd4rl_pomdp.experiments.navigation.rows import load_runs
+from vd4rl_pomdp.experiments.navigation.runs import load_runs
 from vd4rl_pomdp.mazes import FREE_CELLS, MAZES
+from vd4rl_pomdp.navigation.measures import Measure, refitted_error
 from vd4rl_pomdp.navigation.methods import METHOD_NAMES, OBJECTIVES
 
-ROOT = Path(__file__).parents[2]
-STATE = ("state_error", "held_out", "refit", "all", 0)
+ROOT = Path(__file__).parents[3]
+STATE = refitted_error("state")
 
 
-def write_run(base: Path, cell: Cell, seed: int, level: float) -> Path:
+def write_run(base: Path, condition: Condition, seed: int, level: float) -> Path:
     """A finished run whose every error is `level` and whose losses grow with k."""
-    folder = base / cell.name / f"seed{seed}"
+    folder = base / condition.name / f"seed{seed}"
     folder.mkdir(parents=True)
     config = {
-        "method": cell.method,
-        "max_k": cell.max_k,
-        "self_prediction": float(cell.self_prediction),
-        "exogenous": "photographs" if cell.exogenous else "none",
-        "literal_future": cell.literal_future,
+        "method": condition.method,
+        "max_k": condition.max_k,
+        "self_prediction": float(condition.self_prediction),
+        "exogenous": "photographs" if condition.exogenous else "none",
+        "literal_future": condition.literal_future,
         "preset": "cpu",
         "seed": seed,
     }
-    words = ["vd4rl-pomdp", *cell.words("cpu", Path("data"), Path("runs"), seed)]
+    words = ["vd4rl-pomdp", *condition.words("cpu", Path("data"), Path("runs"), seed)]
     record = {"stage": "navigation", "config": config, "git_commit": "abc", "command": " ".join(words)}
     common = {"rows": "all", "k": 0, "value": level}
     rows = [
@@ -46,13 +47,13 @@ def write_run(base: Path, cell: Cell, seed: int, level: float) -> Path:
     rows += [
         common | {"measure": "action_loss", "split": split, "probe": "", "k": k, "value": level + k}
         for split in ("held_out", "training")
-        for k in range(cell.max_k + 1)
+        for k in range(condition.max_k + 1)
     ]
     points = "".join(f"{t},{t / 50},1,0,0,{t / 50},1.1,0,0,0\n" for t in range(60))
     header = "t,x,y,vx,vy,estimated_x,estimated_y,estimated_vx,estimated_vy,hidden\n"
     for name, value in (
         ("config.json", record),
-        ("results.json", {"maze": cell.maze, "set": "f00", "rows": rows}),
+        ("results.json", {"maze": condition.maze, "set": "f00", "rows": rows}),
         ("timing.json", {"steps": 2500, "seconds": 300.0}),
         ("machine.json", {"processor": "some", "gpu": None}),
     ):
@@ -65,29 +66,29 @@ def write_run(base: Path, cell: Cell, seed: int, level: float) -> Path:
 def runs(tmp_path) -> Path:
     for seed in (0, 1, 2):
         for i, method in enumerate((*OBJECTIVES, "random")):
-            write_run(tmp_path / "runs", Cell("three_curtains", method), seed, 10.0 * (8 - i) + seed)
-        write_run(tmp_path / "runs", Cell("three_curtains", "ah+a", 1), seed, 44.0)
-        write_run(tmp_path / "runs", Cell("three_curtains", "mik+a", 1), seed, 12.5 + 20 * (seed == 2))
+            write_run(tmp_path / "runs", Condition("three_curtains", method), seed, 10.0 * (8 - i) + seed)
+        write_run(tmp_path / "runs", Condition("three_curtains", "ah+a", 1), seed, 44.0)
+        write_run(tmp_path / "runs", Condition("three_curtains", "mik+a", 1), seed, 12.5 + 20 * (seed == 2))
     return tmp_path / "runs"
 
 
-def test_every_line_of_the_papers_tables_is_a_cell_with_its_own_number():
+def test_every_line_of_the_papers_tables_is_a_condition_with_its_own_number():
     for line in paper_rows():
         component = line["component"]
-        value = (component if component == "action_loss" else f"{component}_error", "training", "online", "all", 0)
+        name = component if component == "action_loss" else f"{component}_error"
         for maze in MAZES:
-            assert paper_number(cell_of(line, maze), value) == float(line[maze])
-    assert paper_number(Cell("no_curtain", "mik+a"), STATE) == 3.4
-    assert paper_number(Cell("no_curtain", "mik+a", literal_future=True), STATE) is None
-    assert paper_number(Cell("no_curtain", "random"), STATE) is None
+            assert paper_number(condition_of(line, maze), Measure(name, "training", "online")) == float(line[maze])
+    assert paper_number(Condition("no_curtain", "mik+a"), STATE) == 3.4
+    assert paper_number(Condition("no_curtain", "mik+a", literal_future=True), STATE) is None
+    assert paper_number(Condition("no_curtain", "random"), STATE) is None
 
 
 def test_the_page_says_what_training_on_the_true_states_reaches(runs, tmp_path):
     assert "true states" not in verdicts_of(runs)
-    write_run(tmp_path / "runs", Cell("three_curtains", "supervised"), 0, 8.0)
+    write_run(tmp_path / "runs", Condition("three_curtains", "supervised"), 0, 8.0)
     assert "true states" not in verdicts_of(runs), "one side alone compares nothing"
-    write_run(tmp_path / "runs", Cell("three_curtains", "supervised"), 1, 9.0)
-    write_run(tmp_path / "runs", Cell("three_curtains", "supervised+a"), 0, 4.0)
+    write_run(tmp_path / "runs", Condition("three_curtains", "supervised"), 1, 9.0)
+    write_run(tmp_path / "runs", Condition("three_curtains", "supervised+a"), 0, 4.0)
     assert "without and with past actions: three_curtains 8.5 and 4.0." in verdicts_of(runs)
 
 
@@ -139,7 +140,7 @@ def test_damaged_reports_and_runs_are_named(runs, tmp_path):
 
 def test_seeds_of_another_budget_or_set_make_no_mean(tmp_path):
     for seed in (0, 1):
-        folder = write_run(tmp_path / "runs", Cell("no_curtain", "ah"), seed, 9.0)
+        folder = write_run(tmp_path / "runs", Condition("no_curtain", "ah"), seed, 9.0)
     for name, fact in (("timing.json", {"steps": 30, "seconds": 3.0}), ("results.json", {"set": "b17"})):
         before = json.loads((folder / name).read_text())
         (folder / name).write_text(json.dumps(before | fact))
@@ -150,7 +151,7 @@ def test_seeds_of_another_budget_or_set_make_no_mean(tmp_path):
 
 
 def test_seeds_of_other_settings_make_no_mean_and_other_logging_does(tmp_path):
-    folders = [write_run(tmp_path / "runs", Cell("no_curtain", "ah"), seed, 9.0) for seed in (0, 1)]
+    folders = [write_run(tmp_path / "runs", Condition("no_curtain", "ah"), seed, 9.0) for seed in (0, 1)]
     whole = [json.loads((folder / "config.json").read_text()) for folder in folders]
 
     def say(*flags: str) -> None:
@@ -176,7 +177,7 @@ def test_the_committed_rows_make_a_report(folder):
 
 def test_missing_cells_seeds_and_unfinished_runs_are_shown(runs, tmp_path, monkeypatch):
     assert "no run (" not in write_report([runs], tmp_path / "whole").read_text()
-    write_run(tmp_path / "runs", Cell("no_curtain", "no_history"), 0, 50.0)
+    write_run(tmp_path / "runs", Condition("no_curtain", "no_history"), 0, 50.0)
     (runs / "three_curtains" / "mik-K15" / "seed1" / "timing.json").unlink()
     (runs / "three_curtains" / "mik-K15" / "seed1" / "metrics.jsonl").write_text('{"step": 40}\n')
     config = json.loads((runs / "three_curtains" / "mik-K15" / "seed1" / "config.json").read_text())
@@ -224,7 +225,7 @@ def test_a_result_that_is_no_number_is_refused(runs, tmp_path, value):
         load_runs([runs])
 
 
-def test_the_grid_of_the_paper_holds_every_cell_of_its_tables():
+def test_the_grid_of_the_paper_holds_every_condition_of_its_tables():
     commands = list(grid_commands("paper", ("no_curtain", "first_person"), (0,), "paper", Path("d"), Path("r")))
     assert len(commands) == 2 * (12 + 7 + 7), "K=1 and 15, then self-prediction, then exogenous noise"
     assert len({tuple(words) for words in commands}) == len(commands)
@@ -263,9 +264,9 @@ def test_the_page_says_which_statements_hold_and_what_the_paper_has(runs, tmp_pa
 
 def test_the_bar_plot_has_the_papers_variants(runs, tmp_path, monkeypatch):
     drawn = []
-    monkeypatch.setattr(figures, "_bar", lambda axes, place, cell, *rest: drawn.append(cell))
+    monkeypatch.setattr(figures, "_bar", lambda axes, place, condition, *rest: drawn.append(condition))
     figures.accuracy_bars(load_runs([runs]), STATE, tmp_path / "bars.png")
-    paper = {cell_of(line, "three_curtains") for line in paper_rows() if line["exogenous"] == "N"}
+    paper = {condition_of(line, "three_curtains") for line in paper_rows() if line["exogenous"] == "N"}
     assert paper < set(drawn)
 
 
@@ -276,9 +277,9 @@ def test_which_way_round_a_relation_is():
 
 
 def test_the_grid_has_every_cell_and_its_commands_parse(capsys):
-    cells = evidence()
-    assert len(cells) == len(set(cells)) == 2 * (10 + 3)
-    assert {c.method for c in cells if c.max_k == 15} == set(METHOD_NAMES)
+    conditions = evidence()
+    assert len(conditions) == len(set(conditions)) == 2 * (10 + 3)
+    assert {c.method for c in conditions if c.max_k == 15} == set(METHOD_NAMES)
     commands = list(grid_commands("evidence", ("no_curtain",), (0, 1, 2), "cpu", Path("d"), Path("r")))
     assert len(commands) == 39
     assert len({tuple(words) for words in commands}) == 39
@@ -288,7 +289,7 @@ def test_the_grid_has_every_cell_and_its_commands_parse(capsys):
     literal = next(words for words in commands if "--literal-future" in words)
     config = parse_stage(NavigationConfig, literal[2:], "x")
     assert (config.options.literal_future, config.options.max_k, config.preset) == (True, 1, "cpu")
-    options = Cell("no_curtain", "ah", self_prediction=True, exogenous=True)
+    options = Condition("no_curtain", "ah", self_prediction=True, exogenous=True)
     config = parse_stage(NavigationConfig, options.words("cpu", Path("d"), Path("r"), 4)[2:], "x")
     assert (config.options.self_prediction, config.exogenous, config.seed) == (1.0, "photographs", 4)
     main(["navigation", "grid", "--dry-run", "--seeds", "0", "--mazes", "no_curtain"])
@@ -307,7 +308,7 @@ def test_what_cannot_be_reported_is_named(runs, tmp_path):
     for source, message in (("nowhere", "no such folder"), ("empty", "holds no finished run")):
         with pytest.raises(UserError, match=message):
             write_report([tmp_path / source], tmp_path / "out")
-    write_run(tmp_path / "other", Cell("three_curtains", "mik"), 0, 99.0)
+    write_run(tmp_path / "other", Condition("three_curtains", "mik"), 0, 99.0)
     with pytest.raises(UserError, match="twice with other results"):
         write_report([runs, tmp_path / "other"], tmp_path / "out")
     config = next((tmp_path / "other").rglob("config.json"))
@@ -354,4 +355,4 @@ def test_slips_are_one_line_and_exit_code_2(words, message, capsys, tmp_path, mo
 
 
 def test_runs_are_frozen_values():
-    assert replace(Cell("no_curtain", "ah"), max_k=1).name == "no_curtain/ah-K1"
+    assert replace(Condition("no_curtain", "ah"), max_k=1).name == "no_curtain/ah-K1"

@@ -1,0 +1,46 @@
+"""A class or type alias has one meaning: its name is defined once in the project."""
+
+import ast
+from collections import defaultdict
+from pathlib import Path
+
+ROOT = Path(__file__).parents[1]
+PACKAGES = ("vd4rl_pomdp", "pretrain", "finetune", "baselines")
+SHARED = {
+    "CollectConfig": "settings of one command each, data collect and navigation collect",
+    "Info": "Gymnasium's dictionary of facts, in every environment",
+    "Policy": "in data.collect who plays, in nn.policy the network on representations",
+    "ReportCommand": "words of one command each",
+    "Row": "in envs.dmc a time step of an environment, in runs.files a row of a table",
+    "Table": "in cli.dispatch the commands by name, in experiments.navigation.report one of the paper's tables",
+    "Trainer": "one for each stage",
+    "View": "in data.view a set as an agent sees it, in envs.maze_view a way of drawing a maze",
+}
+"""Names that mean several things, and which."""
+
+
+def definitions(source: str) -> set[str]:
+    """Public classes and type aliases that a module defines."""
+    found = set()
+    for node in ast.parse(source).body:
+        if isinstance(node, ast.ClassDef):
+            found.add(node.name)
+        elif isinstance(node, ast.Assign) and isinstance(node.value, ast.Subscript | ast.BinOp | ast.Name):
+            found |= {target.id for target in node.targets if isinstance(target, ast.Name)}
+    return {name for name in found if name[0].isupper() and not name.isupper()}
+
+
+def test_definitions_are_classes_and_aliases():
+    source = "class Aa: pass\nBb = dict[str, int]\nCc = int | None\nDd = Ee\nFF = a | b\n_Hh = list[int]\nii = x[0]\n"
+    assert definitions(source) == {"Aa", "Bb", "Cc", "Dd"}
+
+
+def test_a_name_means_one_thing():
+    places = defaultdict(list)
+    for package in PACKAGES:
+        for path in (ROOT / package).rglob("*.py"):
+            for name in definitions(path.read_text(encoding="utf-8")):
+                places[name].append(path.relative_to(ROOT).as_posix())
+    several = {name: files for name, files in places.items() if len(files) > 1}
+    assert {name: files for name, files in several.items() if name not in SHARED} == {}
+    assert sorted(set(SHARED) - set(several)) == [], "these mean one thing by now: drop them from the list"
