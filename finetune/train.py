@@ -31,7 +31,7 @@ from vd4rl_pomdp.runs.memory import require_disk, require_memory, telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, FRAME_SIZE, MOST_EPISODES, get_task
+from vd4rl_pomdp.tasks import FRAME_SIZES, MOST_EPISODES, TASKS
 
 
 def finetune(config: FinetuneConfig) -> RunFolder:
@@ -46,7 +46,9 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     device = pick_device(config.device)
     dataset = open_dataset(config.data)
     dataset.require_transitions()
-    encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frames.shape[-1])
+    encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frame_size)
+    refuse_outside(config, shift=(0, dataset.frame_size - 1))
+    TASKS.named(card.task)
     if card.end_to_end:
         check(config, card.end_to_end)
         config = replace(config, algorithm=card.end_to_end, views=0)
@@ -73,8 +75,8 @@ def check(config: FinetuneConfig, end_to_end: str = "") -> None:
     """
     refuse_outside(
         config, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, gamma=(0, 1), n_step=1,
-        alpha=0, views=0, shift=(0, FRAME_SIZE - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
-        eval_length=(1, EPISODE_TRANSITIONS), log_every=1, checkpoint_every=1, workers=0,
+        alpha=0, views=0, shift=(0, FRAME_SIZES[1] - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
+        eval_length=1, log_every=1, checkpoint_every=1, workers=0,
     )  # fmt: skip
     algorithm = end_to_end or config.algorithm
     unread = {*OPTIONS.difference(get_algorithm(algorithm).options), *(("views",) if end_to_end else ())}
@@ -120,7 +122,7 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     if dataset.physics is None or dataset.task is None or (run.path / "probe.json").exists():
         return
     arrays = features[0].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
-    write_json(run.path / "probe.json", probe_state(*arrays, get_task(dataset.task)))
+    write_json(run.path / "probe.json", probe_state(*arrays, TASKS.named(dataset.task)))
 
 
 class Trainer:
@@ -190,17 +192,17 @@ class Trainer:
         self.algorithm.policy.save(run.path / "policy")
         if isinstance(self.algorithm, EndToEnd):
             save_encoder(run.path / "encoder", self.algorithm.encoder, self.card)
-        corruption = CorruptionConfig(**self.card.corruption)
+        corruption, task = CorruptionConfig(**self.card.corruption), TASKS.named(self.card.task)
         jobs = [
             EpisodeJob(
                 encoder=run.path / "encoder",
                 policy=run.path / "policy",
                 version=self.step,
-                task=self.card.task,
+                task=task,
                 corruption=corruption,
                 episode=episode,
                 film=episode == 0,
-                length=config.eval_length,
+                length=min(config.eval_length, task.decisions),
             )
             for episode in range(config.eval_episodes)
         ]

@@ -26,7 +26,7 @@ from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.tasks import FRAME_SIZE, get_task
+from vd4rl_pomdp.tasks import FRAME_SIZES, FRAME_STACK, TASKS
 from vd4rl_pomdp.types import Windows
 
 STAGE = "pretrain"
@@ -45,6 +45,7 @@ def pretrain(config: PretrainConfig) -> RunFolder:
 def _pretrain(config: PretrainConfig) -> RunFolder:
     method = METHODS.named(config.method)
     dataset = open_dataset(config.data)
+    check_pictures(config, dataset.frame_size)
     task = _task_of(dataset, config)
     seed_networks(config.seed, STAGE)
     objective = _build(dataset, config)
@@ -124,9 +125,9 @@ def check(config: PretrainConfig) -> None:
     """Refuse settings that cannot work or that nothing reads, before anything is read or written."""
     METHODS.named(config.method)
     refuse_outside(
-        config, seed=(0, MAX_SEED), steps=0, batch_size=1, window=2, learning_rate=0, shift=(0, FRAME_SIZE - 1),
-        feature_dim=1, hidden_dim=1, gru_layers=(1, MAX_LAYERS), head_dim=1, m=0, n=0, history_window=0, max_k=1,
-        codes=1, homer_codes=0, self_prediction=0, l2_states=0, log_every=1, checkpoint_every=1,
+        config, seed=(0, MAX_SEED), steps=0, batch_size=1, window=2, learning_rate=0, feature_dim=1, hidden_dim=1,
+        gru_layers=(1, MAX_LAYERS), head_dim=1, m=0, n=0, history_window=0, max_k=1, codes=1, homer_codes=0,
+        self_prediction=0, l2_states=0, log_every=1, checkpoint_every=1,
     )  # fmt: skip
     check_frame_encoder(config.frame_encoder)
     check_action_target(config.action_target)
@@ -134,7 +135,13 @@ def check(config: PretrainConfig) -> None:
     refuse_unread(config, PRESETS[config.preset], unread, config.method)
     if "max_k" not in unread:
         check_gap(config.max_k, config.window)
-    check_corruption(config)
+    check_pictures(config, FRAME_SIZES[1])
+
+
+def check_pictures(config: PretrainConfig, size: int) -> None:
+    """Refuse a shift or a corruption that does not fit frames of size x size pixels."""
+    refuse_outside(config, shift=(0, size - 1))
+    check_corruption(config, size)
 
 
 def require_batch(objective: Objective, device: torch.device, config: Any) -> None:
@@ -157,7 +164,7 @@ def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
     actions = dataset.action_after(dataset.transition_rows)
     target = make_action_target(config.action_target, actions.numpy(), config.codes, config.seed)
     state_dim = dataset.states().shape[1] if METHODS.named(config.method).reads_state else 0
-    objective = build_objective(config, actions, target, state_dim)
+    objective = build_objective(config, actions, target, state_dim, (3 * FRAME_STACK, dataset.frame_size))
     dataset.num_windows(config.window)
     return objective
 
@@ -168,7 +175,7 @@ def _task_of(dataset: Dataset, config: PretrainConfig) -> str:
         raise UserError(f"{config.data}: cannot tell the task of this set; pass --task")
     if dataset.task is not None and name != dataset.task:
         raise UserError(f"{config.data}: is a set of {dataset.task}, not of {name}; leave --task out")
-    task = get_task(name)
+    task = TASKS.named(name)
     if task.action_dim != dataset.action_dim:
         raise UserError(
             f"{config.data}: has {dataset.action_dim} action dimensions, {name} has {task.action_dim}; "

@@ -18,7 +18,7 @@ from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.corruptions import STAGES, make_corruption
 from vd4rl_pomdp.mazes import get_maze
-from vd4rl_pomdp.tasks import QUALITIES, get_task
+from vd4rl_pomdp.tasks import QUALITIES, TASKS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -116,8 +116,8 @@ CHECKS = {
     "corruptions": make_corruption,
     "algorithm": get_algorithm,
     "algorithms": get_algorithm,
-    "task": get_task,
-    "tasks": get_task,
+    "task": TASKS.named,
+    "tasks": TASKS.named,
     "maze": get_maze,
     "mazes": get_maze,
     "quality": QUALITIES.index,
