@@ -8,6 +8,9 @@ import gymnasium
 import numpy as np
 import pytest
 
+from vd4rl_pomdp.data.check import check_dataset
+from vd4rl_pomdp.data.collect import CollectConfig, collect
+from vd4rl_pomdp.envs.dmc import replay_rewards, replays
 from vd4rl_pomdp.envs.pixels import make_env
 from vd4rl_pomdp.envs.rendering import suite
 from vd4rl_pomdp.errors import UserError
@@ -41,6 +44,28 @@ def test_what_a_task_does_not_tell_is_found(domain, task, layout):
     physics = suite.load(domain, task).physics.get_state()
     states = DMCTask(domain, task).visible_state(physics[None])
     assert states.shape == (1, len(physics) - len(layout.travel))
+
+
+@pytest.mark.parametrize("task", ["cartpole swingup", "acrobot swingup", "dog walk", "quadruped fetch"])
+def test_rewards_of_any_task_of_dm_control_replay(task):
+    env, rng = make_env(DMCTask(*task.split()), size=None), np.random.default_rng(0)
+    first = env.reset(3)
+    actions = rng.uniform(-1, 1, (8, env.action_dim)).astype(np.float32)
+    rewards = [env.step(action).reward for action in actions]
+    with TASKS.isolated():
+        TASKS.register("mine", env.task)
+        assert replays(env.task)
+        np.testing.assert_array_equal(replay_rewards("mine", first.physics, actions), rewards)
+
+
+@pytest.mark.parametrize("task", ["reacher easy", "finger turn_hard", "swimmer swimmer6"])
+def test_a_task_that_draws_a_target_into_its_model_cannot_be_replayed_and_says_so(task, tmp_path):
+    with TASKS.isolated():
+        TASKS.register("mine", DMCTask(*task.split()))
+        collect(CollectConfig("mine", "random", tmp_path / "set", episodes=1, workers=1, frame_size=16), 2)
+        report = check_dataset(tmp_path / "set", tmp_path / "cache")
+    assert report["replay_max_error"] is None
+    assert report["replay"] == "impossible: mine draws more than the simulator state for each episode"
 
 
 def test_an_unknown_task_of_dm_control_is_one_line():

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -26,6 +25,7 @@ class DMCEnv(PixelEnv):
         self._random = np.random.RandomState(0)
         self.simulator = _load(task, self._random)
         """The dm_control environment."""
+        self._layout = task.layout or self._found_layout()
         if size is not None:
             rendering.prepare(self.physics, render)
 
@@ -34,13 +34,15 @@ class DMCEnv(PixelEnv):
         """dm_control's physics."""
         return self.simulator.physics
 
-    @cached_property
+    @property
     def layout(self) -> Layout:
-        """The task's own, else what the model has; a camera that tracks its subject does not show where it is."""
-        if self.task.layout is not None:
-            return self.task.layout
+        """The task's own, else what the model has."""
+        return self._layout
+
+    def _found_layout(self) -> Layout:
+        """Widths of a model; a camera that tracks its subject does not show where it is."""
         model = self.physics.model
-        self.simulator.reset()
+        self.simulator.reset()  # an episode of its own: some tasks observe nothing before
         state = flat_state(self.simulator.task.get_observation(self.physics))
         travel = _ground_travel(model) if _tracks(model, self._camera) else ()
         return Layout(self.simulator.action_spec().shape[0], len(state), model.nq, travel)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from functools import cached_property
 from typing import Any
 
 import gymnasium
@@ -30,7 +29,7 @@ class GymnasiumEnv(PixelEnv):
         self._space = self._bounded_box(self.env.action_space)
         self._observation: Any = None
 
-    @cached_property
+    @property
     def layout(self) -> Layout:
         """The environment's action dimension; it has no states."""
         return Layout(int(np.prod(self._space.shape)))
