@@ -50,7 +50,7 @@ class FinetuneConfig(StageConfig):
     eval_episodes: int = 10
     """Episodes of an evaluation."""
     eval_length: int = 500
-    """Decisions in an evaluation episode; fewer only for trials."""
+    """Most decisions in an evaluation episode, which never has more than the task's; fewer only for trials."""
     workers: int = 0
     """Processes that evaluate; 0 uses every core."""
     device: str = "auto"

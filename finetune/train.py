@@ -17,7 +17,7 @@ from finetune.features import STAGE, ExactSampler, FeatureFile, FeatureSampler, 
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.data.parity import render_info
-from vd4rl_pomdp.errors import UserError, refuse_number
+from vd4rl_pomdp.errors import UserError, refuse_number, refuse_outside
 from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, read_rows, rows_of, rows_until
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, EncoderCard, copy_encoder, encoder_hash, load_encoder, save_encoder
@@ -31,7 +31,7 @@ from vd4rl_pomdp.runs.memory import require_disk, require_memory, telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.tasks import get_task
+from vd4rl_pomdp.tasks import TASKS
 
 
 def finetune(config: FinetuneConfig) -> RunFolder:
@@ -46,7 +46,9 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     device = pick_device(config.device)
     dataset = open_dataset(config.data)
     dataset.require_transitions()
-    encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frames.shape[-1])
+    encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frame_size)
+    refuse_outside(config, shift=(0, dataset.frame_size - 1))
+    TASKS.named(card.task)
     if card.end_to_end:
         config = end_to_end(config, card.end_to_end)
     if encoder.reads_state:
@@ -119,7 +121,7 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     if dataset.physics is None or dataset.task is None or (run.path / "probe.json").exists():
         return
     arrays = features[0].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
-    write_json(run.path / "probe.json", probe_state(*arrays, get_task(dataset.task)))
+    write_json(run.path / "probe.json", probe_state(*arrays, TASKS.named(dataset.task)))
 
 
 class Trainer:
@@ -187,17 +189,17 @@ class Trainer:
         self.algorithm.policy.save(run.path / "policy")
         if isinstance(self.algorithm, EndToEnd):
             save_encoder(run.path / "encoder", self.algorithm.encoder, self.card)
-        corruption = CorruptionConfig.fill(self.card.corruption)
+        corruption, task = CorruptionConfig.fill(self.card.corruption), TASKS.named(self.card.task)
         jobs = [
             EpisodeJob(
                 encoder=run.path / "encoder",
                 policy=run.path / "policy",
                 version=self.step,
-                task=self.card.task,
+                task=task,
                 corruption=corruption,
                 episode=episode,
                 film=episode == 0,
-                length=config.eval_length,
+                length=min(config.eval_length, task.decisions),
             )
             for episode in range(config.eval_episodes)
         ]

@@ -26,7 +26,7 @@ from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.tasks import get_task
+from vd4rl_pomdp.tasks import FRAME_SIZES, FRAME_STACK, TASKS
 from vd4rl_pomdp.types import Windows
 
 STAGE = "pretrain"
@@ -45,6 +45,7 @@ def pretrain(config: PretrainConfig) -> RunFolder:
 def _pretrain(config: PretrainConfig) -> RunFolder:
     method = METHODS.named(config.method)
     dataset = open_dataset(config.data)
+    check_pictures(config, dataset.frame_size)
     task = _task_of(dataset, config)
     seed_networks(config.seed, STAGE)
     objective = _build(dataset, config)
@@ -118,7 +119,13 @@ class Trainer:
 def check(config: PretrainConfig) -> None:
     """Refuse settings that cannot work, before anything is read or written."""
     config.check()
-    check_corruption(config.corruption)
+    check_pictures(config, FRAME_SIZES[1])
+
+
+def check_pictures(config: PretrainConfig, size: int) -> None:
+    """Refuse a shift or a corruption that does not fit frames of size x size pixels."""
+    refuse_outside(config, shift=(0, size - 1))
+    check_corruption(config.corruption, size)
 
 
 def require_batch(objective: Objective, device: torch.device, config: Any) -> None:
@@ -140,7 +147,7 @@ def require_batch(objective: Objective, device: torch.device, config: Any) -> No
 def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
     target = build_target(config, dataset.action_after(dataset.transition_rows).numpy())
     state_dim = dataset.states().shape[1] if METHODS.named(config.method).reads_state else 0
-    objective = build_objective(config, dataset.action_dim, target, state_dim)
+    objective = build_objective(config, dataset.action_dim, target, state_dim, (3 * FRAME_STACK, dataset.frame_size))
     dataset.num_windows(config.window)
     return objective
 
@@ -151,7 +158,7 @@ def _task_of(dataset: Dataset, config: PretrainConfig) -> str:
         raise UserError(f"{config.data}: cannot tell the task of this set; pass --task")
     if dataset.task is not None and name != dataset.task:
         raise UserError(f"{config.data}: is a set of {dataset.task}, not of {name}; leave --task out")
-    task = get_task(name)
+    task = TASKS.named(name)
     if task.action_dim != dataset.action_dim:
         raise UserError(
             f"{config.data}: has {dataset.action_dim} action dimensions, {name} has {task.action_dim}; "

@@ -27,6 +27,7 @@ from vd4rl_pomdp.nn.policy import load_policy
 from vd4rl_pomdp.policies.actor import Actor, load_actor
 from vd4rl_pomdp.runs.files import read_json, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_inside
+from vd4rl_pomdp.tasks import TASKS, Task
 
 SPANS = ((0, 10), (10, 50), (50, None))
 
@@ -45,7 +46,7 @@ class Config:
     """CSV file to write."""
 
 
-def play(agent: Agent, expert: Actor, env: CorruptedEnv, task: str, after: int, episode: int) -> dict[str, float]:
+def play(agent: Agent, expert: Actor, env: CorruptedEnv, task: Task, after: int, episode: int) -> dict[str, float]:
     """Measurements of one episode."""
     agent.reset()
     now = env.reset(EVALUATION_SEED + episode, EVALUATION_SEED, episode)
@@ -72,11 +73,12 @@ def main(config: Config) -> None:
         labels = read_json(run / "labels.json")
         encoder, card = load_encoder(run / "encoder")
         agent, expert = Agent(encoder, load_policy(run / "policy")), load_actor(card.task, "expert")
-        env = CorruptedEnv(card.task, CorruptionConfig.of(**card.corruption))
+        task = TASKS.named(card.task)
+        env = CorruptedEnv(task, CorruptionConfig.fill(card.corruption), size=encoder.config.size)
         for after in config.after:
             for episode in range(config.episodes):
                 row = labels | {"after": after, "episode": episode}
-                rows.append(row | play(agent, expert, env, card.task, after, episode))
+                rows.append(row | play(agent, expert, env, task, after, episode))
                 print(" ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
     write_csv(config.out, list(rows[0]), rows)
 

@@ -9,7 +9,7 @@ from unittest.mock import patch
 import pytest
 import tyro
 
-from finetune.algorithms import get_algorithm
+from finetune.algorithms import ALGORITHMS
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS, Method
 from pretrain.train import pretrain as run_pretrain
@@ -17,12 +17,12 @@ from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.corruptions import STAGES, make_corruption
 from vd4rl_pomdp.mazes import get_maze
-from vd4rl_pomdp.tasks import QUALITIES, get_task
+from vd4rl_pomdp.tasks import QUALITIES, TASKS, DMCTask, GymnasiumTask
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PROGRAMS = (["vd4rl-pomdp"], ["python", "my_method.py"])
-"""What begins a command of ours; the second is the page's own example."""
+PROGRAMS = (["vd4rl-pomdp"], ["python", "my_method.py"], ["python", "my_task.py"])
+"""What begins a command of ours; the others are the pages' own examples."""
 NOT_RUN = {
     "make demo": "minutes of rendering and training; tests/cli looks at its commands, the Dockerfile runs them",
     "make test": "runs these tests",
@@ -30,6 +30,7 @@ NOT_RUN = {
     "parallel": "not a program of ours",
     "sbatch": "needs a cluster",
     "python my_method.py": "test_own_method runs them",
+    "python my_task.py": "test_own_task runs them",
     "vd4rl-pomdp data collect": "renders whole episodes; data/test_collect runs shorter ones",
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
@@ -71,7 +72,7 @@ class ParsedError(Exception):
 
 @pytest.fixture(autouse=True)
 def _registries():
-    with METHODS.isolated(), patch.dict(STAGES):
+    with METHODS.isolated(), TASKS.isolated(), patch.dict(STAGES):
         yield
 
 
@@ -102,6 +103,8 @@ def test_every_command_has_flags_and_values_that_exist(page, line, monkeypatch):
 
     monkeypatch.setattr(tyro, "cli", parse_alone)
     METHODS.register("past_to_frame", Method(METHODS["acro"].build))
+    TASKS.register("cartpole_swingup", DMCTask("cartpole", "swingup"))
+    TASKS.register("centre", GymnasiumTask("Centre-v0"))
     words = shlex.split(re.split(r" [>|] ", line)[0].replace("[SET]", "SET"))
     with pytest.raises(ParsedError):
         main(words[1:] if words[0] == "vd4rl-pomdp" else words[2:])
@@ -113,10 +116,10 @@ CHECKS = {
     "methods": METHODS.named,
     "corruption": make_corruption,
     "corruptions": make_corruption,
-    "algorithm": get_algorithm,
-    "algorithms": get_algorithm,
-    "task": get_task,
-    "tasks": get_task,
+    "algorithm": ALGORITHMS.named,
+    "algorithms": ALGORITHMS.named,
+    "task": TASKS.named,
+    "tasks": TASKS.named,
     "maze": get_maze,
     "mazes": get_maze,
     "quality": QUALITIES.index,
@@ -181,6 +184,9 @@ def check_results(page: str, names: dict) -> None:
         assert names["windows"].obs.shape == (2, 16, 9, 84, 84)
         assert names["z"].shape == (1, names["encoder"].dim)
         assert names["truncated"]
+    elif page == "add_a_task":
+        assert names["obs"].shape == (9, 64, 64)
+        assert not names["truncated"]
     elif page == "README":
         obs, info = names["env"].reset(seed=0)
         frames, clean = (pixels.reshape(3, 3, 84, 84) for pixels in (obs, info["clean"]))
@@ -190,5 +196,5 @@ def check_results(page: str, names: dict) -> None:
 
 
 def test_toml_blocks_are_read_and_name_what_exists():
-    (block,) = [code for page in PAGES for code in blocks(page, "toml")]
-    assert list(tomllib.loads(block)["project"]["entry-points"]) == [METHODS.group]
+    found = [tomllib.loads(code)["project"]["entry-points"] for page in PAGES for code in blocks(page, "toml")]
+    assert sorted(group for groups in found for group in groups) == sorted([METHODS.group, TASKS.group])

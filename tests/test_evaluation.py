@@ -10,10 +10,11 @@ from tests.nn.test_encoder import CARD
 from vd4rl_pomdp import evaluation
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import Observation
-from vd4rl_pomdp.envs.dmc import Row
+from vd4rl_pomdp.envs.pixels import Row
 from vd4rl_pomdp.evaluation import EVALUATION_SEED, EpisodeJob, evaluate, rows_of
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.tasks import TASKS
 from vd4rl_pomdp.types import StepType, Windows
 
 LENGTH, REWARDS = 5, (1.0, 0.5, 0.25, 2.0, 8.0)
@@ -70,7 +71,7 @@ def agent(tmp_path) -> tuple[Encoder, Policy]:
 
 def play(folder: Path, *episodes: int) -> list[evaluation.Episode]:
     places = folder / "encoder", folder / "policy"
-    jobs = [EpisodeJob(*places, 0, "walker_walk", CorruptionConfig.of("patch"), e, film=False) for e in episodes]
+    jobs = [EpisodeJob(*places, 0, TASKS["walker_walk"], CorruptionConfig.of("patch"), e, film=False) for e in episodes]
     return evaluate(jobs, workers=1)
 
 
@@ -103,12 +104,12 @@ def test_an_episode_does_not_depend_on_those_before_it(world, agent, tmp_path, m
 def test_episode_i_has_the_environment_seed_20000_plus_i_and_its_own_corruption(world, agent, tmp_path):
     play(tmp_path, 0, 3)
     assert world[0].seeds == [(20_000, 20_000, 0), (20_003, 20_000, 3)]
-    labels = dict.fromkeys(("method", "task"), "x")
+    labels = {"method": "x", "task": "walker_walk"}
     assert [row["episode_seed"] for row in rows_of(play(tmp_path, 3), labels)] == [EVALUATION_SEED + 3]
 
 
 def test_a_return_is_the_sum_of_all_rewards_and_a_score_a_tenth_of_it(world, agent, tmp_path):
     (episode,) = play(tmp_path, 0)
     assert (episode.total, episode.length) == (sum(REWARDS), LENGTH)
-    (row,) = rows_of([episode], {})
+    (row,) = rows_of([episode], {"task": "walker_walk"})
     assert (row["return"], row["score"], row["length"]) == (11.75, 1.175, LENGTH)

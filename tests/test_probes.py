@@ -3,7 +3,7 @@ import pytest
 
 from vd4rl_pomdp.envs.rendering import suite
 from vd4rl_pomdp.probes import probe_error, probe_state
-from vd4rl_pomdp.tasks import TASKS, get_task
+from vd4rl_pomdp.tasks import TASKS
 
 RNG = np.random.default_rng(0)
 
@@ -26,7 +26,7 @@ def test_constant_states_are_left_out_and_one_episode_is_enough_to_test():
 
 
 def test_pose_and_velocity_are_apart():
-    task = get_task("walker_walk")
+    task = TASKS.named("walker_walk")
     physics = RNG.normal(size=(1000, 18))
     episode = np.arange(1000) // 50
     found = probe_state(task.velocity(physics), physics, episode, task)
@@ -38,10 +38,10 @@ def test_pose_and_velocity_are_apart():
 def test_tasks_name_the_columns_of_their_simulators(name: str):
     task = TASKS[name]
     physics = suite.load(task.domain, task.task).physics
-    assert task.positions == physics.model.nq
+    assert task.layout.positions == physics.model.nq
     joints = [physics.model.id2name(i, "joint") for i in range(physics.model.njnt)]
     travel = (0, 1) if joints[0] == "root" else (joints.index("rootx"),)
-    assert task.travel == travel
+    assert task.layout.travel == travel
     assert task.visible_state(physics.get_state()[None]).shape == (1, physics.get_state().size - len(travel))
 
 

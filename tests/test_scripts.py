@@ -12,6 +12,7 @@ from vd4rl_pomdp.evaluation import Agent
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.policies.actor import load_actor
+from vd4rl_pomdp.tasks import TASKS
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
@@ -23,15 +24,15 @@ def test_the_expert_acts_first_and_the_policy_remembers_its_actions(monkeypatch)
     encoder = Encoder(EncoderConfig(6, frame_encoder="nature", history="gru", use_actions=True, hidden_dim=8)).eval()
     agent, expert = Agent(encoder, Policy(8, 6, 8).eval()), load_actor("walker_walk", "expert")
     executed, remembered = [], []
-    env = CorruptedEnv("walker_walk", CorruptionConfig.of("none"), length=60)
+    env = CorruptedEnv(TASKS["walker_walk"], CorruptionConfig.of("none"), length=60)
     step, act = env.step, agent.act
     env.step = lambda action: (executed.append(action), step(action))[1]
     agent.act = lambda obs: (remembered.append(agent._action[0].numpy().copy()), act(obs))[1]
-    result = script.play(agent, expert, env, "walker_walk", after=59, episode=0)
+    result = script.play(agent, expert, env, TASKS["walker_walk"], after=59, episode=0)
     assert len(executed) == 60
     np.testing.assert_array_equal(remembered[1:], executed[:-1])
 
-    watched = CorruptedEnv("walker_walk", CorruptionConfig.of("none"), length=60)
+    watched = CorruptedEnv(TASKS["walker_walk"], CorruptionConfig.of("none"), length=60)
     now = watched.reset(20_000, 20_000, 0)
     for action in executed[:59]:
         np.testing.assert_array_equal(action, expert.act(now.row.state))

@@ -16,7 +16,7 @@ import torch
 
 from vd4rl_pomdp.corruptions import CorruptionConfig, make_corruption
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
-from vd4rl_pomdp.envs.rendering import Render
+from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import load_encoder
@@ -24,7 +24,7 @@ from vd4rl_pomdp.nn.policy import Policy, load_policy
 from vd4rl_pomdp.runs.files import appending, read_json, write_csv
 from vd4rl_pomdp.runs.reading import regular
 from vd4rl_pomdp.runs.workers import run_jobs
-from vd4rl_pomdp.tasks import MOST_EPISODES, SCORE_DIVISOR, get_task
+from vd4rl_pomdp.tasks import FRAME_SIZE, MOST_EPISODES, TASKS, Task
 
 EVALUATION_SEED = 20_000
 """Evaluation episode i starts from environment seed EVALUATION_SEED + i, for every method and training seed."""
@@ -47,15 +47,15 @@ class Agent:
         self._state = self.encoder.initial_state(1)
         self._action = torch.zeros(1, self.encoder.config.action_dim)
 
-    def observe(self, now: Observation, task: str) -> torch.Tensor:
+    def observe(self, now: Observation, task: Task) -> torch.Tensor:
         """What the encoder reads: the corrupted stack, or the simulator state for the `state` reference."""
         if not self.encoder.reads_state:
             return now.obs
-        return torch.from_numpy(get_task(task).visible_state(now.row.physics))[:, None, None]
+        return torch.from_numpy(task.visible_state(now.row.physics))[:, None, None]
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> np.ndarray:
-        """Mean action (A,) float32 for a (C, 84, 84) uint8 observation."""
+        """Mean action (A,) float32 for a (C, S, S) uint8 observation."""
         z, self._state = self.encoder.step(obs[None], self._action, self._state)
         self._action = self.policy(z)
         return self._action[0].numpy()
@@ -73,7 +73,8 @@ class EpisodeJob:
     policy: Path
     version: int
     """Changes when the policy folder was written anew."""
-    task: str
+    task: Task
+    """Itself and not its name: a task of one's own need not be registered where the job is done."""
     corruption: CorruptionConfig
     episode: int
     film: bool
@@ -89,7 +90,7 @@ class Episode:
     total: float
     length: int
     film: dict[str, np.ndarray] | None
-    """`clean` (F, 3, 84, 84) and `corrupted` (F, C, 84, 84) uint8 pictures, `return` (F,) so far."""
+    """`clean` (F, 3, S, S) and `corrupted` (F, C, S, S) uint8 pictures, `return` (F,) so far."""
 
 
 def evaluate(
@@ -106,6 +107,7 @@ def evaluate(
 
 def rows_of(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, Any]]:
     """Rows of `episodes.csv`: one an episode, `labels` giving the columns up to `step`."""
+    divisor = TASKS.named(labels["task"]).score_divisor
     return [
         labels
         | {
@@ -113,7 +115,7 @@ def rows_of(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, A
             "episode_seed": EVALUATION_SEED + e.episode,
             "return": round(e.total, 4),
             "length": e.length,
-            "score": round(e.total / SCORE_DIVISOR, 4),
+            "score": round(e.total / divisor, 4),
         }
         for e in episodes
     ]
@@ -202,10 +204,12 @@ def _run_episode(job: EpisodeJob) -> Episode:
     if key not in _AGENTS:
         _AGENTS.clear()
         _AGENTS[key] = Agent(load_encoder(job.encoder)[0], load_policy(job.policy))
-    place = (job.task, job.corruption, job.render, job.length)
+    agent = _AGENTS[key]
+    size = FRAME_SIZE if agent.encoder.reads_state else agent.encoder.config.size
+    place = (job.task, job.corruption, job.render, job.length, size)
     if place not in _ENVIRONMENTS:
-        _ENVIRONMENTS[place] = CorruptedEnv(job.task, job.corruption, job.render, job.length)
-    return _play(_AGENTS[key], _ENVIRONMENTS[place], job)
+        _ENVIRONMENTS[place] = CorruptedEnv(*place)
+    return _play(agent, _ENVIRONMENTS[place], job)
 
 
 def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
@@ -254,11 +258,11 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     if missing:
         raise UserError(f"{run / 'labels.json'}: has no {missing[0]!r}; the command that made the run writes it anew")
     card = load_encoder(run / "encoder")[1]
+    task = TASKS.named(card.task)
     chosen = CorruptionConfig.fill(card.corruption) if corruption is None else CorruptionConfig.of(corruption)
     make_corruption(chosen)
     jobs = [
-        EpisodeJob(run / "encoder", run / "policy", 0, card.task, chosen, episode, film=False)
-        for episode in range(episodes)
+        EpisodeJob(run / "encoder", run / "policy", 0, task, chosen, episode, film=False) for episode in range(episodes)
     ]
     step = max(row["step"] for row in evaluated)
     done = evaluate(jobs, workers)

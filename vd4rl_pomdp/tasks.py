@@ -1,17 +1,27 @@
-"""The benchmark's tasks: dm_control's names, dimensions and V-D4RL's conventions, in one place."""
+"""Tasks by name: the benchmark's three with V-D4RL's conventions, those added by a call, and those of other packages.
 
-from dataclasses import dataclass
-from typing import Literal, get_args
+A task is dm_control's (`DMCTask`) or any Gymnasium environment with pixels (`GymnasiumTask`). What a task's name means,
+its parameters included, is fixed where it is registered: no flag changes it.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.registry import Registry
 
 FRAME_SIZE = 84
+"""Height and width of the benchmark's frames."""
+FRAME_SIZES = (16, 480)
+"""Smallest and largest frames that can be collected."""
 FRAME_STACK = 3
 ACTION_REPEAT = 2
 EPISODE_TRANSITIONS = 500
-"""Decisions an episode: 1000 simulator steps at action repeat 2; an episode has one row more."""
+"""Decisions an episode of the benchmark: 1000 simulator steps at action repeat 2; an episode has one row more."""
 MOST_EPISODES = 10**6
 """Most episodes that any command makes or plays at once."""
 SCORE_DIVISOR = 10.0
@@ -27,45 +37,100 @@ SET_QUALITIES = (*QUALITIES, *NOISY_QUALITIES)
 
 
 @dataclass(frozen=True)
-class Task:
-    """One dm_control task as V-D4RL uses it (camera 0, 84x84, action repeat 2)."""
+class Layout:
+    """Widths of what the rows of a task hold."""
 
-    name: str
-    domain: str
-    task: str
     action_dim: int
-    state_dim: int
-    """Width of dm_control's observations, flattened and concatenated in their own order."""
-    positions: int
+    state_dim: int = 0
+    """Width of dm_control's observations, flattened and concatenated in their own order; 0: the task has no states."""
+    positions: int = 0
     """Generalised positions: the first columns of the simulator state, velocities the others."""
-    travel: tuple[int, ...]
-    """Positions along the ground, which the tracking camera does not show."""
-    action_noise: float
-    """Standard deviation of the noise in the noisy sets: of 0.2, 0.3, 0.4 and 0.5 the largest that leaves the expert
-    more than half of its mean return."""
+    travel: tuple[int, ...] = ()
+    """Positions along the ground, which a tracking camera does not show."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """What the harness needs of any task."""
+
+    action_repeat: int
+    """Steps for which an action is applied, and their rewards summed."""
+    decisions: int = EPISODE_TRANSITIONS
+    """Decisions after which an episode is cut off, unless it ends before."""
+    score_divisor: float = SCORE_DIVISOR
+    """A score is a return divided by this."""
+    action_noise: float | None = None
+    """Standard deviation of the noise in the noisy sets; None: it has none."""
+    layout: Layout | None = None
+    """Widths of its rows, if they are to be known without building the environment; None: found from it."""
+
+    def found(self) -> Layout:
+        """The layout as given, else as the environment has it, which is built for that once."""
+        if self.layout is not None:
+            return self.layout
+        from vd4rl_pomdp.envs.pixels import find_layout
+
+        return find_layout(self)
+
+    @property
+    def action_dim(self) -> int:
+        """Action dimension A."""
+        return self.found().action_dim
+
+    @property
+    def state_dim(self) -> int:
+        """Width D of the states that actors read, 0 for none."""
+        return self.found().state_dim
 
     def pose(self, physics: np.ndarray) -> np.ndarray:
         """Positions of (..., P) simulator states, without the place on the ground."""
-        return np.delete(physics[..., : self.positions], self.travel, axis=-1)
+        layout = self.found()
+        return np.delete(physics[..., : layout.positions], layout.travel, axis=-1)
 
     def velocity(self, physics: np.ndarray) -> np.ndarray:
         """Velocities of (..., P) simulator states."""
-        return physics[..., self.positions :]
+        return physics[..., self.found().positions :]
 
     def visible_state(self, physics: np.ndarray) -> np.ndarray:
         """(..., P') float32: pose and velocity."""
         return np.concatenate([self.pose(physics), self.velocity(physics)], axis=-1).astype(np.float32)
 
 
-TASKS = {
-    "walker_walk": Task("walker_walk", "walker", "walk", 6, 24, positions=9, travel=(1,), action_noise=0.5),
-    "cheetah_run": Task("cheetah_run", "cheetah", "run", 6, 17, positions=9, travel=(0,), action_noise=0.4),
-    "humanoid_walk": Task("humanoid_walk", "humanoid", "walk", 21, 67, positions=28, travel=(0, 1), action_noise=0.3),
-}
+@dataclass(frozen=True)
+class DMCTask(Task):
+    """A task of dm_control's suite; its simulator states are stored, and its rewards replay from them."""
+
+    domain: str
+    task: str
+    camera: int = 0
+    """Number of the camera that shows it."""
+    action_repeat: int = field(default=ACTION_REPEAT, kw_only=True)
+    """Simulator steps for which an action is applied, and their rewards summed."""
 
 
-def get_task(name: str) -> Task:
-    """Return the task called `name`; raises UserError listing the choices for an unknown one."""
-    if name not in TASKS:
-        raise UserError(f"unknown task {name!r}: choose one of {', '.join(TASKS)}")
-    return TASKS[name]
+@dataclass(frozen=True)
+class GymnasiumTask(Task):
+    """A Gymnasium environment with pixels and bounded Box actions, which are rescaled to [-1, 1]; it has no states."""
+
+    environment: str | Callable[..., Any]
+    """Id of the environment, or what makes it: a class or a function of a module."""
+    arguments: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """Keyword arguments of the environment."""
+    pixels: Literal["render", "observation"] = "render"
+    """Where the picture comes from: `render()` under render_mode "rgb_array", or the observation itself."""
+    action_repeat: int = field(default=1, kw_only=True)
+    """Steps for which an action is applied, and their rewards summed; an episode that ends ends it, too."""
+
+
+TASKS: Registry[Task] = Registry(
+    "task",
+    {
+        "walker_walk": DMCTask("walker", "walk", layout=Layout(6, 24, 9, travel=(1,)), action_noise=0.5),
+        "cheetah_run": DMCTask("cheetah", "run", layout=Layout(6, 17, 9, travel=(0,)), action_noise=0.4),
+        "humanoid_walk": DMCTask("humanoid", "walk", layout=Layout(21, 67, 28, travel=(0, 1)), action_noise=0.3),
+    },
+    lambda part: isinstance(part, DMCTask | GymnasiumTask),
+    "a vd4rl_pomdp.tasks.DMCTask or GymnasiumTask",
+)
+"""All tasks. Packages offer theirs in the group of entry points `vd4rl_pomdp.tasks`. The noise of the benchmark's is of
+0.2, 0.3, 0.4 and 0.5 the largest that leaves the expert more than half of its mean return."""

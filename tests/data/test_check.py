@@ -40,6 +40,8 @@ def test_the_report_holds_every_number(folder, tmp_path):
         "return_min": 0.0,
         "return_max": pytest.approx(6.003),
         "replay_max_error": 0.0,
+        "replay": "every episode, from its first simulator state",
+        "frame_size": 84,
         "task": "walker_walk",
         "quality": "expert",
         "shards": shards,

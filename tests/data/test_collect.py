@@ -277,7 +277,7 @@ def test_the_noise_has_the_standard_deviation_it_says(monkeypatch, tmp_path):
     job = module._job(config(tmp_path, quality="expert_noisy"), actor(1), 0, 200)
     still = replace(actor(1), weights={k: 0 * v for k, v in actor(1).weights.items()})
     still.weights["log_std.bias"][:] = -20
-    noise = module._roll_out(replace(job, actor=still, render=None))["action"][1:]
+    noise = module._roll_out(replace(job, actor=still, size=None))["action"][1:]
     assert noise[np.abs(noise) < 1].std() == pytest.approx(0.4371, abs=0.03)  # a Gaussian of 0.5, cut at +-1
     assert noise.mean() == pytest.approx(0.0, abs=0.05)
 

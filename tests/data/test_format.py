@@ -145,7 +145,7 @@ def with_value(index, value):
         ("step_type", lambda v: v + 1, r"'step_type' holds something else"),
         ("step_type", lambda v: v + 0.5, r"'step_type' holds something else"),
         ("observation", lambda v: v.astype(np.float32), r"'observation' is float32"),
-        ("observation", lambda v: v[:, :, :64, :64], r"'observation' is uint8 of shape \(7, 3, 64, 64\)"),
+        ("observation", lambda v: v[:, :, :64], r"'observation' is uint8 of shape \(7, 3, 64, 84\)"),
         ("observation", lambda v: v[:0], r"'observation' is uint8 of shape \(0, "),
     ],
 )

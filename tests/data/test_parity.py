@@ -54,7 +54,7 @@ class FakeSet:
     """What parity reads of a data set."""
 
     def __init__(self, task, frames):
-        self.task, self.num_rows, self.frames = task, len(frames), self
+        self.task, self.num_rows, self.frames, self.frame_size = task, len(frames), self, 84
         self._frames = frames
 
     def numpy(self):
@@ -63,12 +63,12 @@ class FakeSet:
 
 @pytest.fixture(scope="module", params=["walker_walk", "cheetah_run"])
 def own_frames(request):
-    return request.param, parity._wandering_frames(request.param, 40)
+    return request.param, parity._wandering_frames(request.param, 84, 40)
 
 
 def background(monkeypatch, task, data, rendered):
     monkeypatch.setattr(parity, "open_dataset", lambda path: FakeSet(task, data))
-    monkeypatch.setattr(parity, "_wandering_frames", lambda task: rendered)
+    monkeypatch.setattr(parity, "_wandering_frames", lambda task, size: rendered)
     return parity._compare_background("somewhere")
 
 
@@ -83,7 +83,7 @@ def test_the_background_of_frames_under_another_sky_differs(monkeypatch, own_fra
     task, frames = own_frames
     with monkeypatch.context() as patch:
         patch.setattr(rendering, "prepare", lambda physics, render: None)
-        others = parity._wandering_frames(task, 40)
+        others = parity._wandering_frames(task, 84, 40)
     assert not background(monkeypatch, task, others, frames)["equal"]
 
 

@@ -211,14 +211,31 @@ def test_shards_of_different_sets_are_refused(tmp_path, cache, second, message):
         open_store(tmp_path / "set", cache)
 
 
-def test_a_set_of_another_frame_size_is_refused_before_and_after_it_was_decoded(tmp_path):
+def with_frames(folder, size, number=0):
+    """Write a shard of one episode whose frames have another size."""
     rows = fake_rows([6])
-    rows["observation"] = np.zeros((6, 3, 100, 100), np.uint8)
-    (tmp_path / "maze").mkdir()
-    write_shard(tmp_path / "maze" / "0_maze.hdf5", rows, {})
-    with pytest.raises(UserError, match="take a set of 84-pixel frames"):
-        open_store(tmp_path / "maze", tmp_path / "cache")
-    store = open_store(tmp_path / "maze", tmp_path / "cache", frame_size=100)
-    assert store.frames().shape == (6, 3, 100, 100)
-    with pytest.raises(UserError, match=r"has frames of 100x100 pixels, expected 84x84"):
-        open_store(tmp_path / "maze", tmp_path / "cache")
+    rows["observation"] = np.random.default_rng(size).integers(0, 256, (6, 3, size, size), dtype=np.uint8)
+    folder.mkdir(exist_ok=True)
+    write_shard(folder / f"{number}_fake.hdf5", rows, {})
+    return rows["observation"]
+
+
+@pytest.mark.parametrize("size", [16, 64, 100, 480])
+def test_the_shards_tell_the_size_of_the_frames(tmp_path, size):
+    frames = with_frames(tmp_path / "set", size)
+    for _ in range(2):
+        np.testing.assert_array_equal(open_store(tmp_path / "set", tmp_path / "cache").frames(), frames)
+
+
+def test_shards_of_two_frame_sizes_are_refused(tmp_path):
+    with_frames(tmp_path / "set", 84)
+    with_frames(tmp_path / "set", 64, number=1)
+    with pytest.raises(UserError, match=r"1_fake.hdf5: has frames of 64x64 pixels, 0_fake.hdf5 of 84x84; keep one set"):
+        open_store(tmp_path / "set", tmp_path / "cache")
+
+
+@pytest.mark.parametrize("size", [15, 481])
+def test_frames_that_nothing_reads_are_refused(tmp_path, size):
+    with_frames(tmp_path / "set", size)
+    with pytest.raises(UserError, match=r"square uint8 frames \(N, 3, S, S\) of 16 to 480 pixels"):
+        open_store(tmp_path / "set", tmp_path / "cache")

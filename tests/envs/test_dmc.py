@@ -4,7 +4,7 @@ import sys
 import numpy as np
 import pytest
 
-from vd4rl_pomdp.envs.dmc import PixelEnv, replay_rewards
+from vd4rl_pomdp.envs.dmc import DMCEnv, replay_rewards
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, TASKS
 from vd4rl_pomdp.types import StepType
@@ -21,20 +21,24 @@ def roll(env, seed, count, action_seed=0):
 
 @pytest.fixture(scope="module", params=TASKS)
 def blind(request):
-    return PixelEnv(request.param, pixels=False)
+    return DMCEnv(TASKS[request.param], size=None)
+
+
+def name_of(env):
+    return next(name for name, task in TASKS.items() if task == env.task)
 
 
 def test_rewards_replay_exactly_from_the_first_stored_state(blind):
     for seed in (3, 4):  # the second episode starts from a used simulator
         rows, actions = roll(blind, seed, 200)
-        replayed = replay_rewards(blind.task.name, rows[0].physics, actions)
+        replayed = replay_rewards(name_of(blind), rows[0].physics, actions)
         assert replayed.dtype == np.float64
         np.testing.assert_array_equal(replayed, [row.reward for row in rows[1:]])
 
 
 def test_replaying_shifted_actions_does_not_give_the_rewards(blind):
     rows, actions = roll(blind, 3, 100)
-    replayed = replay_rewards(blind.task.name, rows[0].physics, np.roll(actions, 1, axis=0))
+    replayed = replay_rewards(name_of(blind), rows[0].physics, np.roll(actions, 1, axis=0))
     assert np.abs(replayed - [row.reward for row in rows[1:]]).max() > 1e-4
 
 
@@ -61,7 +65,7 @@ def test_an_action_is_applied_twice_and_its_rewards_summed(blind):
     start = blind.reset(0).physics
     action = np.full(blind.task.action_dim, 0.5, np.float32)
     row = blind.step(action)
-    by_hand = PixelEnv(blind.task.name, pixels=False)
+    by_hand = DMCEnv(blind.task, size=None)
     by_hand.reset(0)
     steps = [by_hand.simulator.step(action) for _ in range(2)]
     assert row.reward == steps[0].reward + steps[1].reward
@@ -70,7 +74,7 @@ def test_an_action_is_applied_twice_and_its_rewards_summed(blind):
 
 
 def test_only_the_time_limit_ends_an_episode_and_its_discount_stays_one():
-    env = PixelEnv("walker_walk", pixels=False)
+    env = DMCEnv(TASKS["walker_walk"], size=None)
     rows, _ = roll(env, 0, EPISODE_TRANSITIONS)
     assert [row.last for row in rows] == [False] * EPISODE_TRANSITIONS + [True]
     assert rows[-1].discount == 1.0
@@ -78,16 +82,17 @@ def test_only_the_time_limit_ends_an_episode_and_its_discount_stays_one():
 
 def test_an_unknown_task_is_refused():
     with pytest.raises(UserError, match="walker_walk, cheetah_run, humanoid_walk"):
-        PixelEnv("walker_run")
+        replay_rewards("walker_run", np.zeros(18), np.zeros((1, 6)))
 
 
 def test_another_process_renders_the_same_bytes():
     code = (
-        "import sys; from vd4rl_pomdp.envs.dmc import PixelEnv; env = PixelEnv('walker_walk');"
+        "import sys; from vd4rl_pomdp.envs.pixels import make_env; from vd4rl_pomdp.tasks import TASKS;"
+        "env = make_env(TASKS['walker_walk']);"
         "env.reset(9); env.reset(1); sys.stdout.buffer.write(env.step([0.3] * 6).frame.tobytes())"
     )
     theirs = subprocess.run([sys.executable, "-c", code], capture_output=True, check=True).stdout
-    env = PixelEnv("walker_walk")
+    env = DMCEnv(TASKS["walker_walk"])
     env.reset(1)
     frame = env.step(np.full(6, 0.3)).frame
     assert (frame.shape, frame.dtype) == ((3, 84, 84), np.uint8)

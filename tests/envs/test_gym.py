@@ -12,6 +12,7 @@ from vd4rl_pomdp.envs import FINITE_IDS, FINITE_STEPS, GYM_IDS, MAZE_STEPS
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.mazes import MAZES
+from vd4rl_pomdp.tasks import TASKS
 from vd4rl_pomdp.types import row_key
 
 
@@ -116,7 +117,7 @@ def test_a_seed_fixes_the_series_and_every_episode_has_its_own_state_and_masks()
 
 @pytest.mark.parametrize("name", ["patch", "zero_frames", "patch+zero_frames"])
 def test_the_environment_corrupts_a_row_as_a_batch_would(name):
-    env = CorruptedEnv("walker_walk", CorruptionConfig.of(name), length=4)
+    env = CorruptedEnv(TASKS["walker_walk"], CorruptionConfig.of(name), length=4)
     steps = [env.reset(1, corruption_seed=5, episode=2)] + [env.step(np.zeros(6, np.float32)) for _ in range(3)]
     keys = derive_keys(5, row_key(torch.tensor([2]), torch.arange(4)))
     batch = make_corruption(name)(torch.stack([step.clean for step in steps]), keys)

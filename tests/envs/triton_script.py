@@ -7,6 +7,7 @@ import gymnasium
 
 import vd4rl_pomdp.envs  # noqa: F401 (registers the ids)
 from vd4rl_pomdp.runs.workers import run_jobs
+from vd4rl_pomdp.tasks import TASKS
 
 NAMES = ["vd4rl_pomdp/WalkerWalk-v0", "vd4rl_pomdp/MazeOneCurtain-v0"]
 """One for each of two workers: only the first in a process tells anything."""
@@ -41,7 +42,9 @@ def stages() -> None:
 
     shape = {"eval_episodes": 2, "eval_length": 4, "workers": 1}
     finetune(FinetuneConfig.of("smoke", encoder=encoder, data=data, out=Path("finetune"), **shape))
-    job = EpisodeJob(encoder, Path("finetune/policy"), 0, "walker_walk", CorruptionConfig(), 0, film=False, length=4)
+    job = EpisodeJob(
+        encoder, Path("finetune/policy"), 0, TASKS["walker_walk"], CorruptionConfig(), 0, film=False, length=4
+    )
     assert evaluate([job], workers=1)[0].length == 4
 
 

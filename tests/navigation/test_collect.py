@@ -32,7 +32,7 @@ def maze_set(tmp_path_factory) -> Path:
 
 
 def test_stored_actions_lead_through_the_stored_states_and_pictures(maze_set, tmp_path):
-    dataset = open_dataset(maze_set, tmp_path, frame_size=100)
+    dataset = open_dataset(maze_set, tmp_path)
     assert (dataset.num_rows, dataset.num_episodes, dataset.task) == (120, 4, "three_curtains")
     env = MazeEnv("three_curtains", 5)
     for start, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):
@@ -90,7 +90,7 @@ def test_noise_repeat_and_seed_change_the_set(maze_set, tmp_path):
 def test_every_trajectory_has_noise_of_its_own(tmp_path):
     """Under noise that drowns the planner, actions are the noise's signs."""
     collect(small(tmp_path / "set", trajectories=3, noise=1e4))
-    dataset = open_dataset(tmp_path / "set", tmp_path, frame_size=100)
+    dataset = open_dataset(tmp_path / "set", tmp_path)
     actions = dataset.action.view(3, 30, 2)[:, 1:]
     assert (actions.abs() == 1).all()
     for one, other in ((0, 1), (1, 2), (0, 2)):
@@ -120,7 +120,7 @@ def test_another_collection_is_refused(maze_set):
 
 def test_first_person_data_holds_headings_and_moves(tmp_path):
     collect(small(tmp_path / "set", maze="first_person", trajectories=1, trajectory_rows=120))
-    dataset = open_dataset(tmp_path / "set", tmp_path / "cache", frame_size=100)
+    dataset = open_dataset(tmp_path / "set", tmp_path / "cache")
     assert dataset.physics.shape == (120, 6)
     assert np.ptp(dataset.physics[:, 2]) > 1
     assert np.ptp(dataset.physics[:, :2], axis=0).max() > 1

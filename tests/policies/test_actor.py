@@ -9,7 +9,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies import Actor, Ladder, actor, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.policies.actor import read_ladder
 from vd4rl_pomdp.policies.export import CARD_EPISODES, LADDER_RUNGS, episode_returns
-from vd4rl_pomdp.tasks import get_task
+from vd4rl_pomdp.tasks import TASKS
 
 ACTORS = sorted(p.stem for p in actor.ASSETS.glob("*.json"))
 LADDERS = sorted(p.stem.removesuffix("_replay") for p in actor.ASSETS.glob("*_replay.safetensors"))
@@ -34,7 +34,7 @@ def test_twenty_episodes_return_what_the_card_says_to_the_digit(name):
     differing = [k for k in ("mujoco", "dm-control") if version(k) != card["versions"][k]]
     if differing:
         pytest.skip(f"the card was written with another {' and '.join(differing)}")
-    assert episode_returns(shipped, get_task(task), CARD_EPISODES) == card["returns"]
+    assert episode_returns(shipped, TASKS.named(task), CARD_EPISODES) == card["returns"]
 
 
 def test_the_required_actors_ship_and_all_stay_small():
@@ -53,7 +53,7 @@ def test_a_ladder_leads_to_the_medium_actor(task):
     top = ladder.rungs[-1]
     for name, value in medium.weights.items():
         np.testing.assert_array_equal(top.weights[name], value.astype(np.float16).astype(np.float32))
-    state = np.linspace(-1, 1, get_task(task).state_dim, dtype=np.float32)
+    state = np.linspace(-1, 1, TASKS.named(task).state_dim, dtype=np.float32)
     np.testing.assert_allclose(top.act(state), medium.act(state), atol=0.02)
 
 
@@ -85,7 +85,7 @@ def test_bad_actors_are_refused(tmp_path, monkeypatch):
         read_actor(path)
     load_actor("walker_walk", "medium").save(path)
     with pytest.raises(UserError, match="trained on walker_walk, not on cheetah_run"):
-        read_actor(path, get_task("cheetah_run"))
+        read_actor(path, "cheetah_run")
     monkeypatch.setattr(actor, "ASSETS", tmp_path)
     with pytest.raises(UserError, match="no expert actor ships for humanoid_walk"):
         load_actor("humanoid_walk", "expert")
@@ -111,7 +111,7 @@ def test_whole_files_whose_weights_are_no_actor_are_refused(tmp_path, how):
     shipped, path = load_actor("walker_walk", "medium"), tmp_path / "actor.safetensors"
     Actor(spoil(shipped.weights, how), shipped.card).save(path)
     with pytest.raises(UserError, match="its weights form no actor of walker_walk"):
-        read_actor(path, get_task("walker_walk"))
+        read_actor(path, "walker_walk")
 
 
 def test_a_ladder_is_no_actor_and_an_actor_no_ladder():
@@ -126,4 +126,4 @@ def test_a_file_without_a_whole_card_is_one_sentence(tmp_path, card):
     path = tmp_path / "actor.safetensors"
     save_file(load_actor("walker_walk", "medium").weights, path, card)
     with pytest.raises(UserError, match=r"not an actor file|trained on None"):
-        read_actor(path, get_task("walker_walk"))
+        read_actor(path, "walker_walk")

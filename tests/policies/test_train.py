@@ -8,7 +8,7 @@ import pytest
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies import read_actor
-from vd4rl_pomdp.tasks import get_task
+from vd4rl_pomdp.tasks import TASKS
 
 SETTINGS = {
     "mlp": {"critic_norm": True, "n_step": 3, "envs": 2, "updates_per_decision": 0.5},
@@ -33,7 +33,7 @@ def test_an_exported_actor_acts_like_the_learners_network(configure, kind, tmp_p
     from vd4rl_pomdp.policies import learner
 
     config = configure(tmp_path, **SETTINGS[kind])
-    model = learner.build(config, get_task("walker_walk"))
+    model = learner.build(config, TASKS.named("walker_walk"))
     model.learn(120)
     assert model._n_updates > 0
     states = 3 * np.random.default_rng(0).standard_normal((6, 24)).astype(np.float32)
@@ -61,7 +61,7 @@ def test_a_checkpoint_brings_everything_back(configure, tmp_path):
     assert {path.name for path in files.values()} == {
         f"walker_walk_{q}.safetensors" for q in ("expert", "medium", "replay")
     }
-    first, second = (learner.build(config, get_task("walker_walk")) for _ in range(2))
+    first, second = (learner.build(config, TASKS.named("walker_walk")) for _ in range(2))
     assert learner.restore_checkpoint(first, tmp_path) == 120
     learner.save_checkpoint(first, tmp_path)
     learner.restore_checkpoint(second, tmp_path)
@@ -100,7 +100,7 @@ def test_a_new_run_starts_where_committed_networks_stood(configure, tmp_path):
     old, new = tmp_path / "old", tmp_path / "new"
     config = configure(old, decisions=80, **SETTINGS["mlp"])
     train_policy(config)
-    model = learner.build(config, get_task("walker_walk"))
+    model = learner.build(config, TASKS.named("walker_walk"))
     learner.start_from_networks(model, old / NETWORKS)
     before, trained = learner.export_actor(model, config, 0), read_actor(snapshot_path(old, 80))
     for name, value in trained.weights.items():

@@ -135,12 +135,11 @@ def test_every_command_with_an_out_is_tried(capsys):
 
 def test_an_exported_policy_is_replaced_only_by_one_of_its_task(tmp_path):
     from vd4rl_pomdp.policies.export import _refuse_other
-    from vd4rl_pomdp.tasks import get_task
 
     fill(tmp_path / "kept", config__json='{"task": "cheetah_run"}', curve__csv="")
-    _refuse_other(tmp_path / "kept", get_task("cheetah_run"))
+    _refuse_other(tmp_path / "kept", "cheetah_run")
     with pytest.raises(UserError, match="holds a policy"):
-        _refuse_other(tmp_path / "kept", get_task("walker_walk"))
+        _refuse_other(tmp_path / "kept", "walker_walk")
     (tmp_path / "kept" / "snapshots").mkdir()
     with pytest.raises(UserError, match="holds a policy"):
-        _refuse_other(tmp_path / "kept", get_task("cheetah_run"))
+        _refuse_other(tmp_path / "kept", "cheetah_run")

@@ -13,13 +13,13 @@ from vd4rl_pomdp.errors import UserError
 
 
 def _train(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.policies.config import RECIPES, PolicyConfig
+    from vd4rl_pomdp.policies.config import PolicyConfig, recipes
     from vd4rl_pomdp.policies.train import decisions_made, train_policy
     from vd4rl_pomdp.runs.progress import ProgressLine
 
     if not any(word.split("=")[0] in ("--task", "--help", "-h") for word in words):
-        raise UserError(f"--task is missing: choose one of {', '.join(RECIPES)}")
-    config = with_presets(PolicyConfig, RECIPES, words, program, flag="--task")
+        raise UserError(f"--task is missing: choose one of {', '.join(recipes())}")
+    config = with_presets(PolicyConfig, recipes(), words, program, flag="--task")
     done = decisions_made(config.out)
     with ProgressLine(f"train {config.task}", config.decisions, "decisions", done) as progress:
         files = train_policy(config, lambda decisions, mean: progress.reach(decisions, ret=mean))

@@ -12,8 +12,8 @@ from vd4rl_pomdp.data.dataset import Dataset, open_dataset
 from vd4rl_pomdp.data.format import read_attributes, read_dtypes, shard_paths
 from vd4rl_pomdp.data.store import verify_store
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.mazes import MAZES, PICTURE_SIZE
-from vd4rl_pomdp.tasks import FRAME_SIZE
+from vd4rl_pomdp.mazes import MAZES
+from vd4rl_pomdp.tasks import TASKS, DMCTask
 
 ReplayFn = Callable[[str, np.ndarray, np.ndarray], np.ndarray]
 """(task, physics (P,) of an episode's first row, actions (T, A), a_0 first) -> rewards (T,), r_0 first."""
@@ -23,16 +23,16 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
     """Validate a set and describe it.
 
     Args:
-        path: folder (or file) of the shards, of V-D4RL's tasks or of a maze.
+        path: folder (or file) of the shards, of a task or of a maze.
         cache: where decoded sets are kept, as in `open_dataset`.
         replay: what simulates an episode; default `envs.dmc.replay_rewards`.
 
     Returns:
         JSON values: `rows`, `episodes`, `transitions`, `incomplete_episodes`, `action_dim`, `return_mean`,
         `return_min` and `return_max` over all episodes, incomplete ones included, `replay_max_error` (largest absolute
-        difference between a stored reward, in a maze a true state, and its replay; None without physics), `task`,
-        `quality`, `shards` (names in order), `dtypes` (key to the stored dtypes), `store_ok` (True: the decoded files
-        have their checksums).
+        difference between a stored reward, in a maze a true state, and its replay; None where nothing can be
+        replayed), `replay` (how that was found, or why not), `frame_size`, `task`, `quality`, `shards` (names in
+        order), `dtypes` (key to the stored dtypes), `store_ok` (True: the decoded files have their checksums).
 
     Raises:
         UserError: the set or its decoded form is damaged.
@@ -40,9 +40,11 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
     path = Path(path)
     attributes = read_attributes(shard_paths(path)[0])
     is_maze = attributes.get("task") in MAZES
-    dataset = open_dataset(path, cache, PICTURE_SIZE if is_maze else FRAME_SIZE)
+    dataset = open_dataset(path, cache)
     verify_store(dataset.store)
     returns = dataset.returns.numpy()
+    reason = _why_not_replayed(dataset, is_maze)
+    replayed = None if reason else _maze_error(dataset, attributes) if is_maze else _replay_error(dataset, replay)
     return {
         "rows": dataset.num_rows,
         "episodes": dataset.num_episodes,
@@ -52,7 +54,9 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
         "return_mean": float(returns.mean()),
         "return_min": float(returns.min()),
         "return_max": float(returns.max()),
-        "replay_max_error": _maze_error(dataset, attributes) if is_maze else _replay_error(dataset, replay),
+        "replay_max_error": replayed,
+        "replay": reason or "every episode, from its first simulator state",
+        "frame_size": dataset.frame_size,
         "task": dataset.task,
         "quality": dataset.quality,
         "shards": dataset.store.meta["shards"],
@@ -61,11 +65,25 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
     }
 
 
-def _replay_error(dataset: Dataset, replay: ReplayFn | None) -> float | None:
+def _why_not_replayed(dataset: Dataset, is_maze: bool) -> str:
+    """Why a set's actions cannot be replayed to its rewards, "" if they can."""
     if dataset.physics is None:
-        return None
+        return "impossible: the set stores no simulator states"
+    if is_maze:
+        return ""
     if dataset.task is None:
         raise UserError(f"{dataset.path}: has physics but names no task; put it in a folder called like its task")
+    task = TASKS.named(dataset.task)
+    if not isinstance(task, DMCTask):
+        return f"impossible: {dataset.task} is no task of dm_control"
+    from vd4rl_pomdp.envs.dmc import replays
+
+    return "" if replays(task) else f"impossible: {dataset.task} draws more than the simulator state for each episode"
+
+
+def _replay_error(dataset: Dataset, replay: ReplayFn | None) -> float:
+    assert dataset.physics is not None
+    assert dataset.task is not None
     if replay is None:
         from vd4rl_pomdp.envs.dmc import replay_rewards
 
@@ -87,9 +105,8 @@ def _replay_error(dataset: Dataset, replay: ReplayFn | None) -> float | None:
     return worst
 
 
-def _maze_error(dataset: Dataset, attributes: dict[str, Any]) -> float | None:
-    if dataset.physics is None:
-        return None
+def _maze_error(dataset: Dataset, attributes: dict[str, Any]) -> float:
+    assert dataset.physics is not None
     from vd4rl_pomdp.envs.maze import replay_states
 
     states, action = dataset.physics, dataset.store.array("action")

@@ -25,14 +25,15 @@ from vd4rl_pomdp.runs.provenance import versions
 from vd4rl_pomdp.runs.workers import run_jobs
 from vd4rl_pomdp.seeding import episode_seed, stream_seed
 from vd4rl_pomdp.tasks import (
-    EPISODE_TRANSITIONS,
     FRAME_SIZE,
+    FRAME_SIZES,
     MOST_EPISODES,
     NOISY_QUALITIES,
     SET_QUALITIES,
+    TASKS,
     NoisyQuality,
     Quality,
-    get_task,
+    Task,
 )
 
 Policy = Actor | Ladder | None
@@ -47,20 +48,22 @@ class CollectConfig:
     """Settings of `vd4rl-pomdp data collect`."""
 
     task: str
-    """walker_walk, cheetah_run or humanoid_walk."""
+    """walker_walk, cheetah_run or humanoid_walk, or a task that was added."""
     quality: Quality | NoisyQuality
     """Whose episodes: random actions, actors saved on the way to the medium one, the medium actor, half of medium and
     expert each, or the expert actor; the noisy ones, which V-D4RL has not, add the task's noise to every action."""
     out: Path
     """Folder of the set."""
     episodes: int = 200
-    """Episodes in all, 501 rows each (V-D4RL's sets have 200)."""
+    """Episodes in all, of 501 rows each in the benchmark's tasks (V-D4RL's sets have 200)."""
     seed: int = 0
     """Seed of initial states and actions."""
     workers: int = 0
     """Processes that simulate and render; 0 uses every core."""
     render: Literal["fast", "exact"] = "fast"
     """fast: a smaller shadow map, 0.03 of 255 away from exact; exact: dm_control's default."""
+    frame_size: int = FRAME_SIZE
+    """Height and width of the frames in pixels."""
     episodes_per_shard: int = 50
     """Episodes in a shard."""
     actor: Path | None = None
@@ -74,23 +77,24 @@ class CollectConfig:
 class _Job:
     """One episode to roll out."""
 
-    task: str
+    task: Task
     episode: int
     seed: int
     actor: Actor | None
-    render: Literal["fast", "exact"] | None
-    """None: physics alone, no frames."""
-    length: int
+    render: Literal["fast", "exact"]
+    size: int | None
+    """Height and width of the frames; None: physics alone."""
+    length: int | None
     noise: float
     """Standard deviation of the noise on actions."""
 
 
-def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Path]:
+def collect(config: CollectConfig, length: int | None = None) -> list[Path]:
     """Collect the set, or what is missing of it; returns its shards.
 
     Args:
         config: what to collect.
-        length: decisions an episode; everything but tests keeps the benchmark's.
+        length: most decisions of an episode; everything but tests keeps the task's.
     """
     _check(config)
     refuse_inside(config.out)
@@ -105,7 +109,7 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
     ]
     with owned(config.out):
         _claim(config, _hashes(plan))
-        collect_shards(config.out, shards, _roll_out, config.workers, ("collect", "episodes"))
+        collect_shards(config.out, shards, _roll_out, config.workers, ("collect", "episodes"), config.task)
         from vd4rl_pomdp.data.card import write_card  # draws; the processes that render need it not
 
         write_card(config.out)
@@ -114,14 +118,18 @@ def collect(config: CollectConfig, length: int = EPISODE_TRANSITIONS) -> list[Pa
 
 def _check(config: CollectConfig) -> None:
     """Refuse settings that make no set."""
-    get_task(config.task)
+    task = TASKS.named(config.task)
     refuse_outside(config, episodes=(1, MOST_EPISODES), episodes_per_shard=1, seed=(0, MAX_SEED), workers=0)
-    refuse_outside(config, action_noise=(0, MAX_NOISE))
-    shard = min(config.episodes, config.episodes_per_shard) * (EPISODE_TRANSITIONS + 1)
-    require_memory(shard * 3 * FRAME_SIZE**2, CPU, config, "episodes", "episodes_per_shard")
+    refuse_outside(config, action_noise=(0, MAX_NOISE), frame_size=FRAME_SIZES)
+    shard = min(config.episodes, config.episodes_per_shard) * (task.decisions + 1)
+    require_memory(shard * 3 * config.frame_size**2, CPU, config, "episodes", "episodes_per_shard", "frame_size")
     if config.quality not in SET_QUALITIES:
         raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(SET_QUALITIES)}")
     base = _base(config)
+    if not task.state_dim and base != "random":  # the environment is built first, and refused if it cannot be
+        raise UserError(
+            f"{config.task} has no states for an actor to read: --quality random, or a set of your own in this format"
+        )
     if base == "medium_expert" and config.episodes < 2:
         raise UserError(f"--episodes must be at least 2 for {config.quality}, which is half medium and half expert")
     if config.actor is not None and base not in ("medium", "expert"):
@@ -130,6 +138,8 @@ def _check(config: CollectConfig) -> None:
         raise UserError(
             f"{config.quality} has its own noise: leave --action-noise out, or take --quality {base} with it"
         )
+    if config.quality in NOISY_QUALITIES and task.action_noise is None:
+        raise UserError(f"{config.task} names no noise of its own: take --quality {base} with --action-noise")
 
 
 def _base(config: CollectConfig) -> str:
@@ -139,8 +149,8 @@ def _base(config: CollectConfig) -> str:
 
 def _noise(config: CollectConfig) -> float:
     """Standard deviation of the noise on actions."""
-    own = get_task(config.task).action_noise if config.quality in NOISY_QUALITIES else 0.0
-    return own if config.action_noise is None else config.action_noise
+    own = TASKS.named(config.task).action_noise if config.quality in NOISY_QUALITIES else None
+    return own or config.action_noise or 0.0
 
 
 def _suffix(config: CollectConfig) -> str:
@@ -162,7 +172,7 @@ def _hashes(plan: Iterable[tuple[Path, range, Policy]]) -> list[str]:
 def replay_returns(config: CollectConfig) -> list[float]:
     """Returns of all episodes that `collect` would render, by physics alone: the same seeds, actions and rewards."""
     jobs = [
-        replace(_job(config, policy, episode, EPISODE_TRANSITIONS), render=None)
+        replace(_job(config, policy, episode), size=None)
         for _, episodes, policy in _plan(config)
         for episode in episodes
     ]
@@ -194,26 +204,27 @@ def _policy(config: CollectConfig, quality: str) -> Policy:
         return load_ladder(config.task)
     if config.actor is None:
         return load_actor(config.task, quality)
-    return read_actor(config.actor, get_task(config.task))
+    return read_actor(config.actor, config.task)
 
 
-def _job(config: CollectConfig, policy: Policy, episode: int, length: int) -> _Job:
+def _job(config: CollectConfig, policy: Policy, episode: int, length: int | None = None) -> _Job:
     """One episode; with a ladder, by who acted at the moment of training that the episode stands for."""
     actor = policy.actor_at((episode + 0.5) / config.episodes) if isinstance(policy, Ladder) else policy
-    return _Job(config.task, episode, config.seed, actor, config.render, length, _noise(config))
+    task, size = TASKS.named(config.task), config.frame_size
+    return _Job(task, episode, config.seed, actor, config.render, size, length, _noise(config))
 
 
 def _roll_out(job: _Job) -> dict[str, np.ndarray]:
     """Rows of one episode, by key."""
-    env = _environment(job.task, job.render, job.length)
+    env = _environment(job.task, job.render, job.size, job.length)
     rng = np.random.default_rng([job.seed, job.episode])
     noise = np.random.default_rng(stream_seed(job.seed, "action noise", job.episode))
     row = env.reset(episode_seed(job.seed, job.episode))
-    action = np.zeros(env.task.action_dim, np.float32)
+    action = np.zeros(env.action_dim, np.float32)
     rows = [(row, action)]
     while not row.last:
         if job.actor is None:
-            action = rng.uniform(-1.0, 1.0, env.task.action_dim).astype(np.float32)
+            action = rng.uniform(-1.0, 1.0, env.action_dim).astype(np.float32)
         else:
             action = job.actor.act(row.state, rng)
         if job.noise:
@@ -221,13 +232,14 @@ def _roll_out(job: _Job) -> dict[str, np.ndarray]:
             action = shaken.clip(-1.0, 1.0).astype(np.float32)
         row = env.step(action)
         rows.append((row, action))
-    frames = {} if job.render is None else {"observation": np.stack([r.frame for r, _ in rows])}
+    frames = {} if job.size is None else {"observation": np.stack([r.frame for r, _ in rows])}
+    states = {"physics": np.stack([r.physics for r, _ in rows])} if row.physics.size else {}
     return frames | {
         "action": np.stack([a for _, a in rows]),
         "reward": np.array([r.reward for r, _ in rows]),
         "discount": np.array([r.discount for r, _ in rows]),
         "step_type": np.array([int(r.step_type) for r, _ in rows]),
-        "physics": np.stack([r.physics for r, _ in rows]),
+        **states,
     }
 
 
@@ -236,12 +248,10 @@ _ENVIRONMENTS: dict[tuple, Any] = {}
 
 def _environment(*arguments: Any) -> Any:
     """The process's environment for these arguments: one GL context serves all its episodes."""
-    from vd4rl_pomdp.envs.dmc import PixelEnv
+    from vd4rl_pomdp.envs.pixels import make_env
 
     if arguments not in _ENVIRONMENTS:
-        task, render, length = arguments
-        pixels = render is not None
-        _ENVIRONMENTS[arguments] = PixelEnv(task, render or "fast", pixels, length)
+        _ENVIRONMENTS[arguments] = make_env(*arguments)
     return _ENVIRONMENTS[arguments]
 
 
@@ -261,4 +271,6 @@ def _attributes(config: CollectConfig, path: Path, policy: Policy) -> dict[str, 
 def _claim(config: CollectConfig, actors: list[str]) -> None:
     settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS}
     settings["actors"] = actors
+    if config.frame_size == FRAME_SIZE:
+        settings["frame_size"] = None  # as in the plans that say nothing of it
     claim_set(config.out, settings)

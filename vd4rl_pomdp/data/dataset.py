@@ -14,7 +14,7 @@ from torch import Tensor
 from vd4rl_pomdp.buffers import FrameBuffers
 from vd4rl_pomdp.data.store import Store, open_store
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, SET_QUALITIES, TASKS
+from vd4rl_pomdp.tasks import FRAME_STACK, SET_QUALITIES, TASKS
 from vd4rl_pomdp.types import StepType, Transitions, Windows, row_key
 
 Index = int | Sequence[int] | np.ndarray | Tensor
@@ -22,7 +22,7 @@ Observe = Callable[[Tensor], Tensor]
 """Observations (..., C, H, W) uint8 of (...,) int64 rows."""
 
 
-def open_dataset(path: Path | str, cache: Path | None = None, frame_size: int = FRAME_SIZE) -> Dataset:
+def open_dataset(path: Path | str, cache: Path | None = None) -> Dataset:
     """Open a V-D4RL set: a folder of shards, or one shard.
 
     The first opening decodes the set into the store; later ones map it and take well under a second.
@@ -30,12 +30,11 @@ def open_dataset(path: Path | str, cache: Path | None = None, frame_size: int = 
     Args:
         path: folder (or file) of the shards.
         cache: where decoded sets are kept; default `$VD4RL_POMDP_CACHE`, else the user's cache folder.
-        frame_size: height and width S that its frames must have.
 
     Raises:
-        UserError: the set is missing, empty, damaged, incomplete or of another frame size.
+        UserError: the set is missing, empty, damaged, incomplete or of two frame sizes.
     """
-    return Dataset(Path(path), open_store(Path(path), cache, frame_size))
+    return Dataset(Path(path), open_store(Path(path), cache))
 
 
 class Dataset:
@@ -54,7 +53,7 @@ class Dataset:
         """Names as in `tasks`, None where neither the shards nor the folders tell."""
         step_type, reward = store.array("step_type"), store.array("reward")
         self.frames = _read_only_tensor(store.frames())
-        """(N, 3, S, S) uint8, S = 84; mapped memory: writing into it kills the process."""
+        """(N, 3, S, S) uint8; mapped memory: writing into it kills the process."""
         self.action = torch.from_numpy(store.array("action"))
         """(N, A) float32: row t holds a_{t-1}."""
         self.reward = torch.from_numpy(reward.astype(np.float32))
@@ -95,6 +94,11 @@ class Dataset:
         """Rows that have a successor in their episode."""
         return self.num_rows - self.num_episodes
 
+    @property
+    def frame_size(self) -> int:
+        """Height and width S of the frames."""
+        return self.frames.shape[-1]
+
     def require_transitions(self) -> None:
         """Raise UserError if the set holds none."""
         if not self.num_transitions:
@@ -109,7 +113,7 @@ class Dataset:
         """(N, P') float32 poses and velocities on the set's device; raises UserError if the set has no states."""
         if self.physics is None or self.task is None:
             raise UserError(f"{self.path}: stores no simulator states; collect a set with `vd4rl-pomdp data collect`")
-        return torch.from_numpy(TASKS[self.task].visible_state(self.physics)).to(self.t.device)
+        return torch.from_numpy(TASKS.named(self.task).visible_state(self.physics)).to(self.t.device)
 
     def to(self, device: torch.device | str) -> Dataset:
         """Move frames and rows to a device, in place; returns the data set."""

@@ -21,7 +21,7 @@ from urllib3.exceptions import NewConnectionError
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.files import replacing_file
 from vd4rl_pomdp.runs.outputs import refuse_kept
-from vd4rl_pomdp.tasks import QUALITIES, get_task
+from vd4rl_pomdp.tasks import QUALITIES
 
 DEFAULT_ENDPOINT = "https://huggingface.co"
 _REPOSITORY = "datasets/conglu/vd4rl/resolve/main"
@@ -73,7 +73,9 @@ def download(
     Raises:
         UserError: unknown task or quality, no answer from the mirror, a wrong checksum, or a full disk.
     """
-    get_task(task)
+    published = list(dict.fromkeys(file.path.split("/")[2] for file in manifest()))
+    if task not in published:
+        raise UserError(f"unknown task {task!r}: choose one of {', '.join(published)}, of which sets are published")
     if quality not in QUALITIES:
         raise UserError(f"unknown quality {quality!r}: choose one of {', '.join(QUALITIES)}")
     if not endpoint.startswith(("http://", "https://")):

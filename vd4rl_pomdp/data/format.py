@@ -1,11 +1,11 @@
 """V-D4RL shards: gzip HDF5 files of single frames, read as they are published and written so that others can read them.
 
-    observation (N, 3, 84, 84) uint8    action (N, A) float32    reward (N,) float64    discount (N,) float64
+    observation (N, 3, S, S) uint8      action (N, A) float32    reward (N,) float64    discount (N,) float64
     step_type   (N,) 0 first, 1 mid, 2 last (int64 in some published files, float64 in others)
     physics     (N, P) float64, simulator state of every row: only in sets collected by this package
 
-Mazes are stored likewise, in frames of 100x100. A set is a folder of shards. Its rows are those of all shards in order;
-an episode may continue in the next shard.
+S is 84 in the benchmark and 100 in mazes; all shards of a set agree in it. A set is a folder of shards. Its rows are
+those of all shards in order; an episode may continue in the next shard.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from __future__ import annotations
 import io
 import json
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
@@ -24,7 +24,7 @@ import numpy as np
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.reading import parse_json, regular
-from vd4rl_pomdp.tasks import FRAME_SIZE
+from vd4rl_pomdp.tasks import FRAME_SIZES
 from vd4rl_pomdp.types import StepType
 
 SUFFIXES = (".hdf5", ".h5")
@@ -120,18 +120,44 @@ def read_dtypes(path: Path) -> dict[str, str]:
         return {key: str(file[key].dtype) for key in _present(path, file)}
 
 
-def read_shard(path: Path, frame_size: int = FRAME_SIZE) -> dict[str, np.ndarray]:
+def read_frame_size(shards: Sequence[Path]) -> int:
+    """Height and width S of a set's frames; raises UserError for frames of another shape or dtype, or of two sizes."""
+    sizes = [_frame_size(path) for path in shards]
+    for path, size in zip(shards, sizes, strict=True):
+        if size != sizes[0]:
+            raise UserError(
+                f"{path}: has frames of {size}x{size} pixels, {shards[0].name} of {sizes[0]}x{sizes[0]}; keep one set "
+                "in a folder"
+            )
+    return sizes[0]
+
+
+def _frame_size(path: Path) -> int:
+    low, high = FRAME_SIZES
+    with _open(path) as file:
+        _present(path, file)
+        frames = file[FRAMES_KEY]
+        shape = frames.shape
+        square = shape == (*shape[:1], 3, *shape[-1:] * 2) and shape[0] and low <= shape[-1] <= high
+        if frames.dtype != np.uint8 or not square:
+            raise UserError(
+                f"{path}: 'observation' is {frames.dtype} of shape {shape}, expected square uint8 frames (N, 3, S, S) "
+                f"of {low} to {high} pixels; convert them, or take another set"
+            )
+        return shape[-1]
+
+
+def read_shard(path: Path) -> dict[str, np.ndarray]:
     """Read and validate one shard: `read_rows` and, as `observation`, its (N, 3, S, S) uint8 frames."""
-    rows = read_rows(path, frame_size)
+    rows = read_rows(path)
     return {FRAMES_KEY: np.concatenate(list(read_frames(path))), **rows}
 
 
-def read_rows(path: Path, frame_size: int = FRAME_SIZE) -> dict[str, np.ndarray]:
+def read_rows(path: Path) -> dict[str, np.ndarray]:
     """Read and validate all of a shard but its pixels.
 
     Args:
         path: the shard.
-        frame_size: height and width that its frames must have.
 
     Returns:
         action (N, A) float32, reward and discount (N,) float64, step_type (N,) uint8, and where the shard has it
@@ -140,16 +166,11 @@ def read_rows(path: Path, frame_size: int = FRAME_SIZE) -> dict[str, np.ndarray]
     Raises:
         UserError: the file is truncated or no HDF5, lacks a key, or holds a wrong shape, dtype or value.
     """
+    read_frame_size([path])
     with _open(path) as file:
         keys = _present(path, file)
-        frames = file[FRAMES_KEY]
-        if frames.dtype != np.uint8 or frames.shape[1:] != (3, frame_size, frame_size) or not len(frames):
-            raise UserError(
-                f"{path}: 'observation' is {frames.dtype} of shape {frames.shape}, expected uint8 (N, 3, {frame_size}, "
-                f"{frame_size}); take a set of {frame_size}-pixel frames"
-            )
         rows = {key: file[key][()] for key in keys if key != FRAMES_KEY}
-        count = len(frames)
+        count = len(file[FRAMES_KEY])
     for key, value in rows.items():
         _validate(path, key, value, count)
     dtypes = {"action": "float32", "step_type": "uint8"}

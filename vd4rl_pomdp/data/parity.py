@@ -6,15 +6,19 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
+import gymnasium
 import numpy as np
 
 from vd4rl_pomdp.data.dataset import open_dataset
-from vd4rl_pomdp.envs.dmc import PixelEnv, start_from
-from vd4rl_pomdp.envs.rendering import Render, frame, frames_hash, gl_strings, mujoco
+from vd4rl_pomdp.envs.dmc import DMCEnv, start_from
+from vd4rl_pomdp.envs.pixels import Render, make_env
+from vd4rl_pomdp.envs.rendering import frame, frames_hash, gl_strings, mujoco
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import TASKS
+from vd4rl_pomdp.tasks import TASKS, DMCTask
 
 GOLDEN = Path(__file__).parent / "golden.npz"
+CANARY = "walker_walk"
+"""Whose canary frames stand for a machine's rendering where the task has none."""
 MAX_MEAN_DIFFERENCE = 0.25
 """Largest mean absolute difference (of 255) that counts as the same pixels.
 
@@ -27,13 +31,21 @@ _STATIC_STD = 2.0
 
 def canary_frames(task: str, render: Render = "exact") -> np.ndarray:
     """Frames of the golden file's states as this machine renders them: (F, 3, 84, 84) uint8."""
-    return _show_golden_states(PixelEnv(task, render))
+    return _show_golden_states(task, _golden_env(task, render))
 
 
-def render_info(task: str = "walker_walk") -> dict[str, Any]:
-    """What rendered: versions, GL vendor and renderer, and the hash of the canary frames."""
-    env = PixelEnv(task, "exact")  # its GL context must live while its strings are read
-    frames = _show_golden_states(env)
+def render_info(task: str = CANARY) -> dict[str, Any]:
+    """What rendered: versions, GL vendor and renderer, and the hash of the canary frames.
+
+    Args:
+        task: name of what was rendered; one without golden frames has those of the CANARY, and one that is not
+            dm_control's the version of Gymnasium alone.
+    """
+    if not isinstance(TASKS.get(task), DMCTask | None):
+        return {"gymnasium": gymnasium.__version__}
+    task = task if task in golden_tasks() else CANARY
+    env = _golden_env(task, "exact")  # its GL context must live while its strings are read
+    frames = _show_golden_states(task, env)
     return {"mujoco": mujoco.__version__, **gl_strings(), "canary": frames_hash(frames)}
 
 
@@ -55,9 +67,10 @@ def check_parity(path: Path | None = None) -> dict[str, Any]:
         path: a data set; None compares the canaries alone.
 
     Returns:
-        `render`, `canary` (a comparison for every task), `background` (one, or None), and the verdict `equal`.
+        `render`, `canary` (a comparison for every task of the benchmark), `background` (one, or None), and the verdict
+        `equal`.
     """
-    canary = {task: compare(canary_frames(task), _golden()[f"{task}/frames"]) for task in TASKS}
+    canary = {task: compare(canary_frames(task), _golden()[f"{task}/frames"]) for task in golden_tasks()}
     background = None if path is None else _compare_background(path)
     comparisons = [*canary.values(), *([background] if background else [])]
     equal = all(comparison["equal"] for comparison in comparisons)
@@ -70,7 +83,7 @@ def _compare_background(path: Path) -> dict[str, Any]:
     if dataset.task is None:
         raise UserError(f"{path}: cannot tell the task; put the set in a folder named after it, such as walker_walk/")
     rows = np.linspace(0, dataset.num_rows - 1, min(dataset.num_rows, 400)).astype(int)
-    data, ours = dataset.frames.numpy()[rows], _wandering_frames(dataset.task)
+    data, ours = dataset.frames.numpy()[rows], _wandering_frames(dataset.task, dataset.frame_size)
     static = (data.std(0) < _STATIC_STD) & (ours.std(0) < _STATIC_STD)
     if not static.any():
         raise UserError(
@@ -80,19 +93,31 @@ def _compare_background(path: Path) -> dict[str, Any]:
     return {"task": dataset.task, "static_pixels": int(static.sum()), **result}
 
 
-def _wandering_frames(task: str, count: int = 100) -> np.ndarray:
-    """Frames of a short random episode: (count, 3, 84, 84) uint8."""
-    env = PixelEnv(task)
+def _wandering_frames(task: str, size: int, count: int = 100) -> np.ndarray:
+    """Frames of random episodes: (count, 3, size, size) uint8."""
+    env = make_env(TASKS.named(task), size=size)
     rng = np.random.default_rng(0)
     rows = [env.reset(0)]
     while len(rows) < count:
-        rows.append(env.step(rng.uniform(-1, 1, env.task.action_dim).astype(np.float32)))
+        action = rng.uniform(-1, 1, env.action_dim).astype(np.float32)
+        rows.append(env.reset(len(rows)) if rows[-1].last else env.step(action))
     return np.stack([row.frame for row in rows if row.frame is not None])
 
 
-def _show_golden_states(env: PixelEnv) -> np.ndarray:
+def golden_tasks() -> list[str]:
+    """Names of the tasks that have golden frames."""
+    return [name.partition("/")[0] for name in _golden() if name.endswith("/frames")]
+
+
+def _golden_env(task: str, render: Render) -> DMCEnv:
+    played = TASKS.named(task)
+    assert isinstance(played, DMCTask), "Gymnasium environments have no golden frames"
+    return DMCEnv(played, render)
+
+
+def _show_golden_states(task: str, env: DMCEnv) -> np.ndarray:
     frames = []
-    for state in _golden()[f"{env.task.name}/physics"]:
+    for state in _golden()[f"{task}/physics"]:
         start_from(env.simulator, state)
         frames.append(frame(env.physics))
     return np.stack(frames)

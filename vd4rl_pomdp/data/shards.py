@@ -32,7 +32,7 @@ class Shard:
 
 
 def collect_shards(
-    out: Path, shards: list[Shard], roll_out: Callable[[Any], Rows], workers: int, title: tuple[str, str]
+    out: Path, shards: list[Shard], roll_out: Callable[[Any], Rows], workers: int, title: tuple[str, str], task: str
 ) -> None:
     """Write the shards that are missing, then the set's record.
 
@@ -42,6 +42,7 @@ def collect_shards(
         roll_out: plays a job; its rows by key.
         workers: processes, 0 for every core.
         title: what is going on, and the unit of a job.
+        task: name of the task or maze, for what rendered it.
     """
     record = _Record(out)
     with ProgressLine(title[0], sum(len(shard.jobs) for shard in shards), title[1]) as progress:
@@ -57,7 +58,7 @@ def collect_shards(
                 progress.advance(1, ret=float(rollout["reward"].sum()), frames_per_s=speed)
             record.note(shard.path, time.monotonic() - started, frames)
             write_shard(shard.path, join_rollouts(rollouts), shard.attributes)
-    record.write(workers)
+    record.write(workers, task)
 
 
 def claim_set(out: Path, settings: dict[str, Any]) -> None:
@@ -91,7 +92,7 @@ class _Record:
         self._parts[shard.name] = [round(seconds, 1), frames]
         write_json(self._parts_path, self._parts)
 
-    def write(self, workers: int) -> None:
+    def write(self, workers: int, task: str) -> None:
         """Write the set's record, unless it has one and nothing was added."""
         if not self._parts and self._path.exists():
             return
@@ -100,5 +101,5 @@ class _Record:
         seconds, frames = (sum(part[i] for part in self._parts.values()) for i in (0, 1))
         facts = {"seconds": round(seconds, 1), "frames": int(frames), "workers": count_workers(workers)}
         origin = {"command": command(), "git_commit": git_commit(), "versions": versions()}
-        write_json(self._path, facts | origin | {"render": render_info()})
+        write_json(self._path, facts | origin | {"render": render_info(task)})
         self._parts_path.unlink(missing_ok=True)

@@ -25,11 +25,10 @@ from typing import Any, Literal
 import numpy as np
 
 from vd4rl_pomdp.data.episodes import join_shards
-from vd4rl_pomdp.data.format import read_attributes, read_frames, read_rows, shard_paths
+from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows, shard_paths
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
-from vd4rl_pomdp.tasks import FRAME_SIZE
 
 _VERSION = 2
 _FRAMES = "frames.u8"
@@ -87,25 +86,19 @@ def default_cache() -> Path:
     return Path(os.environ.get("VD4RL_POMDP_CACHE") or Path(base) / "vd4rl-pomdp")
 
 
-def open_store(path: Path, cache: Path | None = None, frame_size: int = FRAME_SIZE) -> Store:
+def open_store(path: Path, cache: Path | None = None) -> Store:
     """Open the decoded form of the set at `path`, decoding it first if that was never done.
 
     Raises:
-        UserError: the set is missing, damaged, incomplete or of another frame size, or the cache cannot be written.
+        UserError: the set is missing, damaged, incomplete or of two frame sizes, or the cache cannot be written.
     """
     shards = shard_paths(path)
     folder = (cache or default_cache()) / _key(shards)
     meta = _read_meta(folder)
     if meta is None:
         with _locked(folder):
-            meta = _read_meta(folder) or _decode(shards, folder, frame_size)
-    store = Store(folder, meta)
-    if store.frame_size != frame_size:
-        raise UserError(
-            f"{path}: has frames of {store.frame_size}x{store.frame_size} pixels, expected {frame_size}x{frame_size}; "
-            f"take a set of {frame_size}-pixel frames"
-        )
-    return store
+            meta = _read_meta(folder) or _decode(shards, folder)
+    return Store(folder, meta)
 
 
 def verify_store(store: Store) -> None:
@@ -145,9 +138,10 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
 
 
-def _decode(shards: Sequence[Path], folder: Path, frame_size: int) -> dict[str, Any]:
+def _decode(shards: Sequence[Path], folder: Path) -> dict[str, Any]:
     """Decode into a hidden folder and rename it; what a killed process left there is removed first."""
-    rows = join_shards(shards, [read_rows(shard, frame_size) for shard in shards])
+    frame_size = read_frame_size(shards)
+    rows = join_shards(shards, [read_rows(shard) for shard in shards])
     scratch = folder.with_name(f".{folder.name}.tmp")
     shutil.rmtree(scratch, ignore_errors=True)
     try:

@@ -1,28 +1,30 @@
-"""Environments: dm_control pixels as the data shows them, with the corruptions of the benchmark; and four mazes.
+"""Environments: tasks as the data shows them, with the corruptions of the benchmark; and four mazes.
 
 Importing this package registers every task and corruption with Gymnasium, as `vd4rl_pomdp/WalkerWalk-v0`,
 `vd4rl_pomdp/WalkerWalk-Patch16-v0`, `vd4rl_pomdp/WalkerWalk-ZeroFrames-v0`,
-`vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0`, and likewise for `CheetahRun` and `HumanoidWalk`; the mazes as
+`vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0`, and likewise for `CheetahRun`, `HumanoidWalk` and every other
+task that is registered by then (for a later one there is `vd4rl_pomdp.envs.gym.GymEnv("its_name")`); the mazes as
 `vd4rl_pomdp/MazeNoCurtain-v0`, `MazeOneCurtain`, `MazeThreeCurtains` and `MazeFirstPerson`; and the paper's finite
 counterexample, `vd4rl_pomdp/ForwardJumpCounterexample-v0`.
 
 Gymnasium's time limit truncates their episodes (`gymnasium.make(..., max_episode_steps=100)` chooses another); a step
 after the end is refused. Tasks take the corruption's fields, too: `gymnasium.make("vd4rl_pomdp/WalkerWalk-v0",
-corruption="patch", patch_size=24)`.
+corruption="patch", patch_size=24)`, and `frame_size`, 84 by default.
 """
 
+import re
 from typing import Any
 
 import gymnasium
 from gymnasium.envs.registration import WrapperSpec
 
 from vd4rl_pomdp.mazes import MAZES
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, TASKS
+from vd4rl_pomdp.tasks import TASKS
 
 _SUFFIXES = {"": "none", "-Patch16": "patch", "-ZeroFrames": "zero_frames", "-Patch16-ZeroFrames": "patch+zero_frames"}
 
 GYM_IDS = {
-    f"vd4rl_pomdp/{task.title().replace('_', '')}{suffix}-v0": {"task": task, "corruption": corruption}
+    f"vd4rl_pomdp/{re.sub(r'[^A-Za-z0-9]', '', task.title())}{suffix}-v0": {"task": task, "corruption": corruption}
     for task in TASKS
     for suffix, corruption in _SUFFIXES.items()
 }
@@ -45,7 +47,7 @@ def _register(name: str, entry_point: str, arguments: dict[str, Any], steps: int
 
 
 for _id, _arguments in GYM_IDS.items():
-    _register(_id, "gym:GymEnv", _arguments, EPISODE_TRANSITIONS)
+    _register(_id, "gym:GymEnv", _arguments, TASKS[_arguments["task"]].decisions)
 for _id, _world in FINITE_IDS.items():
     _register(_id, "finite:FiniteEnv", {"world": _world}, FINITE_STEPS)
 for _maze in MAZES.values():

@@ -11,9 +11,8 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys, make_corruption
-from vd4rl_pomdp.envs.dmc import PixelEnv, Row
-from vd4rl_pomdp.envs.rendering import Render
-from vd4rl_pomdp.tasks import FRAME_STACK
+from vd4rl_pomdp.envs.pixels import Render, Row, make_env
+from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, Task
 from vd4rl_pomdp.types import row_key
 
 if hasattr(os, "register_at_fork"):  # a forked process would wait for the threads that it did not inherit
@@ -25,9 +24,9 @@ class Observation:
     """What one step shows."""
 
     obs: Tensor
-    """(C, 84, 84) uint8: the corrupted stack, all the agent may see."""
+    """(C, S, S) uint8: the corrupted stack, all the agent may see."""
     clean: Tensor
-    """(C, 84, 84) uint8: the stack before corruption."""
+    """(C, S, S) uint8: the stack before corruption."""
     row: Row
     """Reward, step type and simulator state."""
 
@@ -36,9 +35,14 @@ class CorruptedEnv:
     """A task with stacked, corrupted frames. Row t of an episode is corrupted by keys of (seed, episode, t)."""
 
     def __init__(
-        self, task: str, corruption: CorruptionConfig, render: Render = "fast", length: int | None = None
+        self,
+        task: Task,
+        corruption: CorruptionConfig,
+        render: Render = "fast",
+        length: int | None = None,
+        size: int = FRAME_SIZE,
     ) -> None:
-        self.env = PixelEnv(task, render, length=length)
+        self.env = make_env(task, render, size, length)
         self._corruption = make_corruption(corruption)
         self._frames: deque[np.ndarray] = deque(maxlen=FRAME_STACK)
         self._seed, self._episode, self._t = 0, 0, 0

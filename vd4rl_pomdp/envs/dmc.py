@@ -1,54 +1,32 @@
-"""dm_control tasks as V-D4RL saw them: camera 0, 84x84, action repeat 2, 500 decisions, and every simulator state."""
+"""dm_control's tasks as V-D4RL saw them: one camera, every action repeated, and the simulator state of every row."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
 from vd4rl_pomdp.envs import rendering
-from vd4rl_pomdp.envs.rendering import Render, suite
+from vd4rl_pomdp.envs.pixels import PixelEnv, Render, Row
+from vd4rl_pomdp.envs.rendering import mujoco, suite
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import ACTION_REPEAT, EPISODE_TRANSITIONS, Task, get_task
+from vd4rl_pomdp.tasks import FRAME_SIZE, TASKS, DMCTask, Layout
 from vd4rl_pomdp.types import StepType
 
 
-@dataclass(frozen=True)
-class Row:
-    """One row of an episode (see the time axis in `types`)."""
+class DMCEnv(PixelEnv):
+    """One task. An episode's rewards replay exactly from its first simulator state."""
 
-    frame: np.ndarray | None
-    """(3, 84, 84) uint8; None when rendering is off."""
-    state: np.ndarray
-    """(D,) float32: dm_control's observations, flattened in their own order."""
-    physics: np.ndarray
-    """(P,) float64: simulator state."""
-    reward: float
-    """Reward that led into this row, summed over the action repeat; 0 in the first."""
-    discount: float
-    step_type: StepType
-
-    @property
-    def last(self) -> bool:
-        """Whether the episode ends here."""
-        return self.step_type == StepType.LAST
-
-
-class PixelEnv:
-    """One task. An episode's first state depends on its seed alone, and its rewards replay from that state exactly."""
-
-    def __init__(self, task: str, render: Render = "fast", pixels: bool = True, length: int | None = None) -> None:
-        self.task = get_task(task)
+    def __init__(
+        self, task: DMCTask, render: Render = "fast", size: int | None = FRAME_SIZE, length: int | None = None
+    ) -> None:
+        super().__init__(task, size, length)
+        self._camera = task.camera
         self._random = np.random.RandomState(0)
-        self.simulator = _load(self.task, self._random)
+        self.simulator = _load(task, self._random)
         """The dm_control environment."""
-        self._pixels = pixels
-        self._length = EPISODE_TRANSITIONS if length is None else length
-        if self._length < 1:
-            raise UserError(f"an episode of {length} decisions is too short; it needs at least 1")
-        self._decisions = 0
-        if pixels:
+        self._layout = task.layout or self._found_layout()
+        if size is not None:
             rendering.prepare(self.physics, render)
 
     @property
@@ -56,24 +34,35 @@ class PixelEnv:
         """dm_control's physics."""
         return self.simulator.physics
 
-    def reset(self, seed: int) -> Row:
-        """Begin the episode of a seed."""
+    @property
+    def layout(self) -> Layout:
+        """The task's own, else what the model has."""
+        return self._layout
+
+    def _found_layout(self) -> Layout:
+        """Widths of a model; a camera that tracks its subject does not show where it is."""
+        model = self.physics.model
+        self.simulator.reset()  # an episode of its own: some tasks observe nothing before
+        state = flat_state(self.simulator.task.get_observation(self.physics))
+        travel = _ground_travel(model) if _tracks(model, self._camera) else ()
+        return Layout(self.simulator.action_spec().shape[0], len(state), model.nq, travel)
+
+    @property
+    def rate(self) -> float:
+        """Decisions a second of simulated time."""
+        return 1 / (self.simulator.control_timestep() * self.task.action_repeat)
+
+    def _begin(self, seed: int) -> None:
         self._random.seed(seed)
         self.simulator.reset()
         start_from(self.simulator, self.physics.get_state())
-        self._decisions = 0
-        return self._row(0.0, 1.0, StepType.FIRST)
 
-    def step(self, action: np.ndarray) -> Row:
-        """Apply an (A,) float32 action in [-1, 1] for two simulator steps."""
-        reward = repeat_action(self.simulator, action)
-        self._decisions += 1
-        last = self._decisions == self._length
-        return self._row(reward, 1.0, StepType.LAST if last else StepType.MID)
+    def _apply(self, action: np.ndarray) -> tuple[float, bool, float]:
+        return repeat_action(self.simulator, action, self.task.action_repeat)
 
     def _row(self, reward: float, discount: float, step_type: StepType) -> Row:
         return Row(
-            frame=rendering.frame(self.physics) if self._pixels else None,
+            frame=None if self.size is None else rendering.frame(self.physics, self.size, self._camera),
             state=flat_state(self.simulator.task.get_observation(self.physics)),
             physics=self.physics.get_state(),
             reward=reward,
@@ -93,29 +82,74 @@ def start_from(env: Any, state: np.ndarray) -> None:
         env.physics.set_state(state)
 
 
-def repeat_action(env: Any, action: np.ndarray) -> float:
-    """Apply one action for the action repeat; returns the summed reward."""
-    return float(sum(env.step(action).reward for _ in range(ACTION_REPEAT)))
+def repeat_action(env: Any, action: np.ndarray, repeat: int) -> tuple[float, bool, float]:
+    """Apply one action for the action repeat, or until the task ends; the summed reward, whether it ended, discount."""
+    total = 0.0
+    for _ in range(repeat):
+        step = env.step(action)
+        total += step.reward
+        if step.last():
+            return float(total), True, float(step.discount)
+    return float(total), False, 1.0
 
 
 def replay_rewards(task: str, physics: np.ndarray, actions: np.ndarray) -> np.ndarray:
     """Rewards of an action sequence from a simulator state.
 
     Args:
-        task: task name.
+        task: name of a dm_control task.
         physics: (P,) float64 state of the first row.
         actions: (T, A) float32, a_0 first.
 
     Returns:
         (T,) float64: r_0 .. r_{T-1}.
     """
-    env = _load(get_task(task), np.random.RandomState(0))
+    played = TASKS.named(task)
+    assert isinstance(played, DMCTask), "other tasks store no states"
+    env = _load(played, np.random.RandomState(0))
     env.reset()
     start_from(env, physics)
-    return np.array([repeat_action(env, action) for action in actions])
+    return np.array([repeat_action(env, action, played.action_repeat)[0] for action in actions])
 
 
-def _load(task: Task, random: np.random.RandomState) -> Any:
+def replays(task: DMCTask) -> bool:
+    """Whether the simulator state is all that an episode begins with: some tasks draw a target into their model."""
+    random = np.random.RandomState(0)
+    env = _load(task, random)
+    return _model_of_an_episode(env, random, 1) == _model_of_an_episode(env, random, 2)
+
+
+def _model_of_an_episode(env: Any, random: np.random.RandomState, seed: int) -> bytes:
+    random.seed(seed)
+    env.reset()
+    model = env.physics.model.ptr
+    buffer = np.empty(mujoco.mj_sizeModel(model), np.uint8)
+    mujoco.mj_saveModel(model, None, buffer)
+    return buffer.tobytes()
+
+
+def _tracks(model: Any, camera: int) -> bool:
+    return model.cam_mode[camera] in (mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
+
+
+def _ground_travel(model: Any) -> tuple[int, ...]:
+    """Positions along the ground of the bodies that stand in the world: x and y of free joints, level slides."""
+    travel: list[int] = []
+    for kind, start, body, axis in zip(
+        model.jnt_type, model.jnt_qposadr, model.jnt_bodyid, model.jnt_axis, strict=True
+    ):
+        if model.body_parentid[body] == 0 and kind == mujoco.mjtJoint.mjJNT_FREE:
+            travel += [int(start), int(start) + 1]
+        elif model.body_parentid[body] == 0 and kind == mujoco.mjtJoint.mjJNT_SLIDE and abs(axis[2]) < 0.5:
+            travel.append(int(start))
+    return tuple(travel)
+
+
+def _load(task: DMCTask, random: np.random.RandomState) -> Any:
     """The dm_control environment; its own time limit never ends an episode, ours does."""
     rendering.check_mujoco()
+    if (task.domain, task.task) not in suite.ALL_TASKS:
+        tasks = ", ".join(name for domain, name in suite.ALL_TASKS if domain == task.domain)
+        choices = tasks or ", ".join(sorted({domain for domain, _ in suite.ALL_TASKS}))
+        raise UserError(f"dm_control has no task {task.domain!r}, {task.task!r}: choose one of {choices}")
     return suite.load(task.domain, task.task, task_kwargs={"random": random, "time_limit": float("inf")})

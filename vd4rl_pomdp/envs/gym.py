@@ -10,19 +10,20 @@ import numpy as np
 
 from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
-from vd4rl_pomdp.envs.rendering import Render
-from vd4rl_pomdp.tasks import ACTION_REPEAT, FRAME_SIZE, FRAME_STACK
+from vd4rl_pomdp.envs.pixels import Render
+from vd4rl_pomdp.errors import refuse_number
+from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_SIZES, FRAME_STACK, TASKS
 
 Info = dict[str, Any]
 
 
 class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """Corrupted pixels in, actions out; nothing terminates, and the registered ids add the time limit.
+    """Corrupted pixels in, actions out; only the task itself terminates, and the registered ids add the time limit.
 
-    Observations: (9, 84, 84) uint8, three frames, oldest first. Actions: (A,) float32 in [-1, 1]. `info` holds `clean`,
-    the observation before corruption, and `physics`, the (P,) float64 simulator state. A seed fixes the initial states
-    and corruptions of all episodes that follow it. `corruption_fields` are the corruption's mode and options;
-    one that does not exist or fit raises UserError.
+    Observations: (9, S, S) uint8, three frames of `frame_size`, oldest first. Actions: (A,) float32 in [-1, 1]. `info`
+    holds `clean`, the observation before corruption, and `physics`, the (P,) float64 simulator state, of width 0 for a
+    task without states. A seed fixes the initial states and corruptions of all episodes that follow it.
+    `corruption_fields` are the corruption's mode and options; one that does not exist or fit raises UserError.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's own name and type)
@@ -33,18 +34,20 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         corruption: str = "none",
         render: Render = "fast",
         render_mode: str | None = None,
+        frame_size: int = FRAME_SIZE,
         **corruption_fields: Any,
     ) -> None:
-        self._env = CorruptedEnv(task, _config(corruption, corruption_fields), render, length=sys.maxsize)
-        shape = (3 * FRAME_STACK, FRAME_SIZE, FRAME_SIZE)
+        refuse_number("frame_size", frame_size, *FRAME_SIZES)
+        config = _config(corruption, corruption_fields, frame_size)
+        self._env = CorruptedEnv(TASKS.named(task), config, render, sys.maxsize, frame_size)
+        shape = (3 * FRAME_STACK, frame_size, frame_size)
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._env.env.task.action_dim,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._env.env.action_dim,), np.float32)
         self.render_mode = render_mode
-        seconds = self._env.env.simulator.control_timestep() * ACTION_REPEAT
-        self.metadata = {**self.metadata, "render_fps": round(1 / seconds)}
+        self.metadata = {**self.metadata, "render_fps": round(self._env.env.rate)}
         self._corruption_seed: int | None = None
         self._episode = 0
-        self._frame = np.zeros((FRAME_SIZE, FRAME_SIZE, 3), np.uint8)
+        self._frame = np.zeros((frame_size, frame_size, 3), np.uint8)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, Info]:
         """Begin the next episode; a seed begins the series anew."""
@@ -56,13 +59,13 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._show(self._env.reset(self._draw(), self._corruption_seed, self._episode))
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """Apply one action for two simulator steps; the reward is their sum."""
+        """Apply one action for the action repeat; the reward is the sum."""
         step = self._env.step(action)
         obs, info = self._show(step)
-        return obs, step.row.reward, False, False, info
+        return obs, step.row.reward, step.row.terminated, step.row.last and not step.row.terminated, info
 
     def render(self) -> np.ndarray:
-        """The newest frame before corruption: (84, 84, 3) uint8."""
+        """The newest frame before corruption: (S, S, 3) uint8."""
         return self._frame
 
     def _draw(self) -> int:
@@ -74,8 +77,8 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return step.obs.numpy(), {"clean": clean, "physics": step.row.physics}
 
 
-def _config(corruption: str, options: Info) -> CorruptionConfig:
+def _config(corruption: str, options: Info, size: int) -> CorruptionConfig:
     """The corruption that `gymnasium.make` was asked for."""
     config = CorruptionConfig.of(corruption, **options)
-    check_corruption(config)
+    check_corruption(config, size)
     return config

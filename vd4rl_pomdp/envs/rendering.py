@@ -3,24 +3,22 @@
 From mujoco 3.2.0 on the random stars of dm_control's sky are drawn from another seed, so an encoder pretrained on
 V-D4RL would be evaluated under another sky. The sky of mujoco 3.1.6 is written back before the first render.
 
-This module alone imports mujoco and dm_control: whatever must happen before OpenGL is loaded happens here.
+This module alone imports mujoco and dm_control, after what must happen before OpenGL is loaded.
 """
 
 from __future__ import annotations
 
-import contextlib
 import ctypes
 import hashlib
 import os
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import Any, get_args
 
 import numpy as np
 
-os.environ.setdefault("MUJOCO_GL", "egl")
-os.environ.setdefault("LP_NUM_THREADS", "1")  # software rendering scales by processes, not by threads
-
+from vd4rl_pomdp.envs import opengl  # noqa: F401
+from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_SIZE
 
@@ -32,11 +30,6 @@ def gl_error(error: Exception) -> UserError:
         "libegl1, libgl1 and libgl1-mesa-dri for MUJOCO_GL=egl, or libosmesa6 for MUJOCO_GL=osmesa"
     )
 
-
-with contextlib.suppress(ImportError):  # not every PyTorch brings it
-    # Triton carries an LLVM of its own. PyTorch's optimisers import it, and the process ends in a segmentation fault
-    # if Mesa's software renderer has loaded another LLVM before.
-    import triton  # noqa: F401
 
 try:  # both load the OpenGL library that MUJOCO_GL names, and fail in many ways where it is missing
     import mujoco
@@ -59,7 +52,6 @@ __all__ = [
     "suite",
 ]
 
-Render = Literal["fast", "exact"]
 _SKYBOX = Path(__file__).parent / "assets" / "skybox.npz"
 TRIED_MUJOCO = ((3, 3), (3, 12))
 """Lowest version and first version not supported: from 3.12 on floor textures are anchored elsewhere."""
@@ -105,11 +97,11 @@ def refuse_after_fork() -> None:
         )
 
 
-def frame(physics: Any) -> np.ndarray:
-    """Camera 0 as V-D4RL stores it: (3, 84, 84) uint8."""
+def frame(physics: Any, size: int = FRAME_SIZE, camera: int = 0) -> np.ndarray:
+    """What a camera shows, as V-D4RL stores it: (3, size, size) uint8."""
     refuse_after_fork()
     try:
-        image = physics.render(FRAME_SIZE, FRAME_SIZE, camera_id=0)
+        image = physics.render(size, size, camera_id=camera)
     except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
         raise gl_error(error) from error
     return np.ascontiguousarray(image.transpose(2, 0, 1))

@@ -18,13 +18,14 @@ from pathlib import Path
 import numpy as np
 
 from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, replay_returns
+from vd4rl_pomdp.data.format import RECORD
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.policies.actor import ships
 from vd4rl_pomdp.runs.files import Row, read_json, write_csv, write_json
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 from vd4rl_pomdp.runs.reading import regular
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, MOST_EPISODES, SET_QUALITIES, get_task
+from vd4rl_pomdp.tasks import MOST_EPISODES, SET_QUALITIES, TASKS
 
 EPISODES = 200
 CORES = 2
@@ -89,7 +90,7 @@ def _check(tasks: Sequence[str], qualities: Sequence[str], timed_episodes: int) 
         raise UserError(f"unknown quality {unknown[0]!r}: choose from {', '.join(SET_QUALITIES)}")
     refuse_number("timed_episodes", timed_episodes, 1, MOST_EPISODES)
     for task in tasks:
-        get_task(task)
+        TASKS.named(task)
 
 
 def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:
@@ -113,7 +114,7 @@ def _cost(task: str, episodes: int) -> Row:
         started = time.process_time()
         collect(CollectConfig(task, "random", Path(folder) / task, episodes, workers=1))
         spent = time.process_time() - started
-    rows = episodes * (EPISODE_TRANSITIONS + 1)
+        rows = read_json(Path(folder) / task / RECORD)["frames"]
     return {"task": task, "episodes": episodes, "rows": rows, "cpu_seconds": f"{spent:.1f}", "commit": git_commit()}
 
 

@@ -53,7 +53,8 @@ def collect(config: CollectConfig) -> list[Path]:
     ]
     with owned(config.out):
         claim_set(config.out, settings)
-        collect_shards(config.out, shards, _roll_out, config.workers, (f"collect {config.maze}", "trajectories"))
+        title = f"collect {config.maze}", "trajectories"
+        collect_shards(config.out, shards, _roll_out, config.workers, title, config.maze)
     return [shard.path for shard in shards]
 
 

@@ -22,11 +22,16 @@ _BLOCK = 1000
 
 def open_maze_set(path: Path, cache: Path | None = None) -> tuple[Dataset, MazeSpec]:
     """A set of maze data and its maze; raises UserError if it is of something else or holds no true states."""
-    dataset = open_dataset(path, cache, PICTURE_SIZE)
+    dataset = open_dataset(path, cache)
     attributes = dataset.store.meta["attributes"]
     names = {stored.get("task") for stored in attributes}
     if len(names) != 1 or not names <= set(MAZES):
         raise UserError(f"{path}: names no maze; collect a set with `vd4rl-pomdp navigation collect`")
+    if dataset.frame_size != PICTURE_SIZE:
+        raise UserError(
+            f"{path}: has frames of {dataset.frame_size} pixels, mazes of {PICTURE_SIZE}; collect a set with "
+            "`vd4rl-pomdp navigation collect`"
+        )
     if dataset.physics is None:
         raise UserError(
             f"{path}: holds no true states ('physics'), which the probe needs; collect a set with "

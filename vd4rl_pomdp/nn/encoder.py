@@ -11,7 +11,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, STATE, FrameEncoder, StateFrame, make_frame_encoder
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.nn.frame import STATE, FrameEncoder, StateFrame, make_frame_encoder
 from vd4rl_pomdp.nn.sequence import run_gru
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.types import Windows
@@ -52,6 +53,16 @@ class StreamState(NamedTuple):
     """(B, L', F + A): the GRU's last inputs under a history window, else empty."""
 
 
+def _frame_encoder(config: EncoderConfig) -> FrameEncoder:
+    try:
+        return make_frame_encoder(config.frame_encoder, config.channels, config.size, config.feature_dim)
+    except RuntimeError as error:  # a convolution's, whose input is smaller than its kernel
+        raise UserError(
+            f"frame encoder {config.frame_encoder!r} cannot read pictures of {config.size}x{config.size} pixels: "
+            "choose another --frame-encoder, or a set of larger frames"
+        ) from error
+
+
 class Encoder(nn.Module):
     """Maps observations and past actions to the representation s_t of width `dim`."""
 
@@ -62,9 +73,7 @@ class Encoder(nn.Module):
             config = self.config = replace(config, feature_dim=config.channels)
             self.frame: FrameEncoder | StateFrame = StateFrame()
         else:
-            told = {"feature_dim": config.feature_dim} | config.frame_options
-            options = FRAME_ENCODERS.named(config.frame_encoder).options.fill(told)
-            self.frame = make_frame_encoder(config.frame_encoder, config.channels, config.size, options)
+            self.frame = _frame_encoder(config)
         inputs = config.feature_dim + (config.action_dim if config.use_actions else 0)
         self.gru = (
             nn.GRU(inputs, config.hidden_dim, config.gru_layers, batch_first=True) if config.history == "gru" else None

@@ -22,7 +22,7 @@ from safetensors.numpy import save
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
-from vd4rl_pomdp.tasks import TASKS, Task, get_task
+from vd4rl_pomdp.tasks import TASKS
 
 LOG_STD_RANGE = (-20.0, 2.0)
 OBSERVATION_CLIP = 10.0
@@ -153,8 +153,8 @@ def _save(weights: dict[str, np.ndarray], card: dict[str, Any], path: Path) -> N
     write_bytes(path, save(arrays, {"card": json.dumps(card)}))
 
 
-def read_actor(path: Path, task: Task | None = None) -> Actor:
-    """Read an actor file; raises UserError if it is missing, damaged, or made for another task than `task`.
+def read_actor(path: Path, task: str | None = None) -> Actor:
+    """Read an actor file; raises UserError if it is missing, damaged, or made for another task than that called `task`.
 
     Its weights must be finite and give an action for a state of the task.
     """
@@ -163,12 +163,12 @@ def read_actor(path: Path, task: Task | None = None) -> Actor:
     return actor
 
 
-def check_actor(path: Path, task: Task | None = None) -> None:
+def check_actor(path: Path, task: str | None = None) -> None:
     """Raise UserError unless a file is an actor that `read_actor` can read."""
     read_actor(path, task)
 
 
-def read_ladder(path: Path, task: Task | None = None) -> Ladder:
+def read_ladder(path: Path, task: str | None = None) -> Ladder:
     """Read a ladder's file; raises UserError as `read_actor` does, for any of its actors."""
     ladder = Ladder(*_read(path, task))
     steps = ladder.card.get("decisions")
@@ -179,7 +179,7 @@ def read_ladder(path: Path, task: Task | None = None) -> Ladder:
     return ladder
 
 
-def _read(path: Path, task: Task | None) -> tuple[dict[str, np.ndarray], dict[str, Any], str]:
+def _read(path: Path, task: str | None) -> tuple[dict[str, np.ndarray], dict[str, Any], str]:
     try:
         sha256 = hashlib.sha256(read_bytes(path)).hexdigest()
         with safe_open(path, framework="np") as file:
@@ -189,33 +189,34 @@ def _read(path: Path, task: Task | None) -> tuple[dict[str, np.ndarray], dict[st
         raise
     except (OSError, SafetensorError, ValueError, TypeError) as error:
         raise UserError(f"{path}: not an actor file ({error}); {_REMEDY}") from error
-    if task is not None and card.get("task") != task.name:
-        raise UserError(f"{path}: this actor was trained on {card.get('task')}, not on {task.name}")
+    if task is not None and card.get("task") != task:
+        raise UserError(f"{path}: this actor was trained on {card.get('task')}, not on {task}")
     return weights, card, sha256
 
 
-def _check_weights(path: Path, actor: Actor, task: Task | None) -> None:
+def _check_weights(path: Path, actor: Actor, task: str | None) -> None:
     """Raise UserError unless the weights are finite and give an action for a state of the task; mazes are no tasks."""
-    task = task or TASKS.get(actor.card.get("task", ""))
-    if task is None:
+    name = task or actor.card.get("task", "")
+    if name not in TASKS:
         return
+    widths = TASKS[name].found()
     try:
         finite = all(np.isfinite(value).all() for value in actor.weights.values())
-        action = actor.act(np.zeros(task.state_dim, np.float32), np.random.default_rng(0)) if finite else None
+        action = actor.act(np.zeros(widths.state_dim, np.float32), np.random.default_rng(0)) if finite else None
     except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{path}: its weights form no actor of {task.name} ({error}); {_REMEDY}") from error
-    if action is None or action.shape != (task.action_dim,):
-        raise UserError(f"{path}: its weights form no actor of {task.name}; {_REMEDY}")
+        raise UserError(f"{path}: its weights form no actor of {name} ({error}); {_REMEDY}") from error
+    if action is None or action.shape != (widths.action_dim,):
+        raise UserError(f"{path}: its weights form no actor of {name}; {_REMEDY}")
 
 
 def load_actor(task: str, quality: str) -> Actor:
     """Load the actor that ships for a task and a quality (`medium` or `expert`)."""
-    return read_actor(_shipped(task, quality), get_task(task))
+    return read_actor(_shipped(task, quality), task)
 
 
 def load_ladder(task: str) -> Ladder:
     """Load the ladder of actors that ships for a task's medium_replay set."""
-    return read_ladder(_shipped(task, "replay"), get_task(task))
+    return read_ladder(_shipped(task, "replay"), task)
 
 
 def ships(task: str, quality: str) -> bool:
@@ -226,7 +227,8 @@ def ships(task: str, quality: str) -> bool:
 
 
 def _asset(task: str, name: str) -> Path:
-    return ASSETS / f"{get_task(task).name}_{name}.safetensors"
+    TASKS.named(task)
+    return ASSETS / f"{task}_{name}.safetensors"
 
 
 def _shipped(task: str, quality: str) -> Path:

@@ -6,17 +6,19 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
+from vd4rl_pomdp.tasks import TASKS, DMCTask
+
 
 @dataclass(frozen=True)
 class PolicyConfig:
     """Settings of one policy training run; `--task` chooses the defaults."""
 
     task: str
-    """walker_walk, cheetah_run or humanoid_walk."""
+    """walker_walk, cheetah_run or humanoid_walk, or a task of dm_control that was added."""
     out: Path
     """Run folder; the same command continues a run that was cut."""
     decisions: int = 300_000
-    """Environment decisions in all (two simulator steps each)."""
+    """Environment decisions in all."""
     seed: int = 0
     """Seed of the networks, the replay draws and the training episodes."""
     learning_rate: float = 7e-4
@@ -69,18 +71,12 @@ _STEADY = PolicyConfig(
     temperature_rate=1e-4,
     target_entropy=-0.5,
 )
-"""What cheetah_run and humanoid_walk share."""
+"""What all tasks but walker_walk share."""
+_GENERAL = replace(_STEADY, decisions=600_000, envs=4, temperature=0.1, replay_size=800_000, eval_every=4_000)
+"""What a task without a recipe of its own gets: cheetah_run's."""
 RECIPES: dict[str, PolicyConfig] = {
     "walker_walk": PolicyConfig("walker_walk", Path()),
-    "cheetah_run": replace(
-        _STEADY,
-        task="cheetah_run",
-        decisions=600_000,
-        envs=4,
-        temperature=0.1,
-        replay_size=800_000,
-        eval_every=4_000,
-    ),
+    "cheetah_run": replace(_GENERAL, task="cheetah_run"),
     "humanoid_walk": replace(
         _STEADY,
         task="humanoid_walk",
@@ -94,3 +90,9 @@ RECIPES: dict[str, PolicyConfig] = {
 """Defaults by task. Plain SAC is enough for walker_walk. The others get standardised observations, layer norms in the
 critics and three-step returns; humanoid_walk also more fresh decisions for each update: physics is far cheaper than
 gradients. Where a run has levelled off, another from it (--start-from) with other steps or exploration climbs on."""
+
+
+def recipes() -> dict[str, PolicyConfig]:
+    """Defaults of every task of dm_control, those that were added included."""
+    tasks = [name for name, task in TASKS.items() if isinstance(task, DMCTask)]
+    return {name: RECIPES.get(name, replace(_GENERAL, task=name)) for name in tasks}

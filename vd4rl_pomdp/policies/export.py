@@ -23,7 +23,7 @@ from vd4rl_pomdp.policies.state_env import StateEnv
 from vd4rl_pomdp.runs.files import read_json, write_bytes
 from vd4rl_pomdp.runs.outputs import refuse_foreign, refuse_inside
 from vd4rl_pomdp.runs.reading import regular
-from vd4rl_pomdp.tasks import Task, get_task
+from vd4rl_pomdp.tasks import TASKS, Task
 
 CARD_EPISODES = 20
 CARD_SEED = 10_000
@@ -44,8 +44,9 @@ def episode_returns(actor: Actor, task: Task, episodes: int, first_seed: int = C
         state, _ = env.reset(seed=first_seed + episode)
         total, ended = 0.0, False
         while not ended:
-            state, reward, _, ended, _ = env.step(actor.act(state))
+            state, reward, terminated, truncated, _ = env.step(actor.act(state))
             total += reward
+            ended = terminated or truncated
         returns.append(total)
     return returns
 
@@ -87,9 +88,10 @@ def export_run(run: Path, out: Path) -> dict[str, Path]:
         raise UserError(f"{run}: is not the folder of a policy run with a snapshot; `policy train` makes one")
     refuse_no_folder(out)
     config = read_json(run / "config.json")
-    task = get_task(str(config.get("task")))
+    played = str(config.get("task"))
+    task = TASKS.named(played)
     if out.resolve() != run.resolve():
-        _refuse_other(out, task)
+        _refuse_other(out, played)
     curve = read_curve(run)
     kept = [row for row in curve if snapshot_path(run, row[0]).exists()]
     if not kept:
@@ -105,19 +107,19 @@ def export_run(run: Path, out: Path) -> dict[str, Path]:
         if (run / name).exists() and out.resolve() != run.resolve():
             shutil.copy(run / name, out / name)
     files = {
-        quality: _publish(run, out / f"{task.name}_{quality}.safetensors", config, quality, step, judged[step], curve)
+        quality: _publish(run, out / f"{played}_{quality}.safetensors", config, quality, step, judged[step], curve)
         for quality, step in (("expert", expert), ("medium", medium))
     }
-    return files | {"replay": _publish_ladder(run, out, task, [row for row in kept if row[0] <= medium])}
+    return files | {"replay": _publish_ladder(run, out, played, [row for row in kept if row[0] <= medium])}
 
 
-def _refuse_other(out: Path, task: Task) -> None:
+def _refuse_other(out: Path, task: str) -> None:
     """Raise UserError for a folder to export to that holds anything but an earlier export for the same task."""
     exported = (out / "curve.csv").is_file() and not (out / "snapshots").exists()
-    if exported and read_json(out / "config.json").get("task") == task.name:
+    if exported and read_json(out / "config.json").get("task") == task:
         refuse_inside(out)
     else:
-        refuse_foreign(out, f"exported policy of {task.name}")
+        refuse_foreign(out, f"exported policy of {task}")
 
 
 def _judge(run: Path, task: Task, steps: list[int]) -> dict[int, list[float]]:
@@ -151,24 +153,24 @@ def _publish(
     return path
 
 
-def _publish_ladder(run: Path, out: Path, task: Task, rows: list[tuple[int, float]]) -> Path:
+def _publish_ladder(run: Path, out: Path, task: str, rows: list[tuple[int, float]]) -> Path:
     """Write at most LADDER_RUNGS snapshots, evenly spread over the run up to the last of `rows`, into one file."""
     chosen = sorted({round(i) for i in np.linspace(0, len(rows) - 1, min(LADDER_RUNGS, len(rows)))})
     steps = [rows[i][0] for i in chosen]
     actors = [read_actor(snapshot_path(run, step)) for step in steps]
-    path = out / f"{task.name}_replay.safetensors"
-    Ladder.of(actors, {"task": task.name, "decisions": steps, "curve": [rows[i][1] for i in chosen]}).save(path)
+    path = out / f"{task}_replay.safetensors"
+    Ladder.of(actors, {"task": task, "decisions": steps, "curve": [rows[i][1] for i in chosen]}).save(path)
     return path
 
 
-def exported_actors(folder: Path, task: Task) -> Iterator[tuple[int, Actor]]:
+def exported_actors(folder: Path, task: str) -> Iterator[tuple[int, Actor]]:
     """Actors that `export_run` wrote into a folder, with their decisions; a ladder's first, rounded as they are."""
-    ladder = folder / f"{task.name}_replay.safetensors"
+    ladder = folder / f"{task}_replay.safetensors"
     if ladder.exists():
         read = read_ladder(ladder, task)
         yield from zip(read.card["decisions"], read.rungs, strict=True)
     for quality in ("medium", "expert"):
-        path = folder / f"{task.name}_{quality}.safetensors"
+        path = folder / f"{task}_{quality}.safetensors"
         if path.exists():
             actor = read_actor(path, task)
             yield actor.card["decisions"], actor

@@ -7,18 +7,18 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from vd4rl_pomdp.envs.dmc import PixelEnv
+from vd4rl_pomdp.envs.pixels import make_env
 from vd4rl_pomdp.tasks import Task
 
 
 class StateEnv(gymnasium.Env[np.ndarray, np.ndarray]):
-    """States in, actions out; the time limit of 500 decisions truncates.
+    """States in, actions out; the task's limit of decisions truncates.
 
     Observations: (D,) float32, dm_control's observations flattened in order. Actions: (A,) float32 in [-1, 1].
     """
 
     def __init__(self, task: Task) -> None:
-        self._env = PixelEnv(task.name, pixels=False)
+        self._env = make_env(task, size=None)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.state_dim,), np.float32)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
 
@@ -29,6 +29,6 @@ class StateEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return row.state, {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
-        """Apply one action for two simulator steps; the reward is their sum."""
+        """Apply one action for the action repeat; the reward is the sum."""
         row = self._env.step(action)
-        return row.state, row.reward, False, row.last, {}
+        return row.state, row.reward, row.terminated, row.last and not row.terminated, {}

@@ -37,7 +37,7 @@ from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_cs
 from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import Owner, owned
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, MOST_EPISODES, get_task
+from vd4rl_pomdp.tasks import MOST_EPISODES, TASKS
 
 if TYPE_CHECKING:
     from sbx import SAC
@@ -56,7 +56,7 @@ def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None]
     Returns:
         The exported files by quality.
     """
-    task = get_task(config.task)
+    task = TASKS.named(config.task)
     refuse_inside(config.out)
     _check(config)
     with owned(config.out) as owner:
@@ -94,7 +94,7 @@ def _learn_and_evaluate(model: SAC, config: PolicyConfig, done: int) -> float:
         return -np.inf
     actor = learner.export_actor(model, config, int(model.num_timesteps))
     first_seed = CARD_SEED - config.eval_episodes
-    mean = float(np.mean(episode_returns(actor, get_task(config.task), config.eval_episodes, first_seed)))
+    mean = float(np.mean(episode_returns(actor, TASKS.named(config.task), config.eval_episodes, first_seed)))
     _record(config.out, actor, int(model.num_timesteps), mean)
     learner.save_networks(model, config.out / NETWORKS)
     return mean
@@ -107,14 +107,17 @@ def decisions_made(run: Path) -> int:
 
 def _check(config: PolicyConfig) -> None:
     """Raise UserError for settings out of range, or that need too much memory, and for a folder of another run."""
+    task = TASKS.named(config.task)
+    if not task.state_dim:
+        raise UserError(f"{config.task} has no states for an actor to read: choose a task of dm_control")
     refuse_outside(
-        config, seed=(0, MAX_SEED), decisions=1, learning_rate=0, hidden=1, n_step=(1, EPISODE_TRANSITIONS),
+        config, seed=(0, MAX_SEED), decisions=1, learning_rate=0, hidden=1, n_step=(1, task.decisions),
         envs=(1, MOST_ENVS), updates_per_decision=0, batch_size=1, temperature=0, temperature_rate=0,
         target_entropy=(-MOST, MOST), replay_size=1, eval_every=1, eval_episodes=(1, MOST_EPISODES),
         stop_at=(-MOST, MOST), refill=0, critic_warmup=0,
     )  # fmt: skip
-    state = get_task(config.task).state_dim  # of float32 numbers, as the weights are
-    require_memory(8 * state * config.replay_size, CPU, config, "replay_size")
+    # of float32 numbers, as the weights are
+    require_memory(8 * task.state_dim * config.replay_size, CPU, config, "replay_size")
     require_memory(4 * (15 * config.hidden**2 + config.batch_size * config.hidden), CPU, config, "hidden", "batch_size")
     _check_folder(config)
 
@@ -161,7 +164,7 @@ def _start_from(model: SAC, config: PolicyConfig, start: Path) -> int:
     learner.start_from_networks(model, start / NETWORKS)
     curve = read_curve(start)
     (config.out / "snapshots").mkdir(exist_ok=True)
-    for step, actor in exported_actors(start, get_task(config.task)):
+    for step, actor in exported_actors(start, config.task):
         actor.save(snapshot_path(config.out, step))
     for step, _ in curve:
         if snapshot_path(start, step).exists():

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.data.parity import canary_frames, compare
-from vd4rl_pomdp.envs.dmc import PixelEnv
+from vd4rl_pomdp.envs.pixels import PixelEnv, make_env
 from vd4rl_pomdp.experiments.bench.timing import rate
 from vd4rl_pomdp.mazes import PICTURE_SIZE
 from vd4rl_pomdp.runs.workers import run_jobs
+from vd4rl_pomdp.tasks import TASKS
 
 ROUNDS = 5
 """Times that two ways of rendering take turns."""
@@ -53,9 +54,9 @@ def _render_wall(job: tuple[Any, int]) -> float:
 
 
 def _warm_environment(render: Any) -> tuple[PixelEnv, np.ndarray]:
-    env = PixelEnv("walker_walk", render)
+    env = make_env(TASKS["walker_walk"], render)
     env.reset(0)
-    action = np.zeros(env.task.action_dim, np.float32)
+    action = np.zeros(env.action_dim, np.float32)
     env.step(action)
     return env, action
 

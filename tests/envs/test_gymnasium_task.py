@@ -1,0 +1,140 @@
+import gymnasium
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.envs.gym import GymEnv
+from vd4rl_pomdp.envs.pixels import make_env
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask
+from vd4rl_pomdp.types import StepType
+
+
+class Counter(gymnasium.Env):
+    """Shows how many steps were made, in grey; pays 1, 2, 3, ... and ends as told."""
+
+    metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012
+
+    def __init__(self, shape=(20, 30), end=1000, truncates=False, low=-1.0, high=1.0, render_mode=None, space=None):
+        self.shape, self.end, self.truncates, self.render_mode = shape, end, truncates, render_mode
+        self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
+        self.action_space = space or gymnasium.spaces.Box(low, high, (2, 1), np.float64)
+        self.actions = []
+
+    def picture(self):
+        return np.full(self.shape, self.steps, np.uint8)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.steps = 0
+        return self.picture(), {}
+
+    def step(self, action):
+        self.steps += 1
+        self.actions.append(action)
+        ends = self.steps >= self.end
+        return self.picture(), self.steps, ends and not self.truncates, ends and self.truncates, {}
+
+    def render(self):
+        return self.picture()
+
+
+def play(task, decisions, **options):
+    env = make_env(task, **options)
+    rows = [env.reset(0)]
+    for _ in range(decisions):
+        rows.append(env.step(np.zeros(2, np.float32)))
+    return env, rows
+
+
+@pytest.mark.parametrize("pixels", ["render", "observation"])
+@pytest.mark.parametrize("shape", [(20, 30), (20, 30, 1), (20, 30, 3), (3, 20, 30), (1, 20, 30), (16, 16, 3)])
+def test_pictures_of_every_layout_become_frames(pixels, shape):
+    _, rows = play(GymnasiumTask(Counter, {"shape": shape}, pixels=pixels), 2, size=16)
+    for t, row in enumerate(rows):
+        assert (row.frame.dtype, row.frame.shape) == (np.uint8, (3, 16, 16))
+        assert (row.frame == t).all()
+
+
+def test_an_action_is_repeated_and_its_rewards_summed():
+    _, rows = play(GymnasiumTask(Counter, action_repeat=3), 2)
+    assert [row.reward for row in rows] == [0, 1 + 2 + 3, 4 + 5 + 6]
+    assert (rows[2].frame == 6).all()
+
+
+@pytest.mark.parametrize(("truncates", "discount"), [(False, 0.0), (True, 1.0)])
+def test_an_end_within_the_repeat_ends_the_episode(truncates, discount):
+    _, rows = play(GymnasiumTask(Counter, {"end": 5, "truncates": truncates}, action_repeat=3), 2)
+    assert [row.step_type for row in rows] == [StepType.FIRST, StepType.MID, StepType.LAST]
+    assert [row.discount for row in rows] == [1.0, 1.0, discount]
+    assert rows[2].terminated != truncates
+    assert rows[2].reward == 4 + 5
+
+
+def test_the_limit_of_decisions_ends_an_episode_with_discount_1():
+    _, rows = play(GymnasiumTask(Counter, decisions=2), 2)
+    assert (rows[2].last, rows[2].discount, rows[2].terminated) == (True, 1.0, False)
+    _, rows = play(GymnasiumTask(Counter), 1, length=1)
+    assert rows[1].last
+
+
+@pytest.mark.parametrize(("low", "high"), [(-1.0, 1.0), (-3.0, 5.0), (0.0, 0.5)])
+def test_actions_reach_the_environments_bounds_in_its_shape(low, high):
+    env = make_env(GymnasiumTask(Counter, {"low": low, "high": high}))
+    env.reset(0)
+    for action in ([-1, 1], [0, 2], [0.1, -0.7]):
+        env.step(np.array(action, np.float32))
+    np.testing.assert_array_equal(env.env.actions[0].ravel(), [low, high])
+    np.testing.assert_allclose(env.env.actions[1].ravel(), [(low + high) / 2, high])
+    assert env.env.actions[0].shape == (2, 1)
+    if (low, high) == (-1.0, 1.0):
+        np.testing.assert_array_equal(env.env.actions[2].ravel(), np.array([0.1, -0.7], np.float32))
+
+
+def test_an_environment_is_made_by_its_id_with_its_arguments():
+    gymnasium.register("vd4rl_pomdp_test/Counter-v0", entry_point=Counter, max_episode_steps=4)
+    try:
+        _, rows = play(GymnasiumTask("vd4rl_pomdp_test/Counter-v0", {"end": 9}), 4)
+        assert (rows[4].last, rows[4].discount) == (True, 1.0), "its own limit of time truncates"
+    finally:
+        gymnasium.registry.pop("vd4rl_pomdp_test/Counter-v0")
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [
+        ({"space": gymnasium.spaces.Discrete(3)}, r"has the actions Discrete\(3\)"),
+        ({"high": np.inf}, "only a bounded Box"),
+        ({"shape": (20,)}, r"Counter shows uint8 of shape \(20,\) by its render\(\)"),
+        ({"shape": (20, 30, 4)}, r"Counter shows uint8 of shape \(20, 30, 4\)"),
+    ],
+)
+def test_what_can_be_no_task_is_one_line(arguments, message):
+    with pytest.raises(UserError, match=message) as caught:
+        play(GymnasiumTask(Counter, arguments), 0)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_corrupted_environment_tells_who_ended_an_episode():
+    with TASKS.isolated():
+        TASKS.register("ending", GymnasiumTask(Counter, {"end": 2}))
+        TASKS.register("cut", GymnasiumTask(Counter, {"end": 2, "truncates": True}))
+        for name, ends in (("ending", (True, False)), ("cut", (False, True))):
+            env = GymEnv(name, corruption="patch", patch_size=4, frame_size=16)
+            obs, info = env.reset(seed=0)
+            assert obs.shape == (9, 16, 16)
+            assert info["physics"].shape == (0,)
+            assert env.step(np.zeros(2, np.float32))[2:4] == (False, False)
+            assert env.step(np.zeros(2, np.float32))[2:4] == ends
+        with pytest.raises(UserError, match="patch size 17 exceeds the image"):
+            GymEnv(name, corruption="patch", patch_size=17, frame_size=16)
+        with pytest.raises(UserError, match="--frame-size is 8"):
+            GymEnv(name, frame_size=8)
+
+
+def test_a_task_of_dm_control_that_ends_has_discount_0():
+    env = make_env(DMCTask("lqr", "lqr_2_1"), size=None)
+    env.reset(0)
+    with env.physics.reset_context():
+        env.physics.set_state(np.zeros(4))
+    row = env.step(np.zeros(1))
+    assert (row.last, row.discount, row.terminated) == (True, 0.0, True)

@@ -1,0 +1,184 @@
+"""The documentation's example of tasks of one's own, executed as it stands, and what its environment shows."""
+
+import csv
+import json
+import os
+import re
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import finetune.config
+import pretrain.config
+from finetune.train import finetune as run_finetune
+from pretrain.train import pretrain as run_pretrain
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data.check import check_dataset
+from vd4rl_pomdp.data.collect import CollectConfig, collect
+from vd4rl_pomdp.data.format import read_shard
+from vd4rl_pomdp.envs.pixels import make_env
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.evaluation import evaluate_run, read_rows
+from vd4rl_pomdp.nn import load_encoder
+from vd4rl_pomdp.policies.config import PolicyConfig, recipes
+from vd4rl_pomdp.policies.train import train_policy
+from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.tasks import TASKS
+
+PAGE = Path(__file__).parents[1] / "docs" / "add_a_task.md"
+CODE = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
+
+
+@pytest.fixture(autouse=True)
+def _cache(tmp_path, monkeypatch):
+    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
+
+
+@pytest.fixture
+def tasks():
+    with TASKS.isolated():
+        exec(compile(CODE, "my_task.py", "exec"), {"__name__": "my_task"})
+        yield TASKS
+
+
+def test_the_example_runs_through_every_stage(tmp_path):
+    script, data, runs = tmp_path / "my_task.py", tmp_path / "centre" / "random", tmp_path / "runs"
+    script.write_text(CODE)
+    for line in (
+        f"data collect --task centre --quality random --frame-size 64 --out {data} --episodes 4 --workers 2",
+        f"data check {data}",
+        f"pretrain --method mik+a --corruption patch --preset smoke --data {data} --out {runs}/pretrain",
+        f"finetune --encoder {runs}/pretrain/encoder --preset smoke --data {data} --out {runs}/finetune --workers 2",
+        f"report {runs} --out {tmp_path}/report",
+    ):
+        command = [sys.executable, str(script), *line.split()]
+        done = subprocess.run(command, capture_output=True, text=True, env=os.environ, check=False)
+        assert done.returncode == 0, done.stderr
+    rows = list(csv.DictReader((tmp_path / "report" / "summary.csv").open()))
+    assert [(row["method"], row["task"]) for row in rows] == [("mik+a", "centre")]
+
+
+def stages(data: Path, out: Path, method: str = "mik+a") -> Path:
+    """Pretrain and fine-tune at smoke size; the fine-tuning's folder."""
+    common = {"data": data, "workers": 1}
+    pretraining = replace(pretrain.config.PRESETS["smoke"], data=data, out=out / "pretrain", method=method)
+    encoder = run_pretrain(pretraining).path / "encoder"
+    return run_finetune(replace(finetune.config.PRESETS["smoke"], encoder=encoder, out=out / "run", **common)).path
+
+
+@pytest.mark.parametrize(("name", "size"), [("cartpole_swingup", 84), ("cartpole_swingup", 64), ("centre", 50)])
+def test_tasks_of_both_kinds_and_any_size_go_through_every_stage(tasks, tmp_path, name, size):
+    data = tmp_path / name / "random"
+    collect(CollectConfig(name, "random", data, episodes=3, workers=1, frame_size=size), 8)
+    checked = check_dataset(data)
+    assert (checked["task"], checked["frame_size"]) == (name, size)
+    assert checked["replay_max_error"] == (None if name == "centre" else 0.0)
+    run = stages(data, tmp_path / "runs")
+    assert load_encoder(run / "encoder")[0].config.size == size
+    assert {row["task"] for row in read_rows(run / "episodes.csv")} == {name}
+    assert {row["task"] for row in evaluate_run(run, "patch", 1, 1)} == {name}
+    assert np.load(run / "film.npz")["corrupted"].shape[1:] == (9, size, size)
+    assert (run / "probe.json").exists() == (name != "centre")
+    write_report([tmp_path / "runs"], tmp_path / "report")
+    assert (tmp_path / "report" / "index.html").exists()
+
+
+def test_the_state_reference_reads_dm_controls_states_and_refuses_a_task_without(tasks, tmp_path):
+    for name in ("cartpole_swingup", "centre"):
+        collect(CollectConfig(name, "random", tmp_path / name, episodes=2, workers=1, frame_size=32), 8)
+    run = stages(tmp_path / "cartpole_swingup", tmp_path / "runs", "state")
+    assert load_encoder(run / "encoder")[0].config.channels == 4
+    with pytest.raises(UserError, match="centre: stores no simulator states"):
+        stages(tmp_path / "centre", tmp_path / "none", "state")
+
+
+def test_an_end_of_the_task_itself_is_stored_in_the_row_that_the_action_led_into(tasks, tmp_path):
+    (shard,) = collect(
+        CollectConfig("centre", "random", tmp_path / "centre", episodes=30, workers=1, frame_size=16), 60
+    )
+    rows = read_shard(shard)
+    starts = np.flatnonzero(rows["step_type"] == 0)
+    lengths = np.diff([*starts, len(rows["reward"])])
+    ended = lengths < 61
+    assert 0 < ended.sum() < 30, "some episodes reach the middle, some the limit"
+    last = starts + lengths - 1
+    assert (rows["step_type"][last] == 2).all()
+    assert (rows["discount"][last] == np.where(ended, 0.0, 1.0)).all()
+    assert (np.delete(rows["discount"], last) == 1).all()
+    assert "physics" not in rows
+    assert (rows["reward"][last][ended] > 0.95).all(), "in the middle the reward is largest"
+    dataset = open_dataset(tmp_path / "centre")
+    assert dataset.transitions([int(lengths[0]) - 2]).discount.item() == (0.0 if ended[0] else 1.0)
+
+
+def test_actions_are_rescaled_and_pictures_shrunk(tasks):
+    env = make_env(TASKS["centre"], size=60)
+    env.reset(3)
+    before = env.env.place.copy()
+    row = env.step(np.array([1.0, -0.5], np.float32))
+    np.testing.assert_allclose(env.env.place, np.clip(before + 0.05 * np.array([3.0, -1.5]), -1, 1), rtol=1e-6)
+    picture = env.env.render()
+    mean = picture.reshape(60, 2, 60, 2, 3).astype(float).mean((1, 3)).transpose(2, 0, 1)
+    assert np.abs(row.frame - mean).max() <= 0.5
+    assert (row.state.size, row.physics.size) == (0, 0)
+    stretched = np.asarray(Image.fromarray(picture).resize((50, 50), Image.Resampling.BOX))
+    env = make_env(TASKS["centre"], size=50)
+    np.testing.assert_array_equal(env.reset(3).frame.shape, (3, 50, 50))
+    assert stretched.shape == (50, 50, 3)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"quality": "expert"}, "centre has no states for an actor to read: --quality random"),
+        ({"quality": "medium_replay"}, "centre has no states"),
+        (
+            {"task": "cartpole_swingup", "quality": "expert"},
+            "no expert actor ships for cartpole_swingup .*policy train",
+        ),
+        ({"task": "cartpole_swingup", "quality": "expert_noisy"}, "names no noise of its own: .*--action-noise"),
+        ({"frame_size": 15}, "--frame-size is 15; it must be at least 16 and at most 480"),
+    ],
+)
+def test_what_a_task_cannot_give_is_refused_before_anything_is_written(tasks, tmp_path, changes, message):
+    config = replace(CollectConfig("centre", "random", tmp_path / "set"), **changes)
+    with pytest.raises(UserError, match=message):
+        collect(config)
+    assert not (tmp_path / "set").exists()
+
+
+def test_pictures_too_small_for_a_patch_a_shift_or_an_encoder_are_refused_before_training(tasks, tmp_path):
+    data = tmp_path / "centre"
+    collect(CollectConfig("centre", "random", data, episodes=2, workers=1, frame_size=16), 8)
+    base = replace(pretrain.config.PRESETS["smoke"], data=data, out=tmp_path / "run")
+    for changes, message in (
+        ({"corruption": "patch", "patch_size": 17}, r"patch size 17 exceeds the image \(16x16\)"),
+        ({"shift": 16}, "--shift is 16; it must be at least 0 and at most 15"),
+        ({"frame_encoder": "nature"}, "frame encoder 'nature' cannot read pictures of 16x16 pixels"),
+    ):
+        with pytest.raises(UserError, match=message):
+            run_pretrain(replace(base, **changes))
+        assert not (tmp_path / "run").exists()
+
+
+def test_a_set_is_not_continued_in_another_size(tasks, tmp_path):
+    config = CollectConfig("centre", "random", tmp_path / "set", episodes=2, workers=1)
+    collect(config, 8)
+    assert json.loads((tmp_path / "set" / "collection.json").read_text())["frame_size"] is None
+    with pytest.raises(UserError, match="another frame_size"):
+        collect(replace(config, frame_size=64), 8)
+    collect(config, 8)
+
+
+def test_policies_have_a_recipe_for_every_task_of_dm_control(tasks, tmp_path):
+    assert set(recipes()) == {"walker_walk", "cheetah_run", "humanoid_walk", "cartpole_swingup"}
+    assert recipes()["cartpole_swingup"] == replace(recipes()["cheetah_run"], task="cartpole_swingup")
+    with pytest.raises(UserError, match="centre has no states for an actor to read"):
+        train_policy(PolicyConfig("centre", tmp_path / "run"))
+    assert not (tmp_path / "run").exists()

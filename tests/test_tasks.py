@@ -1,0 +1,105 @@
+"""Tasks of one's own: what is found from their models, and what is refused."""
+
+import subprocess
+import sys
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.data.check import check_dataset
+from vd4rl_pomdp.data.collect import CollectConfig, collect
+from vd4rl_pomdp.envs.dmc import replay_rewards, replays
+from vd4rl_pomdp.envs.pixels import make_env
+from vd4rl_pomdp.envs.rendering import suite
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask, Layout
+
+
+def test_tasks_are_named_without_loading_a_simulator():
+    code = "import sys, vd4rl_pomdp.tasks; print({'mujoco', 'gymnasium', 'torch'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_layouts_of_the_benchmark_are_what_their_models_have(name):
+    task = TASKS[name]
+    assert replace(task, layout=None).found() == task.layout
+
+
+@pytest.mark.parametrize(
+    ("domain", "task", "layout"),
+    [
+        ("cartpole", "swingup", Layout(1, 5, 2)),  # its camera stands still and shows where the cart is
+        ("hopper", "hop", Layout(4, 15, 7, travel=(0,))),
+        ("quadruped", "run", Layout(12, 78, 23, travel=(0, 1))),
+        ("reacher", "easy", Layout(2, 6, 2)),
+    ],
+)
+def test_what_a_task_does_not_tell_is_found(domain, task, layout):
+    found = DMCTask(domain, task).found()
+    assert found == layout
+    physics = suite.load(domain, task).physics.get_state()
+    states = DMCTask(domain, task).visible_state(physics[None])
+    assert states.shape == (1, len(physics) - len(layout.travel))
+
+
+@pytest.mark.parametrize("task", ["cartpole swingup", "acrobot swingup", "dog walk", "quadruped fetch"])
+def test_rewards_of_any_task_of_dm_control_replay(task):
+    env, rng = make_env(DMCTask(*task.split()), size=None), np.random.default_rng(0)
+    first = env.reset(3)
+    actions = rng.uniform(-1, 1, (8, env.action_dim)).astype(np.float32)
+    rewards = [env.step(action).reward for action in actions]
+    with TASKS.isolated():
+        TASKS.register("mine", env.task)
+        assert replays(env.task)
+        np.testing.assert_array_equal(replay_rewards("mine", first.physics, actions), rewards)
+
+
+@pytest.mark.parametrize("task", ["reacher easy", "finger turn_hard", "swimmer swimmer6"])
+def test_a_task_that_draws_a_target_into_its_model_cannot_be_replayed_and_says_so(task, tmp_path):
+    with TASKS.isolated():
+        TASKS.register("mine", DMCTask(*task.split()))
+        collect(CollectConfig("mine", "random", tmp_path / "set", episodes=1, workers=1, frame_size=16), 2)
+        report = check_dataset(tmp_path / "set", tmp_path / "cache")
+    assert report["replay_max_error"] is None
+    assert report["replay"] == "impossible: mine draws more than the simulator state for each episode"
+
+
+def test_an_unknown_task_of_dm_control_is_one_line():
+    with pytest.raises(UserError, match=r"dm_control has no task 'cartpole', 'swing': choose one of .*swingup"):
+        DMCTask("cartpole", "swing").found()
+    with pytest.raises(UserError, match=r"choose one of acrobot, .*walker"):
+        DMCTask("carpole", "swingup").found()
+
+
+def test_what_is_no_task_is_not_registered():
+    with TASKS.isolated():
+        with pytest.raises(
+            UserError, match=r"task 'mine' is a str, not a vd4rl_pomdp\.tasks\.DMCTask or GymnasiumTask"
+        ):
+            TASKS.register("mine", "cartpole")
+        with pytest.raises(UserError, match="a task called 'walker_walk' exists already"):
+            TASKS.register("walker_walk", DMCTask("walker", "walk"))
+    with pytest.raises(UserError, match="unknown task 'mine': choose one of walker_walk, cheetah_run, humanoid_walk"):
+        TASKS.named("mine")
+
+
+def test_an_environment_that_does_not_exist_is_one_line():
+    for environment, arguments, reason in (
+        ("NoSuchThing-v0", {}, "NoSuchThing"),
+        ("no_such_module:Thing-v0", {}, "no_such_module"),
+        (gymnasium.Env, {"colour": "red"}, "takes no arguments"),
+    ):
+        with pytest.raises(UserError, match=f"cannot be made .*{reason}") as caught:
+            make_env(GymnasiumTask(environment, arguments))
+        assert "\n" not in str(caught.value)
+
+
+def test_tasks_with_other_arguments_are_other_tasks():
+    one, other = (GymnasiumTask("CartPole-v1", {"sutton_barto_reward": value}) for value in (True, False))
+    assert one != other
+    assert len({one, other}) == 2
+    assert np.all([hash(one), hash(other)])

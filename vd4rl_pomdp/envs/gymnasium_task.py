@@ -1,0 +1,106 @@
+"""A Gymnasium environment with pixels as a task: its pictures shrunk to frames, its actions in [-1, 1], no states."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import gymnasium
+import numpy as np
+from PIL import Image
+
+from vd4rl_pomdp.envs import opengl  # noqa: F401
+from vd4rl_pomdp.envs.pixels import PixelEnv, Row
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import FRAME_SIZE, GymnasiumTask, Layout
+from vd4rl_pomdp.types import StepType
+
+NOTHING = np.zeros(0)
+
+
+class GymnasiumEnv(PixelEnv):
+    """One task. Termination ends an episode with discount 0, truncation and the limit of decisions with discount 1."""
+
+    def __init__(self, task: GymnasiumTask, size: int | None = FRAME_SIZE, length: int | None = None) -> None:
+        super().__init__(task, size, length)
+        self._name = task.environment if isinstance(task.environment, str) else task.environment.__name__
+        self._renders = task.pixels == "render"
+        self.env = self._make(task)
+        """The Gymnasium environment."""
+        self._space = self._bounded_box(self.env.action_space)
+        self._observation: Any = None
+
+    @property
+    def layout(self) -> Layout:
+        """The environment's action dimension; it has no states."""
+        return Layout(int(np.prod(self._space.shape)))
+
+    @property
+    def rate(self) -> float:
+        """Decisions a second, as the environment's metadata tell; 30 steps a second if they do not."""
+        return self.env.metadata.get("render_fps", 30) / self.task.action_repeat
+
+    def _make(self, task: GymnasiumTask) -> gymnasium.Env:
+        arguments = dict(task.arguments) | ({"render_mode": "rgb_array"} if self._renders else {})
+        try:
+            if isinstance(task.environment, str):
+                return gymnasium.make(task.environment, disable_env_checker=True, **arguments)
+            return task.environment(**arguments)
+        except (gymnasium.error.Error, ImportError, TypeError) as error:
+            reason = " ".join(str(error).split())
+            raise UserError(
+                f"environment {self._name} cannot be made ({reason}): mend the task's registration, or install what "
+                "the environment needs"
+            ) from error
+
+    def _bounded_box(self, space: gymnasium.Space) -> gymnasium.spaces.Box:
+        if isinstance(space, gymnasium.spaces.Box) and space.is_bounded() and np.issubdtype(space.dtype, np.floating):
+            return space
+        raise UserError(
+            f"environment {self._name} has the actions {space}: only a bounded Box of floating point can be a task; "
+            "wrap the environment in one that translates them"
+        )
+
+    def _begin(self, seed: int) -> None:
+        self._observation, _ = self.env.reset(seed=seed)
+
+    def _apply(self, action: np.ndarray) -> tuple[float, bool, float]:
+        rescaled, total = self._rescaled(action), 0.0
+        for _ in range(self.task.action_repeat):
+            self._observation, reward, terminated, truncated, _ = self.env.step(rescaled)
+            total += float(reward)
+            if terminated or truncated:
+                return total, True, 0.0 if terminated else 1.0
+        return total, False, 1.0
+
+    def _rescaled(self, action: np.ndarray) -> np.ndarray:
+        """An (A,) action in [-1, 1] between the bounds of the environment's own, in its shape and dtype."""
+        low, high = self._space.low.astype(np.float64), self._space.high.astype(np.float64)
+        within = np.clip(action, -1, 1).reshape(low.shape) * ((high - low) / 2) + (high + low) / 2
+        return within.astype(self._space.dtype)
+
+    def _row(self, reward: float, discount: float, step_type: StepType) -> Row:
+        frame = None if self.size is None else self._frame(self.size)
+        return Row(frame, NOTHING.astype(np.float32), NOTHING, reward, discount, step_type)
+
+    def _frame(self, size: int) -> np.ndarray:
+        """The present picture as (3, size, size) uint8, each pixel the mean of the area that it covers."""
+        picture = self._picture()
+        if picture.shape[:2] != (size, size):
+            picture = np.asarray(Image.fromarray(picture).resize((size, size), Image.Resampling.BOX))
+        return np.ascontiguousarray(picture.transpose(2, 0, 1))
+
+    def _picture(self) -> np.ndarray:
+        """The present picture as (H, W, 3) uint8: a grey one has three equal channels."""
+        shown: Any = self.env.render() if self._renders else self._observation
+        picture = shown if isinstance(shown, np.ndarray) else np.zeros(0)
+        if picture.ndim == 3 and picture.shape[0] in (1, 3) and picture.shape[-1] not in (1, 3):
+            picture = picture.transpose(1, 2, 0)
+        if picture.ndim == 2:
+            picture = picture[..., None]
+        if picture.ndim != 3 or picture.shape[-1] not in (1, 3) or picture.dtype != np.uint8:
+            got = f"{picture.dtype} of shape {picture.shape}" if isinstance(shown, np.ndarray) else type(shown).__name__
+            raise UserError(
+                f"environment {self._name} shows {got} by its {'render()' if self._renders else 'observation'}, "
+                "expected uint8 pictures (H, W, 3): choose pixels='render' or 'observation' as fits, or wrap it"
+            )
+        return np.repeat(picture, 3, axis=2) if picture.shape[-1] == 1 else picture

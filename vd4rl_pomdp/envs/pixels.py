@@ -1,0 +1,130 @@
+"""What the harness does with any task: begin an episode, act, read a row. `make_env` builds a task's environment."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from functools import cache
+from typing import Literal
+
+import numpy as np
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import FRAME_SIZE, DMCTask, GymnasiumTask, Layout, Task
+from vd4rl_pomdp.types import StepType
+
+Render = Literal["fast", "exact"]
+"""How dm_control draws: fast, with a smaller shadow map, or exact."""
+
+
+@dataclass(frozen=True)
+class Row:
+    """One row of an episode (see the time axis in `types`)."""
+
+    frame: np.ndarray | None
+    """(3, S, S) uint8; None when rendering is off."""
+    state: np.ndarray
+    """(D,) float32: dm_control's observations, flattened in their own order; (0,) for a task without states."""
+    physics: np.ndarray
+    """(P,) float64: simulator state; (0,) for a task without states."""
+    reward: float
+    """Reward that led into this row, summed over the action repeat; 0 in the first."""
+    discount: float
+    """0 in a last row that the task itself ended, else 1."""
+    step_type: StepType
+
+    @property
+    def last(self) -> bool:
+        """Whether the episode ends here."""
+        return self.step_type == StepType.LAST
+
+    @property
+    def terminated(self) -> bool:
+        """Whether the task itself ended the episode here, and not a limit of time."""
+        return self.last and self.discount == 0
+
+
+class PixelEnv(ABC):
+    """One task. An episode's first state depends on its seed alone."""
+
+    def __init__(self, task: Task, size: int | None, length: int | None) -> None:
+        """See the class.
+
+        Args:
+            task: what is played.
+            size: height and width S of the frames; None: nothing is drawn.
+            length: decisions after which an episode is cut off; None: the task's own.
+        """
+        self.task, self.size = task, size
+        self._length = task.decisions if length is None else length
+        if self._length < 1:
+            raise UserError(f"an episode of {length} decisions is too short; it needs at least 1")
+        self._decisions = 0
+
+    @property
+    @abstractmethod
+    def layout(self) -> Layout:
+        """Widths of the rows."""
+
+    @property
+    @abstractmethod
+    def rate(self) -> float:
+        """Decisions a second of simulated time."""
+
+    @property
+    def action_dim(self) -> int:
+        """Action dimension A."""
+        return self.layout.action_dim
+
+    def reset(self, seed: int) -> Row:
+        """Begin the episode of a seed."""
+        self._begin(seed)
+        self._decisions = 0
+        return self._row(0.0, 1.0, StepType.FIRST)
+
+    def step(self, action: np.ndarray) -> Row:
+        """Apply an (A,) float32 action in [-1, 1] for the action repeat."""
+        reward, ended, discount = self._apply(action)
+        self._decisions += 1
+        last = ended or self._decisions == self._length
+        return self._row(reward, discount, StepType.LAST if last else StepType.MID)
+
+    @abstractmethod
+    def _begin(self, seed: int) -> None:
+        """Put the environment into the first state of a seed's episode."""
+
+    @abstractmethod
+    def _apply(self, action: np.ndarray) -> tuple[float, bool, float]:
+        """Repeat an action, no further than the episode goes; summed reward, whether the episode ended, discount."""
+
+    @abstractmethod
+    def _row(self, reward: float, discount: float, step_type: StepType) -> Row:
+        """The row of the present state."""
+
+
+def make_env(task: Task, render: Render = "fast", size: int | None = FRAME_SIZE, length: int | None = None) -> PixelEnv:
+    """The environment of a task.
+
+    Args:
+        task: what is played.
+        render: how dm_control draws.
+        size: height and width S of the frames; None: nothing is drawn.
+        length: decisions after which an episode is cut off; None: the task's own.
+
+    Raises:
+        UserError: the environment cannot be built, or is of a kind that the harness cannot play.
+    """
+    if isinstance(task, GymnasiumTask):
+        from vd4rl_pomdp.envs.gymnasium_task import GymnasiumEnv
+
+        return GymnasiumEnv(task, size, length)
+    assert isinstance(task, DMCTask), "the registry takes no other kind"
+    from vd4rl_pomdp.envs.dmc import DMCEnv
+
+    return DMCEnv(task, render, size, length)
+
+
+@cache
+def find_layout(task: Task) -> Layout:
+    """Layout of a task as its environment has it."""
+    return make_env(task, size=None).layout
