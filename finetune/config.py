@@ -14,7 +14,7 @@ from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
 from vd4rl_pomdp.options import NO_OPTIONS, Options, StageConfig, all_options
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, FRAME_SIZE, MOST_EPISODES
+from vd4rl_pomdp.tasks import FRAME_SIZES, MOST_EPISODES
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -91,8 +91,8 @@ class FinetuneConfig(StageConfig):
         """Refuse settings that cannot work, before anything is read or written."""
         refuse_outside(
             self, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, views=0,
-            shift=(0, FRAME_SIZE - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
-            eval_length=(1, EPISODE_TRANSITIONS), log_every=1, checkpoint_every=1, workers=0,
+            shift=(0, FRAME_SIZES[1] - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
+            eval_length=1, log_every=1, checkpoint_every=1, workers=0,
         )  # fmt: skip
         for options in all_options(self):
             options.check()

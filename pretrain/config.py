@@ -17,7 +17,6 @@ from vd4rl_pomdp.nn.frame import FRAME_ENCODERS
 from vd4rl_pomdp.options import NO_OPTIONS, Limits, Options, StageConfig, all_options
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
-from vd4rl_pomdp.tasks import FRAME_SIZE
 
 
 @dataclass(frozen=True)
@@ -144,7 +143,6 @@ class PretrainConfig(TrainingConfig):
     def check(self) -> None:
         """Refuse settings that cannot work, before anything is read or written."""
         super().check()
-        refuse_outside(self, shift=(0, FRAME_SIZE - 1))
         usual = self.defaults(self.preset)["frame_encoder"]
         if METHODS.named(self.method).reads_state and self.frame_encoder != usual:
             raise UserError(f"--frame-encoder is not read by the method {self.method}: leave it out")

@@ -12,7 +12,7 @@ from pretrain.config import PretrainConfig, StreamOptions
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.corruptions import check_corruption
 from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_outside
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import EncoderCard, save_encoder
 from vd4rl_pomdp.objective import Objective

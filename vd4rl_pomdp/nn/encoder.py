@@ -54,8 +54,10 @@ class StreamState(NamedTuple):
 
 
 def _frame_encoder(config: EncoderConfig) -> FrameEncoder:
+    told = {"feature_dim": config.feature_dim} | config.frame_options
+    options = FRAME_ENCODERS.named(config.frame_encoder).options.fill(told)
     try:
-        return make_frame_encoder(config.frame_encoder, config.channels, config.size, config.feature_dim)
+        return make_frame_encoder(config.frame_encoder, config.channels, config.size, options)
     except RuntimeError as error:  # a convolution's, whose input is smaller than its kernel
         raise UserError(
             f"frame encoder {config.frame_encoder!r} cannot read pictures of {config.size}x{config.size} pixels: "
