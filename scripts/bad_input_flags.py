@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields, replace
 from pathlib import Path
 from types import NoneType, UnionType
@@ -13,6 +13,7 @@ from unittest import mock
 import tyro
 
 from vd4rl_pomdp.cli import COMMANDS, main
+from vd4rl_pomdp.options import StageConfig, flat, options_in
 
 Words = list[str]
 
@@ -43,6 +44,7 @@ RUN, NAVIGATED = "runs/finetuned", "runs/navigated"
 SMOKE = ["--preset", "smoke"]
 VALID: dict[str, Words] = {
     "demo": [],
+    "list": [],
     "data collect": ["--task", "walker_walk", "--quality", "random", "--episodes", "1", "--out", "new"],
     "data download": [
         *("--task", "walker_walk", "--quality", "expert", "--out", "new", "--endpoint", "http://127.0.0.1:9"),
@@ -53,7 +55,7 @@ VALID: dict[str, Words] = {
     "data parity": [SET],
     "policy train": ["--task", "walker_walk", "--out", "new", "--decisions", "10"],
     "policy export": ["runs/policy", "--out", "new"],
-    "pretrain": ["--data", SET, "--out", "new", *SMOKE],
+    "pretrain": ["--data", SET, "--out", "new", *SMOKE, "--corruption", "patch+zero_frames"],
     "finetune": ["--encoder", ENCODER, "--data", SET, "--out", "new", *SMOKE, "--workers", "1"],
     "evaluate": [RUN, "--episodes", "1", "--workers", "1"],
     "navigation collect": ["--maze", "no_curtain", "--out", "new", *SMOKE],
@@ -98,11 +100,19 @@ LARGE = {
 """Flags for which 10^9 is within the range but beyond any machine."""
 
 
+OTHER_PARTS = {
+    "pretrain": (["--method", "homer"], ["--method", "driml"], ["--method", "one_step_inverse"]),
+    "finetune": (["--algorithm", "iql"],),
+    "navigation train": (["--exogenous", "photographs"], ["--method", "random"]),
+}
+"""Words that choose other parts, whose options are tried, too."""
+
+
 class _CaughtError(Exception):
     """Carries a command's config class and defaults out of its parsing."""
 
 
-def config_of(command: str) -> tuple[type, Any]:
+def config_of(command: str, *chosen: str) -> tuple[type, Any]:
     """The config class that a command parses its words into, and its defaults if they are not the class's own."""
 
     def stop(config: type, **options: Any) -> None:
@@ -110,21 +120,49 @@ def config_of(command: str) -> tuple[type, Any]:
 
     with mock.patch("vd4rl_pomdp.cli.parsing.tyro.cli", stop):
         try:
-            main([*command.split(), "--help"])
+            main([*command.split(), *VALID[command], *chosen, "--help"])
         except _CaughtError as caught:
             return caught.args
     raise AssertionError(f"{command} parses nothing")
+
+
+def hints_of(config: type, default: Any) -> dict[str, Any]:
+    """Type hints of a command's settings by name, those of the chosen parts' options among them."""
+    found: dict[str, Any] = {}
+    hints = get_type_hints(config, include_extras=True)
+    for field in fields(config):
+        nested = options_in(getattr(default, field.name, None))
+        if nested is None:
+            found[field.name] = hints[field.name]
+        for options in nested or ():
+            found |= hints_of(type(options), options)
+    return found
+
+
+def is_required(config: type, default: Any, name: str) -> bool:
+    """Whether a command cannot do without a setting."""
+    field = next((field for field in fields(config) if field.name == name), None)
+    if field is None:
+        return False
+    if default is not None:
+        return getattr(default, name) is tyro.MISSING
+    return field.default is MISSING and field.default_factory is MISSING
 
 
 def flag_cases() -> Iterator[Case]:
     """Every flag of every command in every bad way, and what is wrong with whole command lines."""
     yield from _unknown_commands()
     for command in NAMES:
-        config, _ = config_of(command)
-        hints = get_type_hints(config, include_extras=True)
-        yield from _whole_lines(command, config)
-        for field in fields(config):
-            yield from _of_field(command, field.name, hints[field.name])
+        config, default = config_of(command)
+        hints = hints_of(config, default)
+        yield from _whole_lines(command, hints, [name for name in hints if is_required(config, default, name)])
+        for name, hint in hints.items():
+            yield from _of_field(command, name, hint)
+        for chosen in OTHER_PARTS.get(command, ()):
+            for name, hint in hints_of(*config_of(command, *chosen)).items():
+                if name not in hints:
+                    cases = _of_field(command, name, hint)
+                    yield from (replace(case, words=[*case.words, *chosen]) for case in cases)
         for name in LARGE.get(command, ()):
             yield _changed(command, name, "beyond the machine", [str(HUGE)])
     yield from _unread()
@@ -137,36 +175,29 @@ def _unknown_commands() -> Iterator[Case]:
             yield Case(group, "the command", kind, [group, word])
 
 
-def _whole_lines(command: str, config: type) -> Iterator[Case]:
+def _whole_lines(command: str, hints: Mapping[str, Any], required: list[str]) -> Iterator[Case]:
     words = command.split()
-    required = [f.name for f in fields(config) if f.default is MISSING and f.default_factory is MISSING]
     if required:
         yield Case(command, "(all flags)", "bare", words)
     for name in required:
         yield Case(command, name, "left out", [*words, *_without(VALID[command], name, command)])
     yield Case(command, "(all flags)", "an unknown flag", [*words, *VALID[command], "--no-such-flag", "1"])
     yield Case(command, "(all flags)", "a lone dash", [*words, *VALID[command], "-"])
-    if not any(_is_positional(h) and _core(h)[1] for h in get_type_hints(config, include_extras=True).values()):
+    if not any(_is_positional(h) and _core(h)[1] for h in hints.values()):
         yield Case(command, "(all flags)", "one word more", [*words, *VALID[command], "word", "word"])
 
 
 def _unread() -> Iterator[Case]:
     """Every method and algorithm with every option that it does not read."""
     from finetune.algorithms import ALGORITHMS
-    from finetune.algorithms import OPTIONS as OF_ALGORITHMS
-    from finetune.config import PRESETS as FINETUNE
-    from pretrain.config import PRESETS as PRETRAIN
-    from pretrain.objectives import METHODS, unread_options
+    from finetune.config import FinetuneConfig
+    from pretrain.config import PretrainConfig
+    from pretrain.navigation.config import NavigationConfig
+    from pretrain.objectives import METHODS
 
-    for method in METHODS:
-        unread = unread_options(replace(PRETRAIN["smoke"], method=method))
-        yield from (_chosen("pretrain", PRETRAIN["smoke"], ["--method", method], name) for name in sorted(unread))
-    for method in ("ah", "fj+a", "no_history", "random", "supervised+a"):
-        for name in ("literal_future", "n"):
-            yield _chosen("navigation train", PRETRAIN["smoke"], ["--method", method], name)
-    for name, algorithm in ALGORITHMS.items():
-        for option in sorted(OF_ALGORITHMS.difference(algorithm.options)):
-            yield _chosen("finetune", FINETUNE["smoke"], ["--algorithm", name], option)
+    yield from _unread_by("pretrain", PretrainConfig, "method", METHODS)
+    yield from _unread_by("navigation train", NavigationConfig, "method", ["ah", "fj+a", "no_history", "random"])
+    yield from _unread_by("finetune", FinetuneConfig, "algorithm", ALGORITHMS)
     for method, line in {"acro": "--literal-future", "curl": "--max-k 2", "bc mik+a": "--codes 3"}.items():
         more = ["--methods", *method.split(), f"--pretrain={line}", "--dry-run"]
         yield Case("sweep", "pretrain", f"{line} for {method}", ["sweep", *VALID["sweep"], *more])
@@ -180,12 +211,16 @@ def _unread() -> Iterator[Case]:
         yield Case("sweep", "finetune", f"{line} for {methods}", ["sweep", *VALID["sweep"], *more])
 
 
-def _chosen(command: str, default: Any, choice: Words, name: str) -> Case:
-    """A line with an option set to something else than its default, for a method that does not read it."""
-    value = getattr(default, name)
-    other = {"frame_encoder": "drq", "action_target": "mse"}.get(name) or str((value or 0) + 1)
-    flag = [f"--{'no-' if value else ''}{name.replace('_', '-')}"] if isinstance(value, bool) else [_flag(name), other]
-    return Case(command, name, f"unread by {choice[1]}", [*command.split(), *VALID[command], *choice, *flag])
+def _unread_by(command: str, config: type[StageConfig], chooser: str, names: Iterable[str]) -> Iterator[Case]:
+    """Every part of a kind with every option that another one of the kind reads, and it does not."""
+    read = {name: flat(config.of("smoke", **{chooser: name})) for name in names}
+    every = {option: value for settings in read.values() for option, value in settings.items()}
+    for name, settings in read.items():
+        for option in sorted(every.keys() - settings.keys()):
+            value = every[option]
+            flag = [_flag(option)] if isinstance(value, bool) else [_flag(option), str(value or 1)]
+            words = [*command.split(), *VALID[command], _flag(chooser), name, *flag]
+            yield Case(command, option, f"unread by {name}", words)
 
 
 def _of_field(command: str, name: str, hint: Any) -> Iterator[Case]:
@@ -242,8 +277,8 @@ def _flag(name: str) -> str:
 def _without(words: Words, name: str, command: str) -> Words:
     """Valid words without a flag and its values, or without the positional word in front."""
     if _flag(name) not in words:
-        hints = get_type_hints(config_of(command)[0], include_extras=True)
-        return words[1:] if _is_positional(hints[name]) else words
+        hints = hints_of(*config_of(command))
+        return words[1:] if name in hints and _is_positional(hints[name]) else words
     start = words.index(_flag(name))
     stop = next((i for i in range(start + 1, len(words)) if words[i].startswith("--")), len(words))
     return words[:start] + words[stop:]

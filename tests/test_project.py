@@ -183,8 +183,10 @@ def test_every_flag_of_the_table_of_choices_exists():
 
     from finetune.config import FinetuneConfig
     from pretrain.config import PretrainConfig
+    from vd4rl_pomdp.options import option_names
 
-    flags = {f.name.replace("_", "-") for config in (PretrainConfig, FinetuneConfig) for f in fields(config)}
+    settings = {f.name for config in (PretrainConfig, FinetuneConfig) for f in fields(config)} | option_names()
+    flags = {name.replace("_", "-") for name in settings}
     named = re.findall(r"`--([a-z0-9-]+)", (ROOT / "docs" / "choices.md").read_text())
     assert len(named) > 30
     assert set(named) - flags == set()
@@ -196,9 +198,10 @@ def test_every_flag_of_the_navigation_page_exists():
     from pretrain.navigation.config import NavigationConfig
     from vd4rl_pomdp.cli.navigation import GridCommand
     from vd4rl_pomdp.navigation.config import CollectConfig
+    from vd4rl_pomdp.options import option_names
 
     configs = (NavigationConfig, CollectConfig, GridCommand)
-    flags = {f.name.replace("_", "-") for config in configs for f in fields(config)}
+    flags = {name.replace("_", "-") for c in configs for name in ({f.name for f in fields(c)} | option_names())}
     named = re.findall(r"`--([a-z0-9-]+)", (ROOT / "docs" / "navigation.md").read_text())
     assert len(named) > 20
     assert set(named) - flags == set()

@@ -73,6 +73,11 @@ class Task:
         return find_layout(self)
 
     @property
+    def summary(self) -> str:
+        """One line that says what it is."""
+        return f"each action {self.action_repeat} times, {self.decisions} decisions an episode"
+
+    @property
     def action_dim(self) -> int:
         """Action dimension A."""
         return self.found().action_dim
@@ -107,6 +112,11 @@ class DMCTask(Task):
     action_repeat: int = field(default=ACTION_REPEAT, kw_only=True)
     """Simulator steps for which an action is applied, and their rewards summed."""
 
+    @property
+    def summary(self) -> str:
+        """One line that says what it is."""
+        return f"dm_control's {self.domain} {self.task}, camera {self.camera}, {super().summary}"
+
 
 @dataclass(frozen=True)
 class GymnasiumTask(Task):
@@ -120,6 +130,12 @@ class GymnasiumTask(Task):
     """Where the picture comes from: `render()` under render_mode "rgb_array", or the observation itself."""
     action_repeat: int = field(default=1, kw_only=True)
     """Steps for which an action is applied, and their rewards summed; an episode that ends ends it, too."""
+
+    @property
+    def summary(self) -> str:
+        """One line that says what it is."""
+        name = self.environment if isinstance(self.environment, str) else self.environment.__name__
+        return f"Gymnasium's {name}, {super().summary}"
 
 
 TASKS: Registry[Task] = Registry(

@@ -6,13 +6,14 @@ import io
 import sys
 from collections.abc import Sequence
 
-from vd4rl_pomdp.cli import data, navigation, policy, stages, studies
+from vd4rl_pomdp.cli import data, navigation, parts, policy, stages, studies
 from vd4rl_pomdp.cli.dispatch import Table, run_stage
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs import interrupt
 
 COMMANDS: Table = {
     "demo": stages.DEMO,
+    "list": parts.LIST,
     "data": data.COMMANDS,
     "policy": policy.COMMANDS,
     **stages.COMMANDS,

@@ -152,7 +152,7 @@ def _demo(words: Arguments, program: str) -> None:
 DEMO = Command("every stage on a small set, in minutes", _demo)
 COMMANDS = {
     "pretrain": Command("train an encoder", _pretrain),
-    "finetune": Command("TD3+BC on a frozen encoder", _finetune),
+    "finetune": Command("train a policy on a frozen encoder, by TD3+BC or another algorithm", _finetune),
     "evaluate": Command("evaluate a fine-tuned run again", _evaluate),
 }
 SWEEP = Command("methods x corruptions x seeds", _sweep)

@@ -58,6 +58,7 @@ class Patch(Options):
     patch_shared: bool = False
     """Whether the frames of a stack share their patches."""
 
+    summary: ClassVar[str] = "squares of every frame, at uniformly random places, take one value"
     limits: ClassVar[Limits] = {"patch_size": 1, "patch_count": 1, "patch_fill": (0, 255)}
 
     def __call__(self, frames: Tensor, key: Tensor, number: Tensor) -> None:
@@ -86,6 +87,7 @@ class ZeroFrames(Options):
     zeroed_frames: int = 2
     """Frames of a stack that are blanked."""
 
+    summary: ClassVar[str] = "frames of every stack, chosen uniformly, become 0; it may only end a name"
     limits: ClassVar[Limits] = {"zeroed_frames": 1}
 
 

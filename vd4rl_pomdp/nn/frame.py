@@ -34,6 +34,8 @@ class FrameEncoderPart:
     [-0.5, 0.5]; a linear layer, a layer norm and a tanh follow."""
     options: type[FrameOptions] = FrameOptions
     """Class of its options."""
+    summary: str = ""
+    """One line that says what it is."""
 
 
 class FrameEncoder(nn.Module):
@@ -159,11 +161,13 @@ def _flat(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
 FRAME_ENCODERS: Registry[FrameEncoderPart] = Registry(
     "frame encoder",
     {
-        "drq": FrameEncoderPart(_drq),
-        "nature": FrameEncoderPart(_nature),
-        "small": FrameEncoderPart(_small),
-        "mixer": FrameEncoderPart(_mixer),
-        "flat": FrameEncoderPart(_flat),
+        "drq": FrameEncoderPart(_drq, summary="four 3x3 convolutions of 32 channels, as in DrQ and V-D4RL"),
+        "nature": FrameEncoderPart(_nature, summary="three strided convolutions, at a fraction of drq's cost"),
+        "small": FrameEncoderPart(
+            _small, summary="three strided convolutions of few channels, for grey 50x50 pictures"
+        ),
+        "mixer": FrameEncoderPart(_mixer, summary="MLP-Mixer on patches of 10x10 pixels: the paper's on mazes"),
+        "flat": FrameEncoderPart(_flat, summary="no convolution, for observations of a few numbers"),
     },
     lambda part: isinstance(part, FrameEncoderPart),
     "a vd4rl_pomdp.nn.frame.FrameEncoderPart",
