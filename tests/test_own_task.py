@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import finetune.config
 import pretrain.config
@@ -99,21 +98,20 @@ def test_the_state_reference_reads_dm_controls_states_and_refuses_a_task_without
 
 
 def test_an_end_of_the_task_itself_is_stored_in_the_row_that_the_action_led_into(tasks, tmp_path):
-    (shard,) = collect(
-        CollectConfig("centre", "random", tmp_path / "centre", episodes=30, workers=1, frame_size=16), 60
-    )
+    tasks.register("fast", replace(tasks["centre"], arguments={"speed": 0.2}))
+    (shard,) = collect(CollectConfig("fast", "random", tmp_path / "set", episodes=30, workers=1, frame_size=16), 30)
     rows = read_shard(shard)
     starts = np.flatnonzero(rows["step_type"] == 0)
     lengths = np.diff([*starts, len(rows["reward"])])
-    ended = lengths < 61
+    ended = lengths < 31
     assert 0 < ended.sum() < 30, "some episodes reach the middle, some the limit"
     last = starts + lengths - 1
     assert (rows["step_type"][last] == 2).all()
     assert (rows["discount"][last] == np.where(ended, 0.0, 1.0)).all()
     assert (np.delete(rows["discount"], last) == 1).all()
     assert "physics" not in rows
-    assert (rows["reward"][last][ended] > 0.95).all(), "in the middle the reward is largest"
-    dataset = open_dataset(tmp_path / "centre")
+    assert (rows["reward"][last][ended] > 0.8).all(), "in the middle the reward is largest"
+    dataset = open_dataset(tmp_path / "set")
     assert dataset.transitions([int(lengths[0]) - 2]).discount.item() == (0.0 if ended[0] else 1.0)
 
 
@@ -122,15 +120,11 @@ def test_actions_are_rescaled_and_pictures_shrunk(tasks):
     env.reset(3)
     before = env.env.place.copy()
     row = env.step(np.array([1.0, -0.5], np.float32))
-    np.testing.assert_allclose(env.env.place, np.clip(before + 0.05 * np.array([3.0, -1.5]), -1, 1), rtol=1e-6)
+    np.testing.assert_allclose(env.env.place, np.clip(before + 0.015 * np.array([3.0, -1.5]), -1, 1), rtol=1e-6)
     picture = env.env.render()
     mean = picture.reshape(60, 2, 60, 2, 3).astype(float).mean((1, 3)).transpose(2, 0, 1)
     assert np.abs(row.frame - mean).max() <= 0.5
     assert (row.state.size, row.physics.size) == (0, 0)
-    stretched = np.asarray(Image.fromarray(picture).resize((50, 50), Image.Resampling.BOX))
-    env = make_env(TASKS["centre"], size=50)
-    np.testing.assert_array_equal(env.reset(3).frame.shape, (3, 50, 50))
-    assert stretched.shape == (50, 50, 3)
 
 
 @pytest.mark.parametrize(
