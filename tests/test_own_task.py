@@ -22,7 +22,7 @@ from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import read_shard
 from vd4rl_pomdp.envs.pixels import make_env
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import evaluate_run, read_rows
+from vd4rl_pomdp.evaluation import Episode, evaluate_run, read_rows, rows_of
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.policies.config import PolicyConfig, recipes
 from vd4rl_pomdp.policies.train import train_policy
@@ -71,7 +71,7 @@ def stages(data: Path, out: Path, method: str = "mik+a") -> Path:
     return run_finetune(replace(finetune.config.PRESETS["smoke"], encoder=encoder, out=out / "run", **common)).path
 
 
-@pytest.mark.parametrize(("name", "size"), [("cartpole_swingup", 84), ("cartpole_swingup", 64), ("centre", 50)])
+@pytest.mark.parametrize(("name", "size"), [("cartpole_swingup", 64), ("centre", 50)])
 def test_tasks_of_both_kinds_and_any_size_go_through_every_stage(tasks, tmp_path, name, size):
     data = tmp_path / name / "random"
     collect(CollectConfig(name, "random", data, episodes=3, workers=1, frame_size=size), 8)
@@ -159,6 +159,38 @@ def test_pictures_too_small_for_a_patch_a_shift_or_an_encoder_are_refused_before
         with pytest.raises(UserError, match=message):
             run_pretrain(replace(base, **changes))
         assert not (tmp_path / "run").exists()
+
+
+def test_an_evaluation_is_never_longer_than_the_task(tasks, tmp_path):
+    tasks.register("short", replace(tasks["centre"], decisions=9))
+    data = tmp_path / "short"
+    collect(CollectConfig("short", "random", data, episodes=3, workers=1, frame_size=50))
+    assert {len(part) for part in np.split(open_dataset(data).t, 3)} == {10}
+    encoder = run_pretrain(replace(pretrain.config.PRESETS["smoke"], data=data, out=tmp_path / "pretrain")).path
+    config = replace(finetune.config.PRESETS["smoke"], encoder=encoder / "encoder", data=data, workers=1)
+    run = run_finetune(replace(config, out=tmp_path / "run", eval_length=500))
+    assert {row["length"] for row in read_rows(run.path / "episodes.csv")} == {9}
+    with pytest.raises(UserError, match="--eval-length is 501; it must be at least 1 and at most 500"):
+        run_finetune(replace(config, out=tmp_path / "other", eval_length=501))
+
+
+def test_a_score_is_divided_by_the_tasks_own_number(tasks):
+    tasks.register("games", replace(tasks["centre"], score_divisor=4.0))
+    (row,) = rows_of([Episode(0, 2.0, 1, None)], {"task": "games"})
+    assert (row["return"], row["score"]) == (2.0, 0.5)
+
+
+def test_registered_tasks_have_gymnasium_ids(tmp_path):
+    script = tmp_path / "ids.py"
+    script.write_text(
+        CODE.partition("\nif __name__")[0]
+        + "import vd4rl_pomdp.envs\n"
+        + "env = gymnasium.make('vd4rl_pomdp/Centre-Patch16-v0', frame_size=32)\n"
+        + "print(env.reset(seed=0)[0].shape, env.spec.max_episode_steps)\n"
+        + "print(gymnasium.spec('vd4rl_pomdp/CartpoleSwingup-ZeroFrames-v0').max_episode_steps)\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["(9, 32, 32) 200", "500"]
 
 
 def test_a_set_is_not_continued_in_another_size(tasks, tmp_path):
