@@ -48,7 +48,8 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     dataset.require_transitions()
     encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frame_size)
     refuse_outside(config, shift=(0, dataset.frame_size - 1))
-    TASKS.named(card.task)
+    longest = max(TASKS.named(card.task).decisions, FinetuneConfig.eval_length)
+    refuse_number("eval_length", config.eval_length, 1, longest)
     if card.end_to_end:
         config = end_to_end(config, card.end_to_end)
     if encoder.reads_state:

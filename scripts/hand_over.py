@@ -74,7 +74,7 @@ def main(config: Config) -> None:
         encoder, card = load_encoder(run / "encoder")
         agent, expert = Agent(encoder, load_policy(run / "policy")), load_actor(card.task, "expert")
         task = TASKS.named(card.task)
-        env = CorruptedEnv(task, CorruptionConfig.fill(card.corruption), size=encoder.config.size)
+        env = CorruptedEnv(task, CorruptionConfig.fill(card.corruption), size=agent.picture_size)
         for after in config.after:
             for episode in range(config.episodes):
                 row = labels | {"after": after, "episode": episode}

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from PIL import Image
 
 import finetune.config
 import pretrain.config
@@ -23,7 +22,7 @@ from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import read_shard
 from vd4rl_pomdp.envs.pixels import make_env
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import evaluate_run, read_rows
+from vd4rl_pomdp.evaluation import Episode, evaluate_run, read_rows, rows_of
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.policies.config import PolicyConfig, recipes
 from vd4rl_pomdp.policies.train import train_policy
@@ -72,7 +71,7 @@ def stages(data: Path, out: Path, method: str = "mik+a") -> Path:
     return run_finetune(replace(finetune.config.PRESETS["smoke"], encoder=encoder, out=out / "run", **common)).path
 
 
-@pytest.mark.parametrize(("name", "size"), [("cartpole_swingup", 84), ("cartpole_swingup", 64), ("centre", 50)])
+@pytest.mark.parametrize(("name", "size"), [("cartpole_swingup", 64), ("centre", 50)])
 def test_tasks_of_both_kinds_and_any_size_go_through_every_stage(tasks, tmp_path, name, size):
     data = tmp_path / name / "random"
     collect(CollectConfig(name, "random", data, episodes=3, workers=1, frame_size=size), 8)
@@ -99,21 +98,20 @@ def test_the_state_reference_reads_dm_controls_states_and_refuses_a_task_without
 
 
 def test_an_end_of_the_task_itself_is_stored_in_the_row_that_the_action_led_into(tasks, tmp_path):
-    (shard,) = collect(
-        CollectConfig("centre", "random", tmp_path / "centre", episodes=30, workers=1, frame_size=16), 60
-    )
+    tasks.register("fast", replace(tasks["centre"], arguments={"speed": 0.2}))
+    (shard,) = collect(CollectConfig("fast", "random", tmp_path / "set", episodes=30, workers=1, frame_size=16), 30)
     rows = read_shard(shard)
     starts = np.flatnonzero(rows["step_type"] == 0)
     lengths = np.diff([*starts, len(rows["reward"])])
-    ended = lengths < 61
+    ended = lengths < 31
     assert 0 < ended.sum() < 30, "some episodes reach the middle, some the limit"
     last = starts + lengths - 1
     assert (rows["step_type"][last] == 2).all()
     assert (rows["discount"][last] == np.where(ended, 0.0, 1.0)).all()
     assert (np.delete(rows["discount"], last) == 1).all()
     assert "physics" not in rows
-    assert (rows["reward"][last][ended] > 0.95).all(), "in the middle the reward is largest"
-    dataset = open_dataset(tmp_path / "centre")
+    assert (rows["reward"][last][ended] > 0.8).all(), "in the middle the reward is largest"
+    dataset = open_dataset(tmp_path / "set")
     assert dataset.transitions([int(lengths[0]) - 2]).discount.item() == (0.0 if ended[0] else 1.0)
 
 
@@ -122,15 +120,11 @@ def test_actions_are_rescaled_and_pictures_shrunk(tasks):
     env.reset(3)
     before = env.env.place.copy()
     row = env.step(np.array([1.0, -0.5], np.float32))
-    np.testing.assert_allclose(env.env.place, np.clip(before + 0.05 * np.array([3.0, -1.5]), -1, 1), rtol=1e-6)
+    np.testing.assert_allclose(env.env.place, np.clip(before + 0.015 * np.array([3.0, -1.5]), -1, 1), rtol=1e-6)
     picture = env.env.render()
     mean = picture.reshape(60, 2, 60, 2, 3).astype(float).mean((1, 3)).transpose(2, 0, 1)
     assert np.abs(row.frame - mean).max() <= 0.5
     assert (row.state.size, row.physics.size) == (0, 0)
-    stretched = np.asarray(Image.fromarray(picture).resize((50, 50), Image.Resampling.BOX))
-    env = make_env(TASKS["centre"], size=50)
-    np.testing.assert_array_equal(env.reset(3).frame.shape, (3, 50, 50))
-    assert stretched.shape == (50, 50, 3)
 
 
 @pytest.mark.parametrize(
@@ -165,6 +159,38 @@ def test_pictures_too_small_for_a_patch_a_shift_or_an_encoder_are_refused_before
         with pytest.raises(UserError, match=message):
             run_pretrain(replace(base, **changes))
         assert not (tmp_path / "run").exists()
+
+
+def test_an_evaluation_is_never_longer_than_the_task(tasks, tmp_path):
+    tasks.register("short", replace(tasks["centre"], decisions=9))
+    data = tmp_path / "short"
+    collect(CollectConfig("short", "random", data, episodes=3, workers=1, frame_size=50))
+    assert {len(part) for part in np.split(open_dataset(data).t, 3)} == {10}
+    encoder = run_pretrain(replace(pretrain.config.PRESETS["smoke"], data=data, out=tmp_path / "pretrain")).path
+    config = replace(finetune.config.PRESETS["smoke"], encoder=encoder / "encoder", data=data, workers=1)
+    run = run_finetune(replace(config, out=tmp_path / "run", eval_length=500))
+    assert {row["length"] for row in read_rows(run.path / "episodes.csv")} == {9}
+    with pytest.raises(UserError, match="--eval-length is 501; it must be at least 1 and at most 500"):
+        run_finetune(replace(config, out=tmp_path / "other", eval_length=501))
+
+
+def test_a_score_is_divided_by_the_tasks_own_number(tasks):
+    tasks.register("games", replace(tasks["centre"], score_divisor=4.0))
+    (row,) = rows_of([Episode(0, 2.0, 1, None)], {"task": "games"})
+    assert (row["return"], row["score"]) == (2.0, 0.5)
+
+
+def test_registered_tasks_have_gymnasium_ids(tmp_path):
+    script = tmp_path / "ids.py"
+    script.write_text(
+        CODE.partition("\nif __name__")[0]
+        + "import vd4rl_pomdp.envs\n"
+        + "env = gymnasium.make('vd4rl_pomdp/Centre-Patch16-v0', frame_size=32)\n"
+        + "print(env.reset(seed=0)[0].shape, env.spec.max_episode_steps)\n"
+        + "print(gymnasium.spec('vd4rl_pomdp/CartpoleSwingup-ZeroFrames-v0').max_episode_steps)\n"
+    )
+    done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines() == ["(9, 32, 32) 200", "500"]
 
 
 def test_a_set_is_not_continued_in_another_size(tasks, tmp_path):

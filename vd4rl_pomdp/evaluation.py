@@ -47,6 +47,11 @@ class Agent:
         self._state = self.encoder.initial_state(1)
         self._action = torch.zeros(1, self.encoder.config.action_dim)
 
+    @property
+    def picture_size(self) -> int:
+        """Height and width of the pictures it is shown; one that reads states is watched in the benchmark's."""
+        return FRAME_SIZE if self.encoder.reads_state else self.encoder.config.size
+
     def observe(self, now: Observation, task: Task) -> torch.Tensor:
         """What the encoder reads: the corrupted stack, or the simulator state for the `state` reference."""
         if not self.encoder.reads_state:
@@ -205,8 +210,7 @@ def _run_episode(job: EpisodeJob) -> Episode:
         _AGENTS.clear()
         _AGENTS[key] = Agent(load_encoder(job.encoder)[0], load_policy(job.policy))
     agent = _AGENTS[key]
-    size = FRAME_SIZE if agent.encoder.reads_state else agent.encoder.config.size
-    place = (job.task, job.corruption, job.render, job.length, size)
+    place = (job.task, job.corruption, job.render, job.length, agent.picture_size)
     if place not in _ENVIRONMENTS:
         _ENVIRONMENTS[place] = CorruptedEnv(*place)
     return _play(agent, _ENVIRONMENTS[place], job)

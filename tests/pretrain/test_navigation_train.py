@@ -240,8 +240,11 @@ def test_sets_that_cannot_be_trained_on_are_named(tmp_path):
     from vd4rl_pomdp.data.format import write_shard
 
     other = write_fake_set(tmp_path / "walker_walk" / "expert")
-    with pytest.raises(UserError, match="take a set of 100-pixel frames"):
+    with pytest.raises(UserError, match="names no maze"):
         train(smoke(other, tmp_path / "run"))
+    shrunk = write_fake_set(tmp_path / "shrunk", attributes={"task": "no_curtain"})
+    with pytest.raises(UserError, match="has frames of 84 pixels, mazes of 100"):
+        train(smoke(shrunk, tmp_path / "run"))
     rows = fake_rows([20, 20], action_dim=2) | {"observation": np.zeros((40, 3, 100, 100), np.uint8)}
     for name, attributes, message in (
         ("none", {}, "names no maze"),

@@ -83,6 +83,14 @@ def test_a_worker_that_dies_is_one_sentence():
         list(run_jobs(fail_or_die, [2, 3], 2))
 
 
+def test_a_job_that_no_other_process_can_read_is_one_sentence():
+    class Local:
+        pass
+
+    with pytest.raises(UserError, match=r"a job cannot be sent to a worker process \(.*Local.*\): .* --workers 1"):
+        list(run_jobs(square, [Local(), Local()], 2))
+
+
 def test_results_that_nobody_takes_leave_no_workers():
     results = run_jobs(tell_and_sleep, [0, 1], 2)
     crews = set(workers._CREWS)

@@ -112,7 +112,9 @@ class Dataset:
     def states(self) -> Tensor:
         """(N, P') float32 poses and velocities on the set's device; raises UserError if the set has no states."""
         if self.physics is None or self.task is None:
-            raise UserError(f"{self.path}: stores no simulator states; collect a set with `vd4rl-pomdp data collect`")
+            raise UserError(
+                f"{self.path}: stores no simulator states; `data collect` makes sets of dm_control's tasks that do"
+            )
         return torch.from_numpy(TASKS.named(self.task).visible_state(self.physics)).to(self.t.device)
 
     def to(self, device: torch.device | str) -> Dataset:

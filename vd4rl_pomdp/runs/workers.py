@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
+from pickle import PicklingError
 from typing import Any, TypeVar
 
 from vd4rl_pomdp.errors import UserError
@@ -93,7 +94,7 @@ class _Crew:
         job = next(waiting, None)
         if job is not None:
             with self._expecting_life(connection):
-                connection.send(job)
+                _send(connection, job)
 
     def _take(self, connection: Connection) -> tuple[int, Any, BaseException | None]:
         with self._expecting_life(connection):
@@ -131,6 +132,16 @@ def _end_all() -> None:
     """End the crews whose results nobody asked for to the end."""
     for crew in list(_CREWS):
         crew.end()
+
+
+def _send(connection: Connection, job: Any) -> None:
+    try:
+        connection.send(job)
+    except (PicklingError, AttributeError, TypeError) as error:
+        raise UserError(
+            f"a job cannot be sent to a worker process ({error}): define its classes and functions in a module, or use "
+            "--workers 1"
+        ) from error
 
 
 def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
