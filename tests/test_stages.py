@@ -216,6 +216,12 @@ BELOW = {
     **{"gru_layers": 0, "head_dim": 0, "history_window": -1, "self_prediction": -1.0, "l2_states": float("nan")},
     **{"patch_size": 0, "patch_count": -1, "patch_fill": 256, "zeroed_frames": -1},
 }
+READ_BY = {
+    "homer_codes": {"method": "homer"},
+    "expectile": {"algorithm": "iql"},
+    "temperature": {"algorithm": "iql"},
+}
+"""Part that reads an option, where the usual one does not."""
 BELOW_IN_BOTH = {
     **{"seed": -1, "batch_size": 0, "learning_rate": float("nan"), "shift": -1, "log_every": 0, "checkpoint_every": 0},
 }
@@ -228,14 +234,16 @@ BELOW_IN_FINETUNING = {
 @pytest.mark.parametrize(("field", "value"), [*BELOW.items(), *BELOW_IN_BOTH.items()])
 def test_numbers_out_of_range_stop_pretraining_before_it_begins(data, tmp_path, field, value):
     with pytest.raises(UserError, match=f"--{field.replace('_', '-')} is {value}; it must be at least"):
-        run_pretrain(smoke_pretrain(data, tmp_path / "out", **{field: value}))
+        run_pretrain(smoke_pretrain(data, tmp_path / "out", **({field: value} | READ_BY.get(field, {}))))
     assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(("field", "value"), [*BELOW_IN_FINETUNING.items(), *BELOW_IN_BOTH.items()])
 def test_numbers_out_of_range_stop_finetuning_before_it_begins(data, tmp_path, field, value):
     with pytest.raises(UserError, match=f"--{field.replace('_', '-')} is {value}; it must be at least"):
-        run_finetune(smoke_finetune(tmp_path / "encoder", data, tmp_path / "out", **{field: value}))
+        run_finetune(
+            smoke_finetune(tmp_path / "encoder", data, tmp_path / "out", **({field: value} | READ_BY.get(field, {})))
+        )
     assert not (tmp_path / "out").exists()
 
 
