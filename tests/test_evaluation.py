@@ -10,7 +10,7 @@ from tests.nn.test_encoder import CARD
 from vd4rl_pomdp import evaluation
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import Observation
-from vd4rl_pomdp.envs.pixels import Row
+from vd4rl_pomdp.envs.pixels import TimeStep
 from vd4rl_pomdp.evaluation import EVALUATION_SEED, EpisodeJob, evaluate, rows_of
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
@@ -43,8 +43,8 @@ class ScriptedEnv:
     def _show(self, reward: float, step_type: StepType) -> Observation:
         obs = torch.randint(0, 256, (9, 84, 84), generator=self._random, dtype=torch.uint8)
         self.seen[-1].append(obs)
-        row = Row(None, np.zeros(24, np.float32), np.zeros(18), reward, 1.0, step_type)
-        return Observation(obs, torch.full_like(obs, 255), row)
+        time_step = TimeStep(None, np.zeros(24, np.float32), np.zeros(18), reward, 1.0, step_type)
+        return Observation(obs, torch.full_like(obs, 255), time_step)
 
 
 @pytest.fixture

@@ -56,7 +56,7 @@ class Agent:
         """What the encoder reads: the corrupted stack, or the simulator state for the `state` reference."""
         if not self.encoder.reads_state:
             return now.obs
-        return torch.from_numpy(task.visible_state(now.row.physics))[:, None, None]
+        return torch.from_numpy(task.visible_state(now.time_step.physics))[:, None, None]
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> np.ndarray:
@@ -220,9 +220,9 @@ def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
     agent.reset()
     now = env.reset(EVALUATION_SEED + job.episode, EVALUATION_SEED, job.episode)
     total, length, film = 0.0, 0, [(now, 0.0)]
-    while not now.row.last:
+    while not now.time_step.last:
         now = env.step(agent.act(agent.observe(now, job.task)))
-        total += now.row.reward
+        total += now.time_step.reward
         length += 1
         if job.film and length % FILM_EVERY == 0:
             film.append((now, total))

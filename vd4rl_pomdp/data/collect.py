@@ -219,26 +219,26 @@ def _roll_out(job: _Job) -> dict[str, np.ndarray]:
     env = _environment(job.task, job.render, job.size, job.length)
     rng = np.random.default_rng([job.seed, job.episode])
     noise = np.random.default_rng(stream_seed(job.seed, "action noise", job.episode))
-    row = env.reset(episode_seed(job.seed, job.episode))
+    now = env.reset(episode_seed(job.seed, job.episode))
     action = np.zeros(env.action_dim, np.float32)
-    rows = [(row, action)]
-    while not row.last:
+    steps = [(now, action)]
+    while not now.last:
         if job.actor is None:
             action = rng.uniform(-1.0, 1.0, env.action_dim).astype(np.float32)
         else:
-            action = job.actor.act(row.state, rng)
+            action = job.actor.act(now.state, rng)
         if job.noise:
             shaken = action + job.noise * noise.standard_normal(action.shape)
             action = shaken.clip(-1.0, 1.0).astype(np.float32)
-        row = env.step(action)
-        rows.append((row, action))
-    frames = {} if job.size is None else {"observation": np.stack([r.frame for r, _ in rows])}
-    states = {"physics": np.stack([r.physics for r, _ in rows])} if row.physics.size else {}
+        now = env.step(action)
+        steps.append((now, action))
+    frames = {} if job.size is None else {"observation": np.stack([step.frame for step, _ in steps])}
+    states = {"physics": np.stack([step.physics for step, _ in steps])} if now.physics.size else {}
     return frames | {
-        "action": np.stack([a for _, a in rows]),
-        "reward": np.array([r.reward for r, _ in rows]),
-        "discount": np.array([r.discount for r, _ in rows]),
-        "step_type": np.array([int(r.step_type) for r, _ in rows]),
+        "action": np.stack([action for _, action in steps]),
+        "reward": np.array([step.reward for step, _ in steps]),
+        "discount": np.array([step.discount for step, _ in steps]),
+        "step_type": np.array([int(step.step_type) for step, _ in steps]),
         **states,
     }
 
