@@ -8,7 +8,6 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("vd4rl_pomdp", "pretrain", "finetune", "baselines")
 SHARED = {
     "CollectConfig": "settings of one command each, data collect and navigation collect",
-    "Policy": "in data.collect who plays, in nn.policy the network on representations",
     "ReportCommand": "words of one command each",
     "Table": "in cli.dispatch the commands by name, in experiments.navigation.report one of the paper's tables",
     "Trainer": "one for each stage",

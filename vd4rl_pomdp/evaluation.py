@@ -52,7 +52,7 @@ class Agent:
         """Height and width of the pictures it is shown; one that reads states is watched in the benchmark's."""
         return FRAME_SIZE if self.encoder.reads_state else self.encoder.config.size
 
-    def observe(self, now: Observation, task: Task) -> torch.Tensor:
+    def encoder_input(self, now: Observation, task: Task) -> torch.Tensor:
         """What the encoder reads: the corrupted stack, or the simulator state for the `state` reference."""
         if not self.encoder.reads_state:
             return now.obs
@@ -65,7 +65,7 @@ class Agent:
         self._action = self.policy(z)
         return self._action[0].numpy()
 
-    def acted(self, action: np.ndarray) -> None:
+    def set_last_action(self, action: np.ndarray) -> None:
         """Tell that another (A,) action than the last answer was executed."""
         self._action = torch.from_numpy(action)[None]
 
@@ -221,7 +221,7 @@ def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
     now = env.reset(EVALUATION_SEED + job.episode, EVALUATION_SEED, job.episode)
     total, length, film = 0.0, 0, [(now, 0.0)]
     while not now.time_step.last:
-        now = env.step(agent.act(agent.observe(now, job.task)))
+        now = env.step(agent.act(agent.encoder_input(now, job.task)))
         total += now.time_step.reward
         length += 1
         if job.film and length % FILM_EVERY == 0:

@@ -18,7 +18,7 @@ from vd4rl_pomdp.tasks import FRAME_STACK, SET_QUALITIES, TASKS
 from vd4rl_pomdp.types import StepType, Transitions, Windows, row_key
 
 Index = int | Sequence[int] | np.ndarray | Tensor
-Observe = Callable[[Tensor], Tensor]
+Observations = Callable[[Tensor], Tensor]
 """Observations (..., C, H, W) uint8 of (...,) int64 rows."""
 
 
@@ -166,7 +166,7 @@ class Dataset:
         n_step: int = 1,
         frame_stack: int = FRAME_STACK,
         gamma: float = 0.99,
-        observe: Observe | None = None,
+        observations: Observations | None = None,
     ) -> Transitions:
         """Gather n-step transitions.
 
@@ -175,7 +175,7 @@ class Dataset:
             n_step: rewards to sum; fewer at an episode's end.
             frame_stack: frames in an observation.
             gamma: discount between the summed rewards.
-            observe: what makes observations of (B,) rows, in place of `stacks`.
+            observations: what makes observations of (B,) rows, in place of `stacks`.
 
         Returns:
             `Transitions`. With m = min(n_step, steps left), `reward` is the sum of gamma^i r_{t+i} for i < m and
@@ -187,13 +187,13 @@ class Dataset:
         """
         rows = self._starts(self._index(index, self.num_transitions), self._per_episode(2))
         reward, discount, next_rows = self.n_step_returns(rows, n_step, gamma)
-        observe = observe or (lambda rows: self.stacks(rows, frame_stack))
+        observations = observations or (lambda rows: self.stacks(rows, frame_stack))
         return Transitions(
-            obs=observe(rows),
+            obs=observations(rows),
             action=self.action_after(rows),
             reward=reward,
             discount=discount,
-            next_obs=observe(next_rows),
+            next_obs=observations(next_rows),
             key=self.keys(rows),
             next_key=self.keys(next_rows),
         )
@@ -217,7 +217,7 @@ class Dataset:
         return int(self._windows_per_episode(length).sum())
 
     def windows(
-        self, index: Index, length: int, frame_stack: int = FRAME_STACK, observe: Observe | None = None
+        self, index: Index, length: int, frame_stack: int = FRAME_STACK, observations: Observations | None = None
     ) -> Windows:
         """Gather windows of consecutive rows.
 
@@ -225,7 +225,7 @@ class Dataset:
             index: (B,) numbers in 0..num_windows(length)-1; they count all starts within episodes, in order.
             length: rows T of each window.
             frame_stack: frames in an observation; a stack may reach before its window, never before its episode.
-            observe: what makes observations of (B, T) rows, in place of `stacks`.
+            observations: what makes observations of (B, T) rows, in place of `stacks`.
 
         Returns:
             `Windows`, none of them padded. `action` of the last row is the next row's, outside the window, if any.
@@ -240,7 +240,7 @@ class Dataset:
         has_action = rows + 1 < self.episode_end[self.episode[rows]]
         following = self.action_after(torch.where(has_action, rows, 0))
         return Windows(
-            obs=self.stacks(rows, frame_stack) if observe is None else observe(rows),
+            obs=self.stacks(rows, frame_stack) if observations is None else observations(rows),
             prev_action=self.actions_before(rows),
             action=following * has_action[..., None],
             has_action=has_action,

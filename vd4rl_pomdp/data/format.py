@@ -172,7 +172,7 @@ def read_rows(path: Path) -> dict[str, np.ndarray]:
         rows = {key: file[key][()] for key in keys if key != FRAMES_KEY}
         count = len(file[FRAMES_KEY])
     for key, value in rows.items():
-        _validate(path, key, value, count)
+        _check_column(path, key, value, count)
     dtypes = {"action": "float32", "step_type": "uint8"}
     return {key: value.astype(dtypes.get(key, "float64"), copy=False) for key, value in rows.items()}
 
@@ -232,7 +232,7 @@ def _is_elsewhere(file: h5py.File, key: str) -> bool:
     return isinstance(stored, h5py.Dataset) and (stored.external is not None or stored.is_virtual)
 
 
-def _validate(path: Path, key: str, value: np.ndarray, count: int) -> None:
+def _check_column(path: Path, key: str, value: np.ndarray, count: int) -> None:
     """Refuse a wrong shape, dtype or value of one key."""
     if value.ndim != _ROW_KEYS[key] or len(value) != count or not value.size:
         expected = f"({count},)" if _ROW_KEYS[key] == 1 else f"({count}, width)"

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.data.shards import Shard, claim_set, collect_shards
+from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
 from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, check_maze, get_maze
 from vd4rl_pomdp.navigation.config import CollectConfig
@@ -58,7 +58,7 @@ def collect(config: CollectConfig) -> list[Path]:
     return [shard.path for shard in shards]
 
 
-def drive(maze: str, rows: int, action_repeat: int = 5, noise: float = 0.5, seed: int = 0) -> dict[str, np.ndarray]:
+def drive(maze: str, rows: int, action_repeat: int = 5, noise: float = 0.5, seed: int = 0) -> Columns:
     """Rows of one trajectory, by key, without writing anything."""
     check_maze(maze)
     return _roll_out(_Job(maze, 0, seed, rows, action_repeat, noise))
@@ -86,7 +86,7 @@ def _job(config: CollectConfig, trajectory: int) -> _Job:
     return _Job(config.maze, trajectory, config.seed, rows, repeat, config.noise)
 
 
-def _roll_out(job: _Job) -> dict[str, np.ndarray]:
+def _roll_out(job: _Job) -> Columns:
     """Rows of one trajectory, by key."""
     env, act = _environment(job.maze, job.action_repeat)
     rng = np.random.default_rng([job.seed, job.trajectory])
