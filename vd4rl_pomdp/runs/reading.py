@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import fields
 from pathlib import Path
 from types import UnionType
 from typing import TYPE_CHECKING, Any, Literal, TypeVar, Union, get_args, get_origin, get_type_hints
@@ -47,10 +48,10 @@ def parse_json(text: str | bytes) -> Any:
 
 def build(kind: type[T], values: Any) -> T:
     """An instance of a dataclass from JSON values; wrong names, or a value of another type, raise TypeError."""
-    made = kind(**values)
-    for name, hint in get_type_hints(kind).items():
-        if not _fits(getattr(made, name), hint):
-            raise TypeError(f"{name} is {getattr(made, name)!r}")
+    made, hints = kind(**values), get_type_hints(kind)
+    for field in fields(made):  # type: ignore[arg-type]
+        if not _fits(getattr(made, field.name), hints[field.name]):
+            raise TypeError(f"{field.name} is {getattr(made, field.name)!r}")
     return made
 
 
