@@ -18,7 +18,15 @@ from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.errors import UserError, refuse_number, refuse_outside
-from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, read_rows, rows_of, rows_until
+from vd4rl_pomdp.evaluation import (
+    EpisodeJob,
+    append_episodes,
+    drop_episodes_after,
+    episode_rows,
+    episodes_until,
+    evaluate,
+    read_episodes,
+)
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, EncoderCard, copy_encoder, encoder_hash, load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
@@ -93,7 +101,9 @@ def _returns(config: FinetuneConfig) -> ReturnOptions:
     return config.options if isinstance(config.options, ReturnOptions) else ReturnOptions()
 
 
-def _trainer(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: EncoderCard, run: RunFolder) -> Trainer:
+def _trainer(
+    config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: EncoderCard, run: RunFolder
+) -> FinetuneTrainer:
     """What a run trains and on which batches: cached features, features encoded anew, or pixels."""
     seed_networks(config.seed, STAGE)
     policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(dataset.t.device)
@@ -114,7 +124,9 @@ def _trainer(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: E
         policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(4)]))
     noise = stream_generator(config.seed, STAGE, "noise")
     algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
-    return Trainer(EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, config, card)
+    return FinetuneTrainer(
+        EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, config, card
+    )
 
 
 def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
@@ -125,7 +137,7 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     write_json(run.path / "probe.json", probe_state(*arrays, TASKS.named(dataset.task)))
 
 
-class Trainer:
+class FinetuneTrainer:
     """One algorithm on one stream of batches."""
 
     def __init__(
@@ -161,7 +173,7 @@ class Trainer:
 
     def _require_evaluations(self, path: Path) -> None:
         """Raise UserError if rows of an evaluation before the newest are gone: the run would end without them."""
-        found = Counter(row["step"] for row in rows_until(path, self.step))
+        found = Counter(row["step"] for row in episodes_until(path, self.step))
         due = range(self.config.eval_every, self.step, self.config.eval_every)
         missing = [step for step in due if found[step] < self.config.eval_episodes]
         if missing:
@@ -171,12 +183,12 @@ class Trainer:
         """Whether the run was cut between a checkpoint and its evaluation; rows that count no more are dropped."""
         rows = run.path / "episodes.csv"
         self._require_evaluations(rows)
-        drop_rows_after(rows, self.step)
+        drop_episodes_after(rows, self.step)
         if not self.step or not loop.due(self.config.eval_every):
             return False
-        if sum(row["step"] == self.step for row in read_rows(rows)) == self.config.eval_episodes:
+        if sum(row["step"] == self.step for row in read_episodes(rows)) == self.config.eval_episodes:
             return False
-        drop_rows_after(rows, self.step - 1)
+        drop_episodes_after(rows, self.step - 1)
         return True
 
     def _evaluate(self, run: RunFolder, loop: Loop) -> None:
@@ -205,11 +217,11 @@ class Trainer:
             for episode in range(config.eval_episodes)
         ]
         episodes = evaluate(jobs, config.workers)
-        rows = rows_of(episodes, _labels(config, self.card) | {"step": self.step})
+        rows = episode_rows(episodes, _labels(config, self.card) | {"step": self.step})
         if episodes[0].film is not None:
             with replacing_file(run.path / "film.npz") as fresh, fresh.open("wb") as file:
                 np.savez_compressed(file, **episodes[0].film)  # type: ignore[arg-type]
-        append_rows(run.path / "episodes.csv", rows)
+        append_episodes(run.path / "episodes.csv", rows)
         return float(np.mean([row["score"] for row in rows]))
 
     def state(self) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from vd4rl_pomdp import evaluation
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import Observation
 from vd4rl_pomdp.envs.pixels import TimeStep
-from vd4rl_pomdp.evaluation import EVALUATION_SEED, EpisodeJob, evaluate, rows_of
+from vd4rl_pomdp.evaluation import EVALUATION_SEED, EpisodeJob, episode_rows, evaluate
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.tasks import TASKS
@@ -105,11 +105,11 @@ def test_episode_i_has_the_environment_seed_20000_plus_i_and_its_own_corruption(
     play(tmp_path, 0, 3)
     assert world[0].seeds == [(20_000, 20_000, 0), (20_003, 20_000, 3)]
     labels = {"method": "x", "task": "walker_walk"}
-    assert [row["episode_seed"] for row in rows_of(play(tmp_path, 3), labels)] == [EVALUATION_SEED + 3]
+    assert [row["episode_seed"] for row in episode_rows(play(tmp_path, 3), labels)] == [EVALUATION_SEED + 3]
 
 
 def test_a_return_is_the_sum_of_all_rewards_and_a_score_a_tenth_of_it(world, agent, tmp_path):
     (episode,) = play(tmp_path, 0)
     assert (episode.total, episode.length) == (sum(REWARDS), LENGTH)
-    (row,) = rows_of([episode], {"task": "walker_walk"})
+    (row,) = episode_rows([episode], {"task": "walker_walk"})
     assert (row["return"], row["score"], row["length"]) == (11.75, 1.175, LENGTH)

@@ -7,10 +7,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("vd4rl_pomdp", "pretrain", "finetune", "baselines")
 SHARED = {
-    "CollectConfig": "settings of one command each, data collect and navigation collect",
-    "ReportCommand": "words of one command each",
     "Table": "in cli.dispatch the commands by name, in experiments.navigation.report one of the paper's tables",
-    "Trainer": "one for each stage",
 }
 """Names that mean several things, and which."""
 

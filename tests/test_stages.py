@@ -21,7 +21,7 @@ from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import append_rows, drop_rows_after, evaluate_run, read_rows
+from vd4rl_pomdp.evaluation import append_episodes, drop_episodes_after, evaluate_run, read_episodes
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 from vd4rl_pomdp.runs.metrics import read_metrics
@@ -308,7 +308,7 @@ def test_an_evaluation_names_its_step_and_touches_no_other_file(encoder, data, t
     thesis = tmp_path / "thesis.csv"
     thesis.write_text("a,b\n1,2\n")
     with pytest.raises(UserError, match="has no column 'method'"):
-        append_rows(thesis, [])
+        append_episodes(thesis, [])
     assert thesis.read_text() == "a,b\n1,2\n"
 
 
@@ -316,12 +316,12 @@ def test_a_line_that_was_cut_is_dropped_with_what_follows_the_checkpoint(tmp_pat
     path = tmp_path / "episodes.csv"
     row = dict.fromkeys(("method", "task", "quality", "corruption", "algorithm"), "x")
     row |= dict.fromkeys(("seed", "episode", "episode_seed", "return", "length", "score"), 1)
-    append_rows(path, [row | {"step": 1}, row | {"step": 2}])
+    append_episodes(path, [row | {"step": 1}, row | {"step": 2}])
     path.write_text(path.read_text() + "mik+a,walker_w")
     with pytest.raises(UserError, match="a row is not whole"):
-        read_rows(path)
-    drop_rows_after(path, 1)
-    assert [row["step"] for row in read_rows(path)] == [1]
+        read_episodes(path)
+    drop_episodes_after(path, 1)
+    assert [row["step"] for row in read_episodes(path)] == [1]
 
 
 def test_features_that_are_a_pipe_are_refused(encoder, data, tmp_path, monkeypatch):
@@ -356,9 +356,9 @@ def test_a_damaged_table_of_episodes_is_named_and_kept(tmp_path, cell):
     path = tmp_path / "episodes.csv"
     row = dict.fromkeys(("method", "task", "quality", "corruption", "algorithm"), "x")
     row |= dict.fromkeys(("seed", "episode", "episode_seed", "return", "length"), 1)
-    append_rows(path, [row | {"step": 1, "score": cell}])
+    append_episodes(path, [row | {"step": 1, "score": cell}])
     before = path.read_bytes()
-    for read in (lambda: read_rows(path), lambda: drop_rows_after(path, 1)):
+    for read in (lambda: read_episodes(path), lambda: drop_episodes_after(path, 1)):
         with pytest.raises(UserError, match=r"episodes\.csv: (a row is not whole|the score of seed 1)"):
             read()
     assert path.read_bytes() == before

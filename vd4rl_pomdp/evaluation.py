@@ -110,7 +110,7 @@ def evaluate(
     return episodes
 
 
-def rows_of(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, Any]]:
+def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, Any]]:
     """Rows of `episodes.csv`: one an episode, `labels` giving the columns up to `step`."""
     divisor = TASKS.named(labels["task"]).score_divisor
     return [
@@ -126,9 +126,9 @@ def rows_of(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, A
     ]
 
 
-def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+def append_episodes(path: Path, rows: list[dict[str, Any]]) -> None:
     """Append rows to an `episodes.csv`, writing its header first; another kind of file raises UserError untouched."""
-    read_rows(path)
+    read_episodes(path)
     new = not path.exists() or path.stat().st_size == 0
     with appending(path) as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
@@ -137,7 +137,7 @@ def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
+def read_episodes(path: Path) -> list[dict[str, Any]]:
     """Rows of an `episodes.csv`, numbers parsed, none if there is no file or it is empty.
 
     Raises:
@@ -181,17 +181,17 @@ def _scores(path: Path, row: dict[str, str]) -> dict[str, float]:
     return scores
 
 
-def drop_rows_after(path: Path, step: int) -> None:
+def drop_episodes_after(path: Path, step: int) -> None:
     """Forget evaluations that a cut run made after its last checkpoint, and a last line that is not whole."""
     if not path.exists():
         return
-    if kept := rows_until(path, step):
+    if kept := episodes_until(path, step):
         write_csv(path, COLUMNS, kept)
     else:
         path.unlink()
 
 
-def rows_until(path: Path, step: int) -> list[dict[str, Any]]:
+def episodes_until(path: Path, step: int) -> list[dict[str, Any]]:
     """Rows of the evaluations up to a step, none if there is no file; a last line that is not whole is left out."""
     if not path.exists():
         return []
@@ -254,7 +254,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     """
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
-    evaluated = read_rows(run / "episodes.csv")
+    evaluated = read_episodes(run / "episodes.csv")
     if not evaluated:
         raise UserError(f"{run}: holds no evaluated run; name a folder that `vd4rl-pomdp finetune` wrote")
     labels = read_json(run / "labels.json")
@@ -270,4 +270,4 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     ]
     step = max(row["step"] for row in evaluated)
     done = evaluate(jobs, workers)
-    return rows_of(done, labels | {"corruption": chosen.corruption, "step": step})
+    return episode_rows(done, labels | {"corruption": chosen.corruption, "step": step})

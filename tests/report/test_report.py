@@ -14,7 +14,7 @@ import pytest
 
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import append_rows, drop_rows_after, read_rows
+from vd4rl_pomdp.evaluation import append_episodes, drop_episodes_after, read_episodes
 from vd4rl_pomdp.report import stats, write_report
 from vd4rl_pomdp.report.gaps import find_gaps
 from vd4rl_pomdp.report.load import load_runs
@@ -51,7 +51,7 @@ def write_run(
             | {"return": value * 10, "length": 500, "score": value}
             for i, value in enumerate(values)
         ]
-        append_rows(folder / "episodes.csv", rows)
+        append_episodes(folder / "episodes.csv", rows)
     (folder / "timing.json").write_text('{"seconds": 3.0}')
     if film:
         pictures = np.random.default_rng(0).integers(0, 256, (4, 12, 84, 84), dtype=np.uint8)
@@ -356,9 +356,9 @@ def test_a_report_of_unfinished_runs_alone_says_so(tmp_path):
 @pytest.mark.parametrize("column", ["score", "return"])
 def test_a_score_that_is_no_number_is_refused(tmp_path, value, column):
     run = write_run(tmp_path / "runs/a", "acro", 3, {10: [1.0, 2.0]})
-    rows = read_rows(run / "episodes.csv")
+    rows = read_episodes(run / "episodes.csv")
     (run / "episodes.csv").unlink()
-    append_rows(run / "episodes.csv", [rows[0], rows[1] | {column: value}])
+    append_episodes(run / "episodes.csv", [rows[0], rows[1] | {column: value}])
     with pytest.raises(UserError, match=rf"episodes\.csv: .*{value}"):
         write_report([tmp_path / "runs"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
@@ -404,9 +404,9 @@ def test_a_methods_name_is_text_and_nothing_else(tmp_path, capsys):
     for name in ("summary", "episodes", "runs", "curves"):
         with (tmp_path / "out" / f"{name}.csv").open(newline="", encoding="utf-8") as file:
             assert {row["method"] for row in csv.DictReader(file)} == {HOSTILE}
-    rows = read_rows(tmp_path / "runs" / "a" / "episodes.csv")
-    drop_rows_after(tmp_path / "runs" / "a" / "episodes.csv", 5)
-    assert read_rows(tmp_path / "runs" / "a" / "episodes.csv") == rows[:1]
+    rows = read_episodes(tmp_path / "runs" / "a" / "episodes.csv")
+    drop_episodes_after(tmp_path / "runs" / "a" / "episodes.csv", 5)
+    assert read_episodes(tmp_path / "runs" / "a" / "episodes.csv") == rows[:1]
 
 
 def test_a_machine_that_does_not_speak_utf8_ends_no_command(tmp_path):
