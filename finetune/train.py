@@ -61,11 +61,14 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     if card.end_to_end:
         config = end_to_end(config, card.end_to_end)
     if encoder.reads_state:
-        dataset.states()
-    _require_room(config, dataset, encoder, device)
+        dataset.require_states()
+    _check_n_step(config, dataset)
     card = replace(card, quality=dataset.quality or card.quality)  # the policy's set names its rows
     inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
-    with RunFolder(config.out, STAGE, config, inputs) as run:
+    run = RunFolder(config.out, STAGE, config, inputs)
+    if not run.finished:
+        _require_room(config, dataset, encoder, device, FeatureFile(run.path, inputs).exists)
+    with run:
         if not run.finished:
             write_json(run.path / "labels.json", _labels(config, card))
             _keep_encoder(config.encoder, run.path)
@@ -75,23 +78,34 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
 
 
 def end_to_end(config: FinetuneConfig, algorithm: str) -> FinetuneConfig:
-    """The settings for a method that has no frozen stage, and brings its algorithm along.
-
-    Raises:
-        UserError: a setting that was not the default is not read.
-    """
-    if config.views != config.usual()["views"]:
-        raise UserError(f"--views is not read by the algorithm {algorithm}, which trains the encoder: leave it out")
+    """The settings for a method that has no frozen stage, and brings its algorithm along; raises UserError as
+    `check_end_to_end` does."""
+    check_end_to_end(config, algorithm)
     return config.altered(algorithm=algorithm, views=0)
 
 
-def _require_room(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, device: torch.device) -> None:
-    """Refuse what plainly exceeds the memory or the disk: all views' features, or one batch through the networks."""
+def check_end_to_end(config: FinetuneConfig, algorithm: str) -> None:
+    """Raise UserError for an unknown algorithm, or a setting that was chosen and that it does not read."""
+    ALGORITHMS.check(algorithm)
+    if config.views != config.usual()["views"]:
+        raise UserError(f"--views is not read by the algorithm {algorithm}, which trains the encoder: leave it out")
+
+
+def _check_n_step(config: FinetuneConfig, dataset: Dataset) -> None:
+    """Raise UserError for returns over more steps than an episode has."""
     longest = int((dataset.episode_end - dataset.episode_start).max()) - 1
     refuse_number("n_step", _returns(config).n_step, 1, max(longest, ReturnOptions.n_step))
+
+
+def _require_room(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, device: torch.device, kept: bool) -> None:
+    """Refuse what plainly exceeds the memory or the disk: all views' features, or one batch through the networks.
+
+    Features that are `kept` on the disk already take no more of it.
+    """
     features = config.views * dataset.num_rows * encoder.dim * 2
     require_memory(features, device, config, "views")
-    require_disk(features, config.out, config, "views")
+    if not kept:
+        require_disk(features, config.out, config, "views")
     row, weights = 2 * encoder.dim + 4 * config.hidden_dim, 15 * config.hidden_dim**2  # of float32 numbers
     require_memory(4 * (config.batch_size * row + weights), device, config, "batch_size", "hidden_dim")
 

@@ -148,7 +148,7 @@ def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
     target = build_target(config, dataset.action_after(dataset.transition_rows).numpy())
     state_dim = dataset.states().shape[1] if METHODS.named(config.method).reads_state else 0
     objective = build_objective(config, dataset.action_dim, target, state_dim, (3 * FRAME_STACK, dataset.frame_size))
-    dataset.num_windows(config.window)
+    dataset.check_windows(config.window)
     return objective
 
 

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from vd4rl_pomdp.corruptions import CorruptionConfig, make_corruption
+from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.errors import UserError, refuse_number
@@ -126,9 +126,18 @@ def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[s
     ]
 
 
+def begin_episodes(path: Path) -> None:
+    """Make an `episodes.csv` without rows, unless there is one, so that a path that cannot be written is known early.
+
+    Raises:
+        UserError: the file cannot be written, is of another kind, or is damaged; it stays as it is.
+    """
+    append_episodes(path, [])
+
+
 def append_episodes(path: Path, rows: list[dict[str, Any]]) -> None:
     """Append rows to an `episodes.csv`, writing its header first; another kind of file raises UserError untouched."""
-    read_episodes(path)
+    check_episodes(path)
     new = not path.exists() or path.stat().st_size == 0
     with appending(path) as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
@@ -147,6 +156,11 @@ def read_episodes(path: Path) -> list[dict[str, Any]]:
         return []
     with _whole(path), path.open(newline="", encoding="utf-8") as file:
         return _parse(path, file)
+
+
+def check_episodes(path: Path) -> None:
+    """Raise UserError unless `read_episodes` can read a file."""
+    read_episodes(path)
 
 
 @contextmanager
@@ -264,7 +278,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     card = load_encoder(run / "encoder")[1]
     task = TASKS.named(card.task)
     chosen = CorruptionConfig.fill(card.corruption) if corruption is None else CorruptionConfig.of(corruption)
-    make_corruption(chosen)
+    chosen.check()
     jobs = [
         EpisodeJob(run / "encoder", run / "policy", 0, task, chosen, episode, film=False) for episode in range(episodes)
     ]

@@ -109,12 +109,18 @@ class Dataset:
         """Action dimension A."""
         return self.action.shape[1]
 
-    def states(self) -> Tensor:
-        """(N, P') float32 poses and velocities on the set's device; raises UserError if the set has no states."""
+    def require_states(self) -> None:
+        """Raise UserError if the set stores no simulator states."""
         if self.physics is None or self.task is None:
             raise UserError(
                 f"{self.path}: stores no simulator states; `data collect` makes sets of dm_control's tasks that do"
             )
+
+    def states(self) -> Tensor:
+        """(N, P') float32 poses and velocities on the set's device; raises UserError if the set has no states."""
+        self.require_states()
+        assert self.physics is not None
+        assert self.task is not None
         return torch.from_numpy(TASKS.named(self.task).visible_state(self.physics)).to(self.t.device)
 
     def to(self, device: torch.device | str) -> Dataset:
@@ -214,7 +220,8 @@ class Dataset:
 
     def num_windows(self, length: int) -> int:
         """Number of windows of `length` consecutive rows of one episode; raises UserError as `windows` does."""
-        return int(self._windows_per_episode(length).sum())
+        self.check_windows(length)
+        return int(self._per_episode(length).sum())
 
     def windows(
         self, index: Index, length: int, frame_stack: int = FRAME_STACK, observations: Observations | None = None
@@ -234,7 +241,8 @@ class Dataset:
             UserError: an episode is shorter than the window.
             IndexError: an index is out of range.
         """
-        per_episode = self._windows_per_episode(length)
+        self.check_windows(length)
+        per_episode = self._per_episode(length)
         start = self._starts(self._index(index, int(per_episode.sum())), per_episode)
         rows = start[:, None] + torch.arange(length, device=start.device)
         has_action = rows + 1 < self.episode_end[self.episode[rows]]
@@ -248,7 +256,8 @@ class Dataset:
             key=self.keys(rows),
         )
 
-    def _windows_per_episode(self, length: int) -> Tensor:
+    def check_windows(self, length: int) -> None:
+        """Raise UserError unless every episode has a window of `length` rows."""
         require_positive(length=length)
         short = torch.nonzero(self.episode_end - self.episode_start < length)
         if len(short):
@@ -258,7 +267,6 @@ class Dataset:
                 f"{self.path}: episode {episode} has {rows} rows, fewer than the window of {length} "
                 f"({len(short)} such episodes); choose a shorter window"
             )
-        return self._per_episode(length)
 
     def _per_episode(self, length: int) -> Tensor:
         """(E,) rows from which `length` consecutive rows stay inside the episode: transitions for 2."""
