@@ -23,7 +23,7 @@ from pretrain.navigation.probe import COMPONENTS
 from pretrain.navigation.train import train as run_navigation
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
-from tests.test_stages import contents, smoke_finetune, smoke_pretrain
+from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import read_episodes
