@@ -17,6 +17,7 @@ from finetune.features import STAGE, ExactSampler, FeatureFile, FeatureSampler, 
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.data.parity import render_info
+from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError, refuse_number, refuse_outside
 from vd4rl_pomdp.evaluation import (
     EpisodeJob,
@@ -148,7 +149,7 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     if dataset.physics is None or dataset.task is None or (run.path / "probe.json").exists():
         return
     arrays = features[0].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
-    write_json(run.path / "probe.json", probe_state(*arrays, TASKS.named(dataset.task)))
+    write_json(run.path / "probe.json", probe_state(*arrays, layout_of(TASKS.named(dataset.task))))
 
 
 class FinetuneTrainer:

@@ -12,6 +12,7 @@ from pretrain.config import PretrainConfig, StreamOptions
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.corruptions import check_corruption
 from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
+from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError, refuse_outside
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import EncoderCard, save_encoder
@@ -159,10 +160,9 @@ def _task_of(dataset: Dataset, config: PretrainConfig) -> str:
     if dataset.task is not None and name != dataset.task:
         raise UserError(f"{config.data}: is a set of {dataset.task}, not of {name}; leave --task out")
     task = TASKS.named(name)
-    if task.action_dim != dataset.action_dim:
+    if (width := layout_of(task).action_dim) != dataset.action_dim:
         raise UserError(
-            f"{config.data}: has {dataset.action_dim} action dimensions, {name} has {task.action_dim}; "
-            "pass the right --task"
+            f"{config.data}: has {dataset.action_dim} action dimensions, {name} has {width}; pass the right --task"
         )
     return name
 

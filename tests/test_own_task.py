@@ -20,7 +20,7 @@ from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import read_shard
-from vd4rl_pomdp.envs.pixels import make_env
+from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import Episode, episode_rows, evaluate_run, read_episodes
 from vd4rl_pomdp.nn import load_encoder

@@ -26,10 +26,10 @@ def test_constant_states_are_left_out_and_one_episode_is_enough_to_test():
 
 
 def test_pose_and_velocity_are_apart():
-    task = TASKS.named("walker_walk")
+    layout = TASKS.named("walker_walk").layout
     physics = RNG.normal(size=(1000, 18))
     episode = np.arange(1000) // 50
-    found = probe_state(task.velocity(physics), physics, episode, task)
+    found = probe_state(layout.velocity(physics), physics, episode, layout)
     assert found["probe_velocity"] < 1
     assert found["probe_pose"] > 70
 
@@ -42,7 +42,7 @@ def test_tasks_name_the_columns_of_their_simulators(name: str):
     joints = [physics.model.id2name(i, "joint") for i in range(physics.model.njnt)]
     travel = (0, 1) if joints[0] == "root" else (joints.index("rootx"),)
     assert task.layout.travel == travel
-    assert task.visible_state(physics.get_state()[None]).shape == (1, physics.get_state().size - len(travel))
+    assert task.layout.visible_state(physics.get_state()[None]).shape == (1, physics.get_state().size - len(travel))
 
 
 def test_knowing_nothing_scores_the_mean_deviation_over_the_standard_deviation():

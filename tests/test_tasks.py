@@ -11,7 +11,7 @@ import pytest
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.envs.dmc import replay_rewards, replays
-from vd4rl_pomdp.envs.pixels import make_env
+from vd4rl_pomdp.envs.make import layout_of, make_env
 from vd4rl_pomdp.envs.rendering import suite
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask, Layout
@@ -26,7 +26,7 @@ def test_tasks_are_named_without_loading_a_simulator():
 @pytest.mark.parametrize("name", TASKS)
 def test_the_layouts_of_the_benchmark_are_what_their_models_have(name):
     task = TASKS[name]
-    assert replace(task, layout=None).found() == task.layout
+    assert layout_of(replace(task, layout=None)) == task.layout
 
 
 @pytest.mark.parametrize(
@@ -39,10 +39,10 @@ def test_the_layouts_of_the_benchmark_are_what_their_models_have(name):
     ],
 )
 def test_what_a_task_does_not_tell_is_found(domain, task, layout):
-    found = DMCTask(domain, task).found()
+    found = layout_of(DMCTask(domain, task))
     assert found == layout
     physics = suite.load(domain, task).physics.get_state()
-    states = DMCTask(domain, task).visible_state(physics[None])
+    states = found.visible_state(physics[None])
     assert states.shape == (1, len(physics) - len(layout.travel))
 
 
@@ -70,9 +70,9 @@ def test_a_task_that_draws_a_target_into_its_model_cannot_be_replayed_and_says_s
 
 def test_an_unknown_task_of_dm_control_is_one_line():
     with pytest.raises(UserError, match=r"dm_control has no task 'cartpole', 'swing': choose one of .*swingup"):
-        DMCTask("cartpole", "swing").found()
+        layout_of(DMCTask("cartpole", "swing"))
     with pytest.raises(UserError, match=r"choose one of acrobot, .*walker"):
-        DMCTask("carpole", "swingup").found()
+        layout_of(DMCTask("carpole", "swingup"))
 
 
 def test_what_is_no_task_is_not_registered():

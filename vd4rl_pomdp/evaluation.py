@@ -16,6 +16,7 @@ import torch
 
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
+from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.nn.encoder import Encoder
@@ -56,7 +57,7 @@ class Agent:
         """What the encoder reads: the corrupted stack, or the simulator state for the `state` reference."""
         if not self.encoder.reads_state:
             return now.obs
-        return torch.from_numpy(task.visible_state(now.time_step.physics))[:, None, None]
+        return torch.from_numpy(layout_of(task).visible_state(now.time_step.physics))[:, None, None]
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> np.ndarray:

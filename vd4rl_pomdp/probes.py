@@ -6,7 +6,7 @@ import numpy as np
 from sklearn.linear_model import Ridge
 from sklearn.preprocessing import StandardScaler
 
-from vd4rl_pomdp.tasks import Task
+from vd4rl_pomdp.tasks import Layout
 
 HELD_OUT = 5
 """Every fifth episode is for testing."""
@@ -36,16 +36,16 @@ def probe_error(features: np.ndarray, targets: np.ndarray, episode: np.ndarray) 
     return float(np.abs(error).mean() * 100)
 
 
-def probe_state(features: np.ndarray, physics: np.ndarray, episode: np.ndarray, task: Task) -> dict[str, float]:
+def probe_state(features: np.ndarray, physics: np.ndarray, episode: np.ndarray, layout: Layout) -> dict[str, float]:
     """Errors of `probe_error` on pose (without the place on the ground) and velocity.
 
     Args:
         features: (N, D) representations.
         physics: (N, P) simulator states.
         episode: (N,) episode of every row.
-        task: tells pose from velocity.
+        layout: tells pose from velocity.
     """
     return {
-        "probe_pose": probe_error(features, task.pose(physics), episode),
-        "probe_velocity": probe_error(features, task.velocity(physics), episode),
+        "probe_pose": probe_error(features, layout.pose(physics), episode),
+        "probe_velocity": probe_error(features, layout.velocity(physics), episode),
     }

@@ -48,6 +48,18 @@ class Layout:
     travel: tuple[int, ...] = ()
     """Positions along the ground, which a tracking camera does not show."""
 
+    def pose(self, physics: np.ndarray) -> np.ndarray:
+        """Positions of (..., P) simulator states, without the place on the ground."""
+        return np.delete(physics[..., : self.positions], self.travel, axis=-1)
+
+    def velocity(self, physics: np.ndarray) -> np.ndarray:
+        """Velocities of (..., P) simulator states."""
+        return physics[..., self.positions :]
+
+    def visible_state(self, physics: np.ndarray) -> np.ndarray:
+        """(..., P') float32: pose and velocity."""
+        return np.concatenate([self.pose(physics), self.velocity(physics)], axis=-1).astype(np.float32)
+
 
 @dataclass(frozen=True, kw_only=True)
 class Task:
@@ -62,43 +74,13 @@ class Task:
     action_noise: float | None = None
     """Standard deviation of the noise in the noisy sets; None: it has none."""
     layout: Layout | None = None
-    """Widths of its rows, if they are to be known without building the environment; None: found from it."""
-
-    def found(self) -> Layout:
-        """The layout as given, else as the environment has it, which is built for that once."""
-        if self.layout is not None:
-            return self.layout
-        from vd4rl_pomdp.envs.pixels import find_layout
-
-        return find_layout(self)
+    """Widths of its rows, if they are to be known without building the environment; None: found from it (see
+    `envs.make.layout_of`)."""
 
     @property
     def summary(self) -> str:
         """One line that says what it is."""
         return f"each action {self.action_repeat} times, {self.decisions} decisions an episode"
-
-    @property
-    def action_dim(self) -> int:
-        """Action dimension A."""
-        return self.found().action_dim
-
-    @property
-    def state_dim(self) -> int:
-        """Width D of the states that actors read, 0 for none."""
-        return self.found().state_dim
-
-    def pose(self, physics: np.ndarray) -> np.ndarray:
-        """Positions of (..., P) simulator states, without the place on the ground."""
-        layout = self.found()
-        return np.delete(physics[..., : layout.positions], layout.travel, axis=-1)
-
-    def velocity(self, physics: np.ndarray) -> np.ndarray:
-        """Velocities of (..., P) simulator states."""
-        return physics[..., self.found().positions :]
-
-    def visible_state(self, physics: np.ndarray) -> np.ndarray:
-        """(..., P') float32: pose and velocity."""
-        return np.concatenate([self.pose(physics), self.velocity(physics)], axis=-1).astype(np.float32)
 
 
 @dataclass(frozen=True)

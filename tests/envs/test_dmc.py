@@ -14,7 +14,7 @@ def roll(env, seed, count, action_seed=0):
     rng = np.random.default_rng(action_seed)
     rows, actions = [env.reset(seed)], []
     for _ in range(count):
-        actions.append(rng.uniform(-1, 1, env.task.action_dim).astype(np.float32))
+        actions.append(rng.uniform(-1, 1, env.action_dim).astype(np.float32))
         rows.append(env.step(actions[-1]))
     return rows, np.stack(actions)
 
@@ -57,13 +57,13 @@ def test_rows_have_the_declared_shapes(blind):
     assert rows[0].reward == 0.0
     for row in rows:
         assert row.frame is None
-        assert (row.state.shape, row.state.dtype) == ((blind.task.state_dim,), np.float32)
+        assert (row.state.shape, row.state.dtype) == ((blind.layout.state_dim,), np.float32)
         assert (row.physics.ndim, row.physics.dtype, row.discount) == (1, np.float64, 1.0)
 
 
 def test_an_action_is_applied_twice_and_its_rewards_summed(blind):
     start = blind.reset(0).physics
-    action = np.full(blind.task.action_dim, 0.5, np.float32)
+    action = np.full(blind.action_dim, 0.5, np.float32)
     row = blind.step(action)
     by_hand = DMCEnv(blind.task, size=None)
     by_hand.reset(0)
@@ -87,7 +87,7 @@ def test_an_unknown_task_is_refused():
 
 def test_another_process_renders_the_same_bytes():
     code = (
-        "import sys; from vd4rl_pomdp.envs.pixels import make_env; from vd4rl_pomdp.tasks import TASKS;"
+        "import sys; from vd4rl_pomdp.envs.make import make_env; from vd4rl_pomdp.tasks import TASKS;"
         "env = make_env(TASKS['walker_walk']);"
         "env.reset(9); env.reset(1); sys.stdout.buffer.write(env.step([0.3] * 6).frame.tobytes())"
     )

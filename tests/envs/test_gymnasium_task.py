@@ -3,7 +3,7 @@ import numpy as np
 import pytest
 
 from vd4rl_pomdp.envs.gym import GymEnv
-from vd4rl_pomdp.envs.pixels import make_env
+from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask
 from vd4rl_pomdp.types import StepType

@@ -53,7 +53,7 @@ def test_a_ladder_leads_to_the_medium_actor(task):
     top = ladder.rungs[-1]
     for name, value in medium.weights.items():
         np.testing.assert_array_equal(top.weights[name], value.astype(np.float16).astype(np.float32))
-    state = np.linspace(-1, 1, TASKS.named(task).state_dim, dtype=np.float32)
+    state = np.linspace(-1, 1, TASKS.named(task).layout.state_dim, dtype=np.float32)
     np.testing.assert_allclose(top.act(state), medium.act(state), atol=0.02)
 
 

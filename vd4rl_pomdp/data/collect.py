@@ -14,6 +14,7 @@ from typing import Any, Literal
 import numpy as np
 
 from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
+from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.files import jsonable
@@ -126,7 +127,9 @@ def _check(config: CollectConfig) -> None:
     if config.quality not in SET_QUALITIES:
         raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(SET_QUALITIES)}")
     base = _base(config)
-    if not task.state_dim and base != "random":  # the environment is built first, and refused if it cannot be
+    if (
+        not layout_of(task).state_dim and base != "random"
+    ):  # the environment is built first, and refused if it cannot be
         raise UserError(
             f"{config.task} has no states for an actor to read: --quality random, or a set of your own in this format"
         )
@@ -248,7 +251,7 @@ _ENVIRONMENTS: dict[tuple, Any] = {}
 
 def _environment(*arguments: Any) -> Any:
     """The process's environment for these arguments: one GL context serves all its episodes."""
-    from vd4rl_pomdp.envs.pixels import make_env
+    from vd4rl_pomdp.envs.make import make_env
 
     if arguments not in _ENVIRONMENTS:
         _ENVIRONMENTS[arguments] = make_env(*arguments)

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from vd4rl_pomdp.buffers import FrameBuffers
 from vd4rl_pomdp.data.store import Store, open_store
+from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_STACK, SET_QUALITIES, TASKS
 from vd4rl_pomdp.types import StepType, Transitions, Windows, row_key
@@ -121,7 +122,7 @@ class Dataset:
         self.require_states()
         assert self.physics is not None
         assert self.task is not None
-        return torch.from_numpy(TASKS.named(self.task).visible_state(self.physics)).to(self.t.device)
+        return torch.from_numpy(layout_of(TASKS.named(self.task)).visible_state(self.physics)).to(self.t.device)
 
     def to(self, device: torch.device | str) -> Dataset:
         """Move frames and rows to a device, in place; returns the data set."""

@@ -11,7 +11,8 @@ import numpy as np
 
 from vd4rl_pomdp.data.dataset import open_dataset
 from vd4rl_pomdp.envs.dmc import DMCEnv, start_from
-from vd4rl_pomdp.envs.pixels import Render, make_env
+from vd4rl_pomdp.envs.make import make_env
+from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.envs.rendering import frame, frames_hash, gl_strings, mujoco
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import TASKS, DMCTask

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys, make_corruption
-from vd4rl_pomdp.envs.pixels import Render, TimeStep, make_env
+from vd4rl_pomdp.envs.make import make_env
+from vd4rl_pomdp.envs.pixels import Render, TimeStep
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, Task
 from vd4rl_pomdp.types import row_key
 

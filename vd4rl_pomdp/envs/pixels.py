@@ -1,16 +1,15 @@
-"""What the harness does with any task: begin an episode, act, read a time step; `make_env` builds the environment."""
+"""What the harness does with any task: begin an episode, act, read a time step."""
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from functools import cache
 from typing import Literal
 
 import numpy as np
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import FRAME_SIZE, DMCTask, GymnasiumTask, Layout, Task
+from vd4rl_pomdp.tasks import Layout, Task
 from vd4rl_pomdp.types import StepType
 
 Render = Literal["fast", "exact"]
@@ -100,31 +99,3 @@ class PixelEnv(ABC):
     @abstractmethod
     def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
         """The time step of the present state."""
-
-
-def make_env(task: Task, render: Render = "fast", size: int | None = FRAME_SIZE, length: int | None = None) -> PixelEnv:
-    """The environment of a task.
-
-    Args:
-        task: what is played.
-        render: how dm_control draws.
-        size: height and width S of the frames; None: nothing is drawn.
-        length: decisions after which an episode is cut off; None: the task's own.
-
-    Raises:
-        UserError: the environment cannot be built, or is of a kind that the harness cannot play.
-    """
-    if isinstance(task, GymnasiumTask):
-        from vd4rl_pomdp.envs.gymnasium_task import GymnasiumEnv
-
-        return GymnasiumEnv(task, size, length)
-    assert isinstance(task, DMCTask), "the registry takes no other kind"
-    from vd4rl_pomdp.envs.dmc import DMCEnv
-
-    return DMCEnv(task, render, size, length)
-
-
-@cache
-def find_layout(task: Task) -> Layout:
-    """Layout of a task as its environment has it."""
-    return make_env(task, size=None).layout

@@ -19,6 +19,7 @@ import numpy as np
 from safetensors import SafetensorError, safe_open
 from safetensors.numpy import save
 
+from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
@@ -199,7 +200,7 @@ def _check_weights(path: Path, actor: Actor, task: str | None) -> None:
     name = task or actor.card.get("task", "")
     if name not in TASKS:
         return
-    widths = TASKS[name].found()
+    widths = layout_of(TASKS[name])
     try:
         finite = all(np.isfinite(value).all() for value in actor.weights.values())
         action = actor.act(np.zeros(widths.state_dim, np.float32), np.random.default_rng(0)) if finite else None

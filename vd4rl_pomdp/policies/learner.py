@@ -14,6 +14,7 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import OBSERVATION_CLIP, Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
@@ -59,7 +60,7 @@ def build(config: PolicyConfig, task: Task) -> SAC:
         gradient_steps=max(1, round(rounds * config.envs * config.updates_per_decision)),
         n_steps=config.n_step,
         ent_coef=f"auto_{config.temperature}",
-        target_entropy=config.target_entropy * task.action_dim,
+        target_entropy=config.target_entropy * layout_of(task).action_dim,
         policy_kwargs=network | ({"layer_norm": True} if config.critic_norm else {}),
         seed=config.seed,
     )

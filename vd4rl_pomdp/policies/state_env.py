@@ -7,7 +7,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from vd4rl_pomdp.envs.pixels import make_env
+from vd4rl_pomdp.envs.make import layout_of, make_env
 from vd4rl_pomdp.tasks import Task
 
 
@@ -19,8 +19,8 @@ class StateEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def __init__(self, task: Task) -> None:
         self._env = make_env(task, size=None)
-        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (task.state_dim,), np.float32)
-        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (task.action_dim,), np.float32)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (layout_of(task).state_dim,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (layout_of(task).action_dim,), np.float32)
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Begin the episode of a seed, or of one drawn from the environment's generator."""

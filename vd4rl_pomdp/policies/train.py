@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import MAX_SEED, MOST, UserError, refuse_outside
 from vd4rl_pomdp.policies import learner
 from vd4rl_pomdp.policies.actor import Actor
@@ -108,7 +109,7 @@ def decisions_made(run: Path) -> int:
 def _check(config: PolicyConfig) -> None:
     """Raise UserError for settings out of range, or that need too much memory, and for a folder of another run."""
     task = TASKS.named(config.task)
-    if not task.state_dim:
+    if not (state_dim := layout_of(task).state_dim):
         raise UserError(f"{config.task} has no states for an actor to read: choose a task of dm_control")
     refuse_outside(
         config, seed=(0, MAX_SEED), decisions=1, learning_rate=0, hidden=1, n_step=(1, task.decisions),
@@ -117,7 +118,7 @@ def _check(config: PolicyConfig) -> None:
         stop_at=(-MOST, MOST), refill=0, critic_warmup=0,
     )  # fmt: skip
     # of float32 numbers, as the weights are
-    require_memory(8 * task.state_dim * config.replay_size, CPU, config, "replay_size")
+    require_memory(8 * state_dim * config.replay_size, CPU, config, "replay_size")
     require_memory(4 * (15 * config.hidden**2 + config.batch_size * config.hidden), CPU, config, "hidden", "batch_size")
     _check_folder(config)
 

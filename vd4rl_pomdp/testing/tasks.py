@@ -34,7 +34,7 @@ def check_task(name: str) -> None:
 
 def make(name: str, size: int | None = None, length: int = DECISIONS) -> PixelEnv:
     """A task's environment with short episodes."""
-    from vd4rl_pomdp.envs.pixels import make_env
+    from vd4rl_pomdp.envs.make import make_env
 
     return make_env(TASKS.named(name), size=size, length=length)
 
@@ -75,16 +75,21 @@ def frames_have_the_size_asked_for(name: str) -> None:
 
 def rows_have_the_declared_widths(name: str) -> None:
     """Rows hold states of the task's layout, which is that of its environment, and finite rewards, 0 in the first."""
+    from vd4rl_pomdp.envs.make import layout_of
+
     task = TASKS.named(name)
-    found = replace(task, layout=None).found()
-    claim(task.found() == found, f"its layout says {task.layout}, the environment has {found}")
+    found = layout_of(replace(task, layout=None))
+    claim(layout_of(task) == found, f"its layout says {task.layout}, the environment has {found}")
     rows, actions = play(make(name), 0)
-    claim(actions.shape[1] == task.action_dim, f"{actions.shape[1]} action dimensions, not {task.action_dim}")
+    claim(actions.shape[1] == found.action_dim, f"{actions.shape[1]} action dimensions, not {found.action_dim}")
     claim(rows[0].reward == 0, f"the first row pays {rows[0].reward}")
     width = rows[0].physics.size
     for row in rows:
         claim(row.frame is None, "a frame is drawn that was not asked for")
-        claim((row.state.shape, row.state.dtype) == ((task.state_dim,), np.float32), f"a state is {row.state!r}")
+        claim(
+            (row.state.shape, row.state.dtype) == ((found.state_dim,), np.float32),
+            f"a state is {row.state!r}",
+        )
         claim((row.physics.shape, row.physics.dtype) == ((width,), np.float64), f"a simulator state is {row.physics!r}")
         claim(np.isfinite(row.reward), f"a reward is {row.reward}")
 

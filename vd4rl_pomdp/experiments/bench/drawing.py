@@ -9,7 +9,8 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.data.parity import canary_frames, compare
-from vd4rl_pomdp.envs.pixels import PixelEnv, make_env
+from vd4rl_pomdp.envs.make import make_env
+from vd4rl_pomdp.envs.pixels import PixelEnv
 from vd4rl_pomdp.experiments.bench.timing import rate
 from vd4rl_pomdp.mazes import PICTURE_SIZE
 from vd4rl_pomdp.runs.workers import run_jobs
