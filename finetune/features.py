@@ -13,6 +13,7 @@ from torch import Tensor
 
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.data import Dataset, View
+from vd4rl_pomdp.data.samplers import Sampler
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.runs.device import Precision, autocast
 from vd4rl_pomdp.runs.files import read_json, replacing_file, write_json
@@ -92,9 +93,14 @@ class FeatureFile:
         self._path, self._origin = run / "features.npy", run / "features.json"
         self._inputs = inputs
 
+    @property
+    def exists(self) -> bool:
+        """Whether there are features, be they what these inputs gave or not."""
+        return self._path.exists() and self._origin.exists()
+
     def read(self) -> np.ndarray | None:
         """What was written, None if that is missing, damaged or of other inputs."""
-        if not (self._path.exists() and self._origin.exists()):
+        if not self.exists:
             return None
         return np.load(self._path) if read_json(self._origin) == self._description() else None
 
@@ -172,31 +178,20 @@ class FeatureSampler:
         )
 
 
-class ExactSampler:
+class ExactSampler(Sampler):
     """Uniform n-step transitions whose representations are computed anew for every batch, from whole histories."""
 
     def __init__(
         self, frozen: FrozenEncoder, batch_size: int, n_step: int, gamma: float, generator: torch.Generator
     ) -> None:
-        self._frozen, self._batch_size, self._n_step, self._gamma = frozen, batch_size, n_step, gamma
-        self._generator = generator
-        self._view = frozen.view(0)
+        super().__init__(frozen.view(0), batch_size, generator)
+        self._frozen, self._n_step, self._gamma = frozen, n_step, gamma
         self._starts = frozen.dataset.transition_rows
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on with the same batches."""
-        return {"batches": self._generator.get_state(), "view": self._view.state_dict()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
-        self._generator.set_state(state["batches"])
-        self._view.load_state_dict(state["view"])
 
     def sample(self) -> FeatureBatch:
         """The next batch; sequence encoders read every row from the episode's start, or their history window."""
         dataset = self._frozen.dataset
-        index = torch.randint(len(self._starts), (self._batch_size,), generator=self._generator)
-        rows = self._starts[index.to(self._starts.device)]
+        rows = self._starts[self._draw(len(self._starts)).to(self._starts.device)]
         reward, discount, next_rows = dataset.n_step_returns(rows, self._n_step, self._gamma)
         z, next_z = self._encode(rows, next_rows)
         return FeatureBatch(z, dataset.action_after(rows), reward, discount, next_z)
@@ -204,16 +199,16 @@ class ExactSampler:
     @torch.no_grad()
     def _encode(self, rows: Tensor, next_rows: Tensor) -> tuple[Tensor, Tensor]:
         dataset, encoder = self._frozen.dataset, self._frozen.encoder
-        key = self._view.shifts.take((len(rows),), rows.device)
+        key = self.view.shifts.take((len(rows),), rows.device)
         if encoder.gru is None:
-            features = self._frozen.rows(torch.cat([rows, next_rows]), key.repeat(2), self._view)
+            features = self._frozen.rows(torch.cat([rows, next_rows]), key.repeat(2), self.view)
             return features[: len(rows)], features[len(rows) :]
         first = dataset.episode_start[dataset.episode[rows]]
         if encoder.config.history_window:
             first = torch.maximum(first, rows - encoder.config.history_window + 1)
         span = torch.arange(int((next_rows - first).max()) + 1, device=rows.device)
         history = torch.minimum(first[:, None] + span, next_rows[:, None])
-        features = self._frozen.rows(history.reshape(-1), key.repeat_interleave(len(span)), self._view)
+        features = self._frozen.rows(history.reshape(-1), key.repeat_interleave(len(span)), self.view)
         states = encoder.from_features(features.view(*history.shape, -1), dataset.actions_before(history))
         pick = torch.arange(len(rows), device=rows.device)
         return states[pick, rows - first], states[pick, next_rows - first]

@@ -18,7 +18,15 @@ from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.errors import UserError, refuse_number, refuse_outside
-from vd4rl_pomdp.evaluation import EpisodeJob, append_rows, drop_rows_after, evaluate, read_rows, rows_of, rows_until
+from vd4rl_pomdp.evaluation import (
+    EpisodeJob,
+    append_episodes,
+    drop_episodes_after,
+    episode_rows,
+    episodes_until,
+    evaluate,
+    read_episodes,
+)
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, EncoderCard, copy_encoder, encoder_hash, load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
@@ -53,11 +61,14 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     if card.end_to_end:
         config = end_to_end(config, card.end_to_end)
     if encoder.reads_state:
-        dataset.states()
-    _require_room(config, dataset, encoder, device)
+        dataset.require_states()
+    _check_n_step(config, dataset)
     card = replace(card, quality=dataset.quality or card.quality)  # the policy's set names its rows
     inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
-    with RunFolder(config.out, STAGE, config, inputs) as run:
+    run = RunFolder(config.out, STAGE, config, inputs)
+    if not run.finished:
+        _require_room(config, dataset, encoder, device, FeatureFile(run.path, inputs).exists)
+    with run:
         if not run.finished:
             write_json(run.path / "labels.json", _labels(config, card))
             _keep_encoder(config.encoder, run.path)
@@ -67,23 +78,34 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
 
 
 def end_to_end(config: FinetuneConfig, algorithm: str) -> FinetuneConfig:
-    """The settings for a method that has no frozen stage, and brings its algorithm along.
-
-    Raises:
-        UserError: a setting that was not the default is not read.
-    """
-    if config.views != config.usual()["views"]:
-        raise UserError(f"--views is not read by the algorithm {algorithm}, which trains the encoder: leave it out")
+    """The settings for a method that has no frozen stage, and brings its algorithm along; raises UserError as
+    `check_end_to_end` does."""
+    check_end_to_end(config, algorithm)
     return config.altered(algorithm=algorithm, views=0)
 
 
-def _require_room(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, device: torch.device) -> None:
-    """Refuse what plainly exceeds the memory or the disk: all views' features, or one batch through the networks."""
+def check_end_to_end(config: FinetuneConfig, algorithm: str) -> None:
+    """Raise UserError for an unknown algorithm, or a setting that was chosen and that it does not read."""
+    ALGORITHMS.check(algorithm)
+    if config.views != config.usual()["views"]:
+        raise UserError(f"--views is not read by the algorithm {algorithm}, which trains the encoder: leave it out")
+
+
+def _check_n_step(config: FinetuneConfig, dataset: Dataset) -> None:
+    """Raise UserError for returns over more steps than an episode has."""
     longest = int((dataset.episode_end - dataset.episode_start).max()) - 1
     refuse_number("n_step", _returns(config).n_step, 1, max(longest, ReturnOptions.n_step))
+
+
+def _require_room(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, device: torch.device, kept: bool) -> None:
+    """Refuse what plainly exceeds the memory or the disk: all views' features, or one batch through the networks.
+
+    Features that are `kept` on the disk already take no more of it.
+    """
     features = config.views * dataset.num_rows * encoder.dim * 2
     require_memory(features, device, config, "views")
-    require_disk(features, config.out, config, "views")
+    if not kept:
+        require_disk(features, config.out, config, "views")
     row, weights = 2 * encoder.dim + 4 * config.hidden_dim, 15 * config.hidden_dim**2  # of float32 numbers
     require_memory(4 * (config.batch_size * row + weights), device, config, "batch_size", "hidden_dim")
 
@@ -93,7 +115,9 @@ def _returns(config: FinetuneConfig) -> ReturnOptions:
     return config.options if isinstance(config.options, ReturnOptions) else ReturnOptions()
 
 
-def _trainer(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: EncoderCard, run: RunFolder) -> Trainer:
+def _trainer(
+    config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: EncoderCard, run: RunFolder
+) -> FinetuneTrainer:
     """What a run trains and on which batches: cached features, features encoded anew, or pixels."""
     seed_networks(config.seed, STAGE)
     policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(dataset.t.device)
@@ -114,7 +138,9 @@ def _trainer(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: E
         policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(4)]))
     noise = stream_generator(config.seed, STAGE, "noise")
     algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
-    return Trainer(EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, config, card)
+    return FinetuneTrainer(
+        EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, config, card
+    )
 
 
 def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
@@ -125,7 +151,7 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     write_json(run.path / "probe.json", probe_state(*arrays, TASKS.named(dataset.task)))
 
 
-class Trainer:
+class FinetuneTrainer:
     """One algorithm on one stream of batches."""
 
     def __init__(
@@ -161,7 +187,7 @@ class Trainer:
 
     def _require_evaluations(self, path: Path) -> None:
         """Raise UserError if rows of an evaluation before the newest are gone: the run would end without them."""
-        found = Counter(row["step"] for row in rows_until(path, self.step))
+        found = Counter(row["step"] for row in episodes_until(path, self.step))
         due = range(self.config.eval_every, self.step, self.config.eval_every)
         missing = [step for step in due if found[step] < self.config.eval_episodes]
         if missing:
@@ -171,12 +197,12 @@ class Trainer:
         """Whether the run was cut between a checkpoint and its evaluation; rows that count no more are dropped."""
         rows = run.path / "episodes.csv"
         self._require_evaluations(rows)
-        drop_rows_after(rows, self.step)
+        drop_episodes_after(rows, self.step)
         if not self.step or not loop.due(self.config.eval_every):
             return False
-        if sum(row["step"] == self.step for row in read_rows(rows)) == self.config.eval_episodes:
+        if sum(row["step"] == self.step for row in read_episodes(rows)) == self.config.eval_episodes:
             return False
-        drop_rows_after(rows, self.step - 1)
+        drop_episodes_after(rows, self.step - 1)
         return True
 
     def _evaluate(self, run: RunFolder, loop: Loop) -> None:
@@ -205,11 +231,11 @@ class Trainer:
             for episode in range(config.eval_episodes)
         ]
         episodes = evaluate(jobs, config.workers)
-        rows = rows_of(episodes, _labels(config, self.card) | {"step": self.step})
+        rows = episode_rows(episodes, _labels(config, self.card) | {"step": self.step})
         if episodes[0].film is not None:
             with replacing_file(run.path / "film.npz") as fresh, fresh.open("wb") as file:
                 np.savez_compressed(file, **episodes[0].film)  # type: ignore[arg-type]
-        append_rows(run.path / "episodes.csv", rows)
+        append_episodes(run.path / "episodes.csv", rows)
         return float(np.mean([row["score"] for row in rows]))
 
     def state(self) -> dict[str, Any]:

@@ -36,7 +36,7 @@ DECIDE_MEMORY = ("batch_size", "window", "feature_dim", "hidden_dim", "head_dim"
 
 def pretrain(config: PretrainConfig) -> RunFolder:
     """Run the stage, or go on with it, and write `out/encoder`; returns the run's folder."""
-    check(config)
+    check_config(config)
     refuse_inside(config.out)
     with telling_memory(config, *DECIDE_MEMORY):
         return _pretrain(config)
@@ -54,7 +54,7 @@ def _pretrain(config: PretrainConfig) -> RunFolder:
         require_batch(objective, device, config)
     with RunFolder(config.out, STAGE, replace(config, task=task), {"data": dataset.fingerprint}) as run:
         if not run.finished:
-            trainer = Trainer(objective.to(device), dataset.to(device), config)
+            trainer = PretrainTrainer(objective.to(device), dataset.to(device), config)
             trainer.run(run, config.steps if method.trained else 0)
             card = _card(config, task, dataset, run)
             save_encoder(run.path / "encoder", _with_history_window(objective.encoder, config), card)
@@ -62,7 +62,7 @@ def _pretrain(config: PretrainConfig) -> RunFolder:
     return run
 
 
-class Trainer:
+class PretrainTrainer:
     """One objective on one data set."""
 
     def __init__(self, objective: Objective, dataset: Dataset, config: PretrainConfig) -> None:
@@ -116,7 +116,7 @@ class Trainer:
         self.sampler.load_state_dict(state["sampler"])
 
 
-def check(config: PretrainConfig) -> None:
+def check_config(config: PretrainConfig) -> None:
     """Refuse settings that cannot work, before anything is read or written."""
     config.check()
     check_pictures(config, FRAME_SIZES[1])
@@ -148,7 +148,7 @@ def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
     target = build_target(config, dataset.action_after(dataset.transition_rows).numpy())
     state_dim = dataset.states().shape[1] if METHODS.named(config.method).reads_state else 0
     objective = build_objective(config, dataset.action_dim, target, state_dim, (3 * FRAME_STACK, dataset.frame_size))
-    dataset.num_windows(config.window)
+    dataset.check_windows(config.window)
     return objective
 
 

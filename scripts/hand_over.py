@@ -51,14 +51,14 @@ def play(agent: Agent, expert: Actor, env: CorruptedEnv, task: Task, after: int,
     agent.reset()
     now = env.reset(EVALUATION_SEED + episode, EVALUATION_SEED, episode)
     rewards, errors = [], []
-    while not now.row.last:
-        action, shown = agent.act(agent.observe(now, task)), expert.act(now.row.state)
+    while not now.time_step.last:
+        action, shown = agent.act(agent.encoder_input(now, task)), expert.act(now.time_step.state)
         errors.append(float(np.square(action - shown).mean()))
         if len(errors) <= after:
             action = shown
-            agent.acted(action)
+            agent.set_last_action(action)
         now = env.step(action)
-        rewards.append(now.row.reward)
+        rewards.append(now.time_step.reward)
     spans = {f"error_{a}_{b or 'end'}": round(float(np.mean(errors[a:b])), 4) for a, b in SPANS}
     return {"reward": round(float(np.mean(rewards[after:])), 4)} | spans
 

@@ -4,8 +4,34 @@ Ctrl-C is answered, also where the tests were started in the background of a she
 """
 
 import signal
+from pathlib import Path
 
+import pytest
 import torch
+
+from tests.helpers_data import write_fake_set
 
 torch.set_num_threads(1)
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+
+@pytest.fixture
+def own_cache(tmp_path, monkeypatch):
+    """Decoded sets go to the test's own folder, and runs record no path of pytest as their command."""
+    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+    monkeypatch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
+
+
+@pytest.fixture
+def data(tmp_path) -> Path:
+    """A small expert set of walker_walk."""
+    return write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25, 30])
+
+
+@pytest.fixture
+def encoder(data, own_cache, tmp_path) -> Path:
+    """Folder of an encoder that was pretrained on `data`."""
+    from pretrain.train import pretrain
+    from tests.helpers_stages import smoke_pretrain  # not before: most tests train nothing
+
+    return pretrain(smoke_pretrain(data, tmp_path / "pretrained")).path / "encoder"

@@ -36,8 +36,8 @@ NOT_RUN = {
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
     "vd4rl-pomdp policy": "trains for hours; tests/policies trains less",
-    "vd4rl-pomdp navigation": "trains for minutes to days; pretrain/test_navigation_train trains less",
-    "vd4rl-pomdp pretrain --method": "test_stages runs every method in its smoke size",
+    "vd4rl-pomdp navigation": "trains for minutes to days; pretrain/navigation/test_train trains less",
+    "vd4rl-pomdp pretrain --method": "pretrain/test_train runs every method in its smoke size",
     "vd4rl-pomdp finetune --encoder RUN": "as above",
 }
 """How a line begins that is parsed, if it is ours, but not run, and why."""

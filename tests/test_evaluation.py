@@ -6,12 +6,26 @@ import numpy as np
 import pytest
 import torch
 
+from finetune.train import finetune
+from tests.helpers_stages import smoke_finetune
 from tests.nn.test_encoder import CARD
 from vd4rl_pomdp import evaluation
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import Observation
-from vd4rl_pomdp.envs.pixels import Row
-from vd4rl_pomdp.evaluation import EVALUATION_SEED, EpisodeJob, evaluate, rows_of
+from vd4rl_pomdp.envs.pixels import TimeStep
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.evaluation import (
+    COLUMNS,
+    EVALUATION_SEED,
+    EpisodeJob,
+    append_episodes,
+    begin_episodes,
+    drop_episodes_after,
+    episode_rows,
+    evaluate,
+    evaluate_run,
+    read_episodes,
+)
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.tasks import TASKS
@@ -43,8 +57,8 @@ class ScriptedEnv:
     def _show(self, reward: float, step_type: StepType) -> Observation:
         obs = torch.randint(0, 256, (9, 84, 84), generator=self._random, dtype=torch.uint8)
         self.seen[-1].append(obs)
-        row = Row(None, np.zeros(24, np.float32), np.zeros(18), reward, 1.0, step_type)
-        return Observation(obs, torch.full_like(obs, 255), row)
+        time_step = TimeStep(None, np.zeros(24, np.float32), np.zeros(18), reward, 1.0, step_type)
+        return Observation(obs, torch.full_like(obs, 255), time_step)
 
 
 @pytest.fixture
@@ -105,11 +119,67 @@ def test_episode_i_has_the_environment_seed_20000_plus_i_and_its_own_corruption(
     play(tmp_path, 0, 3)
     assert world[0].seeds == [(20_000, 20_000, 0), (20_003, 20_000, 3)]
     labels = {"method": "x", "task": "walker_walk"}
-    assert [row["episode_seed"] for row in rows_of(play(tmp_path, 3), labels)] == [EVALUATION_SEED + 3]
+    assert [row["episode_seed"] for row in episode_rows(play(tmp_path, 3), labels)] == [EVALUATION_SEED + 3]
 
 
 def test_a_return_is_the_sum_of_all_rewards_and_a_score_a_tenth_of_it(world, agent, tmp_path):
     (episode,) = play(tmp_path, 0)
     assert (episode.total, episode.length) == (sum(REWARDS), LENGTH)
-    (row,) = rows_of([episode], {"task": "walker_walk"})
+    (row,) = episode_rows([episode], {"task": "walker_walk"})
     assert (row["return"], row["score"], row["length"]) == (11.75, 1.175, LENGTH)
+
+
+def test_an_evaluation_names_its_step_and_touches_no_other_file(encoder, data, tmp_path):
+    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2))
+    (run.path / "timing.json").unlink()  # an unfinished run has a step, too
+    with pytest.raises(UserError, match="--episodes is 0"):
+        evaluate_run(run.path, None, 0, 1)
+    with pytest.raises(UserError, match="unknown corruption 'fog'"):
+        evaluate_run(run.path, "fog", 1, 1)
+    with pytest.raises(UserError, match="holds no evaluated run"):
+        evaluate_run(encoder.parent, None, 1, 1)
+    assert [row["step"] for row in evaluate_run(run.path, None, 1, 1)] == [2]
+    (run.path / "labels.json").write_text("{}")
+    with pytest.raises(UserError, match=r"labels\.json: has no 'method'"):
+        evaluate_run(run.path, None, 1, 1)
+    thesis = tmp_path / "thesis.csv"
+    thesis.write_text("a,b\n1,2\n")
+    with pytest.raises(UserError, match="has no column 'method'"):
+        begin_episodes(thesis)
+    assert thesis.read_text() == "a,b\n1,2\n"
+
+
+def test_a_table_of_episodes_is_begun_before_any_is_played_and_only_once(tmp_path):
+    path = tmp_path / "episodes.csv"
+    begin_episodes(path)
+    header = path.read_text()
+    assert header == ",".join(COLUMNS) + "\n"
+    begin_episodes(path)
+    assert path.read_text() == header
+    with pytest.raises(UserError, match=r"nowhere/episodes\.csv: cannot be used"):
+        begin_episodes(tmp_path / "nowhere" / "episodes.csv")
+
+
+def test_a_line_that_was_cut_is_dropped_with_what_follows_the_checkpoint(tmp_path):
+    path = tmp_path / "episodes.csv"
+    row = dict.fromkeys(("method", "task", "quality", "corruption", "algorithm"), "x")
+    row |= dict.fromkeys(("seed", "episode", "episode_seed", "return", "length", "score"), 1)
+    append_episodes(path, [row | {"step": 1}, row | {"step": 2}])
+    path.write_text(path.read_text() + "mik+a,walker_w")
+    with pytest.raises(UserError, match="a row is not whole"):
+        read_episodes(path)
+    drop_episodes_after(path, 1)
+    assert [row["step"] for row in read_episodes(path)] == [1]
+
+
+@pytest.mark.parametrize("cell", ["nan", "inf", "many", "9" * 200_000], ids=["nan", "inf", "word", "endless"])
+def test_a_damaged_table_of_episodes_is_named_and_kept(tmp_path, cell):
+    path = tmp_path / "episodes.csv"
+    row = dict.fromkeys(("method", "task", "quality", "corruption", "algorithm"), "x")
+    row |= dict.fromkeys(("seed", "episode", "episode_seed", "return", "length"), 1)
+    append_episodes(path, [row | {"step": 1, "score": cell}])
+    before = path.read_bytes()
+    for read in (lambda: read_episodes(path), lambda: drop_episodes_after(path, 1)):
+        with pytest.raises(UserError, match=r"episodes\.csv: (a row is not whole|the score of seed 1)"):
+            read()
+    assert path.read_bytes() == before

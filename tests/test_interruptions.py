@@ -23,10 +23,10 @@ from pretrain.navigation.probe import COMPONENTS
 from pretrain.navigation.train import train as run_navigation
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
-from tests.test_stages import contents, smoke_finetune, smoke_pretrain
+from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import read_rows
+from vd4rl_pomdp.evaluation import read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
 from vd4rl_pomdp.runs.metrics import read_metrics
@@ -83,10 +83,10 @@ def stage(request) -> Stage:
     if request.param == "navigation":
         given = {"steps": 8, "log_every": 4, "checkpoint_every": 4, "precision": "fp32"}
         config = NavigationConfig.of("smoke", data=request.getfixturevalue("maze"), **given)
-        return run_navigation, lambda out: replace(config, out=out), pretrain.navigation.trainer.Trainer
+        return run_navigation, lambda out: replace(config, out=out), pretrain.navigation.trainer.NavigationTrainer
     data = request.getfixturevalue("data")
     if request.param == "pretrain":
-        return run_pretrain, lambda out: smoke_pretrain(data, out, method="no_history"), pretrain.train.Trainer
+        return run_pretrain, lambda out: smoke_pretrain(data, out, method="no_history"), pretrain.train.PretrainTrainer
     encoder, changes = request.getfixturevalue("encoder"), FINETUNE | {"algorithm": "bc"}
     return run_finetune, lambda out: smoke_finetune(encoder, data, out, **changes), bc.BC
 
@@ -324,19 +324,19 @@ def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(encoder, data, tmp_
     changes = FINETUNE | {"eval_episodes": 2}
     whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes))
     config = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
-    append = finetune.train.append_rows
+    append = finetune.train.append_episodes
 
     def cut(path: Path, rows: list[dict[str, Any]]) -> None:
         append(path, rows[:1] if rows_written else [])
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(finetune.train, "append_rows", cut)
+        patch.setattr(finetune.train, "append_episodes", cut)
         with pytest.raises(KeyboardInterrupt):
             run_finetune(config)
     run_finetune(config)
     assert contents(config.out) == contents(whole.path)
-    assert [row["step"] for row in read_rows(config.out / "episodes.csv")] == [6, 6, 12, 12]
+    assert [row["step"] for row in read_episodes(config.out / "episodes.csv")] == [6, 6, 12, 12]
 
 
 def test_an_old_format_is_refused_before_anything_is_written(data, tmp_path):

@@ -7,14 +7,7 @@ from pathlib import Path
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("vd4rl_pomdp", "pretrain", "finetune", "baselines")
 SHARED = {
-    "CollectConfig": "settings of one command each, data collect and navigation collect",
-    "Info": "Gymnasium's dictionary of facts, in every environment",
-    "Policy": "in data.collect who plays, in nn.policy the network on representations",
-    "ReportCommand": "words of one command each",
-    "Row": "in envs.dmc a time step of an environment, in runs.files a row of a table",
     "Table": "in cli.dispatch the commands by name, in experiments.navigation.report one of the paper's tables",
-    "Trainer": "one for each stage",
-    "View": "in data.view a set as an agent sees it, in envs.maze_view a way of drawing a maze",
 }
 """Names that mean several things, and which."""
 

@@ -22,7 +22,7 @@ from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import read_shard
 from vd4rl_pomdp.envs.pixels import make_env
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import Episode, evaluate_run, read_rows, rows_of
+from vd4rl_pomdp.evaluation import Episode, episode_rows, evaluate_run, read_episodes
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.policies.config import PolicyConfig, recipes
 from vd4rl_pomdp.policies.train import train_policy
@@ -80,7 +80,7 @@ def test_tasks_of_both_kinds_and_any_size_go_through_every_stage(tasks, tmp_path
     assert checked["replay_max_error"] == (None if name == "centre" else 0.0)
     run = stages(data, tmp_path / "runs")
     assert load_encoder(run / "encoder")[0].config.size == size
-    assert {row["task"] for row in read_rows(run / "episodes.csv")} == {name}
+    assert {row["task"] for row in read_episodes(run / "episodes.csv")} == {name}
     assert {row["task"] for row in evaluate_run(run, "patch", 1, 1)} == {name}
     assert np.load(run / "film.npz")["corrupted"].shape[1:] == (9, size, size)
     assert (run / "probe.json").exists() == (name != "centre")
@@ -157,7 +157,7 @@ def test_pictures_too_small_for_a_patch_a_shift_or_an_encoder_are_refused_before
         ({"frame_encoder": "nature"}, "frame encoder 'nature' cannot read pictures of 16x16 pixels"),
     ):
         with pytest.raises(UserError, match=message):
-            run_pretrain(replace(base, **changes))
+            run_pretrain(base.altered(**changes))
         assert not (tmp_path / "run").exists()
 
 
@@ -169,14 +169,14 @@ def test_an_evaluation_is_never_longer_than_the_task(tasks, tmp_path):
     encoder = run_pretrain(pretrain.config.PretrainConfig.of("smoke", data=data, out=tmp_path / "pretrain")).path
     config = finetune.config.FinetuneConfig.of("smoke", encoder=encoder / "encoder", data=data, workers=1)
     run = run_finetune(replace(config, out=tmp_path / "run", eval_length=500))
-    assert {row["length"] for row in read_rows(run.path / "episodes.csv")} == {9}
+    assert {row["length"] for row in read_episodes(run.path / "episodes.csv")} == {9}
     with pytest.raises(UserError, match="--eval-length is 501; it must be at least 1 and at most 500"):
         run_finetune(replace(config, out=tmp_path / "other", eval_length=501))
 
 
 def test_a_score_is_divided_by_the_tasks_own_number(tasks):
     tasks.register("games", replace(tasks["centre"], score_divisor=4.0))
-    (row,) = rows_of([Episode(0, 2.0, 1, None)], {"task": "games"})
+    (row,) = episode_rows([Episode(0, 2.0, 1, None)], {"task": "games"})
     assert (row["return"], row["score"]) == (2.0, 0.5)
 
 

@@ -203,10 +203,10 @@ def test_every_flag_of_the_navigation_page_exists():
 
     from pretrain.navigation.config import NavigationConfig
     from vd4rl_pomdp.cli.navigation import GridCommand
-    from vd4rl_pomdp.navigation.config import CollectConfig
+    from vd4rl_pomdp.navigation.config import MazeCollectConfig
     from vd4rl_pomdp.options import option_names
 
-    configs = (NavigationConfig, CollectConfig, GridCommand)
+    configs = (NavigationConfig, MazeCollectConfig, GridCommand)
     flags = {name.replace("_", "-") for c in configs for name in ({f.name for f in fields(c)} | option_names())}
     named = re.findall(r"`--([a-z0-9-]+)", (ROOT / "docs" / "navigation.md").read_text())
     assert len(named) > 20

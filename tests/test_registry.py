@@ -45,6 +45,9 @@ def test_what_a_block_registers_is_forgotten_after_it(registry):
 def test_an_unknown_name_is_told_the_choices(registry):
     with pytest.raises(UserError, match="unknown frame encoder 'owl': choose one of own, own\\+a"):
         registry.named("owl")
+    with pytest.raises(UserError, match="unknown frame encoder 'owl'"):
+        registry.check("owl")
+    registry.check("own")
 
 
 def test_a_taken_name_is_refused(registry):

@@ -35,10 +35,10 @@ def test_the_expert_acts_first_and_the_policy_remembers_its_actions(monkeypatch)
     watched = CorruptedEnv(TASKS["walker_walk"], CorruptionConfig.of("none"), length=60)
     now = watched.reset(20_000, 20_000, 0)
     for action in executed[:59]:
-        np.testing.assert_array_equal(action, expert.act(now.row.state))
+        np.testing.assert_array_equal(action, expert.act(now.time_step.state))
         now = watched.step(action)
-    assert not np.allclose(executed[59], expert.act(now.row.state))
-    assert result["reward"] == round(float(watched.step(executed[59]).row.reward), 4)
+    assert not np.allclose(executed[59], expert.act(now.time_step.state))
+    assert result["reward"] == round(float(watched.step(executed[59]).time_step.reward), 4)
 
 
 def test_the_comparison_writes_over_no_run(tmp_path, monkeypatch):

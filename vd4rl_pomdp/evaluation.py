@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from vd4rl_pomdp.corruptions import CorruptionConfig, make_corruption
+from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.errors import UserError, refuse_number
@@ -52,11 +52,11 @@ class Agent:
         """Height and width of the pictures it is shown; one that reads states is watched in the benchmark's."""
         return FRAME_SIZE if self.encoder.reads_state else self.encoder.config.size
 
-    def observe(self, now: Observation, task: Task) -> torch.Tensor:
+    def encoder_input(self, now: Observation, task: Task) -> torch.Tensor:
         """What the encoder reads: the corrupted stack, or the simulator state for the `state` reference."""
         if not self.encoder.reads_state:
             return now.obs
-        return torch.from_numpy(task.visible_state(now.row.physics))[:, None, None]
+        return torch.from_numpy(task.visible_state(now.time_step.physics))[:, None, None]
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> np.ndarray:
@@ -65,7 +65,7 @@ class Agent:
         self._action = self.policy(z)
         return self._action[0].numpy()
 
-    def acted(self, action: np.ndarray) -> None:
+    def set_last_action(self, action: np.ndarray) -> None:
         """Tell that another (A,) action than the last answer was executed."""
         self._action = torch.from_numpy(action)[None]
 
@@ -110,7 +110,7 @@ def evaluate(
     return episodes
 
 
-def rows_of(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, Any]]:
+def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, Any]]:
     """Rows of `episodes.csv`: one an episode, `labels` giving the columns up to `step`."""
     divisor = TASKS.named(labels["task"]).score_divisor
     return [
@@ -126,9 +126,18 @@ def rows_of(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, A
     ]
 
 
-def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
+def begin_episodes(path: Path) -> None:
+    """Make an `episodes.csv` without rows, unless there is one, so that a path that cannot be written is known early.
+
+    Raises:
+        UserError: the file cannot be written, is of another kind, or is damaged; it stays as it is.
+    """
+    append_episodes(path, [])
+
+
+def append_episodes(path: Path, rows: list[dict[str, Any]]) -> None:
     """Append rows to an `episodes.csv`, writing its header first; another kind of file raises UserError untouched."""
-    read_rows(path)
+    check_episodes(path)
     new = not path.exists() or path.stat().st_size == 0
     with appending(path) as file:
         writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
@@ -137,7 +146,7 @@ def append_rows(path: Path, rows: list[dict[str, Any]]) -> None:
         writer.writerows(rows)
 
 
-def read_rows(path: Path) -> list[dict[str, Any]]:
+def read_episodes(path: Path) -> list[dict[str, Any]]:
     """Rows of an `episodes.csv`, numbers parsed, none if there is no file or it is empty.
 
     Raises:
@@ -147,6 +156,11 @@ def read_rows(path: Path) -> list[dict[str, Any]]:
         return []
     with _whole(path), path.open(newline="", encoding="utf-8") as file:
         return _parse(path, file)
+
+
+def check_episodes(path: Path) -> None:
+    """Raise UserError unless `read_episodes` can read a file."""
+    read_episodes(path)
 
 
 @contextmanager
@@ -181,17 +195,17 @@ def _scores(path: Path, row: dict[str, str]) -> dict[str, float]:
     return scores
 
 
-def drop_rows_after(path: Path, step: int) -> None:
+def drop_episodes_after(path: Path, step: int) -> None:
     """Forget evaluations that a cut run made after its last checkpoint, and a last line that is not whole."""
     if not path.exists():
         return
-    if kept := rows_until(path, step):
+    if kept := episodes_until(path, step):
         write_csv(path, COLUMNS, kept)
     else:
         path.unlink()
 
 
-def rows_until(path: Path, step: int) -> list[dict[str, Any]]:
+def episodes_until(path: Path, step: int) -> list[dict[str, Any]]:
     """Rows of the evaluations up to a step, none if there is no file; a last line that is not whole is left out."""
     if not path.exists():
         return []
@@ -220,9 +234,9 @@ def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
     agent.reset()
     now = env.reset(EVALUATION_SEED + job.episode, EVALUATION_SEED, job.episode)
     total, length, film = 0.0, 0, [(now, 0.0)]
-    while not now.row.last:
-        now = env.step(agent.act(agent.observe(now, job.task)))
-        total += now.row.reward
+    while not now.time_step.last:
+        now = env.step(agent.act(agent.encoder_input(now, job.task)))
+        total += now.time_step.reward
         length += 1
         if job.film and length % FILM_EVERY == 0:
             film.append((now, total))
@@ -254,7 +268,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     """
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
-    evaluated = read_rows(run / "episodes.csv")
+    evaluated = read_episodes(run / "episodes.csv")
     if not evaluated:
         raise UserError(f"{run}: holds no evaluated run; name a folder that `vd4rl-pomdp finetune` wrote")
     labels = read_json(run / "labels.json")
@@ -264,10 +278,10 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     card = load_encoder(run / "encoder")[1]
     task = TASKS.named(card.task)
     chosen = CorruptionConfig.fill(card.corruption) if corruption is None else CorruptionConfig.of(corruption)
-    make_corruption(chosen)
+    chosen.check()
     jobs = [
         EpisodeJob(run / "encoder", run / "policy", 0, task, chosen, episode, film=False) for episode in range(episodes)
     ]
     step = max(row["step"] for row in evaluated)
     done = evaluate(jobs, workers)
-    return rows_of(done, labels | {"corruption": chosen.corruption, "step": step})
+    return episode_rows(done, labels | {"corruption": chosen.corruption, "step": step})

@@ -62,6 +62,10 @@ class Registry(Mapping[str, Part], Generic[Part]):
             raise UserError(f"unknown {self.kind} {name!r}: choose one of {', '.join(self._parts)}")
         return self._parts[name]
 
+    def check(self, name: str) -> None:
+        """Raise UserError unless there is a part called `name` that can be loaded."""
+        self.named(name)
+
     def origin(self, name: str) -> str:
         """Where a part comes from: a package and its version, a call, or "" for this package's own."""
         self._load_offered()

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from pretrain.navigation.config import NavigationConfig
 from pretrain.navigation.probe import COMPONENTS, ErrorSums, StateProbe, refit
-from pretrain.navigation.trainer import Trainer
+from pretrain.navigation.trainer import NavigationTrainer
 from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.navigation.measures import Measure, measure_rows
 from vd4rl_pomdp.navigation.methods import UNTRAINED
@@ -28,7 +28,7 @@ TRAJECTORY_ROWS = 200
 
 
 @torch.no_grad()
-def evaluate(trainer: Trainer) -> tuple[dict[str, float], dict[str, float]]:
+def evaluate(trainer: NavigationTrainer) -> tuple[dict[str, float], dict[str, float]]:
     """Action losses, and errors of the probe as trained, on held-out windows."""
     sums: dict[str, float] = defaultdict(float)
     errors, count = ErrorSums(), 0
@@ -44,14 +44,14 @@ def evaluate(trainer: Trainer) -> tuple[dict[str, float], dict[str, float]]:
 
 
 @torch.no_grad()
-def encode(trainer: Trainer, number: Tensor, length: int | None = None) -> tuple[Tensor, Tensor]:
+def encode(trainer: NavigationTrainer, number: Tensor, length: int | None = None) -> tuple[Tensor, Tensor]:
     """Frozen states (B, T, D) float32 of windows, and their rows (B, T)."""
     window = trainer.data.windows(number, length)
     with autocast(trainer.device, trainer.config.precision):
         return trainer.objective.encoder.encode(window).float(), trainer.data.states.rows(window)
 
 
-def refitted_errors(trainer: Trainer) -> tuple[StateProbe, dict[str, dict[str, float]]]:
+def refitted_errors(trainer: NavigationTrainer) -> tuple[StateProbe, dict[str, dict[str, float]]]:
     """A probe fitted on frozen states of training windows, and its errors by split."""
     config, states = trainer.config, trainer.data.states
     trainer.objective.eval()
@@ -68,7 +68,7 @@ def refitted_errors(trainer: Trainer) -> tuple[StateProbe, dict[str, dict[str, f
     return probe, found
 
 
-def measure(trainer: Trainer, log: Path) -> tuple[StateProbe, list[dict[str, Any]]]:
+def measure(trainer: NavigationTrainer, log: Path) -> tuple[StateProbe, list[dict[str, Any]]]:
     """The probe refitted on frozen states, and all rows that `results.json` keeps; `log` is the run's metrics.jsonl."""
     probe, refitted = refitted_errors(trainer)
     values: dict[Measure, float] = {}
@@ -111,7 +111,7 @@ def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]
     return {name: sum(numbers) / len(numbers) for name, numbers in values.items()}
 
 
-def write_trajectory(path: Path, trainer: Trainer, probe: StateProbe) -> None:
+def write_trajectory(path: Path, trainer: NavigationTrainer, probe: StateProbe) -> None:
     """True and estimated states of the first held-out trajectory, read as one stream."""
     dataset, states = trainer.data.dataset, trainer.data.states
     start = int(dataset.episode_start[trainer.data.first_held_out])

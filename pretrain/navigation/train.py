@@ -11,7 +11,7 @@ import shlex
 from pretrain.navigation.config import NavigationConfig, command_of
 from pretrain.navigation.data import open_data
 from pretrain.navigation.measure import measure, write_trajectory
-from pretrain.navigation.trainer import STAGE, Trainer, make_objective
+from pretrain.navigation.trainer import STAGE, NavigationTrainer, make_objective
 from pretrain.train import DECIDE_MEMORY, require_batch
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.navigation.methods import UNTRAINED
@@ -42,13 +42,13 @@ def _train(config: NavigationConfig) -> RunFolder:
     require_batch(objective, device, config)
     with RunFolder(config.out, STAGE, config, data.inputs) as run:
         if not run.finished:
-            trainer = Trainer(objective.to(device), data.on(device), config)
+            trainer = NavigationTrainer(objective.to(device), data.on(device), config)
             trainer.run(run, 0 if config.method == UNTRAINED else config.steps)
             _conclude(run, trainer)
     return run
 
 
-def _conclude(run: RunFolder, trainer: Trainer) -> None:
+def _conclude(run: RunFolder, trainer: NavigationTrainer) -> None:
     """Measure, and write what is kept of a run."""
     config, data, trained = trainer.config, trainer.data, run.seconds
     probe, rows = measure(trainer, run.path / "metrics.jsonl")

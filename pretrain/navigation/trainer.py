@@ -38,7 +38,7 @@ def make_objective(data: MazeData, config: NavigationConfig) -> InverseObjective
     return objective
 
 
-class Trainer:
+class NavigationTrainer:
     """One objective and its probe on one maze's data."""
 
     def __init__(self, objective: InverseObjective, data: MazeData, config: NavigationConfig) -> None:

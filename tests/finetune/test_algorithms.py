@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from finetune.algorithms import Loss, drqv2_bc, td3_bc
+from finetune.algorithms import ALGORITHMS, Loss, drqv2_bc, td3_bc
 from finetune.algorithms.bc import BC
 from finetune.algorithms.drqv2_bc import DrQv2BC
 from finetune.algorithms.iql import IQL, IQLOptions, expectile_loss
@@ -326,3 +326,23 @@ def test_an_update_steps_along_each_loss_before_the_next_is_computed():
     algorithm = make(Twice)
     assert [v.item() for v in algorithm.update(batch()).values()] == [0.0, -1.0]
     assert seen == [0.0, -1.0]
+
+
+def test_what_reads_rewards_finds_the_better_action_and_bc_the_common_one():
+    """One state, two actions: the rarer one is paid. TD3+BC, DrQ-v2+BC and IQL must lean to it, BC to their mean."""
+    chosen = {}
+    for name, build in ALGORITHMS.items():
+        torch.manual_seed(0)
+        policy, options = Policy(2, 1, 32), build.options.fill({"alpha": 25.0})
+        algorithm = build(policy, options, 3e-3, 300, torch.Generator().manual_seed(0))
+        action = torch.where(torch.arange(64) % 4 == 0, 0.5, -0.5)[:, None]
+        batch = FeatureBatch(
+            torch.zeros(64, 2), action, (action[:, 0] > 0).float(), torch.zeros(64), torch.zeros(64, 2)
+        )
+        for _ in range(300):
+            algorithm.update(batch)
+        chosen[name] = policy(torch.zeros(1, 2)).item()
+    assert chosen["bc"] == pytest.approx(-0.25, abs=0.02)
+    assert chosen["td3_bc"] > 0.2
+    assert chosen["drqv2_bc"] > 0.2
+    assert chosen["iql"] > 0.1

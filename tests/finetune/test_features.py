@@ -4,20 +4,18 @@ import numpy as np
 import pytest
 import torch
 
-from finetune.features import FeatureFile, FeatureSampler, FrozenEncoder, encode_views
+from finetune.features import ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
 from tests.helpers_data import fake_action, fake_reward, fake_rows, write_fake_set
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.nn import Encoder, EncoderConfig
+from vd4rl_pomdp.nn import Encoder, EncoderConfig, load_encoder
 
 LENGTHS, VIEWS, N, GAMMA = (6, 4), 3, 2, 0.5
 ROWS = [(e, t) for e, length in enumerate(LENGTHS) for t in range(length)]
 
 
-@pytest.fixture(autouse=True)
-def _cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+pytestmark = pytest.mark.usefixtures("own_cache")
 
 
 def test_every_field_of_a_batch_is_of_one_transition_and_both_ends_of_one_view(tmp_path):
@@ -85,3 +83,18 @@ def test_an_episodes_first_row_carries_no_action(tmp_path):
     for number in range(len(LENGTHS)):
         one, other = (made.episode(number, made.view(0)) for made in (plain, odd))
         torch.testing.assert_close(one, other)
+
+
+def test_exact_batches_agree_with_cached_features(encoder, data):
+    """Without corruption and shift both modes must give the same representation for the same row."""
+    dataset = open_dataset(data)
+    network, _ = load_encoder(encoder)
+    frozen = FrozenEncoder(network, dataset, CorruptionConfig(), 0, "fp32", 0)
+    cached = torch.cat([frozen.episode(i, frozen.view(0)) for i in range(dataset.num_episodes)])
+    sampler = ExactSampler(frozen, 16, 3, 0.99, torch.Generator().manual_seed(0))
+    index = torch.randint(dataset.num_transitions, (16,), generator=torch.Generator().manual_seed(0))
+    batch = sampler.sample()
+    rows = sampler._starts[index]
+    torch.testing.assert_close(batch.z, cached[rows], atol=1e-5, rtol=1e-4)
+    next_rows = torch.minimum(rows + 3, dataset.episode_end[dataset.episode[rows]] - 1)
+    torch.testing.assert_close(batch.next_z, cached[next_rows], atol=1e-5, rtol=1e-4)

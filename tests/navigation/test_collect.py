@@ -12,10 +12,10 @@ from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.envs.maze import MazeEnv
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.navigation.collect import collect
-from vd4rl_pomdp.navigation.config import PRESETS, CollectConfig
+from vd4rl_pomdp.navigation.config import PRESETS, MazeCollectConfig
 
 
-def small(out: Path, **changes: object) -> CollectConfig:
+def small(out: Path, **changes: object) -> MazeCollectConfig:
     given = {"maze": "three_curtains", "out": out, "trajectories": 4, "trajectory_rows": 30, "workers": 1}
     return replace(PRESETS["cpu"], **(given | {"trajectories_per_shard": 2} | changes))
 

@@ -7,22 +7,22 @@ import torch
 
 from baselines import CURL
 from pretrain.config import PretrainConfig
-from pretrain.train import Trainer
+from pretrain.train import PretrainTrainer
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.nn import Encoder, EncoderConfig
 
 
 @pytest.fixture
-def trainer(tmp_path) -> Trainer:
+def trainer(tmp_path) -> PretrainTrainer:
     dataset = open_dataset(write_fake_set(tmp_path / "set", [20, 25]), tmp_path / "cache")
     torch.manual_seed(0)
     encoder = Encoder(EncoderConfig(6, "nature", 8))
     config = PretrainConfig.of("smoke", method="curl", data=Path(), out=Path(), corruption="patch", learning_rate=1e-2)
-    return Trainer(CURL(encoder, None, config.options, 0), dataset, config)
+    return PretrainTrainer(CURL(encoder, None, config.options, 0), dataset, config)
 
 
-def test_curls_momentum_encoder_follows_the_encoder_at_every_step_of_a_training(trainer: Trainer):
+def test_curls_momentum_encoder_follows_the_encoder_at_every_step_of_a_training(trainer: PretrainTrainer):
     objective = trainer.objective
     for _ in range(2):
         old = [p.clone() for p in objective.momentum_encoder.parameters()]
@@ -34,7 +34,7 @@ def test_curls_momentum_encoder_follows_the_encoder_at_every_step_of_a_training(
             assert not torch.equal(slow, was)
 
 
-def test_an_objective_is_told_how_much_of_the_training_is_done(trainer: Trainer):
+def test_an_objective_is_told_how_much_of_the_training_is_done(trainer: PretrainTrainer):
     told, loss = [], trainer.objective.loss
     trainer.objective.loss = lambda window, progress: (told.append(progress), loss(window, progress))[1]
     for _ in range(3):
@@ -42,7 +42,7 @@ def test_an_objective_is_told_how_much_of_the_training_is_done(trainer: Trainer)
     assert told == [0.0, 1 / 20, 2 / 20]
 
 
-def test_an_objective_sees_patches_and_rows_of_one_episode(trainer: Trainer):
+def test_an_objective_sees_patches_and_rows_of_one_episode(trainer: PretrainTrainer):
     window = trainer.batch()
     hidden = (window.obs.view(2, 8, 3, 3, 84, 84) == 0).all(3)
     assert (hidden.flatten(3).sum(3) >= 16 * 16).all()

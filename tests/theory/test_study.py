@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from matplotlib.text import Annotation
 
-from tests.report.test_report import write_run
+from tests.helpers_report import write_run
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.report import write_report

@@ -13,9 +13,9 @@ from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
 
 def _collect(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.navigation.collect import collect
-    from vd4rl_pomdp.navigation.config import PRESETS, CollectConfig
+    from vd4rl_pomdp.navigation.config import PRESETS, MazeCollectConfig
 
-    config = with_presets(CollectConfig, PRESETS, words, program)
+    config = with_presets(MazeCollectConfig, PRESETS, words, program)
     print(f"{len(collect(config))} shards in {config.out}")
 
 
@@ -36,7 +36,7 @@ def _policy(words: Arguments, program: str) -> None:
 
 
 @dataclass(frozen=True)
-class ReportCommand:
+class NavigationReportCommand:
     """Write the paper's navigation tables and figures about finished runs."""
 
     runs: tyro.conf.Positional[list[Path]]
@@ -51,7 +51,7 @@ def _report(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.experiments.navigation.report import write_report
     from vd4rl_pomdp.navigation.samples import sample_observations
 
-    command = parse(ReportCommand, words, program)
+    command = parse(NavigationReportCommand, words, program)
     samples = sample_observations if command.pictures else None
     print(f"report: {write_report(command.runs, command.out, samples)}")
 

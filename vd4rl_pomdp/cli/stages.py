@@ -61,16 +61,16 @@ class EvaluateCommand:
 
 
 def _evaluate(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.evaluation import append_rows, evaluate_run
+    from vd4rl_pomdp.evaluation import append_episodes, begin_episodes, evaluate_run
     from vd4rl_pomdp.runs.outputs import refuse_inside
 
     command = parse(EvaluateCommand, words, program)
     if command.out is not None:
         refuse_inside(command.out)
-        append_rows(command.out, [])  # before any episode is played
+        begin_episodes(command.out)  # before any episode is played
     rows = evaluate_run(command.run, command.corruption, command.episodes, command.workers)
     if command.out is not None:
-        append_rows(command.out, rows)
+        append_episodes(command.out, rows)
     scores = [row["score"] for row in rows]
     labels = {k: rows[0][k] for k in ("method", "task", "quality", "corruption", "algorithm", "seed", "step")}
     summary = {"score_mean": sum(scores) / len(scores), "score_min": min(scores), "score_max": max(scores)}
@@ -117,17 +117,17 @@ def _sweep(words: Arguments, program: str) -> None:
 
 def _check(runs: list[list[Arguments]]) -> None:
     """Raise UserError for settings that a stage would refuse, before the first run and not hours later."""
-    from finetune.train import end_to_end
+    from finetune.train import check_end_to_end
     from pretrain.objectives import METHODS
-    from pretrain.train import check
+    from pretrain.train import check_config
 
     for (_, *first), *others in runs:
         config = _pretrain_config(first, "vd4rl-pomdp pretrain")
-        check(config)
+        check_config(config)
         for _, *words in others:
             finetuning = _finetune_config(words, "vd4rl-pomdp finetune")
             if algorithm := METHODS.named(config.method).end_to_end:
-                end_to_end(finetuning, algorithm)
+                check_end_to_end(finetuning, algorithm)
 
 
 @dataclass(frozen=True)

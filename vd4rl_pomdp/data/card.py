@@ -14,7 +14,7 @@ from matplotlib.figure import Figure
 
 from vd4rl_pomdp.data.dataset import identity
 from vd4rl_pomdp.data.episodes import join_shards
-from vd4rl_pomdp.data.format import RECORD, read_attributes, read_frame_size, read_rows, read_some_frames, shard_paths
+from vd4rl_pomdp.data.format import RECORD, check_frames, read_attributes, read_rows, read_some_frames, shard_paths
 from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.files import read_json
@@ -58,7 +58,7 @@ def write_card(path: Path) -> Path:
     if path.is_file():
         raise UserError(f"{path}: is one file; a card describes a whole set: name its folder")
     shards = shard_paths(path)
-    read_frame_size(shards)
+    check_frames(shards)
     parts = [read_rows(shard) for shard in shards]
     rows = join_shards(shards, parts)
     attributes = [read_attributes(shard) for shard in shards]

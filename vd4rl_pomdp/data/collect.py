@@ -13,7 +13,7 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vd4rl_pomdp.data.shards import Shard, claim_set, collect_shards
+from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.files import jsonable
@@ -36,7 +36,7 @@ from vd4rl_pomdp.tasks import (
     Task,
 )
 
-Policy = Actor | Ladder | None
+Collector = Actor | Ladder | None
 """Who acts in a shard: an actor, a ladder of them, or nobody (random actions)."""
 _RUNTIME_FIELDS = ("out", "workers")
 MAX_NOISE = 2.0
@@ -102,10 +102,10 @@ def collect(config: CollectConfig, length: int | None = None) -> list[Path]:
     shards = [
         Shard(
             path,
-            [_job(config, policy, episode, length) for episode in episodes],
-            _attributes(config, path, policy),
+            [_job(config, collector, episode, length) for episode in episodes],
+            _attributes(config, path, collector),
         )
-        for path, episodes, policy in plan
+        for path, episodes, collector in plan
     ]
     with owned(config.out):
         _claim(config, _hashes(plan))
@@ -165,15 +165,15 @@ def actor_hashes(config: CollectConfig) -> list[str]:
     return _hashes(_plan(config))
 
 
-def _hashes(plan: Iterable[tuple[Path, range, Policy]]) -> list[str]:
-    return sorted({policy.sha256 for _, _, policy in plan if policy is not None})
+def _hashes(plan: Iterable[tuple[Path, range, Collector]]) -> list[str]:
+    return sorted({collector.sha256 for _, _, collector in plan if collector is not None})
 
 
 def replay_returns(config: CollectConfig) -> list[float]:
     """Returns of all episodes that `collect` would render, by physics alone: the same seeds, actions and rewards."""
     jobs = [
-        replace(_job(config, policy, episode), size=None)
-        for _, episodes, policy in _plan(config)
+        replace(_job(config, collector, episode), size=None)
+        for _, episodes, collector in _plan(config)
         for episode in episodes
     ]
     with ProgressLine(f"play {config.task} {config.quality}", config.episodes, "episodes") as progress:
@@ -184,20 +184,20 @@ def replay_returns(config: CollectConfig) -> list[float]:
     return returns
 
 
-def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Policy]]:
-    """Shards to write: file, episode numbers, policy. medium_expert is all medium shards, then all expert ones."""
+def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Collector]]:
+    """Shards to write: file, episode numbers, collector. medium_expert is all medium shards, then all expert ones."""
     halves = ["medium", "expert"] if _base(config) == "medium_expert" else [_base(config)]
     first = 0
     for number, quality in enumerate(halves):
         stop = config.episodes * (number + 1) // len(halves)
-        policy = _policy(config, quality)
+        collector = _collector(config, quality)
         for shard, start in enumerate(range(first, stop, config.episodes_per_shard)):
             episodes = range(start, min(start + config.episodes_per_shard, stop))
-            yield config.out / f"{shard}_{config.task}_{quality}{_suffix(config)}.hdf5", episodes, policy
+            yield config.out / f"{shard}_{config.task}_{quality}{_suffix(config)}.hdf5", episodes, collector
         first = stop
 
 
-def _policy(config: CollectConfig, quality: str) -> Policy:
+def _collector(config: CollectConfig, quality: str) -> Collector:
     if quality == "random":
         return None
     if quality == "medium_replay":
@@ -207,38 +207,38 @@ def _policy(config: CollectConfig, quality: str) -> Policy:
     return read_actor(config.actor, config.task)
 
 
-def _job(config: CollectConfig, policy: Policy, episode: int, length: int | None = None) -> _Job:
+def _job(config: CollectConfig, collector: Collector, episode: int, length: int | None = None) -> _Job:
     """One episode; with a ladder, by who acted at the moment of training that the episode stands for."""
-    actor = policy.actor_at((episode + 0.5) / config.episodes) if isinstance(policy, Ladder) else policy
+    actor = collector.actor_at((episode + 0.5) / config.episodes) if isinstance(collector, Ladder) else collector
     task, size = TASKS.named(config.task), config.frame_size
     return _Job(task, episode, config.seed, actor, config.render, size, length, _noise(config))
 
 
-def _roll_out(job: _Job) -> dict[str, np.ndarray]:
+def _roll_out(job: _Job) -> Columns:
     """Rows of one episode, by key."""
     env = _environment(job.task, job.render, job.size, job.length)
     rng = np.random.default_rng([job.seed, job.episode])
     noise = np.random.default_rng(stream_seed(job.seed, "action noise", job.episode))
-    row = env.reset(episode_seed(job.seed, job.episode))
+    now = env.reset(episode_seed(job.seed, job.episode))
     action = np.zeros(env.action_dim, np.float32)
-    rows = [(row, action)]
-    while not row.last:
+    steps = [(now, action)]
+    while not now.last:
         if job.actor is None:
             action = rng.uniform(-1.0, 1.0, env.action_dim).astype(np.float32)
         else:
-            action = job.actor.act(row.state, rng)
+            action = job.actor.act(now.state, rng)
         if job.noise:
             shaken = action + job.noise * noise.standard_normal(action.shape)
             action = shaken.clip(-1.0, 1.0).astype(np.float32)
-        row = env.step(action)
-        rows.append((row, action))
-    frames = {} if job.size is None else {"observation": np.stack([r.frame for r, _ in rows])}
-    states = {"physics": np.stack([r.physics for r, _ in rows])} if row.physics.size else {}
+        now = env.step(action)
+        steps.append((now, action))
+    frames = {} if job.size is None else {"observation": np.stack([step.frame for step, _ in steps])}
+    states = {"physics": np.stack([step.physics for step, _ in steps])} if now.physics.size else {}
     return frames | {
-        "action": np.stack([a for _, a in rows]),
-        "reward": np.array([r.reward for r, _ in rows]),
-        "discount": np.array([r.discount for r, _ in rows]),
-        "step_type": np.array([int(r.step_type) for r, _ in rows]),
+        "action": np.stack([action for _, action in steps]),
+        "reward": np.array([step.reward for step, _ in steps]),
+        "discount": np.array([step.discount for step, _ in steps]),
+        "step_type": np.array([int(step.step_type) for step, _ in steps]),
         **states,
     }
 
@@ -255,14 +255,14 @@ def _environment(*arguments: Any) -> Any:
     return _ENVIRONMENTS[arguments]
 
 
-def _attributes(config: CollectConfig, path: Path, policy: Policy) -> dict[str, Any]:
+def _attributes(config: CollectConfig, path: Path, collector: Collector) -> dict[str, Any]:
     return {
         "task": config.task,
         "set": _base(config) + _suffix(config),
         "policy": path.stem.split("_", 1)[1].removeprefix(f"{config.task}_"),
         "seed": config.seed,
         "render": config.render,
-        "actor_sha256": policy.sha256 if policy else None,
+        "actor_sha256": collector.sha256 if collector else None,
         **({"action_noise": noise} if (noise := _noise(config)) else {}),
         "versions": {k: v for k, v in versions().items() if k in ("mujoco", "dm-control", "vd4rl-pomdp")},
     }

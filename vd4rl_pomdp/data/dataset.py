@@ -18,7 +18,7 @@ from vd4rl_pomdp.tasks import FRAME_STACK, SET_QUALITIES, TASKS
 from vd4rl_pomdp.types import StepType, Transitions, Windows, row_key
 
 Index = int | Sequence[int] | np.ndarray | Tensor
-Observe = Callable[[Tensor], Tensor]
+Observations = Callable[[Tensor], Tensor]
 """Observations (..., C, H, W) uint8 of (...,) int64 rows."""
 
 
@@ -109,12 +109,18 @@ class Dataset:
         """Action dimension A."""
         return self.action.shape[1]
 
-    def states(self) -> Tensor:
-        """(N, P') float32 poses and velocities on the set's device; raises UserError if the set has no states."""
+    def require_states(self) -> None:
+        """Raise UserError if the set stores no simulator states."""
         if self.physics is None or self.task is None:
             raise UserError(
                 f"{self.path}: stores no simulator states; `data collect` makes sets of dm_control's tasks that do"
             )
+
+    def states(self) -> Tensor:
+        """(N, P') float32 poses and velocities on the set's device; raises UserError if the set has no states."""
+        self.require_states()
+        assert self.physics is not None
+        assert self.task is not None
         return torch.from_numpy(TASKS.named(self.task).visible_state(self.physics)).to(self.t.device)
 
     def to(self, device: torch.device | str) -> Dataset:
@@ -166,7 +172,7 @@ class Dataset:
         n_step: int = 1,
         frame_stack: int = FRAME_STACK,
         gamma: float = 0.99,
-        observe: Observe | None = None,
+        observations: Observations | None = None,
     ) -> Transitions:
         """Gather n-step transitions.
 
@@ -175,7 +181,7 @@ class Dataset:
             n_step: rewards to sum; fewer at an episode's end.
             frame_stack: frames in an observation.
             gamma: discount between the summed rewards.
-            observe: what makes observations of (B,) rows, in place of `stacks`.
+            observations: what makes observations of (B,) rows, in place of `stacks`.
 
         Returns:
             `Transitions`. With m = min(n_step, steps left), `reward` is the sum of gamma^i r_{t+i} for i < m and
@@ -187,13 +193,13 @@ class Dataset:
         """
         rows = self._starts(self._index(index, self.num_transitions), self._per_episode(2))
         reward, discount, next_rows = self.n_step_returns(rows, n_step, gamma)
-        observe = observe or (lambda rows: self.stacks(rows, frame_stack))
+        observations = observations or (lambda rows: self.stacks(rows, frame_stack))
         return Transitions(
-            obs=observe(rows),
+            obs=observations(rows),
             action=self.action_after(rows),
             reward=reward,
             discount=discount,
-            next_obs=observe(next_rows),
+            next_obs=observations(next_rows),
             key=self.keys(rows),
             next_key=self.keys(next_rows),
         )
@@ -214,10 +220,11 @@ class Dataset:
 
     def num_windows(self, length: int) -> int:
         """Number of windows of `length` consecutive rows of one episode; raises UserError as `windows` does."""
-        return int(self._windows_per_episode(length).sum())
+        self.check_windows(length)
+        return int(self._per_episode(length).sum())
 
     def windows(
-        self, index: Index, length: int, frame_stack: int = FRAME_STACK, observe: Observe | None = None
+        self, index: Index, length: int, frame_stack: int = FRAME_STACK, observations: Observations | None = None
     ) -> Windows:
         """Gather windows of consecutive rows.
 
@@ -225,7 +232,7 @@ class Dataset:
             index: (B,) numbers in 0..num_windows(length)-1; they count all starts within episodes, in order.
             length: rows T of each window.
             frame_stack: frames in an observation; a stack may reach before its window, never before its episode.
-            observe: what makes observations of (B, T) rows, in place of `stacks`.
+            observations: what makes observations of (B, T) rows, in place of `stacks`.
 
         Returns:
             `Windows`, none of them padded. `action` of the last row is the next row's, outside the window, if any.
@@ -234,13 +241,14 @@ class Dataset:
             UserError: an episode is shorter than the window.
             IndexError: an index is out of range.
         """
-        per_episode = self._windows_per_episode(length)
+        self.check_windows(length)
+        per_episode = self._per_episode(length)
         start = self._starts(self._index(index, int(per_episode.sum())), per_episode)
         rows = start[:, None] + torch.arange(length, device=start.device)
         has_action = rows + 1 < self.episode_end[self.episode[rows]]
         following = self.action_after(torch.where(has_action, rows, 0))
         return Windows(
-            obs=self.stacks(rows, frame_stack) if observe is None else observe(rows),
+            obs=self.stacks(rows, frame_stack) if observations is None else observations(rows),
             prev_action=self.actions_before(rows),
             action=following * has_action[..., None],
             has_action=has_action,
@@ -248,7 +256,8 @@ class Dataset:
             key=self.keys(rows),
         )
 
-    def _windows_per_episode(self, length: int) -> Tensor:
+    def check_windows(self, length: int) -> None:
+        """Raise UserError unless every episode has a window of `length` rows."""
         require_positive(length=length)
         short = torch.nonzero(self.episode_end - self.episode_start < length)
         if len(short):
@@ -258,7 +267,6 @@ class Dataset:
                 f"{self.path}: episode {episode} has {rows} rows, fewer than the window of {length} "
                 f"({len(short)} such episodes); choose a shorter window"
             )
-        return self._per_episode(length)
 
     def _per_episode(self, length: int) -> Tensor:
         """(E,) rows from which `length` consecutive rows stay inside the episode: transitions for 2."""

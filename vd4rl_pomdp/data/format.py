@@ -132,10 +132,15 @@ def read_frame_size(shards: Sequence[Path]) -> int:
     return sizes[0]
 
 
+def check_frames(shards: Sequence[Path]) -> None:
+    """Raise UserError unless `read_frame_size` can tell the size of a set's frames."""
+    read_frame_size(shards)
+
+
 def _frame_size(path: Path) -> int:
     low, high = FRAME_SIZES
     with _open(path) as file:
-        _present(path, file)
+        _check_keys(path, file)
         frames = file[FRAMES_KEY]
         shape = frames.shape
         square = shape == (*shape[:1], 3, *shape[-1:] * 2) and shape[0] and low <= shape[-1] <= high
@@ -166,13 +171,13 @@ def read_rows(path: Path) -> dict[str, np.ndarray]:
     Raises:
         UserError: the file is truncated or no HDF5, lacks a key, or holds a wrong shape, dtype or value.
     """
-    read_frame_size([path])
+    check_frames([path])
     with _open(path) as file:
         keys = _present(path, file)
         rows = {key: file[key][()] for key in keys if key != FRAMES_KEY}
         count = len(file[FRAMES_KEY])
     for key, value in rows.items():
-        _validate(path, key, value, count)
+        _check_column(path, key, value, count)
     dtypes = {"action": "float32", "step_type": "uint8"}
     return {key: value.astype(dtypes.get(key, "float64"), copy=False) for key, value in rows.items()}
 
@@ -213,15 +218,25 @@ def _one_line(error: Exception) -> str:
 
 def _present(path: Path, file: h5py.File) -> list[str]:
     """The format's keys in a file; a missing one is an error, apart from physics."""
+    _check_keys(path, file)
+    return _expected(file)
+
+
+def _expected(file: h5py.File) -> list[str]:
+    """Keys that a file must have: the format's, and physics if anything is called so."""
     keys = [FRAMES_KEY, *_ROW_KEYS]
-    wanted = [key for key in keys if key != _OPTIONAL or file.get(key, getlink=True) is not None]
+    return [key for key in keys if key != _OPTIONAL or file.get(key, getlink=True) is not None]
+
+
+def _check_keys(path: Path, file: h5py.File) -> None:
+    """Raise UserError unless all keys that are expected are in the file itself."""
+    wanted = _expected(file)
     elsewhere = [key for key in wanted if _is_elsewhere(file, key)]
     if elsewhere:
         raise UserError(f"{path}: {elsewhere[0]!r} lies in another file, which is not followed; {_REPAIR}")
     missing = [key for key in wanted if not isinstance(file.get(key), h5py.Dataset)]
     if missing:
         raise UserError(f"{path}: has no {missing[0]!r}, so it is no V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
-    return wanted
 
 
 def _is_elsewhere(file: h5py.File, key: str) -> bool:
@@ -232,7 +247,7 @@ def _is_elsewhere(file: h5py.File, key: str) -> bool:
     return isinstance(stored, h5py.Dataset) and (stored.external is not None or stored.is_virtual)
 
 
-def _validate(path: Path, key: str, value: np.ndarray, count: int) -> None:
+def _check_column(path: Path, key: str, value: np.ndarray, count: int) -> None:
     """Refuse a wrong shape, dtype or value of one key."""
     if value.ndim != _ROW_KEYS[key] or len(value) != count or not value.size:
         expected = f"({count},)" if _ROW_KEYS[key] == 1 else f"({count}, width)"

@@ -97,11 +97,11 @@ def _wandering_frames(task: str, size: int, count: int = 100) -> np.ndarray:
     """Frames of random episodes: (count, 3, size, size) uint8."""
     env = make_env(TASKS.named(task), size=size)
     rng = np.random.default_rng(0)
-    rows = [env.reset(0)]
-    while len(rows) < count:
+    steps = [env.reset(0)]
+    while len(steps) < count:
         action = rng.uniform(-1, 1, env.action_dim).astype(np.float32)
-        rows.append(env.reset(len(rows)) if rows[-1].last else env.step(action))
-    return np.stack([row.frame for row in rows if row.frame is not None])
+        steps.append(env.reset(len(steps)) if steps[-1].last else env.step(action))
+    return np.stack([step.frame for step in steps if step.frame is not None])
 
 
 def golden_tasks() -> list[str]:

@@ -12,7 +12,7 @@ from vd4rl_pomdp.data.view import View
 from vd4rl_pomdp.types import Transitions, Windows
 
 
-class _Sampler:
+class Sampler:
     """What samplers share: a view (of a set as it is stored, if a set is given), a batch size and a generator.
 
     The generator lives on the CPU, so the draws do not depend on the set's device.
@@ -36,7 +36,7 @@ class _Sampler:
         return torch.randint(count, (self._batch_size,), generator=self._generator)
 
 
-class WindowSampler(_Sampler):
+class WindowSampler(Sampler):
     """Windows whose starts are uniform over the set, drawn with replacement."""
 
     def __init__(self, source: Dataset | View, batch_size: int, length: int, generator: torch.Generator) -> None:
@@ -52,7 +52,7 @@ class WindowSampler(_Sampler):
             yield self.sample()
 
 
-class TransitionSampler(_Sampler):
+class TransitionSampler(Sampler):
     """n-step transitions uniform over the set, drawn with replacement."""
 
     def __init__(

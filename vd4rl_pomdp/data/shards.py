@@ -17,7 +17,7 @@ from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
 from vd4rl_pomdp.runs.workers import count_workers, run_jobs
 
-Rows = dict[str, np.ndarray]
+Columns = dict[str, np.ndarray]
 """An episode's rows, by key."""
 
 
@@ -32,7 +32,7 @@ class Shard:
 
 
 def collect_shards(
-    out: Path, shards: list[Shard], roll_out: Callable[[Any], Rows], workers: int, title: tuple[str, str], task: str
+    out: Path, shards: list[Shard], roll_out: Callable[[Any], Columns], workers: int, title: tuple[str, str], task: str
 ) -> None:
     """Write the shards that are missing, then the set's record.
 
@@ -75,7 +75,7 @@ def claim_set(out: Path, settings: dict[str, Any]) -> None:
     write_json(path, settings)
 
 
-def join_rollouts(rollouts: list[dict[str, np.ndarray]]) -> dict[str, np.ndarray]:
+def join_rollouts(rollouts: list[Columns]) -> Columns:
     """Rows of several episodes, in order."""
     return {key: np.concatenate([rollout[key] for rollout in rollouts]) for key in rollouts[0]}
 

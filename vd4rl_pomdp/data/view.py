@@ -63,11 +63,11 @@ class View:
 
     def windows(self, index: Index, length: int) -> Windows:
         """`Dataset.windows` of what the agent sees."""
-        return self.dataset.windows(index, length, observe=self.observe)
+        return self.dataset.windows(index, length, observations=self.observe)
 
     def transitions(self, index: Index, n_step: int = 1, gamma: float = 0.99) -> Transitions:
         """`Dataset.transitions` of what the agent sees; both ends are shifted and corrupted on their own."""
-        return self.dataset.transitions(index, n_step, gamma=gamma, observe=self.observe)
+        return self.dataset.transitions(index, n_step, gamma=gamma, observations=self.observe)
 
     def state_dict(self) -> dict[str, Any]:
         """Where the streams stand."""

@@ -21,6 +21,8 @@ from gymnasium.envs.registration import WrapperSpec
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.tasks import TASKS
 
+Info = dict[str, Any]
+"""Gymnasium's `info`: what an environment tells besides the observation."""
 _SUFFIXES = {"": "none", "-Patch16": "patch", "-ZeroFrames": "zero_frames", "-Patch16-ZeroFrames": "patch+zero_frames"}
 
 GYM_IDS = {

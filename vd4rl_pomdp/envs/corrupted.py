@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys, make_corruption
-from vd4rl_pomdp.envs.pixels import Render, Row, make_env
+from vd4rl_pomdp.envs.pixels import Render, TimeStep, make_env
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, Task
 from vd4rl_pomdp.types import row_key
 
@@ -27,7 +27,7 @@ class Observation:
     """(C, S, S) uint8: the corrupted stack, all the agent may see."""
     clean: Tensor
     """(C, S, S) uint8: the stack before corruption."""
-    row: Row
+    time_step: TimeStep
     """Reward, step type and simulator state."""
 
 
@@ -50,20 +50,20 @@ class CorruptedEnv:
     def reset(self, environment_seed: int, corruption_seed: int = 0, episode: int = 0) -> Observation:
         """Begin an episode; its corruption is drawn from (corruption_seed, episode)."""
         self._seed, self._episode, self._t = corruption_seed, episode, 0
-        row = self.env.reset(environment_seed)
-        assert row.frame is not None
-        self._frames.extend([row.frame] * FRAME_STACK)
-        return self._observe(row)
+        first = self.env.reset(environment_seed)
+        assert first.frame is not None
+        self._frames.extend([first.frame] * FRAME_STACK)
+        return self._observation(first)
 
     def step(self, action: np.ndarray) -> Observation:
         """Apply an (A,) float32 action."""
-        row = self.env.step(action)
-        assert row.frame is not None
-        self._frames.append(row.frame)
+        time_step = self.env.step(action)
+        assert time_step.frame is not None
+        self._frames.append(time_step.frame)
         self._t += 1
-        return self._observe(row)
+        return self._observation(time_step)
 
-    def _observe(self, row: Row) -> Observation:
+    def _observation(self, time_step: TimeStep) -> Observation:
         clean = torch.from_numpy(np.concatenate(self._frames))
         key = derive_keys(self._seed, row_key(torch.tensor([self._episode]), torch.tensor([self._t])))
-        return Observation(self._corruption(clean[None], key)[0], clean, row)
+        return Observation(self._corruption(clean[None], key)[0], clean, time_step)

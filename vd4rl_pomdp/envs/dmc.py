@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.envs import rendering
-from vd4rl_pomdp.envs.pixels import PixelEnv, Render, Row
+from vd4rl_pomdp.envs.pixels import PixelEnv, Render, TimeStep
 from vd4rl_pomdp.envs.rendering import mujoco, suite
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_SIZE, TASKS, DMCTask, Layout
@@ -60,8 +60,8 @@ class DMCEnv(PixelEnv):
     def _apply(self, action: np.ndarray) -> tuple[float, bool, float]:
         return repeat_action(self.simulator, action, self.task.action_repeat)
 
-    def _row(self, reward: float, discount: float, step_type: StepType) -> Row:
-        return Row(
+    def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
+        return TimeStep(
             frame=None if self.size is None else rendering.frame(self.physics, self.size, self._camera),
             state=flat_state(self.simulator.task.get_observation(self.physics)),
             physics=self.physics.get_state(),

@@ -9,6 +9,8 @@ import numpy as np
 from gymnasium.error import ResetNeeded
 from gymnasium.utils import RecordConstructorArgs
 
+from vd4rl_pomdp.envs import Info
+
 
 class ResetAfterEnd(gymnasium.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
     """Raises Gymnasium's ResetNeeded for a step between the end of an episode and the next `reset`."""
@@ -18,12 +20,12 @@ class ResetAfterEnd(gymnasium.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordC
         gymnasium.Wrapper.__init__(self, env)
         self._over = False
 
-    def reset(self, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
+    def reset(self, **options: Any) -> tuple[np.ndarray, Info]:
         """Begin the next episode."""
         self._over = False
         return self.env.reset(**options)
 
-    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
+    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, Info]:
         """Apply one action, unless the episode is over."""
         if self._over:
             raise ResetNeeded("the episode is over: call reset() before the next step()")

@@ -9,10 +9,9 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from vd4rl_pomdp.envs import Info
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.theory.gallery import WORLDS
-
-Info = dict[str, Any]
 
 
 class FiniteEnv(gymnasium.Env[np.ndarray, np.int64]):

@@ -9,12 +9,11 @@ import gymnasium
 import numpy as np
 
 from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption
+from vd4rl_pomdp.envs import Info
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.errors import refuse_number
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_SIZES, FRAME_STACK, TASKS
-
-Info = dict[str, Any]
 
 
 class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
@@ -60,9 +59,10 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Apply one action for the action repeat; the reward is the sum."""
-        step = self._env.step(action)
-        obs, info = self._show(step)
-        return obs, step.row.reward, step.row.terminated, step.row.last and not step.row.terminated, info
+        now = self._env.step(action)
+        obs, info = self._show(now)
+        reward, terminated = now.time_step.reward, now.time_step.terminated
+        return obs, reward, terminated, now.time_step.last and not terminated, info
 
     def render(self) -> np.ndarray:
         """The newest frame before corruption: (S, S, 3) uint8."""
@@ -71,13 +71,13 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def _draw(self) -> int:
         return int(self.np_random.integers(2**31))
 
-    def _show(self, step: Observation) -> tuple[np.ndarray, Info]:
-        clean = step.clean.numpy()
+    def _show(self, now: Observation) -> tuple[np.ndarray, Info]:
+        clean = now.clean.numpy()
         self._frame = np.ascontiguousarray(clean[-3:].transpose(1, 2, 0))
-        return step.obs.numpy(), {"clean": clean, "physics": step.row.physics}
+        return now.obs.numpy(), {"clean": clean, "physics": now.time_step.physics}
 
 
-def _config(corruption: str, options: Info, size: int) -> CorruptionConfig:
+def _config(corruption: str, options: dict[str, Any], size: int) -> CorruptionConfig:
     """The corruption that `gymnasium.make` was asked for."""
     config = CorruptionConfig.of(corruption, **options)
     check_corruption(config, size)

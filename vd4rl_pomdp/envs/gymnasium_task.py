@@ -9,7 +9,7 @@ import numpy as np
 from PIL import Image
 
 from vd4rl_pomdp.envs import opengl  # noqa: F401
-from vd4rl_pomdp.envs.pixels import PixelEnv, Row
+from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_SIZE, GymnasiumTask, Layout
 from vd4rl_pomdp.types import StepType
@@ -78,9 +78,9 @@ class GymnasiumEnv(PixelEnv):
         within = np.clip(action, -1, 1).reshape(low.shape) * ((high - low) / 2) + (high + low) / 2
         return within.astype(self._space.dtype)
 
-    def _row(self, reward: float, discount: float, step_type: StepType) -> Row:
+    def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
         frame = None if self.size is None else self._frame(self.size)
-        return Row(frame, NOTHING.astype(np.float32), NOTHING, reward, discount, step_type)
+        return TimeStep(frame, NOTHING.astype(np.float32), NOTHING, reward, discount, step_type)
 
     def _frame(self, size: int) -> np.ndarray:
         """The present picture as (3, size, size) uint8, each pixel the mean of the area that it covers."""

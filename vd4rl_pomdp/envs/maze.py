@@ -7,12 +7,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from vd4rl_pomdp.envs import Info
 from vd4rl_pomdp.envs.maze_model import COLLISION_RADIUS, TIMESTEP, build_simulator
-from vd4rl_pomdp.envs.maze_view import ExactView, View, make_view
+from vd4rl_pomdp.envs.maze_renderers import ExactRenderer, MazeRenderer, make_renderer
 from vd4rl_pomdp.envs.rendering import Render, mujoco
 from vd4rl_pomdp.mazes import PICTURE_SIZE, get_maze
 
-Info = dict[str, Any]
 GOAL_RADIUS = 0.2
 """A goal is reached, and another drawn, within this distance."""
 ACTION_REPEAT = 5
@@ -45,7 +45,7 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._point, self.maze = build_simulator(self.maze_spec)
         """The library's description of the cells."""
         self._pixels, self._render = pixels, render
-        self._view: View | None = None
+        self._renderer: MazeRenderer | None = None
         self.observation_space = gymnasium.spaces.Box(0, 255, (3, PICTURE_SIZE, PICTURE_SIZE), np.uint8)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
         self.render_mode = render_mode
@@ -70,7 +70,7 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         state = np.concatenate([qpos, np.zeros(self._point.model.nv)])
         self.set_state((options or {}).get("state", state))
         self.goal = self._free_place()
-        return self._observe()
+        return self._observation_and_info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Apply one action for the action repeat."""
@@ -78,7 +78,7 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         reached = bool(np.linalg.norm(self.state[:2] - self.goal) <= GOAL_RADIUS)
         if reached:
             self.goal = self._free_place()
-        observation, info = self._observe()
+        observation, info = self._observation_and_info()
         return observation, float(reached), False, False, info
 
     def set_state(self, state: np.ndarray) -> None:
@@ -92,8 +92,8 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def close(self) -> None:
         """Free the GL context, if there is one."""
-        if isinstance(self._view, ExactView):
-            self._view.close()
+        if isinstance(self._renderer, ExactRenderer):
+            self._renderer.close()
 
     def is_free(self, place: np.ndarray) -> bool:
         """Whether the mass fits at a (2,) position."""
@@ -123,11 +123,11 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def draw(self) -> np.ndarray:
         """Picture of the present state: (3, 100, 100) uint8."""
         assert self._pixels, "this environment was made without pixels"
-        if self._view is None:  # not before: a process that has rendered cannot be forked
-            self._view = make_view(self.maze_spec, self._point.model, self._render)
-        return self._view(self._point.data)
+        if self._renderer is None:  # not before: a process that has rendered cannot be forked
+            self._renderer = make_renderer(self.maze_spec, self._point.model, self._render)
+        return self._renderer(self._point.data)
 
-    def _observe(self) -> tuple[np.ndarray, Info]:
+    def _observation_and_info(self) -> tuple[np.ndarray, Info]:
         if self._pixels:
             self._picture = self.draw()
         state = self.state

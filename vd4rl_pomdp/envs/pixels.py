@@ -1,4 +1,4 @@
-"""What the harness does with any task: begin an episode, act, read a row. `make_env` builds a task's environment."""
+"""What the harness does with any task: begin an episode, act, read a time step; `make_env` builds the environment."""
 
 from __future__ import annotations
 
@@ -18,8 +18,8 @@ Render = Literal["fast", "exact"]
 
 
 @dataclass(frozen=True)
-class Row:
-    """One row of an episode (see the time axis in `types`)."""
+class TimeStep:
+    """What an environment returns at one step: a row of a set without its action (see the axis in `types`)."""
 
     frame: np.ndarray | None
     """(3, S, S) uint8; None when rendering is off."""
@@ -28,9 +28,9 @@ class Row:
     physics: np.ndarray
     """(P,) float64: simulator state; (0,) for a task without states."""
     reward: float
-    """Reward that led into this row, summed over the action repeat; 0 in the first."""
+    """Reward that led into this time step, summed over the action repeat; 0 in the first."""
     discount: float
-    """0 in a last row that the task itself ended, else 1."""
+    """0 in a last time step that the task itself ended, else 1."""
     step_type: StepType
 
     @property
@@ -76,18 +76,18 @@ class PixelEnv(ABC):
         """Action dimension A."""
         return self.layout.action_dim
 
-    def reset(self, seed: int) -> Row:
+    def reset(self, seed: int) -> TimeStep:
         """Begin the episode of a seed."""
         self._begin(seed)
         self._decisions = 0
-        return self._row(0.0, 1.0, StepType.FIRST)
+        return self._time_step(0.0, 1.0, StepType.FIRST)
 
-    def step(self, action: np.ndarray) -> Row:
+    def step(self, action: np.ndarray) -> TimeStep:
         """Apply an (A,) float32 action in [-1, 1] for the action repeat."""
         reward, ended, discount = self._apply(action)
         self._decisions += 1
         last = ended or self._decisions == self._length
-        return self._row(reward, discount, StepType.LAST if last else StepType.MID)
+        return self._time_step(reward, discount, StepType.LAST if last else StepType.MID)
 
     @abstractmethod
     def _begin(self, seed: int) -> None:
@@ -98,8 +98,8 @@ class PixelEnv(ABC):
         """Repeat an action, no further than the episode goes; summed reward, whether the episode ended, discount."""
 
     @abstractmethod
-    def _row(self, reward: float, discount: float, step_type: StepType) -> Row:
-        """The row of the present state."""
+    def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
+        """The time step of the present state."""
 
 
 def make_env(task: Task, render: Render = "fast", size: int | None = FRAME_SIZE, length: int | None = None) -> PixelEnv:

@@ -90,7 +90,7 @@ def _check(tasks: Sequence[str], qualities: Sequence[str], timed_episodes: int) 
         raise UserError(f"unknown quality {unknown[0]!r}: choose from {', '.join(SET_QUALITIES)}")
     refuse_number("timed_episodes", timed_episodes, 1, MOST_EPISODES)
     for task in tasks:
-        TASKS.named(task)
+        TASKS.check(task)
 
 
 def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:

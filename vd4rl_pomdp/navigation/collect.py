@@ -14,10 +14,10 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.data.shards import Shard, claim_set, collect_shards
+from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
 from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, check_maze, get_maze
-from vd4rl_pomdp.navigation.config import CollectConfig
+from vd4rl_pomdp.navigation.config import MazeCollectConfig
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
@@ -42,7 +42,7 @@ class _Job:
     noise: float
 
 
-def collect(config: CollectConfig) -> list[Path]:
+def collect(config: MazeCollectConfig) -> list[Path]:
     """Collect the set, or what is missing of it; returns its shards."""
     _check(config)
     refuse_inside(config.out)
@@ -58,13 +58,13 @@ def collect(config: CollectConfig) -> list[Path]:
     return [shard.path for shard in shards]
 
 
-def drive(maze: str, rows: int, action_repeat: int = 5, noise: float = 0.5, seed: int = 0) -> dict[str, np.ndarray]:
+def drive(maze: str, rows: int, action_repeat: int = 5, noise: float = 0.5, seed: int = 0) -> Columns:
     """Rows of one trajectory, by key, without writing anything."""
     check_maze(maze)
     return _roll_out(_Job(maze, 0, seed, rows, action_repeat, noise))
 
 
-def _check(config: CollectConfig) -> None:
+def _check(config: MazeCollectConfig) -> None:
     check_maze(config.maze)
     refuse_outside(
         config, trajectories=(1, MOST_EPISODES), trajectory_rows=2, action_repeat=(1, MOST_STEPS), noise=0,
@@ -74,19 +74,19 @@ def _check(config: CollectConfig) -> None:
     require_memory(rows * 3 * PICTURE_SIZE**2, CPU, config, "trajectory_rows", "trajectories_per_shard")
 
 
-def _plan(config: CollectConfig) -> Iterator[tuple[Path, range]]:
+def _plan(config: MazeCollectConfig) -> Iterator[tuple[Path, range]]:
     """Shards to write: file and trajectory numbers."""
     for number, start in enumerate(range(0, config.trajectories, config.trajectories_per_shard)):
         stop = min(start + config.trajectories_per_shard, config.trajectories)
         yield config.out / f"{number}_{config.maze}.hdf5", range(start, stop)
 
 
-def _job(config: CollectConfig, trajectory: int) -> _Job:
+def _job(config: MazeCollectConfig, trajectory: int) -> _Job:
     rows, repeat = config.trajectory_rows, config.action_repeat
     return _Job(config.maze, trajectory, config.seed, rows, repeat, config.noise)
 
 
-def _roll_out(job: _Job) -> dict[str, np.ndarray]:
+def _roll_out(job: _Job) -> Columns:
     """Rows of one trajectory, by key."""
     env, act = _environment(job.maze, job.action_repeat)
     rng = np.random.default_rng([job.seed, job.trajectory])
@@ -126,7 +126,7 @@ def _environment(maze: str, action_repeat: int) -> tuple[Any, Callable[[np.ndarr
     return _ENVIRONMENTS[maze, action_repeat]
 
 
-def _attributes(config: CollectConfig) -> dict[str, Any]:
+def _attributes(config: MazeCollectConfig) -> dict[str, Any]:
     packages = ("mujoco", "gymnasium-robotics", "vd4rl-pomdp")
     return {
         "task": config.maze,

@@ -7,7 +7,7 @@ from pathlib import Path
 
 
 @dataclass(frozen=True)
-class CollectConfig:
+class MazeCollectConfig:
     """Settings of `vd4rl-pomdp navigation collect`."""
 
     maze: str
@@ -32,9 +32,9 @@ class CollectConfig:
     """Trajectories in a shard."""
 
 
-_CPU = CollectConfig("", Path(), preset="cpu", trajectories=100, action_repeat=5)
+_CPU = MazeCollectConfig("", Path(), preset="cpu", trajectories=100, action_repeat=5)
 PRESETS = {
-    "paper": CollectConfig("", Path()),
+    "paper": MazeCollectConfig("", Path()),
     "cpu": _CPU,
     "smoke": replace(_CPU, preset="smoke", trajectories=10, trajectory_rows=120),
 }

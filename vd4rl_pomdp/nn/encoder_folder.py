@@ -10,7 +10,7 @@ from typing import Any
 from safetensors import SafetensorError
 from safetensors.torch import save
 
-from vd4rl_pomdp.corruptions import CorruptionConfig, make_corruption
+from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE
@@ -120,7 +120,7 @@ def _check_corruption(card: EncoderCard) -> None:
     build(CorruptionConfig, {"corruption": config.corruption, "corruption_mode": config.corruption_mode})
     for stage in config.stages:
         build(type(stage), asdict(stage))
-    make_corruption(config)
+    config.check()
 
 
 def _first_line(error: Exception) -> str:

@@ -227,7 +227,7 @@ def ships(task: str, quality: str) -> bool:
 
 
 def _asset(task: str, name: str) -> Path:
-    TASKS.named(task)
+    TASKS.check(task)
     return ASSETS / f"{task}_{name}.safetensors"
 
 

@@ -25,10 +25,10 @@ class StateEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[np.ndarray, dict]:
         """Begin the episode of a seed, or of one drawn from the environment's generator."""
         super().reset(seed=seed)
-        row = self._env.reset(int(self.np_random.integers(2**31)) if seed is None else seed)
-        return row.state, {}
+        first = self._env.reset(int(self.np_random.integers(2**31)) if seed is None else seed)
+        return first.state, {}
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict]:
         """Apply one action for the action repeat; the reward is the sum."""
-        row = self._env.step(action)
-        return row.state, row.reward, row.terminated, row.last and not row.terminated, {}
+        now = self._env.step(action)
+        return now.state, now.reward, now.terminated, now.last and not now.terminated, {}

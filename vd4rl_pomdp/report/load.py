@@ -11,7 +11,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import read_rows
+from vd4rl_pomdp.evaluation import read_episodes
 from vd4rl_pomdp.report.variants import Parts, Settings, differences, read_settings
 from vd4rl_pomdp.runs.files import Row, read_json
 from vd4rl_pomdp.runs.metrics import read_metrics
@@ -160,7 +160,7 @@ def _load(folder: Path) -> LoadedRun:
         raise TypeError("config.json holds no settings")
     if not isinstance(record["stage"], str):
         raise TypeError(f"its stage is {record['stage']!r}")
-    rows = read_rows(folder / "episodes.csv")
+    rows = read_episodes(folder / "episodes.csv")
     card = _card(folder)
     timing = folder / "timing.json"
     return LoadedRun(

@@ -95,7 +95,7 @@ def finite_world(
         exogenous,
         actions,
         _law(name, "initial", initial, pairs),
-        {(s, a): _known(name, f"step({s}, {a})", step(s, a), states) for s in states for a in actions},
+        _successors(name, states, actions, step),
         {xi: _law(name, f"drift({xi})", drift(xi), exogenous) for xi in exogenous},
         {(s, xi): _law(name, f"emit({s}, {xi})", emit(s, xi), None) for s, xi in pairs},
         {s: _agent_centric(name, s, exogenous, actions, choose) for s in states},
@@ -147,7 +147,7 @@ def _law(name: str, where: str, row: Mapping[Any, Any], allowed: Iterable[Any] |
         raise UserError(f"world {name!r}: {where} sums to {sum(law.values())}, not to 1: correct that row")
     for key in law:
         if allowed is not None:
-            _known(name, where, key, allowed)
+            _check_declared(name, where, key, allowed)
     return {key: p for key, p in law.items() if p}
 
 
@@ -162,10 +162,20 @@ def _fraction(name: str, where: str, value: Any) -> Fraction:
     )
 
 
-def _known(name: str, where: str, value: Any, allowed: Iterable[Any]) -> Any:
+def _successors(
+    name: str, states: tuple, actions: tuple, step: Callable[[AgentState, Action], AgentState]
+) -> dict[tuple[AgentState, Action], AgentState]:
+    """The state after every state and action."""
+    after = {(s, a): step(s, a) for s in states for a in actions}
+    for (s, a), state in after.items():
+        _check_declared(name, f"step({s}, {a})", state, states)
+    return after
+
+
+def _check_declared(name: str, where: str, value: Any, allowed: Iterable[Any]) -> None:
+    """Raise UserError unless a value is among those that a world declares."""
     if value not in set(allowed):
         raise UserError(f"world {name!r}: {where} gives {value!r}, which is not declared: add it or correct the entry")
-    return value
 
 
 def _agent_centric(

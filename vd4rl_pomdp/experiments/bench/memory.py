@@ -12,7 +12,7 @@ from vd4rl_pomdp.runs.workers import run_jobs
 
 if TYPE_CHECKING:
     from pretrain.config import PretrainConfig
-    from pretrain.train import Trainer
+    from pretrain.train import PretrainTrainer
 
 STEPS = 3
 
@@ -27,14 +27,14 @@ def memory(folder: Path, frame_bytes: int) -> dict[str, float]:
     }
 
 
-def make_trainer(dataset: Dataset, config: PretrainConfig) -> Trainer:
+def make_trainer(dataset: Dataset, config: PretrainConfig) -> PretrainTrainer:
     """A trainer of the config's objective, its codebook fitted on a few actions."""
     from pretrain.build import build_objective, build_target
-    from pretrain.train import Trainer
+    from pretrain.train import PretrainTrainer
 
     target = build_target(config, dataset.action[:2000].numpy())
     objective = build_objective(config, dataset.action_dim, target)
-    return Trainer(objective.to(dataset.t.device), dataset, config)
+    return PretrainTrainer(objective.to(dataset.t.device), dataset, config)
 
 
 def touch(frames: torch.Tensor) -> None:

@@ -107,7 +107,7 @@ def maze_training() -> dict[str, float]:
     """Steps/s of `navigation train --preset cpu`, and the share of a step that sampling and the optimiser take."""
     from pretrain.navigation.config import NavigationConfig
     from pretrain.navigation.data import MazeData
-    from pretrain.navigation.trainer import Trainer, make_objective
+    from pretrain.navigation.trainer import NavigationTrainer, make_objective
     from vd4rl_pomdp.navigation.collect import collect
     from vd4rl_pomdp.navigation.config import PRESETS as SETS
     from vd4rl_pomdp.navigation.observations import open_maze_set
@@ -119,6 +119,6 @@ def maze_training() -> dict[str, float]:
         config = NavigationConfig.of("cpu", data=folder / "set", out=folder)
         data = MazeData(*open_maze_set(folder / "set", folder / "cache"), config, None)
         device = pick_device("auto")
-        trainer = Trainer(make_objective(data, config).to(device), data.on(device), config)
+        trainer = NavigationTrainer(make_objective(data, config).to(device), data.on(device), config)
     step, sampling, optimiser = alternating(5, trainer.update, trainer.batch, trainer.optimiser.step)
     return {"training_steps_per_s": 1 / step, "training_overhead_share": (sampling + optimiser) / step}

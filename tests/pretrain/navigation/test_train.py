@@ -10,7 +10,7 @@ from pretrain.navigation.config import NavigationConfig, command_of
 from pretrain.navigation.data import MazeData, open_data
 from pretrain.navigation.probe import ErrorSums, StateProbe, TrueStates, refit
 from pretrain.navigation.train import train
-from pretrain.navigation.trainer import Trainer, learning_rate, make_objective
+from pretrain.navigation.trainer import NavigationTrainer, learning_rate, make_objective
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.mazes import MAZES
@@ -31,10 +31,10 @@ def smoke(data: Path, out: Path, **changes: object) -> NavigationConfig:
     return NavigationConfig.of("smoke", **(given | changes))
 
 
-def trainer_of(config: NavigationConfig) -> Trainer:
+def trainer_of(config: NavigationConfig) -> NavigationTrainer:
     torch.manual_seed(0)
     data = open_data(config)
-    return Trainer(make_objective(data, config), data.on(torch.device("cpu")), config)
+    return NavigationTrainer(make_objective(data, config), data.on(torch.device("cpu")), config)
 
 
 def results(out: Path) -> dict[tuple, float]:
@@ -75,7 +75,7 @@ def test_the_run_measures_every_k_hidden_steps_and_both_splits(maze_set, tmp_pat
 
 def test_an_interrupted_run_ends_like_an_uninterrupted_one(maze_set, tmp_path, monkeypatch):
     whole = train(smoke(maze_set, tmp_path / "whole"))
-    update, calls = Trainer.update, []
+    update, calls = NavigationTrainer.update, []
 
     def cut(self):
         calls.append(1)
@@ -83,10 +83,10 @@ def test_an_interrupted_run_ends_like_an_uninterrupted_one(maze_set, tmp_path, m
             raise KeyboardInterrupt
         return update(self)
 
-    monkeypatch.setattr(Trainer, "update", cut)
+    monkeypatch.setattr(NavigationTrainer, "update", cut)
     with pytest.raises(KeyboardInterrupt):
         train(smoke(maze_set, tmp_path / "cut"))
-    monkeypatch.setattr(Trainer, "update", update)
+    monkeypatch.setattr(NavigationTrainer, "update", update)
     manifest = tmp_path / "cut" / "checkpoints" / "4" / "manifest.json"
     manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"seconds": 1000.0}))
     train(smoke(maze_set, tmp_path / "cut"))

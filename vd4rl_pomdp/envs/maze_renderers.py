@@ -30,7 +30,7 @@ _AMBIENT, _DIFFUSE, _SPECULAR, _SHININESS = 0.4, 0.8, 0.045, 64
 """MuJoCo's headlight on PointMaze's materials."""
 
 
-class ExactView:
+class ExactRenderer:
     """MuJoCo's picture from the camera `view`, drawn finer and averaged, so that edges are smooth."""
 
     def __init__(self, model: mujoco.MjModel, fine: int = _FINE) -> None:
@@ -89,7 +89,7 @@ def average(fine: np.ndarray, by: int) -> np.ndarray:
     return np.ascontiguousarray(((sums + by * by // 2) // (by * by)).astype(np.uint8).transpose(2, 0, 1))
 
 
-class TopView:
+class TopRenderer:
     """The fast picture from the top."""
 
     _WINDOW = 48
@@ -133,11 +133,11 @@ def _static_picture(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     """Colours and depths of the maze without the ball."""
     color = model.site("particle_site").rgba.copy()
     model.site("particle_site").rgba[3] = 0
-    view = ExactView(model)
+    exact = ExactRenderer(model)
     data = mujoco.MjData(model)
     mujoco.mj_forward(model, data)
-    picture = view.fine_picture(data)
-    view.close()
+    picture = exact.fine_picture(data)
+    exact.close()
     model.site("particle_site").rgba[:] = color
     return picture
 
@@ -155,7 +155,7 @@ def _hit_sphere(right: np.ndarray, up: np.ndarray, x: float, y: float) -> tuple[
     return depth, np.sqrt(np.maximum(inside, 0) / squared) / BALL_RADIUS
 
 
-class FirstPersonView:
+class FirstPersonRenderer:
     """The fast picture from the ball. It leaves out the faint highlight on walls that are faced squarely."""
 
     _FINE = 2
@@ -216,11 +216,11 @@ class FirstPersonView:
         return ((np.stack(sums) + self._FINE) // self._FINE**2).astype(np.uint8)
 
 
-View = ExactView | TopView | FirstPersonView
+MazeRenderer = ExactRenderer | TopRenderer | FirstPersonRenderer
 
 
-def make_view(spec: MazeSpec, model: mujoco.MjModel, render: Render) -> View:
+def make_renderer(spec: MazeSpec, model: mujoco.MjModel, render: Render) -> MazeRenderer:
     """What draws a maze: `exact` is MuJoCo alone with smooth edges, `fast` the rays."""
     if render == "exact":
-        return ExactView(model)
-    return FirstPersonView() if spec.first_person else TopView(model)
+        return ExactRenderer(model)
+    return FirstPersonRenderer() if spec.first_person else TopRenderer(model)

@@ -1,0 +1,195 @@
+"""Fine-tuning: cut anywhere and started again, it ends in the files of an uninterrupted run."""
+
+import csv
+import json
+import os
+import shutil
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from finetune.features import FrozenEncoder
+from finetune.train import finetune as run_finetune
+from pretrain.train import pretrain as run_pretrain
+from tests.helpers_data import write_fake_set
+from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_finetune, smoke_pretrain
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.nn import load_encoder
+from vd4rl_pomdp.runs import memory
+from vd4rl_pomdp.runs.metrics import read_metrics
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+
+
+def finetune_cut_and_whole(monkeypatch, encoder: Path, data: Path, out: Path, **changes: object) -> Path:
+    """Fine-tune in one go, and again with a cut at the second checkpoint; both must agree. Returns the whole run."""
+    whole = run_finetune(smoke_finetune(encoder, data, out / "whole", **changes))
+    cut = smoke_finetune(encoder, data, out / "cut", **changes)
+    with monkeypatch.context() as patch:
+        cut_at(patch, 2)
+        with pytest.raises(CutError):
+            run_finetune(cut)
+    run_finetune(cut)
+    assert contents(out / "cut") == contents(whole.path)
+    return whole.path
+
+
+@pytest.mark.parametrize(("algorithm", "views"), [("td3_bc", 2), ("drqv2_bc", 1), ("iql", 1), ("bc", 1), ("td3_bc", 0)])
+def test_finetuning_resumes_to_the_bit(encoder, data, tmp_path, monkeypatch, algorithm, views):
+    changes = {"algorithm": algorithm, "views": views, "eval_length": 2, "updates": 30, "eval_every": 15}
+    changes |= {"checkpoint_every": 10, "batch_size": 4}
+    whole = finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
+    rows = list(csv.DictReader((whole / "episodes.csv").open()))
+    assert [row["step"] for row in rows] == ["15", "30"]
+    assert {row["method"] for row in rows} == {"mik+a"}
+    assert not (whole / "features.npy").exists()
+
+
+@pytest.fixture
+def with_states(tmp_path) -> Path:
+    return write_fake_set(tmp_path / "own" / "walker_walk" / "expert", [20, 25, 30], physics_dim=18)
+
+
+@pytest.mark.parametrize("method", ["bc", "drq_bc", "state"])
+def test_references_resume_to_the_bit(with_states, tmp_path, monkeypatch, method):
+    made = run_pretrain(smoke_pretrain(with_states, tmp_path / "made", method=method)).path / "encoder"
+    changes = {"updates": 12, "eval_every": 6, "checkpoint_every": 4, "batch_size": 4, "eval_length": 2}
+    whole = finetune_cut_and_whole(monkeypatch, made, with_states, tmp_path, **changes)
+    trained = (whole / "encoder" / "model.safetensors").read_bytes()
+    assert (trained != (made / "model.safetensors").read_bytes()) == (method != "state")
+    rows = list(csv.DictReader((whole / "episodes.csv").open()))
+    assert {row["algorithm"] for row in rows} == {{"bc": "bc", "drq_bc": "drqv2_bc", "state": "td3_bc"}[method]}
+
+
+def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_them(with_states, data, tmp_path):
+    encoder, _ = load_encoder(
+        run_pretrain(smoke_pretrain(with_states, tmp_path / "s", method="state")).path / "encoder"
+    )
+    dataset = open_dataset(with_states)
+    frozen = FrozenEncoder(encoder, dataset, CorruptionConfig.of("patch"), 4, "fp32", 0)
+    z = frozen.episode(1, frozen.view(0)).numpy()
+    rows = slice(int(dataset.episode_start[1]), int(dataset.episode_end[1]))
+    assert z.shape == (25, 17)
+    assert np.allclose(z, np.delete(dataset.physics[rows], 1, axis=1))
+    with pytest.raises(UserError, match="stores no simulator states"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "none", method="state"))
+    with pytest.raises(UserError, match="drq_bc has no memory"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "gru", method="drq_bc", history="gru"))
+
+
+def test_user_slips_are_one_line(data, encoder, tmp_path):
+    with pytest.raises(UserError, match="unknown algorithm"):
+        run_finetune(smoke_finetune(encoder, data, tmp_path / "c", algorithm="ppo"))
+    other = write_fake_set(tmp_path / "humanoid_walk" / "expert", [20, 20], action_dim=21)
+    with pytest.raises(UserError, match="6 action dimensions"):
+        run_finetune(smoke_finetune(encoder, other, tmp_path / "d"))
+    assert not any((tmp_path / name).exists() for name in "cd")
+
+
+BELOW_IN_FINETUNING = {
+    **{"updates": 0, "gamma": 1.5, "n_step": 0, "alpha": -1.0, "views": -1, "eval_every": 0, "eval_episodes": 0},
+    **{"eval_length": -1, "hidden_dim": 0, "expectile": 1.1, "temperature": -1.0},
+}
+
+
+@pytest.mark.parametrize(("field", "value"), [*BELOW_IN_FINETUNING.items(), *BELOW_IN_BOTH.items()])
+def test_numbers_out_of_range_stop_finetuning_before_it_begins(data, tmp_path, field, value):
+    reader = {"algorithm": "iql"} if field in ("expectile", "temperature") else {}
+    with pytest.raises(UserError, match=f"--{field.replace('_', '-')} is {value}; it must be at least"):
+        run_finetune(smoke_finetune(tmp_path / "encoder", data, tmp_path / "out", **{field: value}, **reader))
+    assert not (tmp_path / "out").exists()
+
+
+def test_a_set_without_transitions_and_a_missing_gpu_leave_no_finetuning_behind(encoder, data, tmp_path):
+    single = write_fake_set(tmp_path / "single" / "walker_walk", [1, 1])
+    for given, change in ((single, {}), (data, {"device": "cuda:99"})):
+        with pytest.raises(UserError, match=r"holds no transition|no such GPU"):
+            run_finetune(smoke_finetune(encoder, given, tmp_path / "out", **change))
+        assert not (tmp_path / "out").exists()
+
+
+def test_rows_are_named_after_the_set_that_the_policy_learned_from(encoder, data, tmp_path):
+    other = write_fake_set(tmp_path / "walker_walk" / "medium", [20, 25])
+    run = run_finetune(smoke_finetune(encoder, other, tmp_path / "out", updates=2, batch_size=4, eval_length=2))
+    assert {row["quality"] for row in csv.DictReader((run.path / "episodes.csv").open())} == {"medium"}
+
+
+def test_a_checkpoint_of_another_config_is_one_line(encoder, data, tmp_path):
+    changes = {"updates": 2, "batch_size": 4, "eval_length": 2}
+    narrow, wide = (
+        smoke_finetune(encoder, data, tmp_path / name, hidden_dim=units, **changes)
+        for name, units in (("narrow", 8), ("wide", 16))
+    )
+    for config in (narrow, wide):
+        run_finetune(config)
+        (config.out / "timing.json").unlink()
+    shutil.rmtree(wide.out / "checkpoints")
+    shutil.copytree(narrow.out / "checkpoints", wide.out / "checkpoints")
+    with pytest.raises(UserError, match=r"wide/checkpoints/2: this checkpoint does not fit the run") as caught:
+        run_finetune(wide)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_row_lacks_what_no_step_since_the_row_before_gave(encoder, data, tmp_path, monkeypatch):
+    """The actor learns at every other update only; also where a run is cut in between."""
+    changes = {"updates": 6, "log_every": 1, "checkpoint_every": 1, "eval_every": 6, "batch_size": 4, "eval_length": 2}
+    whole = finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
+    assert ["actor_loss" in row for row in read_metrics(whole / "metrics.jsonl")] == [False, True] * 3
+
+
+def test_features_that_are_a_pipe_are_refused(encoder, data, tmp_path, monkeypatch):
+    config = smoke_finetune(encoder, data, tmp_path / "out")
+    with monkeypatch.context() as patch:
+        cut_at(patch, 1)
+        with pytest.raises(CutError):
+            run_finetune(config)
+    path = config.out / "features.npy"
+    path.unlink()
+    os.mkfifo(path)
+    with pytest.raises(UserError, match=r"features\.npy: is no regular file .* remove it"):
+        run_finetune(config)
+
+
+def test_a_cut_run_whose_evaluations_are_gone_does_not_go_on(encoder, data, tmp_path, monkeypatch):
+    config = smoke_finetune(encoder, data, tmp_path / "out", eval_every=10, checkpoint_every=10, eval_length=2)
+    with monkeypatch.context() as patch:
+        cut_at(patch, 3)
+        with pytest.raises(CutError):
+            run_finetune(config)
+    rows = (config.out / "episodes.csv").read_text().splitlines(keepends=True)
+    (config.out / "episodes.csv").write_text(rows[0] + rows[2])
+    with pytest.raises(UserError, match=r"episodes\.csv: lacks the evaluation at update 10"):
+        run_finetune(config)
+    (config.out / "episodes.csv").write_text("".join(rows))
+    assert run_finetune(config).finished
+
+
+def test_an_encoder_of_another_image_size_is_refused(data, encoder, tmp_path):
+    shutil.copytree(encoder, tmp_path / "small")
+    config = json.loads((tmp_path / "small" / "config.json").read_text())
+    config["encoder"]["size"] = 64
+    (tmp_path / "small" / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match=r"small: this encoder reads pictures of 64x64 pixels, the data set has 84x84"):
+        run_finetune(smoke_finetune(tmp_path / "small", data, tmp_path / "run"))
+    assert not (tmp_path / "run").exists()
+
+
+def test_the_disk_must_have_room_only_for_features_that_are_still_to_be_written(encoder, data, tmp_path, monkeypatch):
+    config = smoke_finetune(encoder, data, tmp_path / "out", updates=4, batch_size=4, eval_length=2)
+    free = shutil.disk_usage
+    monkeypatch.setattr(memory.shutil, "disk_usage", lambda path: free(path)._replace(free=100))
+    with pytest.raises(UserError, match=r"--views 1 takes 0\.0 GB on the disk"):
+        run_finetune(config)
+    assert not config.out.exists()
+    with monkeypatch.context() as patch:
+        patch.setattr(memory.shutil, "disk_usage", free)
+        cut_at(patch, 1)
+        with pytest.raises(CutError):
+            run_finetune(config)
+    assert (config.out / "features.npy").exists()
+    assert run_finetune(config).finished, "its features are there already"
+    assert not (config.out / "features.npy").exists()
+    assert run_finetune(config).finished, "a finished run writes none"

@@ -1,0 +1,56 @@
+"""The stages in their smallest size, cut and whole, and what their folders hold."""
+
+import hashlib
+from pathlib import Path
+
+import finetune.config
+import pretrain.config
+from vd4rl_pomdp.runs.checkpoint import Checkpoints
+
+VARYING = ("timing.json", "pretrain_timing.json", "machine.json", "manifest.json")
+
+
+def contents(folder: Path) -> dict[str, str]:
+    files = (p for p in sorted(folder.rglob("*")) if p.is_file() and p.name not in VARYING)
+    return {p.relative_to(folder).as_posix(): hashlib.sha256(_stable(p)).hexdigest() for p in files}
+
+
+def _stable(path: Path) -> bytes:
+    """A file's bytes without run paths."""
+    text = path.read_bytes()
+    if path.name == "results.json":
+        return b"\n".join(line for line in text.splitlines() if b'"command"' not in line)
+    if path.name == "config.json":
+        return b"\n".join(line for line in text.splitlines() if b'"out"' not in line and b'"encoder":' not in line)
+    return text
+
+
+class CutError(Exception):
+    pass
+
+
+def cut_at(monkeypatch, number: int) -> None:
+    """Raise in place of writing the `number`-th checkpoint."""
+    calls, add = [], Checkpoints.add
+
+    def cut(self, *arguments):
+        calls.append(arguments)
+        if len(calls) == number:
+            raise CutError
+        add(self, *arguments)
+
+    monkeypatch.setattr(Checkpoints, "add", cut)
+
+
+def smoke_pretrain(data: Path, out: Path, **changes: object) -> pretrain.config.PretrainConfig:
+    return pretrain.config.PretrainConfig.of("smoke", data=data, out=out, corruption="patch+zero_frames", **changes)
+
+
+def smoke_finetune(encoder: Path, data: Path, out: Path, **changes: object) -> finetune.config.FinetuneConfig:
+    return finetune.config.FinetuneConfig.of("smoke", encoder=encoder, data=data, out=out, workers=1, **changes)
+
+
+BELOW_IN_BOTH = {
+    **{"seed": -1, "batch_size": 0, "learning_rate": float("nan"), "shift": -1, "log_every": 0, "checkpoint_every": 0},
+}
+"""Settings of both stages with a value below their range."""

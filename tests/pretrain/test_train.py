@@ -1,0 +1,91 @@
+"""Pretraining: cut anywhere and started again, it ends in the files of an uninterrupted run."""
+
+import json
+
+import pytest
+
+from pretrain.objectives import METHODS
+from pretrain.train import pretrain as run_pretrain
+from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_pretrain
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.nn import load_encoder
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+
+
+@pytest.mark.parametrize("method", [name for name, method in METHODS.items() if method.trained])
+def test_pretraining_resumes_to_the_bit(data, tmp_path, monkeypatch, method):
+    whole = run_pretrain(smoke_pretrain(data, tmp_path / "whole", method=method))
+    cut = smoke_pretrain(data, tmp_path / "cut", method=method)
+    with monkeypatch.context() as patch:
+        cut_at(patch, 2)
+        with pytest.raises(CutError):
+            run_pretrain(cut)
+    assert not (tmp_path / "cut" / "encoder").exists()
+    run_pretrain(cut)
+    assert contents(tmp_path / "cut") == contents(whole.path)
+    again = run_pretrain(cut)
+    assert contents(again.path) == contents(whole.path)
+
+
+def test_an_encoder_tells_how_it_was_pretrained_and_an_older_one_still_loads(encoder, data):
+    settings = load_encoder(encoder)[1].settings
+    assert (settings["method"], settings["max_k"], settings["corruption"], settings["task"]) == (
+        *("mik+a", 3, "patch+zero_frames", "walker_walk"),
+    )
+    assert not {"seed", "data", "out", "device", "log_every", "checkpoint_every", "wandb"} & set(settings)
+    config = json.loads((encoder / "config.json").read_text())
+    del config["pretrain"]["settings"]
+    (encoder / "config.json").write_text(json.dumps(config))
+    assert load_encoder(encoder)[1].settings == {}
+
+
+def test_another_config_in_the_same_folder_is_refused_and_nothing_is_lost(data, tmp_path):
+    run_pretrain(smoke_pretrain(data, tmp_path / "run"))
+    before = contents(tmp_path / "run")
+    with pytest.raises(UserError, match=r"another config \(seed\)"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "run", seed=1))
+    (tmp_path / "full").mkdir()
+    (tmp_path / "full" / "thesis.txt").write_text("mine")
+    with pytest.raises(UserError, match="not empty"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "full"))
+    assert contents(tmp_path / "run") == before
+
+
+def test_user_slips_are_one_line(data, tmp_path):
+    with pytest.raises(UserError, match=r"unknown method 'mikado'.*mik\+a"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "a", method="mikado"))
+    with pytest.raises(UserError, match=r"episode 0 .*20 rows"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "b", window=21))
+    assert not any((tmp_path / name).exists() for name in "ab")
+
+
+BELOW = {
+    **{"m": -1, "n": -1, "max_k": 0, "homer_codes": -1, "steps": -1, "window": 1, "feature_dim": 0, "hidden_dim": 0},
+    **{"gru_layers": 0, "head_dim": 0, "history_window": -1, "self_prediction": -1.0, "l2_states": float("nan")},
+    **{"patch_size": 0, "patch_count": -1, "patch_fill": 256, "zeroed_frames": -1},
+}
+
+
+@pytest.mark.parametrize(("field", "value"), [*BELOW.items(), *BELOW_IN_BOTH.items()])
+def test_numbers_out_of_range_stop_pretraining_before_it_begins(data, tmp_path, field, value):
+    reader = {"homer_codes": {"method": "homer"}}.get(field, {})
+    with pytest.raises(UserError, match=f"--{field.replace('_', '-')} is {value}; it must be at least"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "out", **{field: value}, **reader))
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"patch_size": 85}, "exceeds the image"),
+        ({"zeroed_frames": 4}, "cannot zero 4 of 3"),
+        ({"device": "meta"}, "unknown device 'meta'"),
+        ({"frame_encoder": "state"}, "unknown frame encoder 'state'"),
+        ({"task": "cheetah_run"}, "is a set of walker_walk, not of cheetah_run"),
+    ],
+)
+def test_what_does_not_fit_leaves_no_run_behind(data, tmp_path, change, message):
+    with pytest.raises(UserError, match=message):
+        run_pretrain(smoke_pretrain(data, tmp_path / "out", **change))
+    assert not (tmp_path / "out").exists()

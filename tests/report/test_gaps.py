@@ -1,0 +1,29 @@
+"""Which runs are missing."""
+
+from tests.helpers_report import describe, write_run
+from vd4rl_pomdp.report.gaps import find_gaps
+from vd4rl_pomdp.report.load import load_runs
+
+
+def test_an_ablation_is_missing_elsewhere_but_a_budget_for_every_task_is_not(tmp_path):
+    runs = tmp_path / "runs"
+    for k in (1, 15):
+        describe(write_run(runs / f"expert{k}", "mik+a", 0, {10: [1.0]}), {"max_k": k})
+    describe(write_run(runs / "medium", "mik+a", 0, {10: [1.0]}, labels={"quality": "medium"}), {"max_k": 15})
+    for quality, steps in (("expert", 20), ("medium", 60)):
+        run = write_run(runs / f"{quality}-acro", "acro", 0, {10: [1.0]}, labels={"quality": quality})
+        describe(run, {"steps": steps})
+    describe(write_run(runs / "none", "random", 0, {10: [1.0]}, labels={"corruption": "none"}), {"steps": 20})
+    for size in (16, 48):
+        run = write_run(runs / f"patch{size}", "random", 0, {10: [1.0]})
+        describe(run, {"patch_size": size}, data=f"f{size}")
+    names = ("quality", "corruption", "method", "variant")
+    assert {tuple(row[name] for name in names) for row in find_gaps(load_runs([runs]))} == {
+        ("medium", "patch", "mik+a", "max_k 1"),
+        ("medium", "patch", "random", "patch_size 16"),
+        ("medium", "patch", "random", "patch_size 48"),
+        ("expert", "none", "mik+a", "max_k 1"),
+        ("expert", "none", "mik+a", "max_k 15"),
+        ("expert", "none", "acro", "steps 20"),
+        ("expert", "none", "acro", "steps 60"),
+    }

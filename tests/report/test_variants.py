@@ -1,0 +1,65 @@
+"""Runs pool under one label unless their settings differ."""
+
+import pytest
+
+from tests.helpers_report import describe, pooled, write_run
+from vd4rl_pomdp.report import write_report
+
+
+def test_runs_pool_whatever_their_seed_folder_device_and_logging(tmp_path):
+    for seed in (0, 1):
+        run = write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [1.0]})
+        noise = {"out": str(run), "encoder": str(seed), "device": str(seed), "log_every": seed, "workers": seed}
+        describe(run, {"seed": seed} if seed > 5 else {}, data="f00", **noise)
+    assert pooled(tmp_path / "runs") == {"acro": 2}
+
+
+@pytest.mark.parametrize(
+    ("one", "other", "names"),
+    [
+        ({"card": {"patch_size": 16}}, {"card": {"patch_size": 48}}, ["acro, patch_size 16", "acro, patch_size 48"]),
+        ({"card": {"steps": 20}}, {"card": {"steps": 60}}, ["acro, steps 20", "acro, steps 60"]),
+        ({"card": {}, "updates": 5}, {"card": {}, "updates": 9}, ["acro, updates 5", "acro, updates 9"]),
+        (
+            {"card": {"batch_size": 8}},
+            {"card": {"batch_size": 16}},
+            ["acro, pretraining batch_size 8", "acro, pretraining batch_size 16"],
+        ),
+        (
+            {"card": {"data": "a" * 24}, "data": "a" * 24},
+            {"card": {"data": "b" * 24}, "data": "b" * 24},
+            ["acro, data aaaaaaaa", "acro, data bbbbbbbb"],
+        ),
+        (
+            {"card": {"data": "a" * 24}, "data": "a" * 24},
+            {"card": {"data": "b" * 24}, "data": "a" * 24},
+            ["acro, pretraining data the same", "acro, pretraining data bbbbbbbb"],
+        ),
+        ({"card": {}}, {"card": {}, "data": "f00"}, ["acro, data not recorded", "acro, data f00"]),
+        ({"card": {}, "views": 4}, {"card": {}, "views": None}, ["acro, views 4", "acro, views none"]),
+        ({"card": {"m": 8}}, {"card": {}}, ["acro, m 8", "acro, m unset"]),
+        ({"card": {}}, {}, ["acro", "acro, pretraining not recorded"]),
+        (
+            {"card": {"preset": "cpu", "steps": 20}, "preset": "cpu", "views": 4},
+            {"card": {"preset": "smoke", "steps": 60}, "preset": "smoke", "views": 1},
+            ["acro, preset cpu", "acro, preset smoke"],
+        ),
+    ],
+    ids=["patch", "steps", "updates", "same name", "data", "data before", "old", "none", "new", "no card", "preset"],
+)
+def test_runs_that_differ_are_rows_of_their_own(tmp_path, one, other, names):
+    for seed in (0, 1):
+        for folder, settings in (("one", one), ("other", other)):
+            describe(write_run(tmp_path / f"runs/{folder}{seed}", "acro", seed, {10: [1.0]}), **settings)
+    write_run(tmp_path / "runs/random", "random", 0, {10: [1.0]})
+    assert pooled(tmp_path / "runs") == dict.fromkeys(names, 2) | {"random": 1}
+
+
+def test_a_preset_stands_for_what_it_decides_and_the_page_says_all(tmp_path):
+    for preset, k in (("cpu", 15), ("cpu", 1), ("smoke", 3)):
+        run = write_run(tmp_path / f"runs/{preset}{k}", "acro", 0, {10: [1.0]})
+        describe(run, {"max_k": k, "preset": preset, "steps": len(preset)}, preset=preset)
+    labels = {"acro, preset cpu, max_k 15", "acro, preset cpu, max_k 1", "acro, preset smoke, max_k 3"}
+    assert set(pooled(tmp_path / "runs")) == labels
+    page = write_report([tmp_path / "runs"], tmp_path / "out")[0].read_text()
+    assert "<td>preset smoke, steps 5, pretraining preset smoke, max_k 3</td>" in page

@@ -1,0 +1,187 @@
+"""What a report's page and tables say."""
+
+import csv
+import hashlib
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+from tests.helpers_report import describe, grid, write_run
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.evaluation import drop_episodes_after, read_episodes
+from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.runs.files import write_json
+
+
+def test_a_report_counts_seeds_not_episodes(tmp_path):
+    for seed, scores in enumerate([[10.0, 30.0], [40.0, 40.0]]):
+        write_run(tmp_path / f"runs/acro/{seed}", "acro", seed, {5: [90.0, 90.0], 10: scores}, film=seed == 0)
+    write_run(tmp_path / "runs/random/0", "random", 0, {10: [95.0]})
+    page, summary = write_report([tmp_path / "runs"], tmp_path / "out")
+    assert [row["method"] for row in summary] == ["acro", "random"], "references come last, whatever their score"
+    acro = summary[0]
+    assert acro["score"] == pytest.approx(30.0)
+    assert (acro["seeds"], acro["episodes"], acro["best_step"]) == (2, 4, 5)
+    assert (acro["low"], acro["high"]) == (20.0, 40.0)
+    assert summary[1]["low"] is None
+    with (tmp_path / "out" / "episodes.csv").open() as file:
+        assert len(list(csv.DictReader(file))) == 9
+    text = page.read_text()
+    assert "data:image/webp;base64" in text
+    assert "30.0" in text
+    assert not re.search(r'(src|href)="?(https?:)?//', text), "the page must not need a network"
+
+
+def test_references_with_their_own_algorithm_stand_in_the_same_table(tmp_path):
+    write_run(tmp_path / "runs/acro", "acro", 0, {10: [50.0]})
+    end_to_end = write_run(tmp_path / "runs/bc", "bc", 0, {10: [20.0]})
+    rows = (end_to_end / "episodes.csv").read_text()
+    (end_to_end / "episodes.csv").write_text(rows.replace("td3_bc", "bc"))
+    (end_to_end / "probe.json").write_text('{"probe_pose": 12.5, "probe_velocity": 34.5}')
+    (end_to_end / "pretrain_timing.json").write_text('{"seconds": 7.0}')
+    page, _ = write_report([tmp_path / "runs"], tmp_path / "out")
+    text = page.read_text()
+    assert text.count("<h3>walker_walk expert, patch</h3>") == 1
+    with (tmp_path / "out" / "runs.csv").open() as file:
+        acro, bc = csv.DictReader(file)
+    assert (acro["method"], acro["return"], acro["probe_pose"]) == ("acro", "500.0", "")
+    assert (bc["method"], bc["probe_pose"], bc["probe_velocity"]) == ("bc", "12.5", "34.5")
+    assert (bc["pretrain_seconds"], bc["finetune_seconds"]) == ("7.0", "3.0")
+    with (tmp_path / "out" / "improvement.csv").open() as file:
+        chances = {(row["method"], row["other"]): float(row["probability"]) for row in csv.DictReader(file)}
+    assert chances == {("acro", "bc"): 1.0, ("bc", "acro"): 0.0}
+
+
+def test_an_ablation_is_two_rows_everywhere(tmp_path):
+    for k in (1, 15):
+        describe(write_run(tmp_path / f"runs/{k}", "mik+a", 0, {5: [k], 10: [k]}, film=True), {"max_k": k})
+    page, summary = write_report([tmp_path / "runs"], tmp_path / "out")
+    assert {row["variant"]: row["score"] for row in summary} == {"max_k 15": 15.0, "max_k 1": 1.0}
+    text = page.read_text()
+    for name in ("mik+a, max_k 1", "mik+a, max_k 15"):
+        assert f"<td>{name}</td>" in text
+        assert f"<h3>finetune {name}, walker_walk expert, patch, seed 0</h3>" in text
+    for name in ("summary", "curves", "aggregate", "runs", "episodes"):
+        with (tmp_path / "out" / f"{name}.csv").open() as file:
+            assert {row["variant"] for row in csv.DictReader(file)} == {"max_k 1", "max_k 15"}
+    describe(write_run(tmp_path / "runs/twin", "mik+a", 0, {10: [3.0]}), {"max_k": 1})
+    with pytest.raises(UserError, match="two runs of one method, setting and seed"):
+        write_report([tmp_path / "runs"], tmp_path / "out")
+
+
+def test_missing_cells_and_seeds_are_shown_as_missing(tmp_path):
+    page, summary = write_report([grid(tmp_path)], tmp_path / "out")
+    found = {(row["quality"], row["method"]): (row["score"], row["missing"]) for row in summary}
+    assert found == {
+        ("expert", "acro"): (21.0, ""),
+        ("expert", "mik+a"): (20.5, "seed 2 missing"),
+        ("medium", "acro"): (9.0, ""),
+        ("medium", "mik+a"): (None, "seed 0 missing"),
+    }
+    text = page.read_text()
+    assert '<tr class="gap"><td>mik+a</td><td colspan="6">seed 0 missing</td></tr>' in text
+    assert '<span class="gap">seed 2 missing</span>' in text
+    for legend in ("mik+a (seed 2 missing)", "mik+a (seed 0 missing)", "mik+a (1 of 2 tasks)"):
+        assert f"<!-- {legend} -->" in text, "a figure's legend says it, too"
+    with (tmp_path / "out" / "missing.csv").open() as file:
+        assert [(row["quality"], row["seed"], row["state"]) for row in csv.DictReader(file)] == [
+            ("expert", "2", "missing"),
+            ("medium", "0", "missing"),
+        ]
+    with (tmp_path / "out" / "runs.csv").open() as file:
+        states = {(r["quality"], r["method"], r["seed"]): r["state"] for r in csv.DictReader(file)}
+    assert len(states) == 8
+    assert {setting for setting, state in states.items() if state == "missing"} == {
+        ("expert", "mik+a", "2"),
+        ("medium", "mik+a", "0"),
+    }
+
+
+def test_unfinished_runs_are_named_and_kept_out_of_final_scores(tmp_path):
+    runs = grid(tmp_path)
+    cut = runs / "acro2"
+    (cut / "timing.json").unlink()
+    rows = [line for line in (cut / "episodes.csv").read_text().splitlines() if ",10,0," not in line]
+    (cut / "episodes.csv").write_text("\n".join(rows) + "\n")
+    (cut / "metrics.jsonl").write_text('{"step": 7, "bc_loss": 0.5}\n')
+    begun = describe(write_run(runs / "begun", "mik+a", 2, {}), {})
+    (begun / "timing.json").unlink()
+    (begun / "metrics.jsonl").unlink()
+    page, summary = write_report([runs], tmp_path / "out")
+    found = {(row["quality"], row["method"]): (row["score"], row["seeds"], row["missing"]) for row in summary}
+    assert found["expert", "acro"] == (20.5, 2, "seed 2 unfinished at 7 of 10 updates")
+    assert found["expert", "mik+a"] == (20.5, 2, "seed 2 unfinished at 0 of 10 updates")
+    text = page.read_text()
+    assert "6 finished runs" not in text
+    assert "5 finished runs, 2 unfinished" in text
+    for folder in (cut, begun):
+        assert f"<td>{folder}</td>" in text
+    with (tmp_path / "out" / "curves.csv").open() as file:
+        seeds = {(r["quality"], r["method"], r["step"]): r["seeds"] for r in csv.DictReader(file)}
+    assert (seeds["expert", "acro", "5"], seeds["expert", "acro", "10"]) == ("3", "2"), "curves show what there is"
+
+
+def test_a_report_of_unfinished_runs_alone_says_so(tmp_path):
+    (describe(write_run(tmp_path / "runs/a", "acro", 0, {5: [1.0]}), {}) / "timing.json").unlink()
+    page, summary = write_report([tmp_path / "runs"], tmp_path / "out")
+    assert [(row["score"], row["missing"]) for row in summary] == [(None, "seed 0 unfinished at 10 of 10 updates")]
+    assert "0 finished runs, 1 unfinished" in page.read_text()
+
+
+def test_a_report_writes_over_nothing_but_an_earlier_report(tmp_path, capsys):
+    for seed in (0, 1):
+        write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [25.0]})
+    write_run(tmp_path / "runs/random", "random", 0, {10: [1.0]})
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "index.html").write_text("mine")
+    for out in ("runs", "runs/0", "runs/0/report", "notes"):
+        before = {p: hashlib.sha256(p.read_bytes()).digest() for p in tmp_path.rglob("*") if p.is_file()}
+        with pytest.raises(SystemExit) as end:
+            main(["report", str(tmp_path / "runs"), "--out", str(tmp_path / out)])
+        assert end.value.code == 2
+        assert "choose another --out" in capsys.readouterr().err
+        assert {p: hashlib.sha256(p.read_bytes()).digest() for p in tmp_path.rglob("*") if p.is_file()} == before
+    write_report([tmp_path / "runs"], tmp_path / "out")
+    first = {p.name for p in (tmp_path / "out").iterdir()}
+    write_report([tmp_path / "runs" / "0"], tmp_path / "out")
+    again = {p.name for p in (tmp_path / "out").iterdir()}
+    assert first - again == {"improvement.csv", "missing.csv"}, "no table of the earlier report is left"
+    write_report([tmp_path / "runs"], tmp_path / "runs" / "report")
+    assert len(write_report([tmp_path / "runs"], tmp_path / "runs" / "report")[1]) == 2
+
+
+HOSTILE = '$\\frac$ <b>=1+1</b>, "x"|`y`\n[/red]_\u2028μ'
+
+
+def test_a_methods_name_is_text_and_nothing_else(tmp_path, capsys):
+    assert "\n" in HOSTILE
+    write_run(tmp_path / "runs/a", HOSTILE, 0, {5: [1.0], 10: [2.0]}, film=True, labels={"quality": "_$x_$"})
+    pretrain = tmp_path / "runs" / "pretrain"
+    pretrain.mkdir()
+    write_json(pretrain / "config.json", {"stage": "pretrain", "config": {"method": HOSTILE, "seed": 0}})
+    (pretrain / "metrics.jsonl").write_text('{"step": 1, "action_loss": 0.5}\n{"step": 2, "action_loss": 0.4}\n')
+    main(["report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")])
+    assert "<b>=1+1" in capsys.readouterr().out.replace("\n", "")
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert "<b>" not in page
+    assert "&lt;b&gt;=1+1&lt;/b&gt;" in page
+    for name in ("summary", "episodes", "runs", "curves"):
+        with (tmp_path / "out" / f"{name}.csv").open(newline="", encoding="utf-8") as file:
+            assert {row["method"] for row in csv.DictReader(file)} == {HOSTILE}
+    rows = read_episodes(tmp_path / "runs" / "a" / "episodes.csv")
+    drop_episodes_after(tmp_path / "runs" / "a" / "episodes.csv", 5)
+    assert read_episodes(tmp_path / "runs" / "a" / "episodes.csv") == rows[:1]
+
+
+def test_a_machine_that_does_not_speak_utf8_ends_no_command(tmp_path):
+    write_run(tmp_path / "runs/a", "μ", 0, {10: [2.0]})
+    words = [sys.executable, "-m", "vd4rl_pomdp.cli", "report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
+    ascii_only = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(words, capture_output=True, env=os.environ | ascii_only)
+    assert (done.returncode, b"\\u03bc" in done.stdout) == (0, True), done.stderr
+    for name in ("index.html", "summary.csv", "episodes.csv"):
+        assert "μ" in (tmp_path / "out" / name).read_text(encoding="utf-8")
