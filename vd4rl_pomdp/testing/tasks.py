@@ -12,7 +12,7 @@ from vd4rl_pomdp.testing.contract import Check, claim, run_checks
 from vd4rl_pomdp.types import StepType
 
 if TYPE_CHECKING:
-    from vd4rl_pomdp.envs.pixels import PixelEnv, Row
+    from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep
 
 SIZES = (84, 32)
 DECISIONS = 12
@@ -39,10 +39,10 @@ def make(name: str, size: int | None = None, length: int = DECISIONS) -> PixelEn
     return make_env(TASKS.named(name), size=size, length=length)
 
 
-def play(env: PixelEnv, seed: int) -> tuple[list[Row], np.ndarray]:
+def play(env: PixelEnv, seed: int) -> tuple[list[TimeStep], np.ndarray]:
     """All rows of a seed's episode under random actions, the same at every call, and these actions (T, A) float32."""
     rng = np.random.default_rng(0)
-    rows: list[Row] = [env.reset(seed)]
+    rows: list[TimeStep] = [env.reset(seed)]
     actions: list[np.ndarray] = []
     while not rows[-1].last:
         claim(len(actions) < DECISIONS, f"an episode of {DECISIONS} decisions goes on")
