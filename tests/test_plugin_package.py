@@ -157,7 +157,7 @@ def test_the_command_line_finds_an_installed_packages_parts_and_the_record_names
     common = ["--preset", "smoke", "--data", data]
     first, second = chosen("method", "corruption", "frame_encoder"), chosen("algorithm")
     python("-m", "vd4rl_pomdp", "pretrain", *first, *common, "--out", out / "pretrain")
-    encoder = ["--encoder", out / "pretrain" / "encoder", "--workers", 2, "--eval-episodes", 2]
+    encoder = ["--encoder", out / "pretrain" / "encoder", "--workers", 1, "--eval-episodes", 2]
     python("-m", "vd4rl_pomdp", "finetune", *second, *encoder, *common, "--out", out / "finetune")
     for stage, kinds in (
         ("pretrain", ("method", "corruption", "frame_encoder", "task")),
