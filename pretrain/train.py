@@ -10,7 +10,7 @@ import torch
 from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig, StreamOptions
 from pretrain.objectives import METHODS
-from vd4rl_pomdp.corruptions import check_corruption
+from vd4rl_pomdp.corruptions import check_corruption_fits
 from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError, refuse_outside
@@ -126,7 +126,7 @@ def check_config(config: PretrainConfig) -> None:
 def check_pictures(config: PretrainConfig, size: int) -> None:
     """Refuse a shift or a corruption that does not fit frames of size x size pixels."""
     refuse_outside(config, shift=(0, size - 1))
-    check_corruption(config.corruption, size)
+    check_corruption_fits(config.corruption, size)
 
 
 def require_batch(objective: Objective, device: torch.device, config: Any) -> None:

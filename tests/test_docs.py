@@ -10,26 +10,28 @@ import tyro
 
 from finetune.algorithms import ALGORITHMS
 from pretrain.config import PretrainConfig
-from pretrain.objectives import METHODS, Method
+from pretrain.objectives import METHODS
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
+from tests.helpers_pages import PAGES as EXAMPLES
+from tests.helpers_pages import isolated_registries, load_example
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.corruptions import STAGES, make_corruption
+from vd4rl_pomdp.corruptions import make_corruption
 from vd4rl_pomdp.mazes import get_maze
-from vd4rl_pomdp.tasks import QUALITIES, TASKS, DMCTask, GymnasiumTask
+from vd4rl_pomdp.registry import REGISTRIES
+from vd4rl_pomdp.tasks import QUALITIES, TASKS
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
-PROGRAMS = (["vd4rl-pomdp"], ["python", "my_method.py"], ["python", "my_task.py"])
-"""What begins a command of ours; the others are the pages' own examples."""
+PROGRAMS = (["vd4rl-pomdp"], *(["python", file] for file in EXAMPLES))
+"""What begins a command of ours."""
 NOT_RUN = {
     "make demo": "minutes of rendering and training; tests/cli looks at its commands, the Dockerfile runs them",
     "make test": "runs these tests",
     "pip install": "fetches packages",
     "parallel": "not a program of ours",
     "sbatch": "needs a cluster",
-    "python my_method.py": "test_own_method runs them",
-    "python my_task.py": "test_own_task runs them",
+    **{f"python {file}": "test_own_parts and test_own_task run them" for file in EXAMPLES},
     "vd4rl-pomdp data collect": "renders whole episodes; data/test_collect runs shorter ones",
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
@@ -71,7 +73,7 @@ class ParsedError(Exception):
 
 @pytest.fixture(autouse=True)
 def _registries():
-    with METHODS.isolated(), TASKS.isolated(), STAGES.isolated():
+    with isolated_registries():
         yield
 
 
@@ -92,7 +94,7 @@ OURS = [(page, line) for page, line in COMMANDS if line.split()[:1] in PROGRAMS 
 
 
 @pytest.mark.parametrize(("page", "line"), OURS, ids=[f"{page.stem}: {line}" for page, line in OURS])
-def test_every_command_has_flags_and_values_that_exist(page, line, monkeypatch):
+def test_every_command_has_flags_and_values_that_exist(page, line, tmp_path, monkeypatch):
     parsed = []
     real = tyro.cli
 
@@ -101,10 +103,9 @@ def test_every_command_has_flags_and_values_that_exist(page, line, monkeypatch):
         raise ParsedError
 
     monkeypatch.setattr(tyro, "cli", parse_alone)
-    METHODS.register("past_to_frame", Method(METHODS["acro"].build))
-    TASKS.register("cartpole_swingup", DMCTask("cartpole", "swingup"))
-    TASKS.register("centre", GymnasiumTask("Centre-v0"))
     words = shlex.split(re.split(r" [>|] ", line)[0].replace("[SET]", "SET"))
+    if words[1] in EXAMPLES:
+        load_example(words[1], tmp_path, monkeypatch)
     with pytest.raises(ParsedError):
         main(words[1:] if words[0] == "vd4rl-pomdp" else words[2:])
     check_names(parsed[0])
@@ -186,14 +187,17 @@ def check_results(page: str, names: dict) -> None:
     elif page == "add_a_task":
         assert names["obs"].shape == (9, 64, 64)
         assert not names["truncated"]
-    elif page == "README":
+    elif page in ("README", "add_a_corruption"):
         obs, info = names["env"].reset(seed=0)
         frames, clean = (pixels.reshape(3, 3, 84, 84) for pixels in (obs, info["clean"]))
         shown = [i for i in range(3) if frames[i].any()]
         assert len(shown) == 2
-        assert all((frames[i] != clean[i]).any((0, 2)).sum() == 16 for i in shown), "16 rows are black"
+        rows = 16 if page == "README" else 24
+        assert all((frames[i] != clean[i]).any((0, 2)).sum() == rows for i in shown), "so many rows are black"
 
 
 def test_toml_blocks_are_read_and_name_what_exists():
     found = [tomllib.loads(code)["project"]["entry-points"] for page in PAGES for code in blocks(page, "toml")]
-    assert sorted(group for groups in found for group in groups) == sorted([METHODS.group, TASKS.group])
+    assert sorted(group for groups in found for group in groups) == sorted(
+        registry.group for registry in REGISTRIES.values()
+    )

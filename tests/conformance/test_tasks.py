@@ -97,14 +97,14 @@ def test_what_the_harness_itself_could_break_is_caught(tasks, monkeypatch):
     from vd4rl_pomdp.envs.pixels import PixelEnv
 
     tasks.register("mine", GymnasiumTask(Square))
-    step, row, frame = PixelEnv.step, GymnasiumEnv._row, GymnasiumEnv._frame
+    step, time_step, frame = PixelEnv.step, GymnasiumEnv._time_step, GymnasiumEnv._frame
     broken = [
         (GymnasiumEnv, "_rescaled", lambda self, a: a * 5, actions_fill_their_bounds, "becomes .* the bounds are"),
         (GymnasiumEnv, "_frame", lambda self, s: frame(self, s + 1), frames_have_the_size_asked_for, "of size 84 is"),
         (
             GymnasiumEnv,
-            "_row",
-            lambda self, r, d, k: row(self, r, 0.9, k),
+            "_time_step",
+            lambda self, r, d, k: time_step(self, r, 0.9, k),
             episodes_end_once,
             "another discount than 1",
         ),

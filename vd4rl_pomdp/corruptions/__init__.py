@@ -10,7 +10,7 @@ from vd4rl_pomdp.corruptions.corruption import (
     Patch,
     Stage,
     ZeroFrames,
-    check_corruption,
+    check_corruption_fits,
     corruption_settings,
     make_corruption,
 )
@@ -27,7 +27,7 @@ __all__ = [
     "Patch",
     "Stage",
     "ZeroFrames",
-    "check_corruption",
+    "check_corruption_fits",
     "corruption_settings",
     "derive_keys",
     "draw_integers",

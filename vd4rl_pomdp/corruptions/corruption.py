@@ -235,7 +235,7 @@ def make_corruption(config: CorruptionConfig | str) -> Corruption:
     return Corruption(config.corruption, stages, zeroed)  # type: ignore[arg-type]
 
 
-def check_corruption(config: CorruptionConfig, size: int = FRAME_SIZE) -> None:
+def check_corruption_fits(config: CorruptionConfig, size: int = FRAME_SIZE) -> None:
     """Raise UserError for a corruption that does not fit stacks of size x size pixels, before any is corrupted."""
     stack = torch.zeros(1, _CHANNELS * FRAME_STACK, size, size, dtype=torch.uint8)
     make_corruption(config)(stack, torch.zeros(1, dtype=torch.int64))

@@ -8,7 +8,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption
+from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption_fits
 from vd4rl_pomdp.envs import Info
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
 from vd4rl_pomdp.envs.pixels import Render
@@ -80,5 +80,5 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 def _config(corruption: str, options: dict[str, Any], size: int) -> CorruptionConfig:
     """The corruption that `gymnasium.make` was asked for."""
     config = CorruptionConfig.of(corruption, **options)
-    check_corruption(config, size)
+    check_corruption_fits(config, size)
     return config

@@ -1,0 +1,45 @@
+"""The files that the documentation's pages on parts of one's own write, as scripts and as modules."""
+
+import importlib.util
+import re
+import sys
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from types import ModuleType
+
+import pytest
+
+import finetune.algorithms  # noqa: F401 (a kind's registry is made where its parts are)
+import pretrain.objectives  # noqa: F401
+from vd4rl_pomdp.registry import REGISTRIES
+
+DOCS = Path(__file__).parents[1] / "docs"
+PAGES = {f"my_{page.stem.split('_', 2)[2]}.py": page for page in sorted(DOCS.glob("add_a*.md"))}
+"""Name of the file and the page, whose first block it holds."""
+
+
+def write_example(file: str, folder: Path) -> Path:
+    """Write a page's file into a folder."""
+    script = folder / file
+    script.write_text(re.findall(r"```python\n(.*?)```", PAGES[file].read_text(), re.DOTALL)[0])
+    return script
+
+
+def load_example(file: str, folder: Path, patch: pytest.MonkeyPatch) -> ModuleType:
+    """Import a page's file, which registers its parts; its flags are described by its source."""
+    name = file.removesuffix(".py")
+    spec = importlib.util.spec_from_file_location(name, write_example(file, folder))
+    module = importlib.util.module_from_spec(spec)
+    patch.setitem(sys.modules, name, module)
+    spec.loader.exec_module(module)
+    return module
+
+
+@contextmanager
+def isolated_registries() -> Iterator[None]:
+    """Within the block parts of all kinds may be registered; after it they are forgotten."""
+    with ExitStack() as stack:
+        for registry in REGISTRIES.values():
+            stack.enter_context(registry.isolated())
+        yield
