@@ -127,9 +127,8 @@ def _check(config: CollectConfig) -> None:
     if config.quality not in SET_QUALITIES:
         raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(SET_QUALITIES)}")
     base = _base(config)
-    if (
-        not layout_of(task).state_dim and base != "random"
-    ):  # the environment is built first, and refused if it cannot be
+    layout = layout_of(task)  # also refuses an environment that cannot be built
+    if not layout.state_dim and base != "random":
         raise UserError(
             f"{config.task} has no states for an actor to read: --quality random, or a set of your own in this format"
         )
