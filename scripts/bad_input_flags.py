@@ -115,8 +115,8 @@ class _CaughtError(Exception):
 def config_of(command: str, *chosen: str) -> tuple[type, Any]:
     """The config class that a command parses its words into, and its defaults if they are not the class's own."""
 
-    def stop(config: type, **options: Any) -> None:
-        raise _CaughtError(config, options.get("default"))
+    def stop(kind: type, **options: Any) -> None:
+        raise _CaughtError(kind, options.get("default"))
 
     with mock.patch("vd4rl_pomdp.cli.parsing.tyro.cli", stop):
         try:

@@ -4,7 +4,6 @@ import re
 import shlex
 import tomllib
 from pathlib import Path
-from unittest.mock import patch
 
 import pytest
 import tyro
@@ -72,7 +71,7 @@ class ParsedError(Exception):
 
 @pytest.fixture(autouse=True)
 def _registries():
-    with METHODS.isolated(), TASKS.isolated(), patch.dict(STAGES):
+    with METHODS.isolated(), TASKS.isolated(), STAGES.isolated():
         yield
 
 

@@ -140,7 +140,7 @@ def test_rows_are_means_over_the_steps_since_the_row_before(stage, tmp_path, mon
     run, config, learner = stage
     config = replace(config(tmp_path / "run"), log_every=4, checkpoint_every=3)
     if learner is bc.BC:
-        config, learner = replace(config, algorithm="td3_bc"), td3_bc.TD3BC
+        config, learner = config.altered(algorithm="td3_bc"), td3_bc.TD3BC
     update, steps = learner.update, []
 
     def watched(self, *arguments):

@@ -66,9 +66,9 @@ def test_the_example_runs_through_every_stage(tmp_path):
 def stages(data: Path, out: Path, method: str = "mik+a") -> Path:
     """Pretrain and fine-tune at smoke size; the fine-tuning's folder."""
     common = {"data": data, "workers": 1}
-    pretraining = replace(pretrain.config.PRESETS["smoke"], data=data, out=out / "pretrain", method=method)
+    pretraining = pretrain.config.PretrainConfig.of("smoke", data=data, out=out / "pretrain", method=method)
     encoder = run_pretrain(pretraining).path / "encoder"
-    return run_finetune(replace(finetune.config.PRESETS["smoke"], encoder=encoder, out=out / "run", **common)).path
+    return run_finetune(finetune.config.FinetuneConfig.of("smoke", encoder=encoder, out=out / "run", **common)).path
 
 
 @pytest.mark.parametrize(("name", "size"), [("cartpole_swingup", 64), ("centre", 50)])
@@ -150,7 +150,7 @@ def test_what_a_task_cannot_give_is_refused_before_anything_is_written(tasks, tm
 def test_pictures_too_small_for_a_patch_a_shift_or_an_encoder_are_refused_before_training(tasks, tmp_path):
     data = tmp_path / "centre"
     collect(CollectConfig("centre", "random", data, episodes=2, workers=1, frame_size=16), 8)
-    base = replace(pretrain.config.PRESETS["smoke"], data=data, out=tmp_path / "run")
+    base = pretrain.config.PretrainConfig.of("smoke", data=data, out=tmp_path / "run")
     for changes, message in (
         ({"corruption": "patch", "patch_size": 17}, r"patch size 17 exceeds the image \(16x16\)"),
         ({"shift": 16}, "--shift is 16; it must be at least 0 and at most 15"),
@@ -166,8 +166,8 @@ def test_an_evaluation_is_never_longer_than_the_task(tasks, tmp_path):
     data = tmp_path / "short"
     collect(CollectConfig("short", "random", data, episodes=3, workers=1, frame_size=50))
     assert {len(part) for part in np.split(open_dataset(data).t, 3)} == {10}
-    encoder = run_pretrain(replace(pretrain.config.PRESETS["smoke"], data=data, out=tmp_path / "pretrain")).path
-    config = replace(finetune.config.PRESETS["smoke"], encoder=encoder / "encoder", data=data, workers=1)
+    encoder = run_pretrain(pretrain.config.PretrainConfig.of("smoke", data=data, out=tmp_path / "pretrain")).path
+    config = finetune.config.FinetuneConfig.of("smoke", encoder=encoder / "encoder", data=data, workers=1)
     run = run_finetune(replace(config, out=tmp_path / "run", eval_length=500))
     assert {row["length"] for row in read_episodes(run.path / "episodes.csv")} == {9}
     with pytest.raises(UserError, match="--eval-length is 501; it must be at least 1 and at most 500"):

@@ -145,10 +145,6 @@ class NavigationConfig(TrainingConfig):
             raise UserError(f"unknown picture {self.picture!r}: choose one of {', '.join(SHAPES)}")
         if self.burn_in >= self.window:
             raise UserError(f"--burn-in {self.burn_in} leaves no row of a window of {self.window}: lower it")
-        if self.checkpoint_every % self.log_every:
-            raise UserError(
-                f"--checkpoint-every {self.checkpoint_every} is no multiple of --log-every {self.log_every}: change one"
-            )
 
 
 def command_of(config: NavigationConfig) -> list[str]:

@@ -6,9 +6,10 @@ import math
 import pytest
 import torch
 
-from baselines import CURL, DRIML, HOMER
+from baselines import CURL, DRIML, HOMER, DRIMLOptions, HOMEROptions
 from vd4rl_pomdp.nn.contrastive import info_nce
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.types import Windows
 
 STATES = 4
@@ -53,7 +54,7 @@ def train(objective: torch.nn.Module, steps: int, noise: float, batch: int = 64,
 @pytest.mark.parametrize("codes", [0, 8])
 def test_homers_classifier_is_the_bayes_posterior(codes: int):
     noise = 0.5
-    objective = HOMER(encoder(), codes, seed=0)
+    objective = HOMER(encoder(), None, HOMEROptions(codes), 0)
     train(objective, 700, noise)
     objective.eval()
     eye = (torch.eye(STATES) * 255).to(torch.uint8)[:, :, None, None]
@@ -70,7 +71,7 @@ def test_homers_classifier_is_the_bayes_posterior(codes: int):
 
 
 def test_homers_imposters_are_uniform_over_the_batchs_next_states():
-    objective, given = HOMER(encoder(), 0, seed=0), []
+    objective, given = HOMER(encoder(), None, HOMEROptions(0), 0), []
     window, _ = finite_windows(4, 3, 0.0, torch.Generator().manual_seed(0))
     window = window.replace(obs=torch.randint(0, 256, window.obs.shape, dtype=torch.uint8))
     real = objective.logits
@@ -119,10 +120,10 @@ def test_driml_reaches_the_loss_of_the_true_density_ratio_and_needs_the_action()
     g = torch.Generator().manual_seed(9)
     following = [finite_windows(batch, rows, 0.0, g)[1][:, 1] for _ in range(20)]
     copies = torch.stack([(s[:, None] == s[None, :]).sum(1).float().log().mean() for s in following]).mean().item()
-    reached = train(DRIML(encoder(), 1, seed=0), 400, 0.0, batch, rows)
+    reached = train(DRIML(encoder(), None, DRIMLOptions(1), 0), 400, 0.0, batch, rows)
     assert reached == pytest.approx(copies, rel=0.03)
 
-    blind = DRIML(encoder(), 1, seed=0)
+    blind = DRIML(encoder(), None, DRIMLOptions(1), 0)
     anchor = blind._anchor
     blind._anchor = lambda name, features, action: anchor(name, features, action * 0)
     assert train(blind, 400, 0.0, batch, rows) > copies + 0.5 * math.log(2)
@@ -131,7 +132,7 @@ def test_driml_reaches_the_loss_of_the_true_density_ratio_and_needs_the_action()
 @pytest.mark.parametrize("seed", range(4))
 def test_drimls_anchors_are_a_state_and_the_action_taken_in_it(seed: int):
     """psi(s_t, a_t) against phi(s_{t+k}): in windows of T rows, a_0..a_{T-1-k} count and the later ones do not."""
-    rows, objective = 4, DRIML(encoder(), 3, seed)
+    rows, objective = 4, DRIML(encoder(), None, DRIMLOptions(3), seed)
     window, _ = finite_windows(8, rows, 0.0, torch.Generator().manual_seed(0))
     plain, logs = copy.deepcopy(objective).loss(window, 0.0)
     counts = []
@@ -143,7 +144,10 @@ def test_drimls_anchors_are_a_state_and_the_action_taken_in_it(seed: int):
 
 
 def test_driml_draws_every_gap_equally_often():
-    objective, (window, _) = DRIML(encoder(), 3, 0), finite_windows(2, 4, 0.0, torch.Generator().manual_seed(0))
+    objective, (window, _) = (
+        DRIML(encoder(), None, DRIMLOptions(3), 0),
+        finite_windows(2, 4, 0.0, torch.Generator().manual_seed(0)),
+    )
     with torch.no_grad():
         drawn = torch.stack([objective.loss(window, 0.0)[1]["k"] for _ in range(300)])
     assert torch.bincount(drawn.long(), minlength=4).tolist() == pytest.approx([0, 100, 100, 100], abs=30)
@@ -151,7 +155,7 @@ def test_driml_draws_every_gap_equally_often():
 
 def test_driml_scores_places_against_the_same_place():
     torch.manual_seed(0)
-    objective = DRIML(Encoder(EncoderConfig(1, "nature", 8)), 1, seed=0)
+    objective = DRIML(Encoder(EncoderConfig(1, "nature", 8)), None, DRIMLOptions(1), 0)
     obs = torch.randint(0, 256, (2, 3, 9, 84, 84), dtype=torch.uint8)
     maps = objective.encoder.frame.maps(obs)
     places = objective._places(maps)
@@ -160,7 +164,7 @@ def test_driml_scores_places_against_the_same_place():
 
 
 def test_curls_momentum_encoder_follows_slowly_and_takes_no_gradient():
-    objective = CURL(encoder(), seed=0)
+    objective = CURL(encoder(), None, Options(), 0)
     window, _ = finite_windows(8, 3, 0.0, torch.Generator().manual_seed(0))
     objective.loss(window, 0.0)[0].backward()
     assert all(p.grad is None for p in objective.momentum_encoder.parameters())
@@ -176,7 +180,7 @@ def test_curls_momentum_encoder_follows_slowly_and_takes_no_gradient():
 
 def test_curl_compares_two_shifts_the_second_by_the_momentum_encoder():
     torch.manual_seed(0)
-    objective = CURL(Encoder(EncoderConfig(1, "nature", 8)), seed=0)
+    objective = CURL(Encoder(EncoderConfig(1, "nature", 8)), None, Options(), 0)
     window, _ = finite_windows(4, 2, 0.0, torch.Generator().manual_seed(0))
     window = window.replace(obs=torch.randint(0, 256, (4, 2, 9, 84, 84), dtype=torch.uint8))
     seen = {}
@@ -199,4 +203,4 @@ def test_curl_tells_states_apart_up_to_their_copies():
     g = torch.Generator().manual_seed(9)
     states = [finite_windows(batch, rows, 0.0, g)[1][:, 0] for _ in range(20)]
     copies = torch.stack([(s[:, None] == s[None, :]).sum(1).float().log().mean() for s in states]).mean().item()
-    assert train(CURL(encoder(), seed=0), 400, 0.0, batch, rows) == pytest.approx(copies, rel=0.03)
+    assert train(CURL(encoder(), None, Options(), 0), 400, 0.0, batch, rows) == pytest.approx(copies, rel=0.03)

@@ -31,7 +31,7 @@ SWEPT = ["--data", "x", "--out", "y", "--dry-run"]
 @pytest.mark.parametrize(
     ("words", "message"),
     [
-        (["pretrian"], "unknown command 'vd4rl-pomdp pretrian': choose one of demo, data"),
+        (["pretrian"], "unknown command 'vd4rl-pomdp pretrian': choose one of demo, list, data"),
         (["data", "chekc"], "choose one of collect"),
         (["data", "check", "nowhere"], "nowhere"),
         (["pretrain", "--data", "nowhere", "--out", "x"], "nowhere: no such folder"),
@@ -65,7 +65,10 @@ SWEPT = ["--data", "x", "--out", "y", "--dry-run"]
         (["sweep", "--data", "x", "--out", "y", "--dry-run", "--preset", "foo"], "unknown preset 'foo'"),
         (["sweep", "--data", "x", "--out", "y", "--dry-run", "--finetune=--foo"], "--foo"),
         (["sweep", "--data", "x", "--out", "y", "--dry-run", "--seeds", "0", "-1"], "--seed is -1"),
-        (["sweep", *SWEPT, "--methods", "random", "acro", "--pretrain=--codes 3"], "--codes is not read by random"),
+        (
+            ["sweep", *SWEPT, "--methods", "random", "acro", "--pretrain=--codes 3"],
+            "--codes is not read by the method random",
+        ),
         (
             ["sweep", *SWEPT, "--methods", "acro", "bc", "--finetune=--alpha 1"],
             "--alpha is not read by the algorithm bc",

@@ -139,7 +139,7 @@ def test_the_corruptions_fields_are_arguments():
     [
         ({"render": "x"}, "'x'"),
         ({"corruption": "fog"}, "unknown corruption 'fog'"),
-        ({"patch_sise": 8}, "unknown argument 'patch_sise': choose one of corruption, .*patch_size"),
+        ({"patch_sise": 8}, "--patch-sise is not read by the corruption none"),
         ({"corruption": "patch", "patch_size": 0}, "patch-size is 0"),
         ({"corruption": "patch", "patch_size": 85}, "patch size 85 exceeds the image"),
         ({"corruption": "zero_frames", "zeroed_frames": 4}, "cannot zero 4 of 3"),

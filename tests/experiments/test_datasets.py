@@ -87,7 +87,7 @@ def test_physics_alone_gives_the_rewards_of_the_rendered_episodes(tmp_path):
     _, episodes, policy = next(iter(_plan(config)))
     for episode in episodes:
         job = _job(config, policy, episode, 6)
-        rendered, played = _roll_out(job), _roll_out(replace(job, render=None))
+        rendered, played = _roll_out(job), _roll_out(replace(job, size=None))
         assert "observation" in rendered
         assert "observation" not in played
         for key, value in played.items():

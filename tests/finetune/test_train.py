@@ -98,7 +98,9 @@ BELOW_IN_FINETUNING = {
 @pytest.mark.parametrize(("field", "value"), [*BELOW_IN_FINETUNING.items(), *BELOW_IN_BOTH.items()])
 def test_numbers_out_of_range_stop_finetuning_before_it_begins(data, tmp_path, field, value):
     with pytest.raises(UserError, match=f"--{field.replace('_', '-')} is {value}; it must be at least"):
-        run_finetune(smoke_finetune(tmp_path / "encoder", data, tmp_path / "out", **{field: value}))
+        run_finetune(
+            smoke_finetune(tmp_path / "encoder", data, tmp_path / "out", **({field: value} | READ_BY.get(field, {})))
+        )
     assert not (tmp_path / "out").exists()
 
 

@@ -20,6 +20,7 @@ Parts = tuple[str, str, str]
 UNKNOWN = "pretraining"
 """Key in the settings of a run whose encoder does not say how it was pretrained."""
 _NOT_RECORDED = "not recorded"
+_UNSET = "unset"
 _PRESETS = ("preset", "pretraining preset")
 _DATA = ("data", "pretraining data")
 _LABELS = ("method", "task", "quality")
@@ -93,6 +94,9 @@ def _name(settings: list[Settings], wanted: Callable[[str], bool], brief: bool) 
     """What differs among some settings: "max_k 1, steps 20"."""
     known = filter(wanted, dict.fromkeys(name for one in settings for name in one))
     names = [name for name in known if _differs(settings, name)]
+    # An option of a chosen part is not there without the part: naming the part says it all.
+    everywhere = [name for name in names if all(_value(one, name) != _UNSET for one in settings)]
+    names = [name for name in names if name in everywhere or not _decided(settings, name, everywhere)]
     deciding: list[str] = []
     for preset in _PRESETS if brief else ():
         if preset in names and not _decided(settings, preset, deciding):
@@ -102,12 +106,12 @@ def _name(settings: list[Settings], wanted: Callable[[str], bool], brief: bool) 
 
 
 def _value(settings: Settings, name: str) -> str:
-    """A value in words; none where nothing read the setting, or an encoder does not say how it was pretrained."""
+    """A value in words; none where an encoder does not say how it was pretrained."""
     if name in settings:
         return settings[name]
     if name in _DATA:
         return _NOT_RECORDED
-    return ""
+    return "" if UNKNOWN in settings or name == UNKNOWN else _UNSET
 
 
 def _differs(settings: list[Settings], name: str) -> bool:
