@@ -13,7 +13,7 @@ from finetune.features import FrozenEncoder
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
-from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_finetune, smoke_pretrain
+from tests.helpers_stages import BELOW_IN_BOTH, READ_BY, CutError, contents, cut_at, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.errors import UserError
