@@ -50,12 +50,6 @@ def smoke_finetune(encoder: Path, data: Path, out: Path, **changes: object) -> f
     return finetune.config.FinetuneConfig.of("smoke", encoder=encoder, data=data, out=out, workers=1, **changes)
 
 
-READ_BY = {
-    "homer_codes": {"method": "homer"},
-    "expectile": {"algorithm": "iql"},
-    "temperature": {"algorithm": "iql"},
-}
-"""Part that reads an option, where the usual one does not."""
 BELOW_IN_BOTH = {
     **{"seed": -1, "batch_size": 0, "learning_rate": float("nan"), "shift": -1, "log_every": 0, "checkpoint_every": 0},
 }

@@ -157,7 +157,7 @@ def test_pictures_too_small_for_a_patch_a_shift_or_an_encoder_are_refused_before
         ({"frame_encoder": "nature"}, "frame encoder 'nature' cannot read pictures of 16x16 pixels"),
     ):
         with pytest.raises(UserError, match=message):
-            run_pretrain(replace(base, **changes))
+            run_pretrain(base.altered(**changes))
         assert not (tmp_path / "run").exists()
 
 

@@ -21,7 +21,7 @@ MAY_IMPORT = {
     "pretrain": {"pretrain", "baselines", "vd4rl_pomdp"},
     "finetune": {"finetune", "vd4rl_pomdp"},
 }
-MAY_CALL_STAGES = ("vd4rl_pomdp/cli/", "vd4rl_pomdp/experiments/bench/")
+MAY_CALL_STAGES = ("vd4rl_pomdp/cli/", "vd4rl_pomdp/experiments/bench/", "vd4rl_pomdp/testing/")
 """Folders whose functions call the stages, and import them there: what is not called is not loaded."""
 JUDGES = "vd4rl_pomdp.experiments"
 """What judges runs: the command line alone imports it."""
@@ -82,6 +82,12 @@ def test_an_import_counts_unless_it_waits_for_a_call_or_is_for_types():
     tree = ast.parse(source + "    def h(self):\n        import i\n")
     assert at_load(tree) == {"a", "c", "f.g"}
     assert everywhere(tree) == {"a", "c", "d", "f.g", "i"}
+
+
+def test_nothing_but_tests_imports_pytest():
+    trees = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in SOURCES}
+    named = {name: {module.split(".")[0] for module in everywhere(tree)} for name, tree in trees.items()}
+    assert [name for name in named if named[name] & {"pytest", "_pytest", "hypothesis", "tests"}] == []
 
 
 def test_what_judges_runs_is_imported_by_the_command_line_alone():

@@ -1,142 +1,47 @@
-"""Every method of the registry keeps the contracts: losses, gradients, state, padding, streaming, resumption."""
+"""Every method of the registry keeps the contract of methods, and what breaks it is caught."""
 
-import copy
+from collections.abc import Callable
 
 import pytest
 import torch
 
-from pretrain.build import build_objective, build_target
-from pretrain.config import PretrainConfig
-from pretrain.objectives import METHODS
-from vd4rl_pomdp.nn.action_target import ACTION_TARGETS
-from vd4rl_pomdp.objective import InverseObjective, Objective
-from vd4rl_pomdp.types import Windows
+from pretrain.objectives import METHODS, Method
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.objective import InverseOptions, Objective, StateInverse
+from vd4rl_pomdp.testing import check_method
+from vd4rl_pomdp.testing.contract import run_check
+from vd4rl_pomdp.testing.methods import (
+    ROWS,
+    a_loss_is_a_finite_scalar,
+    a_loss_moves_the_whole_encoder,
+    a_training_that_goes_on_elsewhere_takes_the_same_steps,
+    batch,
+    build,
+    checks_of,
+    padding_changes_no_loss,
+    predictions_depend_on_what_is_declared,
+    predicts_actions,
+    steps_lower_the_loss,
+    streaming_equals_batch,
+    the_state_holds_all_that_a_loss_depends_on,
+)
 
-ROWS, ACTIONS = 6, 2
-TRAINED = [name for name, method in METHODS.items() if method.trained]
-
-
-def build(method: str, **changes: object) -> Objective:
-    torch.manual_seed(0)
-    small = {"max_k": 3, "feature_dim": 8, "hidden_dim": 7, "head_dim": 8}
-    config = PretrainConfig.of("smoke", method=method, **changes).with_known(**(small | changes))
-    actions = torch.rand(50, ACTIONS) * 2 - 1
-    target = build_target(config, actions.numpy())
-    return build_objective(config, actions.shape[1], target, state_dim=5)
-
-
-def batch(lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0, state: bool = False) -> Windows:
-    g = torch.Generator().manual_seed(seed)
-    shape = (5, 1, 1) if state else (9, 4, 4)
-    obs = torch.randint(0, 256, (len(lengths), ROWS, *shape), generator=g, dtype=torch.uint8)
-    if not state:  # blocks of 21 pixels, which a shift leaves recognisable
-        obs = obs.repeat_interleave(21, -1).repeat_interleave(21, -2)
-    length = torch.tensor(lengths)
-    has_action = torch.arange(ROWS) < length[:, None] - 1
-    action = (torch.rand(len(lengths), ROWS, ACTIONS, generator=g) * 2 - 1) * has_action[..., None]
-    prev_action = torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], 1)
-    key = torch.arange(len(lengths) * ROWS).view(len(lengths), ROWS)
-    return Windows(obs, prev_action, action, has_action, length, key)
+CASES = [(name, check) for name in METHODS for check in checks_of(name)]
+INVERSE = [name for name in METHODS if predicts_actions(name)]
 
 
-@pytest.mark.parametrize("method", TRAINED)
-def test_loss_is_a_finite_scalar_that_moves_every_part_of_the_encoder(method: str):
-    objective = build(method)
-    loss, logs = objective.loss(batch(), 0.0)
-    assert loss.shape == ()
-    assert torch.isfinite(loss)
-    assert all(value.numel() == 1 and not value.requires_grad for value in logs.values())
-    assert torch.equal(logs["loss"], loss.detach())
-    loss.backward()
-    still = [n for n, p in objective.encoder.named_parameters() if p.grad is None or not p.grad.any()]
-    assert still == []
-
-
-@pytest.mark.parametrize("method", TRAINED)
-def test_a_step_on_one_batch_lowers_its_loss(method: str):
-    objective, window = build(method, **({"max_k": 1} if method == "driml" else {})), batch()
-    optimiser = torch.optim.Adam(objective.parameters(), lr=1e-3)
-    losses = []
-    for _ in range(30):
-        loss, _ = objective.loss(window, 0.0)
-        optimiser.zero_grad()
-        loss.backward()
-        optimiser.step()
-        objective.after_step()
-        losses.append(loss.item())
-    assert sum(losses[-5:]) < 0.97 * sum(losses[:5])
-
-
-@pytest.mark.parametrize("method", TRAINED)
-def test_state_dict_holds_all_that_a_loss_depends_on(method: str):
-    objective, window = build(method), batch()
-    objective.loss(window, 0.0)
-    other = build(method)
-    with torch.no_grad():
-        for parameter in other.parameters():
-            parameter.add_(0.1)
-    other.load_state_dict(objective.state_dict())
-    assert objective.loss(window, 0.0)[0].item() == other.loss(window, 0.0)[0].item()
-
-
-@pytest.mark.parametrize("method", TRAINED)
-def test_padding_changes_no_loss(method: str):
-    objective, window = build(method), batch((4, 4, 4))
-    noisy = window.replace(obs=window.obs.clone(), action=window.action.clone(), prev_action=window.prev_action.clone())
-    noisy.obs[:, 4:], noisy.action[:, 4:], noisy.prev_action[:, 5:] = 255, 7.0, 7.0
-    again = copy.deepcopy(objective)
-    torch.testing.assert_close(again.loss(noisy, 0.0)[0], objective.loss(window, 0.0)[0])
-
-
-@pytest.mark.parametrize("method", METHODS)
-def test_streaming_and_batch_encodings_agree(method: str):
-    encoder = build(method).encoder.eval()
-    window = batch((ROWS, ROWS), state=METHODS[method].reads_state)
-    with torch.no_grad():
-        whole = encoder.encode(window)
-        state, rows = encoder.initial_state(2), []
-        for t in range(ROWS):
-            z, state = encoder.step(window.obs[:, t], window.prev_action[:, t], state)
-            rows.append(z)
-    torch.testing.assert_close(torch.stack(rows, 1), whole, atol=1e-5, rtol=1e-5)
-    assert whole.shape == (2, ROWS, encoder.dim)
-
-
-INVERSE = [name for name in TRAINED if isinstance(build(name), InverseObjective)]
-
-
-@pytest.mark.parametrize("target", ACTION_TARGETS)
-@pytest.mark.parametrize("method", INVERSE)
-def test_every_inverse_method_takes_every_action_target(method: str, target: str):
-    loss, _ = build(method, action_target=target).loss(batch(), 0.0)
-    assert torch.isfinite(loss)
+@pytest.mark.parametrize(("name", "check"), CASES, ids=lambda value: getattr(value, "__name__", value))
+def test_a_method_keeps_its_promises(name: str, check: Callable):
+    run_check("method", check, name)
 
 
 @pytest.mark.parametrize("method", INVERSE)
-def test_options_add_their_terms(method: str):
-    plain = build(method)
-    rich = build(method, self_prediction=0.5, l2_states=0.1, k_embedding=False)
-    loss, logs = rich.loss(batch(), 0.25)
+def test_the_loss_of_an_inverse_method_is_its_action_loss(method: str):
+    loss, logs = build(method).loss(batch(), 0.0)
+    assert torch.equal(loss.detach(), logs["action_loss"])
+    loss, logs = build(method, self_prediction=0.5, l2_states=0.1).loss(batch(), 0.25)
     expected = logs["action_loss"] + 0.5 * logs["self_prediction"] + 0.1 * 0.75 * logs["l2_states"]
     torch.testing.assert_close(loss.detach(), expected)
-    assert rich.head.k is None
-    assert plain.head.k is not None
-
-
-@pytest.mark.parametrize("method", INVERSE)
-def test_the_loss_is_that_of_the_first_action_after_each_pairs_earlier_state(method: str):
-    """-log P(a_t | ...), averaged over all real pairs (t, t+k) of the batch: here one by one, and for each k."""
-    objective, window = build(method), batch()
-    logits = objective.action_logits(window)
-    alone: dict[int, list[torch.Tensor]] = {}
-    for p, (t, k) in enumerate(objective.pairs(ROWS).tolist()):
-        for b, length in enumerate(window.length.tolist()):
-            if t + k < length:
-                alone.setdefault(k, []).append(objective.target.loss(logits[b, p], window.action[b, t]))
-    loss, logs = objective.loss(window, 0.0)
-    torch.testing.assert_close(loss, torch.stack([value for values in alone.values() for value in values]).mean())
-    for k, values in alone.items():
-        torch.testing.assert_close(logs[f"loss_k{k:02d}"], torch.stack(values).mean().detach())
 
 
 def test_self_prediction_moves_the_prediction_and_never_its_target():
@@ -157,3 +62,146 @@ def test_self_prediction_moves_the_prediction_and_never_its_target():
 def test_inverse_methods_are_those_of_the_papers():
     expected = {"no_history", "ah", "ah+a", "fj", "fj+a", "mik", "mik+a", "acro", "one_step_inverse"}
     assert set(INVERSE) == expected
+
+
+class Mean(Objective):
+    """Pulls the mean of the features to 1; right, but for what its subclasses break."""
+
+    def __init__(self, encoder, target, options, seed):
+        super().__init__()
+        self.encoder = encoder
+        self.steps = 0
+
+    def loss(self, window, progress):
+        error = (self.encoder.encode(window).mean(-1) - 1).square()
+        loss = (error * window.real).sum() / window.real.sum()
+        return loss, {"loss": loss.detach()}
+
+
+class Vector(Mean):
+    def loss(self, window, progress):
+        loss, logs = super().loss(window, progress)
+        return loss[None], logs
+
+
+class Diverged(Mean):
+    def loss(self, window, progress):
+        loss = super().loss(window, progress)[0] / 0
+        return loss, {"loss": loss.detach()}
+
+
+class Attached(Mean):
+    def loss(self, window, progress):
+        loss, _ = super().loss(window, progress)
+        return loss, {"loss": loss}
+
+
+class Unlogged(Mean):
+    def loss(self, window, progress):
+        return super().loss(window, progress)[0], {}
+
+
+class Misreported(Mean):
+    def loss(self, window, progress):
+        loss, _ = super().loss(window, progress)
+        return loss, {"loss": loss.detach() + 1}
+
+
+class Frozen(Mean):
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        self.encoder.frame.project[0].bias.requires_grad_(False)
+
+
+class Still(Mean):
+    """Its gradient leads nowhere that its value tells of."""
+
+    def loss(self, window, progress):
+        loss = super().loss(window, progress)[0]
+        loss = loss - loss.detach() + 1
+        return loss, {"loss": loss.detach()}
+
+
+class Counting(Mean):
+    """Its loss depends on a number that no state holds."""
+
+    def loss(self, window, progress):
+        self.steps += 1
+        loss = super().loss(window, progress)[0] * self.steps
+        return loss, {"loss": loss.detach()}
+
+
+class Drawing(Mean):
+    """Draws from torch's own generator while it trains."""
+
+    def loss(self, window, progress):
+        loss = super().loss(window, progress)[0] * torch.rand(())
+        return loss, {"loss": loss.detach()}
+
+
+class Unmasked(Mean):
+    def loss(self, window, progress):
+        loss = (self.encoder.encode(window).mean(-1) - 1).square().mean()
+        return loss, {"loss": loss.detach()}
+
+
+class Looking(Mean):
+    """Its encoder sees a window's last row in every row, which a stream cannot."""
+
+    def __init__(self, *arguments):
+        super().__init__(*arguments)
+        encode = self.encoder.from_features
+        self.encoder.from_features = lambda f, a: encode(f + f[:, -1:], a)
+
+
+class Undeclared(StateInverse):
+    def visible(self, t, k, rows):
+        return {t, t + k - 1}, set()
+
+
+class Broken(Mean):
+    def loss(self, window, progress):
+        raise RuntimeError("a shape does not fit")
+
+
+MUTANTS = [
+    (Vector, a_loss_is_a_finite_scalar, r"its shape is \(1,\)"),
+    (Diverged, a_loss_is_a_finite_scalar, "it is inf"),
+    (Attached, a_loss_is_a_finite_scalar, "loss is logged with its graph"),
+    (Unlogged, a_loss_is_a_finite_scalar, "no `loss` is logged, only none"),
+    (Misreported, a_loss_is_a_finite_scalar, "is logged, the loss is"),
+    (Frozen, a_loss_moves_the_whole_encoder, "none reaches frame.project.0.bias"),
+    (Still, steps_lower_the_loss, "the mean of the first five is"),
+    (Counting, the_state_holds_all_that_a_loss_depends_on, "register what the loss reads"),
+    (Drawing, a_training_that_goes_on_elsewhere_takes_the_same_steps, "draw from vd4rl_pomdp.nn.draws.Draws"),
+    (Unmasked, padding_changes_no_loss, "leave out rows beyond `real`"),
+    (Looking, streaming_equals_batch, "the two differ"),
+    (Undeclared, predictions_depend_on_what_is_declared, "the prediction of a_0 from rows 0 and 1 has gradients to"),
+    (Broken, a_loss_is_a_finite_scalar, "RuntimeError: a shape does not fit"),
+]
+
+
+@pytest.fixture
+def methods():
+    with METHODS.isolated():
+        yield METHODS
+
+
+@pytest.mark.parametrize(("kind", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
+def test_a_method_that_breaks_a_promise_is_told_which_and_how(methods, kind, check, reason):
+    options = {"options": InverseOptions} if issubclass(kind, StateInverse) else {}
+    methods.register("mine", Method(kind, **options))
+    with pytest.raises(AssertionError, match=f"method 'mine' breaks a promise(.|\n)*{reason}"):
+        run_check("method", check, "mine")
+    with pytest.raises(AssertionError, match="method 'mine' breaks a promise"):
+        check_method("mine")
+
+
+def test_a_method_that_keeps_all_promises_passes_and_unknown_ones_and_settings_are_refused(methods):
+    methods.register("mine", Method(Mean))
+    check_method("mine")
+    check_method("mine", feature_dim=5)
+    with pytest.raises(UserError, match="--max-k is not read by the method mine"):
+        check_method("mine", max_k=2)
+    with pytest.raises(UserError, match="unknown method 'yours'"):
+        check_method("yours")

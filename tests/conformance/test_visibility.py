@@ -9,38 +9,16 @@ from collections.abc import Callable
 import pytest
 import torch
 
-from pretrain.build import build_objective, build_target
-from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.objective import InverseObjective
+from vd4rl_pomdp.testing.contract import run_check
+from vd4rl_pomdp.testing.methods import ROWS, claim_visibility, predictions_depend_on_what_is_declared, predicts_actions
+from vd4rl_pomdp.testing.methods import build_inverse as inverse
 from vd4rl_pomdp.types import Windows
 from vd4rl_pomdp.visibility import declared, dependence, response, wrong_pairs
 
-ROWS, MAX_K, ACTIONS = 6, 4, 2
-
-
-def inverse(method: str, **changes: object) -> InverseObjective:
-    torch.manual_seed(0)
-    small = {"max_k": MAX_K, "feature_dim": 6, "hidden_dim": 5, "head_dim": 32}
-    config = PretrainConfig.of("smoke", method=method, **({"frame_encoder": "flat"} | changes))
-    config = config.with_known(**(small | changes))
-    actions = torch.rand(50, ACTIONS) * 2 - 1
-    target = build_target(config, actions.numpy())
-    picture = (3, 2) if config.frame_encoder == "flat" else (9, 84)
-    objective = build_objective(config, actions.shape[1], target, observation=picture).double()
-    assert isinstance(objective, InverseObjective)
-    return objective
-
-
-def predicts_actions(method: str) -> bool:
-    try:
-        return bool(inverse(method))
-    except AssertionError:
-        return False
-
-
-INVERSE = [name for name, method in METHODS.items() if method.trained and predicts_actions(name)]
-CASES = [(name, {}) for name in INVERSE] + [
+INVERSE = [name for name in METHODS if predicts_actions(name)]
+OPTIONS = [
     ("mik+a", {"literal_future": True}),
     ("mik+a", {"m": 1, "n": 0}),
     ("mik", {"m": 2, "n": 1}),
@@ -54,11 +32,21 @@ CASES = [(name, {}) for name in INVERSE] + [
 ]
 
 
-@pytest.mark.parametrize("mode", ["train", "eval"])
-@pytest.mark.parametrize(("method", "changes"), CASES)
-def test_dependence_is_what_is_declared(method: str, changes: dict, mode: str):
-    objective = inverse(method, **changes).train(mode == "train")
-    assert wrong_pairs(objective, [ROWS, ROWS, 4]) == []
+@pytest.mark.parametrize(("method", "changes"), OPTIONS)
+def test_dependence_is_what_is_declared(method: str, changes: dict):
+    run_check("method", predictions_depend_on_what_is_declared, method, **changes)
+
+
+def test_a_wrong_pair_is_named_with_what_it_sees():
+    objective = inverse("acro")
+    objective.visible = lambda t, k, rows: ({t, t + k}, {t})
+    message = (
+        "the prediction of a_0 from rows 0 and 1 has gradients to rows [0, 1] and actions []; changes with rows [0, 1] "
+        "and actions []; is declared to see rows [0, 1] and actions [0] (14 pairs are wrong)"
+    )
+    with pytest.raises(AssertionError) as caught:
+        claim_visibility(objective, [ROWS], ROWS)
+    assert str(caught.value) == message
 
 
 def test_mik_a_never_sees_the_masked_actions():

@@ -6,7 +6,7 @@ import pytest
 
 from pretrain.objectives import METHODS
 from pretrain.train import pretrain as run_pretrain
-from tests.helpers_stages import BELOW_IN_BOTH, READ_BY, CutError, contents, cut_at, smoke_pretrain
+from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_pretrain
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn import load_encoder
 
@@ -69,8 +69,9 @@ BELOW = {
 
 @pytest.mark.parametrize(("field", "value"), [*BELOW.items(), *BELOW_IN_BOTH.items()])
 def test_numbers_out_of_range_stop_pretraining_before_it_begins(data, tmp_path, field, value):
+    reader = {"homer_codes": {"method": "homer"}}.get(field, {})
     with pytest.raises(UserError, match=f"--{field.replace('_', '-')} is {value}; it must be at least"):
-        run_pretrain(smoke_pretrain(data, tmp_path / "out", **({field: value} | READ_BY.get(field, {}))))
+        run_pretrain(smoke_pretrain(data, tmp_path / "out", **{field: value}, **reader))
     assert not (tmp_path / "out").exists()
 
 

@@ -1,0 +1,156 @@
+"""Every corruption of the benchmark keeps the contract of corruptions, and what breaks it is caught."""
+
+from dataclasses import dataclass
+
+import pytest
+import torch
+
+from vd4rl_pomdp.corruptions import CORRUPTIONS, STAGES, Patch
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.options import Options
+from vd4rl_pomdp.testing import check_corruption
+from vd4rl_pomdp.testing.contract import run_check
+from vd4rl_pomdp.testing.corruptions import (
+    CHECKS,
+    a_record_gives_back_the_corruption,
+    a_view_shows_shifted_then_corrupted_stacks,
+    draws_depend_on_keys_alone,
+    emission_never_changes_a_row,
+    equal_keys_give_equal_masks,
+    frames_that_are_dropped_stay_dropped,
+    pixels_stay_pixels,
+    something_changes,
+    the_environment_shows_what_the_data_show,
+)
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("name", CORRUPTIONS)
+def test_a_corruption_keeps_its_promises(name, check):
+    run_check("corruption", check, name)
+
+
+@pytest.mark.parametrize("zeroed", [1, 2, 3])
+@pytest.mark.parametrize(
+    "options", [{}, {"patch_fill": 7, "patch_count": 2}, {"patch_shared": True}], ids=["", "two grey ones", "shared"]
+)
+def test_patches_and_zeroed_frames_keep_them_with_other_options(options, zeroed):
+    check_corruption("patch+zero_frames", zeroed_frames=zeroed, **options)
+
+
+@dataclass(frozen=True)
+class Nothing(Options):
+    def __call__(self, frames, key, number):
+        pass
+
+
+@dataclass(frozen=True)
+class Batchwise(Options):
+    """Draws one place for the whole batch."""
+
+    def __call__(self, frames, key, number):
+        frames[..., int(key.sum() % 80) :, :] = 0
+
+
+@dataclass(frozen=True)
+class Drawing(Options):
+    def __call__(self, frames, key, number):
+        frames[..., int(torch.randint(80, ())) :, :] = 0
+
+
+@dataclass(frozen=True)
+class Mixing(Options):
+    """Reads the stacks beside a stack's own."""
+
+    def __call__(self, frames, key, number):
+        frames[..., 0, 0] = frames.float().mean().to(torch.uint8)
+
+
+@dataclass(frozen=True)
+class Counting(Options):
+    """Looks otherwise at every call."""
+
+    def __call__(self, frames, key, number):
+        CALLS.append(1)
+        frames[..., len(CALLS) % 80, :] = 0
+
+
+CALLS: list[int] = []
+
+
+@dataclass(frozen=True)
+class Listed(Options):
+    """An option that JSON gives back as another type."""
+
+    columns: tuple[int, ...] = (3, 4)
+
+    def __call__(self, frames, key, number):
+        frames[..., list(self.columns)] = 0
+
+
+@dataclass(frozen=True)
+class Failing(Options):
+    def __call__(self, frames, key, number):
+        raise IndexError("no such column")
+
+
+MUTANTS = [
+    (Nothing, something_changes, "none differs"),
+    (Batchwise, equal_keys_give_equal_masks, "stacks look otherwise in a batch than alone"),
+    (Mixing, equal_keys_give_equal_masks, "stacks look otherwise in a batch than alone"),
+    (Batchwise, the_environment_shows_what_the_data_show, "a row looks otherwise in the environment"),
+    (Drawing, draws_depend_on_keys_alone, "equal keys gave different pixels"),
+    (Counting, emission_never_changes_a_row, "a row looked otherwise when it came again"),
+    (Counting, a_view_shows_shifted_then_corrupted_stacks, "they differ under resample with a shift of 0"),
+    (Listed, a_record_gives_back_the_corruption, r"columns=\[3, 4\]"),
+    (Failing, pixels_stay_pixels, "IndexError: no such column"),
+]
+
+
+@pytest.fixture
+def stages():
+    with STAGES.isolated():
+        yield STAGES
+
+
+@pytest.mark.parametrize(("kind", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
+def test_a_corruption_that_breaks_a_promise_is_told_which_and_how(stages, kind, check, reason):
+    stages.register("mine", kind)
+    with pytest.raises(AssertionError, match=f"corruption 'mine' breaks a promise(.|\n)*{reason}"):
+        run_check("corruption", check, "mine")
+    with pytest.raises(AssertionError, match="corruption 'mine' breaks a promise"):
+        check_corruption("mine")
+
+
+def test_an_input_that_is_changed_and_a_dropped_frame_that_is_seen_are_caught(monkeypatch):
+    from vd4rl_pomdp.corruptions import Corruption
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Corruption, "__call__", Corruption.apply_)
+        with pytest.raises(AssertionError, match="the input was changed"):
+            run_check("corruption", pixels_stay_pixels, "patch")
+    kept = Corruption.kept
+    monkeypatch.setattr(Corruption, "kept", lambda self, key, stack: (kept(self, key, stack) + CALLS[-1]) % stack)
+    CALLS.append(0)
+    run_check("corruption", frames_that_are_dropped_stay_dropped, "patch")
+    apply = Corruption.apply_
+
+    def other(self, obs, key):
+        CALLS.append(1)
+        try:
+            return apply(self, obs, key)
+        finally:
+            CALLS.append(0)
+
+    monkeypatch.setattr(Corruption, "apply_", other)
+    with pytest.raises(AssertionError, match="a dropped frame is not black"):
+        run_check("corruption", frames_that_are_dropped_stay_dropped, "patch")
+
+
+def test_options_reach_the_stages_and_unknown_ones_are_refused(stages):
+    stages.register("larger", type("Larger", (Patch,), {}))
+    check_corruption("larger", patch_size=20)
+    with pytest.raises(UserError, match="--zeroed-frames is not read by the corruption patch"):
+        check_corruption("patch", zeroed_frames=1)
+    with pytest.raises(UserError, match="unknown corruption 'fog'"):
+        check_corruption("fog")

@@ -1,0 +1,130 @@
+"""Every frame encoder of the registry keeps the contract of frame encoders, and what breaks it is caught."""
+
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import nn
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, FrameEncoderPart
+from vd4rl_pomdp.testing import check_frame_encoder
+from vd4rl_pomdp.testing.contract import run_check
+from vd4rl_pomdp.testing.frame_encoders import (
+    CHECKS,
+    a_folder_gives_back_the_encoder,
+    a_seed_decides_everything,
+    features_have_one_shape,
+    gradients_reach_all_parameters,
+    pictures_are_not_mixed,
+)
+
+SIZE = 20
+"""Which all of them read, but for those with large kernels."""
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("name", FRAME_ENCODERS)
+def test_a_frame_encoder_keeps_its_promises(name, check):
+    run_check("frame encoder", check, name, size=50)
+
+
+def convolution(channels: int, size: int, options: object) -> nn.Sequential:
+    return nn.Sequential(nn.Conv2d(channels, 4, 5, stride=3), nn.ReLU())
+
+
+def with_layer(make: Callable[[], nn.Module]) -> Callable[..., nn.Sequential]:
+    """A frame encoder with one layer more."""
+    return lambda channels, size, options: nn.Sequential(convolution(channels, size, options), make())
+
+
+class Flat(nn.Module):
+    def forward(self, x):
+        return x.flatten(1)
+
+
+class Bounded(nn.Module):
+    """Lets no picture through that is unlike the zeros that the shape is found with."""
+
+    def forward(self, x):
+        return x / (x * 0)
+
+
+class Lost(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.unused = nn.Linear(2, 2)
+
+    def forward(self, x):
+        return x
+
+
+class Counting(nn.Module):
+    def __init__(self):
+        super().__init__()
+        self.calls = 0
+
+    def forward(self, x):
+        self.calls += 1
+        return x + self.calls
+
+
+class Hidden(nn.Module):
+    """Its weights are in no state."""
+
+    def __init__(self):
+        super().__init__()
+        self.weight = torch.rand(()) + 1
+
+    def forward(self, x):
+        return x * self.weight
+
+
+class Centred(nn.Module):
+    """Subtracts the mean of the batch."""
+
+    def forward(self, x):
+        return x - x.mean(0)
+
+
+MUTANTS = [
+    (Flat, features_have_one_shape, r"its maps have the shape \(144,\)"),
+    (Bounded, features_have_one_shape, "some are not finite"),
+    (
+        lambda: nn.BatchNorm2d(4),
+        pictures_are_not_mixed,
+        r"features of picture 1 have gradients to \[True, True, True\]",
+    ),
+    (Centred, pictures_are_not_mixed, "features of picture 1 have gradients to"),
+    (Lost, gradients_reach_all_parameters, "none reaches convolutions.1.unused.bias, convolutions.1.unused.weight"),
+    (Counting, a_seed_decides_everything, "features differ from call to call"),
+    (nn.Dropout, a_seed_decides_everything, "features differ from call to call, training True"),
+    (Hidden, a_folder_gives_back_the_encoder, "its features differ"),
+]
+
+
+@pytest.fixture
+def encoders():
+    with FRAME_ENCODERS.isolated():
+        yield FRAME_ENCODERS
+
+
+@pytest.mark.parametrize(("layer", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
+def test_a_frame_encoder_that_breaks_a_promise_is_told_which_and_how(encoders, layer, check, reason):
+    encoders.register("mine", FrameEncoderPart(with_layer(layer)))
+    with pytest.raises(AssertionError, match=f"frame encoder 'mine' breaks a promise(.|\n)*{reason}"):
+        run_check("frame encoder", check, "mine", size=SIZE)
+    with pytest.raises(AssertionError, match="frame encoder 'mine' breaks a promise"):
+        check_frame_encoder("mine", size=SIZE)
+
+
+def test_a_right_one_passes_at_any_size_and_what_cannot_be_is_refused(encoders):
+    encoders.register("mine", FrameEncoderPart(convolution))
+    check_frame_encoder("mine")
+    check_frame_encoder("mine", size=SIZE, feature_dim=5)
+    with pytest.raises(UserError, match="--depth is not read by"):
+        check_frame_encoder("mine", depth=3)
+    with pytest.raises(UserError, match="'mixer' cuts pictures into patches"):
+        check_frame_encoder("mixer", size=84)
+    with pytest.raises(UserError, match="unknown frame encoder 'vit'"):
+        check_frame_encoder("vit")

@@ -1,0 +1,127 @@
+"""Every task of the benchmark keeps the contract of tasks, and what breaks it is caught."""
+
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.envs import dmc
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask, Layout
+from vd4rl_pomdp.testing import check_task
+from vd4rl_pomdp.testing.contract import run_check
+from vd4rl_pomdp.testing.tasks import (
+    CHECKS,
+    actions_fill_their_bounds,
+    episodes_end_once,
+    episodes_repeat_from_their_seeds,
+    frames_have_the_size_asked_for,
+    rewards_replay,
+    rows_have_the_declared_widths,
+)
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("name", TASKS)
+def test_a_task_keeps_its_promises(name, check):
+    run_check("task", check, name)
+
+
+class Square(gymnasium.Env):
+    """Shows and pays a number that its seed decides; right, but for what its subclasses break."""
+
+    def __init__(self, render_mode=None):
+        self.render_mode = render_mode
+        self.observation_space = gymnasium.spaces.Box(0, 255, (1,))
+        self.action_space = gymnasium.spaces.Box(-2.0, 3.0, (2,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        super().reset(seed=seed)
+        self.number = self.draw()
+        return np.array([self.number]), {}
+
+    def draw(self):
+        return int(self.np_random.integers(256))
+
+    def step(self, action):
+        return np.array([self.number]), float(self.number), False, False, {}
+
+    def render(self):
+        return np.full((90, 90), self.number, np.uint8)
+
+
+class Unseeded(Square):
+    def draw(self):
+        self.drawn = getattr(self, "drawn", 0) + 1
+        return self.drawn
+
+
+class Infinite(Square):
+    def step(self, action):
+        return np.array([0]), np.inf, False, False, {}
+
+
+class Failing(Square):
+    def step(self, action):
+        raise RuntimeError("the motor is off")
+
+
+@pytest.fixture
+def tasks():
+    with TASKS.isolated():
+        yield TASKS
+
+
+WALKER = TASKS["walker_walk"]
+MUTANTS = [
+    (GymnasiumTask(Unseeded), episodes_repeat_from_their_seeds, "row 0 shows another picture or state"),
+    (GymnasiumTask(Infinite), rows_have_the_declared_widths, "a reward is inf"),
+    (GymnasiumTask(Square, layout=Layout(3)), rows_have_the_declared_widths, "its layout says .* the environment has"),
+    (replace(WALKER, layout=Layout(6, 23, 9, travel=(1,))), rows_have_the_declared_widths, "its layout says"),
+    (GymnasiumTask(Failing), episodes_end_once, "RuntimeError: the motor is off"),
+]
+
+
+@pytest.mark.parametrize(("task", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))
+def test_a_task_that_breaks_a_promise_is_told_which_and_how(tasks, task, check, reason):
+    tasks.register("mine", task)
+    with pytest.raises(AssertionError, match=f"task 'mine' breaks a promise(.|\n)*{reason}"):
+        run_check("task", check, "mine")
+    with pytest.raises(AssertionError, match="task 'mine' breaks a promise"):
+        check_task("mine")
+
+
+def test_what_the_harness_itself_could_break_is_caught(tasks, monkeypatch):
+    from vd4rl_pomdp.envs.gymnasium_task import GymnasiumEnv
+    from vd4rl_pomdp.envs.pixels import PixelEnv
+
+    tasks.register("mine", GymnasiumTask(Square))
+    step, row, frame = PixelEnv.step, GymnasiumEnv._row, GymnasiumEnv._frame
+    broken = [
+        (GymnasiumEnv, "_rescaled", lambda self, a: a * 5, actions_fill_their_bounds, "becomes .* the bounds are"),
+        (GymnasiumEnv, "_frame", lambda self, s: frame(self, s + 1), frames_have_the_size_asked_for, "of size 84 is"),
+        (
+            GymnasiumEnv,
+            "_row",
+            lambda self, r, d, k: row(self, r, 0.9, k),
+            episodes_end_once,
+            "another discount than 1",
+        ),
+        (PixelEnv, "step", lambda self, a: replace(step(self, a), step_type=1), episodes_end_once, "decisions goes on"),
+        (dmc, "replay_rewards", lambda n, p, a: np.zeros(len(a)), rewards_replay, "were paid"),
+    ]
+    for place, name, instead, check, reason in broken:
+        with monkeypatch.context() as patch:
+            patch.setattr(place, name, instead)
+            with pytest.raises(AssertionError, match=reason):
+                run_check("task", check, "walker_walk" if place is dmc else "mine")
+
+
+def test_right_ones_of_both_kinds_pass_and_unknown_names_are_refused(tasks):
+    tasks.register("square", GymnasiumTask(Square, decisions=5))
+    tasks.register("reacher", DMCTask("reacher", "easy"))  # it draws a target, and cannot be replayed
+    check_task("square")
+    check_task("reacher")
+    with pytest.raises(UserError, match="unknown task 'mine'"):
+        check_task("mine")

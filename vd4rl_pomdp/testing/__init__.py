@@ -1,0 +1,18 @@
+"""The contracts of parts of one's own, for a package's own tests: one line checks a part that is registered by name.
+
+    from vd4rl_pomdp.testing import check_method
+
+    def test_my_method():
+        check_method("past_to_frame")
+
+Each function makes the part at a small size, puts it to every check of its kind, and raises AssertionError saying which
+promise is broken, and by what. An unknown name or option raises UserError.
+"""
+
+from vd4rl_pomdp.testing.algorithms import check_algorithm
+from vd4rl_pomdp.testing.corruptions import check_corruption
+from vd4rl_pomdp.testing.frame_encoders import check_frame_encoder
+from vd4rl_pomdp.testing.methods import check_method
+from vd4rl_pomdp.testing.tasks import check_task
+
+__all__ = ["check_algorithm", "check_corruption", "check_frame_encoder", "check_method", "check_task"]

@@ -1,0 +1,185 @@
+"""What every corruption must satisfy: it is a pure function of a stack and its key, in data and environment alike."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import TYPE_CHECKING, Any, get_args
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from vd4rl_pomdp.corruptions import BatchCorruption, Corruption, CorruptionConfig, derive_keys, make_corruption
+from vd4rl_pomdp.corruptions.corruption import ZERO_FRAMES, Mode
+from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.seeding import stream_seed
+from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
+from vd4rl_pomdp.testing.contract import Check, claim, run_checks
+from vd4rl_pomdp.types import StepType, row_key
+
+if TYPE_CHECKING:
+    from vd4rl_pomdp.data import Dataset
+
+STACKS = 8
+_MODES: tuple[Mode, ...] = get_args(Mode)
+
+
+def check_corruption(name: str, **options: Any) -> None:
+    """Check every promise of a corruption.
+
+    Args:
+        name: of a stage in `vd4rl_pomdp.corruptions.STAGES`, or of several, joined by `+`.
+        options: the stages' options.
+
+    Raises:
+        AssertionError: a promise is broken; says which one, and by what.
+        UserError: there is no such stage or option.
+    """
+    CorruptionConfig.of(name, **options)
+    run_checks("corruption", CHECKS, name, **options)
+
+
+def stacks(count: int = STACKS) -> Tensor:
+    """(count, C, S, S) uint8 random pixels from 1 on, the same at every call."""
+    shape = (count, 3 * FRAME_STACK, FRAME_SIZE, FRAME_SIZE)
+    return torch.randint(1, 256, shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+
+
+def _make(name: str, options: dict[str, Any]) -> Corruption:
+    return make_corruption(CorruptionConfig.of(name, **options))
+
+
+def pixels_stay_pixels(name: str, **options: Any) -> None:
+    """A corrupted batch is a new one of the same shape, uint8; what was given stays as it was."""
+    obs = stacks()
+    out = _make(name, options)(obs, torch.arange(STACKS))
+    claim(out.dtype == torch.uint8, f"it is {out.dtype}")
+    claim(out.shape == obs.shape, f"its shape is {tuple(out.shape)}, not {tuple(obs.shape)}")
+    claim(torch.equal(obs, stacks()), "the input was changed")
+
+
+def something_changes(name: str, **options: Any) -> None:
+    """A corruption changes pixels; the one called `none` changes none."""
+    changed = not torch.equal(_make(name, options)(stacks(), torch.arange(STACKS)), stacks())
+    claim(changed == (name != "none"), f"of {STACKS} random stacks {'some differ' if changed else 'none differs'}")
+
+
+def equal_keys_give_equal_masks(name: str, **options: Any) -> None:
+    """A stack and its key decide what is seen, whatever else is in the batch and however that is shaped."""
+    obs, key, corruption = stacks(), torch.arange(100, 100 + STACKS), _make(name, options)
+    whole = corruption(obs, key)
+    alone = torch.cat([corruption(obs[i : i + 1], key[i : i + 1]) for i in range(STACKS)])
+    claim(torch.equal(whole, alone), "stacks look otherwise in a batch than alone")
+    windows = corruption(obs.view(2, STACKS // 2, *obs.shape[1:]), key.view(2, -1))
+    claim(torch.equal(windows.view_as(whole), whole), "stacks look otherwise in windows than in a batch")
+
+
+def draws_depend_on_keys_alone(name: str, **options: Any) -> None:
+    """Nothing is drawn but from the keys: another call, or another seed of torch and numpy, changes nothing."""
+    seen = []
+    for seed in (1, 2):
+        torch.manual_seed(seed)
+        np.random.seed(seed)  # noqa: NPY002 (what a stage must not read)
+        corruption = _make(name, options)
+        seen += [corruption(stacks(), torch.arange(STACKS)) for _ in range(2)]
+    claim(all(torch.equal(seen[0], other) for other in seen), "equal keys gave different pixels")
+
+
+def frames_that_are_dropped_stay_dropped(name: str, **options: Any) -> None:
+    """Where `zero_frames` drops a frame, nothing is drawn into it, and what it held changes no other frame."""
+    if name == "none":
+        return
+    corruption = _make(name if ZERO_FRAMES in name.split("+") else f"{name}+{ZERO_FRAMES}", options)
+    obs, key = stacks(), torch.arange(STACKS)
+    dropped = torch.ones(STACKS, FRAME_STACK, dtype=torch.bool).scatter_(1, corruption.kept(key, FRAME_STACK), False)
+    out = corruption(obs, key)
+    claim(not _frames(out)[dropped].any(), "a dropped frame is not black")
+    other = obs.clone()
+    _frames(other)[dropped] = 7
+    claim(torch.equal(corruption(other, key), out), "the frames that stay show what a dropped one held")
+
+
+def _frames(obs: Tensor) -> Tensor:
+    """(N, 3 * K, S, S) stacks as (N, K, 3, S, S) frames, the same memory."""
+    return obs.view(len(obs), FRAME_STACK, 3, *obs.shape[-2:])
+
+
+def emission_never_changes_a_row(name: str, **options: Any) -> None:
+    """Under `emission` a row always looks the same; under `resample` runs with equal seeds see equal masks."""
+    row = torch.arange(STACKS)
+    always = BatchCorruption(CorruptionConfig.of(name, "emission", **options), 0)
+    claim(torch.equal(always(stacks(), row), always(stacks(), row)), "a row looked otherwise when it came again")
+    one, other = (BatchCorruption(CorruptionConfig.of(name, "resample", **options), 3) for _ in range(2))
+    for _ in range(2):
+        claim(torch.equal(one(stacks(), row), other(stacks(), row)), "two runs with one seed saw different masks")
+
+
+def the_environment_shows_what_the_data_show(name: str, **options: Any) -> None:
+    """Row t of an episode is corrupted alike in a batch of data and in the environment, where it comes alone."""
+    rows = row_key(torch.tensor([0, 0, 1, 1]), torch.tensor([5, 6, 0, 1]))
+    data = BatchCorruption(CorruptionConfig.of(name, "emission", **options), 7)(stacks(4), rows)
+    environment, seed = _make(name, options), stream_seed(7, "corruption", "emission")
+    for i, (seen, row) in enumerate(zip(stacks(4), rows, strict=True)):
+        now = environment(seen[None], derive_keys(seed, row[None]))[0]
+        claim(torch.equal(now, data[i]), "a row looks otherwise in the environment")
+
+
+def a_view_shows_shifted_then_corrupted_stacks(name: str, **options: Any) -> None:
+    """The fast path by which a set is read shows what the corruption makes of shifted stacks."""
+    with TemporaryDirectory() as folder:
+        dataset = _random_set(Path(folder))
+        for mode in _MODES:
+            for shift in (0, 4):
+                _claim_view(dataset, CorruptionConfig.of(name, mode, **options), shift)
+
+
+def _claim_view(dataset: Dataset, config: CorruptionConfig, shift: int) -> None:
+    from vd4rl_pomdp.augmentation import random_shift
+    from vd4rl_pomdp.data import View
+
+    rows, key = torch.arange(dataset.num_rows).view(2, -1), torch.tensor([5, 6])
+    apart, together = BatchCorruption(config, 1, "a"), View(dataset, config, shift, 1, "a")
+    for _ in range(2):
+        expected = apart(random_shift(dataset.stacks(rows), key, shift).clone(), dataset.keys(rows))
+        seen = together.observe(rows, key)
+        claim(torch.equal(seen, expected), f"they differ under {config.corruption_mode} with a shift of {shift}")
+
+
+def _random_set(folder: Path) -> Dataset:
+    """Two short episodes of random pixels."""
+    from vd4rl_pomdp.data import open_dataset
+    from vd4rl_pomdp.data.format import write_shard
+
+    steps = [StepType.FIRST, *[StepType.MID] * 4, StepType.LAST] * 2
+    shape = (len(steps), 3, FRAME_SIZE, FRAME_SIZE)
+    rows: dict[str, np.ndarray] = {
+        "observation": np.random.default_rng(0).integers(1, 256, shape, dtype=np.uint8),
+        "action": np.zeros((len(steps), 1), np.float32),
+        "reward": np.zeros(len(steps)),
+        "discount": np.ones(len(steps)),
+        "step_type": np.array(steps, np.int64),
+    }
+    write_shard(folder / "0_random.hdf5", rows, {})
+    return open_dataset(folder, folder / "cache")
+
+
+def a_record_gives_back_the_corruption(name: str, **options: Any) -> None:
+    """Written as JSON, as an encoder's card has it, a corruption's settings give back the same corruption."""
+    config = CorruptionConfig.of(name, **options)
+    again = CorruptionConfig.fill(json.loads(json.dumps(flat(config))))
+    claim(again == config, f"{config} came back as {again}: options are numbers, words, truth values or None")
+
+
+CHECKS: tuple[Check, ...] = (
+    pixels_stay_pixels,
+    something_changes,
+    equal_keys_give_equal_masks,
+    draws_depend_on_keys_alone,
+    frames_that_are_dropped_stay_dropped,
+    emission_never_changes_a_row,
+    the_environment_shows_what_the_data_show,
+    a_view_shows_shifted_then_corrupted_stacks,
+    a_record_gives_back_the_corruption,
+)

@@ -1,0 +1,117 @@
+"""What every frame encoder must satisfy: shapes, no mixing of pictures, gradients, and a folder that gives it back."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.encoder_folder import EncoderCard, load_encoder, save_encoder
+from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, FrameEncoder
+from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
+from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
+
+CHANNELS = 3 * FRAME_STACK
+
+
+def check_frame_encoder(name: str, size: int = FRAME_SIZE, **options: Any) -> None:
+    """Check every promise of a frame encoder.
+
+    Args:
+        name: of the frame encoder in `vd4rl_pomdp.nn.frame.FRAME_ENCODERS`.
+        size: height and width of the pictures that it is to read.
+        options: its options.
+
+    Raises:
+        AssertionError: a promise is broken; says which one, and by what.
+        UserError: there is no such frame encoder or option, or it cannot read pictures of that size.
+    """
+    FRAME_ENCODERS.named(name)
+    run_checks("frame encoder", CHECKS, name, size=size, **options)
+
+
+def make(name: str, size: int = FRAME_SIZE, **options: Any) -> Encoder:
+    """A memoryless encoder with the frame encoder, the same at every call."""
+    from pretrain.build import build_objective
+    from pretrain.config import PretrainConfig
+
+    config = PretrainConfig.of("smoke", method="curl", frame_encoder=name, **options)
+    torch.manual_seed(0)
+    return build_objective(config, 2, None, observation=(CHANNELS, size)).encoder
+
+
+def pictures(count: int, size: int = FRAME_SIZE) -> Tensor:
+    """(count, C, size, size) uint8 random pictures, the same at every call."""
+    shape = (count, CHANNELS, size, size)
+    return torch.randint(0, 256, shape, generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
+
+
+def features_have_one_shape(name: str, **options: Any) -> None:
+    """Pictures (..., C, S, S), uint8 or float of 0 to 255, become finite features (..., feature_dim) float32."""
+    encoder, size = make(name, **options), options["size"]
+    frame, width, obs = encoder.frame, encoder.config.feature_dim, pictures(6, size)
+    assert isinstance(frame, FrameEncoder)
+    claim(len(frame.map_shape) == 3, f"its maps have the shape {frame.map_shape}, not (channels, height, width)")
+    with torch.no_grad():
+        flat, windows, floats = frame(obs), frame(obs.view(2, 3, *obs.shape[1:])), frame(obs.float())
+    for given, shape in ((flat, (6, width)), (windows, (2, 3, width)), (floats, (6, width))):
+        claim((tuple(given.shape), given.dtype) == (shape, torch.float32), f"{tuple(given.shape)} {given.dtype}")
+        claim(given.isfinite().all(), "some are not finite")
+    claim_close(windows.flatten(0, 1), flat, "windows give other features than a batch", 1e-5)
+    claim_close(floats, flat, "float pictures give other features than uint8", 1e-5)
+
+
+def pictures_are_not_mixed(name: str, **options: Any) -> None:
+    """A picture's features depend on all of it that is seen and on no other picture of the batch, trained or not."""
+    obs = pictures(3, options["size"]).float().requires_grad_()
+    for training in (False, True):
+        features = make(name, **options).frame.train(training)(obs)
+        weights = torch.randn(features.shape[-1], generator=torch.Generator().manual_seed(0))
+        (gradient,) = torch.autograd.grad((features[1] * weights).sum(), obs)
+        reached = gradient.flatten(1).abs().amax(1) > 0
+        claim(reached.tolist() == [False, True, False], f"features of picture 1 have gradients to {reached.tolist()}")
+
+
+def gradients_reach_all_parameters(name: str, **options: Any) -> None:
+    """A loss on the features moves every parameter."""
+    frame = make(name, **options).frame
+    features = frame(pictures(3, options["size"]))
+    (features * torch.randn(features.shape, generator=torch.Generator().manual_seed(0))).sum().backward()
+    still = [key for key, value in frame.named_parameters() if value.grad is None or not value.grad.any()]
+    claim(still == [], f"none reaches {shown(still)}")
+
+
+def a_seed_decides_everything(name: str, **options: Any) -> None:
+    """Built from one seed of torch, encoders are equal; the same pictures always give the same features."""
+    one, other, obs = make(name, **options), make(name, **options), pictures(2, options["size"])
+    state = other.state_dict()
+    differing = [key for key, value in one.state_dict().items() if not torch.equal(value, state[key])]
+    claim(differing == [], f"these differ from build to build: {shown(differing)}")
+    for training in (True, False):
+        with torch.no_grad():
+            first, second = (one.train(training).frame(obs) for _ in range(2))
+        claim(torch.equal(first, second), f"features differ from call to call, training {training}")
+
+
+def a_folder_gives_back_the_encoder(name: str, **options: Any) -> None:
+    """Saved as a folder and loaded, an encoder has its options and gives the same features."""
+    encoder, obs = make(name, **options).eval(), pictures(2, options["size"])
+    with TemporaryDirectory() as folder:
+        save_encoder(Path(folder), encoder, EncoderCard("curl", "", "", {"corruption": "none"}, 0, 0, "smoke"))
+        loaded, _ = load_encoder(folder)
+    claim(loaded.config == encoder.config, f"{encoder.config} came back as {loaded.config}")
+    with torch.no_grad():
+        claim(torch.equal(loaded.frame(obs), encoder.frame(obs)), "its features differ")
+
+
+CHECKS: tuple[Check, ...] = (
+    features_have_one_shape,
+    pictures_are_not_mixed,
+    gradients_reach_all_parameters,
+    a_seed_decides_everything,
+    a_folder_gives_back_the_encoder,
+)

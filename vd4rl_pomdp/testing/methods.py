@@ -1,0 +1,272 @@
+"""What every pretraining method must satisfy: losses, gradients, state, padding, streaming, resumption, visibility."""
+
+from __future__ import annotations
+
+import copy
+from collections.abc import Iterable
+from typing import Any, cast
+
+import torch
+
+from vd4rl_pomdp.nn.action_target import ACTION_TARGETS
+from vd4rl_pomdp.objective import InverseObjective, Objective
+from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
+from vd4rl_pomdp.types import Windows
+from vd4rl_pomdp.visibility import declared, dependence, response, wrong_pairs
+
+ROWS, ACTIONS, STATE = 6, 2, 5
+_SMALL = {"max_k": 3, "feature_dim": 8, "hidden_dim": 7, "head_dim": 8}
+_SMALLEST = {"max_k": 4, "feature_dim": 6, "hidden_dim": 5, "head_dim": 32}
+"""A proof takes a backward pass for every pair; of very few units in the head all may be rectified to zero."""
+_PICTURE, _GRID = (9, 84), (3, 2)
+"""Channels and size of an observation, and of one that is encoded without convolutions."""
+
+
+def check_method(name: str, **settings: Any) -> None:
+    """Check every promise of a method.
+
+    Args:
+        name: of the method in `pretrain.objectives.METHODS`.
+        settings: of `vd4rl-pomdp pretrain`: the method's options, `history`, `frame_encoder`, ...
+
+    Raises:
+        AssertionError: a promise is broken; says which one, and by what.
+        UserError: there is no such method or setting.
+    """
+    run_checks("method", checks_of(name), name, **settings)
+
+
+def checks_of(name: str) -> tuple[Check, ...]:
+    """The checks that a method has to pass: all encode, those that are trained have a loss, some predict actions."""
+    from pretrain.objectives import METHODS
+
+    trained = TRAINED if METHODS.named(name).trained else ()
+    return ENCODING + trained + (INVERSE if predicts_actions(name) else ())
+
+
+def predicts_actions(name: str) -> bool:
+    """Whether a method is trained as an inverse model."""
+    from pretrain.objectives import METHODS
+
+    return METHODS.named(name).trained and isinstance(build(name), InverseObjective)
+
+
+def build(name: str, **settings: Any) -> Objective:
+    """A small objective of a method, the same at every call."""
+    return _build(name, _SMALL, _PICTURE, settings)
+
+
+def build_inverse(name: str, **settings: Any) -> InverseObjective:
+    """An inverse model in float64, small enough to try each of its inputs; its pictures are encoded as they are."""
+    settings = {"frame_encoder": "flat"} | settings
+    observation = _GRID if settings["frame_encoder"] == "flat" else _PICTURE
+    return cast(InverseObjective, _build(name, _SMALLEST, observation, settings).double())
+
+
+def _build(name: str, small: dict[str, int], observation: tuple[int, int], settings: dict[str, Any]) -> Objective:
+    from pretrain.build import build_objective, build_target
+    from pretrain.config import PretrainConfig
+
+    torch.manual_seed(0)
+    config = PretrainConfig.of("smoke", method=name, **settings).with_known(**(small | settings))
+    actions = torch.rand(50, ACTIONS) * 2 - 1
+    return build_objective(config, ACTIONS, build_target(config, actions.numpy()), STATE, observation)
+
+
+def batch(lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0, state: bool = False) -> Windows:
+    """Windows of random pictures or simulator states and actions, which end in padding where they are shorter."""
+    g = torch.Generator().manual_seed(seed)
+    shape = (STATE, 1, 1) if state else (9, 4, 4)
+    obs = torch.randint(0, 256, (len(lengths), ROWS, *shape), generator=g, dtype=torch.uint8)
+    if not state:  # blocks of 21 pixels, which a shift leaves recognisable
+        obs = obs.repeat_interleave(21, -1).repeat_interleave(21, -2)
+    length = torch.tensor(lengths)
+    has_action = torch.arange(ROWS) < length[:, None] - 1
+    action = (torch.rand(len(lengths), ROWS, ACTIONS, generator=g) * 2 - 1) * has_action[..., None]
+    prev_action = torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], 1)
+    key = torch.arange(len(lengths) * ROWS).view(len(lengths), ROWS)
+    return Windows(obs, prev_action, action, has_action, length, key)
+
+
+def streaming_equals_batch(name: str, **settings: Any) -> None:
+    """Row by row, as the environment delivers them, an encoder gives what it gives for whole windows."""
+    from pretrain.objectives import METHODS
+
+    encoder = build(name, **settings).encoder.eval()
+    window = batch((ROWS, ROWS), state=METHODS.named(name).reads_state)
+    with torch.no_grad():
+        whole = encoder.encode(window)
+        state, rows = encoder.initial_state(2), []
+        for t in range(ROWS):
+            z, state = encoder.step(window.obs[:, t], window.prev_action[:, t], state)
+            rows.append(z)
+    shape = (2, ROWS, encoder.dim)
+    claim(whole.shape == shape, f"windows are encoded as {tuple(whole.shape)}, not {shape}")
+    claim_close(torch.stack(rows, 1), whole, "the two differ", 1e-5)
+
+
+def a_loss_is_a_finite_scalar(name: str, **settings: Any) -> None:
+    """A loss is a finite scalar, and what is logged are detached scalars, the loss among them."""
+    loss, logs = build(name, **settings).loss(batch(), 0.0)
+    claim(loss.shape == (), f"its shape is {tuple(loss.shape)}")
+    claim(torch.isfinite(loss), f"it is {loss.item()}")
+    for key, value in logs.items():
+        claim(value.numel() == 1, f"{key} is logged with shape {tuple(value.shape)}")
+        claim(not value.requires_grad, f"{key} is logged with its graph: detach it")
+    claim("loss" in logs, f"no `loss` is logged, only {shown(logs)}")
+    claim(torch.equal(logs["loss"], loss.detach()), f"{logs['loss'].item()} is logged, the loss is {loss.item()}")
+
+
+def a_loss_moves_the_whole_encoder(name: str, **settings: Any) -> None:
+    """A loss has a gradient to every parameter of the encoder."""
+    objective = build(name, **settings)
+    objective.loss(batch(), 0.0)[0].backward()
+    still = [n for n, p in objective.encoder.named_parameters() if p.grad is None or not p.grad.any()]
+    claim(still == [], f"none reaches {shown(still)}")
+
+
+def steps_lower_the_loss(name: str, **settings: Any) -> None:
+    """Steps along the loss of one batch lower it: by 3% within 30 of them."""
+    objective = build(name, **settings)
+    losses = _train(objective, torch.optim.Adam(objective.parameters(), lr=1e-3), [0] * 30)
+    first, last = sum(losses[:5]) / 5, sum(losses[-5:]) / 5
+    claim(last < 0.97 * first, f"the mean of the first five is {first:.4f}, of the last five {last:.4f}")
+
+
+def _train(objective: Objective, optimiser: torch.optim.Optimizer, batches: Iterable[int]) -> list[float]:
+    """Make a step on each batch; its losses."""
+    losses = []
+    for number in batches:
+        loss, _ = objective.loss(batch(seed=number), 0.0)
+        optimiser.zero_grad()
+        loss.backward()
+        optimiser.step()
+        objective.after_step()
+        losses.append(loss.item())
+    return losses
+
+
+def the_state_holds_all_that_a_loss_depends_on(name: str, **settings: Any) -> None:
+    """An objective that takes over another's state has the other's loss."""
+    objective, window = build(name, **settings), batch()
+    objective.loss(window, 0.0)
+    other = _elsewhere(name, objective, **settings)
+    here, there = objective.loss(window, 0.0)[0].item(), other.loss(window, 0.0)[0].item()
+    claim(here == there, f"the losses are {here} and {there}: register what the loss reads as parameters or buffers")
+
+
+def a_training_that_goes_on_elsewhere_takes_the_same_steps(name: str, **settings: Any) -> None:
+    """A training that goes on from its saved state takes the steps of one that was never cut, whatever torch draws."""
+    here = build(name, **settings)
+    optimiser = torch.optim.Adam(here.parameters(), lr=1e-3)
+    _train(here, optimiser, range(2))
+    there = _elsewhere(name, here, **settings)
+    other = torch.optim.Adam(there.parameters(), lr=1e-3)
+    other.load_state_dict(copy.deepcopy(optimiser.state_dict()))
+    torch.manual_seed(1)
+    losses = _train(here, optimiser, range(2, 5))
+    torch.manual_seed(2)
+    again = _train(there, other, range(2, 5))
+    claim(losses == again, f"the losses are {losses} and {again}: draw from vd4rl_pomdp.nn.draws.Draws")
+    state = there.state_dict()
+    differing = [key for key, value in here.state_dict().items() if not torch.equal(value, state[key])]
+    claim(differing == [], f"these differ at the end: {shown(differing)}")
+
+
+def _elsewhere(name: str, objective: Objective, **settings: Any) -> Objective:
+    """Another objective with the state of a given one."""
+    other = build(name, **settings)
+    with torch.no_grad():
+        for parameter in other.parameters():
+            parameter.add_(0.1)
+    other.load_state_dict(copy.deepcopy(objective.state_dict()))
+    return other
+
+
+def padding_changes_no_loss(name: str, **settings: Any) -> None:
+    """What stands in the rows behind a window's end changes no loss."""
+    objective, window = build(name, **settings), batch((4, 4, 4))
+    noisy = window.replace(obs=window.obs.clone(), action=window.action.clone(), prev_action=window.prev_action.clone())
+    noisy.obs[:, 4:], noisy.action[:, 4:], noisy.prev_action[:, 5:] = 255, 7.0, 7.0
+    again = copy.deepcopy(objective)
+    claim_close(again.loss(noisy, 0.0)[0], objective.loss(window, 0.0)[0], "it does: leave out rows beyond `real`")
+
+
+def every_action_target_is_taken(name: str, **settings: Any) -> None:
+    """A method that predicts actions has a finite loss with every action target."""
+    for target in ACTION_TARGETS:
+        loss, _ = build(name, **(settings | {"action_target": target})).loss(batch(), 0.0)
+        claim(torch.isfinite(loss), f"with {target} it is {loss.item()}")
+
+
+def optional_terms_are_added(name: str, **settings: Any) -> None:
+    """Self-prediction and the norm of states add to the loss by their weights, and a head need not be told k."""
+    terms = {"self_prediction": 0.5, "l2_states": 0.1}
+    rich = cast(InverseObjective, build(name, **(settings | terms | {"k_embedding": False})))
+    plain = cast(InverseObjective, build(name, **(settings | dict.fromkeys(terms, 0.0) | {"k_embedding": False})))
+    state = rich.state_dict()
+    plain.load_state_dict({key: state[key] for key in plain.state_dict()})
+    loss, logs = rich.loss(batch(), 0.25)
+    expected = plain.loss(batch(), 0.25)[0] + 0.5 * logs["self_prediction"] + 0.1 * 0.75 * logs["l2_states"]
+    claim_close(loss.detach(), expected.detach(), "the loss with them is not the loss without, and they")
+    claim(rich.head.k is None, "--no-k-embedding leaves k in the head")
+    told = cast(InverseObjective, build(name, **(settings | {"k_embedding": True})))
+    claim(told.head.k is not None, "--k-embedding gives the head no k")
+
+
+def the_action_loss_is_that_of_each_pairs_first_action(name: str, **settings: Any) -> None:
+    """`action_loss` is the mean of -log P(a_t | ...) over all real pairs (t, t+k), and `loss_kNN` over those of a k."""
+    objective, window = cast(InverseObjective, build(name, **settings)), batch()
+    logits = objective.action_logits(window)
+    alone: dict[int, list[torch.Tensor]] = {}
+    for p, (t, k) in enumerate(objective.pairs(ROWS).tolist()):
+        for b, length in enumerate(window.length.tolist()):
+            if t + k < length:
+                alone.setdefault(k, []).append(objective.target.loss(logits[b, p], window.action[b, t]).detach())
+    logs = objective.loss(window, 0.0)[1]
+    whole = torch.stack([value for values in alone.values() for value in values]).mean()
+    claim_close(logs["action_loss"], whole, "computed one by one they give another action_loss")
+    for k, values in alone.items():
+        claim_close(logs[f"loss_k{k:02d}"], torch.stack(values).mean(), f"one by one they give another loss_k{k:02d}")
+
+
+def predictions_depend_on_what_is_declared(name: str, **settings: Any) -> None:
+    """The prediction of each pair depends on what `visible` declares, all of it and nothing else."""
+    for training in (False, True):
+        claim_visibility(build_inverse(name, **settings).train(training), [ROWS, ROWS, 4], ROWS)
+
+
+def claim_visibility(objective: InverseObjective, lengths: list[int], rows: int) -> None:
+    """Raise AssertionError, naming the first pair that is wrong, unless an objective sees what it declares."""
+    wrong = wrong_pairs(objective, lengths, rows)
+    if not wrong:
+        return
+    b, t, k = wrong[0]
+    promised = declared(objective, t, k, lengths[b], last_action=b == 0)
+    found = {
+        "has gradients to": dependence(objective, lengths, rows)[b, t, k],
+        "changes with": response(objective, lengths, rows)[b, t, k],
+        "is declared to see": promised,
+    }
+    told = "; ".join(f"{how} rows {sorted(o)} and actions {sorted(a)}" for how, (o, a) in found.items())
+    raise AssertionError(f"the prediction of a_{t} from rows {t} and {t + k} {told} ({len(wrong)} pairs are wrong)")
+
+
+ENCODING: tuple[Check, ...] = (streaming_equals_batch,)
+"""Of all methods."""
+TRAINED: tuple[Check, ...] = (
+    a_loss_is_a_finite_scalar,
+    a_loss_moves_the_whole_encoder,
+    steps_lower_the_loss,
+    the_state_holds_all_that_a_loss_depends_on,
+    a_training_that_goes_on_elsewhere_takes_the_same_steps,
+    padding_changes_no_loss,
+)
+"""Of methods that take gradient steps."""
+INVERSE: tuple[Check, ...] = (
+    every_action_target_is_taken,
+    optional_terms_are_added,
+    the_action_loss_is_that_of_each_pairs_first_action,
+    predictions_depend_on_what_is_declared,
+)
+"""Of those that predict actions."""

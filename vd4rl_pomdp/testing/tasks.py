@@ -1,0 +1,154 @@
+"""What every task must satisfy: episodes that repeat, rows of the declared shapes, ends and discounts, replay."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask
+from vd4rl_pomdp.testing.contract import Check, claim, run_checks
+from vd4rl_pomdp.types import StepType
+
+if TYPE_CHECKING:
+    from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep
+
+SIZES = (84, 32)
+DECISIONS = 12
+
+
+def check_task(name: str) -> None:
+    """Check every promise of a task, by playing a few short episodes of it.
+
+    Args:
+        name: of the task in `vd4rl_pomdp.tasks.TASKS`.
+
+    Raises:
+        AssertionError: a promise is broken; says which one, and by what.
+        UserError: there is no such task, or its environment cannot be built.
+    """
+    TASKS.named(name)
+    run_checks("task", CHECKS, name)
+
+
+def make(name: str, size: int | None = None, length: int = DECISIONS) -> PixelEnv:
+    """A task's environment with short episodes."""
+    from vd4rl_pomdp.envs.pixels import make_env
+
+    return make_env(TASKS.named(name), size=size, length=length)
+
+
+def play(env: PixelEnv, seed: int) -> tuple[list[TimeStep], np.ndarray]:
+    """All rows of a seed's episode under random actions, the same at every call, and these actions (T, A) float32."""
+    rng = np.random.default_rng(0)
+    rows: list[TimeStep] = [env.reset(seed)]
+    actions: list[np.ndarray] = []
+    while not rows[-1].last:
+        claim(len(actions) < DECISIONS, f"an episode of {DECISIONS} decisions goes on")
+        actions.append(rng.uniform(-1, 1, env.action_dim).astype(np.float32))
+        rows.append(env.step(actions[-1]))
+    return rows, np.stack(actions)
+
+
+def episodes_repeat_from_their_seeds(name: str) -> None:
+    """A seed and the actions decide an episode, in a used environment and in a fresh one."""
+    env = make(name, SIZES[1])
+    first, _ = play(env, 3)
+    play(env, 4)
+    for again in (play(env, 3)[0], play(make(name, SIZES[1]), 3)[0]):
+        claim(len(again) == len(first), f"it had {len(first)} rows and has {len(again)}")
+        for t, (one, other) in enumerate(zip(first, again, strict=True)):
+            same = (np.array_equal(getattr(one, part), getattr(other, part)) for part in ("frame", "state", "physics"))
+            claim(all(same), f"row {t} shows another picture or state: draw from the seed that reset is given")
+            claim(one.reward == other.reward, f"row {t} pays {one.reward} and {other.reward}")
+
+
+def frames_have_the_size_asked_for(name: str) -> None:
+    """Frames are (3, S, S) uint8 of any size S."""
+    for size in SIZES:
+        for row in play(make(name, size, length=2), 0)[0]:
+            assert row.frame is not None
+            found = row.frame.shape, row.frame.dtype
+            claim(found == ((3, size, size), np.uint8), f"a frame of size {size} is {found[0]} {found[1]}")
+
+
+def rows_have_the_declared_widths(name: str) -> None:
+    """Rows hold states of the task's layout, which is that of its environment, and finite rewards, 0 in the first."""
+    task = TASKS.named(name)
+    found = replace(task, layout=None).found()
+    claim(task.found() == found, f"its layout says {task.layout}, the environment has {found}")
+    rows, actions = play(make(name), 0)
+    claim(actions.shape[1] == task.action_dim, f"{actions.shape[1]} action dimensions, not {task.action_dim}")
+    claim(rows[0].reward == 0, f"the first row pays {rows[0].reward}")
+    width = rows[0].physics.size
+    for row in rows:
+        claim(row.frame is None, "a frame is drawn that was not asked for")
+        claim((row.state.shape, row.state.dtype) == ((task.state_dim,), np.float32), f"a state is {row.state!r}")
+        claim((row.physics.shape, row.physics.dtype) == ((width,), np.float64), f"a simulator state is {row.physics!r}")
+        claim(np.isfinite(row.reward), f"a reward is {row.reward}")
+
+
+def episodes_end_once(name: str) -> None:
+    """Step types are FIRST, MID and LAST; the limit ends with discount 1, the task itself perhaps with 0, MID never."""
+    rows, _ = play(make(name), 0)
+    kinds = [row.step_type for row in rows]
+    middle = [StepType.MID] * (len(rows) - 2)
+    claim(kinds == [StepType.FIRST, *middle, StepType.LAST], f"they are {[kind.name for kind in kinds]}")
+    claim(all(row.discount == 1 for row in rows[:-1]), "a row before the last has another discount than 1")
+    claim(rows[-1].discount in (0, 1), f"the last row has the discount {rows[-1].discount}")
+    claim(rows[-1].terminated == (rows[-1].discount == 0), "it is told otherwise whether the task ended the episode")
+    limited, _ = play(make(name, length=1), 0)
+    claim(len(limited) == 2 and limited[1].last, "a limit of one decision does not end an episode")
+
+
+def actions_fill_their_bounds(name: str) -> None:
+    """Actions in [-1, 1] reach the environment within its own bounds, its extremes among them."""
+    for action in (-1.0, 0.0, 1.0):
+        env = make(name)
+        env.reset(0)
+        low, high, given = _given(env, np.full(env.action_dim, action, np.float32))
+        claim(((low <= given) & (given <= high)).all(), f"{action} becomes {given}, the bounds are {low} and {high}")
+
+
+def _given(env: PixelEnv, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Make a step; the bounds of the environment's own actions, and what it was given, all (A,)."""
+    inner: Any = env.env if isinstance(env.task, GymnasiumTask) else env.simulator  # type: ignore[attr-defined]
+    given: list[np.ndarray] = []
+    step = inner.step
+
+    def watched(action: np.ndarray) -> Any:
+        given.append(action)
+        return step(action)
+
+    inner.step = watched
+    env.step(action)
+    if isinstance(env.task, GymnasiumTask):
+        space = inner.action_space
+        return space.low.ravel(), space.high.ravel(), given[0].ravel()
+    spec = inner.action_spec()
+    return spec.minimum, spec.maximum, given[0]
+
+
+def rewards_replay(name: str) -> None:
+    """Where simulator states are stored and are all that an episode begins with, rewards replay from the first one."""
+    from vd4rl_pomdp.envs.dmc import replay_rewards, replays
+
+    task = TASKS.named(name)
+    if not isinstance(task, DMCTask) or not replays(task):
+        return
+    env = make(name)
+    for seed in (3, 4):  # the second episode starts from a used simulator
+        rows, actions = play(env, seed)
+        found, paid = replay_rewards(name, rows[0].physics, actions), [row.reward for row in rows[1:]]
+        claim(np.array_equal(found, paid), f"{paid} were paid, {found.tolist()} are replayed")
+
+
+CHECKS: tuple[Check, ...] = (
+    episodes_repeat_from_their_seeds,
+    frames_have_the_size_asked_for,
+    rows_have_the_declared_widths,
+    episodes_end_once,
+    actions_fill_their_bounds,
+    rewards_replay,
+)
