@@ -79,17 +79,19 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
 
 
 def end_to_end(config: FinetuneConfig, algorithm: str) -> FinetuneConfig:
-    """The settings for a method that has no frozen stage, and brings its algorithm along; raises UserError as
-    `check_end_to_end` does."""
-    check_end_to_end(config, algorithm)
+    """The settings for a method that has no frozen stage, and brings its algorithm along.
+
+    Raises:
+        UserError: a setting that was not the default is not read.
+    """
+    if config.views != config.usual()["views"]:
+        raise UserError(f"--views is not read by the algorithm {algorithm}, which trains the encoder: leave it out")
     return config.altered(algorithm=algorithm, views=0)
 
 
 def check_end_to_end(config: FinetuneConfig, algorithm: str) -> None:
-    """Raise UserError for an unknown algorithm, or a setting that was chosen and that it does not read."""
-    ALGORITHMS.check(algorithm)
-    if config.views != config.usual()["views"]:
-        raise UserError(f"--views is not read by the algorithm {algorithm}, which trains the encoder: leave it out")
+    """Raise UserError unless `end_to_end` accepts the settings."""
+    end_to_end(config, algorithm)
 
 
 def _check_n_step(config: FinetuneConfig, dataset: Dataset) -> None:

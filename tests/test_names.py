@@ -6,10 +6,6 @@ from pathlib import Path
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("vd4rl_pomdp", "pretrain", "finetune", "baselines")
-SHARED = {
-    "Table": "in cli.dispatch the commands by name, in experiments.navigation.report one of the paper's tables",
-}
-"""Names that mean several things, and which."""
 
 
 def definitions(source: str) -> set[str]:
@@ -34,6 +30,4 @@ def test_a_name_means_one_thing():
         for path in (ROOT / package).rglob("*.py"):
             for name in definitions(path.read_text(encoding="utf-8")):
                 places[name].append(path.relative_to(ROOT).as_posix())
-    several = {name: files for name, files in places.items() if len(files) > 1}
-    assert {name: files for name, files in several.items() if name not in SHARED} == {}
-    assert sorted(set(SHARED) - set(several)) == [], "these mean one thing by now: drop them from the list"
+    assert {name: files for name, files in places.items() if len(files) > 1} == {}

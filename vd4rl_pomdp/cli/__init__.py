@@ -7,11 +7,11 @@ import sys
 from collections.abc import Sequence
 
 from vd4rl_pomdp.cli import data, navigation, parts, policy, stages, studies
-from vd4rl_pomdp.cli.dispatch import Table, run_stage
+from vd4rl_pomdp.cli.dispatch import Commands, run_stage
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs import interrupt
 
-COMMANDS: Table = {
+COMMANDS: Commands = {
     "demo": stages.DEMO,
     "list": parts.LIST,
     "data": data.COMMANDS,
@@ -29,7 +29,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     words = list(sys.argv[1:] if arguments is None else arguments)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
-            stream.reconfigure(errors="backslashreplace")  # of what a terminal cannot show, the number
+            stream.reconfigure(errors="backslashreplace")  # \u2028 and the like for what a terminal cannot show
     try:
         _refuse_undecodable(words)
         with interrupt.handled(program=True):

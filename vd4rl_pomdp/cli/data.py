@@ -63,7 +63,7 @@ def _card(words: Arguments, program: str) -> None:
 
 
 def _names(table: str) -> list[str]:
-    """Names in a table of `tasks`, which needs numpy: not imported before a command does."""
+    """Names in a table of the module `tasks`, which is imported here because it needs numpy, slow to load."""
     from vd4rl_pomdp import tasks
 
     return list(getattr(tasks, table))

@@ -21,23 +21,23 @@ class Command:
     run: Callable[[Arguments, str], None]
 
 
-Table = Mapping[str, Command | Mapping[str, Command]]
+Commands = Mapping[str, Command | Mapping[str, Command]]
 """Subcommands by name, and groups of them."""
 
 
-def dispatch(table: Table, words: Arguments, program: str) -> None:
+def dispatch(commands: Commands, words: Arguments, program: str) -> None:
     """Run the subcommand that `words` name, or print what there is."""
     if not words or words[0] in ("-h", "--help"):
-        print(_overview(table, program))
+        print(_overview(commands, program))
         return
     if words[0] == "--version":
         from vd4rl_pomdp import __version__
 
         print(__version__)
         return
-    if words[0] not in table:
-        raise UserError(f"unknown command '{program} {words[0]}': choose one of {', '.join(table)}")
-    entry = table[words[0]]
+    if words[0] not in commands:
+        raise UserError(f"unknown command '{program} {words[0]}': choose one of {', '.join(commands)}")
+    entry = commands[words[0]]
     program = f"{program} {words[0]}"
     if isinstance(entry, Mapping):
         dispatch(entry, words[1:], program)
@@ -45,10 +45,10 @@ def dispatch(table: Table, words: Arguments, program: str) -> None:
         entry.run(words[1:], program)
 
 
-def _overview(table: Table, program: str) -> str:
-    width = max(map(len, table))
+def _overview(commands: Commands, program: str) -> str:
+    width = max(map(len, commands))
     lines = [f"usage: {program} COMMAND [--flags]   ({program} COMMAND --help says more)", ""]
-    for name, entry in table.items():
+    for name, entry in commands.items():
         text = ", ".join(entry) if isinstance(entry, Mapping) else entry.summary
         lines.append(f"  {name:<{width}}  {text}")
     return "\n".join(lines)

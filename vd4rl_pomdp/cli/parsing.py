@@ -69,7 +69,7 @@ def parse_stage(config: type[Stage], words: Arguments, program: str) -> Stage:
 
 
 def _refuse_unread(default: StageConfig, words: Arguments) -> None:
-    """Name who does not read a flag, where it is one of a part that was not chosen."""
+    """Refuse a flag that only parts which were not chosen read, and say which chosen one does not."""
     flags = (word.partition("=")[0][2:].replace("-", "_") for word in words if word.startswith("--"))
     names = (flag.removeprefix("no_") for flag in flags)
     optional = option_names()
@@ -87,7 +87,7 @@ def _chosen(words: Arguments, name: str) -> str | None:
 
 
 def with_presets(config: type, presets: dict[str, Any], words: Arguments, program: str, flag: str = "--preset") -> Any:
-    """Parse a config one of whose flags, `--preset`, chooses the defaults of all others."""
+    """Parse a config with a flag, `--preset`, that chooses the defaults of all others."""
     name = _chosen(words, flag.removeprefix("--")) or next(iter(presets))
     if name not in presets:
         raise UserError(f"unknown {flag.removeprefix('--')} {name!r}: choose one of {', '.join(presets)}")

@@ -1,7 +1,7 @@
 """Exogenous noise: an image from a pool is added to each observation, and has nothing to do with the agent.
 
-A row always shows the same image (it is drawn by the row's key), as in a real environment; the pool is crops of the
-photographs that scikit-learn ships, or images from a folder: CIFAR-10's python or binary files, or PNG and JPEG files.
+A row's key chooses its image, so that a row always shows the same one, as in a real environment. The pool consists of
+crops of the photographs that scikit-learn ships, or of a folder's images: CIFAR-10's python or binary files, PNG, JPEG.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class ExogenousNoise:
         """(P, 3, 100, 100) uint8."""
 
     def fingerprint(self) -> str:
-        """Name of the content of the pool's files; of photographs, which come with a package, just their name."""
+        """Hash of the files of the pool; for photographs, which come with a package, only the name of that pool."""
         if self._source == PHOTOGRAPHS:
             return PHOTOGRAPHS
         digest = hashlib.blake2b(digest_size=12)

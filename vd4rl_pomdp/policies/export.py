@@ -164,7 +164,7 @@ def _publish_ladder(run: Path, out: Path, task: str, rows: list[tuple[int, float
 
 
 def exported_actors(folder: Path, task: str) -> Iterator[tuple[int, Actor]]:
-    """Actors that `export_run` wrote into a folder, with their decisions; a ladder's first, rounded as they are."""
+    """Actors that `export_run` wrote into a folder, each after its decisions: first the ladder's, which are rounded."""
     ladder = folder / f"{task}_replay.safetensors"
     if ladder.exists():
         read = read_ladder(ladder, task)

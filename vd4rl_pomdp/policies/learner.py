@@ -33,7 +33,7 @@ STATISTICS = ("mean", "var", "count")
 DECISIONS_A_ROUND = 4
 """Decisions between two rounds of updates, or one for each environment if those are more."""
 RANDOM_DECISIONS = 1_000
-"""Uniformly random decisions of a new run, for each environment up to ten."""
+"""Uniformly random decisions that a new run begins with, times its environments (ten at most)."""
 
 
 def build(config: PolicyConfig, task: Task) -> SAC:
@@ -69,7 +69,7 @@ def build(config: PolicyConfig, task: Task) -> SAC:
 
 
 def _set_temperature_rate(model: SAC, rate: float) -> None:
-    """SBX learns the temperature at the actor's rate."""
+    """Give the temperature a learning rate of its own; SBX takes the actor's."""
     import optax
 
     state, optimiser = model.ent_coef_state, optax.adam(rate)
@@ -216,7 +216,7 @@ def _networks(model: SAC) -> tuple[Any, ...]:
 
 
 def _envs(model: SAC) -> Any:
-    """The environments behind their running statistics, SB3's VecNormalize."""
+    """The environments in SB3's VecNormalize, which keeps the statistics of their observations."""
     return model.get_vec_normalize_env()
 
 

@@ -29,7 +29,7 @@ class Terminated(SystemExit):
 
 
 class _Signals:
-    """What has arrived in this process, and what is to be done about it."""
+    """Whether signals are answered or wait in this process, and which of them arrived last."""
 
     handled = deferred = False
     asked: int | None = None
@@ -40,8 +40,8 @@ def handled(program: bool = False) -> Iterator[None]:
     """Answer signals as the module says. Nested, or outside the main thread, it changes nothing.
 
     Args:
-        program: this is the command line: a second signal kills the process even inside a library's C code. Else it
-            does what it did before.
+        program: whether this is the command line, where a second signal kills the process even inside a library's C
+            code; elsewhere a second signal does what it did before this block.
     """
     if _Signals.handled or threading.current_thread() is not threading.main_thread():
         yield
@@ -71,7 +71,7 @@ def handled(program: bool = False) -> Iterator[None]:
 
 @contextmanager
 def deferred() -> Iterator[None]:
-    """Within, a signal waits for the next `check`."""
+    """Within the block a signal waits for the next `check`, at the latest the one at the block's end."""
     with _deferring(True):
         yield
     check()
@@ -79,7 +79,7 @@ def deferred() -> Iterator[None]:
 
 @contextmanager
 def at_once() -> Iterator[None]:
-    """Within, inside `deferred`, a signal is raised where it arrives."""
+    """Within this block, itself within a `deferred` one, a signal is raised where it arrives."""
     with _deferring(False):
         check()
         yield
@@ -100,14 +100,14 @@ def asked() -> bool:
 
 
 def check(reason: str = "") -> None:
-    """Raise what has arrived, if anything has; `reason` says from where the run goes on."""
+    """Raise Interrupted or Terminated if a signal has arrived; `reason` says from where the run goes on."""
     if asked():
         raise Interrupted(reason) if _Signals.asked == signal.SIGINT else Terminated(reason)
 
 
 @contextmanager
 def blocked() -> Iterator[None]:
-    """Within, signals stay pending; processes that are started inherit that for their whole life."""
+    """Within the block signals stay pending; processes that are started in it never receive them."""
     if not hasattr(signal, "pthread_sigmask"):
         yield
         return

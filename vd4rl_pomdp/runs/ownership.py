@@ -27,7 +27,7 @@ from vd4rl_pomdp.runs.interrupt import handled
 
 LEASE_S = 60.0
 EMPTY_S = 2.0
-"""How long a lock without a name in it is given to get one."""
+"""Seconds after which a lock that does not name its owner counts as left behind."""
 _LOCK, _NOTE = ".lock", ".owner.json"
 
 
@@ -41,7 +41,7 @@ class Owner:
         write_json(folder / _NOTE, self._note)
 
     def check(self) -> None:
-        """Raise UserError unless the folder is still this process's: before anything that cannot be taken back."""
+        """Raise UserError unless the folder is still this process's; called before what cannot be undone."""
         note = _read_note(self._folder)
         if note != self._note:
             taken = f"was taken over by {_name(note)}" if note else "was removed or taken over"
@@ -76,23 +76,23 @@ def owned(folder: Path) -> Iterator[Owner]:
 
 
 def _acquire(lease: SoftFileLease, folder: Path) -> None:
-    if _is_free(lease):
+    if _take(lease):
         return
     if _stays_empty(folder / _LOCK):
         lease.force_break()
-        if _is_free(lease):
+        if _take(lease):
             return
     note = _read_note(folder)
     if not _runs_here(note):
         print(f"{folder}: held by {_name(note)}; waiting for a sign of its life", file=sys.stderr)
         seen = _heartbeat(folder)
-        if _is_free(lease, 1.5 * LEASE_S, lambda: _heartbeat(folder) not in (seen, None)):
+        if _take(lease, 1.5 * LEASE_S, lambda: _heartbeat(folder) not in (seen, None)):
             return
     raise UserError(f"{folder}: is in use by {_name(_read_note(folder))}; wait until it ends, or choose another folder")
 
 
-def _is_free(lease: SoftFileLease, wait_s: float = 0.0, refused: Callable[[], bool] | None = None) -> bool:
-    """Take the lease, if it can be had within some seconds and before it is `refused`; whether it was."""
+def _take(lease: SoftFileLease, wait_s: float = 0.0, refused: Callable[[], bool] | None = None) -> bool:
+    """Try to take the lease for `wait_s` seconds or until `refused` is true; whether it was taken."""
     try:
         lease.acquire(timeout=wait_s, cancel_check=refused)
     except Timeout:

@@ -64,7 +64,7 @@ class _Crew:
     def start(self, function: Callable[[Any], Any], size: int) -> None:
         """Start the processes, which do `function`."""
         context = multiprocessing.get_context("spawn")
-        resource_tracker.ensure_running()  # unblocks signals where it is started later
+        resource_tracker.ensure_running()  # now: to start it later would unblock the signals that are `blocked` below
         for _ in range(size):
             ours, theirs = context.Pipe()
             process = context.Process(target=_serve, args=(theirs, function), daemon=True)
@@ -129,7 +129,7 @@ _CREWS: set[_Crew] = set()
 
 @atexit.register
 def _end_all() -> None:
-    """End the crews whose results nobody asked for to the end."""
+    """End the crews whose results were not all read."""
     for crew in list(_CREWS):
         crew.end()
 

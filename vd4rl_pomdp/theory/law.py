@@ -1,9 +1,9 @@
 """The exact joint law of observations, actions and states of a finite world's sequences, as integer counts.
 
-Every table of probabilities is brought to one denominator, so that all sequences of one length share one total, which
-is never needed: a law is a list of distinct sequences and an integer for each. The recursion goes row by row over
-arrays; what no one asked for is summed out as it passes, so masked steps cost nothing. Integers are 64 bits wide where
-that suffices and unbounded where it does not.
+The probabilities of a table are written with one denominator. All sequences of one length then have one denominator,
+too, and a law is a list of distinct sequences with an integer for each, its numerator. Sequences are extended row by
+row, as arrays; variables that no one asked for are summed out at once, so masked steps cost nothing. Integers are 64
+bits wide where that suffices and unbounded where it does not.
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""What an objective needs of its representation: coarsest partitions of histories through which its classifier factors.
+"""What an objective needs of its representation: the coarsest partitions of histories that determine its predictions.
 
 At its optimum an objective knows F_k(x, y) = P(a_t | x, y) for every history x and later view y that occur together. A
 representation phi is enough if F_k is a function of phi(x) and phi(y) (of phi(x) and y, where the later view is one of
@@ -28,7 +28,7 @@ History = tuple
 
 
 class Relation:
-    """F: which prediction goes with which pair of histories at which k. Histories and predictions go by numbers."""
+    """F: the prediction for each pair of histories at each k. Histories and predictions are numbered."""
 
     def __init__(self, world: World, shared: bool) -> None:
         self.world = world
@@ -52,7 +52,7 @@ class Relation:
         self._entries.append(np.stack([np.full_like(past, k), past, later, values]))
 
     def add_facts(self, law: Law, past: Iterable[Variable], content: Iterable[Variable], row: int) -> None:
-        """Record what histories that end at a row go with, from a law of all that is named.
+        """Record the states, exogenous states and contents that histories which end at a row may have.
 
         Args:
             law: of `past`, `content` and the s and xi of `row`.
@@ -95,7 +95,7 @@ class Relation:
         return table
 
     def conflicts(self) -> np.ndarray:
-        """(H, H) bool: pairs of histories that no representation that is enough can put together."""
+        """(H, H) bool: pairs of histories that every representation that is enough keeps apart."""
         k, past, later, value = self.entries
         found = np.zeros((len(self.histories),) * 2, bool)
         _mark_differing(found, past, number_rows([k, later])[0], value)
@@ -106,7 +106,7 @@ class Relation:
         return found | found.T
 
     def _contradict_as_one(self, entries: np.ndarray) -> np.ndarray:
-        """(H, H): pairs whose predictions between themselves, at one k, would differ under one name."""
+        """(H, H): pairs of histories that, put together, would need several predictions for one pair at this k."""
         past, later, value = entries
         table = np.full((len(self.histories),) * 2, -1, np.int32)
         table[past, later] = value
@@ -246,8 +246,8 @@ def state_relation(world: World, ks: Iterable[int]) -> Relation:
 def forced_shares(found: Relation) -> dict[frozenset, Fraction]:
     """For every pair of states, the share of pairs of their histories that every optimal representation separates.
 
-    Only histories whose exogenous parts can be the same are paired: else a code could lean on what the future shows of
-    the exogenous part.
+    Only histories that may have the same exogenous state are paired: others can be told apart by what the future shows
+    of the exogenous state.
     """
     ends, noises = found.states.astype(float), found.noises.astype(float)  # whole numbers, far below 2^53: exact
     eligible = noises @ noises.T > 0
@@ -260,12 +260,12 @@ def forced_shares(found: Relation) -> dict[frozenset, Fraction]:
 
 
 def discards_noise(found: Relation) -> bool:
-    """Whether F factors through the agent-centric content of histories: what differs in noise alone is put together."""
+    """Whether F depends on the agent-centric content of histories alone, so that what differs in noise can be one."""
     return found.factors(_linked(found.contents))
 
 
 def state_classes(found: Relation, blocks: np.ndarray) -> list[int]:
-    """Class of each state: states that a partition of histories cannot tell have one class.
+    """Class of each state: states that a partition of histories cannot tell apart share one.
 
     They share a block at an equal exogenous state, directly or through others.
     """

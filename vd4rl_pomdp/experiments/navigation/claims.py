@@ -54,7 +54,7 @@ class Verdict:
 
 
 def claims(maze: str) -> list[Claim]:
-    """The maturity gate, then the statements, of one maze."""
+    """The claims about one maze: first whether training has gone far enough to compare, then the paper's statements."""
 
     best, best_1 = Condition(maze, "mik+a"), Condition(maze, "mik+a", 1)
     recorder, recorder_1 = Condition(maze, "ah+a"), Condition(maze, "ah+a", 1)
@@ -101,7 +101,7 @@ def claims(maze: str) -> list[Claim]:
 
 
 def judge(claim: Claim, runs: Sequence[NavigationRun]) -> Verdict:
-    """What the runs say of a claim, seeds paired; no seeds and NaN while a side has no run."""
+    """What the runs say of a claim, over the seeds that both sides have; NaN while there is none."""
     left = _by_seed(claim.left, runs)
     right = dict.fromkeys(left, 1.0) if claim.right is None else _by_seed(claim.right, runs)
     seeds = sorted(left.keys() & right.keys())
