@@ -30,7 +30,7 @@ def check_frame_encoder(name: str, size: int = FRAME_SIZE, **options: Any) -> No
         AssertionError: a promise is broken; says which one, and by what.
         UserError: there is no such frame encoder or option, or it cannot read pictures of that size.
     """
-    FRAME_ENCODERS.named(name)
+    FRAME_ENCODERS.check(name)
     run_checks("frame encoder", CHECKS, name, size=size, **options)
 
 

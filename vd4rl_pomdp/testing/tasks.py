@@ -28,7 +28,7 @@ def check_task(name: str) -> None:
         AssertionError: a promise is broken; says which one, and by what.
         UserError: there is no such task, or its environment cannot be built.
     """
-    TASKS.named(name)
+    TASKS.check(name)
     run_checks("task", CHECKS, name)
 
 
