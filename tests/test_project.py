@@ -5,6 +5,7 @@ import re
 import subprocess
 import tomllib
 from collections.abc import Iterable, Iterator
+from graphlib import TopologicalSorter
 from importlib.metadata import requires
 from pathlib import Path
 
@@ -88,6 +89,16 @@ def test_nothing_but_tests_imports_pytest():
     trees = {path.relative_to(ROOT).as_posix(): ast.parse(path.read_text()) for path in SOURCES}
     named = {name: {module.split(".")[0] for module in everywhere(tree)} for name, tree in trees.items()}
     assert [name for name in named if named[name] & {"pytest", "_pytest", "hypothesis", "tests"}] == []
+
+
+def test_no_modules_import_each_other_in_a_circle():
+    modules = {".".join(p.relative_to(ROOT).with_suffix("").parts).removesuffix(".__init__"): p for p in SOURCES}
+    graph = {}
+    for module, path in modules.items():
+        names = everywhere(ast.parse(path.read_text()))
+        imported = {name if name in modules else name.rpartition(".")[0] for name in names}
+        graph[module] = imported & modules.keys() - {module}
+    TopologicalSorter(graph).prepare()  # names the circle, if there is one
 
 
 def test_what_judges_runs_is_imported_by_the_command_line_alone():

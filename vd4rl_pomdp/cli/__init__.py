@@ -7,11 +7,11 @@ import sys
 from collections.abc import Sequence
 
 from vd4rl_pomdp.cli import data, navigation, parts, policy, stages, studies
-from vd4rl_pomdp.cli.dispatch import Commands, run_stage
+from vd4rl_pomdp.cli.dispatch import COMMANDS, run_stage
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs import interrupt
 
-COMMANDS: Commands = {
+COMMANDS |= {
     "demo": stages.DEMO,
     "list": parts.LIST,
     "data": data.COMMANDS,
@@ -21,7 +21,6 @@ COMMANDS: Commands = {
     "sweep": stages.SWEEP,
     **studies.COMMANDS,
 }
-"""All subcommands, in the order in which they are listed."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:

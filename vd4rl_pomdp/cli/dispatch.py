@@ -25,6 +25,10 @@ Commands = Mapping[str, Command | Mapping[str, Command]]
 """Subcommands by name, and groups of them."""
 
 
+COMMANDS: dict[str, Command | Mapping[str, Command]] = {}
+"""The program's subcommands, as they are listed. Those who define them import this module: the package fills it."""
+
+
 def dispatch(commands: Commands, words: Arguments, program: str) -> None:
     """Run the subcommand that `words` name, or print what there is."""
     if not words or words[0] in ("-h", "--help"):
@@ -56,8 +60,6 @@ def _overview(commands: Commands, program: str) -> str:
 
 def run_stage(words: Arguments) -> None:
     """Do what `vd4rl-pomdp WORDS` does, in this process."""
-    from vd4rl_pomdp.cli import COMMANDS
-
     dispatch(COMMANDS, words, PROGRAM)
 
 
