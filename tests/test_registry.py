@@ -66,6 +66,13 @@ def test_an_entry_point_offers_a_part(registry, monkeypatch):
     assert len(registry) == len(list(registry)) == 3, "loaded once"
 
 
+def test_what_is_known_at_import_loads_no_package(registry, monkeypatch):
+    offer(monkeypatch, theirs="tests.test_registry:THEIRS")
+    assert list(registry.registered()) == ["own", "own+a"]
+    assert "theirs" in registry
+    assert list(registry.registered()) == ["own", "own+a", "theirs"]
+
+
 def test_a_package_and_its_version_are_the_origin_of_what_it_offers(registry, monkeypatch):
     from importlib.metadata import entry_points
 

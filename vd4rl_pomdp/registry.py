@@ -42,6 +42,10 @@ class Registry(Mapping[str, Part], Generic[Part]):
         """Add a part of one's own; a name that is taken, or a part of another kind, raises UserError."""
         self._add(name, part, "registered by a call")
 
+    def registered(self) -> dict[str, Part]:
+        """The parts that are known without loading what installed packages offer: for code that runs at import."""
+        return dict(self._parts)
+
     @contextmanager
     def isolated(self) -> Iterator[None]:
         """Within the block parts may be registered; after it they are forgotten, as tests want it."""

@@ -3,7 +3,7 @@
 Importing this package registers every task and corruption with Gymnasium, as `vd4rl_pomdp/WalkerWalk-v0`,
 `vd4rl_pomdp/WalkerWalk-Patch16-v0`, `vd4rl_pomdp/WalkerWalk-ZeroFrames-v0`,
 `vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0`, and likewise for `CheetahRun`, `HumanoidWalk` and every other
-task that is registered by then (for a later one there is `vd4rl_pomdp.envs.gym.GymEnv("its_name")`); the mazes as
+task that a call has registered by then (for others there is `vd4rl_pomdp.envs.gym.GymEnv("its_name")`); the mazes as
 `vd4rl_pomdp/MazeNoCurtain-v0`, `MazeOneCurtain`, `MazeThreeCurtains` and `MazeFirstPerson`; and the paper's finite
 counterexample, `vd4rl_pomdp/ForwardJumpCounterexample-v0`.
 
@@ -27,7 +27,7 @@ _SUFFIXES = {"": "none", "-Patch16": "patch", "-ZeroFrames": "zero_frames", "-Pa
 
 GYM_IDS = {
     f"vd4rl_pomdp/{re.sub(r'[^A-Za-z0-9]', '', task.title())}{suffix}-v0": {"task": task, "corruption": corruption}
-    for task in TASKS
+    for task in TASKS.registered()
     for suffix, corruption in _SUFFIXES.items()
 }
 """Every Gymnasium id, and the task and corruption it names."""
@@ -49,7 +49,7 @@ def _register(name: str, entry_point: str, arguments: dict[str, Any], steps: int
 
 
 for _id, _arguments in GYM_IDS.items():
-    _register(_id, "gym:GymEnv", _arguments, TASKS[_arguments["task"]].decisions)
+    _register(_id, "gym:GymEnv", _arguments, TASKS.registered()[_arguments["task"]].decisions)
 for _id, _world in FINITE_IDS.items():
     _register(_id, "finite:FiniteEnv", {"world": _world}, FINITE_STEPS)
 for _maze in MAZES.values():
