@@ -28,6 +28,7 @@ from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.contrastive import info_nce
 from vd4rl_pomdp.nn.draws import Draws
 from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.heads import move_target
 from vd4rl_pomdp.objective import Objective
 from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.types import Windows
@@ -59,11 +60,9 @@ class CURL(Objective):
         right = (scores.argmax(1) == torch.arange(len(scores), device=scores.device)).float().mean()
         return loss, {"loss": loss.detach(), "accuracy": right}
 
-    @torch.no_grad()
     def after_step(self) -> None:
         """Move the momentum encoder."""
-        for slow, fast in zip(self.momentum_encoder.parameters(), self.encoder.parameters(), strict=True):
-            slow.lerp_(fast, MOMENTUM)
+        move_target(self.momentum_encoder, self.encoder, MOMENTUM)
 
     def _shifted(self, window: Windows) -> Windows:
         """The window, shifted anew: each row by itself, or all alike if the encoder has a memory."""

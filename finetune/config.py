@@ -11,7 +11,7 @@ import tyro
 
 from finetune.algorithms import ALGORITHMS
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
-from vd4rl_pomdp.options import NO_OPTIONS, Options, StageConfig, all_options
+from vd4rl_pomdp.options import NO_OPTIONS, Options, StageConfig
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
 from vd4rl_pomdp.tasks import FRAME_SIZES, MOST_EPISODES
@@ -94,5 +94,4 @@ class FinetuneConfig(StageConfig):
             shift=(0, FRAME_SIZES[1] - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
             eval_length=1, log_every=1, checkpoint_every=1, workers=0,
         )  # fmt: skip
-        for options in all_options(self):
-            options.check()
+        super().check()

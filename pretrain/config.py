@@ -14,7 +14,7 @@ from vd4rl_pomdp.corruptions import NO_CORRUPTION, CorruptionConfig
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.nn.encoder import MAX_LAYERS
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS
-from vd4rl_pomdp.options import NO_OPTIONS, Limits, Options, StageConfig, all_options
+from vd4rl_pomdp.options import NO_OPTIONS, Limits, Options, StageConfig
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
 
@@ -89,8 +89,7 @@ class TrainingConfig(StageConfig):
         refuse_outside(
             self, seed=(0, MAX_SEED), steps=0, batch_size=1, window=2, learning_rate=0, log_every=1, checkpoint_every=1
         )
-        for options in all_options(self):
-            options.check()
+        super().check()
         if (gap := getattr(self.options, "max_k", 0)) >= self.window:
             raise UserError(f"--max-k {gap} needs windows of more than that many rows: raise --window or lower it")
 

@@ -6,7 +6,7 @@ nested in the stage's config; on the command line and in records all settings st
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Self
 
@@ -30,9 +30,10 @@ class Options:
         return cls(**{field.name: values[field.name] for field in fields(cls) if field.name in values})
 
     def check(self) -> None:
-        """Raise UserError for a value that cannot work."""
+        """Raise UserError for a value that cannot work, here or in options within."""
         for kind in type(self).__mro__:
             refuse_outside(self, **vars(kind).get("limits", {}))
+        check_options(self)
 
 
 NO_OPTIONS = Options()
@@ -58,12 +59,11 @@ def options_in(value: Any) -> tuple[Options, ...] | None:
     return value if isinstance(value, tuple) and all(isinstance(part, Options) for part in value) else None
 
 
-def all_options(config: Any) -> Iterator[Options]:
-    """All options in a config, outer ones first."""
+def check_options(config: Any) -> None:
+    """Raise UserError for a value that cannot work among all options of a config."""
     for field in fields(config):
         for options in options_in(getattr(config, field.name)) or ():
-            yield options
-            yield from all_options(options)
+            options.check()
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -115,6 +115,10 @@ class StageConfig:
         for name in names:
             if name not in known:
                 raise UserError(f"{flag_of(name)} is not read by {_reader(cls.choosers, name, known)}: leave it out")
+
+    def check(self) -> None:
+        """Refuse settings that cannot work, before anything is read or written."""
+        check_options(self)
 
     def altered(self, **changes: Any) -> Self:
         """The same with other settings, perhaps other parts; what differs from the preset's defaults is kept.

@@ -1,4 +1,4 @@
-"""What algorithms with critics share: two independent Q functions, and targets that creep behind them."""
+"""What algorithms with critics share: two independent Q functions."""
 
 from __future__ import annotations
 
@@ -20,10 +20,3 @@ class TwinCritic(nn.Module):
         """Both values."""
         both = torch.cat([z, action], dim=-1)
         return self.first(both)[:, 0], self.second(both)[:, 0]
-
-
-@torch.no_grad()
-def move_target(target: nn.Module, online: nn.Module, tau: float) -> None:
-    """Move a target's parameters by the share `tau` of the way to those of its network."""
-    for a, b in zip(online.parameters(), target.parameters(), strict=True):
-        b.lerp_(a, tau)

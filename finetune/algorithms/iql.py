@@ -30,9 +30,9 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
-from finetune.algorithms.critic import TwinCritic, move_target
+from finetune.algorithms.critic import TwinCritic
 from finetune.features import FeatureBatch
-from vd4rl_pomdp.nn.heads import mlp
+from vd4rl_pomdp.nn.heads import mlp, move_target
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.options import Limits, Options
 

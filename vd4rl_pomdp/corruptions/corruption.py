@@ -144,7 +144,7 @@ class CorruptionConfig(Options):
             UserError: an unknown name, or an option that no stage reads.
         """
         config = cls.fill({"corruption": corruption, "corruption_mode": corruption_mode} | options)
-        for name in options.keys() - flat(config).keys():
+        for name in (name for name in options if name not in flat(config)):
             raise UserError(f"{flag_of(name)} is not read by the corruption {corruption}: leave it out")
         return config
 
@@ -153,11 +153,6 @@ class CorruptionConfig(Options):
         """The corruption that many values name, with its stages' options among them."""
         stages = tuple(kind.fill(values) for kind in _kinds(values.get("corruption", "none")))
         return cls(**{name: values[name] for name in _OWN if name in values}, stages=stages)
-
-    def check(self) -> None:
-        """Raise UserError for a field out of range."""
-        for stage in self.stages:
-            stage.check()
 
 
 _OWN = ("corruption", "corruption_mode")

@@ -1,4 +1,4 @@
-"""Prediction heads on pairs of representations."""
+"""Prediction heads on pairs of representations, multilayer perceptrons, and targets that creep behind networks."""
 
 from __future__ import annotations
 
@@ -54,3 +54,10 @@ def all_pairs(rows: int, max_k: int) -> Tensor:
     """Every (t, k) with 1 <= k <= max_k and t + k < rows: (P, 2) int64, ordered by k, then t."""
     pairs = [(t, k) for k in range(1, min(max_k, rows - 1) + 1) for t in range(rows - k)]
     return torch.tensor(pairs, dtype=torch.int64).view(-1, 2)
+
+
+@torch.no_grad()
+def move_target(target: nn.Module, online: nn.Module, tau: float) -> None:
+    """Move a target's parameters by the share `tau` of the way to those of its network."""
+    for a, b in zip(online.parameters(), target.parameters(), strict=True):
+        b.lerp_(a, tau)
