@@ -10,9 +10,9 @@ import pytest
 
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
-from vd4rl_pomdp.envs.dmc import replay_rewards, replays
+from vd4rl_pomdp.envs.dmc import replay_rewards, replays, start_from
 from vd4rl_pomdp.envs.make import layout_of, make_env
-from vd4rl_pomdp.envs.rendering import suite
+from vd4rl_pomdp.envs.rendering import mujoco, suite
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask, Layout
 
@@ -32,18 +32,55 @@ def test_the_layouts_of_the_benchmark_are_what_their_models_have(name):
 @pytest.mark.parametrize(
     ("domain", "task", "layout"),
     [
-        ("cartpole", "swingup", Layout(1, 5, 2)),  # its camera stands still and shows where the cart is
-        ("hopper", "hop", Layout(4, 15, 7, travel=(0,))),
-        ("quadruped", "run", Layout(12, 78, 23, travel=(0, 1))),
-        ("reacher", "easy", Layout(2, 6, 2)),
+        ("cartpole", "swingup", Layout(1, 5, 2, turning=(1,))),  # its camera stands still and shows where the cart is
+        ("hopper", "hop", Layout(4, 15, 7, travel=(0,), turning=(2,))),
+        ("quadruped", "run", Layout(12, 78, 23, travel=(0, 1), quaternions=(3,))),
+        ("reacher", "easy", Layout(2, 6, 2, turning=(0,))),
+        ("ball_in_cup", "catch", Layout(2, 8, 4)),
     ],
 )
 def test_what_a_task_does_not_tell_is_found(domain, task, layout):
     found = layout_of(DMCTask(domain, task))
     assert found == layout
     physics = suite.load(domain, task).physics.get_state()
-    states = found.visible_state(physics[None])
-    assert states.shape == (1, len(physics) - len(layout.travel))
+    width = len(physics) - len(layout.travel) + len(layout.turning) + 2 * len(layout.quaternions)
+    assert found.visible_state(physics[None]).shape == (1, width)
+
+
+def _alike(layout: Layout, physics: np.ndarray) -> np.ndarray:
+    """Another simulator state of the same look."""
+    other = physics.copy()
+    other[list(layout.turning)] += [2 * np.pi * (-1) ** i for i in range(len(layout.turning))]
+    for first in layout.quaternions:
+        other[first : first + 4] *= -1
+    return other
+
+
+@pytest.mark.parametrize("name", [*TASKS, "quadruped walk", "acrobot swingup"])
+def test_states_that_look_the_same_are_the_same_vector_and_others_are_not(name):
+    task = TASKS[name] if name in TASKS else DMCTask(*name.split())
+    env, rng = make_env(task, size=48), np.random.default_rng(0)
+    env.reset(1)
+    for _ in range(30):
+        step = env.step(rng.uniform(-1, 1, env.action_dim).astype(np.float32))
+    other = _alike(env.layout, step.physics)
+    assert np.abs(other - step.physics).max() > 0.1
+    start_from(env.simulator, other)
+    drawn = env._time_step(0.0, 1.0, step.step_type)
+    np.testing.assert_array_equal(drawn.frame, step.frame)
+    np.testing.assert_allclose(env.layout.visible_state(other), env.layout.visible_state(step.physics), atol=1e-6)
+    turned = step.physics.copy()
+    column = (*env.layout.turning, *(first + 1 for first in env.layout.quaternions))[0]
+    turned[column] += 0.2
+    assert np.abs(env.layout.visible_state(turned) - env.layout.visible_state(step.physics)).max() > 0.01
+
+
+def test_the_two_columns_of_a_quaternion_are_those_of_its_rotation_matrix():
+    quaternion, matrix = np.random.default_rng(0).normal(size=4), np.zeros(9)
+    quaternion /= np.linalg.norm(quaternion)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    pose = Layout(1, positions=4, quaternions=(0,)).pose(quaternion)
+    np.testing.assert_allclose(pose, matrix.reshape(3, 3)[:, :2].T.ravel(), atol=1e-12)
 
 
 @pytest.mark.parametrize("task", ["cartpole swingup", "acrobot swingup", "dog walk", "quadruped fetch"])

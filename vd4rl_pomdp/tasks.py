@@ -47,10 +47,22 @@ class Layout:
     """Generalised positions: the first columns of the simulator state, velocities the others."""
     travel: tuple[int, ...] = ()
     """Positions along the ground, which a tracking camera does not show."""
+    turning: tuple[int, ...] = ()
+    """Positions that are angles without limits: a full turn more looks the same."""
+    quaternions: tuple[int, ...] = ()
+    """First of the four positions of every unit quaternion: one of the other sign looks the same."""
 
     def pose(self, physics: np.ndarray) -> np.ndarray:
-        """Positions of (..., P) simulator states, without the place on the ground."""
-        return np.delete(physics[..., : self.positions], self.travel, axis=-1)
+        """What (..., P) simulator states look like, in coordinates without winding: equal for equal looks.
+
+        Limited positions, sine and cosine of turning angles, then two columns of every quaternion's rotation matrix
+        (Zhou et al. 2019, arXiv 1812.07035); nothing of the place on the ground.
+        """
+        positions, turning = physics[..., : self.positions], physics[..., list(self.turning)]
+        rotations = [_two_columns(positions[..., first : first + 4]) for first in self.quaternions]
+        replaced = [column for first in self.quaternions for column in range(first, first + 4)]
+        plain = np.delete(positions, [*self.travel, *self.turning, *replaced], axis=-1)
+        return np.concatenate([plain, np.sin(turning), np.cos(turning), *rotations], axis=-1)
 
     def velocity(self, physics: np.ndarray) -> np.ndarray:
         """Velocities of (..., P) simulator states."""
@@ -59,6 +71,14 @@ class Layout:
     def visible_state(self, physics: np.ndarray) -> np.ndarray:
         """(..., P') float32: pose and velocity."""
         return np.concatenate([self.pose(physics), self.velocity(physics)], axis=-1).astype(np.float32)
+
+
+def _two_columns(quaternion: np.ndarray) -> np.ndarray:
+    """First two columns (..., 6) of the rotation matrices of (..., 4) unit quaternions, real part first."""
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    first = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+    second = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]
+    return np.stack([*first, *second], axis=-1)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -123,9 +143,11 @@ class GymnasiumTask(Task):
 TASKS: Registry[Task] = Registry(
     "task",
     {
-        "walker_walk": DMCTask("walker", "walk", layout=Layout(6, 24, 9, travel=(1,)), action_noise=0.5),
-        "cheetah_run": DMCTask("cheetah", "run", layout=Layout(6, 17, 9, travel=(0,)), action_noise=0.4),
-        "humanoid_walk": DMCTask("humanoid", "walk", layout=Layout(21, 67, 28, travel=(0, 1)), action_noise=0.3),
+        "walker_walk": DMCTask("walker", "walk", layout=Layout(6, 24, 9, travel=(1,), turning=(2,)), action_noise=0.5),
+        "cheetah_run": DMCTask("cheetah", "run", layout=Layout(6, 17, 9, travel=(0,), turning=(2,)), action_noise=0.4),
+        "humanoid_walk": DMCTask(
+            "humanoid", "walk", layout=Layout(21, 67, 28, travel=(0, 1), quaternions=(3,)), action_noise=0.3
+        ),
     },
     lambda part: isinstance(part, DMCTask | GymnasiumTask),
     "a vd4rl_pomdp.tasks.DMCTask or GymnasiumTask",

@@ -45,7 +45,8 @@ class DMCEnv(PixelEnv):
         self.simulator.reset()  # an episode of its own: some tasks observe nothing before
         state = flat_state(self.simulator.task.get_observation(self.physics))
         travel = _ground_travel(model) if _tracks(model, self._camera) else ()
-        return Layout(self.simulator.action_spec().shape[0], len(state), model.nq, travel)
+        turning, quaternions = _free_joints(model)
+        return Layout(self.simulator.action_spec().shape[0], len(state), model.nq, travel, turning, quaternions)
 
     @property
     def rate(self) -> float:
@@ -143,6 +144,15 @@ def _ground_travel(model: Any) -> tuple[int, ...]:
         elif model.body_parentid[body] == 0 and kind == mujoco.mjtJoint.mjJNT_SLIDE and abs(axis[2]) < 0.5:
             travel.append(int(start))
     return tuple(travel)
+
+
+def _free_joints(model: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Positions that are angles of hinges without limits, and the first position of every quaternion."""
+    joints = list(zip(model.jnt_type, model.jnt_qposadr, model.jnt_limited, strict=True))
+    turning = [int(start) for kind, start, limited in joints if kind == mujoco.mjtJoint.mjJNT_HINGE and not limited]
+    offset = {mujoco.mjtJoint.mjJNT_FREE: 3, mujoco.mjtJoint.mjJNT_BALL: 0}  # a free joint begins with its place
+    quaternions = [int(start) + offset[kind] for kind, start, _ in joints if kind in offset]
+    return tuple(turning), tuple(quaternions)
 
 
 def _load(task: DMCTask, random: np.random.RandomState) -> Any:
