@@ -10,6 +10,7 @@ from typing import Annotated, Any, ClassVar
 import tyro
 
 from finetune.algorithms import ALGORITHMS
+from finetune.histories import HistoryOptions
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
 from vd4rl_pomdp.options import NO_OPTIONS, Options, StageConfig
 from vd4rl_pomdp.runs.device import Precision
@@ -63,6 +64,8 @@ class FinetuneConfig(StageConfig):
     """Mirror metrics to wandb: off, offline or online."""
     options: Annotated[Options, tyro.conf.arg(name="algorithm")] = NO_OPTIONS
     """What the chosen algorithm can be told."""
+    memory: Annotated[Options, tyro.conf.arg(name="memory")] = NO_OPTIONS
+    """What of an encoder with a memory the policy is given."""
 
     choosers: ClassVar[tuple[str, ...]] = ("algorithm",)
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
@@ -84,8 +87,11 @@ class FinetuneConfig(StageConfig):
 
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
-        """Options of the algorithm."""
-        return {"options": ALGORITHMS.named(values["algorithm"]).options.fill(values)}
+        """Options of the algorithm, and of the encoder's memory."""
+        return {
+            "options": ALGORITHMS.named(values["algorithm"]).options.fill(values),
+            "memory": HistoryOptions.fill(values),
+        }
 
     def check(self) -> None:
         """Refuse settings that cannot work, before anything is read or written."""

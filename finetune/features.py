@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import hashlib
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,12 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from finetune.histories import Histories, HistoryOptions, draw_lengths, read_both_ends
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.data import Dataset, View
 from vd4rl_pomdp.data.samplers import Sampler
 from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.runs.device import Precision, autocast
 from vd4rl_pomdp.runs.files import read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
@@ -76,14 +79,12 @@ class FrozenEncoder:
                 parts.append(self.encoder.frame(obs).float())
         return torch.cat(parts)
 
-    @torch.no_grad()
     def episode(self, number: int, view: View) -> Tensor:
-        """Representations (rows, D) of a whole episode, streamed from its first row; one shift for all of it."""
+        """Frame features (rows, F) of a whole episode; one shift for all of it."""
         start, end = int(self.dataset.episode_start[number]), int(self.dataset.episode_end[number])
         rows = torch.arange(start, end, device=self.device)
         key = derive_keys(view.shifts.seed, torch.tensor([number], device=self.device))
-        features = self.rows(rows, key.expand(len(rows)), view)
-        return self.encoder.from_features(features[None], self.dataset.actions_before(rows)[None])[0]
+        return self.rows(rows, key.expand(len(rows)), view)
 
 
 class FeatureFile:
@@ -120,27 +121,30 @@ class FeatureFile:
             return self._inputs | {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
 
 
-def encode_views(frozen: FrozenEncoder, views: int, kept: FeatureFile) -> Tensor:
+def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: FeatureFile) -> Tensor:
     """Encode the whole set under `views` draws, or read what was encoded before.
 
     Returns:
-        (views, N, D) float16 on the data set's device; `kept` keeps them for the run's resumption.
+        (views, features, D) float16 on the data set's device, numbered as `Histories` says; `kept` keeps them for the
+        run's resumption.
     """
     features = kept.read()
     if features is None:
-        features = _encode_all(frozen, views)
+        features = _encode_all(frozen, histories, views)
         kept.write(features)
     return torch.from_numpy(features).to(frozen.device)
 
 
-def _encode_all(frozen: FrozenEncoder, views: int) -> np.ndarray:
-    dataset = frozen.dataset
-    out = np.empty((views, dataset.num_rows, frozen.encoder.dim), np.float16)
-    with ProgressLine("encode", views * dataset.num_episodes, "episodes") as progress:
-        for features, view in zip(out, map(frozen.view, range(views)), strict=True):
-            for number in range(dataset.num_episodes):
-                start, end = int(dataset.episode_start[number]), int(dataset.episode_end[number])
-                features[start:end] = frozen.episode(number, view).cpu().numpy()
+@torch.no_grad()
+def _encode_all(frozen: FrozenEncoder, histories: Histories, views: int) -> np.ndarray:
+    episodes = frozen.dataset.num_episodes
+    out = np.empty((views, histories.features, frozen.encoder.dim), np.float16)
+    with ProgressLine("encode", views * episodes, "episodes") as progress:
+        for number in range(views):
+            view, random = frozen.view(number), histories.of_view(number)
+            for episode in range(episodes):
+                frames = frozen.episode(episode, view)
+                random.fill(torch.from_numpy(out[number]), frozen.encoder, frames, episode)
                 progress.advance()
     return out
 
@@ -149,12 +153,15 @@ class FeatureSampler:
     """Uniform n-step transitions of cached features; a transition's two ends come from the same view."""
 
     def __init__(
-        self, dataset: Dataset, features: Tensor, batch_size: int, n_step: int, gamma: float, generator: torch.Generator
-    ) -> None:
+        self, histories: Histories, features: Tensor, batch_size: int, n_step: int, gamma: float,
+        generator: torch.Generator,
+    ) -> None:  # fmt: skip
         self._features, self._batch_size, self._generator = features, batch_size, generator
-        self._rows = dataset.transition_rows
-        self._reward, self._discount, self._next = dataset.n_step_returns(self._rows, n_step, gamma)
-        self._action = dataset.action_after(self._rows)
+        dataset, rows = histories.dataset, histories.rows
+        self._reward, self._discount, _ = dataset.n_step_returns(rows, n_step, gamma)
+        self._action = dataset.action_after(rows)
+        ends = [histories.of_view(view).numbers() for view in range(len(features))]
+        self._first, self._last = (torch.stack(numbers) for numbers in zip(*ends, strict=True))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on with the same batches."""
@@ -166,30 +173,32 @@ class FeatureSampler:
 
     def sample(self) -> FeatureBatch:
         """The next batch."""
-        device = self._rows.device
-        index = torch.randint(len(self._rows), (self._batch_size,), generator=self._generator).to(device)
+        device = self._action.device
+        index = torch.randint(len(self._action), (self._batch_size,), generator=self._generator).to(device)
         view = torch.randint(len(self._features), (self._batch_size,), generator=self._generator).to(device)
         return FeatureBatch(
-            z=self._features[view, self._rows[index]].float(),
+            z=self._features[view, self._first[view, index]].float(),
             action=self._action[index],
             reward=self._reward[index],
             discount=self._discount[index],
-            next_z=self._features[view, self._next[index]].float(),
+            next_z=self._features[view, self._last[view, index]].float(),
         )
 
 
 class ExactSampler(Sampler):
-    """Uniform n-step transitions whose representations are computed anew for every batch, from whole histories."""
+    """Uniform n-step transitions whose representations are computed anew for every batch."""
 
     def __init__(
-        self, frozen: FrozenEncoder, batch_size: int, n_step: int, gamma: float, generator: torch.Generator
-    ) -> None:
+        self, frozen: FrozenEncoder, options: Options, batch_size: int, n_step: int, gamma: float,
+        generator: torch.Generator,
+    ) -> None:  # fmt: skip
         super().__init__(frozen.view(0), batch_size, generator)
         self._frozen, self._n_step, self._gamma = frozen, n_step, gamma
+        self._options = options if isinstance(options, HistoryOptions) else HistoryOptions()
         self._starts = frozen.dataset.transition_rows
 
     def sample(self) -> FeatureBatch:
-        """The next batch; sequence encoders read every row from the episode's start, or their history window."""
+        """The next batch; an encoder with a memory reads every row of a transition's history, or of its window."""
         dataset = self._frozen.dataset
         rows = self._starts[self._draw(len(self._starts)).to(self._starts.device)]
         reward, discount, next_rows = dataset.n_step_returns(rows, self._n_step, self._gamma)
@@ -198,17 +207,28 @@ class ExactSampler(Sampler):
 
     @torch.no_grad()
     def _encode(self, rows: Tensor, next_rows: Tensor) -> tuple[Tensor, Tensor]:
-        dataset, encoder = self._frozen.dataset, self._frozen.encoder
+        encoder = self._frozen.encoder
         key = self.view.shifts.take((len(rows),), rows.device)
-        if encoder.gru is None:
+        if not encoder.remembers:
             features = self._frozen.rows(torch.cat([rows, next_rows]), key.repeat(2), self.view)
             return features[: len(rows)], features[len(rows) :]
+        return read_both_ends(
+            encoder, partial(self._frames, key), self._frozen.dataset, self._first(rows), rows, next_rows
+        )
+
+    def _frames(self, key: Tensor, rows: Tensor) -> Tensor:
+        """Frame features (B, T, F) of (B, T) rows, those under one leading index shifted alike."""
+        keys = key.repeat_interleave(rows.shape[1])
+        return self._frozen.rows(rows.reshape(-1), keys, self.view).view(*rows.shape, -1)
+
+    def _first(self, rows: Tensor) -> Tensor:
+        """Rows at which the histories of (B,) rows begin."""
+        dataset, window = self._frozen.dataset, self._frozen.encoder.config.history_window
         first = dataset.episode_start[dataset.episode[rows]]
-        if encoder.config.history_window:
-            first = torch.maximum(first, rows - encoder.config.history_window + 1)
-        span = torch.arange(int((next_rows - first).max()) + 1, device=rows.device)
-        history = torch.minimum(first[:, None] + span, next_rows[:, None])
-        features = self._frozen.rows(history.reshape(-1), key.repeat_interleave(len(span)), self.view)
-        states = encoder.from_features(features.view(*history.shape, -1), dataset.actions_before(history))
-        pick = torch.arange(len(rows), device=rows.device)
-        return states[pick, rows - first], states[pick, next_rows - first]
+        if window:
+            first = torch.maximum(first, rows - window + 1)
+        if not self._options.random_histories:
+            return first
+        random = torch.rand(len(rows), generator=self._generator) < self._options.random_histories
+        length = draw_lengths(self._options, len(rows), self._generator).to(rows.device)
+        return torch.where(random.to(rows.device), torch.maximum(first, rows - length + 1), first)

@@ -14,11 +14,12 @@ from finetune.algorithms import ALGORITHMS, Algorithm, ReturnOptions
 from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd
 from finetune.features import STAGE, ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
+from finetune.histories import Histories, HistoryOptions
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.envs.make import layout_of
-from vd4rl_pomdp.errors import UserError, refuse_number, refuse_outside
+from vd4rl_pomdp.errors import UserError, flag_of, refuse_number, refuse_outside
 from vd4rl_pomdp.evaluation import (
     EpisodeJob,
     append_episodes,
@@ -31,6 +32,7 @@ from vd4rl_pomdp.evaluation import (
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, EncoderCard, copy_encoder, encoder_hash, load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.options import NO_OPTIONS, flat
 from vd4rl_pomdp.probes import probe_state
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.device import pick_device
@@ -61,6 +63,7 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     refuse_number("eval_length", config.eval_length, 1, longest)
     if card.end_to_end:
         config = end_to_end(config, card.end_to_end)
+    config = _with_memory(config, encoder, card)
     if encoder.reads_state:
         dataset.require_states()
     _check_n_step(config, dataset)
@@ -72,10 +75,27 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     with run:
         if not run.finished:
             write_json(run.path / "labels.json", _labels(config, card))
-            _keep_encoder(config.encoder, run.path)
+            _keep_encoder(config, run.path)
             dataset.to(device)
             _trainer(config, dataset, encoder.to(device), card, run).run(run)
     return run
+
+
+def _with_memory(config: FinetuneConfig, encoder: Encoder, card: EncoderCard) -> FinetuneConfig:
+    """The settings for an encoder, which is told what of its memory is read; one without a memory reads none of them.
+
+    Raises:
+        UserError: a setting that was not the default is not read.
+    """
+    assert isinstance(config.memory, HistoryOptions)
+    if encoder.gru is not None and not card.end_to_end:
+        encoder.config = replace(encoder.config, **config.memory.encoder_changes)
+        return config
+    usual = config.usual()
+    for name, value in flat(config.memory).items():
+        if value != usual[name]:
+            raise UserError(f"{flag_of(name)} is not read: {card.method} has no memory; leave it out")
+    return replace(config, memory=NO_OPTIONS)
 
 
 def end_to_end(config: FinetuneConfig, algorithm: str) -> FinetuneConfig:
@@ -105,7 +125,8 @@ def _require_room(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, de
 
     Features that are `kept` on the disk already take no more of it.
     """
-    features = config.views * dataset.num_rows * encoder.dim * 2
+    histories = Histories(dataset, config.memory, 1, config.seed)
+    features = config.views * histories.features * encoder.dim * 2
     require_memory(features, device, config, "views")
     if not kept:
         require_disk(features, config.out, config, "views")
@@ -132,12 +153,13 @@ def _trainer(
         view = View(dataset, corruption, config.shift, config.seed, STAGE)
         sampler = TransitionSampler(view, config.batch_size, generator, returns.n_step, returns.gamma)
     elif config.views:
-        features = encode_views(frozen, config.views, FeatureFile(run.path, run.inputs))
+        histories = Histories(dataset, config.memory, returns.n_step, config.seed)
+        features = encode_views(frozen, histories, config.views, FeatureFile(run.path, run.inputs))
         policy.standardise.fit(features)
         _probe(features, dataset, run)
-        sampler = FeatureSampler(dataset, features, config.batch_size, returns.n_step, returns.gamma, generator)
+        sampler = FeatureSampler(histories, features, config.batch_size, returns.n_step, returns.gamma, generator)
     else:
-        sampler = ExactSampler(frozen, config.batch_size, returns.n_step, returns.gamma, generator)
+        sampler = ExactSampler(frozen, config.memory, config.batch_size, returns.n_step, returns.gamma, generator)
         policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(4)]))
     noise = stream_generator(config.seed, STAGE, "noise")
     algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
@@ -150,7 +172,7 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     """Write how well the first view tells the simulator state, where the set stores it."""
     if dataset.physics is None or dataset.task is None or (run.path / "probe.json").exists():
         return
-    arrays = features[0].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
+    arrays = features[0, : dataset.num_rows].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
     write_json(run.path / "probe.json", probe_state(*arrays, layout_of(TASKS.named(dataset.task))))
 
 
@@ -265,11 +287,13 @@ def _labels(config: FinetuneConfig, card: EncoderCard) -> dict[str, Any]:
     }
 
 
-def _keep_encoder(source: Path, run: Path) -> None:
+def _keep_encoder(config: FinetuneConfig, run: Path) -> None:
     """Copy the encoder into the run, so that the run can be evaluated wherever it is moved; its timing, too."""
+    source = config.encoder
     if (run / "encoder" / CONFIG).exists():
         return
     timing = source.parent / "timing.json"
     if timing.exists():
         write_json(run / "pretrain_timing.json", read_json(timing))
-    copy_encoder(source, run / "encoder")
+    changes = config.memory.encoder_changes if isinstance(config.memory, HistoryOptions) else {}
+    copy_encoder(source, run / "encoder", changes)

@@ -33,16 +33,6 @@ class MemoryOptions(Options):
     limits: ClassVar[Limits] = {"hidden_dim": 1, "gru_layers": (1, MAX_LAYERS), "m": 0}
 
 
-@dataclass(frozen=True)
-class StreamOptions(MemoryOptions):
-    """Options of encoders with a memory that are kept to read episodes."""
-
-    history_window: int = 0
-    """After pretraining, compute states from the last this many rows; 0: as in training."""
-
-    limits: ClassVar[Limits] = {"history_window": 0}
-
-
 @dataclass(frozen=True, kw_only=True)
 class TrainingConfig(StageConfig):
     """Settings of every training of an objective."""
@@ -134,7 +124,7 @@ class PretrainConfig(TrainingConfig):
         recurrent = memory_of(values["method"], method, values["history"]) == "gru"
         return {
             "options": method.options.fill(values),
-            "memory": (StreamOptions if recurrent else Options).fill(values),
+            "memory": (MemoryOptions if recurrent else Options).fill(values),
             "frame": frame_options(method, values),
             "corruption": CorruptionConfig.fill(values),
         }

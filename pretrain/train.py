@@ -8,13 +8,12 @@ from typing import Any
 import torch
 
 from pretrain.build import build_objective, build_target
-from pretrain.config import PretrainConfig, StreamOptions
+from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.corruptions import check_corruption_fits
 from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError, refuse_outside
-from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import EncoderCard, save_encoder
 from vd4rl_pomdp.objective import Objective
 from vd4rl_pomdp.options import flat
@@ -58,7 +57,7 @@ def _pretrain(config: PretrainConfig) -> RunFolder:
             trainer = PretrainTrainer(objective.to(device), dataset.to(device), config)
             trainer.run(run, config.steps if method.trained else 0)
             card = _card(config, task, dataset, run)
-            save_encoder(run.path / "encoder", _with_history_window(objective.encoder, config), card)
+            save_encoder(run.path / "encoder", objective.encoder, card)
             run.finish(steps=trainer.step, frames=trainer.step * config.batch_size * config.window)
     return run
 
@@ -188,9 +187,3 @@ def _last_action_loss(run: RunFolder) -> float | None:
     rows = read_metrics(run.path / "metrics.jsonl")
     losses = [row["action_loss"] for row in rows if "action_loss" in row]
     return sum(last) / len(last) if (last := losses[-max(1, len(losses) // 10) :]) else None
-
-
-def _with_history_window(encoder: Encoder, config: PretrainConfig) -> Encoder:
-    if isinstance(config.memory, StreamOptions) and config.memory.history_window:
-        encoder.config = replace(encoder.config, history_window=config.memory.history_window)
-    return encoder

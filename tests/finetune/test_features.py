@@ -5,11 +5,13 @@ import pytest
 import torch
 
 from finetune.features import ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
+from finetune.histories import Histories
 from tests.helpers_data import fake_action, fake_reward, fake_rows, write_fake_set
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, load_encoder
+from vd4rl_pomdp.options import NO_OPTIONS
 
 LENGTHS, VIEWS, N, GAMMA = (6, 4), 3, 2, 0.5
 ROWS = [(e, t) for e, length in enumerate(LENGTHS) for t in range(length)]
@@ -21,7 +23,8 @@ pytestmark = pytest.mark.usefixtures("own_cache")
 def test_every_field_of_a_batch_is_of_one_transition_and_both_ends_of_one_view(tmp_path):
     dataset = open_dataset(write_fake_set(tmp_path / "set", LENGTHS))
     features = torch.stack(torch.meshgrid(torch.arange(VIEWS), torch.arange(len(ROWS)), indexing="ij"), -1)
-    sampler = FeatureSampler(dataset, features, 500, N, GAMMA, torch.Generator().manual_seed(0))
+    histories = Histories(dataset, NO_OPTIONS, N, 0)
+    sampler = FeatureSampler(histories, features, 500, N, GAMMA, torch.Generator().manual_seed(0))
     batch, drawn = sampler.sample(), set()
     ends = zip(batch.z.int().tolist(), batch.next_z.int().tolist(), strict=True)
     for i, ((view, row), (next_view, next_row)) in enumerate(ends):
@@ -56,7 +59,7 @@ def frozen(dataset: Dataset, corruption: CorruptionConfig, shift: int) -> Frozen
 
 def views_of(tmp_path, corruption: str, mode: str, shift: int) -> torch.Tensor:
     made = frozen(noise_set(tmp_path / "set"), CorruptionConfig.of(corruption, mode), shift)
-    return encode_views(made, 2, FeatureFile(tmp_path, {}))
+    return encode_views(made, Histories(made.dataset, NO_OPTIONS, N, 0), 2, FeatureFile(tmp_path, {}))
 
 
 @pytest.mark.parametrize(
@@ -81,8 +84,16 @@ def test_an_episodes_first_row_carries_no_action(tmp_path):
         for name, action in (("plain", 0.0), ("odd", 0.9))
     )
     for number in range(len(LENGTHS)):
-        one, other = (made.episode(number, made.view(0)) for made in (plain, odd))
+        one, other = (states(made, number) for made in (plain, odd))
         torch.testing.assert_close(one, other)
+
+
+def states(made: FrozenEncoder, number: int) -> torch.Tensor:
+    """Representations (features, D) of an episode's rows, written where they belong, zeros elsewhere."""
+    out = torch.zeros(made.dataset.num_rows, made.encoder.dim)
+    view = Histories(made.dataset, NO_OPTIONS, 1, 0).of_view(0)
+    view.fill(out, made.encoder, made.episode(number, made.view(0)), number)
+    return out
 
 
 def test_exact_batches_agree_with_cached_features(encoder, data):
@@ -90,8 +101,8 @@ def test_exact_batches_agree_with_cached_features(encoder, data):
     dataset = open_dataset(data)
     network, _ = load_encoder(encoder)
     frozen = FrozenEncoder(network, dataset, CorruptionConfig(), 0, "fp32", 0)
-    cached = torch.cat([frozen.episode(i, frozen.view(0)) for i in range(dataset.num_episodes)])
-    sampler = ExactSampler(frozen, 16, 3, 0.99, torch.Generator().manual_seed(0))
+    cached = sum(states(frozen, i) for i in range(dataset.num_episodes))
+    sampler = ExactSampler(frozen, NO_OPTIONS, 16, 3, 0.99, torch.Generator().manual_seed(0))
     index = torch.randint(dataset.num_transitions, (16,), generator=torch.Generator().manual_seed(0))
     batch = sampler.sample()
     rows = sampler._starts[index]

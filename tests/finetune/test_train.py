@@ -72,8 +72,10 @@ def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_th
     frozen = FrozenEncoder(encoder, dataset, CorruptionConfig.of("patch"), 4, "fp32", 0)
     z = frozen.episode(1, frozen.view(0)).numpy()
     rows = slice(int(dataset.episode_start[1]), int(dataset.episode_end[1]))
-    assert z.shape == (25, 17)
-    assert np.allclose(z, np.delete(dataset.physics[rows], 1, axis=1))
+    assert z.shape == (25, 18)
+    hinges, angle = np.delete(dataset.physics[rows], [1, 2], axis=1), dataset.physics[rows, 2:3]
+    expected = np.concatenate([hinges[:, :7], np.sin(angle), np.cos(angle), hinges[:, 7:]], axis=1)
+    np.testing.assert_allclose(z, expected, atol=1e-6)
     with pytest.raises(UserError, match="stores no simulator states"):
         run_pretrain(smoke_pretrain(data, tmp_path / "none", method="state"))
     with pytest.raises(UserError, match="drq_bc has no memory"):

@@ -1,4 +1,5 @@
 import json
+from dataclasses import replace
 
 import pytest
 import torch
@@ -42,6 +43,22 @@ def test_streaming_and_batch_encodings_agree(history: str, use_actions: bool, sp
         for t in range(9):
             z, state = encoder.step(batch.obs[:, t], batch.prev_action[:, t], state)
             torch.testing.assert_close(z, whole[:, t], atol=1e-5, rtol=1e-4)
+
+
+@pytest.mark.parametrize("span", [0, 3])
+def test_a_readout_is_the_frame_the_state_or_both_in_streams_and_batches(span: int):
+    batch, read = window(), {}
+    for readout in ("frame", "state", "frame+state"):
+        encoder = make("gru", True, span)
+        encoder.config = replace(encoder.config, readout=readout)
+        with torch.no_grad():
+            read[readout], state = encoder.encode(batch), encoder.initial_state(2)
+            assert read[readout].shape == (2, 9, encoder.dim)
+            for t in range(9):
+                z, state = encoder.step(batch.obs[:, t], batch.prev_action[:, t], state)
+                torch.testing.assert_close(z, read[readout][:, t], atol=1e-5, rtol=1e-4)
+            torch.testing.assert_close(encoder.frame(batch.obs), read["frame"])
+    assert torch.equal(read["frame+state"], torch.cat([read["frame"], read["state"]], dim=-1))
 
 
 def test_a_history_window_forgets_what_is_before_it_and_only_that():

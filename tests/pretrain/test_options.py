@@ -48,7 +48,7 @@ def test_the_states_frame_encoder_cannot_be_chosen():
     [
         {"method": "mik+a", "literal_future": True, "n": 2, "m": 3, "gru_layers": 2, "codes": 7},
         {"method": "acro", "history": "gru", "m": 3, "hidden_dim": 16},
-        {"method": "fj", "m": 3, "history_window": 2},
+        {"method": "fj", "m": 3},
         {"method": "homer", "homer_codes": 8},
         {"method": "driml", "max_k": 2},
         {"method": "curl", "window": 3},  # which is shorter than the default K of other methods

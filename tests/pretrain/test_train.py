@@ -62,7 +62,7 @@ def test_user_slips_are_one_line(data, tmp_path):
 
 BELOW = {
     **{"m": -1, "n": -1, "max_k": 0, "homer_codes": -1, "steps": -1, "window": 1, "feature_dim": 0, "hidden_dim": 0},
-    **{"gru_layers": 0, "head_dim": 0, "history_window": -1, "self_prediction": -1.0, "l2_states": float("nan")},
+    **{"gru_layers": 0, "head_dim": 0, "self_prediction": -1.0, "l2_states": float("nan")},
     **{"patch_size": 0, "patch_count": -1, "patch_fill": 256, "zeroed_frames": -1},
 }
 

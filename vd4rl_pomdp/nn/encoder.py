@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import torch
 from torch import Tensor, nn
@@ -19,6 +19,8 @@ from vd4rl_pomdp.types import Windows
 
 MAX_LAYERS = 64
 """Most layers of a GRU."""
+Readout = Literal["state", "frame", "frame+state"]
+"""What of an encoder with a memory its representation is: s_t, e(o_t), or both one after the other."""
 
 
 @dataclass(frozen=True)
@@ -36,6 +38,8 @@ class EncoderConfig:
     gru_layers: int = 1
     history_window: int = 0
     """Rows the state is computed from, 0 for all since the episode's start."""
+    readout: Readout = "state"
+    """What the representation is; other than s_t only after pretraining."""
     channels: int = 3 * FRAME_STACK
     """Channels of an observation."""
     size: int = FRAME_SIZE
@@ -80,7 +84,17 @@ class Encoder(nn.Module):
         self.gru = (
             nn.GRU(inputs, config.hidden_dim, config.gru_layers, batch_first=True) if config.history == "gru" else None
         )
-        self.dim = config.hidden_dim if self.gru is not None else config.feature_dim
+
+    @property
+    def dim(self) -> int:
+        """Width of the representation."""
+        widths = {"frame": self.config.feature_dim, "state": self.config.hidden_dim}
+        return sum(widths[part] for part in self.config.readout.split("+")) if self.gru else widths["frame"]
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the representation depends on rows before."""
+        return self.gru is not None and self.config.readout != "frame"
 
     @property
     def reads_state(self) -> bool:
@@ -93,13 +107,9 @@ class Encoder(nn.Module):
 
     def from_features(self, features: Tensor, prev_action: Tensor) -> Tensor:
         """Representations from (B, T, F) frame features and (B, T, A) previous actions."""
-        if self.gru is None:
+        if not self.remembers:
             return features
-        rows = self._gru_rows(features, prev_action)
-        span = self.config.history_window
-        if span == 0 or rows.shape[1] <= span:
-            return run_gru(self.gru, rows)[0]
-        return torch.cat([run_gru(self.gru, rows[:, :span])[0], self._over_last_rows(rows, span)], dim=1)
+        return self._read(features, self._states(self._gru_rows(features, prev_action)))
 
     def initial_state(self, batch: int) -> StreamState:
         """State before an episode's first row."""
@@ -122,15 +132,29 @@ class Encoder(nn.Module):
             (B, dim) representation, and the state for the next row.
         """
         features = self.frame(obs)
-        if self.gru is None:
+        if not self.remembers:
             return features, state
+        assert self.gru is not None
         row = self._gru_rows(features[:, None], prev_action[:, None])
         span = self.config.history_window
         if span == 0:
             out, hidden = run_gru(self.gru, row, state.hidden)
-            return out[:, 0], state._replace(hidden=hidden)
+            return self._read(features, out[:, 0]), state._replace(hidden=hidden)
         rows = torch.cat([state.rows, row], dim=1)[:, -span:]
-        return run_gru(self.gru, self._forget_first_action(rows))[0][:, -1], state._replace(rows=rows)
+        newest = run_gru(self.gru, self._forget_first_action(rows))[0][:, -1]
+        return self._read(features, newest), state._replace(rows=rows)
+
+    def _read(self, features: Tensor, states: Tensor) -> Tensor:
+        """The representation, given e(o_t) (..., F) and s_t (..., H)."""
+        return torch.cat([features, states], dim=-1) if self.config.readout == "frame+state" else states
+
+    def _states(self, rows: Tensor) -> Tensor:
+        """s_t (B, T, H) of the GRU's (B, T, I) inputs."""
+        assert self.gru is not None
+        span = self.config.history_window
+        if span == 0 or rows.shape[1] <= span:
+            return run_gru(self.gru, rows)[0]
+        return torch.cat([run_gru(self.gru, rows[:, :span])[0], self._over_last_rows(rows, span)], dim=1)
 
     def _gru_rows(self, features: Tensor, prev_action: Tensor) -> Tensor:
         return torch.cat([features, prev_action.to(features)], dim=-1) if self.config.use_actions else features

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any
@@ -54,12 +55,19 @@ def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard) -> None:
     write_json(folder / CONFIG, {"encoder": asdict(encoder.config), "pretrain": asdict(card)})
 
 
-def copy_encoder(source: Path, target: Path) -> None:
-    """Copy an encoder folder, its config.json last: without it a copy is no encoder folder."""
+def copy_encoder(source: Path, target: Path, changes: Mapping[str, Any]) -> None:
+    """Copy an encoder folder, its config.json last: without it a copy is no encoder folder.
+
+    Args:
+        source: an encoder folder.
+        target: folder to write.
+        changes: fields of the copy's `EncoderConfig` by name.
+    """
     with disk_errors(target):
         target.mkdir(parents=True, exist_ok=True)
-    for name in (WEIGHTS, CONFIG):
-        write_bytes(target / name, read_bytes(source / name))
+    write_bytes(target / WEIGHTS, read_bytes(source / WEIGHTS))
+    config = parse_json(read_bytes(source / CONFIG))
+    write_json(target / CONFIG, config | {"encoder": config["encoder"] | changes})
 
 
 def encoder_hash(folder: Path) -> str:

@@ -15,6 +15,7 @@ from vd4rl_pomdp.experiments.bench.data import BATCH
 from vd4rl_pomdp.experiments.bench.memory import make_trainer
 from vd4rl_pomdp.experiments.bench.timing import alternating, seconds_of
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.options import NO_OPTIONS
 from vd4rl_pomdp.runs.device import Precision, pick_device
 
 HISTORY_WINDOW = 32
@@ -79,6 +80,7 @@ def _updates_per_s(
     from finetune.algorithms import TD3BC
     from finetune.config import FinetuneConfig
     from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder
+    from finetune.histories import Histories
     from vd4rl_pomdp.nn.policy import Policy
 
     config = FinetuneConfig.of("cpu")
@@ -95,8 +97,8 @@ def _updates_per_s(
         for _ in range(updates):
             algorithm.update(sampler.sample())
 
-    cached = FeatureSampler(dataset, features, BATCH, 3, 0.99, generator)
-    exact = ExactSampler(frozen, BATCH, 3, 0.99, generator)
+    cached = FeatureSampler(Histories(dataset, NO_OPTIONS, 3, 0), features, BATCH, 3, 0.99, generator)
+    exact = ExactSampler(frozen, NO_OPTIONS, BATCH, 3, 0.99, generator)
     many, few = 20, algorithm.policy_delay
     fast, slow = alternating(max(1, repeats), lambda: train(cached, many), lambda: train(exact, few))
     fast, slow = fast / many, slow / few

@@ -1,0 +1,158 @@
+"""What the policy is given of an encoder with a memory: which of its outputs, and where the histories begin.
+
+A policy is trained on the states of the data's histories, and meets its own. Where all of the data's are whole
+episodes of one behaviour, a state also tells how the episode went so far, which a policy can lean on and which is
+different as soon as it acts (Swamy et al. 2022, arXiv 2208.02225). Histories of part of the transitions can therefore
+begin at random rows instead: both ends of such a transition are then read from the same beginning.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor
+
+from vd4rl_pomdp.data import Dataset
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.nn.encoder import Encoder, Readout
+from vd4rl_pomdp.options import Limits, Options
+from vd4rl_pomdp.seeding import stream_generator
+
+
+@dataclass(frozen=True)
+class HistoryOptions(Options):
+    """Options for encoders with a memory; those without refuse them."""
+
+    readout: Readout = "state"
+    """What the policy is given: state (s_t), frame (e(o_t) alone) or frame+state (both)."""
+    history_window: int = 0
+    """Rows that a state is computed from, in training and in evaluation; 0: as the encoder was pretrained."""
+    random_histories: float = 0.0
+    """Share of the transitions whose history begins at a random row, and not with the episode."""
+    shortest_history: int = 2
+    """Least rows of a history that begins at a random row."""
+    longest_history: int = 8
+    """Most rows of a history that begins at a random row."""
+
+    limits: ClassVar[Limits] = {
+        "history_window": 0,
+        "random_histories": (0, 1),
+        "shortest_history": 1,
+        "longest_history": 1,
+    }
+
+    def check(self) -> None:
+        """Raise UserError for values that cannot work."""
+        super().check()
+        if self.shortest_history > self.longest_history:
+            raise UserError(
+                f"--shortest-history is {self.shortest_history}, --longest-history {self.longest_history}: "
+                "choose a longest that is no shorter"
+            )
+
+    @property
+    def encoder_changes(self) -> dict[str, Any]:
+        """What they change about an encoder's config, also where it is evaluated."""
+        window = {"history_window": self.history_window} if self.history_window else {}
+        return {"readout": self.readout} | window
+
+
+class Histories:
+    """Transitions of a set, and which of them, in every view, have a history that begins at a random row.
+
+    The features of a view are numbered: first those of the set's N rows, each with its whole history; then the first
+    ends, then the last ends, of the R transitions with a random history.
+    """
+
+    def __init__(self, dataset: Dataset, options: Options, n_step: int, seed: int) -> None:
+        """See the class.
+
+        Args:
+            dataset: the set.
+            options: `HistoryOptions`; others mean whole histories.
+            n_step: rows from one end of a transition to the other; fewer at an episode's end.
+            seed: the run's seed.
+        """
+        self.dataset, self._seed = dataset, seed
+        self._options = options if isinstance(options, HistoryOptions) else HistoryOptions()
+        self.rows = dataset.transition_rows
+        """(M,) int64: first end of every transition."""
+        self.ends = torch.minimum(self.rows + n_step, (dataset.episode_end - 1)[dataset.episode[self.rows]])
+        """(M,) int64: last end of every transition."""
+        self.random = round(self._options.random_histories * len(self.rows))
+        """R."""
+        self.features = dataset.num_rows + 2 * self.random
+        """Features of a view."""
+
+    def of_view(self, view: int) -> RandomHistories:
+        """What is drawn for a view."""
+        generator = stream_generator(self._seed, "finetune", "histories", view)
+        chosen = torch.randperm(len(self.rows), generator=generator)[: self.random].sort().values
+        length = draw_lengths(self._options, self.random, generator)
+        return RandomHistories(self, chosen.to(self.rows.device), length.to(self.rows.device))
+
+
+def draw_lengths(options: HistoryOptions, count: int, generator: torch.Generator) -> Tensor:
+    """Rows, up to a transition's first end, of (count,) random histories."""
+    return torch.randint(options.shortest_history, options.longest_history + 1, (count,), generator=generator)
+
+
+@dataclass(frozen=True)
+class RandomHistories:
+    """The random histories of one view."""
+
+    histories: Histories
+    chosen: Tensor
+    """(R,) int64, in order: the transitions that have one."""
+    length: Tensor
+    """(R,) int64: its rows up to the transition's first end."""
+
+    def numbers(self) -> tuple[Tensor, Tensor]:
+        """Numbers of the features of both ends of every transition: (M,) and (M,) int64."""
+        first, last = self.histories.rows.clone(), self.histories.ends.clone()
+        fresh = self.histories.dataset.num_rows + torch.arange(len(self.chosen), device=first.device)
+        first[self.chosen], last[self.chosen] = fresh, fresh + len(self.chosen)
+        return first, last
+
+    def fill(self, out: Tensor, encoder: Encoder, frames: Tensor, episode: int) -> None:
+        """Write an episode's features into a view's.
+
+        Args:
+            out: (features, D), numbered as `Histories` says.
+            encoder: with a memory, if any history is random.
+            frames: (L, F) frame features of the episode's rows.
+            episode: its number.
+        """
+        dataset = self.histories.dataset
+        start, end = int(dataset.episode_start[episode]), int(dataset.episode_end[episode])
+        rows = torch.arange(start, end, device=frames.device)
+        out[start:end] = encoder.from_features(frames[None], dataset.actions_before(rows)[None])[0]
+        row = self.histories.rows[self.chosen]
+        mine = torch.nonzero((row >= start) & (row < end))[:, 0]
+        if len(mine):
+            row, last = row[mine], self.histories.ends[self.chosen[mine]]
+            first = (row - self.length[mine] + 1).clamp(min=start)
+            z, next_z = read_both_ends(encoder, lambda rows: frames[rows - start], dataset, first, row, last)
+            number = (dataset.num_rows + mine).to(out.device)
+            out[number], out[number + len(self.chosen)] = z.to(out), next_z.to(out)
+
+
+def read_both_ends(
+    encoder: Encoder, frames: Callable[[Tensor], Tensor], dataset: Dataset, first: Tensor, row: Tensor, last: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Representations (B, D) and (B, D) of rows `row` and `last`, with histories that begin at rows `first`.
+
+    Args:
+        encoder: with a memory.
+        frames: frame features (B, T, F) of (B, T) int64 rows.
+        dataset: the set.
+        first, row, last: (B,) int64, of one episode each, first <= row <= last.
+    """
+    span = torch.arange(int((last - first).max()) + 1, device=row.device)
+    history = torch.minimum(first[:, None] + span, last[:, None])
+    states = encoder.from_features(frames(history), dataset.actions_before(history))
+    pick = torch.arange(len(row), device=row.device)
+    return states[pick, row - first], states[pick, last - first]

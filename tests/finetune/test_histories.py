@@ -1,0 +1,124 @@
+"""Where histories begin: against encoding one transition after the other, from exactly the rows it may see."""
+
+import json
+
+import pytest
+import torch
+
+from finetune.config import FinetuneConfig
+from finetune.features import ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
+from finetune.histories import Histories, HistoryOptions
+from finetune.train import finetune
+from pretrain.train import pretrain
+from tests.finetune.test_features import LENGTHS, ROWS, noise_set
+from tests.helpers_stages import smoke_finetune, smoke_pretrain
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.nn import Encoder, EncoderConfig, load_encoder
+
+N = 2
+pytestmark = pytest.mark.usefixtures("own_cache")
+
+
+@pytest.fixture
+def frozen(tmp_path) -> FrozenEncoder:
+    torch.manual_seed(0)
+    encoder = Encoder(EncoderConfig(6, "nature", 16, "gru", use_actions=True, hidden_dim=8)).eval()
+    return FrozenEncoder(
+        encoder.requires_grad_(False), noise_set(tmp_path / "set", 0.9), CorruptionConfig(), 0, "fp32", 0
+    )
+
+
+def ends_of(frozen: FrozenEncoder, first: int, row: int, last: int) -> tuple[torch.Tensor, torch.Tensor]:
+    """Both ends of a transition, from a stream that begins at row `first` and knows no earlier action."""
+    state, action, read = frozen.encoder.initial_state(1), torch.zeros(1, 6), []
+    for now in range(first, last + 1):
+        z, state = frozen.encoder.step(frozen.dataset.stacks(torch.tensor([now])), action, state)
+        read.append(z[0])
+        action = frozen.dataset.action[now + 1 : now + 2]
+    return read[row - first], read[last - first]
+
+
+@pytest.mark.parametrize(("share", "shortest", "longest"), [(0.0, 2, 8), (0.5, 1, 3), (1.0, 2, 2), (1.0, 9, 9)])
+def test_both_ends_of_every_transition_share_a_history_of_the_drawn_rows(frozen, tmp_path, share, shortest, longest):
+    options = HistoryOptions(random_histories=share, shortest_history=shortest, longest_history=longest)
+    histories = Histories(frozen.dataset, options, N, 0)
+    features = encode_views(frozen, histories, 2, FeatureFile(tmp_path, {})).float()
+    rows = histories.rows.tolist()
+    assert histories.random == round(share * len(rows))
+    for view in range(2):
+        drawn = histories.of_view(view)
+        length = dict(zip(drawn.chosen.tolist(), drawn.length.tolist(), strict=True))
+        assert len(length) == histories.random
+        assert set(length.values()) <= set(range(shortest, longest + 1))
+        for i, (first_end, last_end) in enumerate(zip(*drawn.numbers(), strict=True)):
+            episode, t = ROWS[rows[i]]
+            begin = rows[i] - min(t, length.get(i, len(ROWS)) - 1)
+            expected = ends_of(frozen, begin, rows[i], rows[i] + min(N, LENGTHS[episode] - 1 - t))
+            torch.testing.assert_close(features[view, first_end], expected[0], atol=2e-3, rtol=0)
+            torch.testing.assert_close(features[view, last_end], expected[1], atol=2e-3, rtol=0)
+
+
+def test_views_draw_their_random_histories_apart_and_the_same_again(frozen):
+    histories = Histories(frozen.dataset, HistoryOptions(random_histories=0.5), N, 0)
+    assert torch.equal(histories.of_view(0).chosen, histories.of_view(0).chosen)
+    draws = [torch.cat([(view := histories.of_view(n)).chosen, view.length]).tolist() for n in range(4)]
+    assert len({tuple(draw) for draw in draws}) > 1
+
+
+def test_batches_are_of_the_drawn_histories(frozen, tmp_path):
+    histories = Histories(frozen.dataset, HistoryOptions(random_histories=1.0, longest_history=2), N, 0)
+    features = encode_views(frozen, histories, 1, FeatureFile(tmp_path, {}))
+    sampler = FeatureSampler(histories, features, 64, N, 0.99, torch.Generator().manual_seed(0))
+    batch, known = sampler.sample(), features[0].float()
+    first, last = histories.of_view(0).numbers()
+    index = torch.randint(len(first), (64,), generator=torch.Generator().manual_seed(0))
+    assert torch.equal(batch.z, known[first[index]])
+    assert torch.equal(batch.next_z, known[last[index]])
+    assert first.min() >= len(ROWS), "none is a whole history"
+
+
+def test_exact_batches_begin_at_random_rows_too(frozen):
+    options = HistoryOptions(random_histories=1.0, shortest_history=1, longest_history=1)
+    batch = ExactSampler(frozen, options, 16, N, 0.99, torch.Generator().manual_seed(0)).sample()
+    index = torch.randint(len(ROWS) - 2, (16,), generator=torch.Generator().manual_seed(0))
+    rows = frozen.dataset.transition_rows[index].tolist()
+    for z, next_z, row in zip(batch.z, batch.next_z, rows, strict=True):
+        episode, t = ROWS[row]
+        expected = ends_of(frozen, row, row, row + min(N, LENGTHS[episode] - 1 - t))
+        torch.testing.assert_close(z, expected[0], atol=1e-5, rtol=1e-4)
+        torch.testing.assert_close(next_z, expected[1], atol=1e-5, rtol=1e-4)
+
+
+def test_a_run_keeps_what_its_policy_reads_and_evaluates_with_it(encoder, data, tmp_path):
+    told = {"readout": "frame+state", "history_window": 4, "random_histories": 0.5, "longest_history": 3}
+    config = smoke_finetune(encoder, data, tmp_path / "run", **told)
+    run = finetune(config)
+    kept, _ = load_encoder(run.path / "encoder")
+    assert (kept.config.readout, kept.config.history_window) == ("frame+state", 4)
+    assert json.loads((run.path / "policy" / "config.json").read_text())["dim"] == kept.dim == 64
+    record = json.loads((run.path / "config.json").read_text())["config"]
+    assert {name: record[name] for name in told} == told
+    assert finetune(config).finished
+
+
+def test_an_encoder_without_a_memory_refuses_the_options_of_one(data, tmp_path):
+    memoryless = pretrain(smoke_pretrain(data, tmp_path / "random", method="random")).path / "encoder"
+    with pytest.raises(UserError, match="--random-histories is not read: random has no memory; leave it out"):
+        finetune(smoke_finetune(memoryless, data, tmp_path / "run", random_histories=0.5))
+    assert not (tmp_path / "run").exists()
+    record = json.loads((finetune(smoke_finetune(memoryless, data, tmp_path / "run")).path / "config.json").read_text())
+    assert "readout" not in record["config"], "nothing that is not read"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"random_histories": 1.5}, "--random-histories is 1.5; it must be at least 0 and at most 1"),
+        ({"shortest_history": 5, "longest_history": 4}, "--shortest-history is 5, --longest-history 4: choose"),
+        ({"history_window": -1}, "--history-window is -1; it must be at least 0"),
+    ],
+)
+def test_options_that_cannot_work_are_refused(settings, message):
+    with pytest.raises(UserError, match=message):
+        FinetuneConfig.of("smoke", **settings).check()
