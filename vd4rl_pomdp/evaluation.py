@@ -15,7 +15,7 @@ import numpy as np
 import torch
 
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
+from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Draws, Observation
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.errors import UserError, refuse_number
@@ -225,10 +225,17 @@ def _run_episode(job: EpisodeJob) -> Episode:
         _AGENTS.clear()
         _AGENTS[key] = Agent(load_encoder(job.encoder)[0], load_policy(job.policy))
     agent = _AGENTS[key]
-    place = (job.task, job.corruption, job.render, job.length, agent.picture_size)
+    place = (job.task, job.corruption, job.render, job.length, agent.picture_size, _draws(agent, job))
     if place not in _ENVIRONMENTS:
         _ENVIRONMENTS[place] = CorruptedEnv(*place)
     return _play(agent, _ENVIRONMENTS[place], job)
+
+
+def _draws(agent: Agent, job: EpisodeJob) -> Draws:
+    """A film shows all frames; else no frame is drawn that its agent does not see."""
+    if job.film:
+        return "all"
+    return "nothing" if agent.encoder.reads_state else "seen"
 
 
 def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import os
 from collections import deque
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 import torch
@@ -25,11 +26,15 @@ class Observation:
     """What one step shows."""
 
     obs: Tensor
-    """(C, S, S) uint8: the corrupted stack, all the agent may see."""
+    """(C, S, S) uint8: the corrupted stack, all the agent may see; (0,) where nothing is drawn."""
     clean: Tensor
-    """(C, S, S) uint8: the stack before corruption."""
+    """(C, S, S) uint8: the stack before corruption, zeros in place of frames that are not drawn; (0,) without any."""
     time_step: TimeStep
     """Reward, step type and simulator state."""
+
+
+Draws = Literal["all", "seen", "nothing"]
+"""Which frames are drawn: all, those that an agent will see in any stack, or none."""
 
 
 class CorruptedEnv:
@@ -42,29 +47,47 @@ class CorruptedEnv:
         render: Render = "fast",
         length: int | None = None,
         size: int = FRAME_SIZE,
+        draws: Draws = "all",
     ) -> None:
-        self.env = make_env(task, render, size, length)
+        self.env = make_env(task, render, None if draws == "nothing" else size, length)
         self._corruption = make_corruption(corruption)
         self._frames: deque[np.ndarray] = deque(maxlen=FRAME_STACK)
         self._seed, self._episode, self._t = 0, 0, 0
+        self._draws, self._undrawn = draws, np.zeros((3, size, size), np.uint8)
 
     def reset(self, environment_seed: int, corruption_seed: int = 0, episode: int = 0) -> Observation:
         """Begin an episode; its corruption is drawn from (corruption_seed, episode)."""
         self._seed, self._episode, self._t = corruption_seed, episode, 0
+        self._choose_whether_to_draw()
         first = self.env.reset(environment_seed)
-        assert first.frame is not None
-        self._frames.extend([first.frame] * FRAME_STACK)
+        self._frames.extend([self._frame(first)] * FRAME_STACK)
         return self._observation(first)
 
     def step(self, action: np.ndarray) -> Observation:
         """Apply an (A,) float32 action."""
-        time_step = self.env.step(action)
-        assert time_step.frame is not None
-        self._frames.append(time_step.frame)
         self._t += 1
+        self._choose_whether_to_draw()
+        time_step = self.env.step(action)
+        self._frames.append(self._frame(time_step))
         return self._observation(time_step)
 
+    def _frame(self, time_step: TimeStep) -> np.ndarray:
+        return self._undrawn if time_step.frame is None else time_step.frame
+
+    def _choose_whether_to_draw(self) -> None:
+        """Turn drawing on for frames that will be seen: what is zeroed in a stack is known before it is drawn."""
+        if self._draws == "seen":
+            kept = self._corruption.kept(self._keys(torch.arange(self._t, self._t + FRAME_STACK)), FRAME_STACK)
+            newest = torch.arange(FRAME_STACK - 1, -1, -1)[:, None]  # the frame's place in the stacks from row t on
+            places = kept <= newest if self._t == 0 else kept == newest  # the first fills all places before its own
+            self.env.drawing = bool(places.any())
+
+    def _keys(self, t: Tensor) -> Tensor:
+        """What (T,) rows are corrupted by: (T,) int64."""
+        return derive_keys(self._seed, row_key(torch.full_like(t, self._episode), t))
+
     def _observation(self, time_step: TimeStep) -> Observation:
+        if self._draws == "nothing":
+            return Observation(torch.empty(0), torch.empty(0), time_step)
         clean = torch.from_numpy(np.concatenate(self._frames))
-        key = derive_keys(self._seed, row_key(torch.tensor([self._episode]), torch.tensor([self._t])))
-        return Observation(self._corruption(clean[None], key)[0], clean, time_step)
+        return Observation(self._corruption(clean[None], self._keys(torch.tensor([self._t])))[0], clean, time_step)

@@ -63,7 +63,7 @@ class DMCEnv(PixelEnv):
 
     def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
         return TimeStep(
-            frame=None if self.size is None else rendering.frame(self.physics, self.size, self._camera),
+            frame=rendering.frame(self.physics, self.size, self._camera) if self.size and self.drawing else None,
             state=flat_state(self.simulator.task.get_observation(self.physics)),
             physics=self.physics.get_state(),
             reward=reward,

@@ -79,7 +79,7 @@ class GymnasiumEnv(PixelEnv):
         return within.astype(self._space.dtype)
 
     def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
-        frame = None if self.size is None else self._frame(self.size)
+        frame = self._frame(self.size) if self.size and self.drawing else None
         return TimeStep(frame, NOTHING.astype(np.float32), NOTHING, reward, discount, step_type)
 
     def _frame(self, size: int) -> np.ndarray:

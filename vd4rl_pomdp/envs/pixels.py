@@ -21,7 +21,7 @@ class TimeStep:
     """What an environment returns at one step: a row of a set without its action (see the axis in `types`)."""
 
     frame: np.ndarray | None
-    """(3, S, S) uint8; None when rendering is off."""
+    """(3, S, S) uint8; None when drawing is off."""
     state: np.ndarray
     """(D,) float32: dm_control's observations, flattened in their own order; (0,) for a task without states."""
     physics: np.ndarray
@@ -55,6 +55,8 @@ class PixelEnv(ABC):
             length: decisions after which an episode is cut off; None: the task's own.
         """
         self.task, self.size = task, size
+        self.drawing = size is not None
+        """Whether the next time steps have a frame; it can be turned off and on where there is a size."""
         self._length = task.decisions if length is None else length
         if self._length < 1:
             raise UserError(f"an episode of {length} decisions is too short; it needs at least 1")

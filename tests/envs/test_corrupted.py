@@ -1,0 +1,39 @@
+"""Frames that no agent sees need not be drawn; what it sees is the same to the bit."""
+
+import numpy as np
+import pytest
+import torch
+
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Draws
+from vd4rl_pomdp.tasks import TASKS
+
+ROWS = 40
+
+
+def episode(name: str, draws: Draws, task: str = "walker_walk") -> tuple[list[torch.Tensor], list[float], int]:
+    """What an agent sees, its rewards, and how many frames were drawn."""
+    env, rng = CorruptedEnv(TASKS[task], CorruptionConfig.of(name), length=ROWS, draws=draws), np.random.default_rng(0)
+    shown, drawn = [env.reset(5, 6, 7)], 0
+    while not shown[-1].time_step.last:
+        drawn += shown[-1].time_step.frame is not None
+        shown.append(env.step(rng.uniform(-1, 1, 6).astype(np.float32)))
+    drawn += shown[-1].time_step.frame is not None
+    return [now.obs for now in shown], [now.time_step.reward for now in shown], drawn
+
+
+@pytest.mark.parametrize("name", ["none", "patch", "zero_frames", "patch+zero_frames"])
+def test_what_is_seen_does_not_depend_on_what_else_is_drawn(name):
+    everything, rewards, drawn = episode(name, "all")
+    seen, same_rewards, fewer = episode(name, "seen")
+    assert torch.equal(torch.stack(seen), torch.stack(everything))
+    assert rewards == same_rewards
+    assert drawn == ROWS + 1
+    assert fewer < 0.85 * drawn if "zero_frames" in name else fewer == drawn, "a third of the stacks show a frame"
+
+
+def test_nothing_is_drawn_where_nothing_is_looked_at():
+    shown, rewards, drawn = episode("patch", "nothing")
+    assert drawn == 0
+    assert {obs.numel() for obs in shown} == {0}
+    assert rewards == episode("patch", "all")[1]
