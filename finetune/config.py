@@ -46,6 +46,8 @@ class FinetuneConfig(StageConfig):
     """Random shift in pixels, one for each episode and view."""
     precision: Precision = "fp32"
     """Precision of the frozen encoder: fp32, or bf16 autocast."""
+    update_precision: Precision = "fp32"
+    """Precision of the algorithm's matrix products, but for last layers: fp32, or bf16 autocast."""
     eval_every: int = 50_000
     """Updates between two evaluations; the last one is always evaluated."""
     eval_episodes: int = 10

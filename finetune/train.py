@@ -163,6 +163,7 @@ def _trainer(
         policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(4)]))
     noise = stream_generator(config.seed, STAGE, "noise")
     algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
+    algorithm.precision = config.update_precision
     return FinetuneTrainer(
         EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, config, card
     )

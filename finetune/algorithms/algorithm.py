@@ -14,6 +14,7 @@ from torch.optim import Optimizer
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.options import Limits, Options
+from vd4rl_pomdp.runs.device import Precision, autocast
 
 
 @dataclass(frozen=True)
@@ -47,6 +48,8 @@ class Algorithm(ABC):
     """Class of its options."""
     summary: str = ""
     """One line that says what it is."""
+    precision: Precision = "fp32"
+    """Of the matrix products that losses are computed by; gradients are taken outside."""
 
     @abstractmethod
     def __init__(
@@ -80,11 +83,20 @@ class Algorithm(ABC):
             Detached scalars of all losses.
         """
         logs: dict[str, Tensor] = {}
-        for loss in self.losses(batch):
+        for loss in self._computed(self.losses(batch), batch.z.device):
             _step(loss.value, [loss.optimiser] if encoder is None else [loss.optimiser, encoder])
             logs |= loss.logs
             encoder = None
         return logs
+
+    def _computed(self, losses: Iterator[Loss], device: torch.device) -> Iterator[Loss]:
+        """The same losses, each computed in the algorithm's precision."""
+        while True:
+            with autocast(device, self.precision):
+                loss = next(losses, None)
+            if loss is None:
+                return
+            yield loss
 
     @abstractmethod
     def parts(self) -> dict[str, Any]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.nn.heads import mlp
+from vd4rl_pomdp.nn.heads import ExactLinear, mlp
 
 
 class TwinCritic(nn.Module):
@@ -13,8 +13,8 @@ class TwinCritic(nn.Module):
 
     def __init__(self, dim: int, action_dim: int, hidden: int) -> None:
         super().__init__()
-        self.first = mlp(dim + action_dim, hidden, 1)
-        self.second = mlp(dim + action_dim, hidden, 1)
+        self.first = mlp(dim + action_dim, hidden, 1, last=ExactLinear)
+        self.second = mlp(dim + action_dim, hidden, 1, last=ExactLinear)
 
     def forward(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
         """Both values."""

@@ -32,7 +32,7 @@ from torch import Tensor, nn
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
 from finetune.algorithms.critic import TwinCritic
 from finetune.features import FeatureBatch
-from vd4rl_pomdp.nn.heads import mlp, move_target
+from vd4rl_pomdp.nn.heads import ExactLinear, mlp, move_target
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.options import Limits, Options
 
@@ -80,7 +80,7 @@ class IQL(Algorithm):
         device = policy.standardise.mean.device
         self.critic = TwinCritic(dim, action_dim, hidden).to(device)
         self.target_critic = copy.deepcopy(self.critic)
-        self.value = mlp(dim, hidden, 1).to(device)
+        self.value = mlp(dim, hidden, 1, last=ExactLinear).to(device)
         self.gaussian = Gaussian(action_dim).to(device)
         actor = [*policy.net.parameters(), *self.gaussian.parameters()]
         self.policy_optimiser = torch.optim.Adam(actor, lr=learning_rate, fused=True)

@@ -9,6 +9,7 @@ import torch.nn.functional as F
 
 from finetune.algorithms import ALGORITHMS, Loss, drqv2_bc, td3_bc
 from finetune.algorithms.bc import BC
+from finetune.algorithms.critic import TwinCritic
 from finetune.algorithms.drqv2_bc import DrQv2BC
 from finetune.algorithms.iql import IQL, IQLOptions, expectile_loss
 from finetune.algorithms.td3_bc import TD3BC
@@ -346,3 +347,27 @@ def test_what_reads_rewards_finds_the_better_action_and_bc_the_common_one():
     assert chosen["td3_bc"] > 0.2
     assert chosen["drqv2_bc"] > 0.2
     assert chosen["iql"] > 0.1
+
+
+@pytest.mark.parametrize("name", ["td3_bc", "drqv2_bc", "iql", "bc"])
+def test_bf16_halves_the_digits_of_matrix_products_and_nothing_else(name):
+    full, half = make(ALGORITHMS[name]), make(ALGORITHMS[name])
+    half.precision = "bf16"
+    for seed in range(4):
+        exact, rough = full.update(batch(seed)), half.update(batch(seed))
+        assert {value.dtype for value in rough.values()} == {torch.float32}
+        for key, value in exact.items():
+            torch.testing.assert_close(rough[key], value, atol=0.03, rtol=0.05)
+    assert any(not torch.equal(rough[key], exact[key]) for key in exact), "the products were rounded"
+    assert {p.dtype for p in half.policy.parameters()} == {torch.float32}
+
+
+def test_outputs_are_differences_of_full_precision_also_in_bf16():
+    """Values of 256 and more, a bf16 number's digits, would else be even."""
+    critic = TwinCritic(DIM, ACTIONS, 16)
+    with torch.no_grad():
+        critic.first[-1].bias.fill_(257.0)
+        critic.first[-1].weight.zero_()
+        with torch.autocast("cpu", torch.bfloat16):
+            value, _ = critic(batch().z, batch().action)
+    assert value.unique().tolist() == [257.0]

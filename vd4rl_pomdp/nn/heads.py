@@ -41,13 +41,22 @@ class PairHead(nn.Module):
         return self.rest(hidden)
 
 
-def mlp(inputs: int, hidden: int, outputs: int, layers: int = 2) -> nn.Sequential:
-    """Rectified MLP with `layers` hidden layers."""
+class ExactLinear(nn.Linear):
+    """A linear layer in its own precision, also inside autocast: for outputs that differences are taken of."""
+
+    def forward(self, x: Tensor) -> Tensor:
+        """(..., inputs) -> (..., outputs)."""
+        with torch.autocast(x.device.type, enabled=False):
+            return super().forward(x.to(self.weight))
+
+
+def mlp(inputs: int, hidden: int, outputs: int, layers: int = 2, last: type[nn.Linear] = nn.Linear) -> nn.Sequential:
+    """Rectified MLP with `layers` hidden layers and a last layer of the given kind."""
     widths = [inputs] + [hidden] * layers
     modules: list[nn.Module] = []
     for a, b in pairwise(widths):
         modules += [nn.Linear(a, b), nn.ReLU()]
-    return nn.Sequential(*modules, nn.Linear(hidden, outputs))
+    return nn.Sequential(*modules, last(hidden, outputs))
 
 
 def all_pairs(rows: int, max_k: int) -> Tensor:

@@ -10,7 +10,7 @@ from safetensors.torch import save
 from torch import Tensor, nn
 
 from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.nn.heads import mlp
+from vd4rl_pomdp.nn.heads import ExactLinear, mlp
 from vd4rl_pomdp.runs.files import read_json, write_bytes, write_json
 from vd4rl_pomdp.runs.reading import read_tensors
 
@@ -51,7 +51,7 @@ class Policy(nn.Module):
         super().__init__()
         self.shape = {"dim": dim, "action_dim": action_dim, "hidden": hidden}
         self.standardise = Standardise(dim)
-        self.net = mlp(dim, hidden, action_dim)
+        self.net = mlp(dim, hidden, action_dim, last=ExactLinear)
 
     def forward(self, z: Tensor) -> Tensor:
         """Mean action."""
