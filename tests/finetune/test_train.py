@@ -43,7 +43,12 @@ def test_finetuning_resumes_to_the_bit(encoder, data, tmp_path, monkeypatch, alg
     changes |= {"checkpoint_every": 10, "batch_size": 4}
     whole = finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
     rows = list(csv.DictReader((whole / "episodes.csv").open()))
-    assert [row["step"] for row in rows] == ["15", "30"]
+    assert [(row["step"], row["evaluated_under"]) for row in rows] == [
+        ("15", "patch+zero_frames"),
+        ("30", "patch+zero_frames"),
+        ("30", "none"),
+    ]
+    assert {row["corruption"] for row in rows} == {"patch+zero_frames"}
     assert {row["method"] for row in rows} == {"mik+a"}
     assert not (whole / "features.npy").exists()
 
