@@ -52,6 +52,8 @@ class FinetuneConfig(StageConfig):
     """Updates between two evaluations; the last one is always evaluated."""
     eval_episodes: int = 10
     """Episodes of an evaluation."""
+    eval_clean: bool = True
+    """Play the last evaluation under no corruption, too, which takes as long again; it changes nothing else."""
     eval_length: int = 500
     """Most decisions in an evaluation episode, which never has more than the task's; fewer only for trials."""
     workers: int = 0

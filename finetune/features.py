@@ -12,7 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from finetune.histories import Histories, HistoryOptions, draw_lengths, read_both_ends
+from finetune.histories import Histories, HistoryOptions, draw_lengths, read_both_ends, read_whole
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.data import Dataset, View
 from vd4rl_pomdp.data.samplers import Sampler
@@ -79,7 +79,12 @@ class FrozenEncoder:
                 parts.append(self.encoder.frame(obs).float())
         return torch.cat(parts)
 
+    @torch.no_grad()
     def episode(self, number: int, view: View) -> Tensor:
+        """Representations (rows, D) of a whole episode, streamed from its first row."""
+        return read_whole(self.encoder, self.frames(number, view), self.dataset, number)
+
+    def frames(self, number: int, view: View) -> Tensor:
         """Frame features (rows, F) of a whole episode; one shift for all of it."""
         start, end = int(self.dataset.episode_start[number]), int(self.dataset.episode_end[number])
         rows = torch.arange(start, end, device=self.device)
@@ -143,7 +148,7 @@ def _encode_all(frozen: FrozenEncoder, histories: Histories, views: int) -> np.n
         for number in range(views):
             view, random = frozen.view(number), histories.of_view(number)
             for episode in range(episodes):
-                frames = frozen.episode(episode, view)
+                frames = frozen.frames(episode, view)
                 random.fill(torch.from_numpy(out[number]), frozen.encoder, frames, episode)
                 progress.advance()
     return out

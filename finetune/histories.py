@@ -128,8 +128,7 @@ class RandomHistories:
         """
         dataset = self.histories.dataset
         start, end = int(dataset.episode_start[episode]), int(dataset.episode_end[episode])
-        rows = torch.arange(start, end, device=frames.device)
-        out[start:end] = encoder.from_features(frames[None], dataset.actions_before(rows)[None])[0]
+        out[start:end] = read_whole(encoder, frames, dataset, episode)
         row = self.histories.rows[self.chosen]
         mine = torch.nonzero((row >= start) & (row < end))[:, 0]
         if len(mine):
@@ -138,6 +137,12 @@ class RandomHistories:
             z, next_z = read_both_ends(encoder, lambda rows: frames[rows - start], dataset, first, row, last)
             number = (dataset.num_rows + mine).to(out.device)
             out[number], out[number + len(self.chosen)] = z.to(out), next_z.to(out)
+
+
+def read_whole(encoder: Encoder, frames: Tensor, dataset: Dataset, episode: int) -> Tensor:
+    """Representations (L, D) of an episode's rows, whose (L, F) frame features are given, from its first row on."""
+    rows = torch.arange(int(dataset.episode_start[episode]), int(dataset.episode_end[episode]), device=frames.device)
+    return encoder.from_features(frames[None], dataset.actions_before(rows)[None])[0]
 
 
 def read_both_ends(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +16,7 @@ from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd
 from finetune.features import STAGE, ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories, HistoryOptions
+from finetune.path import DataPath
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.data.parity import render_info
@@ -27,13 +29,16 @@ from vd4rl_pomdp.evaluation import (
     episode_rows,
     episodes_until,
     evaluate,
+    own_and_none,
     read_episodes,
 )
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, EncoderCard, copy_encoder, encoder_hash, load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.options import NO_OPTIONS, flat
+from vd4rl_pomdp.policies.actor import read_actor
 from vd4rl_pomdp.probes import probe_state
+from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import read_json, replacing_file, write_json
@@ -148,6 +153,7 @@ def _trainer(
     generator = stream_generator(config.seed, STAGE, "batches")
     corruption, returns = CorruptionConfig.fill(card.corruption), _returns(config)
     frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed)
+    encode = partial(frozen.episode, view=frozen.view(0))
     sampler: FeatureSampler | ExactSampler | TransitionSampler
     if card.end_to_end:
         view = View(dataset, corruption, config.shift, config.seed, STAGE)
@@ -157,6 +163,7 @@ def _trainer(
         features = encode_views(frozen, histories, config.views, FeatureFile(run.path, run.inputs))
         policy.standardise.fit(features)
         _probe(features, dataset, run)
+        encode = partial(_cached, features, dataset)
         sampler = FeatureSampler(histories, features, config.batch_size, returns.n_step, returns.gamma, generator)
     else:
         sampler = ExactSampler(frozen, config.memory, config.batch_size, returns.n_step, returns.gamma, generator)
@@ -164,9 +171,17 @@ def _trainer(
     noise = stream_generator(config.seed, STAGE, "noise")
     algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
     algorithm.precision = config.update_precision
+    reference = Reference.of(dataset)
+    actor = reference.actor_file
+    path = DataPath(dataset, read_actor(actor), encode) if actor and dataset.physics is not None else None
     return FinetuneTrainer(
-        EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, config, card
+        EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, config, card, reference, path
     )
+
+
+def _cached(features: torch.Tensor, dataset: Dataset, number: int) -> torch.Tensor:
+    """Representations (rows, D) of an episode in the first view."""
+    return features[0, int(dataset.episode_start[number]) : int(dataset.episode_end[number])].float()
 
 
 def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
@@ -186,15 +201,19 @@ class FinetuneTrainer:
         sampler: FeatureSampler | ExactSampler | TransitionSampler,
         config: FinetuneConfig,
         card: EncoderCard,
+        reference: Reference,
+        path: DataPath | None,
     ) -> None:
         self.algorithm, self.sampler = algorithm, sampler
         self.config, self.card = config, card
+        self.reference, self.path = reference, path
         self.step = 0
 
     def run(self, run: RunFolder) -> None:
         """Train to the end, from the newest checkpoint if there is one."""
         config = self.config
         title = f"finetune {config.algorithm} on {self.card.method}"
+        self.reference.write(run.path)
         with training(run, self, title, config.updates, "updates") as loop:
             if self._lacks_evaluation(run, loop):
                 self._evaluate(run, loop)
@@ -207,6 +226,8 @@ class FinetuneTrainer:
                 loop.step_done(save=evaluates or self.step % config.checkpoint_every == 0)
                 if evaluates:
                     self._evaluate(run, loop)
+        if self.path:
+            self.reference.with_path_error(self.path.action_error(self.algorithm.policy)).write(run.path)
         FeatureFile(run.path, run.inputs).remove()
         write_json(run.path / "render.json", render_info(self.card.task))
         run.finish(updates=self.step)
@@ -226,10 +247,17 @@ class FinetuneTrainer:
         drop_episodes_after(rows, self.step)
         if not self.step or not loop.due(self.config.eval_every):
             return False
-        if sum(row["step"] == self.step for row in read_episodes(rows)) == self.config.eval_episodes:
+        expected = len(self._evaluated_under()) * self.config.eval_episodes
+        if sum(row["step"] == self.step for row in read_episodes(rows)) == expected:
             return False
         drop_episodes_after(rows, self.step - 1)
         return True
+
+    def _evaluated_under(self) -> list[CorruptionConfig]:
+        """The corruptions of the evaluation at the present step; the run's own comes first."""
+        own = CorruptionConfig.fill(self.card.corruption)
+        clean = self.config.eval_clean and self.step == self.config.updates
+        return own_and_none(own) if clean else [own]
 
     def _evaluate(self, run: RunFolder, loop: Loop) -> None:
         """Evaluate the present policy, whose checkpoint is kept: here a signal need not wait."""
@@ -237,12 +265,12 @@ class FinetuneTrainer:
             loop.show(score=self._play(run))
 
     def _play(self, run: RunFolder) -> float:
-        """Keep a film of the first episode, then append the rows of all; returns the mean score."""
+        """Keep a film of the first episode, then append the rows of all; returns the mean score as trained."""
         config = self.config
         self.algorithm.policy.save(run.path / "policy")
         if isinstance(self.algorithm, EndToEnd):
             save_encoder(run.path / "encoder", self.algorithm.encoder, self.card)
-        corruption, task = CorruptionConfig.fill(self.card.corruption), TASKS.named(self.card.task)
+        task, under, actor = TASKS.named(self.card.task), self._evaluated_under(), self.reference.actor_file
         jobs = [
             EpisodeJob(
                 encoder=run.path / "encoder",
@@ -251,9 +279,11 @@ class FinetuneTrainer:
                 task=task,
                 corruption=corruption,
                 episode=episode,
-                film=episode == 0,
+                film=episode == 0 and corruption is under[0],
                 length=min(config.eval_length, task.decisions),
+                actor=actor,
             )
+            for corruption in under
             for episode in range(config.eval_episodes)
         ]
         episodes = evaluate(jobs, config.workers)
@@ -262,7 +292,7 @@ class FinetuneTrainer:
             with replacing_file(run.path / "film.npz") as fresh, fresh.open("wb") as file:
                 np.savez_compressed(file, **episodes[0].film)  # type: ignore[arg-type]
         append_episodes(run.path / "episodes.csv", rows)
-        return float(np.mean([row["score"] for row in rows]))
+        return float(np.mean([row["score"] for row in rows[: config.eval_episodes]]))
 
     def state(self) -> dict[str, Any]:
         """Everything needed to go on to the bit."""

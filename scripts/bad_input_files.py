@@ -50,7 +50,7 @@ READERS: list[tuple[str, list[str], list[str]]] = [
             f"{RUN}/{name}"
             for name in (
                 *("labels.json", "episodes.csv", "encoder/config.json", "encoder/model.safetensors"),
-                *("policy/config.json", "policy/model.safetensors"),
+                *("policy/config.json", "policy/model.safetensors", "reference.json"),
             )
         ],
     ),
@@ -61,7 +61,7 @@ READERS: list[tuple[str, list[str], list[str]]] = [
             f"{RUN}/{name}"
             for name in (
                 *("config.json", "metrics.jsonl", "timing.json", "probe.json", "film.npz", "episodes.csv"),
-                *("encoder/config.json", "pretrain_timing.json"),
+                *("encoder/config.json", "pretrain_timing.json", "reference.json"),
             )
         ],
     ),
@@ -109,6 +109,9 @@ FINE: dict[str, str] = {
     "report | */probe.json | missing": "a set without states gives none",
     "report | */probe.json | a dangling link": "a set without states gives none",
     "report | */probe.json | no key": "a set without states gives none",
+    "* | */reference.json | missing": "earlier versions kept none",
+    "* | */reference.json | a dangling link": "likewise",
+    "* | */episodes.csv | without a column": "the last one is the action error, which earlier versions did not know",
     "report | */pretrain_timing.json | missing": "an encoder of other origin has none",
     "report | */pretrain_timing.json | a dangling link": "likewise",
     "report | */pretrain_timing.json | no key": "what it does not say is left out of the report",

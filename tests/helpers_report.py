@@ -39,7 +39,7 @@ def write_run(
         rows = [
             names
             | {"step": step, "episode": i, "episode_seed": i}
-            | {"return": value * 10, "length": 500, "score": value}
+            | {"return": value * 10, "length": 500, "score": value, "evaluated_under": names["corruption"]}
             for i, value in enumerate(values)
         ]
         append_episodes(folder / "episodes.csv", rows)

@@ -1,5 +1,7 @@
 """An evaluated agent sees, remembers and is paid what an episode gives, on a scripted environment."""
 
+import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +12,9 @@ from finetune.train import finetune
 from tests.helpers_stages import smoke_finetune
 from tests.nn.test_encoder import CARD
 from vd4rl_pomdp import evaluation
+from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.envs.corrupted import Observation
 from vd4rl_pomdp.envs.pixels import TimeStep
 from vd4rl_pomdp.errors import UserError
@@ -25,9 +29,12 @@ from vd4rl_pomdp.evaluation import (
     evaluate,
     evaluate_run,
     read_episodes,
+    summarise,
 )
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.policies.actor import ASSETS, load_actor
+from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.tasks import TASKS
 from vd4rl_pomdp.types import StepType, Windows
 
@@ -57,7 +64,8 @@ class ScriptedEnv:
     def _show(self, reward: float, step_type: StepType) -> Observation:
         obs = torch.randint(0, 256, (9, 84, 84), generator=self._random, dtype=torch.uint8)
         self.seen[-1].append(obs)
-        time_step = TimeStep(None, np.zeros(24, np.float32), np.zeros(18), reward, 1.0, step_type)
+        state = np.full(24, len(self.done[-1]) / 10, np.float32)
+        time_step = TimeStep(None, state, np.zeros(18), reward, 1.0, step_type)
         return Observation(obs, torch.full_like(obs, 255), time_step)
 
 
@@ -83,10 +91,11 @@ def agent(tmp_path) -> tuple[Encoder, Policy]:
     return encoder, policy
 
 
-def play(folder: Path, *episodes: int) -> list[evaluation.Episode]:
-    places = folder / "encoder", folder / "policy"
-    jobs = [EpisodeJob(*places, 0, TASKS["walker_walk"], CorruptionConfig.of("patch"), e, film=False) for e in episodes]
-    return evaluate(jobs, workers=1)
+def play(folder: Path, *episodes: int, actor: Path | None = None) -> list[evaluation.Episode]:
+    job = EpisodeJob(
+        folder / "encoder", folder / "policy", 0, TASKS["walker_walk"], CorruptionConfig.of("patch"), 0, film=False
+    )
+    return evaluate([replace(job, episode=episode, actor=actor) for episode in episodes], workers=1)
 
 
 def test_actions_are_the_policys_on_what_was_seen_and_done_in_the_episode(world, agent, tmp_path):
@@ -129,7 +138,101 @@ def test_a_return_is_the_sum_of_all_rewards_and_a_score_a_tenth_of_it(world, age
     assert (row["return"], row["score"], row["length"]) == (11.75, 1.175, LENGTH)
 
 
-def test_an_evaluation_names_its_step_and_touches_no_other_file(encoder, data, tmp_path):
+def test_the_action_error_is_to_what_the_datas_actor_does_where_the_policy_is(world, agent, tmp_path):
+    (without,) = play(tmp_path, 0)
+    assert without.action_error is None
+    (episode,) = play(tmp_path, 0, actor=ASSETS / "walker_walk_expert.safetensors")
+    expert = load_actor("walker_walk", "expert")
+    shown = [expert.act(np.full(24, t / 10, np.float32)) for t in range(LENGTH)]
+    assert episode.action_error == pytest.approx(np.square(np.array(world[0].done[-1]) - shown).mean())
+    assert np.abs(np.diff(shown, axis=0)).max() > 0.1, "the states tell the rows apart"
+    (row,) = episode_rows([episode], {"task": "walker_walk"})
+    assert (row["evaluated_under"], row["action_error"]) == ("patch", round(episode.action_error, 6))
+
+
+def test_a_run_is_evaluated_as_it_was_trained_and_under_none_or_as_one_says(world, encoder, data, tmp_path, capsys):
+    config = smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2)
+    run = finetune(config).path
+    for asked, expected in ((None, ["patch+zero_frames", "none"]), ("patch", ["patch"])):
+        rows = evaluate_run(run, asked, 1, 1)
+        assert [row["evaluated_under"] for row in rows] == expected
+        assert {row["corruption"] for row in rows} == {"patch+zero_frames"}, "what it was trained under"
+    main(["evaluate", str(run), "--episodes", "1", "--workers", "1", "--out", str(tmp_path / "rows.csv")])
+    told = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert told["data_return"] == f"{open_dataset(data).returns.mean():.6g}"
+    assert (told["path_error"], told["under.none.action_error"]) == ("unknown", "unknown")
+    written = read_episodes(tmp_path / "rows.csv")
+    for row in written:
+        assert told[f"under.{row['evaluated_under']}.return_mean"] == f"{row['return']:.6g}"
+        assert told[f"under.{row['evaluated_under']}.share_above_80"] == "0"
+    main(["evaluate", str(run), "--episodes", "1", "--workers", "1", "--corruption", "none", "--json"])
+    (only,) = json.loads(capsys.readouterr().out)["under"].items()
+    assert (only[0], only[1]["episodes"]) == ("none", written[1:])
+
+
+def test_a_summary_counts_episodes_above_four_fifths_of_the_datas_return():
+    rows = [
+        {"return": total, "score": total / 10, "action_error": error}
+        for total, error in ((90.0, 0.2), (80.0, 0.4), (100.0, None))
+    ]
+    summary = summarise(rows, Reference(data_return=100.0))
+    assert summary == {
+        "score_mean": 9.0,
+        "score_min": 8.0,
+        "score_max": 10.0,
+        "return_mean": 90.0,
+        "share_above_80": 2 / 3,
+        "action_error": pytest.approx(0.3),
+    }
+    assert summarise(rows[2:], Reference())["share_above_80"] is None
+    assert summarise(rows[2:], Reference(data_return=-5.0))["share_above_80"] is None, "80% of what is lost is no aim"
+    assert summarise(rows[2:], Reference())["action_error"] is None
+
+
+EARLIER = """method,task,quality,corruption,algorithm,seed,step,episode,episode_seed,return,length,score
+acro,walker_walk,expert,patch,td3_bc,0,1,0,20000,719.1985,500,71.9199
+acro,walker_walk,expert,patch,td3_bc,0,2,0,20000,847.1,500,84.71
+"""
+
+
+def test_a_table_of_an_earlier_version_is_read_and_appended_to(tmp_path):
+    path = tmp_path / "episodes.csv"
+    path.write_text(EARLIER)
+    rows = read_episodes(path)
+    assert [(row["evaluated_under"], row["action_error"]) for row in rows] == [("patch", None)] * 2
+    assert path.read_text() == EARLIER, "reading changes nothing"
+    new = rows[1] | {"step": 3, "evaluated_under": "none", "action_error": 0.25}
+    append_episodes(path, [new])
+    lines = EARLIER.splitlines()
+    assert path.read_text().splitlines() == [
+        f"{lines[0]},evaluated_under,action_error",
+        *(f"{line},patch," for line in lines[1:]),
+        lines[2].replace("0,2,0", "0,3,0") + ",none,0.25",
+    ]
+    assert read_episodes(path) == [*rows, new]
+    drop_episodes_after(path, 2)
+    assert read_episodes(path) == rows
+
+
+def test_columns_of_ones_own_stay_in_a_table_that_is_appended_to(tmp_path):
+    path = tmp_path / "episodes.csv"
+    lines = EARLIER.splitlines()
+    path.write_text("\n".join([f"{lines[0]},variant", f"{lines[1]},max_k 1"]) + "\n")
+    row = {name: value for name, value in read_episodes(path)[0].items() if name != "variant"}
+    append_episodes(path, [row])
+    assert read_episodes(path) == [row | {"variant": "max_k 1"}, row | {"variant": ""}]
+
+
+@pytest.mark.parametrize("end", ["", ",", ",patch", ",patch,nan", ",patch,0.1.2", ",,0.1"])
+def test_a_row_whose_end_is_missing_or_wrong_is_not_read(tmp_path, end):
+    path = tmp_path / "episodes.csv"
+    lines = EARLIER.splitlines()
+    path.write_text(f"{lines[0]},evaluated_under,action_error\n{lines[1]}{end}\n")
+    with pytest.raises(UserError, match="a row is not whole"):
+        read_episodes(path)
+
+
+def test_an_evaluation_names_its_step_and_touches_no_other_file(world, encoder, data, tmp_path):
     run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2))
     (run.path / "timing.json").unlink()  # an unfinished run has a step, too
     with pytest.raises(UserError, match="--episodes is 0"):
@@ -138,7 +241,7 @@ def test_an_evaluation_names_its_step_and_touches_no_other_file(encoder, data, t
         evaluate_run(run.path, "fog", 1, 1)
     with pytest.raises(UserError, match="holds no evaluated run"):
         evaluate_run(encoder.parent, None, 1, 1)
-    assert [row["step"] for row in evaluate_run(run.path, None, 1, 1)] == [2]
+    assert [row["step"] for row in evaluate_run(run.path, None, 1, 1)] == [2, 2]
     (run.path / "labels.json").write_text("{}")
     with pytest.raises(UserError, match=r"labels\.json: has no 'method'"):
         evaluate_run(run.path, None, 1, 1)
@@ -163,7 +266,7 @@ def test_a_table_of_episodes_is_begun_before_any_is_played_and_only_once(tmp_pat
 def test_a_line_that_was_cut_is_dropped_with_what_follows_the_checkpoint(tmp_path):
     path = tmp_path / "episodes.csv"
     row = dict.fromkeys(("method", "task", "quality", "corruption", "algorithm"), "x")
-    row |= dict.fromkeys(("seed", "episode", "episode_seed", "return", "length", "score"), 1)
+    row |= dict.fromkeys(("seed", "episode", "episode_seed", "return", "length", "score", "evaluated_under"), 1)
     append_episodes(path, [row | {"step": 1}, row | {"step": 2}])
     path.write_text(path.read_text() + "mik+a,walker_w")
     with pytest.raises(UserError, match="a row is not whole"):
@@ -176,7 +279,7 @@ def test_a_line_that_was_cut_is_dropped_with_what_follows_the_checkpoint(tmp_pat
 def test_a_damaged_table_of_episodes_is_named_and_kept(tmp_path, cell):
     path = tmp_path / "episodes.csv"
     row = dict.fromkeys(("method", "task", "quality", "corruption", "algorithm"), "x")
-    row |= dict.fromkeys(("seed", "episode", "episode_seed", "return", "length"), 1)
+    row |= dict.fromkeys(("seed", "episode", "episode_seed", "return", "length", "evaluated_under"), 1)
     append_episodes(path, [row | {"step": 1, "score": cell}])
     before = path.read_bytes()
     for read in (lambda: read_episodes(path), lambda: drop_episodes_after(path, 1)):

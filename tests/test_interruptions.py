@@ -319,24 +319,36 @@ def test_features_of_other_inputs_or_damaged_ones_are_made_anew(encoder, data, t
     assert not origin.exists()
 
 
-@pytest.mark.parametrize("rows_written", [False, True])
-def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(encoder, data, tmp_path, monkeypatch, rows_written):
+@pytest.mark.parametrize(("evaluation", "rows_written"), [(1, 0), (1, 1), (2, 0), (2, 2)])
+def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
+    encoder, data, tmp_path, monkeypatch, evaluation, rows_written
+):
+    """Also in the last one, where rows under the run's own corruption alone are not all."""
     changes = FINETUNE | {"eval_episodes": 2}
     whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes))
     config = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
-    append = finetune.train.append_episodes
+    append, evaluations = finetune.train.append_episodes, []
 
     def cut(path: Path, rows: list[dict[str, Any]]) -> None:
-        append(path, rows[:1] if rows_written else [])
+        evaluations.append(rows)
+        if len(evaluations) < evaluation:
+            append(path, rows)
+            return
+        append(path, rows[:rows_written])
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
         patch.setattr(finetune.train, "append_episodes", cut)
         with pytest.raises(KeyboardInterrupt):
             run_finetune(config)
+    monkeypatch.setattr(td3_bc.TD3BC, "update", _fail if evaluation == 2 else td3_bc.TD3BC.update)
     run_finetune(config)
     assert contents(config.out) == contents(whole.path)
-    assert [row["step"] for row in read_episodes(config.out / "episodes.csv")] == [6, 6, 12, 12]
+    assert [row["step"] for row in read_episodes(config.out / "episodes.csv")] == [6, 6, 12, 12, 12, 12]
+
+
+def _fail(*arguments: object) -> None:
+    raise AssertionError("the checkpoint before the evaluation is kept")
 
 
 def test_an_old_format_is_refused_before_anything_is_written(data, tmp_path):

@@ -176,7 +176,7 @@ def test_an_evaluation_is_never_longer_than_the_task(tasks, tmp_path):
 
 def test_a_score_is_divided_by_the_tasks_own_number(tasks):
     tasks.register("games", replace(tasks["centre"], score_divisor=4.0))
-    (row,) = episode_rows([Episode(0, 2.0, 1, None)], {"task": "games"})
+    (row,) = episode_rows([Episode("none", 0, 2.0, 1, None)], {"task": "games"})
     assert (row["return"], row["score"]) == (2.0, 0.5)
 
 

@@ -8,6 +8,7 @@ import math
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from functools import cache
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +16,15 @@ import numpy as np
 import torch
 
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Draws, Observation
+from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn, Observation
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import load_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy
+from vd4rl_pomdp.policies.actor import Actor, read_actor
+from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.runs.files import appending, read_json, write_csv
 from vd4rl_pomdp.runs.reading import regular
 from vd4rl_pomdp.runs.workers import run_jobs
@@ -33,7 +36,9 @@ FILM_EVERY = 4
 """Rows between two pictures of a film."""
 LABELS = ("method", "task", "quality", "corruption", "algorithm", "seed")
 """What names the rows of a run."""
-COLUMNS = (*LABELS, "step", "episode", "episode_seed", "return", "length", "score")
+ADDED = ("evaluated_under", "action_error")
+"""Columns that files of earlier versions lack."""
+COLUMNS = (*LABELS, "step", "episode", "episode_seed", "return", "length", "score", *ADDED)
 
 
 class Agent:
@@ -86,17 +91,24 @@ class EpisodeJob:
     film: bool
     render: Render = "fast"
     length: int | None = None
+    actor: Path | None = None
+    """File of the actor that made the data; None: it is not known."""
 
 
 @dataclass(frozen=True)
 class Episode:
     """What an evaluation episode gave."""
 
+    evaluated_under: str
+    """Name of the corruption that it was played under."""
     episode: int
     total: float
     length: int
     film: dict[str, np.ndarray] | None
     """`clean` (F, 3, S, S) and `corrupted` (F, C, S, S) uint8 pictures, `return` (F,) so far."""
+    action_error: float | None = None
+    """In closed loop: mean over its decisions of the mean squared difference between the policy's action and the mean
+    action of the data's actor at the state it is in."""
 
 
 def evaluate(
@@ -112,7 +124,7 @@ def evaluate(
 
 
 def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, Any]]:
-    """Rows of `episodes.csv`: one an episode, `labels` giving the columns up to `step`."""
+    """Rows of `episodes.csv`: one an episode, `labels` giving the columns up to `step`: those of the training."""
     divisor = TASKS.named(labels["task"]).score_divisor
     return [
         labels
@@ -122,6 +134,8 @@ def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[s
             "return": round(e.total, 4),
             "length": e.length,
             "score": round(e.total / divisor, 4),
+            "evaluated_under": e.evaluated_under,
+            "action_error": None if e.action_error is None else round(e.action_error, 6),
         }
         for e in episodes
     ]
@@ -137,18 +151,38 @@ def begin_episodes(path: Path) -> None:
 
 
 def append_episodes(path: Path, rows: list[dict[str, Any]]) -> None:
-    """Append rows to an `episodes.csv`, writing its header first; another kind of file raises UserError untouched."""
-    check_episodes(path)
-    new = not path.exists() or path.stat().st_size == 0
+    """Append rows to an `episodes.csv`, writing its header first; another kind of file raises UserError untouched.
+
+    A file of an earlier version gets the columns that it lacks, with what `read_episodes` says of its rows.
+    """
+    header = _completed(path, read_episodes(path))
     with appending(path) as file:
-        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-        if new:
+        writer = csv.DictWriter(file, header or COLUMNS, lineterminator="\n")
+        if not header:
             writer.writeheader()
         writer.writerows(rows)
 
 
+def _completed(path: Path, rows: list[dict[str, Any]]) -> list[str]:
+    """Columns of a file, none if it has no header yet, after those that it lacks were added to it."""
+    header = _header(path)
+    lacking = [name for name in ADDED if name not in header]
+    if header and lacking:
+        write_csv(path, header := [*header, *lacking], rows)
+    return header
+
+
+def _header(path: Path) -> list[str]:
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return next(csv.reader(file), [])
+
+
 def read_episodes(path: Path) -> list[dict[str, Any]]:
     """Rows of an `episodes.csv`, numbers parsed, none if there is no file or it is empty.
+
+    Rows of an earlier version were evaluated under their `corruption`, and have no action error.
 
     Raises:
         UserError: the file was not written by this package, or is damaged.
@@ -178,11 +212,22 @@ def _whole(path: Path) -> Iterator[None]:
 def _parse(path: Path, lines: Iterable[str]) -> list[dict[str, Any]]:
     """Rows of an `episodes.csv`, numbers parsed; raises ValueError, TypeError or csv.Error for a damaged one."""
     reader = csv.DictReader(lines)
-    missing = [name for name in COLUMNS if name not in (reader.fieldnames or [])]
+    missing = [name for name in COLUMNS if name not in (*(reader.fieldnames or []), *ADDED)]
     if missing:
         raise UserError(f"{path}: has no column {missing[0]!r}; it was not written by this package")
     whole = ("seed", "step", "episode", "episode_seed", "length")
-    return [row | {k: int(row[k]) for k in whole} | _scores(path, row) for row in reader]
+    return [row | {k: int(row[k]) for k in whole} | _scores(path, row) | _added(row) for row in reader]
+
+
+def _added(row: dict[str, str]) -> dict[str, Any]:
+    """The columns that files of earlier versions lack, parsed."""
+    under, text = row.get("evaluated_under", row["corruption"]), row.get("action_error", "")
+    if not under or text is None:
+        raise ValueError("its end is missing")
+    error = float(text) if text else None
+    if error is not None and not math.isfinite(error):
+        raise ValueError(f"its action error is {error}")
+    return {"evaluated_under": under, "action_error": error}
 
 
 def _scores(path: Path, row: dict[str, str]) -> dict[str, float]:
@@ -231,7 +276,7 @@ def _run_episode(job: EpisodeJob) -> Episode:
     return _play(agent, _ENVIRONMENTS[place], job)
 
 
-def _draws(agent: Agent, job: EpisodeJob) -> Draws:
+def _draws(agent: Agent, job: EpisodeJob) -> Drawn:
     """A film shows all frames; else no frame is drawn that its agent does not see."""
     if job.film:
         return "all"
@@ -242,13 +287,23 @@ def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
     agent.reset()
     now = env.reset(EVALUATION_SEED + job.episode, EVALUATION_SEED, job.episode)
     total, length, film = 0.0, 0, [(now, 0.0)]
+    actor, errors = job.actor and _actor(job.actor), []
     while not now.time_step.last:
-        now = env.step(agent.act(agent.encoder_input(now, job.task)))
+        action = agent.act(agent.encoder_input(now, job.task))
+        if actor:
+            errors.append(np.square(action - actor.act(now.time_step.state)).mean())
+        now = env.step(action)
         total += now.time_step.reward
         length += 1
         if job.film and length % FILM_EVERY == 0:
             film.append((now, total))
-    return Episode(job.episode, total, length, _film(film) if job.film else None)
+    error = float(np.mean(errors)) if errors else None
+    return Episode(job.corruption.corruption, job.episode, total, length, _film(film) if job.film else None, error)
+
+
+@cache
+def _actor(path: Path) -> Actor:
+    return read_actor(path)
 
 
 def _film(shots: list[tuple[Observation, float]]) -> dict[str, np.ndarray]:
@@ -264,12 +319,14 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
 
     Args:
         run: its folder.
-        corruption: name of another corruption (default fields), None for the run's own.
+        corruption: name of the corruption to evaluate under (default fields); None for the run's own, and for none
+            at all, too.
         episodes: how many.
         workers: processes, 0 for every core.
 
     Returns:
-        Rows of `episodes.csv`; `step` is that of the run's newest policy.
+        Rows of `episodes.csv`, `episodes` of them under each corruption; `corruption` is that of training, `step`
+        that of the run's newest policy.
 
     Raises:
         UserError: an unknown corruption, no episode, or a folder without an evaluated run.
@@ -285,11 +342,40 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
         raise UserError(f"{run / 'labels.json'}: has no {missing[0]!r}; the command that made the run writes it anew")
     card = load_encoder(run / "encoder")[1]
     task = TASKS.named(card.task)
-    chosen = CorruptionConfig.fill(card.corruption) if corruption is None else CorruptionConfig.of(corruption)
-    chosen.check()
+    chosen = own_and_none(CorruptionConfig.fill(card.corruption))
+    if corruption is not None:
+        chosen = [CorruptionConfig.of(corruption)]
+    for one in chosen:
+        one.check()
+    actor = Reference.read(run).actor_file
     jobs = [
-        EpisodeJob(run / "encoder", run / "policy", 0, task, chosen, episode, film=False) for episode in range(episodes)
+        EpisodeJob(run / "encoder", run / "policy", 0, task, one, episode, film=False, actor=actor)
+        for one in chosen
+        for episode in range(episodes)
     ]
     step = max(row["step"] for row in evaluated)
-    done = evaluate(jobs, workers)
-    return episode_rows(done, labels | {"corruption": chosen.corruption, "step": step})
+    return episode_rows(evaluate(jobs, workers), labels | {"step": step})
+
+
+def own_and_none(corruption: CorruptionConfig) -> list[CorruptionConfig]:
+    """The corruptions that a policy trained under one is evaluated under: that one, and none at all."""
+    clean = CorruptionConfig.of("none")
+    return [corruption] if corruption.corruption == clean.corruption else [corruption, clean]
+
+
+def summarise(rows: list[dict[str, Any]], reference: Reference) -> dict[str, float | None]:
+    """What the episodes of one policy under one corruption come to; None is unknown.
+
+    Returns:
+        `score_mean`, `score_min`, `score_max`, `return_mean`, `share_above_80` (see `Reference`), `action_error`.
+    """
+    scores, returns = ([row[name] for row in rows] for name in ("score", "return"))
+    errors = [row["action_error"] for row in rows if row["action_error"] is not None]
+    return {
+        "score_mean": float(np.mean(scores)),
+        "score_min": min(scores),
+        "score_max": max(scores),
+        "return_mean": float(np.mean(returns)),
+        "share_above_80": reference.share_above_80(returns),
+        "action_error": float(np.mean(errors)) if errors else None,
+    }

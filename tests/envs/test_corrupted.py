@@ -5,13 +5,13 @@ import pytest
 import torch
 
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Draws
+from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn
 from vd4rl_pomdp.tasks import TASKS
 
 ROWS = 40
 
 
-def episode(name: str, draws: Draws, task: str = "walker_walk") -> tuple[list[torch.Tensor], list[float], int]:
+def episode(name: str, draws: Drawn, task: str = "walker_walk") -> tuple[list[torch.Tensor], list[float], int]:
     """What an agent sees, its rewards, and how many frames were drawn."""
     env, rng = CorruptedEnv(TASKS[task], CorruptionConfig.of(name), length=ROWS, draws=draws), np.random.default_rng(0)
     shown, drawn = [env.reset(5, 6, 7)], 0

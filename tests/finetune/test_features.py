@@ -84,16 +84,8 @@ def test_an_episodes_first_row_carries_no_action(tmp_path):
         for name, action in (("plain", 0.0), ("odd", 0.9))
     )
     for number in range(len(LENGTHS)):
-        one, other = (states(made, number) for made in (plain, odd))
+        one, other = (made.episode(number, made.view(0)) for made in (plain, odd))
         torch.testing.assert_close(one, other)
-
-
-def states(made: FrozenEncoder, number: int) -> torch.Tensor:
-    """Representations (features, D) of an episode's rows, written where they belong, zeros elsewhere."""
-    out = torch.zeros(made.dataset.num_rows, made.encoder.dim)
-    view = Histories(made.dataset, NO_OPTIONS, 1, 0).of_view(0)
-    view.fill(out, made.encoder, made.episode(number, made.view(0)), number)
-    return out
 
 
 def test_exact_batches_agree_with_cached_features(encoder, data):
@@ -101,7 +93,7 @@ def test_exact_batches_agree_with_cached_features(encoder, data):
     dataset = open_dataset(data)
     network, _ = load_encoder(encoder)
     frozen = FrozenEncoder(network, dataset, CorruptionConfig(), 0, "fp32", 0)
-    cached = sum(states(frozen, i) for i in range(dataset.num_episodes))
+    cached = torch.cat([frozen.episode(i, frozen.view(0)) for i in range(dataset.num_episodes)])
     sampler = ExactSampler(frozen, NO_OPTIONS, 16, 3, 0.99, torch.Generator().manual_seed(0))
     index = torch.randint(dataset.num_transitions, (16,), generator=torch.Generator().manual_seed(0))
     batch = sampler.sample()

@@ -43,7 +43,12 @@ def test_finetuning_resumes_to_the_bit(encoder, data, tmp_path, monkeypatch, alg
     changes |= {"checkpoint_every": 10, "batch_size": 4}
     whole = finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
     rows = list(csv.DictReader((whole / "episodes.csv").open()))
-    assert [row["step"] for row in rows] == ["15", "30"]
+    assert [(row["step"], row["evaluated_under"]) for row in rows] == [
+        ("15", "patch+zero_frames"),
+        ("30", "patch+zero_frames"),
+        ("30", "none"),
+    ]
+    assert {row["corruption"] for row in rows} == {"patch+zero_frames"}
     assert {row["method"] for row in rows} == {"mik+a"}
     assert not (whole / "features.npy").exists()
 
@@ -167,6 +172,35 @@ def test_a_cut_run_whose_evaluations_are_gone_does_not_go_on(encoder, data, tmp_
         run_finetune(config)
     (config.out / "episodes.csv").write_text("".join(rows))
     assert run_finetune(config).finished
+
+
+def test_a_run_that_an_earlier_version_began_goes_on_and_is_evaluated_clean_at_the_end(
+    encoder, data, tmp_path, monkeypatch
+):
+    """It knew neither the setting nor the columns, and kept no reference."""
+    changes = {"eval_every": 10, "checkpoint_every": 10, "updates": 20, "batch_size": 4, "eval_length": 2}
+    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes)).path
+    config = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
+    with monkeypatch.context() as patch:
+        cut_at(patch, 2)
+        with pytest.raises(CutError):
+            run_finetune(config)
+    record = json.loads((config.out / "config.json").read_text())
+    del record["config"]["eval_clean"]
+    (config.out / "config.json").write_text(json.dumps(record))
+    (config.out / "reference.json").unlink()
+    rows = (config.out / "episodes.csv").read_text().splitlines()
+    (config.out / "episodes.csv").write_text("".join(row.rsplit(",", 2)[0] + "\n" for row in rows))
+    run_finetune(config)
+    ours, theirs = contents(config.out), contents(whole)
+    assert {name for name in theirs if ours[name] != theirs[name]} == {"config.json"}
+
+
+def test_the_clean_evaluation_can_be_left_out(encoder, data, tmp_path):
+    changes = {"updates": 2, "batch_size": 4, "eval_length": 2, "eval_clean": False}
+    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "out", **changes))
+    rows = list(csv.DictReader((run.path / "episodes.csv").open()))
+    assert [row["evaluated_under"] for row in rows] == ["patch+zero_frames"]
 
 
 def test_an_encoder_of_another_image_size_is_refused(data, encoder, tmp_path):

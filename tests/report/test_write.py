@@ -6,13 +6,15 @@ import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 
 import pytest
 
 from tests.helpers_report import describe, grid, write_run
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import drop_episodes_after, read_episodes
+from vd4rl_pomdp.evaluation import append_episodes, drop_episodes_after, read_episodes
+from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.runs.files import write_json
 
@@ -54,6 +56,65 @@ def test_references_with_their_own_algorithm_stand_in_the_same_table(tmp_path):
     with (tmp_path / "out" / "improvement.csv").open() as file:
         chances = {(row["method"], row["other"]): float(row["probability"]) for row in csv.DictReader(file)}
     assert chances == {("acro", "bc"): 1.0, ("bc", "acro"): 0.0}
+
+
+def evaluated_clean(run: Path, returns: list[float], errors: tuple[float, float]) -> None:
+    """Give a run's last evaluation, whose action errors become the first of two, one under none with the second."""
+    rows = [row for row in read_episodes(run / "episodes.csv") if row["step"] == 10]
+    (run / "episodes.csv").unlink()
+    append_episodes(run / "episodes.csv", [row | {"action_error": errors[0]} for row in rows])
+    clean = {"evaluated_under": "none", "action_error": errors[1]}
+    append_episodes(run / "episodes.csv", [rows[0] | clean | {"return": r, "score": r / 10} for r in returns])
+
+
+def test_scores_are_as_trained_and_the_control_table_tells_of_both(tmp_path):
+    for seed, score in enumerate((30.0, 50.0)):
+        run = write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [score, 90.0]})
+        Reference(500.0, None, 0.01 * (seed + 1)).write(run)
+        evaluated_clean(run, [401.0, 399.0, 900.0], (0.1, 0.2))
+    write_run(tmp_path / "runs/earlier", "mik", 0, {10: [70.0]})
+    page, summary = write_report([tmp_path / "runs"], tmp_path / "out")
+    assert {row["method"]: (row["score"], row["episodes"]) for row in summary} == {"acro": (65.0, 4), "mik": (70.0, 1)}
+    tables = {}
+    for name in ("control", "runs", "curves", "episodes"):
+        with (tmp_path / "out" / f"{name}.csv").open() as file:
+            tables[name] = list(csv.DictReader(file))
+    assert [row["score"] for row in tables["runs"] if row["method"] == "acro"] == ["70.0", "60.0"]
+    assert [row["score"] for row in tables["curves"] if row["method"] == "acro"] == ["65.0"]
+    assert [row["evaluated_under"] for row in tables["episodes"]].count("none") == 6
+    mik, acro = tables["control"]
+    assert {name: round(float(acro[name]), 4) for name in list(acro)[6:]} == {
+        **{"data_return": 500, "return": 650, "share_above_80": 0.75, "action_error": 0.1},
+        **{"clean_return": 566.6667, "clean_share_above_80": 0.6667, "clean_action_error": 0.2},
+        **{"path_error": 0.015, "seeds": 2},
+    }
+    assert {name for name in list(mik)[6:] if mik[name]} == {"return", "seeds"}, "earlier runs know no more"
+    shown = page.read_text().partition("<h2>Control</h2>")[2].partition("</table>")[0].replace("\n", "")
+    cells = ["acro", "500", "650", "567", "0.75", "0.67", "0.0150", "0.1000", "0.2000", "2"]
+    assert re.findall(r"<td[^>]*>([^<]*)</td>", shown)[10:] == cells
+
+
+def test_what_was_trained_clean_counts_as_both(tmp_path):
+    run = write_run(tmp_path / "runs/0", "acro", 0, {10: [30.0]}, labels={"corruption": "none"})
+    write_report([run], tmp_path / "out")
+    with (tmp_path / "out" / "control.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert (row["return"], row["clean_return"]) == ("300.0", "300.0")
+
+
+def test_returns_are_drawn_against_probes(tmp_path):
+    for seed, method in enumerate(("acro", "mik", "random")):
+        run = write_run(tmp_path / f"runs/{method}", method, seed, {10: [10.0 * (seed + 1)]})
+        if method != "random":
+            write_json(run / "probe.json", {"probe_pose": 20.0 + seed, "probe_velocity": 40.0})
+    page, _ = write_report([tmp_path / "runs"], tmp_path / "out")
+    text = page.read_text()
+    words = "mik, seed 1: return 200, pose 21.0%, velocity 40.0%; acro, seed 0: return 100, pose 20.0%, velocity 40.0%."
+    assert f'aria-label="Return against probe errors. {words}"' in text
+    figure = text[text.index("aria-label") :].partition("</figure>")[0]
+    assert figure.count("clip-path") >= 2
+    assert "<!-- mik -->" in figure
+    assert "<!-- random -->" not in figure, "without states nothing is known of it"
 
 
 def test_an_ablation_is_two_rows_everywhere(tmp_path):

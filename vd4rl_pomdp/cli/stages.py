@@ -44,14 +44,14 @@ def _finetune(words: Arguments, program: str) -> None:
 
 @dataclass(frozen=True)
 class EvaluateCommand:
-    """Evaluate a fine-tuned run again, also under another corruption; prints the rows' summary."""
+    """Evaluate a fine-tuned run again, as it was trained and under no corruption, or under a given one alone."""
 
     run: tyro.conf.Positional[Path]
     """A fine-tuning run's folder."""
     corruption: str | None = None
-    """Corruption at evaluation; default: the one it was trained under."""
+    """Corruption at evaluation; default: the one it was trained under, and then none, which takes as long again."""
     episodes: int = 10
-    """Episodes."""
+    """Episodes under each corruption."""
     workers: int = 0
     """Processes; 0 uses every core."""
     out: Path | None = None
@@ -61,7 +61,9 @@ class EvaluateCommand:
 
 
 def _evaluate(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.evaluation import append_episodes, begin_episodes, evaluate_run
+    from vd4rl_pomdp.evaluation import append_episodes, begin_episodes, evaluate_run, summarise
+    from vd4rl_pomdp.reference import Reference
+    from vd4rl_pomdp.runs.files import flatten
     from vd4rl_pomdp.runs.outputs import refuse_inside
 
     command = parse(EvaluateCommand, words, program)
@@ -71,10 +73,16 @@ def _evaluate(words: Arguments, program: str) -> None:
     rows = evaluate_run(command.run, command.corruption, command.episodes, command.workers)
     if command.out is not None:
         append_episodes(command.out, rows)
-    scores = [row["score"] for row in rows]
+    reference = Reference.read(command.run)
     labels = {k: rows[0][k] for k in ("method", "task", "quality", "corruption", "algorithm", "seed", "step")}
-    summary = {"score_mean": sum(scores) / len(scores), "score_min": min(scores), "score_max": max(scores)}
-    show(labels | summary | {"episodes": rows if command.json else len(rows)}, command.json)
+    known = {"data_return": reference.data_return, "path_error": reference.path_error}
+    under = {}
+    for name in dict.fromkeys(row["evaluated_under"] for row in rows):
+        mine = [row for row in rows if row["evaluated_under"] == name]
+        under[name] = summarise(mine, reference) | {"episodes": mine if command.json else len(mine)}
+    result = labels | known | {"under": under}
+    told = {name: "unknown" if value is None else value for name, value in flatten(result).items()}
+    show(result if command.json else told, command.json)
 
 
 @dataclass(frozen=True)

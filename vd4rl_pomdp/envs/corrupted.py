@@ -33,7 +33,7 @@ class Observation:
     """Reward, step type and simulator state."""
 
 
-Draws = Literal["all", "seen", "nothing"]
+Drawn = Literal["all", "seen", "nothing"]
 """Which frames are drawn: all, those that an agent will see in any stack, or none."""
 
 
@@ -47,7 +47,7 @@ class CorruptedEnv:
         render: Render = "fast",
         length: int | None = None,
         size: int = FRAME_SIZE,
-        draws: Draws = "all",
+        draws: Drawn = "all",
     ) -> None:
         self.env = make_env(task, render, None if draws == "nothing" else size, length)
         self._corruption = make_corruption(corruption)

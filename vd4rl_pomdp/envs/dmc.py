@@ -77,6 +77,20 @@ def flat_state(observation: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate([np.ravel(value) for value in observation.values()]).astype(np.float32)
 
 
+def observed_states(task: str, physics: np.ndarray) -> np.ndarray:
+    """What a dm_control task, by name, observes in each of (N, P) simulator states: (N, D) float32."""
+    played = TASKS.named(task)
+    assert isinstance(played, DMCTask), "other tasks store no states"
+    env = _load(played, np.random.RandomState(0))
+    env.reset()
+    return np.stack([_observed(env, state) for state in physics])
+
+
+def _observed(env: Any, state: np.ndarray) -> np.ndarray:
+    start_from(env, state)
+    return flat_state(env.task.get_observation(env.physics))
+
+
 def start_from(env: Any, state: np.ndarray) -> None:
     """Put the simulator into a state with nothing left of what was before, the solver's warm start included."""
     with env.physics.reset_context():

@@ -220,6 +220,13 @@ def load_ladder(task: str) -> Ladder:
     return read_ladder(_shipped(task, "replay"), task)
 
 
+def shipped_file(task: str, quality: str, sha256: str) -> Path | None:
+    """File of the actor that ships for a task and a quality, None if there is none or its content has another hash."""
+    path = _asset(task, quality)
+    same = path.exists() and hashlib.sha256(read_bytes(path)).hexdigest() == sha256
+    return path if same else None
+
+
 def ships(task: str, quality: str) -> bool:
     """Whether the actors of a set ship: random needs none, medium_expert needs two."""
     needed = {"random": (), "medium_replay": ("replay",), "medium_expert": ("medium", "expert")}

@@ -12,6 +12,7 @@ from matplotlib.lines import Line2D
 from PIL import Image
 
 from vd4rl_pomdp.report.tables import label
+from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.text import plain
 
 mpl.rcParams["svg.hashsalt"] = "vd4rl-pomdp"
@@ -94,6 +95,41 @@ def loss_figure(series: list[tuple[str, list[dict[str, float]]]], methods: list[
         axes.plot(steps, values, lw=1.2, label=entry, **_style(methods.index(name)))
     axes.set(xlabel="gradient steps", ylabel="action loss")
     return _svg(figure, axes)
+
+
+PROBES = {"probe_pose": "pose", "probe_velocity": "velocity"}
+"""What probes measure, as a figure names it."""
+MARKERS = "osD^vP"
+
+
+def probe_figure(rows: list[Row], methods: list[str]) -> tuple[str, str]:
+    """Return against the probes' errors, pose at the left and velocity at the right, one dot a run.
+
+    Returns:
+        The figure, and in words what it shows.
+    """
+    figure = Figure(figsize=(8.2, 3.4), layout="constrained")
+    panels = figure.subplots(1, 2, sharey=True)
+    for method in dict.fromkeys(map(label, rows)):
+        number = methods.index(method)
+        style = {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number // len(COLOURS) % len(MARKERS)]}
+        mine = [row for row in rows if label(row) == method]
+        for axes, probe in zip(panels, PROBES, strict=True):
+            known = [row for row in mine if row[probe] is not None]
+            errors, returns = [row[probe] for row in known], [row["return"] for row in known]
+            axes.scatter(errors, returns, 36, label=plain(method, LEGEND_WIDTH), ec="white", lw=0.6, zorder=3, **style)
+    for axes, name in zip(panels, PROBES.values(), strict=True):
+        axes.set(xlabel=f"{name} error, %")
+        axes.set_xlim(-0.04 * axes.get_xlim()[1])  # room for the whole dot of a run without error
+        axes.grid(alpha=0.25)
+        axes.spines[["top", "right"]].set_visible(False)
+    panels[0].set(ylabel="return", ylim=(-0.04 * panels[0].get_ylim()[1], None))
+    return _svg(figure, panels[1]), "; ".join(map(_probe_words, rows))
+
+
+def _probe_words(row: Row) -> str:
+    errors = (f"{name} {row[probe]:.1f}%" for probe, name in PROBES.items() if row[probe] is not None)
+    return f"{label(row)}, seed {row['seed']}: return {row['return']:.0f}, {', '.join(errors)}"
 
 
 def _svg(figure: Figure, axes: Any) -> str:

@@ -12,6 +12,7 @@ import numpy as np
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import read_episodes
+from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.report.variants import Parts, Settings, differences, read_settings
 from vd4rl_pomdp.runs.files import Row, read_json
 from vd4rl_pomdp.runs.metrics import read_metrics
@@ -38,12 +39,16 @@ class LoadedRun:
     settings: Settings
     """All settings in which runs of its method may differ, in words."""
     rows: list[Row]
-    """Evaluation rows, numbers parsed, with the run's `variant`."""
+    """Evaluation rows under the corruption of training, numbers parsed, with the run's `variant`."""
     metrics: list[dict[str, float]]
     seconds: float | None
     """Wall-clock time; None while the run is unfinished."""
     representation: dict[str, float | None]
     """Measures of its encoder: action_loss, probe_pose, probe_velocity, pretrain_seconds."""
+    others: list[Row]
+    """Evaluation rows under other corruptions, likewise: under none, if it was trained under one."""
+    reference: Reference
+    """What its policy is held against."""
     parts: Parts = ("", "", "")
     """Its settings that differ from those of other runs of its method, by the runs it is compared with."""
 
@@ -57,6 +62,11 @@ class LoadedRun:
         """Values of IDENTITY."""
         labels = self.labels | {"variant": self.variant}
         return tuple(str(labels[name]) for name in IDENTITY)
+
+    @property
+    def clean(self) -> list[Row]:
+        """Evaluation rows under no corruption, whatever it was trained under."""
+        return [row for row in (*self.rows, *self.others) if row["evaluated_under"] == "none"]
 
     @property
     def finished(self) -> bool:
@@ -137,7 +147,8 @@ def _groups(runs: Iterable[LoadedRun], key: Callable[[LoadedRun], Any]) -> list[
 
 def _with_parts(run: LoadedRun, parts: Parts) -> LoadedRun:
     named = replace(run, parts=parts)
-    return replace(named, rows=[row | {"variant": named.variant} for row in run.rows])
+    rows, others = ([row | {"variant": named.variant} for row in part] for part in (run.rows, run.others))
+    return replace(named, rows=rows, others=others)
 
 
 def _is_run(config: Path) -> bool:
@@ -169,7 +180,9 @@ def _load(folder: Path) -> LoadedRun:
         record=record,
         labels=_labels(folder, record, rows, card),
         settings=read_settings(record, card if record["stage"] == "finetune" else {}),
-        rows=rows,
+        rows=[row for row in rows if row["evaluated_under"] == row["corruption"]],
+        others=[row for row in rows if row["evaluated_under"] != row["corruption"]],
+        reference=Reference.read(folder),
         metrics=read_metrics(folder / "metrics.jsonl"),
         seconds=_number(read_json(timing)["seconds"]) if timing.exists() else None,
         representation=_representation(folder, card),

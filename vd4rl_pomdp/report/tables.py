@@ -6,6 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from vd4rl_pomdp.evaluation import summarise
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import CONDITION, condition_of, in_words
 from vd4rl_pomdp.report.load import IDENTITY, LoadedRun
@@ -40,6 +41,39 @@ def representations(runs: list[LoadedRun], gaps: list[Row]) -> list[Row]:
             scores = {"score": score, "return": score * SCORE_DIVISOR}
             table.append(identity | run.representation | scores | costs | {"state": run.progress})
     return sorted([*table, *(dict.fromkeys(_RUN) | gap for gap in gaps)], key=_table_order)
+
+
+def control(runs: list[LoadedRun]) -> list[Row]:
+    """What the policies of every condition do, beside the data they learned from: means over the finished seeds.
+
+    Return, share of episodes above 80% of the data's return, and action error in closed loop are those of the last
+    evaluation: as trained, and under no corruption (`clean_`). What no seed knows is None.
+    """
+    finished = [run for run in runs if run.rows and run.finished]
+    measured = [dict(zip(IDENTITY, run.identity, strict=True)) | _control(run) for run in finished]
+    table = [
+        dict(zip(CONDITION, group, strict=True))
+        | {name: _known_mean([row[name] for row in members]) for name in _CONTROL}
+        | {"seeds": len(members)}
+        for group, members in _grouped(measured, CONDITION)
+    ]
+    return sorted(table, key=_table_order)
+
+
+def _control(run: LoadedRun) -> Row:
+    """Values of _CONTROL of one run."""
+    found: Row = {"data_return": run.reference.data_return, "path_error": run.reference.path_error}
+    final = max(row["step"] for row in run.rows)
+    for prefix, rows in (("", run.rows), ("clean_", run.clean)):
+        last = [row for row in rows if row["step"] == final]
+        summed = summarise(last, run.reference) if last else {}
+        found |= {prefix + name: summed.get(key) for name, key in _EVALUATED.items()}
+    return found
+
+
+def _known_mean(values: list[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
 
 
 def improvement(rows: list[Row]) -> list[Row]:
@@ -147,13 +181,16 @@ _RUN = (
     *(*IDENTITY, "action_loss", "probe_pose", "probe_velocity", "pretrain_seconds"),
     *("score", "return", "finetune_seconds", "git_commit", "state"),
 )
+_EVALUATED = {"return": "return_mean", "share_above_80": "share_above_80", "action_error": "action_error"}
+"""Columns of `control` that tell of an evaluation, and what `summarise` calls them."""
+_CONTROL = ("data_return", *_EVALUATED, *(f"clean_{name}" for name in _EVALUATED), "path_error")
 _MEASURED = ("step", "score", "low", "high", "seeds", "episodes", "few_seeds", "best_score", "best_step")
 
 
 def _table_order(row: Row) -> tuple:
     """By setting, references last, the highest score first, and rows without a score at the end."""
     setting = tuple(row.get(name, "") for name in ("task", "quality", "corruption"))
-    score = row["iqm"] if "iqm" in row else row.get("score")
+    score = row["iqm"] if "iqm" in row else row.get("score", row.get("return"))
     return *setting, row["method"] in REFERENCES, np.inf if score is None else -float(score)
 
 

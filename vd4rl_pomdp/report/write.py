@@ -39,6 +39,7 @@ def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
     refuse_foreign(out, "report", f"{_MARK}.csv")
     runs = load_runs(paths)
     rows = [row for run in runs for row in run.rows]
+    everything = [row for run in runs for row in (*run.rows, *run.others)]
     if not rows:
         raise UserError(f"{paths[0]}: holds no evaluated run yet; `vd4rl-pomdp finetune` evaluates")
     final = [row for run in runs if run.finished for row in run.rows]
@@ -48,6 +49,7 @@ def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
         "curves": tables.curves(rows),
         "aggregate": tables.aggregate(final, gaps),
         "runs": tables.representations(runs, gaps),
+        "control": tables.control(runs),
         "improvement": tables.improvement(final),
         "profiles": tables.profiles(final, np.linspace(0, 100, 101)),
         "missing": gaps,
@@ -60,7 +62,7 @@ def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
             write_csv(path, list(table[0]), table)
         else:
             path.unlink(missing_ok=True)
-    write_csv(out / "episodes.csv", (*COLUMNS, "variant"), rows)
+    write_csv(out / "episodes.csv", (*COLUMNS, "variant"), everything)
     write_text(out / "index.html", page)
     return out / "index.html", made[_MARK]
 
@@ -103,12 +105,14 @@ def _render(runs: list[LoadedRun], rows: list[Row], made: dict[str, list[Row]], 
         finished=sum(run.finished for run in runs),
         unfinished=[(str(run.path), _title(run), run.progress) for run in runs if not run.finished],
         gaps=len(made["missing"]),
-        rows=len(rows),
+        rows=sum(len(run.rows) + len(run.others) for run in runs),
         few=FEW_SEEDS,
         tables=list(settings.items()),
         differing=_differing(runs),
         aggregate=made["aggregate"],
         representations=_by_setting(made["runs"]),
+        control=_by_setting(made["control"]) if _has_diagnostics(made["control"]) else [],
+        probes=_probe_figures(made["runs"], names),
         improvement=_matrices(made["improvement"]),
         curves=[
             (name, figures.curve_figure(part, names, settings[name])) for name, part in _by_setting(made["curves"])
@@ -123,6 +127,17 @@ def _render(runs: list[LoadedRun], rows: list[Row], made: dict[str, list[Row]], 
         theory=theory,
         runs=[_facts(run) for run in runs],
     )
+
+
+def _has_diagnostics(control: list[Row]) -> bool:
+    """Whether anything is known but the return as trained; earlier versions kept no more."""
+    return any(row["data_return"] is not None or row["clean_return"] is not None for row in control)
+
+
+def _probe_figures(runs: list[Row], names: list[str]) -> list[tuple[str, str, str]]:
+    """Setting, figure and words of probes against returns, wherever there is something to show."""
+    probed = [row for row in runs if any(row[probe] is not None for probe in figures.PROBES)]
+    return [(setting, *figures.probe_figure(members, names)) for setting, members in _by_setting(probed)]
 
 
 def _has_losses(run: LoadedRun) -> bool:

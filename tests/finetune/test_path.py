@@ -1,0 +1,64 @@
+"""The path error is that of the policy's action to the actor's mean action at the same row."""
+
+import numpy as np
+import pytest
+import torch
+
+from finetune.path import DataPath
+from finetune.train import finetune
+from tests.helpers_data import fake_rows
+from tests.helpers_stages import smoke_finetune
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.envs.dmc import observed_states
+from vd4rl_pomdp.envs.make import make_env
+from vd4rl_pomdp.policies import load_actor
+from vd4rl_pomdp.reference import Reference
+from vd4rl_pomdp.tasks import TASKS
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+ROWS = 12
+
+
+@pytest.fixture
+def walked(tmp_path):
+    """Two episodes of the expert, whose frames and actions are others'."""
+    env, actor = make_env(TASKS["walker_walk"], size=None, length=ROWS - 1), load_actor("walker_walk", "expert")
+    steps, rng = [], np.random.default_rng(0)
+    for seed in range(2):
+        steps.append(env.reset(seed))
+        while not steps[-1].last:
+            steps.append(env.step(actor.act(steps[-1].state, rng)))
+    rows = fake_rows([ROWS, ROWS]) | {"physics": np.stack([step.physics for step in steps])}
+    folder = tmp_path / "walker_walk" / "walked"
+    folder.mkdir(parents=True)
+    attributes = {"task": "walker_walk", "set": "expert", "actor_sha256": actor.sha256}
+    write_shard(folder / "0_walker_walk_expert.hdf5", rows, attributes)
+    return folder, np.stack([step.state for step in steps]), actor
+
+
+def test_simulator_states_are_observed_as_in_the_environment(walked):
+    folder, states, _ = walked
+    np.testing.assert_allclose(observed_states("walker_walk", open_dataset(folder).physics), states, atol=1e-6)
+
+
+def test_the_path_error_is_to_the_actors_mean_action_at_the_same_row(walked):
+    folder, states, actor = walked
+    shown = torch.from_numpy(np.stack([actor.act(state) for state in states]))
+    path = DataPath(open_dataset(folder), actor, lambda number: shown[number * ROWS : (number + 1) * ROWS])
+    assert path.action_error(lambda z: z) == pytest.approx(0, abs=1e-10)
+    assert path.action_error(lambda z: z + 0.1) == pytest.approx(0.01, rel=1e-4)
+    assert path.action_error(lambda z: z.roll(1, 0)) > 0.01, "the rows differ"
+
+
+@pytest.mark.parametrize("views", [1, 0])
+def test_a_run_keeps_its_path_error_and_compares_closed_loop_actions(walked, encoder, tmp_path, views):
+    folder, _, actor = walked
+    config = smoke_finetune(encoder, folder, tmp_path / "run", updates=2, batch_size=4, eval_length=2, views=views)
+    run = finetune(config).path
+    reference = Reference.read(run)
+    assert reference.actor == {"task": "walker_walk", "quality": "expert", "sha256": actor.sha256}
+    assert 0 < reference.path_error < 4
+    rows = (run / "episodes.csv").read_text().splitlines()[1:]
+    assert len(rows) == 2
+    assert all(0 < float(row.rpartition(",")[2]) < 4 for row in rows)
