@@ -61,7 +61,12 @@ def test_an_example_runs_through_every_stage_and_the_record_names_it(tmp_path, k
     assert (record["config"][kind], record["config"][option]) == (name, value)
     (row,) = csv.DictReader((tmp_path / "report" / "summary.csv").open())
     assert row.get(kind, name) == name
-    assert len((runs / "finetune" / "episodes.csv").read_text().splitlines()) == 1 + 2 * 2, "two evaluations of two"
+    rows = list(csv.DictReader((runs / "finetune" / "episodes.csv").open()))
+    as_trained = [row for row in rows if row["evaluated_under"] == row["corruption"]]
+    assert len(as_trained) == 2 * 2, "two evaluations of two"
+    assert len(rows) - len(as_trained) == (0 if as_trained[0]["corruption"] == "none" else 2), (
+        "the last one is clean, too"
+    )
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
