@@ -101,7 +101,7 @@ def test_the_page_about_runs_has_the_same_section(shown, tmp_path):
     for title in re.findall(r"<h[23]>.*?</h[23]>", template):
         assert title in text
     assert study["counterexample_differences"][0] in text
-    alone, _ = write_report([tmp_path / "runs"], tmp_path / "alone")
+    alone, *_ = write_report([tmp_path / "runs"], tmp_path / "alone")
     assert "finite worlds" not in alone.read_text()
 
 

@@ -27,9 +27,9 @@ def _report(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.report import print_summary, write_report
 
     command = parse(ReportCommand, words, program)
-    page, summary = write_report(command.runs, command.out)
-    print_summary(summary)
-    print(f"report: {page}")
+    report = write_report(command.runs, command.out)
+    print_summary(report)
+    print(f"report: {report.page}")
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Collection, Iterable
 
 import numpy as np
 
@@ -14,8 +14,8 @@ from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.tasks import SCORE_DIVISOR
 
 SERIES = ("corruption", "algorithm", "method", "variant")
-REFERENCES = ("random", "bc", "drq_bc", "state")
-"""Methods that are references: last in a table."""
+REFERENCES = ("random", "bc", "drq_bc", "supervised", "supervised+a", "state")
+"""Methods that are references, floors and ceilings: last in a table."""
 END_TO_END = ("bc", "drq_bc")
 """References that bring their own algorithm."""
 
@@ -104,9 +104,10 @@ def profiles(rows: list[Row], thresholds: np.ndarray) -> list[Row]:
     return table
 
 
-def summary(rows: list[Row], gaps: list[Row]) -> list[Row]:
+def summary(rows: list[Row], gaps: list[Row], unranked: Collection[tuple[str, ...]] = ()) -> list[Row]:
     """Final score of every condition: mean over seeds, 95% interval, n seeds, n episodes, best evaluation's mean.
 
+    The highest score of a setting (task, quality, corruption) comes first, unless it is `unranked`: there names decide.
     `missing` names its seeds that are missing or unfinished; a condition without any finished seed has no numbers.
     """
     absent: dict[tuple[str, ...], list[Row]] = {}
@@ -132,7 +133,7 @@ def summary(rows: list[Row], gaps: list[Row]) -> list[Row]:
         dict(zip(CONDITION, group, strict=True)) | nothing | {"missing": in_words(members)}
         for group, members in absent.items()
     ]
-    return sorted(table, key=_table_order)
+    return sorted(table, key=lambda row: _summary_order(row, unranked))
 
 
 def curves(rows: list[Row]) -> list[Row]:
@@ -192,6 +193,12 @@ def _table_order(row: Row) -> tuple:
     setting = tuple(row.get(name, "") for name in ("task", "quality", "corruption"))
     score = row["iqm"] if "iqm" in row else row.get("score", row.get("return"))
     return *setting, row["method"] in REFERENCES, np.inf if score is None else -float(score)
+
+
+def _summary_order(row: Row, unranked: Collection[tuple[str, ...]]) -> tuple:
+    """`_table_order`, but by name where methods are not ranked."""
+    *setting, reference, score = _table_order(row)
+    return *setting, reference, 0.0 if tuple(setting) in unranked else score, label(row)
 
 
 def _grouped(rows: list[Row], names: Iterable[str]) -> list[tuple[tuple, list[Row]]]:

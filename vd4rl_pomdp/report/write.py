@@ -5,6 +5,7 @@ from __future__ import annotations
 import base64
 import json
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -16,6 +17,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import COLUMNS
 from vd4rl_pomdp.report import figures, tables
 from vd4rl_pomdp.report.gaps import MISSING, find_gaps
+from vd4rl_pomdp.report.gates import gates, unranked
 from vd4rl_pomdp.report.load import LoadedRun, compare, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.templates import render
@@ -28,8 +30,18 @@ _MARK = "summary"
 """The table that is always there: its file tells a report's folder."""
 
 
-def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
-    """Write the report of all runs at or below `paths` into `out`; returns the page and the table of final scores.
+class Report(NamedTuple):
+    """What was written."""
+
+    page: Path
+    summary: list[Row]
+    """Table of final scores."""
+    gates: list[Row]
+    """Table of what has to hold before methods are ranked."""
+
+
+def write_report(paths: list[Path], out: Path) -> Report:
+    """Write the report of all runs at or below `paths` into `out`.
 
     A study that `vd4rl-pomdp theory` wrote at or below `paths` becomes a section of the page.
 
@@ -44,8 +56,10 @@ def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
         raise UserError(f"{paths[0]}: holds no evaluated run yet; `vd4rl-pomdp finetune` evaluates")
     final = [row for run in runs if run.finished for row in run.rows]
     gaps = find_gaps(runs)
+    gated = gates(runs)
     made = {
-        _MARK: tables.summary(final, gaps),
+        _MARK: tables.summary(final, gaps, unranked(gated)),
+        "gates": gated,
         "curves": tables.curves(rows),
         "aggregate": tables.aggregate(final, gaps),
         "runs": tables.representations(runs, gaps),
@@ -64,14 +78,16 @@ def write_report(paths: list[Path], out: Path) -> tuple[Path, list[Row]]:
             path.unlink(missing_ok=True)
     write_csv(out / "episodes.csv", (*COLUMNS, "variant"), everything)
     write_text(out / "index.html", page)
-    return out / "index.html", made[_MARK]
+    return Report(out / "index.html", made[_MARK], gated)
 
 
-def print_summary(summary: list[Row], console: Console | None = None) -> None:
-    """The tables of final scores on the terminal, one a setting."""
+def print_summary(report: Report, console: Console | None = None) -> None:
+    """The verdicts of the gates, then the tables of final scores, one a setting, on the terminal."""
     console = console or Console()
+    for row in report.gates:
+        console.print(f"{_setting(row)}: {row['verdict']}", markup=False, highlight=False)
     console.print("score = return / 10, mean over seeds [95% interval]", markup=False, highlight=False)
-    for setting, members in _by_setting(summary):
+    for setting, members in _by_setting(report.summary):
         console.print(_terminal_table(setting, members))
 
 
@@ -108,6 +124,7 @@ def _render(runs: list[LoadedRun], rows: list[Row], made: dict[str, list[Row]], 
         rows=sum(len(run.rows) + len(run.others) for run in runs),
         few=FEW_SEEDS,
         tables=list(settings.items()),
+        gates=[(_setting(row), row) for row in made["gates"]],
         differing=_differing(runs),
         aggregate=made["aggregate"],
         representations=_by_setting(made["runs"]),
