@@ -58,7 +58,8 @@ class ScriptedEnv:
         obs = torch.randint(0, 256, (9, 84, 84), generator=self._random, dtype=torch.uint8)
         self.seen[-1].append(obs)
         time_step = TimeStep(None, np.zeros(24, np.float32), np.zeros(18), reward, 1.0, step_type)
-        return Observation(obs, torch.full_like(obs, 255), time_step)
+        key = torch.tensor([len(self.done[-1])])
+        return Observation(obs, torch.full_like(obs, 255), time_step, key)
 
 
 @pytest.fixture

@@ -30,6 +30,8 @@ class Observation:
     """(C, S, S) uint8: the stack before corruption."""
     time_step: TimeStep
     """Reward, step type and simulator state."""
+    key: Tensor
+    """(1,) int64: what the corruption was drawn from, the same for a row of an episode wherever it is played."""
 
 
 class CorruptedEnv:
@@ -67,4 +69,4 @@ class CorruptedEnv:
     def _observation(self, time_step: TimeStep) -> Observation:
         clean = torch.from_numpy(np.concatenate(self._frames))
         key = derive_keys(self._seed, row_key(torch.tensor([self._episode]), torch.tensor([self._t])))
-        return Observation(self._corruption(clean[None], key)[0], clean, time_step)
+        return Observation(self._corruption(clean[None], key)[0], clean, time_step, key)
