@@ -77,7 +77,12 @@ def test_the_error_is_as_large_as_was_asked_in_a_probes_unit(noisy, with_states)
     batch = sampler.sample()
     for z, at in ((batch.z, rows), (batch.next_z, rows + 1)):
         assert percent(z - dataset.states()[at], dataset)[7:].mean() == pytest.approx(VELOCITY, rel=0.05)
-    assert not torch.equal(sampler.sample().z[:1], batch.z[:1]), "drawn anew for every batch"
+    position, again = sampler.state_dict(), [made.rows(rows, rows, sampler.view) for _ in range(2)]
+    assert not (again[0] == again[1])[:, :2].any(), "drawn anew whenever a row enters a batch"
+    sampler.load_state_dict(position)
+    following = sampler.sample()
+    sampler.load_state_dict(position)
+    assert torch.equal(sampler.sample().z, following.z), "a training that goes on has the noise of one never cut"
 
 
 @pytest.mark.parametrize("mode", ["resample", "emission"])
