@@ -17,6 +17,7 @@ from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.data import Dataset, View
 from vd4rl_pomdp.data.samplers import Sampler
 from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.runs.device import Precision, autocast
 from vd4rl_pomdp.runs.files import read_json, replacing_file, write_json
@@ -70,14 +71,19 @@ class FrozenEncoder:
     @torch.no_grad()
     def rows(self, rows: Tensor, shift_key: Tensor, view: View) -> Tensor:
         """Frame features (N, F) of (N,) rows, shifted by (N,) keys, in chunks."""
-        if self.encoder.reads_state:
-            return self.encoder.frame(self.states[rows, :, None, None])
+        if isinstance(self.encoder.frame, StateFrame):
+            return self._state_features(self.encoder.frame, rows, view)
         parts = []
         for part, key in zip(rows.split(CHUNK), shift_key.split(CHUNK), strict=True):
             obs = view.observe(part, key)
             with autocast(self.device, self.precision):
                 parts.append(self.encoder.frame(obs).float())
         return torch.cat(parts)
+
+    def _state_features(self, frame: StateFrame, rows: Tensor, view: View) -> Tensor:
+        """Simulator states of rows, with noise, if there is any, drawn as a corruption of pixels would be."""
+        key = view.corruption.keys(self.dataset.keys(rows)) if frame.noisy else torch.zeros_like(rows)
+        return frame(frame.observe(self.states[rows], key))
 
     @torch.no_grad()
     def episode(self, number: int, view: View) -> Tensor:

@@ -9,11 +9,13 @@ import numpy as np
 
 from pretrain.config import MemoryOptions, TrainingConfig
 from pretrain.objectives import METHODS, Method
+from pretrain.objectives.untrained import StateOptions
 from vd4rl_pomdp.nn.action_target import ActionTarget, make_action_target
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE
 from vd4rl_pomdp.objective import ActionOptions, Objective
-from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.options import Options, flat
+from vd4rl_pomdp.state_scale import StateScale
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 
 
@@ -34,7 +36,7 @@ def build_objective(
     config: TrainingConfig,
     action_dim: int,
     target: ActionTarget | None,
-    state_dim: int = 0,
+    states: StateScale | None = None,
     observation: tuple[int, int] = (3 * FRAME_STACK, FRAME_SIZE),
 ) -> Objective:
     """Build the objective of a config.
@@ -43,12 +45,12 @@ def build_objective(
         config: the run's settings.
         action_dim: width of actions.
         target: from `build_target`.
-        state_dim: width of the simulator state, for methods that read it.
+        states: scale of the simulator's states, for methods that read or regress them.
         observation: channels and size of an observation, for methods that read pixels.
     """
     method = METHODS.named(config.method)
-    channels, size = (state_dim, 1) if method.reads_state else observation
-    frame = asdict(config.frame)
+    channels, size = (len(states.std), 1) if method.reads_state and states else observation
+    frame = _noise(config.options, states) or asdict(config.frame)
     encoder = EncoderConfig(
         action_dim=action_dim,
         frame_encoder=STATE if method.reads_state else config.frame_encoder,
@@ -58,7 +60,14 @@ def build_objective(
         size=size,
         **_memory(config, method),
     )
-    return method.build(Encoder(encoder), target, config.options, config.seed)
+    return method.build(Encoder(encoder), states if method.regresses_state else target, config.options, config.seed)
+
+
+def _noise(options: Options, states: StateScale | None) -> dict[str, Any]:
+    """What the `state` reference's encoder is told of noise; nothing if there is none."""
+    if not isinstance(options, StateOptions) or not states or not (options.pose_noise or options.velocity_noise):
+        return {}
+    return {"noise": states.noise(options.pose_noise, options.velocity_noise).tolist()}
 
 
 def _memory(config: TrainingConfig, method: Method) -> dict[str, Any]:

@@ -27,7 +27,7 @@ from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.tasks import FRAME_SIZES, FRAME_STACK, TASKS
-from vd4rl_pomdp.types import Windows
+from vd4rl_pomdp.types import StateWindows, Windows
 
 STAGE = "pretrain"
 DECIDE_MEMORY = ("batch_size", "window", "feature_dim", "hidden_dim", "head_dim", "codes")
@@ -68,6 +68,7 @@ class PretrainTrainer:
     def __init__(self, objective: Objective, dataset: Dataset, config: PretrainConfig) -> None:
         self.objective, self.dataset, self.config = objective, dataset, config
         self.device = dataset.t.device
+        self.states = dataset.states() if METHODS.named(config.method).regresses_state else None
         view = View(dataset, config.corruption, config.shift, config.seed, STAGE)
         batches = stream_generator(config.seed, STAGE, "batches")
         self.sampler = WindowSampler(view, config.batch_size, config.window, batches)
@@ -75,8 +76,11 @@ class PretrainTrainer:
         self.step = 0
 
     def batch(self) -> Windows:
-        """The next windows, shifted and corrupted: what the agent would see."""
-        return self.sampler.sample()
+        """The next windows, shifted and corrupted: what the agent would see, with the states if the loss wants them."""
+        window = self.sampler.sample()
+        if self.states is None:
+            return window
+        return StateWindows(**window, state=self.states[self.dataset.rows(window.key)])
 
     def update(self) -> dict[str, torch.Tensor]:
         """One gradient step; returns the objective's scalars."""
@@ -146,8 +150,9 @@ def require_batch(objective: Objective, device: torch.device, config: Any) -> No
 
 def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
     target = build_target(config, dataset.action_after(dataset.transition_rows).numpy())
-    state_dim = dataset.states().shape[1] if METHODS.named(config.method).reads_state else 0
-    objective = build_objective(config, dataset.action_dim, target, state_dim, (3 * FRAME_STACK, dataset.frame_size))
+    method = METHODS.named(config.method)
+    states = dataset.state_scale() if method.reads_state or method.regresses_state else None
+    objective = build_objective(config, dataset.action_dim, target, states, (3 * FRAME_STACK, dataset.frame_size))
     dataset.check_windows(config.window)
     return objective
 

@@ -101,7 +101,7 @@ LARGE = {
 
 
 OTHER_PARTS = {
-    "pretrain": (["--method", "homer"], ["--method", "driml"], ["--method", "one_step_inverse"]),
+    "pretrain": (["--method", "homer"], ["--method", "driml"], ["--method", "one_step_inverse"], ["--method", "state"]),
     "finetune": (["--algorithm", "iql"],),
     "navigation train": (["--exogenous", "photographs"], ["--method", "random"]),
 }

@@ -43,7 +43,9 @@ def cut_at(monkeypatch, number: int) -> None:
 
 
 def smoke_pretrain(data: Path, out: Path, **changes: object) -> pretrain.config.PretrainConfig:
-    return pretrain.config.PretrainConfig.of("smoke", data=data, out=out, corruption="patch+zero_frames", **changes)
+    return pretrain.config.PretrainConfig.of(
+        "smoke", **({"data": data, "out": out, "corruption": "patch+zero_frames"} | changes)
+    )
 
 
 def smoke_finetune(encoder: Path, data: Path, out: Path, **changes: object) -> finetune.config.FinetuneConfig:

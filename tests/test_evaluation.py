@@ -66,7 +66,8 @@ class ScriptedEnv:
         self.seen[-1].append(obs)
         state = np.full(24, len(self.done[-1]) / 10, np.float32)
         time_step = TimeStep(None, state, np.zeros(18), reward, 1.0, step_type)
-        return Observation(obs, torch.full_like(obs, 255), time_step)
+        key = torch.tensor([len(self.done[-1])])
+        return Observation(obs, torch.full_like(obs, 255), time_step, key)
 
 
 @pytest.fixture

@@ -22,6 +22,7 @@ from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import load_encoder
+from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.nn.policy import Policy, load_policy
 from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.reference import Reference
@@ -60,9 +61,10 @@ class Agent:
 
     def encoder_input(self, now: Observation, task: Task) -> torch.Tensor:
         """What the encoder reads: the corrupted stack, or the simulator state for the `state` reference."""
-        if not self.encoder.reads_state:
+        if not isinstance(self.encoder.frame, StateFrame):
             return now.obs
-        return torch.from_numpy(layout_of(task).visible_state(now.time_step.physics))[:, None, None]
+        state = torch.from_numpy(layout_of(task).visible_state(now.time_step.physics))
+        return self.encoder.frame.observe(state[None], now.key)[0]
 
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> np.ndarray:

@@ -110,3 +110,11 @@ class Windows(Batch):
     def real(self) -> Tensor:
         """(B, T) bool: rows that are no padding."""
         return torch.arange(self.has_action.shape[1], device=self.length.device) < self.length[:, None]
+
+
+@dataclass(frozen=True)
+class StateWindows(Windows):
+    """Windows that also tell the true state: for methods that are trained on it, and for no other."""
+
+    state: Tensor
+    """(B, T, P) float32: pose and velocity of every row, as `Dataset.states` has them."""

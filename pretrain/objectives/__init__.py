@@ -9,7 +9,8 @@ from baselines import ACRO, CURL, DRIML, HOMER, DRIMLOptions, HOMEROptions, OneS
 from pretrain.objectives.all_history import AllHistory
 from pretrain.objectives.forward_jump import ForwardJump
 from pretrain.objectives.masked_inverse import MaskedActionOptions, MaskedInverse, MaskedOptions
-from pretrain.objectives.untrained import Untrained
+from pretrain.objectives.supervised import Supervised, SupervisedOptions
+from pretrain.objectives.untrained import StateOptions, Untrained
 from vd4rl_pomdp.objective import ActionOptions, InverseOptions, Objective
 from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.registry import Registry
@@ -21,7 +22,8 @@ class Method:
 
     build: Callable[..., Objective]
     """From (encoder, target, options, seed): an `Encoder`, the `ActionTarget` if its options are `ActionOptions` (else
-    None), its options and the run's seed. An objective's class is one."""
+    None; the `StateScale` of the set if it regresses states), its options and the run's seed. An objective's class is
+    one."""
     history: str = "none"
     """Memory of its encoder, gru or none; --history gru gives one to those that have none."""
     use_actions: bool = False
@@ -34,6 +36,8 @@ class Method:
     """Fine-tuning algorithm that trains the encoder, too; empty for frozen encoders."""
     reads_state: bool = False
     """Whether it is given the simulator state in place of pixels."""
+    regresses_state: bool = False
+    """Whether its loss, and nothing else of it, is told the simulator states: its windows are `StateWindows`."""
     options: type[Options] = Options
     """Class of its options."""
     summary: str = ""
@@ -86,12 +90,31 @@ _OWN = {
     ),
     "homer": Method(HOMER, options=HOMEROptions, summary="tells real transitions from imposters"),
     "random": Method(Untrained, trained=False, summary="no training: the floor"),
+    "supervised": Method(
+        Supervised,
+        "gru",
+        regresses_state=True,
+        options=SupervisedOptions,
+        summary="mik's encoder, trained to regress the simulator's state: the ceiling of memory",
+    ),
+    "supervised+a": Method(
+        Supervised,
+        "gru",
+        use_actions=True,
+        regresses_state=True,
+        options=SupervisedOptions,
+        summary="supervised whose past holds actions, as mik+a's does",
+    ),
     "bc": Method(Untrained, trained=False, end_to_end="bc", summary="end to end by behaviour cloning, no frozen stage"),
     "drq_bc": Method(
         Untrained, trained=False, end_to_end="drqv2_bc", summary="end to end by DrQ-v2+BC, no frozen stage"
     ),
     "state": Method(
-        Untrained, trained=False, reads_state=True, summary="the simulator's state in place of an encoder: the ceiling"
+        Untrained,
+        trained=False,
+        reads_state=True,
+        options=StateOptions,
+        summary="the simulator's state in place of an encoder: the ceiling",
     ),
 }
 METHODS: Registry[Method] = Registry(

@@ -8,13 +8,28 @@ state    is no network: the simulator state itself, the ceiling on sets that sto
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from typing import ClassVar
+
 from torch import Tensor
 
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.objective import Objective
-from vd4rl_pomdp.options import Options
+from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.types import Windows
+
+
+@dataclass(frozen=True)
+class StateOptions(Options):
+    """Options of the simulator state in place of an encoder."""
+
+    pose_noise: float = 0.0
+    """Normal noise on poses: its mean absolute value in percent of each one's standard deviation, as probes count."""
+    velocity_noise: float = 0.0
+    """The same on velocities."""
+
+    limits: ClassVar[Limits] = {"pose_noise": (0, 1000), "velocity_noise": (0, 1000)}
 
 
 class Untrained(Objective):

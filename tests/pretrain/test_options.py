@@ -26,6 +26,8 @@ from vd4rl_pomdp.options import flat, option_names
         ({"method": "driml", "self_prediction": 1.0}, "the method driml"),
         ({"method": "bc", "k_embedding": False}, "the method bc"),
         ({"method": "state", "feature_dim": 3}, "what is chosen .method state"),
+        ({"method": "supervised", "max_k": 3}, "the method supervised"),
+        ({"method": "supervised+a", "pose_noise": 3.0}, "the method supervised.a"),
         ({"method": "mik+a", "codes": 7, "action_target": "mse"}, "what is chosen .*action target mse"),
         ({"patch_size": 8}, "the corruption none"),
         ({"corruption": "patch", "zeroed_frames": 1}, "the corruption patch"),
@@ -54,6 +56,15 @@ def test_the_states_frame_encoder_cannot_be_chosen():
         {"method": "curl", "window": 3},  # which is shorter than the default K of other methods
         {"method": "random", "steps": 7, "batch_size": 3, "corruption": "patch", "patch_size": 8},
         {"method": "bc", "feature_dim": 16},
+        {
+            "method": "supervised+a",
+            "head_dim": 16,
+            "m": 3,
+            "gru_layers": 2,
+            "history_window": 4,
+            "frame_encoder": "drq",
+        },
+        {"method": "state", "pose_noise": 25.0, "velocity_noise": 33.0},
         {"corruption": "patch+zero_frames", "corruption_mode": "emission", "patch_shared": True, "zeroed_frames": 1},
     ],
 )

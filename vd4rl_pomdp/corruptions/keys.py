@@ -15,6 +15,8 @@ from torch import Tensor
 _GOLDEN = 0x9E3779B97F4A7C15 - (1 << 64)
 _MIX_A = 0xBF58476D1CE4E5B9 - (1 << 64)
 _MIX_B = 0x94D049BB133111EB - (1 << 64)
+_DRAWS = 1 << 31
+"""Integers that a draw tells apart."""
 
 
 def hash_keys(key: Tensor) -> Tensor:
@@ -56,6 +58,11 @@ def draw_numbered(key: Tensor, high: int, number: Tensor) -> Tensor:
     key = key.view(*key.shape, *[1] * max(1, number.ndim - key.ndim))
     bits = _shift_right(hash_keys(key ^ hash_keys(number + 1)), 33)
     return (bits * high) >> 31
+
+
+def draw_normals(key: Tensor, count: int) -> Tensor:
+    """`count` standard normal numbers from each key: (...,) int64 -> (..., count) float64."""
+    return torch.special.ndtri((draw_integers(key, _DRAWS, count).double() + 0.5) / _DRAWS)
 
 
 class KeyStream:

@@ -15,8 +15,9 @@ from vd4rl_pomdp.buffers import FrameBuffers
 from vd4rl_pomdp.data.store import Store, open_store
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.state_scale import StateScale
 from vd4rl_pomdp.tasks import FRAME_STACK, SET_QUALITIES, TASKS
-from vd4rl_pomdp.types import StepType, Transitions, Windows, row_key
+from vd4rl_pomdp.types import StepType, Transitions, Windows, row_key, unpack_row_key
 
 Index = int | Sequence[int] | np.ndarray | Tensor
 Observations = Callable[[Tensor], Tensor]
@@ -124,6 +125,14 @@ class Dataset:
         assert self.task is not None
         return torch.from_numpy(layout_of(TASKS.named(self.task)).visible_state(self.physics)).to(self.t.device)
 
+    def state_scale(self) -> StateScale:
+        """Means and standard deviations of `states`, on the CPU; raises UserError if the set has no states."""
+        states = self.states().cpu()
+        assert self.physics is not None
+        assert self.task is not None
+        pose = layout_of(TASKS.named(self.task)).pose(self.physics[:1])
+        return StateScale.fit(states, pose.shape[1])
+
     def to(self, device: torch.device | str) -> Dataset:
         """Move frames and rows to a device, in place; returns the data set."""
         for name, value in vars(self).items():
@@ -134,6 +143,11 @@ class Dataset:
     def keys(self, rows: Tensor) -> Tensor:
         """`row_key` of every row in `rows`."""
         return row_key(self.episode[rows], self.t[rows])
+
+    def rows(self, key: Tensor) -> Tensor:
+        """The rows that (...,) int64 `row_key`s name: (...,) int64."""
+        episode, t = unpack_row_key(key)
+        return self.episode_start[episode] + t
 
     @property
     def transition_rows(self) -> Tensor:

@@ -31,6 +31,8 @@ class Observation:
     """(C, S, S) uint8: the stack before corruption, zeros in place of frames that are not drawn; (0,) without any."""
     time_step: TimeStep
     """Reward, step type and simulator state."""
+    key: Tensor
+    """(1,) int64: what the corruption was drawn from, the same for a row of an episode wherever it is played."""
 
 
 Drawn = Literal["all", "seen", "nothing"]
@@ -87,7 +89,8 @@ class CorruptedEnv:
         return derive_keys(self._seed, row_key(torch.full_like(t, self._episode), t))
 
     def _observation(self, time_step: TimeStep) -> Observation:
+        key = self._keys(torch.tensor([self._t]))
         if self._draws == "nothing":
-            return Observation(torch.empty(0), torch.empty(0), time_step)
+            return Observation(torch.empty(0), torch.empty(0), time_step, key)
         clean = torch.from_numpy(np.concatenate(self._frames))
-        return Observation(self._corruption(clean[None], self._keys(torch.tensor([self._t])))[0], clean, time_step)
+        return Observation(self._corruption(clean[None], key)[0], clean, time_step, key)

@@ -77,7 +77,7 @@ class Encoder(nn.Module):
         self.config = config
         if config.frame_encoder == STATE:
             config = self.config = replace(config, feature_dim=config.channels)
-            self.frame: FrameEncoder | StateFrame = StateFrame()
+            self.frame: FrameEncoder | StateFrame = StateFrame(config.channels, **config.frame_options)
         else:
             self.frame = _frame_encoder(config)
         inputs = config.feature_dim + (config.action_dim if config.use_actions else 0)

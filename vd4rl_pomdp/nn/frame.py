@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 from torch import Tensor, nn
 
+from vd4rl_pomdp.corruptions.keys import draw_normals
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.registry import Registry
@@ -178,14 +179,47 @@ FRAME_ENCODERS: Registry[FrameEncoderPart] = Registry(
 class StateFrame(nn.Module):
     """Hands the simulator state through, in place of pixels: (..., P, 1, 1) -> (..., P) float32."""
 
-    def __init__(self) -> None:
+    noise: Tensor
+
+    def __init__(self, width: int, noise: Sequence[float] = ()) -> None:
+        """See the class.
+
+        Args:
+            width: coordinates P of a state.
+            noise: standard deviation of the noise that is added to each coordinate; empty for none.
+
+        Raises:
+            ValueError: noise of another width.
+        """
         super().__init__()
+        if len(noise) not in (0, width):
+            raise ValueError(f"noise of {len(noise)} coordinates for states of {width}")
+        self.register_buffer("noise", torch.tensor(noise, dtype=torch.float64), persistent=False)
         self.nothing = nn.Parameter(torch.zeros(0))
         """Optimisers and files want one."""
 
     def forward(self, obs: Tensor) -> Tensor:
         """The state itself."""
         return obs.flatten(-3).float()
+
+    @property
+    def noisy(self) -> bool:
+        """Whether states are observed with noise."""
+        return len(self.noise) > 0
+
+    def observe(self, state: Tensor, key: Tensor) -> Tensor:
+        """Observations of states.
+
+        Args:
+            state: (N, P) float32.
+            key: (N,) int64, what the noise of each is drawn from; equal keys give equal noise.
+
+        Returns:
+            (N, P, 1, 1) float32.
+        """
+        if self.noisy:
+            state = (state + draw_normals(key, state.shape[1]) * self.noise).float()
+        return state[..., None, None]
 
 
 STATE = "state"

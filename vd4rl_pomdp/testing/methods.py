@@ -10,11 +10,12 @@ import torch
 
 from vd4rl_pomdp.nn.action_target import ACTION_TARGETS
 from vd4rl_pomdp.objective import InverseObjective, Objective
+from vd4rl_pomdp.state_scale import StateScale
 from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
-from vd4rl_pomdp.types import Windows
+from vd4rl_pomdp.types import StateWindows, Windows
 from vd4rl_pomdp.visibility import declared, dependence, response, wrong_pairs
 
-ROWS, ACTIONS, STATE = 6, 2, 5
+ROWS, ACTIONS, STATE, POSE = 6, 2, 5, 3
 _SMALL = {"max_k": 3, "feature_dim": 8, "hidden_dim": 7, "head_dim": 8}
 _SMALLEST = {"max_k": 4, "feature_dim": 6, "hidden_dim": 5, "head_dim": 32}
 """A proof takes a backward pass for every pair; of very few units in the head all may be rectified to zero."""
@@ -70,7 +71,8 @@ def _build(name: str, small: dict[str, int], observation: tuple[int, int], setti
     torch.manual_seed(0)
     config = PretrainConfig.of("smoke", method=name, **settings).with_known(**(small | settings))
     actions = torch.rand(50, ACTIONS) * 2 - 1
-    return build_objective(config, ACTIONS, build_target(config, actions.numpy()), STATE, observation)
+    states = StateScale(torch.zeros(STATE), torch.ones(STATE), POSE)
+    return build_objective(config, ACTIONS, build_target(config, actions.numpy()), states, observation)
 
 
 def batch(lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0, state: bool = False) -> Windows:
@@ -86,6 +88,17 @@ def batch(lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0, state: bool
     prev_action = torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], 1)
     key = torch.arange(len(lengths) * ROWS).view(len(lengths), ROWS)
     return Windows(obs, prev_action, action, has_action, length, key)
+
+
+def windows(name: str, lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0) -> Windows:
+    """The windows of `batch`, as the training of a method is given them: with random states if it regresses them."""
+    from pretrain.objectives import METHODS
+
+    plain = batch(lengths, seed)
+    if not METHODS.named(name).regresses_state:
+        return plain
+    g = torch.Generator().manual_seed(seed)
+    return StateWindows(**plain, state=torch.randn(len(lengths), ROWS, STATE, generator=g))
 
 
 def streaming_equals_batch(name: str, **settings: Any) -> None:
@@ -107,7 +120,7 @@ def streaming_equals_batch(name: str, **settings: Any) -> None:
 
 def a_loss_is_a_finite_scalar(name: str, **settings: Any) -> None:
     """A loss is a finite scalar, and what is logged are detached scalars, the loss among them."""
-    loss, logs = build(name, **settings).loss(batch(), 0.0)
+    loss, logs = build(name, **settings).loss(windows(name), 0.0)
     claim(loss.shape == (), f"its shape is {tuple(loss.shape)}")
     claim(torch.isfinite(loss), f"it is {loss.item()}")
     for key, value in logs.items():
@@ -120,7 +133,7 @@ def a_loss_is_a_finite_scalar(name: str, **settings: Any) -> None:
 def a_loss_moves_the_whole_encoder(name: str, **settings: Any) -> None:
     """A loss has a gradient to every parameter of the encoder."""
     objective = build(name, **settings)
-    objective.loss(batch(), 0.0)[0].backward()
+    objective.loss(windows(name), 0.0)[0].backward()
     still = [n for n, p in objective.encoder.named_parameters() if p.grad is None or not p.grad.any()]
     claim(still == [], f"none reaches {shown(still)}")
 
@@ -128,16 +141,16 @@ def a_loss_moves_the_whole_encoder(name: str, **settings: Any) -> None:
 def steps_lower_the_loss(name: str, **settings: Any) -> None:
     """Steps along the loss of one batch lower it: by 3% within 30 of them."""
     objective = build(name, **settings)
-    losses = _train(objective, torch.optim.Adam(objective.parameters(), lr=1e-3), [0] * 30)
+    losses = _train(name, objective, torch.optim.Adam(objective.parameters(), lr=1e-3), [0] * 30)
     first, last = sum(losses[:5]) / 5, sum(losses[-5:]) / 5
     claim(last < 0.97 * first, f"the mean of the first five is {first:.4f}, of the last five {last:.4f}")
 
 
-def _train(objective: Objective, optimiser: torch.optim.Optimizer, batches: Iterable[int]) -> list[float]:
+def _train(name: str, objective: Objective, optimiser: torch.optim.Optimizer, batches: Iterable[int]) -> list[float]:
     """Make a step on each batch; its losses."""
     losses = []
     for number in batches:
-        loss, _ = objective.loss(batch(seed=number), 0.0)
+        loss, _ = objective.loss(windows(name, seed=number), 0.0)
         optimiser.zero_grad()
         loss.backward()
         optimiser.step()
@@ -148,7 +161,7 @@ def _train(objective: Objective, optimiser: torch.optim.Optimizer, batches: Iter
 
 def the_state_holds_all_that_a_loss_depends_on(name: str, **settings: Any) -> None:
     """An objective that takes over another's state has the other's loss."""
-    objective, window = build(name, **settings), batch()
+    objective, window = build(name, **settings), windows(name)
     objective.loss(window, 0.0)
     other = _elsewhere(name, objective, **settings)
     here, there = objective.loss(window, 0.0)[0].item(), other.loss(window, 0.0)[0].item()
@@ -159,14 +172,14 @@ def a_training_that_goes_on_elsewhere_takes_the_same_steps(name: str, **settings
     """A training that goes on from its saved state takes the steps of one that was never cut, whatever torch draws."""
     here = build(name, **settings)
     optimiser = torch.optim.Adam(here.parameters(), lr=1e-3)
-    _train(here, optimiser, range(2))
+    _train(name, here, optimiser, range(2))
     there = _elsewhere(name, here, **settings)
     other = torch.optim.Adam(there.parameters(), lr=1e-3)
     other.load_state_dict(copy.deepcopy(optimiser.state_dict()))
     torch.manual_seed(1)
-    losses = _train(here, optimiser, range(2, 5))
+    losses = _train(name, here, optimiser, range(2, 5))
     torch.manual_seed(2)
-    again = _train(there, other, range(2, 5))
+    again = _train(name, there, other, range(2, 5))
     claim(losses == again, f"the losses are {losses} and {again}: draw from vd4rl_pomdp.nn.draws.Draws")
     state = there.state_dict()
     differing = [key for key, value in here.state_dict().items() if not torch.equal(value, state[key])]
@@ -185,9 +198,11 @@ def _elsewhere(name: str, objective: Objective, **settings: Any) -> Objective:
 
 def padding_changes_no_loss(name: str, **settings: Any) -> None:
     """What stands in the rows behind a window's end changes no loss."""
-    objective, window = build(name, **settings), batch((4, 4, 4))
+    objective, window = build(name, **settings), windows(name, (4, 4, 4))
     noisy = window.replace(obs=window.obs.clone(), action=window.action.clone(), prev_action=window.prev_action.clone())
     noisy.obs[:, 4:], noisy.action[:, 4:], noisy.prev_action[:, 5:] = 255, 7.0, 7.0
+    if isinstance(noisy, StateWindows):
+        noisy = noisy.replace(state=noisy.state.index_fill(1, torch.arange(4, ROWS), 7.0))
     again = copy.deepcopy(objective)
     claim_close(again.loss(noisy, 0.0)[0], objective.loss(window, 0.0)[0], "it does: leave out rows beyond `real`")
 

@@ -1,0 +1,199 @@
+"""States with noise of a probe's size: as large as asked, drawn like a corruption, none where none was asked for."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from finetune.features import ExactSampler, FrozenEncoder
+from pretrain.train import pretrain as run_pretrain
+from tests.helpers_data import write_fake_set
+from tests.helpers_stages import contents, smoke_pretrain
+from vd4rl_pomdp import evaluation
+from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
+from vd4rl_pomdp.corruptions.keys import draw_normals
+from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.envs.corrupted import CorruptedEnv
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.evaluation import EVALUATION_SEED, Agent, EpisodeJob, evaluate
+from vd4rl_pomdp.nn import load_encoder
+from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.options import NO_OPTIONS
+from vd4rl_pomdp.state_scale import StateScale
+from vd4rl_pomdp.tasks import TASKS
+from vd4rl_pomdp.types import row_key
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+WALKER = TASKS.named("walker_walk")
+ROWS, POSE, VELOCITY = 400, 25.0, 40.0
+
+
+@pytest.fixture
+def with_states(tmp_path, monkeypatch) -> Path:
+    """A set whose states are random numbers of many sizes; one pose never changes."""
+    path = write_fake_set(tmp_path / "own" / "walker_walk" / "expert", [ROWS] * 5, physics_dim=18)
+    physics = np.random.default_rng(0).normal(size=(5 * ROWS, 18)) * 10.0 ** np.arange(-2, 4).repeat(3) + 7
+    physics[:, 3] = 2
+    monkeypatch.setattr("vd4rl_pomdp.data.store.Store.physics", lambda self: physics)
+    return path
+
+
+def pretrained(data: Path, out: Path, **noise: float) -> Path:
+    return run_pretrain(smoke_pretrain(data, out, method="state", **noise)).path / "encoder"
+
+
+@pytest.fixture
+def noisy(with_states, tmp_path) -> Path:
+    return pretrained(with_states, tmp_path / "noisy", pose_noise=POSE, velocity_noise=VELOCITY)
+
+
+def frozen(encoder: Path, dataset: Dataset, mode: str = "resample") -> FrozenEncoder:
+    corruption = CorruptionConfig.of("patch", corruption_mode=mode)
+    return FrozenEncoder(load_encoder(encoder)[0], dataset, corruption, 4, "fp32", 0)
+
+
+def percent(error: torch.Tensor, dataset: Dataset) -> np.ndarray:
+    """Mean absolute errors (P,) in percent of each coordinate's standard deviation; a constant one's must be 0."""
+    states = dataset.states().double().numpy()
+    std, found = states.std(0), error.abs().double().numpy().mean(0)
+    assert found[states.std(0) < 1e-6].tolist() == [0.0]
+    return 100 * found[std > 1e-6] / std[std > 1e-6]
+
+
+def test_the_error_is_as_large_as_was_asked_in_a_probes_unit(noisy, with_states):
+    dataset = open_dataset(with_states)
+    made = frozen(noisy, dataset)
+    view = made.view(0)
+    z = torch.cat([made.episode(i, view) for i in range(dataset.num_episodes)])
+    found = percent(z - dataset.states(), dataset)
+    np.testing.assert_allclose(found[:8], POSE, rtol=0.08)
+    np.testing.assert_allclose(found[8:], VELOCITY, rtol=0.08)
+    assert found[:8].mean() == pytest.approx(POSE, rel=0.03)
+    assert found[8:].mean() == pytest.approx(VELOCITY, rel=0.03)
+
+    sampler = ExactSampler(made, NO_OPTIONS, 500, 1, 0.99, torch.Generator().manual_seed(0))
+    rows = sampler._starts[torch.randint(len(sampler._starts), (500,), generator=torch.Generator().manual_seed(0))]
+    batch = sampler.sample()
+    for z, at in ((batch.z, rows), (batch.next_z, rows + 1)):
+        assert percent(z - dataset.states()[at], dataset)[8:].mean() == pytest.approx(VELOCITY, rel=0.05)
+    position, again = sampler.state_dict(), [made.rows(rows, rows, sampler.view) for _ in range(2)]
+    assert not (again[0] == again[1])[:, :2].any(), "drawn anew whenever a row enters a batch"
+    sampler.load_state_dict(position)
+    following = sampler.sample()
+    sampler.load_state_dict(position)
+    assert torch.equal(sampler.sample().z, following.z), "a training that goes on has the noise of one never cut"
+
+
+@pytest.mark.parametrize("mode", ["resample", "emission"])
+def test_noise_is_drawn_for_every_row_and_view_unless_a_row_always_looks_the_same(noisy, with_states, mode):
+    dataset = open_dataset(with_states)
+    made = frozen(noisy, dataset, mode)
+    first, again, second = (made.episode(0, made.view(number)) for number in (0, 0, 1))
+    assert torch.equal(first, again), "a view repeats"
+    assert torch.equal(first, second) == (mode == "emission")
+    error = (first - dataset.states()[:ROWS])[:, [0, 2, 10, 17]]
+    table = np.corrcoef(torch.cat([error[:-1], error[1:]], 1).T.double().numpy())
+    assert np.abs(table - np.eye(8)).max() < 0.2, "coordinates and neighbouring rows have noise of their own"
+
+
+def test_normal_draws_are_normal_and_depend_on_their_key_alone():
+    key = derive_keys(3, torch.arange(40_000))
+    draws = draw_normals(key, 3)
+    assert (draws.shape, draws.dtype) == ((40_000, 3), torch.float64)
+    torch.testing.assert_close(draws.mean(0), torch.zeros(3, dtype=torch.float64), atol=0.02, rtol=0)
+    below = [(draws < z).double().mean().item() for z in (-2.0, -1.0, 0.0, 1.0, 2.0)]
+    assert below == pytest.approx([0.0228, 0.1587, 0.5, 0.8413, 0.9772], abs=0.004)
+    assert torch.equal(draw_normals(key[7:8], 3), draws[7:8])
+    assert draw_normals(key.view(4, -1), 2).shape == (4, 10_000, 2)
+
+
+def test_a_stream_of_rows_is_seen_as_a_batch_of_them_and_keyed_by_seed_episode_and_row(noisy):
+    agent = Agent(load_encoder(noisy)[0], Policy(18, 6, 8))
+    env = CorruptedEnv(WALKER, CorruptionConfig.of("patch"), length=4)
+    now, seen, states = env.reset(3, EVALUATION_SEED, 2), [], []
+    while True:
+        seen.append(agent.encoder_input(now, WALKER)[:, 0, 0])
+        states.append(torch.from_numpy(WALKER.layout.visible_state(now.time_step.physics)))
+        if now.time_step.last:
+            break
+        now = env.step(np.zeros(6, np.float32))
+    key = derive_keys(EVALUATION_SEED, row_key(torch.full((5,), 2), torch.arange(5)))
+    batch = agent.encoder.frame.observe(torch.stack(states), key)[..., 0, 0]
+    assert torch.equal(torch.stack(seen), batch)
+    assert (batch != torch.stack(states)).sum(1).tolist() == [17] * 5
+
+
+def test_evaluation_repeats_whatever_the_number_of_workers(noisy, with_states, tmp_path, monkeypatch):
+    monkeypatch.setattr(evaluation, "_AGENTS", {})
+    torch.manual_seed(0)
+    policy = Policy(18, 6, 8)
+    with torch.no_grad():
+        policy.net[-1].weight.mul_(20)
+    policy.save(tmp_path / "policy")
+    plain, corruption = pretrained(with_states, tmp_path / "plain"), CorruptionConfig.of("patch")
+
+    def totals(encoder: Path, workers: int) -> list[float]:
+        places = encoder, tmp_path / "policy"
+        jobs = [EpisodeJob(*places, 0, WALKER, corruption, e, film=False, length=6) for e in (0, 1)]
+        return [episode.total for episode in evaluate(jobs, workers)]
+
+    alone = totals(noisy, 1)
+    assert totals(noisy, 2) == alone
+    assert not set(totals(plain, 1)) & set(alone), "the noise changes what is done"
+
+
+def test_without_noise_all_is_as_it_was(with_states, tmp_path):
+    """No word of noise in the folder, which an earlier version would have written like that, and no key is taken."""
+    encoder = pretrained(with_states, tmp_path / "plain")
+    zero = pretrained(with_states, tmp_path / "zero", pose_noise=0.0, velocity_noise=0.0)
+    assert contents(encoder) == contents(zero)
+    config = json.loads((encoder / "config.json").read_text())
+    assert config["encoder"]["frame_options"] == {}
+    dataset = open_dataset(with_states)
+    made = frozen(encoder, dataset)
+    view = made.view(0)
+    assert torch.equal(made.episode(1, view), dataset.states()[ROWS : 2 * ROWS])
+    assert view.corruption.stream.position == 0
+
+
+def test_either_kind_of_noise_leaves_the_other_coordinates_alone(with_states, tmp_path):
+    dataset = open_dataset(with_states)
+    for name, touched in (("pose_noise", slice(0, 9)), ("velocity_noise", slice(9, 18))):
+        made = frozen(pretrained(with_states, tmp_path / name, **{name: 10.0}), dataset)
+        changed = (made.episode(0, made.view(0)) != dataset.states()[:ROWS]).any(0)
+        expected = torch.zeros(18, dtype=torch.bool)
+        expected[touched] = True
+        expected[1] = False  # the pose that never changes: the simulator's column 3, after place and angle
+        assert torch.equal(changed, expected)
+
+
+def test_a_scale_tells_constant_coordinates():
+    scale = StateScale.fit(torch.tensor([[1.0, 5.0, -2.0], [3.0, 5.0, 2.0]]), pose=1)
+    assert (scale.mean.tolist(), scale.std.tolist()) == ([2.0, 5.0, 0.0], [1.0, 0.0, 2.0])
+    assert scale.noise(100, 50).tolist() == pytest.approx([(np.pi / 2) ** 0.5, 0, (np.pi / 2) ** 0.5])
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"pose_noise": -1.0}, "--pose-noise is -1.0; it must be at least 0"),
+        ({"velocity_noise": float("nan")}, "--velocity-noise is nan"),
+        ({"method": "mik+a", "pose_noise": 5.0}, "--pose-noise is not read by the method mik"),
+    ],
+)
+def test_noise_that_cannot_be_is_refused(with_states, tmp_path, settings, message):
+    with pytest.raises(UserError, match=message):
+        run_pretrain(smoke_pretrain(with_states, tmp_path / "run", **({"method": "state"} | settings)))
+    assert not (tmp_path / "run").exists()
+
+
+@pytest.mark.parametrize("noise", [[1.0], ["loud"] * 18, 3])
+def test_noise_of_nonsense_in_an_encoder_folder_is_one_line(noisy, noise):
+    config = json.loads((noisy / "config.json").read_text())
+    assert len(config["encoder"]["frame_options"]["noise"]) == 18
+    config["encoder"]["frame_options"]["noise"] = noise
+    (noisy / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match="names no encoder"):
+        load_encoder(noisy)

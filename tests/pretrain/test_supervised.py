@@ -1,0 +1,160 @@
+"""The supervised references: the loss alone is told the state of its own row, and what it learns is in the encoder."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from finetune.features import FrozenEncoder
+from pretrain.objectives import METHODS
+from pretrain.train import PretrainTrainer, _build
+from pretrain.train import pretrain as run_pretrain
+from tests.helpers_data import fake_rows, write_fake_set
+from tests.helpers_stages import smoke_pretrain
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.nn import load_encoder
+from vd4rl_pomdp.probes import probe_state
+from vd4rl_pomdp.runs.metrics import read_metrics
+from vd4rl_pomdp.tasks import TASKS
+from vd4rl_pomdp.testing import check_method
+from vd4rl_pomdp.testing.methods import ROWS, build, windows
+from vd4rl_pomdp.types import StateWindows, Windows
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+LAYOUT = TASKS.named("walker_walk").layout
+METHOD_NAMES = ["supervised", "supervised+a"]
+
+
+@pytest.fixture
+def with_states(tmp_path) -> Dataset:
+    """A set whose states are random numbers, but for a pose and a velocity that never change."""
+    dataset = open_dataset(write_fake_set(tmp_path / "own" / "walker_walk" / "expert", [20, 20], physics_dim=18))
+    dataset.physics = np.random.default_rng(0).normal(size=(40, 18)) * np.arange(1, 19) + 5
+    dataset.physics[:, [3, 12]] = 2
+    return dataset
+
+
+def trainer(dataset: Dataset, tmp_path: Path, method: str, **changes: object) -> PretrainTrainer:
+    config = smoke_pretrain(dataset.path, tmp_path / "run", method=method, **changes)
+    torch.manual_seed(0)
+    return PretrainTrainer(_build(dataset, config), dataset, config)
+
+
+@pytest.mark.parametrize("name", METHODS)
+def test_windows_hold_the_states_of_their_own_rows_and_only_for_a_method_that_regresses_them(
+    with_states, tmp_path, name
+):
+    window = trainer(with_states, tmp_path, name).batch()
+    if name not in METHOD_NAMES:
+        assert type(window) is Windows
+        return
+    episode, t = window.key >> 20, window.key & 0xFFFFF
+    state = LAYOUT.visible_state(with_states.physics[(20 * episode + t).numpy()])
+    np.testing.assert_array_equal(window.state, state)
+
+
+@pytest.mark.parametrize("name", METHOD_NAMES)
+def test_the_loss_depends_on_the_states_and_the_representation_does_not(name):
+    objective, window = build(name), windows(name)
+    assert isinstance(window, StateWindows)
+    told = window.replace(state=window.state.clone().requires_grad_())
+    z = objective.encoder.encode(told)
+    assert torch.autograd.grad(z.sum(), told.state, allow_unused=True, retain_graph=True) == (None,)
+    assert torch.equal(z, objective.encoder.encode(window.replace(state=torch.full_like(window.state, 9.0))))
+    (felt,) = torch.autograd.grad(objective.loss(told, 0.0)[0], told.state)
+    assert torch.equal(felt.abs().amax(-1) > 0, window.real), "every real row has a state, and padding has none"
+
+
+def test_the_promises_hold_for_other_frame_encoders_and_memories():
+    check_method("supervised+a", frame_encoder="small", m=2, gru_layers=2)
+
+
+def test_the_prediction_of_row_t_is_of_the_state_of_row_t():
+    """A change of the picture in row t changes how the states of rows t.. are predicted, and of none before."""
+    objective, window = build("supervised"), windows("supervised", (ROWS,))
+    dark = window.replace(obs=window.obs.clone())
+    dark.obs[:, 3] = 0
+
+    def errors(window: Windows) -> torch.Tensor:
+        told = window.replace(state=window.state.clone().requires_grad_())
+        return torch.autograd.grad(objective.loss(told, 0.0)[0], told.state)[0]
+
+    assert (errors(window) != errors(dark)).any(-1).tolist() == [[False] * 3 + [True] * 3]
+
+
+def test_a_head_that_predicts_the_mean_has_a_loss_of_one_whatever_the_units(with_states, tmp_path):
+    made = trainer(with_states, tmp_path, "supervised", window=20)
+    torch.nn.init.zeros_(made.objective.head[-1].weight)
+    torch.nn.init.zeros_(made.objective.head[-1].bias)
+    whole = made.sampler.view.windows([0, 1], 20)
+    states = with_states.states().view(2, 20, -1)
+    logs = made.objective.loss(StateWindows(**whole, state=states), 0.0)[1]
+    assert made.objective.head[-1].out_features == 16, "18 coordinates, two of which are constant"
+    assert {name: value.item() for name, value in logs.items()} == pytest.approx(
+        {"loss": 1.0, "pose_loss": 1.0, "velocity_loss": 1.0}, rel=1e-4
+    )
+    moved = states.clone()
+    moved[..., :9] += 3 * made.dataset.state_scale().std[:9]
+    logs = made.objective.loss(StateWindows(**whole, state=moved), 0.0)[1]
+    assert logs["pose_loss"].item() == pytest.approx(10, rel=1e-3)
+    assert logs["velocity_loss"].item() == pytest.approx(1, rel=1e-3)
+    assert logs["loss"].item() == pytest.approx((8 * 10 + 8) / 16, rel=1e-3)
+
+
+def test_a_set_without_states_or_with_one_only_is_refused_in_a_line(data, with_states, tmp_path, capsys):
+    words = ["--preset", "smoke", "--data", str(data), "--out", str(tmp_path / "run")]
+    with pytest.raises(SystemExit) as caught:
+        main(["pretrain", "--method", "supervised+a", *words])
+    assert caught.value.code == 2
+    (line,) = capsys.readouterr().err.splitlines()
+    assert "stores no simulator states" in line
+    assert not (tmp_path / "run").exists()
+    with_states.physics[:] = 3
+    with pytest.raises(UserError, match="states in this set are all the same"):
+        trainer(with_states, tmp_path, "supervised")
+
+
+SIZE = 16
+
+
+def bright_square(folder: Path, episodes: int = 25, rows: int = 30) -> Path:
+    """A square that drifts over small pictures: two of the simulator's poses tell where, two velocities how fast."""
+    g = np.random.default_rng(0)
+    rows_of = fake_rows([rows] * episodes, physics_dim=18)
+    speed = g.uniform(-1.5, 1.5, (episodes, 1, 2))
+    place = g.uniform(4, SIZE - 4, (episodes, 1, 2)) + speed * np.arange(rows)[:, None]
+    low, span = 4, SIZE - 8
+    folded = np.abs((place - low) % (2 * span) - span)  # bounces between the walls
+    velocity = speed * -np.sign((place - low) % (2 * span) - span)
+    rows_of["physics"][:] = 0
+    rows_of["physics"][:, [0, 3]] = folded.reshape(-1, 2)
+    rows_of["physics"][:, [9, 10]] = velocity.reshape(-1, 2)
+    grid = np.arange(SIZE)
+    near = np.exp(-((grid - low - folded.reshape(-1, 2)[..., None]) ** 2) / 8)
+    picture = 40 + 200 * near[:, 0, :, None] * near[:, 1, None, :]
+    rows_of["observation"] = np.repeat(picture[:, None], 3, 1).astype(np.uint8)
+    folder.mkdir(parents=True)
+    write_shard(folder / "0_square.hdf5", rows_of, {})
+    return folder
+
+
+def test_a_trained_reference_knows_pose_and_velocity_that_an_untrained_one_does_not(tmp_path):
+    data, found = bright_square(tmp_path / "walker_walk" / "expert"), {}
+    dataset, hidden = open_dataset(data), {"corruption": "zero_frames", "zeroed_frames": 1}
+    settings = hidden | {"frame_encoder": "flat", "hidden_dim": 64, "shift": 0, "window": 16, "batch_size": 8}
+    for method, own in (("supervised", {"steps": 200, "learning_rate": 5e-3}), ("random", {"history": "gru"})):
+        run = run_pretrain(smoke_pretrain(data, tmp_path / method, method=method, **settings, **own))
+        frozen = FrozenEncoder(
+            load_encoder(run.path / "encoder")[0], dataset, CorruptionConfig.of(**hidden), 0, "fp32", 0
+        )
+        z = torch.cat([frozen.episode(i, frozen.view(0)) for i in range(dataset.num_episodes)])
+        found[method] = probe_state(z.numpy(), dataset.physics, dataset.episode.numpy(), LAYOUT)
+    losses = [row["loss"] for row in read_metrics(tmp_path / "supervised" / "metrics.jsonl")]
+    assert losses[-1] < 0.3 * losses[0]
+    for probe in ("probe_pose", "probe_velocity"):
+        assert found["supervised"][probe] < 0.6 * found["random"][probe]
