@@ -46,18 +46,40 @@ def build_objective(
         state_dim: width of the simulator state, for methods that read it.
         observation: channels and size of an observation, for methods that read pixels.
     """
-    method = METHODS.named(config.method)
-    channels, size = (state_dim, 1) if method.reads_state else observation
+    if METHODS.named(config.method).reads_state:
+        return build_on_states(config, action_dim, target, state_dim)
+    channels, size = observation
     frame = asdict(config.frame)
-    encoder = EncoderConfig(
+    return _build(
+        config,
+        target,
         action_dim=action_dim,
-        frame_encoder=STATE if method.reads_state else config.frame_encoder,
-        feature_dim=frame.pop("feature_dim", channels),
+        frame_encoder=config.frame_encoder,
+        feature_dim=frame.pop("feature_dim"),
         frame_options=frame,
         channels=channels,
         size=size,
-        **_memory(config, method),
     )
+
+
+def build_on_states(config: TrainingConfig, action_dim: int, target: ActionTarget | None, state_dim: int) -> Objective:
+    """Build the objective of a config on states in place of pixels, whatever its method reads.
+
+    Args:
+        config: the run's settings; those of the frame encoder are not read.
+        action_dim: width of actions.
+        target: from `build_target`.
+        state_dim: width P of the states; observations are (..., P, 1, 1).
+    """
+    return _build(
+        config, target, action_dim=action_dim, frame_encoder=STATE, feature_dim=state_dim, channels=state_dim, size=1
+    )
+
+
+def _build(config: TrainingConfig, target: ActionTarget | None, **shape: Any) -> Objective:
+    """The objective of a config on an encoder of a given shape, with the memory that the config says."""
+    method = METHODS.named(config.method)
+    encoder = EncoderConfig(**shape, **_memory(config, method))
     return method.build(Encoder(encoder), target, config.options, config.seed)
 
 

@@ -77,6 +77,17 @@ def flat_state(observation: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate([np.ravel(value) for value in observation.values()]).astype(np.float32)
 
 
+def observed_states(task: DMCTask, physics: np.ndarray) -> np.ndarray:
+    """What an actor reads in simulator states: (N, P) float64 -> (N, D) float32, as `TimeStep.state`."""
+    env = DMCEnv(task, size=None).simulator
+    env.reset()
+    found = []
+    for state in physics:
+        start_from(env, state)
+        found.append(flat_state(env.task.get_observation(env.physics)))
+    return np.stack(found)
+
+
 def start_from(env: Any, state: np.ndarray) -> None:
     """Put the simulator into a state with nothing left of what was before, the solver's warm start included."""
     with env.physics.reset_context():
