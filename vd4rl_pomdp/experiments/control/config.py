@@ -97,8 +97,10 @@ class ControlRun:
 LABELS = tuple(f.name for f in fields(ControlRun))
 SETTING = LABELS[:-2]
 """What the methods of one comparison share."""
-MEASURED = ("return", "return_min", "return_max", "data_return", "good_share", "error_on_data", "error_in_loop")
-MEASURED += ("probe_pose", "probe_velocity", "action_loss", "seconds")
+MEASURED = (
+    *("return", "return_min", "return_max", "data_return", "good_share", "error_on_data", "error_in_loop"),
+    *("probe_pose", "probe_velocity", "action_loss", "seconds"),
+)
 RUN_COLUMNS = (*LABELS, *MEASURED, "git_commit")
 WORDS = ("task", "method", "git_commit")
 """Columns that hold text; all others hold numbers."""

@@ -30,8 +30,8 @@ EPISODE_COLUMNS = (*LABELS, "episode", "episode_seed", "return", "length", "acti
 
 def measured(run: ControlRun) -> tuple[Row, list[Row]]:
     """Train a run and measure it: its row of runs.csv, and those of episodes.csv."""
-    started = time.perf_counter()
     played = played_set(run.task, run.action_noise, run.episodes, run.decisions)
+    started = time.perf_counter()
     encoder, logs = pretrained(run, played)
     policy, ends = trained_policy(run, played, encoder)
     agent = HiddenAgent(Agent(encoder, policy), played, run.hidden_share)
