@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from itertools import count
 from typing import Any
 
 import numpy as np
@@ -84,7 +85,7 @@ class HiddenAgent:
     def play(self, env: PixelEnv, number: int) -> Row:
         """Evaluation episode `number`, its rows as in episodes.csv."""
         self._agent.reset()
-        t = iter(range(1 << 20))
+        t = count()
 
         def act(now: TimeStep) -> np.ndarray:
             return self._agent.act(self.observe(now, number, next(t)))
