@@ -4,9 +4,10 @@ import torch
 
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.evaluation import EVALUATION_SEED, Agent
+from vd4rl_pomdp.experiments.control.config import ControlRun
 from vd4rl_pomdp.experiments.control.data import played_set
 from vd4rl_pomdp.experiments.control.measures import HiddenAgent, _error_on_data, action_error, play_episode
-from vd4rl_pomdp.experiments.control.training import Ends, both_ends
+from vd4rl_pomdp.experiments.control.training import pretrained, trained_policy
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.policy import Policy
 
@@ -35,14 +36,8 @@ def test_a_known_distance_from_the_expert_is_measured_at_the_visited_states(play
     assert action_error(np.array([[1.0, 0.0], [0.0, 0.0]]), np.zeros((2, 2))) == 0.25
 
 
-def test_the_error_on_the_data_is_that_of_the_first_view(played):
-    class Same(torch.nn.Module):
-        def forward(self, z):
-            return z
-
-    wanted = played.expert_actions
-    ends = Ends(torch.stack([wanted + 0.5, wanted]), torch.zeros(0))
-    assert _error_on_data(Same(), ends, played) == pytest.approx(0.25, rel=1e-3)
+def test_the_error_on_the_data_is_taken_at_its_rows(played):
+    assert _error_on_data(lambda z: z, played.expert_actions + 0.5, played) == pytest.approx(0.25, rel=1e-3)
 
 
 def recurrent(played) -> Encoder:
@@ -52,22 +47,21 @@ def recurrent(played) -> Encoder:
     return Encoder(EncoderConfig(played.dataset.action_dim, history="gru", use_actions=True, **shape)).eval()
 
 
-@torch.no_grad()
-def test_both_ends_are_what_a_stream_over_their_episode_gives(played):
-    dataset, encoder = played.dataset, recurrent(played)
-    features = played.visible(dataset.physics)
-    next_rows = dataset.n_step_returns(dataset.transition_rows, 3, 0.99)[2]
-    ends = both_ends(encoder, features, dataset, next_rows)
-    streamed = []
-    for start, end in zip(dataset.episode_start, dataset.episode_end, strict=True):
-        state, action = encoder.initial_state(1), torch.zeros(1, dataset.action_dim)
-        for row in range(start, end):
-            z, state = encoder.step(features[row, None, :, None, None], action, state)
-            streamed.append(z[0])
-            action = dataset.action[row + 1 : row + 2]
-    expected = torch.stack(streamed)
-    torch.testing.assert_close(ends.z, expected[dataset.transition_rows], atol=1e-5, rtol=1e-4)
-    torch.testing.assert_close(ends.next_z, expected[next_rows], atol=1e-5, rtol=1e-4)
+@pytest.mark.parametrize(("share", "window"), [(0.0, 0), (0.5, 0), (0.0, 4)])
+def test_a_policy_is_trained_on_the_histories_that_it_is_told(played, share, window):
+    run = ControlRun("walker_walk", 0.5, 0.0, 2, DECISIONS, 2, 2, 1, "mik+a", "state", share, window, 0)
+    encoder, _ = pretrained(run, played)
+    _, features = trained_policy(run, played, encoder)
+    rows = played.dataset.num_rows
+    assert encoder.config.history_window == window
+    assert features.shape == (4, rows + 2 * round(share * 2 * DECISIONS), encoder.dim)
+    states = played.visible(played.dataset.physics)
+    agent, streamed = encoder.initial_state(1), []
+    for row in range(DECISIONS + 1):
+        action = played.dataset.action[row : row + 1] * (row > 0)
+        z, agent = encoder.step(states[row, None, :, None, None], action, agent)
+        streamed.append(z[0])
+    torch.testing.assert_close(features[0, : DECISIONS + 1].float(), torch.stack(streamed), atol=2e-3, rtol=1e-2)
 
 
 def test_an_agent_sees_the_standardised_state_and_hides_by_episode_and_step_alone(played, env):

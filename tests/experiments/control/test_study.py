@@ -72,7 +72,7 @@ def test_a_cut_study_goes_on_and_ends_in_the_same_rows(whole, tmp_path, monkeypa
     assert [row["method"] for row in tables(out)[0]] == ["none"]
     again = []
     monkeypatch.setattr(module, "measured", lambda run: (again.append(run.method), real(run))[1])
-    assert [labels[-2] for labels in ran(config(out))] == ["none", "mik+a"]
+    assert [labels[LABELS.index("method")] for labels in ran(config(out))] == ["none", "mik+a"]
     assert again == ["mik+a"]
     for ended, expected in zip(tables(out), tables(whole), strict=True):
         assert ended == [row for row in expected if row["method"] in ("none", "mik+a")]
@@ -114,6 +114,8 @@ def test_another_commands_folder_is_refused_and_stays_as_it_is(tmp_path):
         ({"seeds": [0, -1]}, "--seeds is -1"),
         ({"action_noises": [3.0]}, "--action-noises is 3.0"),
         ({"hidden_shares": [1.5]}, "--hidden-shares is 1.5"),
+        ({"random_histories": [2.0]}, "--random-histories is 2.0"),
+        ({"history_windows": [-1]}, "--history-windows is -1"),
         ({"episodes": 1}, "--episodes is 1; it must be at least 2"),
         ({"episodes": 10**6, "decisions": None}, "--episodes 1000000 takes"),
         ({"pretrain_steps": 0}, "--pretrain-steps is 0"),
@@ -130,6 +132,8 @@ def test_a_slip_is_a_sentence_before_anything_is_played(changes, message, tmp_pa
 
 
 def test_runs_go_seed_by_seed_and_none_is_run_twice(tmp_path):
+    windows = list(config(tmp_path, history_windows=[0, 4]).runs())
+    assert [(run.method, run.history_window) for run in windows] == [("none", 0), ("mik+a", 0), ("mik+a", 4)]
     runs = list(config(tmp_path, seeds=[0, 1, 0], hidden_shares=[0.5, 0.0]).runs())
     assert [(run.hidden_share, run.seed, run.method) for run in runs] == [
         (share, seed, method) for share in (0.5, 0.0) for seed in (0, 1) for method in ("none", "mik+a")
@@ -137,4 +141,5 @@ def test_runs_go_seed_by_seed_and_none_is_run_twice(tmp_path):
     assert runs[0].labels == {
         **{"task": "walker_walk", "action_noise": "0.5", "hidden_share": "0.5", "episodes": "2", "decisions": "32"},
         **{"pretrain_steps": "2", "updates": "2", "eval_episodes": "2", "method": "none", "seed": "0"},
+        **{"readout": "state", "random_histories": "0", "history_window": "0"},
     }

@@ -4,12 +4,12 @@ from vd4rl_pomdp.experiments.control.config import MEASURED, ControlRun
 from vd4rl_pomdp.experiments.control.table import difference, line_of, summary
 
 
-def rows(method: str, *returns: float, share: float = 0.5, data: float = 700.0) -> list[dict]:
+def rows(method: str, *returns: float, share: float = 0.5, read=("state", 0.0, 0)) -> list[dict]:
     """Rows of runs.csv, a seed each."""
     made = []
     for seed, value in enumerate(returns):
-        run = ControlRun("walker_walk", 0.5, share, 50, 500, 3000, 10_000, 20, method, seed)
-        numbers = dict.fromkeys(MEASURED, 0.1) | {"data_return": data, "return": value}
+        run = ControlRun("walker_walk", 0.5, share, 50, 500, 3000, 10_000, 20, method, *read, seed)
+        numbers = dict.fromkeys(MEASURED, 0.1) | {"data_return": 700.0, "return": value}
         made.append(run.labels | numbers | {"return_min": value - 10, "return_max": value + 10, "git_commit": ""})
     return made
 
@@ -61,6 +61,16 @@ def test_a_setting_that_misses_a_gate_is_not_ranked(groups):
     assert lines[-1] == "does not discriminate"
     assert any(line.startswith("gate, ") and line.endswith("missed") for line in lines)
     assert not any("pay" in line for line in lines)
+
+
+def test_what_is_read_of_a_memory_is_part_of_a_methods_name():
+    last = ("state", 0.0, 4)
+    groups = [rows("none", 110.0, 90.0), rows("mik", 260.0, 270.0), rows("mik", 400.0, 390.0, read=last)]
+    lines = told(*groups, rows("mik+a", 500.0, 480.0, read=last), rows("mik+a", 1.0, 2.0, read=("frame+state", 0.5, 0)))
+    assert "memory pays: mik, last 4 rows minus none is +295 ± 5 (n = 2)" in lines
+    assert "past actions pay: mik+a, last 4 rows minus mik, last 4 rows is +95 ± 5 (n = 2)" in lines
+    assert any(line.startswith("mik+a, readout frame+state, 0.5 random histories  2 ") for line in lines)
+    assert sum("minus" in line for line in lines) == 4, "nothing to compare the last one with"
 
 
 def test_a_ceiling_that_was_not_measured_is_said():

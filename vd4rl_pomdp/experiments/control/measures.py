@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from itertools import count
-from typing import Any
 
 import numpy as np
 import torch
+from torch import Tensor
 
 from vd4rl_pomdp.corruptions.keys import derive_keys
 from vd4rl_pomdp.envs.make import layout_of, make_env
@@ -16,7 +16,7 @@ from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep
 from vd4rl_pomdp.evaluation import EVALUATION_SEED, Agent
 from vd4rl_pomdp.experiments.control.config import LABELS, ControlRun
 from vd4rl_pomdp.experiments.control.data import PlayedSet, hide, played_set
-from vd4rl_pomdp.experiments.control.training import Ends, pretrained, trained_policy
+from vd4rl_pomdp.experiments.control.training import pretrained, trained_policy
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.policies.actor import Actor
 from vd4rl_pomdp.probes import probe_state
@@ -34,7 +34,8 @@ def measured(run: ControlRun) -> tuple[Row, list[Row]]:
     played = played_set(run.task, run.action_noise, run.episodes, run.decisions)
     started = time.perf_counter()
     encoder, logs = pretrained(run, played)
-    policy, ends = trained_policy(run, played, encoder)
+    policy, features = trained_policy(run, played, encoder)
+    seen = features[0, played.dataset.transition_rows].float()
     agent = HiddenAgent(Agent(encoder, policy), played, run.hidden_share)
     env = make_env(played.task, size=None, length=run.decisions)
     episodes: list[Row] = [run.labels | agent.play(env, number) for number in range(run.eval_episodes)]
@@ -45,9 +46,9 @@ def measured(run: ControlRun) -> tuple[Row, list[Row]]:
         "return_max": returns.max(),
         "data_return": data,
         "good_share": (returns > GOOD * data).mean(),
-        "error_on_data": _error_on_data(policy, ends, played),
+        "error_on_data": _error_on_data(policy, seen, played),
         "error_in_loop": sum(e["action_error"] * e["length"] for e in episodes) / sum(e["length"] for e in episodes),
-        **_probes(ends, played),
+        **_probes(seen, played),
         "action_loss": logs.get("action_loss", 0.0),
         "seconds": time.perf_counter() - started,
     }
@@ -92,21 +93,21 @@ class HiddenAgent:
 
         return {"episode": number} | play_episode(act, env, self._played.expert, EVALUATION_SEED + number)
 
-    def observe(self, now: TimeStep, episode: int, t: int) -> torch.Tensor:
+    def observe(self, now: TimeStep, episode: int, t: int) -> Tensor:
         """(P, 1, 1) float32: what is seen of a state in row t of an episode."""
         key = derive_keys(EVALUATION_SEED, row_key(torch.tensor([episode]), torch.tensor([t])))
         return hide(self._played.visible(now.physics)[None], key, self._share)[0, :, None, None]
 
 
-def _error_on_data(policy: Policy, ends: Ends, played: PlayedSet) -> float:
-    """Action error on the path of the data, as the first view shows it."""
-    with torch.no_grad():
-        actions = torch.cat([policy(z.float()) for z in ends.z[0].split(4096)])
+@torch.no_grad()
+def _error_on_data(policy: Policy, features: Tensor, played: PlayedSet) -> float:
+    """Action error on the path of the data, of (M, D) float32 representations of the rows that have a successor."""
+    actions = torch.cat([policy(part) for part in features.split(4096)])
     return action_error(actions.numpy(), played.expert_actions.numpy())
 
 
-def _probes(ends: Ends, played: PlayedSet) -> dict[str, Any]:
+def _probes(features: Tensor, played: PlayedSet) -> dict[str, float]:
     dataset, rows = played.dataset, played.dataset.transition_rows
     assert dataset.physics is not None
     arrays = dataset.physics[rows.numpy()], dataset.episode[rows].numpy()
-    return probe_state(ends.z[0].float().numpy(), *arrays, layout_of(played.task))
+    return probe_state(features.numpy(), *arrays, layout_of(played.task))

@@ -6,7 +6,6 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass
 from itertools import groupby
-from operator import itemgetter
 
 import numpy as np
 
@@ -53,7 +52,7 @@ def line_of(row: Row) -> str:
     return "; ".join(
         [
             f"{row['task']}, noise {row['action_noise']}, hidden {row['hidden_share']}",
-            f"{row['method']}, seed {row['seed']}",
+            f"{name_of(row)}, seed {row['seed']}",
             f"returns {value['return']:.0f} ({low:.0f} to {high:.0f}) of the data's {data:.0f}",
             f"action error {value['error_on_data']:.3f} on the data, {value['error_in_loop']:.3f} in closed loop",
             f"probes {value['probe_pose']:.1f}, {value['probe_velocity']:.1f}",
@@ -70,6 +69,16 @@ def difference(rows: list[Row], method: str, other: str) -> SeedDifference | Non
         return None
     error = values.std(ddof=1) / math.sqrt(len(values)) if len(values) > 1 else math.inf
     return SeedDifference(float(values.mean()), float(error), len(values))
+
+
+def name_of(row: Row) -> str:
+    """A row's method, and what else than whole histories' states is read of its memory."""
+    told = {
+        f"readout {row['readout']}": row["readout"] != "state",
+        f"{row['random_histories']} random histories": row["random_histories"] != "0",
+        f"last {row['history_window']} rows": row["history_window"] != "0",
+    }
+    return ", ".join([row["method"], *(text for text, is_told in told.items() if is_told)])
 
 
 def _setting(row: Row) -> tuple[str, ...]:
@@ -96,7 +105,7 @@ def _summary_of(rows: list[Row], every: list[Row]) -> Iterator[str]:
 
 
 def _method_row(rows: list[Row], method: str) -> tuple[str, ...]:
-    mine = [row for row in rows if row["method"] == method]
+    mine = [row for row in rows if name_of(row) == method]
     returns = np.array([float(row["return"]) for row in mine])
     error = f" ± {returns.std(ddof=1) / math.sqrt(len(mine)):.0f}" if len(mine) > 1 else ""
     low, high = min(float(row["return_min"]) for row in mine), max(float(row["return_max"]) for row in mine)
@@ -132,9 +141,11 @@ def _floor(rows: list[Row]) -> str | None:
 
 def _answers(rows: list[Row]) -> Iterator[str]:
     """One sentence for every pair of methods that differ in memory alone, or in past actions alone."""
-    methods = [name for name in _by_return(rows) if name not in (NO_MEMORY, UNTRAINED)]
-    pairs = [("memory", name, NO_MEMORY) for name in methods if not name.endswith("+a")]
-    pairs += [("past actions", name, name.removesuffix("+a")) for name in methods if name.endswith("+a")]
+    methods = {name_of(row): row["method"] for row in rows if row["method"] not in (NO_MEMORY, UNTRAINED)}
+    pairs = [("memory", name, NO_MEMORY) for name, method in methods.items() if not method.endswith("+a")]
+    pairs += [
+        ("past actions", name, name.replace("+a", "", 1)) for name, method in methods.items() if method.endswith("+a")
+    ]
     for what, method, other in pairs:
         if (found := difference(rows, method, other)) is not None:
             verb = "pay" if what.endswith("s") else "pays"
@@ -146,10 +157,10 @@ def _answers(rows: list[Row]) -> Iterator[str]:
 
 def _returns(rows: list[Row], method: str) -> dict[str, float]:
     """Mean return by seed."""
-    return {row["seed"]: float(row["return"]) for row in rows if row["method"] == method}
+    return {row["seed"]: float(row["return"]) for row in rows if name_of(row) == method}
 
 
 def _by_return(rows: list[Row]) -> list[str]:
     """Methods, the one that returns most first."""
-    names = dict.fromkeys(map(itemgetter("method"), rows))
+    names = dict.fromkeys(map(name_of, rows))
     return sorted(names, key=lambda name: -float(np.mean(list(_returns(rows, name).values()))))

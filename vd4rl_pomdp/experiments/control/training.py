@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from typing import TYPE_CHECKING, Any, NamedTuple
+from dataclasses import replace
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.experiments.control.config import NO_MEMORY, UNTRAINED, ControlRun
 from vd4rl_pomdp.experiments.control.data import HiddenView, PlayedSet
 from vd4rl_pomdp.nn.encoder import Encoder
@@ -17,7 +16,7 @@ from vd4rl_pomdp.runs.metrics import Means
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
 
 if TYPE_CHECKING:
-    from finetune.features import FeatureBatch
+    from finetune.histories import Histories
     from pretrain.config import PretrainConfig
 
 
@@ -51,74 +50,48 @@ def _pretrain_config(run: ControlRun) -> PretrainConfig:
     return PretrainConfig.of("cpu", **chosen, **memory)
 
 
-class Ends(NamedTuple):
-    """Representations of both ends of every transition, in order."""
+def trained_policy(run: ControlRun, played: PlayedSet, encoder: Encoder) -> tuple[Policy, Tensor]:
+    """TD3+BC on a frozen encoder, as the `cpu` preset has it, but for the run's updates and histories.
 
-    z: Tensor
-    """(..., M, D)."""
-    next_z: Tensor
-    """(..., M, D)."""
-
-
-def both_ends(encoder: Encoder, features: Tensor, dataset: Dataset, next_rows: Tensor) -> Ends:
-    """Representations of the rows that have a successor, and of where their transitions end, from whole histories.
-
-    Args:
-        encoder: the frozen encoder.
-        features: (N, F) frame features of all rows.
-        dataset: the set.
-        next_rows: (M,) int64, the row where each transition ends.
+    Returns:
+        The policy, and what it was trained on: (V, N + ..., D) float16 of V views, first those of the set's N rows.
     """
-    episodes = zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True)
-    parts = []
-    for rows in (torch.arange(start, end) for start, end in episodes):
-        parts.append(encoder.from_features(features[rows][None], dataset.actions_before(rows)[None])[0])
-    states = torch.cat(parts)
-    return Ends(states[dataset.transition_rows], states[next_rows])
-
-
-def trained_policy(run: ControlRun, played: PlayedSet, encoder: Encoder) -> tuple[Policy, Ends]:
-    """TD3+BC, as the `cpu` preset has it, on a frozen encoder; the policy, and the (V, M, D) float16 representations
-    of V views that it was trained on."""
     from finetune.algorithms import TD3BC
     from finetune.config import FinetuneConfig
-    from finetune.features import STAGE
+    from finetune.features import STAGE, FeatureSampler
+    from finetune.histories import Histories
 
-    config = FinetuneConfig.of("cpu", seed=run.seed, updates=run.updates)
+    memory = {name: getattr(run, name) for name in ("readout", "random_histories", "history_window")}
+    config = FinetuneConfig.of("cpu", seed=run.seed, updates=run.updates, **memory)
     options: Any = config.options
-    dataset = played.dataset
-    returns = dataset.n_step_returns(dataset.transition_rows, options.n_step, options.gamma)
-    views = (HiddenView(played, run.hidden_share, run.seed, STAGE, number) for number in range(config.views))
-    every = torch.arange(dataset.num_rows)
-    with torch.no_grad():
-        ends = [both_ends(encoder, encoder.frame(view.observe(every)), dataset, returns[2]) for view in views]
-    encoded = Ends(*(torch.stack([part.half() for part in parts]) for parts in zip(*ends, strict=True)))
+    told: Any = config.memory
+    if encoder.gru is not None:
+        encoder.config = replace(encoder.config, **told.encoder_changes)
+    histories = Histories(played.dataset, told, options.n_step, run.seed)
+    views = [HiddenView(played, run.hidden_share, run.seed, STAGE, number) for number in range(config.views)]
+    features = torch.stack([_encoded(encoder, histories, number, view) for number, view in enumerate(views)])
     seed_networks(run.seed, STAGE)
-    policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim)
-    policy.standardise.fit(encoded.z)
-    algorithm = TD3BC(policy, options, config.learning_rate, config.updates, stream_generator(run.seed, STAGE, "noise"))
-    generator = stream_generator(run.seed, STAGE, "batches")
-    batches = _batches(dataset, encoded, returns[:2], config.batch_size, generator)
-    means = Means()
+    policy = Policy(encoder.dim, played.dataset.action_dim, config.hidden_dim)
+    policy.standardise.fit(features)
+    batches, noise = (stream_generator(run.seed, STAGE, name) for name in ("batches", "noise"))
+    sampler = FeatureSampler(histories, features, config.batch_size, options.n_step, options.gamma, batches)
+    algorithm, means = TD3BC(policy, options, config.learning_rate, config.updates, noise), Means()
     for _ in range(config.updates):
-        means.add(algorithm.update(next(batches)))
+        means.add(algorithm.update(sampler.sample()))
     _finite(run, means.take())
-    return policy.eval().requires_grad_(False), encoded
+    return policy.eval().requires_grad_(False), features
 
 
-def _batches(
-    dataset: Dataset, ends: Ends, returns: tuple[Tensor, Tensor], size: int, generator: torch.Generator
-) -> Iterator[FeatureBatch]:
-    """Uniform transitions; both ends come from the same view."""
-    from finetune.features import FeatureBatch
-
-    action, (reward, discount) = dataset.action_after(dataset.transition_rows), returns
-    views, transitions = ends.z.shape[:2]
-    while True:
-        index = torch.randint(transitions, (size,), generator=generator)
-        view = torch.randint(views, (size,), generator=generator)
-        z, next_z = (part[view, index].float() for part in ends)
-        yield FeatureBatch(z, action[index], reward[index], discount[index], next_z)
+@torch.no_grad()
+def _encoded(encoder: Encoder, histories: Histories, number: int, view: HiddenView) -> Tensor:
+    """A view's representations (N + ..., D) float16, numbered as `Histories` says."""
+    dataset, drawn = histories.dataset, histories.of_view(number)
+    frames = encoder.frame(view.observe(torch.arange(dataset.num_rows)))
+    out = torch.empty(histories.features, encoder.dim, dtype=torch.float16)
+    bounds = zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True)
+    for episode, (start, end) in enumerate(bounds):
+        drawn.fill(out, encoder, frames[start:end], episode)
+    return out
 
 
 def _finite(run: ControlRun, means: dict[str, float]) -> dict[str, float]:
