@@ -114,7 +114,7 @@ class ControlRun:
     def labels(self) -> dict[str, str]:
         """The columns that name its rows, as a CSV file has them."""
         values = ((name, getattr(self, name)) for name in LABELS)
-        return {name: f"{value:g}" if isinstance(value, float) else str(value) for name, value in values}
+        return {name: f"{value:.12g}" if isinstance(value, float) else str(value) for name, value in values}
 
 
 LABELS = tuple(f.name for f in fields(ControlRun))
