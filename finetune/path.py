@@ -12,6 +12,7 @@ from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.envs.dmc import observed_states
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.policies.actor import Actor
+from vd4rl_pomdp.tasks import TASKS, DMCTask
 
 EPISODES = 20
 """Episodes that the error is measured on, evenly spaced in the set."""
@@ -42,7 +43,9 @@ class DataPath:
         dataset = self._dataset
         assert dataset.task is not None
         assert dataset.physics is not None
+        task = TASKS.named(dataset.task)
+        assert isinstance(task, DMCTask), "other tasks store no states"
         rows = slice(int(dataset.episode_start[number]), int(dataset.episode_end[number]) - 1)
-        shown = [self._actor.act(state) for state in observed_states(dataset.task, dataset.physics[rows])]
+        shown = [self._actor.act(state) for state in observed_states(task, dataset.physics[rows])]
         actions = policy(self._encode(number)[:-1]).cpu().numpy()
         return np.square(actions - np.array(shown).reshape(actions.shape)).mean(1)

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import asdict
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -49,23 +51,60 @@ def build_objective(
         observation: channels and size of an observation, for methods that read pixels.
     """
     method = METHODS.named(config.method)
-    channels, size = (len(states.std), 1) if method.reads_state and states else observation
-    frame = _noise(config.options, states) or asdict(config.frame)
-    encoder = EncoderConfig(
+    if method.reads_state and states is not None:
+        return build_on_states(config, action_dim, target, len(states.std), _noise(config.options, states))
+    channels, size = observation
+    frame = asdict(config.frame)
+    return _build(
+        config,
+        states if method.regresses_state else target,
         action_dim=action_dim,
-        frame_encoder=STATE if method.reads_state else config.frame_encoder,
-        feature_dim=frame.pop("feature_dim", channels),
+        frame_encoder=config.frame_encoder,
+        feature_dim=frame.pop("feature_dim"),
         frame_options=frame,
         channels=channels,
         size=size,
-        **_memory(config, method),
     )
-    return method.build(Encoder(encoder), states if method.regresses_state else target, config.options, config.seed)
 
 
-def _noise(options: Options, states: StateScale | None) -> dict[str, Any]:
+def build_on_states(
+    config: TrainingConfig,
+    action_dim: int,
+    target: ActionTarget | None,
+    state_dim: int,
+    frame_options: Mapping[str, Any] = MappingProxyType({}),
+) -> Objective:
+    """Build the objective of a config on states in place of pixels, whatever its method reads.
+
+    Args:
+        config: the run's settings; those of the frame encoder are not read.
+        action_dim: width of actions.
+        target: from `build_target`.
+        state_dim: width P of the states; observations are (..., P, 1, 1).
+        frame_options: what `StateFrame` is told.
+    """
+    return _build(
+        config,
+        target,
+        action_dim=action_dim,
+        frame_encoder=STATE,
+        feature_dim=state_dim,
+        frame_options=dict(frame_options),
+        channels=state_dim,
+        size=1,
+    )
+
+
+def _build(config: TrainingConfig, target: ActionTarget | StateScale | None, **shape: Any) -> Objective:
+    """The objective of a config on an encoder of a given shape, with the memory that the config says."""
+    method = METHODS.named(config.method)
+    encoder = EncoderConfig(**shape, **_memory(config, method))
+    return method.build(Encoder(encoder), target, config.options, config.seed)
+
+
+def _noise(options: Options, states: StateScale) -> dict[str, Any]:
     """What the `state` reference's encoder is told of noise; nothing if there is none."""
-    if not isinstance(options, StateOptions) or not states or not (options.pose_noise or options.velocity_noise):
+    if not isinstance(options, StateOptions) or not (options.pose_noise or options.velocity_noise):
         return {}
     return {"noise": states.noise(options.pose_noise, options.velocity_noise).tolist()}
 

@@ -65,11 +65,14 @@ def _pretrain(config: PretrainConfig) -> RunFolder:
 class PretrainTrainer:
     """One objective on one data set."""
 
-    def __init__(self, objective: Objective, dataset: Dataset, config: PretrainConfig) -> None:
+    def __init__(
+        self, objective: Objective, dataset: Dataset, config: PretrainConfig, view: View | None = None
+    ) -> None:
+        """See the class; `view` is what is seen of the set, unless it is what the config says."""
         self.objective, self.dataset, self.config = objective, dataset, config
         self.device = dataset.t.device
         self.states = dataset.states() if METHODS.named(config.method).regresses_state else None
-        view = View(dataset, config.corruption, config.shift, config.seed, STAGE)
+        view = view or View(dataset, config.corruption, config.shift, config.seed, STAGE)
         batches = stream_generator(config.seed, STAGE, "batches")
         self.sampler = WindowSampler(view, config.batch_size, config.window, batches)
         self.optimiser = torch.optim.Adam(objective.parameters(), lr=config.learning_rate)

@@ -10,7 +10,7 @@ from functools import partial
 from pathlib import Path
 
 from bad_input_damage import ANY, BY_SUFFIX, JSON, Damage, each_place
-from bad_input_flags import ENCODER, MAZE, NAVIGATED, RUN, SET, SMOKE, Case
+from bad_input_flags import ENCODER, MAZE, NAVIGATED, RUN, SET, SMOKE, STUDY, Case
 from bad_input_world import CUT
 
 READERS: list[tuple[str, list[str], list[str]]] = [
@@ -86,6 +86,11 @@ READERS: list[tuple[str, list[str], list[str]]] = [
         ["--out", "reports/sets", "--tasks", "walker_walk", "--qualities", "random"],
         [f"reports/sets/{name}" for name in ("returns.csv", "costs.csv", "actors.json")],
     ),
+    (
+        "control-study",
+        ["--out", "reports/control", *STUDY],
+        ["reports/control/runs.csv", "reports/control/episodes.csv"],
+    ),
 ]
 """Command, words that read some files, and those files."""
 
@@ -99,6 +104,11 @@ FINE: dict[str, str] = {
     **{
         f"data table | */actors.json | {kind}": "sets whose actors are not known are played anew"
         for kind in ("missing", "a dangling link", "no key")
+    },
+    **{f"control-study | */runs.csv | {kind}": "the last column is a commit" for kind in ("a word*", "nan", "inf")},
+    **{
+        f"control-study | */episodes.csv | {kind}": "a run without its episodes is run anew"
+        for kind in ("missing", "a dangling link")
     },
     "report | runs-cut/finetuning/labels.json | *": "a run that has rows is named by them",
     "navigation report | */runs.csv | a word for a number": "the last column is a command",

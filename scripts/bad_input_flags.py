@@ -42,6 +42,8 @@ NAMES = [name for name, entry in COMMANDS.items() if not isinstance(entry, Mappi
 SET, MAZE, ENCODER = "data/walker_walk/random", "data/no_curtain", "runs/pretrained/encoder"
 RUN, NAVIGATED = "runs/finetuned", "runs/navigated"
 SMOKE = ["--preset", "smoke"]
+STUDY = ["--methods", "none", "--seeds", "0", "--action-noises", "0", "--episodes", "2", "--decisions", "32"]
+STUDY += ["--updates", "1", "--eval-episodes", "1"]
 VALID: dict[str, Words] = {
     "demo": [],
     "list": [],
@@ -66,6 +68,7 @@ VALID: dict[str, Words] = {
     "sweep": ["--data", SET, "--out", "new", *SMOKE],
     "report": ["runs", "--out", "new"],
     "theory": [],
+    "control-study": ["--out", "new", *STUDY],
     "bench": ["--quick"],
 }
 """Words after each command's name that are right, with files of the folder in which cases run."""

@@ -12,7 +12,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from unittest import mock
 
-from bad_input_flags import ENCODER, MAZE, NAVIGATED, RUN, SET, SMOKE
+from bad_input_flags import ENCODER, MAZE, NAVIGATED, RUN, SET, SMOKE, STUDY
 
 ROWS, EPISODES = 20, 4
 """Rows of an episode of the small set, and its episodes."""
@@ -54,6 +54,7 @@ def _stages() -> Iterator[list[str]]:
     yield ["navigation", "train", "--data", MAZE, "--out", NAVIGATED, *SMOKE]
     yield ["navigation", "report", NAVIGATED, "--out", "reports/navigation", "--no-pictures"]
     yield ["theory", "--out", "reports/theory"]
+    yield ["control-study", "--out", "reports/control", *STUDY]
 
 
 @contextmanager

@@ -36,6 +36,7 @@ NOT_RUN = {
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
     "vd4rl-pomdp policy": "trains for hours; tests/policies trains less",
+    "vd4rl-pomdp control-study": "trains for minutes; experiments/control trains less",
     "vd4rl-pomdp navigation": "trains for minutes to days; pretrain/navigation/test_train trains less",
     "vd4rl-pomdp pretrain --method": "pretrain/test_train runs every method in its smoke size",
     "vd4rl-pomdp finetune --encoder RUN": "as above",
@@ -128,7 +129,7 @@ CHECKS = {
 
 def check_names(config: object) -> None:
     """Names that a command looks up after parsing must exist."""
-    if type(config).__name__ == "NavigationConfig":  # its methods are those of pretraining and two more
+    if type(config).__name__ in ("NavigationConfig", "ControlConfig"):  # their methods are others, too
         return
     for field, check in CHECKS.items():
         value = getattr(config, field, None)

@@ -22,7 +22,10 @@ MAY_IMPORT = {
     "pretrain": {"pretrain", "baselines", "vd4rl_pomdp"},
     "finetune": {"finetune", "vd4rl_pomdp"},
 }
-MAY_CALL_STAGES = ("vd4rl_pomdp/cli/", "vd4rl_pomdp/experiments/bench/", "vd4rl_pomdp/testing/")
+MAY_CALL_STAGES = (
+    *("vd4rl_pomdp/cli/", "vd4rl_pomdp/testing/"),
+    *("vd4rl_pomdp/experiments/bench/", "vd4rl_pomdp/experiments/control/"),
+)
 """Folders whose functions call the stages, and import them there: what is not called is not loaded."""
 JUDGES = "vd4rl_pomdp.experiments"
 """What judges runs: the command line alone imports it."""

@@ -25,6 +25,7 @@ def test_every_command_has_help(words, capsys):
     assert words[-1] in capsys.readouterr().out
 
 
+STUDY = ["--methods", "none", "--episodes", "2", "--decisions", "32", "--updates", "1", "--eval-episodes", "1"]
 SWEPT = ["--data", "x", "--out", "y", "--dry-run"]
 
 
@@ -75,6 +76,13 @@ SWEPT = ["--data", "x", "--out", "y", "--dry-run"]
         ),
         (["sweep", *SWEPT, "--methods", "acro", "drq_bc", "--finetune=--views 2"], "--views is not read by"),
         (["navigation", "grid", "--seeds", "-1", "--dry-run"], "--seeds is -1"),
+        (["control-study"], "Missing from vd4rl-pomdp control-study: --out"),
+        (
+            ["control-study", "--out", "x", "--methods", "acro"],
+            "unknown method 'acro' of this study: choose from none,",
+        ),
+        (["control-study", "--out", "x", "--hidden-shares", "2"], "--hidden-shares is 2.0; it must be at least 0 and"),
+        (["control-study", "--out", "file/below", *STUDY], "file/below"),
         (["pretrain", "--data", "x", "--out", "y", "--steps", "many"], "--steps: invalid literal"),
         (["finetune", "--encoder", "a", "--data", "b", "--out", "c", "--veiws", "3"], "Perhaps you meant: --views"),
     ],

@@ -4,7 +4,7 @@ import sys
 import numpy as np
 import pytest
 
-from vd4rl_pomdp.envs.dmc import DMCEnv, replay_rewards
+from vd4rl_pomdp.envs.dmc import DMCEnv, observed_states, replay_rewards
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, TASKS
 from vd4rl_pomdp.types import StepType
@@ -34,6 +34,12 @@ def test_rewards_replay_exactly_from_the_first_stored_state(blind):
         replayed = replay_rewards(name_of(blind), rows[0].physics, actions)
         assert replayed.dtype == np.float64
         np.testing.assert_array_equal(replayed, [row.reward for row in rows[1:]])
+
+
+def test_what_an_actor_reads_is_found_in_stored_states(blind):
+    rows, _ = roll(blind, 3, 20)
+    found = observed_states(blind.task, np.stack([row.physics for row in rows]))
+    np.testing.assert_allclose(found, np.stack([row.state for row in rows]), atol=1e-5)
 
 
 def test_replaying_shifted_actions_does_not_give_the_rewards(blind):

@@ -39,7 +39,7 @@ def walked(tmp_path):
 
 def test_simulator_states_are_observed_as_in_the_environment(walked):
     folder, states, _ = walked
-    np.testing.assert_allclose(observed_states("walker_walk", open_dataset(folder).physics), states, atol=1e-6)
+    np.testing.assert_allclose(observed_states(TASKS["walker_walk"], open_dataset(folder).physics), states, atol=1e-6)
 
 
 def test_the_path_error_is_to_the_actors_mean_action_at_the_same_row(walked):

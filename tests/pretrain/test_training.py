@@ -6,10 +6,11 @@ import pytest
 import torch
 
 from baselines import CURL
+from pretrain.build import build_on_states, build_target
 from pretrain.config import PretrainConfig
 from pretrain.train import PretrainTrainer
 from tests.helpers_data import write_fake_set
-from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data import View, open_dataset
 from vd4rl_pomdp.nn import Encoder, EncoderConfig
 
 
@@ -47,3 +48,22 @@ def test_an_objective_sees_patches_and_rows_of_one_episode(trainer: PretrainTrai
     hidden = (window.obs.view(2, 8, 3, 3, 84, 84) == 0).all(3)
     assert (hidden.flatten(3).sum(3) >= 16 * 16).all()
     assert (window.key.diff(dim=1) == 1).all()
+
+
+@pytest.mark.parametrize("method", ["mik+a", "acro", "state"])
+def test_any_objective_can_be_built_on_states(method):
+    config = PretrainConfig.of("smoke", method=method)
+    target = build_target(config, torch.rand(50, 6).numpy())
+    encoder = build_on_states(config, 6, target, 18).encoder
+    assert encoder.reads_state
+    assert encoder.dim == (32 if method == "mik+a" else 18)
+    states = torch.rand(2, 8, 18, 1, 1)
+    assert torch.equal(encoder.frame(states), states[..., 0, 0])
+
+
+def test_a_trainer_takes_another_view_of_the_set(trainer: PretrainTrainer):
+    view = View(trainer.dataset, None, 0, 7, "own")
+    window = PretrainTrainer(trainer.objective, trainer.dataset, trainer.config, view).batch()
+    assert trainer.config.shift > 0
+    rows = trainer.dataset.episode_start[window.key >> 20] + (window.key & 0xFFFFF)
+    assert torch.equal(window.obs, trainer.dataset.stacks(rows)), "neither shifted nor corrupted"

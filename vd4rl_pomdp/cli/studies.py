@@ -1,4 +1,4 @@
-"""Commands that measure or summarise: report, theory, bench."""
+"""Commands that measure or summarise: report, theory, control-study, bench."""
 
 from __future__ import annotations
 
@@ -81,8 +81,19 @@ def _bench(words: Arguments, program: str) -> None:
         print_table(results)
 
 
+def _control_study(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.experiments.control.config import ControlConfig
+    from vd4rl_pomdp.experiments.control.study import control_study
+    from vd4rl_pomdp.experiments.control.table import line_of, summary
+
+    config = parse(ControlConfig, words, program)
+    rows = control_study(config, lambda row: print(line_of(row), flush=True))
+    print(*summary(rows), sep="\n")
+
+
 COMMANDS = {
     "report": Command("an HTML page and CSV files about runs", _report),
     "theory": Command("the paper's claims on finite worlds, by enumeration", _theory),
+    "control-study": Command("does memory pay? told on simulator states, in minutes", _control_study),
     "bench": Command("speed and memory on this machine", _bench),
 }

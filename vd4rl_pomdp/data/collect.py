@@ -171,19 +171,27 @@ def _hashes(plan: Iterable[tuple[Path, range, Collector]]) -> list[str]:
     return sorted({collector.sha256 for _, _, collector in plan if collector is not None})
 
 
-def replay_returns(config: CollectConfig) -> list[float]:
-    """Returns of all episodes that `collect` would render, by physics alone: the same seeds, actions and rewards."""
+def play(config: CollectConfig, length: int | None = None) -> Iterator[Columns]:
+    """Rows of all episodes that `collect` would render, by physics alone: the same seeds, actions and rewards.
+
+    Args:
+        config: what would be collected; its folder is not touched.
+        length: most decisions of an episode; None: the task's own.
+    """
     jobs = [
-        replace(_job(config, collector, episode), size=None)
+        replace(_job(config, collector, episode, length), size=None)
         for _, episodes, collector in _plan(config)
         for episode in episodes
     ]
     with ProgressLine(f"play {config.task} {config.quality}", config.episodes, "episodes") as progress:
-        returns = []
         for rollout in run_jobs(_roll_out, jobs, config.workers):
-            returns.append(float(rollout["reward"].sum()))
-            progress.advance(1, ret=returns[-1])
-    return returns
+            progress.advance(1, ret=float(rollout["reward"].sum()))
+            yield rollout
+
+
+def replay_returns(config: CollectConfig) -> list[float]:
+    """Returns of all episodes that `collect` would render, played by physics alone."""
+    return [float(rollout["reward"].sum()) for rollout in play(config)]
 
 
 def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Collector]]:

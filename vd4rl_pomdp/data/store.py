@@ -16,7 +16,7 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
 from pathlib import Path
@@ -78,6 +78,39 @@ class Store:
     def physics(self) -> np.ndarray | None:
         """(N, P) float64 simulator states, mapped read-only; None if the set has none."""
         return self._load("physics.npy", "r") if "physics.npy" in self.meta["files"] else None
+
+
+@dataclass(frozen=True)
+class PlayedStore(Store):
+    """Rows that were played by physics alone, in memory: a set without pixels, in no folder."""
+
+    rows: Mapping[str, np.ndarray]
+    """`action`, `reward`, `discount`, `step_type` and perhaps `physics` by key, as `Store.array` has them."""
+
+    @property
+    def fingerprint(self) -> str:
+        """Name of the rows' content."""
+        digest = hashlib.blake2b(digest_size=12)
+        for key in sorted(self.rows):
+            digest.update(np.ascontiguousarray(self.rows[key]).tobytes())
+        return digest.hexdigest()
+
+    @property
+    def frame_size(self) -> int:
+        """Nothing was drawn."""
+        return 0
+
+    def frames(self) -> np.ndarray:
+        """(N, 3, 0, 0) uint8."""
+        return np.zeros((len(self.rows["reward"]), 3, 0, 0), np.uint8)
+
+    def array(self, key: str) -> np.ndarray:
+        """A copy of rows, which is the caller's own."""
+        return self.rows[key].copy()
+
+    def physics(self) -> np.ndarray | None:
+        """(N, P) float64 simulator states, None if there are none."""
+        return self.rows.get("physics")
 
 
 def default_cache() -> Path:

@@ -77,11 +77,9 @@ def flat_state(observation: dict[str, np.ndarray]) -> np.ndarray:
     return np.concatenate([np.ravel(value) for value in observation.values()]).astype(np.float32)
 
 
-def observed_states(task: str, physics: np.ndarray) -> np.ndarray:
-    """What a dm_control task, by name, observes in each of (N, P) simulator states: (N, D) float32."""
-    played = TASKS.named(task)
-    assert isinstance(played, DMCTask), "other tasks store no states"
-    env = _load(played, np.random.RandomState(0))
+def observed_states(task: DMCTask, physics: np.ndarray) -> np.ndarray:
+    """What an actor reads in simulator states: (N, P) float64 -> (N, D) float32, as `TimeStep.state`."""
+    env = _load(task, np.random.RandomState(0))
     env.reset()
     return np.stack([_observed(env, state) for state in physics])
 

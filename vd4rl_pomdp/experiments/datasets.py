@@ -7,8 +7,6 @@ rendering.
 
 from __future__ import annotations
 
-import csv
-import math
 import tempfile
 import time
 from collections.abc import Sequence
@@ -21,10 +19,9 @@ from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, repla
 from vd4rl_pomdp.data.format import RECORD
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.policies.actor import ships
-from vd4rl_pomdp.runs.files import Row, read_json, write_csv, write_json
+from vd4rl_pomdp.runs.files import Row, read_csv, read_json, write_csv, write_json
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
-from vd4rl_pomdp.runs.reading import regular
 from vd4rl_pomdp.tasks import MOST_EPISODES, SET_QUALITIES, TASKS
 
 EPISODES = 200
@@ -57,7 +54,8 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
     refuse_number("workers", workers, 0)
     refuse_foreign(out, "table of sets", "returns.csv", "sets.csv")
     out.mkdir(parents=True, exist_ok=True)
-    returns, costs = _read(out / "returns.csv", RETURNS), _read(out / "costs.csv", COSTS)
+    returns = read_csv(out / "returns.csv", RETURNS, _WORDS)
+    costs = read_csv(out / "costs.csv", COSTS, _WORDS)
     actors = read_json(out / "actors.json") if (out / "actors.json").exists() else {}
     for task, quality in product(tasks, qualities):
         if not ships(task, quality):
@@ -116,23 +114,3 @@ def _cost(task: str, episodes: int) -> Row:
         spent = time.process_time() - started
         rows = read_json(Path(folder) / task / RECORD)["frames"]
     return {"task": task, "episodes": episodes, "rows": rows, "cpu_seconds": f"{spent:.1f}", "commit": git_commit()}
-
-
-def _read(path: Path, columns: Sequence[str]) -> list[Row]:
-    if not path.exists():
-        return []
-    try:
-        with regular(path).open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            if tuple(reader.fieldnames or ()) != columns:
-                raise UserError(
-                    f"{path}: has other columns than {', '.join(columns)}; remove it or choose another --out"
-                )
-            rows = list(reader)
-        if not all(math.isfinite(float(row[name])) for row in rows for name in columns if name not in _WORDS):
-            raise ValueError("a number is not finite")
-    except UserError:
-        raise
-    except (ValueError, TypeError, csv.Error) as error:
-        raise UserError(f"{path}: is damaged ({error}); remove it or choose another --out") from error
-    return rows

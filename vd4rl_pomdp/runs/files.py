@@ -4,14 +4,15 @@ from __future__ import annotations
 
 import csv
 import json
+import math
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.runs.reading import parse_json, read_bytes
+from vd4rl_pomdp.runs.reading import parse_json, read_bytes, regular
 
 Row = dict[str, Any]
 """One row of a table, its values by column."""
@@ -51,6 +52,36 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
+
+
+def read_csv(path: Path, columns: Sequence[str], words: Collection[str]) -> list[Row]:
+    """Rows of a CSV file that `write_csv` wrote, its values as text; none if there is no file.
+
+    Args:
+        path: the file.
+        columns: all of its columns, in order.
+        words: columns that may hold any text; the others hold finite numbers.
+
+    Raises:
+        UserError: the file has other columns, or is damaged.
+    """
+    if not path.exists():
+        return []
+    try:
+        with regular(path).open(newline="", encoding="utf-8") as file:
+            reader = csv.DictReader(file)
+            if tuple(reader.fieldnames or ()) != tuple(columns):
+                raise UserError(
+                    f"{path}: has other columns than {', '.join(columns)}; remove it or choose another --out"
+                )
+            rows = list(reader)
+        if not all(math.isfinite(float(row[name])) for row in rows for name in columns if name not in words):
+            raise ValueError("a number is not finite")
+    except UserError:
+        raise
+    except (ValueError, TypeError, csv.Error) as error:
+        raise UserError(f"{path}: is damaged ({error}); remove it or choose another --out") from error
+    return rows
 
 
 def write_bytes(path: Path, content: bytes) -> None:
