@@ -79,7 +79,7 @@ def test_the_error_is_as_large_as_was_asked_in_a_probes_unit(noisy, with_states)
     for z, at in ((batch.z, rows), (batch.next_z, rows + 1)):
         assert percent(z - dataset.states()[at], dataset)[8:].mean() == pytest.approx(VELOCITY, rel=0.05)
     position, again = sampler.state_dict(), [made.rows(rows, rows, sampler.view) for _ in range(2)]
-    assert not (again[0] == again[1])[:, :2].any(), "drawn anew whenever a row enters a batch"
+    assert not (again[0] == again[1])[:, [0, 2]].any(), "drawn anew whenever a row enters a batch"
     sampler.load_state_dict(position)
     following = sampler.sample()
     sampler.load_state_dict(position)
