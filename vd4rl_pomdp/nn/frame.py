@@ -194,12 +194,22 @@ class StateFrame(nn.Module):
         super().__init__()
         if len(noise) not in (0, width):
             raise ValueError(f"noise of {len(noise)} coordinates for states of {width}")
+        self.width = width
         self.register_buffer("noise", torch.tensor(noise, dtype=torch.float64), persistent=False)
         self.nothing = nn.Parameter(torch.zeros(0))
         """Optimisers and files want one."""
 
     def forward(self, obs: Tensor) -> Tensor:
-        """The state itself."""
+        """The state itself.
+
+        Raises:
+            UserError: it has another width, as those of earlier versions have.
+        """
+        if obs.shape[-3] != self.width:
+            raise UserError(
+                f"this encoder reads states of {self.width} coordinates, the task's have {obs.shape[-3]}: "
+                "pretrain the reference `state` again"
+            )
         return obs.flatten(-3).float()
 
     @property

@@ -10,13 +10,9 @@ from itertools import groupby
 import numpy as np
 
 from vd4rl_pomdp.experiments.control.config import MEASURED, NO_MEMORY, SETTING, UNTRAINED
+from vd4rl_pomdp.report.gates import FAILED, STANDARD_ERRORS, STATE_SHARE
 from vd4rl_pomdp.runs.files import Row
 
-STATE_GATE = 0.9
-"""What is seen whole must return this share of the set's mean return."""
-ERRORS = 2.0
-"""Standard errors beyond which the seeds tell a difference."""
-NO_RANKING = "does not discriminate"
 COLUMNS = ("method", "seeds", "return", "episodes", "good", "error: data", "in loop", "pose", "velocity")
 
 
@@ -32,7 +28,7 @@ class SeedDifference:
     @property
     def tells(self) -> bool:
         """Whether it is larger than chance over seeds would have it."""
-        return abs(self.mean) > ERRORS * self.error
+        return abs(self.mean) > STANDARD_ERRORS * self.error
 
     def __str__(self) -> str:
         error = f" ± {self.error:.0f}" if math.isfinite(self.error) else ""
@@ -93,15 +89,21 @@ def _summary_of(rows: list[Row], every: list[Row]) -> Iterator[str]:
         f"({first['episodes']} episodes, {first['pretrain_steps']} steps, {first['updates']} updates); "
         f"the data returns {float(first['data_return']):.0f}"
     )
-    table = [COLUMNS, *(_method_row(rows, method) for method in _by_return(rows))]
-    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
-    for cells in table:
-        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(cells, widths, strict=True)).rstrip()
     passed = True
     for name, verdict, told in _gates(rows, every):
         yield f"gate, {name}: {told}, {'not measured' if verdict is None else 'reached' if verdict else 'missed'}"
         passed = passed and verdict is not False
-    yield from _answers(rows) if passed else [NO_RANKING]
+    if not passed:
+        yield f"{FAILED}: methods are listed by name"
+    yield from _table(rows, _by_return(rows) if passed else sorted(_by_return(rows)))
+    yield from _answers(rows) if passed else ()
+
+
+def _table(rows: list[Row], methods: list[str]) -> Iterator[str]:
+    table = [COLUMNS, *(_method_row(rows, method) for method in methods)]
+    widths = [max(map(len, column)) for column in zip(*table, strict=True)]
+    for cells in table:
+        yield "  ".join(f"{cell:<{width}}" for cell, width in zip(cells, widths, strict=True)).rstrip()
 
 
 def _method_row(rows: list[Row], method: str) -> tuple[str, ...]:
@@ -124,12 +126,12 @@ def _gates(rows: list[Row], every: list[Row]) -> Iterator[tuple[str, bool | None
     whole = dict(zip(SETTING, _setting(rows[0]), strict=True)) | {"hidden_share": "0"}
     ceiling = list(_returns([row for row in every if _setting(row) == tuple(whole.values())], NO_MEMORY).values())
     share = float(np.mean(ceiling)) / float(rows[0]["data_return"]) if ceiling else math.nan
-    told = f"{share:.2f} of the data's return (n = {len(ceiling)}), at least {STATE_GATE}" if ceiling else "-"
-    yield "nothing hidden and no memory", share >= STATE_GATE if ceiling else None, told
+    told = f"{share:.2f} of the data's return (n = {len(ceiling)}), at least {STATE_SHARE}" if ceiling else "-"
+    yield "nothing hidden and no memory", share >= STATE_SHARE if ceiling else None, told
     best, floor = _by_return(rows)[0], _floor(rows)
     if floor is not None and best != floor:
         found = difference(rows, best, floor)
-        told = f"{found}, at least {ERRORS:g} standard errors" if found else "-"
+        told = f"{found}, at least {STANDARD_ERRORS:g} standard errors" if found else "-"
         yield f"{best} minus {floor}", None if found is None else found.tells and found.mean > 0, told
     elif floor is not None and len(_by_return(rows)) > 1:
         yield f"the best minus {floor}", False, f"{floor} returns most"
