@@ -120,11 +120,16 @@ def probe_figure(rows: list[Row], methods: list[str]) -> tuple[str, str]:
             axes.scatter(errors, returns, 36, label=plain(method, LEGEND_WIDTH), ec="white", lw=0.6, zorder=3, **style)
     for axes, name in zip(panels, PROBES.values(), strict=True):
         axes.set(xlabel=f"{name} error, %")
-        axes.set_xlim(-0.04 * axes.get_xlim()[1])  # room for the whole dot of a run without error
+        axes.set_xlim(*_with_room(axes.get_xlim()[1]))
         axes.grid(alpha=0.25)
         axes.spines[["top", "right"]].set_visible(False)
-    panels[0].set(ylabel="return", ylim=(-0.04 * panels[0].get_ylim()[1], None))
+    panels[0].set(ylabel="return", ylim=_with_room(panels[0].get_ylim()[1]))
     return _svg(figure, panels[1]), "; ".join(map(_probe_words, rows))
+
+
+def _with_room(highest: float) -> tuple[float, float]:
+    """Limits of an axis that begins at 0, with room for whole dots at both ends."""
+    return -0.04 * highest, 1.04 * highest
 
 
 def _probe_words(row: Row) -> str:
