@@ -92,7 +92,9 @@ def test_the_state_reference_reads_dm_controls_states_and_refuses_a_task_without
     for name in ("cartpole_swingup", "centre"):
         collect(CollectConfig(name, "random", tmp_path / name, episodes=2, workers=1, frame_size=32), 8)
     run = stages(tmp_path / "cartpole_swingup", tmp_path / "runs", "state")
-    assert load_encoder(run / "encoder")[0].config.channels == 4
+    assert load_encoder(run / "encoder")[0].config.channels == 5, (
+        "place of the cart, sine and cosine of the pole, two velocities"
+    )
     with pytest.raises(UserError, match="centre: stores no simulator states"):
         stages(tmp_path / "centre", tmp_path / "none", "state")
 

@@ -61,7 +61,6 @@ def test_the_states_frame_encoder_cannot_be_chosen():
             "head_dim": 16,
             "m": 3,
             "gru_layers": 2,
-            "history_window": 4,
             "frame_encoder": "drq",
         },
         {"method": "state", "pose_noise": 25.0, "velocity_noise": 33.0},

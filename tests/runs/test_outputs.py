@@ -91,6 +91,7 @@ def commands(data: Path, run: Path) -> dict[str, list[str]]:
         "sweep": ["sweep", "--data", str(data), *preset, "--dry-run"],
         "report": ["report", str(run)],
         "theory": ["theory"],
+        "control-study": ["control-study", "--methods", "none", "--seeds", "0"],
     }
 
 
