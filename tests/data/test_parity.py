@@ -31,7 +31,7 @@ def test_fast_rendering_differs_by_less_than_a_twentieth_of_a_grey_level(exact, 
 @pytest.fixture
 def unrepaired(monkeypatch):
     """Environments with the sky of the installed mujoco."""
-    monkeypatch.setattr(rendering, "prepare", lambda physics, render: None)
+    monkeypatch.setattr(rendering, "prepare", lambda physics, render, size: None)
 
 
 @pytest.mark.usefixtures("unrepaired")
@@ -82,7 +82,7 @@ def test_the_background_of_our_own_frames_is_equal(monkeypatch, own_frames):
 def test_the_background_of_frames_under_another_sky_differs(monkeypatch, own_frames):
     task, frames = own_frames
     with monkeypatch.context() as patch:
-        patch.setattr(rendering, "prepare", lambda physics, render: None)
+        patch.setattr(rendering, "prepare", lambda physics, render, size: None)
         others = parity._wandering_frames(task, 84, 40)
     assert not background(monkeypatch, task, others, frames)["equal"]
 

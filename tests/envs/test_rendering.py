@@ -1,10 +1,14 @@
 import subprocess
 import sys
 
+import numpy as np
 import pytest
 
 from vd4rl_pomdp.envs import rendering
+from vd4rl_pomdp.envs.make import make_env
+from vd4rl_pomdp.envs.rendering import suite
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import TASKS
 
 
 @pytest.mark.parametrize("version", ["3.1.6", "3.2.7", "3.12.0", "4.0.0"])
@@ -36,3 +40,15 @@ def test_a_machine_without_opengl_gets_a_sentence(tmp_path):
 def test_a_machine_without_dm_control_is_told_how_to_install_it():
     line = last_line("import sys; sys.modules['dm_control'] = None")
     assert line.endswith("UserError: dm-control is not installed: `pip install --no-deps dm-control==1.0.44`")
+
+
+@pytest.mark.parametrize("task", TASKS)
+def test_pictures_do_not_depend_on_the_size_of_the_buffer_they_are_drawn_in(task):
+    env = make_env(TASKS[task], "exact")
+    frame = env.reset(1).frame
+    other = suite.load(TASKS[task].domain, TASKS[task].task).physics
+    rendering.prepare(other, "exact", 480)
+    start = env.physics.get_state()
+    with other.reset_context():
+        other.set_state(start)
+    np.testing.assert_array_equal(rendering.frame(other), frame)

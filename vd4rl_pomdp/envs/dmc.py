@@ -27,7 +27,7 @@ class DMCEnv(PixelEnv):
         """The dm_control environment."""
         self._layout = task.layout or self._found_layout()
         if size is not None:
-            rendering.prepare(self.physics, render)
+            rendering.prepare(self.physics, render, size)
 
     @property
     def physics(self) -> Any:

@@ -68,17 +68,21 @@ def check_mujoco(version: str = mujoco.__version__) -> None:
         )
 
 
-def prepare(physics: Any, render: Render) -> None:
-    """Restore the old sky and set the shadow map's size; must be called before the first render of `physics`."""
+def prepare(physics: Any, render: Render, size: int) -> None:
+    """Restore the old sky, set the shadow map's size, and that of the buffer to what `size` x `size` pictures need.
+
+    Must be called before the first render of `physics`. The buffer, 640x480 by default, is cleared for every picture.
+    """
     if render not in get_args(Render):
         raise UserError(f"unknown rendering {render!r}: choose one of {', '.join(get_args(Render))}")
     model = physics.model
     sky = _sky()
     number = next(i for i in range(model.ntex) if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
     start = model.tex_adr[number]
-    size = model.tex_width[number] * model.tex_height[number] * model.tex_nchannel[number]
-    assert size == sky.size, "the skybox has another size than the one to restore"
-    model.tex_data[start : start + size] = sky
+    stored = model.tex_width[number] * model.tex_height[number] * model.tex_nchannel[number]
+    assert stored == sky.size, "the skybox has another size than the one to restore"
+    model.tex_data[start : start + stored] = sky
+    model.vis.global_.offwidth = model.vis.global_.offheight = size
     if render == "fast":
         model.vis.quality.shadowsize = _FAST_SHADOW_SIZE
 
