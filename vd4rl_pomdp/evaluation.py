@@ -25,7 +25,7 @@ from vd4rl_pomdp.nn.encoder_folder import load_encoder
 from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.nn.policy import Policy, load_policy
 from vd4rl_pomdp.policies.actor import Actor, read_actor
-from vd4rl_pomdp.reference import Reference
+from vd4rl_pomdp.reference import Reference, action_error
 from vd4rl_pomdp.runs.files import appending, read_json, write_csv
 from vd4rl_pomdp.runs.reading import regular
 from vd4rl_pomdp.runs.workers import run_jobs
@@ -293,7 +293,7 @@ def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
     while not now.time_step.last:
         action = agent.act(agent.encoder_input(now, job.task))
         if actor:
-            errors.append(np.square(action - actor.act(now.time_step.state)).mean())
+            errors.append(action_error(action, actor.act(now.time_step.state)))
         now = env.step(action)
         total += now.time_step.reward
         length += 1

@@ -70,6 +70,11 @@ class Reference:
         return float(np.mean(np.array(returns) > REACHED * self.data_return))
 
 
+def action_error(action: np.ndarray, shown: np.ndarray) -> np.floating:
+    """Mean squared difference of (..., A) actions from those that the actor shows, in their precision."""
+    return np.square(action - shown).mean()
+
+
 def _sole_actor(dataset: Dataset) -> dict[str, str] | None:
     """The actor of all shards, if it is one and ships."""
     hashes = {one.get("actor_sha256") for one in dataset.store.meta["attributes"]}

@@ -13,7 +13,7 @@ from typing import Any, ClassVar, Literal, Protocol, Self
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_integers, draw_numbered, hash_keys
+from vd4rl_pomdp.corruptions.keys import DRAWS, KeyStream, derive_keys, draw_integers, draw_numbered, hash_keys
 from vd4rl_pomdp.errors import UserError, flag_of
 from vd4rl_pomdp.options import Limits, Options, flat
 from vd4rl_pomdp.registry import Registry
@@ -211,7 +211,7 @@ class Corruption:
         if self._zeroed > stack:
             raise UserError(f"cannot zero {self._zeroed} of {stack} stacked frames: choose a smaller --zeroed-frames")
         key = hash_keys(derive_keys(len(self._stages), key) ^ 1)
-        return draw_integers(key, 1 << 31, stack).argsort(dim=1)[:, self._zeroed :]
+        return draw_integers(key, DRAWS, stack).argsort(dim=1)[:, self._zeroed :]
 
     def change_(self, frames: Tensor, key: Tensor, kept: Tensor) -> None:
         """Apply the stages, in place, to the (N, K, 3, H, W) frames that (N, K) `kept` names."""

@@ -15,7 +15,7 @@ from torch import Tensor
 _GOLDEN = 0x9E3779B97F4A7C15 - (1 << 64)
 _MIX_A = 0xBF58476D1CE4E5B9 - (1 << 64)
 _MIX_B = 0x94D049BB133111EB - (1 << 64)
-_DRAWS = 1 << 31
+DRAWS = 1 << 31
 """Integers that a draw tells apart."""
 
 
@@ -62,7 +62,7 @@ def draw_numbered(key: Tensor, high: int, number: Tensor) -> Tensor:
 
 def draw_normals(key: Tensor, count: int) -> Tensor:
     """`count` standard normal numbers from each key: (...,) int64 -> (..., count) float64."""
-    return torch.special.ndtri((draw_integers(key, _DRAWS, count).double() + 0.5) / _DRAWS)
+    return torch.special.ndtri((draw_integers(key, DRAWS, count).double() + 0.5) / DRAWS)
 
 
 class KeyStream:

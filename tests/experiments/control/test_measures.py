@@ -6,10 +6,11 @@ from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.evaluation import EVALUATION_SEED, Agent
 from vd4rl_pomdp.experiments.control.config import ControlRun
 from vd4rl_pomdp.experiments.control.data import played_set
-from vd4rl_pomdp.experiments.control.measures import HiddenAgent, _error_on_data, action_error, play_episode
+from vd4rl_pomdp.experiments.control.measures import HiddenAgent, _error_on_data, play_episode
 from vd4rl_pomdp.experiments.control.training import pretrained, trained_policy
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.reference import action_error
 
 DECISIONS = 40
 

@@ -11,7 +11,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.corruptions.keys import draw_integers
+from vd4rl_pomdp.corruptions.keys import DRAWS, draw_integers
 from vd4rl_pomdp.data import Dataset, View
 from vd4rl_pomdp.data.collect import CollectConfig, play
 from vd4rl_pomdp.data.store import PlayedStore
@@ -20,8 +20,6 @@ from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.nn.policy import Standardise
 from vd4rl_pomdp.policies.actor import Actor, load_actor
 from vd4rl_pomdp.tasks import TASKS, DMCTask
-
-_DRAWS = 1 << 31
 
 
 @dataclass(frozen=True)
@@ -76,7 +74,7 @@ def hide(states: Tensor, key: Tensor, share: float) -> Tensor:
         key: (...,) int64; equal keys hide the same coordinates.
         share: probability that a coordinate is hidden.
     """
-    return states.masked_fill(draw_integers(key, _DRAWS, states.shape[-1]) < share * _DRAWS, 0.0)
+    return states.masked_fill(draw_integers(key, DRAWS, states.shape[-1]) < share * DRAWS, 0.0)
 
 
 class HiddenView(View):

@@ -20,12 +20,11 @@ from vd4rl_pomdp.experiments.control.training import pretrained, trained_policy
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.policies.actor import Actor
 from vd4rl_pomdp.probes import probe_state
+from vd4rl_pomdp.reference import REACHED, action_error
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.provenance import git_commit
 from vd4rl_pomdp.types import row_key
 
-GOOD = 0.8
-"""An episode is good if it returns more than this share of the set's mean return."""
 EPISODE_COLUMNS = (*LABELS, "episode", "episode_seed", "return", "length", "action_error")
 
 
@@ -45,7 +44,7 @@ def measured(run: ControlRun) -> tuple[Row, list[Row]]:
         "return_min": returns.min(),
         "return_max": returns.max(),
         "data_return": data,
-        "good_share": (returns > GOOD * data).mean(),
+        "good_share": (returns > REACHED * data).mean(),
         "error_on_data": _error_on_data(policy, seen, played),
         "error_in_loop": sum(e["action_error"] * e["length"] for e in episodes) / sum(e["length"] for e in episodes),
         **_probes(seen, played),
@@ -56,17 +55,12 @@ def measured(run: ControlRun) -> tuple[Row, list[Row]]:
     return run.labels | numbers | {"git_commit": git_commit()}, episodes
 
 
-def action_error(action: np.ndarray, expert: np.ndarray) -> float:
-    """Mean squared difference of (..., A) actions from the expert's."""
-    return float(np.square(action - expert).mean())
-
-
 def play_episode(act: Callable[[TimeStep], np.ndarray], env: PixelEnv, expert: Actor, seed: int) -> Row:
     """Return, length and mean action error of an episode; the expert's mean action is asked at every visited state."""
     now, total, errors = env.reset(seed), 0.0, []
     while not now.last:
         action = act(now)
-        errors.append(action_error(action, expert.act(now.state)))
+        errors.append(float(action_error(action, expert.act(now.state))))
         now = env.step(action)
         total += now.reward
     return {
@@ -103,7 +97,7 @@ class HiddenAgent:
 def _error_on_data(policy: Policy, features: Tensor, played: PlayedSet) -> float:
     """Action error on the path of the data, of (M, D) float32 representations of the rows that have a successor."""
     actions = torch.cat([policy(part) for part in features.split(4096)])
-    return action_error(actions.numpy(), played.expert_actions.numpy())
+    return float(action_error(actions.numpy(), played.expert_actions.numpy()))
 
 
 def _probes(features: Tensor, played: PlayedSet) -> dict[str, float]:
