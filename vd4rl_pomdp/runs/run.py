@@ -13,6 +13,7 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
+from vd4rl_pomdp.data.format import PLAN
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.registry import origins
@@ -22,6 +23,11 @@ from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_js
 from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.runs.provenance import command, git_commit, machine, versions
 from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS
+
+
+def collection_of(data: Path) -> dict[str, Any]:
+    """How a set was collected, which says more than its fingerprint where it is not at hand; empty for foreign sets."""
+    return read_json(data / PLAN) if (data / PLAN).exists() else {}
 
 
 class RunFolder:
@@ -94,7 +100,7 @@ class RunFolder:
         if not (self.path / "config.json").exists():
             record = {"format": FORMAT, "stage": self._stage, "config": self.config, "inputs": self.inputs}
             origin = {"versions": versions(), "git_commit": git_commit(), "command": command()}
-            origin |= {"plugins": origins(self.config)}
+            origin |= {"plugins": origins(self.config), "collection": collection_of(Path(self.config["data"]))}
             write_json(self.path / "config.json", record | origin)
         if not (self.path / "machine.json").exists():
             write_json(self.path / "machine.json", machine())

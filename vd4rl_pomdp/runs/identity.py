@@ -1,0 +1,34 @@
+"""What a run computes, by name: equal for equal settings, seed, data and format, whatever its folder and its machine.
+
+A run's `recipe` can be told before its data exist; with the fingerprints of the data it becomes its `identity`.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Mapping
+from typing import Any
+
+from vd4rl_pomdp.runs.settings import settings_of
+
+
+def identity(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:
+    """Name of what a run computes, 24 characters.
+
+    Args:
+        record: its config.json.
+        card: what the encoder it started from says of its pretraining; empty for a pretraining run.
+    """
+    return _hash([recipe(record, card), record.get("inputs", {}).get("data"), card.get("data")])
+
+
+def recipe(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:
+    """Name of what a run computes but for the content of its data, likewise."""
+    own = settings_of(record["config"]) | {"seed": record["config"]["seed"]}
+    before = {"settings": card["settings"], "seed": card["seed"]} if card else {}
+    return _hash([record.get("format", 1), record["stage"], own, before])
+
+
+def _hash(told: Any) -> str:
+    return hashlib.blake2b(json.dumps(told, sort_keys=True).encode(), digest_size=12).hexdigest()
