@@ -66,9 +66,9 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     refuse_outside(config, shift=(0, dataset.frame_size - 1))
     longest = max(TASKS.named(card.task).decisions, FinetuneConfig.eval_length)
     refuse_number("eval_length", config.eval_length, 1, longest)
-    if card.end_to_end:
-        config = end_to_end(config, card.end_to_end)
-    config = _with_memory(config, encoder, card)
+    config = as_trained(config, card.method, card.end_to_end, encoder.gru is not None)
+    if isinstance(config.memory, HistoryOptions):
+        encoder.config = replace(encoder.config, **config.memory.encoder_changes)
     if encoder.reads_state:
         dataset.require_states()
     _check_n_step(config, dataset)
@@ -86,37 +86,35 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     return run
 
 
-def _with_memory(config: FinetuneConfig, encoder: Encoder, card: EncoderCard) -> FinetuneConfig:
-    """The settings for an encoder, which is told what of its memory is read; one without a memory reads none of them.
+def as_trained(config: FinetuneConfig, method: str, algorithm: str, remembers: bool) -> FinetuneConfig:
+    """The settings as an encoder's policy is trained with them: what it cannot read is no part of them.
+
+    Args:
+        config: the settings that were told.
+        method: the encoder's.
+        algorithm: the algorithm that the method brings along, if it has no frozen stage; else empty.
+        remembers: whether the encoder has a memory.
 
     Raises:
         UserError: a setting that was not the default is not read.
     """
-    assert isinstance(config.memory, HistoryOptions)
-    if encoder.gru is not None and not card.end_to_end:
-        encoder.config = replace(encoder.config, **config.memory.encoder_changes)
-        return config
-    usual = config.usual()
-    for name, value in flat(config.memory).items():
-        if value != usual[name]:
-            raise UserError(f"{flag_of(name)} is not read: {card.method} has no memory; leave it out")
-    return replace(config, memory=NO_OPTIONS)
+    if algorithm:
+        config = _end_to_end(config, algorithm)
+    return config if remembers and not algorithm else _without_memory(config, method)
 
 
-def end_to_end(config: FinetuneConfig, algorithm: str) -> FinetuneConfig:
-    """The settings for a method that has no frozen stage, and brings its algorithm along.
-
-    Raises:
-        UserError: a setting that was not the default is not read.
-    """
+def _end_to_end(config: FinetuneConfig, algorithm: str) -> FinetuneConfig:
     if config.views != config.usual()["views"]:
         raise UserError(f"--views is not read by the algorithm {algorithm}, which trains the encoder: leave it out")
     return config.altered(algorithm=algorithm, views=0)
 
 
-def check_end_to_end(config: FinetuneConfig, algorithm: str) -> None:
-    """Raise UserError unless `end_to_end` accepts the settings."""
-    end_to_end(config, algorithm)
+def _without_memory(config: FinetuneConfig, method: str) -> FinetuneConfig:
+    usual = config.usual()
+    for name, value in flat(config.memory).items():
+        if value != usual[name]:
+            raise UserError(f"{flag_of(name)} is not read: {method} has no memory; leave it out")
+    return replace(config, memory=NO_OPTIONS)
 
 
 def _check_n_step(config: FinetuneConfig, dataset: Dataset) -> None:

@@ -20,6 +20,33 @@ class UserError(ValueError):
     The command line prints the message and exits with code 2; a library caller catches a ValueError.
     """
 
+    cause = "refused"
+    """In one word why it ended: a sweep tries some causes again."""
+
+
+class OutOfMemoryError(UserError):
+    """The memory of the machine or its GPU did not suffice."""
+
+    cause = "out of memory"
+
+
+class DiskFullError(UserError):
+    """No space was left where something was to be written."""
+
+    cause = "disk full"
+
+
+class InUseError(UserError):
+    """Another process owns the folder."""
+
+    cause = "in use"
+
+
+class WorkerDiedError(UserError):
+    """A process that helped was ended from outside."""
+
+    cause = "killed"
+
 
 MAX_SEED = 2**31 - 1
 """Largest seed that every random generator in use takes."""
@@ -65,7 +92,7 @@ def disk_error(path: Path | str | None, error: OSError) -> UserError:
     """A sentence for a file or folder that could not be read or written; None where the system does not name it."""
     where = f"{path}: " if path is not None else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return UserError(f"{where}the disk is full: free some space and start the same command again")
+        return DiskFullError(f"{where}the disk is full: free some space and start the same command again")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         reason = (error.strerror or str(error)).lower()
         return UserError(f"{where}may not be used ({reason}); ask its owner for access, or choose another path")

@@ -6,10 +6,9 @@ import io
 import sys
 from collections.abc import Sequence
 
-from vd4rl_pomdp.cli import data, navigation, parts, policy, stages, studies
-from vd4rl_pomdp.cli.dispatch import COMMANDS, run_stage
-from vd4rl_pomdp.errors import UserError, disk_error
-from vd4rl_pomdp.runs import interrupt
+from vd4rl_pomdp.cli import data, navigation, parts, policy, stages, studies, sweeps
+from vd4rl_pomdp.cli.dispatch import COMMANDS
+from vd4rl_pomdp.cli.ends import run_to_end
 
 COMMANDS |= {
     "demo": stages.DEMO,
@@ -18,7 +17,7 @@ COMMANDS |= {
     "policy": policy.COMMANDS,
     **stages.COMMANDS,
     "navigation": navigation.COMMANDS,
-    "sweep": stages.SWEEP,
+    "sweep": sweeps.COMMANDS,
     **studies.COMMANDS,
 }
 
@@ -29,39 +28,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # \u2028 and the like for what a terminal cannot show
-    try:
-        _refuse_undecodable(words)
-        with interrupt.handled(program=True):
-            run_stage(words)
-    except UserError as error:
-        print(f"error: {' '.join(str(error).split())}", file=sys.stderr)
-        sys.exit(2)
-    except FloatingPointError as error:
-        print(f"error: training diverged, {error}; lower --learning-rate or use --precision fp32", file=sys.stderr)
-        sys.exit(1)
-    except KeyboardInterrupt as error:
-        _say_ended("interrupted", str(error))
-        sys.exit(130)
-    except interrupt.Terminated as error:
-        _say_ended("terminated", error.reason)
-        raise
-    except BrokenPipeError:
-        sys.exit(141)
-    except OSError as error:
-        print(f"error: {disk_error(error.filename, error)}", file=sys.stderr)
-        sys.exit(2)
-
-
-def _say_ended(how: str, kept: str) -> None:
-    """One line for a signal's end; what was `kept` is where a training loop stood."""
-    where = f"{kept}, and the same command goes on from there" if kept else "the same command does what is left"
-    print(f"{how}: {where}", file=sys.stderr)
-
-
-def _refuse_undecodable(words: Sequence[str]) -> None:
-    """Names and paths go into files and pages, which are UTF-8."""
-    for word in words:
-        try:
-            word.encode()
-        except UnicodeEncodeError:
-            raise UserError(f"{word!a} is not UTF-8: use another name") from None
+    end = run_to_end(words)
+    if end.line:
+        print(end.line, file=sys.stderr)
+    if end.code:
+        sys.exit(end.code)

@@ -26,7 +26,7 @@ import numpy as np
 
 from vd4rl_pomdp.data.episodes import join_shards
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows, shard_paths
-from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.errors import DiskFullError, UserError, disk_error
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 
@@ -134,6 +134,13 @@ def open_store(path: Path, cache: Path | None = None) -> Store:
     return Store(folder, meta)
 
 
+def known_fingerprint(path: Path, cache: Path | None = None) -> str | None:
+    """Fingerprint of the set at `path`, None if it was never decoded; raises UserError if there is no whole set."""
+    folder = (cache or default_cache()) / _key(shard_paths(path))
+    meta = _read_meta(folder)
+    return None if meta is None else Store(folder, meta).fingerprint
+
+
 def verify_store(store: Store) -> None:
     """Recompute every checksum; raises UserError naming the file that has changed since it was decoded."""
     for name, file in store.meta["files"].items():
@@ -197,7 +204,7 @@ def _decode(shards: Sequence[Path], folder: Path) -> dict[str, Any]:
 def _require_space(folder: Path, needed: int) -> None:
     free = shutil.disk_usage(folder).free
     if needed > free:
-        raise UserError(
+        raise DiskFullError(
             f"{folder.parent}: decoding needs {needed / 1e9:.1f} GB, the disk has {free / 1e9:.1f} GB; "
             "free some space or set VD4RL_POMDP_CACHE to a folder on another disk"
         )

@@ -79,4 +79,8 @@ def training(run: RunFolder, learner: Learner, title: str, total: int, unit: str
     run.restore(restore)
     log = MetricsLog(run.path / "metrics.jsonl", learner.step, run.config["wandb"], run.config)
     with closing(log), ProgressLine(title, total, unit, learner.step) as progress, interrupt.deferred():
-        yield Loop(run, learner, means, total, log, progress)
+        try:
+            yield Loop(run, learner, means, total, log, progress)
+        except FloatingPointError as error:
+            run.mark_diverged(learner.step, str(error))
+            raise

@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.errors import UserError, flag_of
+from vd4rl_pomdp.errors import DiskFullError, OutOfMemoryError, UserError, flag_of
 from vd4rl_pomdp.options import flat
 
 _OUT = ("DefaultCPUAllocator", "not enough memory", "Storage size calculation overflowed", "out of memory")
@@ -47,7 +47,7 @@ def require_disk(needed: float, path: Path, config: Any, *names: str) -> None:
     place = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
     free = shutil.disk_usage(place).free
     if needed > free:
-        raise UserError(
+        raise DiskFullError(
             f"{_named(config, names)} takes {needed / 1e9:,.1f} GB on the disk of {path}, and {free / 1e9:,.1f} GB are "
             f"free: {_remedy(names)} or free some space"
         )
@@ -61,7 +61,7 @@ def telling_memory(config: Any, *names: str) -> Iterator[None]:
     except (MemoryError, RuntimeError) as error:
         if not _ran_out(error):
             raise
-        raise UserError(f"out of memory with {_named(config, names)}: {_remedy(names)}") from error
+        raise OutOfMemoryError(f"out of memory with {_named(config, names)}: {_remedy(names)}") from error
 
 
 def _ran_out(error: Exception) -> bool:

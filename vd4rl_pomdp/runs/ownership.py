@@ -21,7 +21,7 @@ from typing import Any
 
 from filelock import SoftFileLease, Timeout
 
-from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.errors import InUseError, disk_errors
 from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.runs.interrupt import handled
 
@@ -41,11 +41,11 @@ class Owner:
         write_json(folder / _NOTE, self._note)
 
     def check(self) -> None:
-        """Raise UserError unless the folder is still this process's; called before what cannot be undone."""
+        """Raise InUseError unless the folder is still this process's; called before what cannot be undone."""
         note = _read_note(self._folder)
         if note != self._note:
             taken = f"was taken over by {_name(note)}" if note else "was removed or taken over"
-            raise UserError(f"{self._folder}: {taken} while this process wrote there; it ends and leaves it alone")
+            raise InUseError(f"{self._folder}: {taken} while this process wrote there; it ends and leaves it alone")
 
     def release(self) -> None:
         """Remove the note, if it is still this process's."""
@@ -58,7 +58,8 @@ def owned(folder: Path) -> Iterator[Owner]:
     """Own a folder, made if missing, and answer signals as `interrupt` says.
 
     Raises:
-        UserError: another process owns it, which the message names, or it cannot be written.
+        InUseError: another process owns it, which the message names.
+        UserError: it cannot be written.
     """
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
@@ -75,6 +76,15 @@ def owned(folder: Path) -> Iterator[Owner]:
         lease.release()
 
 
+def in_use(folder: Path) -> bool:
+    """Whether a process seems to own a folder: one that lives on this machine, or gave a sign of life of late."""
+    note = _read_note(folder)
+    if note.get("host") == socket.gethostname():
+        return _runs_here(note)
+    beat = _heartbeat(folder)
+    return beat is not None and time.time_ns() - beat < LEASE_S * 1e9
+
+
 def _acquire(lease: SoftFileLease, folder: Path) -> None:
     if _take(lease):
         return
@@ -88,7 +98,9 @@ def _acquire(lease: SoftFileLease, folder: Path) -> None:
         seen = _heartbeat(folder)
         if _take(lease, 1.5 * LEASE_S, lambda: _heartbeat(folder) not in (seen, None)):
             return
-    raise UserError(f"{folder}: is in use by {_name(_read_note(folder))}; wait until it ends, or choose another folder")
+    raise InUseError(
+        f"{folder}: is in use by {_name(_read_note(folder))}; wait until it ends, or choose another folder"
+    )
 
 
 def _take(lease: SoftFileLease, wait_s: float = 0.0, refused: Callable[[], bool] | None = None) -> bool:

@@ -24,6 +24,8 @@ from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.runs.provenance import command, git_commit, machine, versions
 from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS
 
+DIVERGED = "diverged.json"
+
 
 def collection_of(data: Path) -> dict[str, Any]:
     """How a set was collected, which says more than its fingerprint where it is not at hand; empty for foreign sets."""
@@ -102,6 +104,7 @@ class RunFolder:
             origin = {"versions": versions(), "git_commit": git_commit(), "command": command()}
             origin |= {"plugins": origins(self.config), "collection": collection_of(Path(self.config["data"]))}
             write_json(self.path / "config.json", record | origin)
+        (self.path / DIVERGED).unlink(missing_ok=True)
         if not (self.path / "machine.json").exists():
             write_json(self.path / "machine.json", machine())
 
@@ -133,6 +136,10 @@ class RunFolder:
         assert self._owner is not None, "a run is written inside its `with` block"
         self._owner.check()
         self._checkpoints.add(step, pack(state), self.seconds)
+
+    def mark_diverged(self, step: int, message: str) -> None:
+        """Say that a number was no longer finite after `step`; going on with the run takes the mark away."""
+        write_json(self.path / DIVERGED, {"step": step, "message": message})
 
     def finish(self, **more: Any) -> None:
         """Mark the run as done, keeping its wall-clock seconds and the last checkpoint."""

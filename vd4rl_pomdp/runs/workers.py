@@ -15,7 +15,7 @@ from multiprocessing.connection import Connection
 from pickle import PicklingError
 from typing import Any, TypeVar
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, WorkerDiedError
 from vd4rl_pomdp.runs.interrupt import blocked
 
 Job = TypeVar("Job")
@@ -108,7 +108,7 @@ class _Crew:
         except (EOFError, ConnectionError):
             process = self._workers[connection]
             process.join()
-            raise UserError(
+            raise WorkerDiedError(
                 f"a worker process ended before its job (exit code {process.exitcode}), perhaps for want of memory: "
                 "use fewer --workers and start the same command again"
             ) from None

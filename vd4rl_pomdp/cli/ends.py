@@ -1,0 +1,61 @@
+"""How a command ends: exit code, cause and one line for every end that is no defect of the program."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+from vd4rl_pomdp.cli.dispatch import run_stage
+from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.runs import interrupt
+
+DONE, DIVERGED, INTERRUPTED = "done", "diverged", "interrupted"
+
+
+@dataclass(frozen=True)
+class End:
+    """What is left of a command."""
+
+    code: int = 0
+    cause: str = DONE
+    """done, diverged, interrupted, or the `cause` of a UserError."""
+    line: str = ""
+    """What the user is told, empty if nothing is."""
+
+
+def run_to_end(words: Sequence[str]) -> End:
+    """Do what `vd4rl-pomdp WORDS` does; only a defect is raised."""
+    try:
+        _refuse_undecodable(words)
+        with interrupt.handled(program=True):
+            run_stage(list(words))
+    except UserError as error:
+        return End(2, error.cause, f"error: {' '.join(str(error).split())}")
+    except FloatingPointError as error:
+        remedy = "lower --learning-rate or use --precision fp32"
+        return End(1, DIVERGED, f"error: training diverged, {error}; {remedy}")
+    except KeyboardInterrupt as error:
+        return End(130, INTERRUPTED, _ended("interrupted", str(error)))
+    except interrupt.Terminated as error:
+        return End(143, INTERRUPTED, _ended("terminated", error.reason))
+    except BrokenPipeError:
+        return End(141, INTERRUPTED)
+    except OSError as error:
+        told = disk_error(error.filename, error)
+        return End(2, told.cause, f"error: {told}")
+    return End()
+
+
+def _ended(how: str, kept: str) -> str:
+    """One line for a signal's end; what was `kept` is where a training loop stood."""
+    where = f"{kept}, and the same command goes on from there" if kept else "the same command does what is left"
+    return f"{how}: {where}"
+
+
+def _refuse_undecodable(words: Sequence[str]) -> None:
+    """Names and paths go into files and pages, which are UTF-8."""
+    for word in words:
+        try:
+            word.encode()
+        except UnicodeEncodeError:
+            raise UserError(f"{word!a} is not UTF-8: use another name") from None

@@ -1,0 +1,199 @@
+"""`vd4rl-pomdp sweep`: grids of runs on whatever there is to run them."""
+
+from __future__ import annotations
+
+import shlex
+import sys
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar
+
+import tyro
+
+from vd4rl_pomdp.cli.dispatch import PROGRAM, Arguments, Command
+from vd4rl_pomdp.cli.parsing import parse, parse_stage, show
+from vd4rl_pomdp.options import NO_OPTIONS, Options, StageConfig
+from vd4rl_pomdp.sweeps.executors import executor_kind
+
+if TYPE_CHECKING:
+    from vd4rl_pomdp.sweeps.history import History
+    from vd4rl_pomdp.sweeps.plan import Job
+
+
+@dataclass(frozen=True, kw_only=True)
+class _ExecutorConfig(StageConfig):
+    """What carries out jobs."""
+
+    executor: str = "local"
+    """local (this machine), slurm or ray."""
+    options: Annotated[Options, tyro.conf.arg(name="executor")] = NO_OPTIONS
+    """What the chosen executor can be told."""
+
+    preset: tyro.conf.Suppress[str] = "paper"
+    choosers: ClassVar[tuple[str, ...]] = ("executor",)
+
+    @classmethod
+    def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
+        """Options of the executor."""
+        return {"options": executor_kind(values["executor"]).options.fill(values)}
+
+
+@dataclass(frozen=True, kw_only=True)
+class RunCommand(_ExecutorConfig):
+    """Carry out a grid: collect its sets, pretrain its encoders, once each, and fine-tune its policies.
+
+    The same command goes on with what is left. Exit code 0: all is finished; 1: some is not.
+    """
+
+    grid: tyro.conf.Positional[str] = ""
+    """A grid that ships (`vd4rl-pomdp sweep list`), or a TOML or Python file."""
+    out: Path = Path()
+    """Folder of the runs; runs that lie there are found by what they computed."""
+    data: Path | None = None
+    """Folder of the sets, DATA/TASK/QUALITY: those that are there are taken, others collected; default OUT/data."""
+    only: list[str] = field(default_factory=list)
+    """Cells with these values alone: method=mik+a,acro seed=0."""
+    change: list[str] = field(default_factory=list)
+    """Settings that replace those of every block: preset=cpu finetune.updates=20000."""
+    testing: bool = False
+    """Run the grid's testing subset: minutes, to see that all works."""
+    done: list[Path] = field(default_factory=list)
+    """Results folders whose runs count as finished."""
+    dry_run: bool = False
+    """Print every job, what is finished, what is shared, and an estimate of time; run nothing."""
+
+
+def _run(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.runs.outputs import refuse_kept
+    from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below
+    from vd4rl_pomdp.sweeps.grid import load_grid, narrow
+    from vd4rl_pomdp.sweeps.history import History
+    from vd4rl_pomdp.sweeps.plan import Planner
+
+    command = parse_stage(RunCommand, words, program)
+    grid = load_grid(command.grid, command.change, command.testing)
+    cells = narrow(grid.cells(), command.only)
+    refuse_kept(command.out)
+    here, kept = FoundRuns(runs_below(command.out)), FoundRuns([])
+    jobs = Planner(command.out, command.data, kept, here).plan(cells)
+    if command.dry_run:
+        _print_plan(jobs, [*here.runs, *kept.runs])
+        return
+    history = History(command.out)
+    history.keep_plan(grid.name, jobs)
+    _carry_out(jobs, command, history)
+
+
+def _print_plan(jobs: list[Job], past: list[Any]) -> None:
+    """Every job as one line of shell, then what is shared, and how long it takes."""
+    from vd4rl_pomdp.sweeps.estimate import Estimates
+    from vd4rl_pomdp.sweeps.work import told_seconds
+
+    estimates, users = Estimates(past), Counter(name for job in jobs for name in job.needs)
+    known, unknown = 0.0, 0
+    for job in jobs:
+        seconds = estimates.seconds(job)
+        state = "done" if job.done else "goes on" if job.begun else "new"
+        took = "" if job.done or seconds is None else f", about {told_seconds(seconds)}"
+        shared = f", for {users[job.name]} jobs" if users[job.name] > 1 else ""
+        print(f"# {job.name}: {state}{shared}{took}")
+        if not job.done:
+            print(f"{PROGRAM} {shlex.join(job.words)}")
+            known, unknown = known + (seconds or 0.0), unknown + (seconds is None)
+    done = sum(job.done for job in jobs)
+    print(
+        f"# {len(jobs)} jobs, {done} done, {len(jobs) - done} to do: {told_seconds(known)} of work by past runs", end=""
+    )
+    print(f", {unknown} jobs of unknown length" if unknown else "")
+
+
+def _carry_out(jobs: list[Job], command: _ExecutorConfig, history: History) -> None:
+    """Run jobs to their end; SystemExit 1 if some are not finished."""
+    from vd4rl_pomdp.sweeps.driver import Driver
+
+    executor = executor_kind(command.executor).build(command.options)
+    if not Driver(jobs, executor, history).run():
+        failures = _status(history, jobs).failures
+        for name, row in failures.items():
+            print(f"{row['cause']}: {name}: {row['line']}", file=sys.stderr)
+        left = sum(not job.finished for job in jobs)
+        print(
+            f"{left} of {len(jobs)} jobs are not finished, {len(failures)} failed; `sweep retry` takes those up again"
+        )
+        sys.exit(1)
+    print(f"all {len(jobs)} jobs are finished")
+
+
+def _status(history: History, jobs: list[Job]) -> Any:
+    from vd4rl_pomdp.sweeps.estimate import Estimates
+    from vd4rl_pomdp.sweeps.found import runs_below
+    from vd4rl_pomdp.sweeps.status import status
+
+    return status(jobs, history.attempts(), Estimates(runs_below(history.out)))
+
+
+@dataclass(frozen=True)
+class StatusCommand:
+    """Show where a sweep stands: counts, rate, time left, and failures with their last line."""
+
+    out: tyro.conf.Positional[Path]
+    """Folder of the sweep."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def _show_status(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.sweeps.history import History
+    from vd4rl_pomdp.sweeps.status import lines
+
+    command = parse(StatusCommand, words, program)
+    history = History(command.out)
+    found = _status(history, history.jobs())
+    if command.json:
+        numbers = {"per_hour": found.per_hour, "seconds_left": found.seconds_left, "finished": found.finished}
+        show({"counts": dict(found.counts)} | numbers | {"states": found.states, "failures": found.failures}, True)
+    else:
+        print(*lines(found), sep="\n")
+
+
+@dataclass(frozen=True, kw_only=True)
+class RetryCommand(_ExecutorConfig):
+    """Take up the failures of a sweep again, and whatever else is left of its grids."""
+
+    out: tyro.conf.Positional[Path] = Path()
+    """Folder of the sweep."""
+
+
+def _retry(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.sweeps.history import History
+
+    command = parse_stage(RetryCommand, words, program)
+    history = History(command.out)
+    jobs = history.jobs()
+    for name in _status(history, jobs).failures:
+        history.forget(name)
+    _carry_out(jobs, command, history)
+
+
+@dataclass(frozen=True)
+class ListCommand:
+    """List the grids that ship with the package."""
+
+
+def _list(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.sweeps.grid import load_grid, names
+
+    parse(ListCommand, words, program)
+    for name in names():
+        grid = load_grid(name)
+        print(f"{name:<18} {len(grid.cells()):>5} cells  {grid.title}")
+
+
+COMMANDS = {
+    "run": Command("carry out a grid, or go on with it", _run),
+    "status": Command("counts, rate, time left and failures of a sweep", _show_status),
+    "retry": Command("take up failures again", _retry),
+    "list": Command("the grids that ship", _list),
+}

@@ -1,0 +1,172 @@
+"""Carries out a plan: starts what can be started, tries again what is worth it, and lets the rest go on.
+
+Whether a job is done, its folder says; so a driver may be killed at any moment, several may work on one folder, and the
+next one goes on with whatever is left.
+"""
+
+from __future__ import annotations
+
+import socket
+import sys
+import time
+from collections.abc import Iterable
+from dataclasses import dataclass
+
+from vd4rl_pomdp.errors import DiskFullError, InUseError, OutOfMemoryError, UserError, disk_errors
+from vd4rl_pomdp.runs import interrupt
+from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.ownership import in_use
+from vd4rl_pomdp.sweeps.history import History
+from vd4rl_pomdp.sweeps.plan import Job
+from vd4rl_pomdp.sweeps.progress import progress_of
+from vd4rl_pomdp.sweeps.work import DIVERGED, DONE, FAILED, INTERRUPTED, KILLED, Ended, Executor
+
+POLL_S = 0.1
+
+
+@dataclass(frozen=True)
+class Retry:
+    """What is done about a cause."""
+
+    times: int
+    """How often a job is tried again in a row without having got further."""
+    wait_s: float = 0.0
+    """Before that."""
+
+
+_ALWAYS = 10**6
+RETRIES = {
+    KILLED: Retry(4),
+    DiskFullError.cause: Retry(20, 30.0),
+    InUseError.cause: Retry(_ALWAYS, 10.0),
+    INTERRUPTED: Retry(_ALWAYS),
+    OutOfMemoryError.cause: Retry(1),
+    FAILED: Retry(1),
+    UserError.cause: Retry(0),
+    DIVERGED: Retry(0),
+    DONE: Retry(0),
+}
+"""By cause. Out of memory is tried again with twice the slots; where a job has them all already, it is not."""
+
+
+def given_up(rows: list[Row], largest: int = 1) -> str:
+    """Why a job is not tried again, judging by its attempts since it was last taken up; empty if it is.
+
+    Args:
+        rows: its attempts, oldest first.
+        largest: the most slots it could have.
+    """
+    if not rows:
+        return ""
+    last = rows[-1]
+    alike = 0
+    for row in reversed(rows):
+        if (row["cause"], row["step"]) != (last["cause"], last["step"]):
+            break
+        alike += 1
+    hopeless = last["cause"] == OutOfMemoryError.cause and last["slots"] >= largest
+    return last["cause"] if hopeless or alike > RETRIES[last["cause"]].times else ""
+
+
+class Driver:
+    """One process's part in a sweep."""
+
+    def __init__(self, jobs: Iterable[Job], executor: Executor, history: History) -> None:
+        """See the module."""
+        self._jobs = {job.name: job for job in jobs}
+        self._executor, self._history = executor, history
+        self._rows = history.attempts()
+        self._left = {job.name: job for job in self._jobs.values() if not job.finished}
+        self._running: dict[str, tuple[float, int]] = {}
+        """When each began, and its slots."""
+        self._not_before: dict[str, float] = {}
+
+    def run(self) -> bool:
+        """Work until nothing is left that can be done; whether all is finished."""
+        try:
+            while self._left and (self._start() or self._running or self._waiting()):
+                time.sleep(POLL_S)
+                self._collect()
+                interrupt.check("the sweep's jobs have ended")
+        except BaseException:
+            self._executor.stop()
+            self._collect()
+            raise
+        return not self._left
+
+    def _start(self) -> bool:
+        """Start every job that can be; whether there was one."""
+        before = len(self._running)
+        for job in list(self._left.values()):
+            if not self._executor.fits(1):
+                break
+            if self._ready(job) and self._executor.fits(self._slots(job)) and not self._elsewhere(job):
+                self._begin(job)
+        return len(self._running) > before
+
+    def _begin(self, job: Job) -> None:
+        slots = self._slots(job)
+        self._running[job.name] = (time.monotonic(), slots)
+        try:
+            with disk_errors(job.folder):
+                self._executor.start(self._history.work(job, slots))
+        except DiskFullError as error:
+            self._end(Ended(job.name, error.cause, str(error)))
+
+    def _ready(self, job: Job) -> bool:
+        free = job.name not in self._running and time.monotonic() >= self._not_before.get(job.name, 0)
+        return free and not self._given_up(job) and not any(name in self._left for name in job.needs)
+
+    def _elsewhere(self, job: Job) -> bool:
+        """Whether another process has finished a job, or is at it."""
+        if job.finished:
+            del self._left[job.name]
+            return True
+        if busy := in_use(job.folder):
+            self._not_before[job.name] = time.monotonic() + RETRIES[InUseError.cause].wait_s
+        return busy
+
+    def _given_up(self, job: Job) -> bool:
+        return bool(given_up(self._rows.get(job.name, []), self._executor.largest))
+
+    def _waiting(self) -> bool:
+        """Whether a job waits for its time."""
+        now = time.monotonic()
+        return any(self._not_before.get(name, 0) > now and not self._given_up(job) for name, job in self._left.items())
+
+    def _slots(self, job: Job) -> int:
+        """One, or twice as many as when the memory last did not suffice."""
+        short = [row["slots"] for row in self._rows.get(job.name, []) if row["cause"] == OutOfMemoryError.cause]
+        return min(2 * max(short), self._executor.largest) if short else 1
+
+    def _collect(self) -> None:
+        for ended in self._executor.ended():
+            self._end(ended)
+
+    def _end(self, ended: Ended) -> None:
+        began, slots = self._running.pop(ended.name)
+        seconds = time.monotonic() - began
+        self._note(ended, seconds, slots)
+        if self._jobs[ended.name].finished:
+            del self._left[ended.name]
+        else:
+            self._not_before[ended.name] = time.monotonic() + RETRIES[ended.cause].wait_s
+        self._say(ended, seconds)
+
+    def _note(self, ended: Ended, seconds: float, slots: int) -> None:
+        """Keep the row of an attempt, here and on the disk, unless that is full."""
+        row: Row = {"job": ended.name, "ended": round(time.time(), 1), "seconds": round(seconds, 1)}
+        row |= {"cause": ended.cause}
+        row |= {"line": ended.line, "step": progress_of(self._jobs[ended.name]), "slots": slots}
+        row |= {"host": socket.gethostname()}
+        self._rows.setdefault(ended.name, []).append(row)
+        try:
+            self._history.add(row)
+        except DiskFullError as error:
+            print(f"warning: {error}", file=sys.stderr)
+
+    def _say(self, ended: Ended, seconds: float) -> None:
+        done = len(self._jobs) - len(self._left)
+        line = f"[{done}/{len(self._jobs)}] {ended.cause:<8} {seconds:6.0f} s  {ended.name}"
+        line += f": {ended.line}" if ended.line else ""
+        print(line, file=sys.stderr, flush=True)

@@ -1,0 +1,36 @@
+"""What jobs will take, judging by runs that were finished: an estimate, for machines like those."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from statistics import median
+
+from vd4rl_pomdp.sweeps.found import FoundRun
+from vd4rl_pomdp.sweeps.plan import Job, cost_of
+from vd4rl_pomdp.sweeps.stages import STAGES
+
+_SECTIONS = {stage: section for section, stage in STAGES.items()}
+_SCALE = {"pretrain": "steps", "finetune": "updates", "navigation_train": "steps"}
+"""Setting that the time of a stage is about proportional to."""
+
+
+class Estimates:
+    """Seconds by stage and settings, from past runs."""
+
+    def __init__(self, runs: Iterable[FoundRun]) -> None:
+        """Args: runs: those to judge by; unfinished ones tell nothing."""
+        self._exact: dict[tuple, list[float]] = {}
+        self._by_stage: dict[str, list[tuple[float, float]]] = {}
+        for run in runs:
+            if run.seconds is not None and (section := _SECTIONS.get(run.record["stage"])):
+                self._exact.setdefault((section, cost_of(run.settings)), []).append(run.seconds)
+                amount = float(run.record["config"].get(_SCALE[section]) or 1)
+                self._by_stage.setdefault(section, []).append((amount, run.seconds))
+
+    def seconds(self, job: Job) -> float | None:
+        """What a job takes from its beginning; None if no run tells."""
+        if known := self._exact.get((job.section, job.settings)):
+            return median(known)
+        rates = [seconds / amount for amount, seconds in self._by_stage.get(job.section, ())]
+        amounts = dict(job.settings)
+        return median(rates) * float(amounts.get(_SCALE[job.section], 1)) if rates else None

@@ -1,0 +1,67 @@
+"""Runs that are there already, by what they compute: below a sweep's folder, and in rows that were kept."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vd4rl_pomdp.nn.encoder_folder import CONFIG
+from vd4rl_pomdp.runs.files import Row, read_json
+from vd4rl_pomdp.runs.identity import recipe
+from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.sweeps.sets import DataSet
+
+
+@dataclass(frozen=True)
+class FoundRun:
+    """A run, as far as a sweep looks into it."""
+
+    folder: Path
+    record: Row
+    """Its config.json."""
+    card: Row
+    """What its encoder says of its pretraining, empty where it has none."""
+    seconds: float | None
+    """Wall-clock time; None while it is unfinished."""
+
+    @property
+    def recipe(self) -> str:
+        """What it computes, but for its data's content."""
+        return recipe(self.record, self.card if self.record["stage"] == "finetune" else {})
+
+    @property
+    def settings(self) -> dict[str, Any]:
+        """Its settings and its encoder's, without the seed: what its cost depends on, beside the machine."""
+        return self.card.get("settings", {}) | settings_of(self.record["config"])
+
+
+class FoundRuns:
+    """Runs by what they compute."""
+
+    def __init__(self, runs: Iterable[FoundRun]) -> None:
+        self.runs = list(runs)
+        self._by_recipe: dict[str, list[FoundRun]] = {}
+        for run in self.runs:
+            self._by_recipe.setdefault(run.recipe, []).append(run)
+        self._folders = {run.folder for run in self.runs}
+
+    def of(self, name: str, data: DataSet) -> FoundRun | None:
+        """The run of a recipe on a set, a finished one if there is one."""
+        fitting = [run for run in self._by_recipe.get(name, ()) if data.made(run.record)]
+        return max(fitting, key=lambda run: run.seconds is not None, default=None)
+
+    def __contains__(self, folder: Path) -> bool:
+        return folder in self._folders
+
+
+def runs_below(out: Path) -> Iterator[FoundRun]:
+    """Every run below a folder; UserError for a damaged record."""
+    for path in sorted(out.rglob("config.json")):
+        record = read_json(path)
+        if "stage" in record and isinstance(record.get("config"), dict) and "seed" in record["config"]:
+            timing, encoder = path.with_name("timing.json"), path.parent / "encoder" / CONFIG
+            seconds = read_json(timing).get("seconds") if timing.exists() else None
+            card = read_json(encoder).get("pretrain") if encoder.exists() else None
+            yield FoundRun(path.parent, record, card if isinstance(card, dict) and "settings" in card else {}, seconds)

@@ -1,0 +1,107 @@
+"""What a sweep keeps beside its runs: its plans, one row for every attempt at a job, and what the jobs printed.
+
+    OUT/sweep/plans/GRID.json    the jobs of a grid: name, stage, folder, command, needs
+    OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, step, slots, host
+    OUT/sweep/logs/JOB.log
+
+Rows are appended whole, so that several drivers may share a folder. Whether a job is finished is never read here: its
+own folder says it.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Iterable
+from dataclasses import asdict
+from pathlib import Path
+from typing import Any
+
+from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.runs.files import Row, jsonable, write_json
+from vd4rl_pomdp.runs.reading import parse_json, read_bytes
+from vd4rl_pomdp.sweeps.plan import Job
+from vd4rl_pomdp.sweeps.work import Work
+
+FOLDER = "sweep"
+RETRIED = "retried"
+"""Cause of a row that says: forget this job's failures."""
+
+
+class History:
+    """The files of a sweep in its folder."""
+
+    def __init__(self, out: Path) -> None:
+        """Nothing is written."""
+        self.out = out
+        self._folder = out / FOLDER
+        self._attempts = self._folder / "attempts.jsonl"
+
+    def keep_plan(self, grid: str, jobs: Iterable[Job]) -> None:
+        """Write the jobs of a grid, in place of what was written of it before."""
+        with disk_errors(self._folder):
+            (self._folder / "plans").mkdir(parents=True, exist_ok=True)
+        write_json(self._folder / "plans" / f"{grid}.json", [jsonable(asdict(job)) for job in jobs])
+
+    def jobs(self) -> list[Job]:
+        """The jobs of all plans; UserError if there is none."""
+        plans = sorted((self._folder / "plans").glob("*.json"))
+        if not plans:
+            raise UserError(
+                f"{self._folder.parent}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one"
+            )
+        jobs = [_job(told) for path in plans for told in _parse(path, read_bytes(path).decode())]
+        return list({job.name: job for job in jobs}.values())
+
+    def work(self, job: Job, slots: int) -> Work:
+        """A job as an executor takes it."""
+        log = self._folder / "logs" / f"{job.name}.log"
+        return Work(job.name, job.words, log, slots)
+
+    def add(self, row: Row) -> None:
+        """Append the row of an attempt."""
+        line = json.dumps(row) + "\n"
+        with disk_errors(self._attempts):
+            self._folder.mkdir(parents=True, exist_ok=True)
+            handle = os.open(self._attempts, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+            try:
+                os.write(handle, line.encode())
+            finally:
+                os.close(handle)
+
+    def forget(self, job: str) -> None:
+        """Have the job taken up as if it had never been tried."""
+        self.add({"job": job, "cause": RETRIED})
+
+    def attempts(self) -> dict[str, list[Row]]:
+        """By job, its attempts since it was last taken up again; a line that a full disk cut is left out."""
+        found: dict[str, list[Row]] = {}
+        if self._attempts.exists():
+            for line in read_bytes(self._attempts).decode(errors="replace").splitlines():
+                row = _row(line)
+                if row.get("cause") == RETRIED:
+                    found.pop(row["job"], None)
+                elif "job" in row:
+                    found.setdefault(row["job"], []).append(row)
+        return found
+
+
+def _row(line: str) -> Row:
+    try:
+        row = parse_json(line)
+    except ValueError:
+        return {}
+    return row if isinstance(row, dict) and {"job", "cause"} <= row.keys() else {}
+
+
+def _parse(path: Path, text: str) -> list[dict[str, Any]]:
+    try:
+        return parse_json(text)
+    except ValueError as error:
+        raise UserError(f"{path}: is damaged ({error}); remove it and start `sweep run` again") from error
+
+
+def _job(told: dict[str, Any]) -> Job:
+    listed = {name: tuple(told[name]) for name in ("words", "needs")}
+    settings = tuple((name, value) for name, value in told["settings"])
+    return Job(**(told | listed | {"folder": Path(told["folder"]), "settings": settings}))

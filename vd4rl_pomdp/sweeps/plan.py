@@ -1,0 +1,134 @@
+"""From a grid's cells to jobs: one for every set, encoder and policy, whoever shares it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.sweeps.found import FoundRuns
+from vd4rl_pomdp.sweeps.grid import Cell
+from vd4rl_pomdp.sweeps.naming import run_folder
+from vd4rl_pomdp.sweeps.sets import DataSet, set_of
+from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, check_cell, recipe_of, recorded, told, words_of
+
+DATA = "data"
+"""Folder of the sets in a sweep's, unless another is named."""
+
+
+@dataclass(frozen=True)
+class Job:
+    """One command of a sweep."""
+
+    name: str
+    """What it makes: a folder below the sweep's, or data/ and a set's name."""
+    section: str
+    """Which stage it is."""
+    folder: Path
+    words: tuple[str, ...]
+    """Its command line, after `vd4rl-pomdp`."""
+    needs: tuple[str, ...] = ()
+    """Names of the jobs that come before it."""
+    done: bool = False
+    """Whether it was finished when the plan was made."""
+    settings: tuple[tuple[str, str], ...] = ()
+    """Settings that its cost depends on."""
+
+    @property
+    def finished(self) -> bool:
+        """Whether there is nothing left to do now."""
+        mark = "timing.json" if self.section in STAGES else "provenance.json"
+        return self.done or (self.folder / mark).is_file()
+
+    @property
+    def begun(self) -> bool:
+        """Whether something of it is there."""
+        mark = "config.json" if self.section in STAGES else "collection.json"
+        return (self.folder / mark).is_file()
+
+
+class Planner:
+    """Makes the jobs of a grid, looking at what is there."""
+
+    def __init__(self, out: Path, data: Path | None, kept: FoundRuns, here: FoundRuns) -> None:
+        """Nothing is written.
+
+        Args:
+            out: the sweep's folder.
+            data: folder of the sets, `out`/data if None.
+            kept: runs whose rows are kept, their folders being elsewhere.
+            here: runs below `out`.
+        """
+        self._out, self._data, self._kept, self._here = out, data or out / DATA, kept, here
+        self._jobs: dict[tuple[str, str, str], Job] = {}
+        self._sets: dict[str, DataSet] = {}
+        self._taken: set[str] = set()
+
+    def plan(self, cells: Iterable[Cell]) -> list[Job]:
+        """The jobs of some cells, each after those it needs; what only finished jobs would need is left out.
+
+        Raises:
+            UserError: a stage would refuse a cell's settings, or a folder holds another set.
+        """
+        for cell in cells:
+            check_cell(cell)
+            self._add(cell)
+        return _needed(list(self._jobs.values()))
+
+    def _add(self, cell: Cell) -> None:
+        found = set_of(cell, self._data)
+        data = self._sets.setdefault(found.name, found)
+        values: dict[str, Any] = {}
+        before = [self._collection(cell, data)]
+        for section in cell.chain[1:]:
+            values |= recorded(cell, section)
+            before.append(self._training(cell, section, data, values, before))
+
+    def _collection(self, cell: Cell, data: DataSet) -> Job:
+        words = (*COMMANDS[data.section], *words_of(told(cell, data.section)), "--out", str(data.folder))
+        job = Job(
+            f"{DATA}/{data.name}", data.section, data.folder, words, done=data.there, settings=cost_of(data.wanted)
+        )
+        return self._jobs.setdefault((data.section, "", data.name), job)
+
+    def _training(self, cell: Cell, section: str, data: DataSet, values: dict[str, Any], before: list[Job]) -> Job:
+        recipe = recipe_of(cell, section)
+        key = (section, recipe, data.name)
+        if key in self._jobs:
+            return self._jobs[key]
+        run, kept = self._here.of(recipe, data), self._kept.of(recipe, data)
+        if run is not None and run.folder.is_relative_to(self._out):
+            name = run.folder.relative_to(self._out).as_posix()
+        else:
+            name = self._free(run_folder(cell, section, data.name, values), recipe)
+        self._taken.add(name)
+        folder = self._out / name
+        places = {"data": data.folder} | ({"encoder": before[-1].folder / "encoder"} if section == "finetune" else {})
+        words = (*COMMANDS[section], *words_of(told(cell, section) | places | {"out": folder}))
+        done = any(found is not None and found.seconds is not None for found in (run, kept))
+        needs = tuple(job.name for job in before)
+        self._jobs[key] = Job(name, section, folder, words, needs, done, cost_of(values))
+        return self._jobs[key]
+
+    def _free(self, name: str, recipe: str) -> str:
+        """A name that no other run has, be it in the plan or from an earlier sweep."""
+        if name in self._taken or self._out / name in self._here:
+            return f"{name}~{recipe[:6]}"
+        return name
+
+
+def cost_of(values: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
+    """Settings that a job's cost depends on, in order, their values as words."""
+    return tuple(sorted((name, str(value)) for name, value in settings_of(values).items()))
+
+
+def _needed(jobs: list[Job]) -> list[Job]:
+    """The finished jobs, and those that are the last of a cell or that an unfinished one needs."""
+    inner = {name for job in jobs for name in job.needs}
+    wanted: set[str] = set()
+    for job in reversed(jobs):
+        if not job.done and (job.name not in inner or job.name in wanted):
+            wanted |= {job.name, *job.needs}
+    return [job for job in jobs if job.done or job.name in wanted]

@@ -1,0 +1,17 @@
+"""How far an unfinished job is."""
+
+from __future__ import annotations
+
+from vd4rl_pomdp.data.format import SUFFIXES
+from vd4rl_pomdp.runs.checkpoint import Checkpoints
+from vd4rl_pomdp.sweeps.plan import Job
+from vd4rl_pomdp.sweeps.stages import STAGES
+
+
+def progress_of(job: Job) -> int:
+    """Step of a training's newest checkpoint, or shards of a set; 0 where there is nothing."""
+    if job.section in STAGES:
+        return max(Checkpoints(job.folder).steps(), default=0)
+    if not job.folder.is_dir():
+        return 0
+    return sum(path.suffix.lower() in SUFFIXES for path in job.folder.iterdir())

@@ -1,0 +1,95 @@
+"""The data sets of a sweep: found below a folder, or to be collected there."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Any
+
+from vd4rl_pomdp.data.format import PLAN, RECORD, SUFFIXES
+from vd4rl_pomdp.data.store import known_fingerprint
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.runs.files import jsonable, read_json
+from vd4rl_pomdp.sweeps.grid import Cell
+from vd4rl_pomdp.sweeps.naming import extras
+from vd4rl_pomdp.sweeps.stages import config_of
+
+_DOWNLOADED = "84px"
+"""Folder in which a downloaded set has its shards."""
+_NOT_COMPARED = ("out", "workers", "frame_size")
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A set that cells of a grid need."""
+
+    name: str
+    folder: Path
+    section: str
+    """Which command collects it."""
+    wanted: Mapping[str, Any]
+    """How it is collected, by setting."""
+
+    @property
+    def collected(self) -> bool:
+        """Whether it is there and whole, having been collected."""
+        return (self.folder / RECORD).is_file()
+
+    @property
+    def foreign(self) -> bool:
+        """Whether shards are there that nothing here collected, such as a downloaded set."""
+        return not (self.folder / PLAN).exists() and _has_shards(self.folder)
+
+    @property
+    def there(self) -> bool:
+        """Whether nothing is left to collect."""
+        return self.collected or self.foreign
+
+    @cached_property
+    def fingerprint(self) -> str | None:
+        """Name of its content, None while it is not there or was never opened."""
+        return known_fingerprint(self.folder) if self.there else None
+
+    def check(self) -> None:
+        """Raise UserError if its folder holds a set that was collected otherwise."""
+        if (self.folder / PLAN).exists() and not self._agrees(read_json(self.folder / PLAN)):
+            stored = read_json(self.folder / PLAN)
+            name = next(n for n, v in self.wanted.items() if stored.get(n, v) != v)
+            raise UserError(
+                f"{self.folder}: holds a set collected with {name} {stored[name]}, the grid says {self.wanted[name]}; "
+                "choose another --data"
+            )
+
+    def made(self, record: Mapping[str, Any]) -> bool:
+        """Whether a run, as its config.json tells it, was trained on this set."""
+        before = record.get("inputs", {}).get("data")
+        if self.fingerprint is not None:
+            return before == self.fingerprint
+        collection = record.get("collection") or {}
+        return bool(collection) and self._agrees(collection)
+
+    def _agrees(self, stored: Mapping[str, Any]) -> bool:
+        return all(stored.get(name, value) == value for name, value in self.wanted.items())
+
+
+def set_of(cell: Cell, root: Path) -> DataSet:
+    """The set of a cell, below `root`; raises UserError if another is there."""
+    section = cell.chain[0]
+    if section not in ("collect", "navigation_collect"):
+        raise UserError(f"a block trains on no set: add a section {'navigation_' * ('navigation' in section)}collect")
+    config = config_of(cell, section)
+    place = "/".join((config.task, config.quality) if section == "collect" else (config.maze,))
+    name = place + extras(cell, section)
+    wanted = {name: value for name, value in jsonable(flat(config)).items() if name not in _NOT_COMPARED}
+    folder = root / name
+    inner = folder / _DOWNLOADED
+    found = DataSet(name, inner if _has_shards(inner) else folder, section, wanted)
+    found.check()
+    return found
+
+
+def _has_shards(folder: Path) -> bool:
+    return folder.is_dir() and any(path.suffix.lower() in SUFFIXES for path in folder.iterdir())

@@ -1,0 +1,149 @@
+"""What a sweep knows of each stage: its command, its settings, and how the settings of a run are recorded.
+
+Settings are parsed once for all seeds and folders, by the stage's own command line.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import replace
+from functools import cache
+from typing import Any
+
+from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
+from vd4rl_pomdp.errors import MAX_SEED, flag_of, refuse_number
+from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.runs import FORMAT
+from vd4rl_pomdp.runs.files import jsonable
+from vd4rl_pomdp.runs.identity import recipe
+from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.sweeps.grid import Cell, Settings
+
+_NOWHERE = "-"
+"""Stands for a path while settings are parsed."""
+COMMANDS = {
+    "collect": ("data", "collect"),
+    "pretrain": ("pretrain",),
+    "finetune": ("finetune",),
+    "navigation_collect": ("navigation", "collect"),
+    "navigation_train": ("navigation", "train"),
+}
+"""Words of every section's command."""
+STAGES = {"pretrain": "pretrain", "finetune": "finetune", "navigation_train": "navigation"}
+"""What a training's record calls its stage, by section."""
+_READS = {"collect": (), "pretrain": ("data",), "finetune": ("data", "encoder"), "navigation_train": ("data",)}
+"""Folders that a stage is given, beside the one it writes."""
+_TAKES = {"collect": (), "navigation_collect": ("preset",)}
+"""What a stage takes of the shared settings, where that is not all of them."""
+
+
+def told(cell: Cell, section: str) -> Settings:
+    """What a cell tells a stage, in the order of its command line."""
+    takes = _TAKES.get(section, tuple(cell.shared))
+    return {name: value for name, value in cell.shared.items() if name in takes} | cell.sections[section]
+
+
+def words_of(settings: Settings) -> list[str]:
+    """Settings as words of a command line."""
+    words: list[str] = []
+    for name, value in settings.items():
+        flag = flag_of(name)
+        if isinstance(value, bool):
+            words.append(flag if value else f"--no-{flag[2:]}")
+        else:
+            words += [f"{flag}={value}"] if str(value).startswith("-") else [flag, str(value)]
+    return words
+
+
+def check_cell(cell: Cell) -> None:
+    """Raise UserError for settings that a stage would refuse."""
+    for section in cell.chain:
+        config_of(cell, section)
+    if "finetune" in cell.chain:
+        _finetuning(cell)
+
+
+def config_of(cell: Cell, section: str) -> Any:
+    """A stage's settings, its folders left open."""
+    settings = told(cell, section)
+    seed = settings.pop("seed", 0)
+    refuse_number("seed", seed, 0, MAX_SEED)
+    return replace(_parsed(section, tuple(words_of(settings))), seed=seed)
+
+
+@cache
+def _parsed(section: str, words: tuple[str, ...]) -> Any:
+    command = " ".join(COMMANDS[section])
+    places = words_of(dict.fromkeys((*_READS.get(section, ()), "out"), _NOWHERE))
+    return _PARSERS[section]([*words, *places], f"vd4rl-pomdp {command}")
+
+
+def _collect(words: list[str], program: str) -> Any:
+    from vd4rl_pomdp.data.collect import CollectConfig
+
+    return parse(CollectConfig, words, program)
+
+
+def _pretrain(words: list[str], program: str) -> Any:
+    from pretrain.config import PretrainConfig
+    from pretrain.train import check_config
+
+    config = parse_stage(PretrainConfig, words, program)
+    check_config(config)
+    return config
+
+
+def _finetune(words: list[str], program: str) -> Any:
+    from finetune.config import FinetuneConfig
+
+    return parse_stage(FinetuneConfig, words, program)
+
+
+def _navigation_collect(words: list[str], program: str) -> Any:
+    from vd4rl_pomdp.navigation.config import PRESETS, MazeCollectConfig
+
+    return with_presets(MazeCollectConfig, PRESETS, words, program)
+
+
+def _navigation_train(words: list[str], program: str) -> Any:
+    from pretrain.navigation.config import NavigationConfig
+
+    return parse_stage(NavigationConfig, words, program)
+
+
+_PARSERS: dict[str, Callable[[list[str], str], Any]] = {
+    "collect": _collect,
+    "pretrain": _pretrain,
+    "finetune": _finetune,
+    "navigation_collect": _navigation_collect,
+    "navigation_train": _navigation_train,
+}
+
+
+def recipe_of(cell: Cell, section: str) -> str:
+    """Name of what a training of a cell computes but for the content of its data; as its run's records have it."""
+    record = {"format": FORMAT, "stage": STAGES[section], "config": recorded(cell, section)}
+    if section != "finetune":
+        return recipe(record, {})
+    before = recorded(cell, "pretrain")
+    return recipe(record, {"settings": settings_of(before), "seed": before["seed"]})
+
+
+def recorded(cell: Cell, section: str) -> Settings:
+    """The config that a training records, folders aside."""
+    config = _finetuning(cell) if section == "finetune" else config_of(cell, section)
+    if section == "pretrain":  # its set tells it the task
+        config = replace(config, task=cell.value("task") or config.task)
+    return jsonable(flat(config))
+
+
+def _finetuning(cell: Cell) -> Any:
+    """The config that a fine-tuning trains with: what its encoder's method cannot read is no part of it."""
+    from finetune.train import as_trained
+    from pretrain.config import memory_of
+    from pretrain.objectives import METHODS
+
+    before = config_of(cell, "pretrain")
+    method = METHODS.named(before.method)
+    remembers = memory_of(before.method, method, before.history) == "gru"
+    return as_trained(config_of(cell, "finetune"), before.method, method.end_to_end, remembers)

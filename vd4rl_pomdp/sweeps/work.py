@@ -1,0 +1,117 @@
+"""A job as an executor gets it, and how its process says how it ended: by its exit code."""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Protocol
+
+from vd4rl_pomdp.errors import DiskFullError, InUseError, OutOfMemoryError, UserError, WorkerDiedError
+
+DONE, DIVERGED, INTERRUPTED, FAILED = "done", "diverged", "interrupted", "failed"
+KILLED = WorkerDiedError.cause
+_FIRST = 64
+_CAUSES = (UserError, OutOfMemoryError, DiskFullError, InUseError, WorkerDiedError)
+CAUSES = (*(kind.cause for kind in _CAUSES), DIVERGED, INTERRUPTED)
+"""Causes that a job's process tells; its exit code is _FIRST and the position here."""
+
+
+@dataclass(frozen=True)
+class Work:
+    """One attempt at a job."""
+
+    name: str
+    words: tuple[str, ...]
+    log: Path
+    """What the command prints goes to this file's end."""
+    slots: int = 1
+    """Share of the executor's places that it takes."""
+
+
+@dataclass(frozen=True)
+class Ended:
+    """How an attempt ended."""
+
+    name: str
+    cause: str
+    line: str
+    """The last line of its log."""
+
+
+class Executor(Protocol):
+    """Where jobs run. Run folders and logs lie on a disk that driver and jobs share."""
+
+    @property
+    def slots(self) -> int:
+        """Jobs at a time."""
+
+    @property
+    def largest(self) -> int:
+        """The most slots that share a memory, so that one job may take them all."""
+
+    def fits(self, slots: int) -> bool:
+        """Whether so many slots wait for a job."""
+
+    def start(self, work: Work) -> None:
+        """Begin a job that fits."""
+
+    def ended(self) -> list[Ended]:
+        """What has ended since the last call."""
+
+    def stop(self) -> None:
+        """Ask every job to end where nothing is lost, and wait for it."""
+
+
+def start_process(work: Work, environment: Mapping[str, str], cores: Sequence[int] = ()) -> subprocess.Popen:
+    """Start the process that does a job and appends to its log.
+
+    Args:
+        work: the job.
+        environment: what is added to this process's environment.
+        cores: those that it may use; none: all.
+    """
+    told = json.dumps({"words": work.words, "cores": list(cores), "parent": os.getpid()})
+    work.log.parent.mkdir(parents=True, exist_ok=True)
+    with work.log.open("ab") as log:
+        return subprocess.Popen(
+            [sys.executable, "-m", "vd4rl_pomdp.sweeps.worker", told],
+            env=os.environ | dict(environment),
+            stdin=subprocess.DEVNULL,
+            stdout=log,
+            stderr=log,
+            start_new_session=True,  # Ctrl-C is the driver's business
+        )
+
+
+def code_of(cause: str) -> int:
+    """Exit code of a process that ended for a cause."""
+    return 0 if cause == DONE else _FIRST + CAUSES.index(cause)
+
+
+def ended(work: Work, code: int) -> Ended:
+    """How a job's process ended, by its exit code: negative for a signal, as `subprocess` has it."""
+    if code == 0:
+        return Ended(work.name, DONE, "")
+    told = CAUSES[code - _FIRST] if _FIRST <= code < _FIRST + len(CAUSES) else None
+    return Ended(work.name, told or (KILLED if code < 0 else FAILED), last_line(work.log))
+
+
+def last_line(log: Path) -> str:
+    """The last line of a log that is not empty."""
+    try:
+        text = log.read_bytes()[-4096:].decode(errors="replace")
+    except OSError:
+        return ""
+    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
+
+
+def told_seconds(seconds: float) -> str:
+    """A time as one reads it: "42 s", "12 min", "3.4 h"."""
+    if seconds < 100:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60:.0f} min" if seconds < 6000 else f"{seconds / 3600:.1f} h"

@@ -1,0 +1,46 @@
+"""The process that does one job of a sweep: `python -m vd4rl_pomdp.sweeps.worker JSON`.
+
+It ends with the process that started it, and its exit code says why it ended. A code that is none of those comes from a
+signal that cannot be answered, or from a defect, whose traceback is in the log.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import ctypes
+import json
+import os
+import signal
+import sys
+
+from vd4rl_pomdp.sweeps.work import code_of
+
+_PR_SET_PDEATHSIG = 1
+
+
+def main() -> None:
+    """Do the job that the command line names."""
+    told = json.loads(sys.argv[1])
+    if sys.platform == "linux":
+        _end_with(told["parent"])
+        if told["cores"]:
+            os.sched_setaffinity(0, told["cores"])
+    words = told["words"]
+    sys.argv = ["vd4rl-pomdp", *words]  # what a run records as its command
+    from vd4rl_pomdp.cli.ends import run_to_end
+
+    end = run_to_end(words)
+    with contextlib.suppress(OSError):  # a full disk
+        print(end.line or end.cause, file=sys.stderr, flush=True)
+    sys.exit(code_of(end.cause))
+
+
+def _end_with(parent: int) -> None:
+    """Have the system send this process SIGTERM when its parent is gone, however it went."""
+    ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGTERM)
+    if os.getppid() != parent:  # it went before the line above
+        sys.exit(128 + signal.SIGTERM)
+
+
+if __name__ == "__main__":
+    main()
