@@ -112,8 +112,9 @@ def _print_plan(jobs: list[Job], past: list[Any]) -> None:
 def _carry_out(jobs: list[Job], command: _ExecutorConfig, history: History) -> None:
     """Run jobs to their end; SystemExit 1 if some are not finished."""
     from vd4rl_pomdp.sweeps.driver import Driver
+    from vd4rl_pomdp.sweeps.history import FOLDER
 
-    executor = executor_kind(command.executor).build(command.options)
+    executor = executor_kind(command.executor).build(command.options, history.out / FOLDER / command.executor)
     if not Driver(jobs, executor, history).run():
         failures = _status(history, jobs).failures
         for name, row in failures.items():

@@ -103,7 +103,7 @@ class LocalExecutor:
 
 def _places(options: LocalOptions) -> list[Place]:
     """The machine's cores and GPUs, shared out among the jobs."""
-    gpus = _gpus()
+    gpus = visible_gpus()
     jobs = options.jobs or max(1, len(gpus) * options.jobs_per_gpu)
     if gpus and jobs > len(gpus) * options.jobs_per_gpu:
         raise UserError(
@@ -116,7 +116,7 @@ def _places(options: LocalOptions) -> list[Place]:
     return [Place(share, gpus[number % len(gpus)] if gpus else None) for number, share in enumerate(shares)]
 
 
-def _gpus() -> list[str]:
+def visible_gpus() -> list[str]:
     """Names of the GPUs that this process may use, as CUDA_VISIBLE_DEVICES has them."""
     import torch
 
