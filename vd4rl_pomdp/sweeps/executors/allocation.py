@@ -20,7 +20,7 @@ from vd4rl_pomdp.sweeps.executors.local import LocalExecutor, LocalOptions, visi
 from vd4rl_pomdp.sweeps.work import INTERRUPTED, KILLED, Ended, Work
 
 IDLE_S = 30.0
-"""A task without a job for so long ends."""
+"""On network file systems a new job may be seen that late."""
 POLL_S = 0.5
 WARNING = signal.SIGUSR2
 """What submitit has Slurm send before the time limit, and what makes it start the task again."""
@@ -36,6 +36,8 @@ class Allocation:
     """Which of its tasks this is."""
     jobs: int
     """At a time."""
+    idle_s: float = IDLE_S
+    """Without a job for so long it ends."""
     _asked: list[int] = field(default_factory=list)
     """Signals that have arrived."""
     _attempts: dict[str, str] = field(default_factory=dict)
@@ -43,7 +45,7 @@ class Allocation:
     _untold: list[Ended] = field(default_factory=list)
 
     def __call__(self) -> None:
-        """Do what is handed over until there has been nothing for IDLE_S, or a signal asks to end."""
+        """Do what is handed over until there has been nothing for `idle_s`, or a signal asks to end."""
         requeue = signal.getsignal(WARNING)
         for number in (signal.SIGTERM, WARNING):
             signal.signal(number, self._note)
@@ -55,19 +57,19 @@ class Allocation:
         """What submitit calls when the task is started again: the same."""
         from submitit.helpers import DelayedSubmission
 
-        return DelayedSubmission(Allocation(self.folder, self.number, self.jobs))
+        return DelayedSubmission(Allocation(self.folder, self.number, self.jobs, self.idle_s))
 
     def _note(self, number: int, frame: FrameType | None) -> None:
         self._asked.append(number)
 
     def _work(self, executor: LocalExecutor) -> None:
         handed = Handover(self.folder)
-        until = time.monotonic() + IDLE_S
+        until = time.monotonic() + self.idle_s
         while time.monotonic() < until and not self._asked:
             self._begin(executor, handed.left(self.number))
             time.sleep(POLL_S)
             if self._attempts:
-                until = time.monotonic() + IDLE_S
+                until = time.monotonic() + self.idle_s
             self._tell(executor, handed)
         executor.stop()
         self._tell(executor, handed)

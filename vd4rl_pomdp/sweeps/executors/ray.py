@@ -194,5 +194,6 @@ def _own_signals() -> Iterator[None]:
 
 
 def _line(error: BaseException) -> str:
-    """The first line of an error."""
-    return next((line.strip() for line in str(error).splitlines() if line.strip()), type(error).__name__)
+    """The first sentence of an error."""
+    lines = (line.strip() for line in str(error).splitlines())
+    return next((line.partition(". ")[0] for line in lines if line), type(error).__name__)

@@ -300,7 +300,7 @@ def _submit(tasks: list[_Task], options: SlurmOptions) -> None:
     executor = submitit.SlurmExecutor(folder, max_num_timeout=REQUEUES)
     executor.update_parameters(job_name=folder.name, **_parameters(options))
     try:
-        executor.submit_array([Allocation(folder, task.number, task.places) for task in tasks])
+        executor.submit_array([Allocation(folder, task.number, task.places, IDLE_S) for task in tasks])
     except RuntimeError as error:  # submitit's for a command that failed
         told = str(error).strip().splitlines()
         raise UserError(f"Slurm took no array ({told[-1] if told else 'it does not say why'})") from error
