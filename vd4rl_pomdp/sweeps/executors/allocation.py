@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import signal
 import time
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
 from typing import Any
@@ -79,6 +79,7 @@ class Allocation:
         for attempt, work in left.items():
             if work.name in self._attempts:
                 continue
+            work = replace(work, slots=min(work.slots, executor.largest))  # handed over by a driver of other options
             if not executor.fits(work.slots):
                 return
             self._attempts[work.name] = attempt

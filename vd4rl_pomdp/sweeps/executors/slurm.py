@@ -163,9 +163,9 @@ class SlurmExecutor:
         """
         _require_slurm()
         self._options, self._folder = options, folder
-        self.largest = options.jobs_per_task
-        self.slots = options.tasks * self.largest
-        self._tasks = _known(folder, self.largest)
+        self.largest = -(-options.jobs_per_task // max(1, options.gpus))
+        self.slots = options.tasks * options.jobs_per_task
+        self._tasks = _known(folder, options.jobs_per_task)
         self._fresh: list[_Task] = []
         """Tasks of the array that is not submitted yet."""
         self._accepted = False
@@ -189,7 +189,7 @@ class SlurmExecutor:
         if best is not None and (best.free >= slots or len(tasks) >= self._options.tasks):
             return best
         array = self._fresh[0].array if self._fresh else Handover(self._folder / f"{_NAME}{token_hex(4)}")
-        self._fresh.append(_Task(array, len(self._fresh), self.largest))
+        self._fresh.append(_Task(array, len(self._fresh), self._options.jobs_per_task))
         return self._fresh[-1]
 
     def ended(self) -> list[Ended]:
