@@ -31,6 +31,8 @@ NOT_RUN = {
     "pip install": "fetches packages",
     "parallel": "not a program of ours",
     "sbatch": "needs a cluster",
+    "ray start": "starts a cluster; tests/sweeps/executors has one of its own",
+    "vd4rl-pomdp sweep run paper_patch": "trains for days; tests/sweeps carries out smaller grids",
     **{f"python {file}": "test_own_parts and test_own_task run them" for file in EXAMPLES},
     "vd4rl-pomdp data collect": "renders whole episodes; data/test_collect runs shorter ones",
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",

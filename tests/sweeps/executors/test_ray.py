@@ -9,6 +9,7 @@ import pytest
 
 from tests.sweeps.executors.waiting import begun, run, until, waiting_job, work_of
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs.ownership import in_use
 from vd4rl_pomdp.sweeps.driver import Driver
 from vd4rl_pomdp.sweeps.executors import ray as module
 from vd4rl_pomdp.sweeps.executors.ray import RayExecutor, RayOptions
@@ -101,7 +102,8 @@ def test_all_is_finished_although_a_node_dies(cluster, options, tmp_path):
         """Kill a node while all jobs run, and let them end once it is known which of them that killed."""
         if nodes and all(begun(job) for job in jobs):
             cluster.remove_node(nodes.pop(), allow_graceful=False)
-        if history.attempts():
+        killed = history.attempts()
+        if killed and not any(in_use(tmp_path / name) for name in killed):
             (tmp_path / "go").touch()
         return fits(slots)
 

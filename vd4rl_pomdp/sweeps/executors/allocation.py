@@ -50,7 +50,7 @@ class Allocation:
         for number in (signal.SIGTERM, WARNING):
             signal.signal(number, self._note)
         self._work(_executor(self.jobs))
-        if WARNING in self._asked and callable(requeue):
+        if WARNING in self._asked and callable(requeue) and Handover(self.folder).left(self.number):
             requeue(WARNING, None)  # submitit's: it calls `checkpoint`, puts the task into the queue and exits
 
     def checkpoint(self) -> Any:
