@@ -19,6 +19,7 @@ from typing import Any, ClassVar
 from vd4rl_pomdp.errors import OutOfMemoryError, UserError
 from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.sweeps.executors.local import PATIENCE_S
+from vd4rl_pomdp.sweeps.oom import oom_kills
 from vd4rl_pomdp.sweeps.work import FAILED, INTERRUPTED, KILLED, Ended, Work, ended, start_process
 
 NODES_S = 5.0
@@ -149,13 +150,14 @@ def attempt(work: Work, threads: int, folder: str) -> Ended:
         os.chdir(folder)
     except OSError as error:
         raise UserError(f"{folder}: not on node {os.uname().nodename}; use a disk that all nodes share") from error
+    before = oom_kills()
     process = start_process(work, {"OMP_NUM_THREADS": str(threads), "LP_NUM_THREADS": "1"})
     try:
         while process.poll() is None:
             time.sleep(POLL_S)
     except KeyboardInterrupt:  # as which a cancellation arrives
         _end_process(process)
-    return ended(work, process.returncode)
+    return ended(work, process.returncode, before)
 
 
 def _end_process(process: subprocess.Popen) -> None:
