@@ -96,13 +96,14 @@ class Driver:
 
     def _start(self) -> bool:
         """Start every job that can be; whether there was one."""
-        before = len(self._running)
+        begun = False
         for job in list(self._left.values()):
             if not self._executor.fits(1):
                 break
             if self._ready(job) and self._executor.fits(self._slots(job)) and not self._elsewhere(job):
                 self._begin(job)
-        return len(self._running) > before
+                begun = True
+        return begun
 
     def _begin(self, job: Job) -> None:
         slots = self._slots(job)

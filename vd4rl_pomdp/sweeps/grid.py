@@ -214,9 +214,9 @@ def _check_block(block: Sections) -> None:
         raise UserError(f"a block needs sections of {', '.join(PIXELS)}, or of {', '.join(MAZES)}")
     for section, settings in block.items():
         for name, value in settings.items():
-            for one in value if isinstance(value, list) else [value]:
-                if not isinstance(one, str | int | float) or value == []:
-                    raise UserError(f"{section}.{name} is {value!r}: write a number, a word, true or false, or a list")
+            values = value if isinstance(value, list) else [value]
+            if not values or not all(isinstance(one, str | int | float) for one in values):
+                raise UserError(f"{section}.{name} is {value!r}: write a number, a word, true or false, or a list")
 
 
 def narrow(cells: list[Cell], only: Sequence[str]) -> list[Cell]:
