@@ -6,7 +6,7 @@ from tests.helpers_sweeps import Scripted, job
 from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.sweeps import driver
 from vd4rl_pomdp.sweeps.driver import Driver, Retry, given_up
-from vd4rl_pomdp.sweeps.history import History
+from vd4rl_pomdp.sweeps.folder import SweepFolder
 
 
 @pytest.fixture(autouse=True)
@@ -23,7 +23,7 @@ def jobs(tmp_path):
 
 def carry_out(jobs, tmp_path, script=None, slots=2):
     executor = Scripted(jobs, script, slots)
-    return Driver(jobs, executor, History(tmp_path)).run(), executor
+    return Driver(jobs, executor, SweepFolder(tmp_path)).run(), executor
 
 
 def names(executor):
@@ -80,7 +80,7 @@ def test_without_more_slots_out_of_memory_is_final(jobs, tmp_path):
 def test_failures_stay_until_they_are_taken_up_again(jobs, tmp_path):
     carry_out(jobs, tmp_path, {"a": ["diverged"]})
     assert "a" not in names(carry_out(jobs, tmp_path)[1])
-    History(tmp_path).forget("a")
+    SweepFolder(tmp_path).forget("a")
     finished, executor = carry_out(jobs, tmp_path)
     assert finished
     assert names(executor) == ["a", "b"]
@@ -88,7 +88,7 @@ def test_failures_stay_until_they_are_taken_up_again(jobs, tmp_path):
 
 def test_a_job_that_another_driver_finished_meanwhile_is_left_alone(jobs, tmp_path):
     executor = Scripted(jobs)
-    worker = Driver(jobs, executor, History(tmp_path))
+    worker = Driver(jobs, executor, SweepFolder(tmp_path))
     for other in jobs[:2]:
         other.folder.mkdir(parents=True)
         write_json(other.folder / "timing.json", {})
@@ -119,7 +119,7 @@ def test_an_interruption_stops_the_jobs_and_is_told(jobs, tmp_path, monkeypatch)
 
     monkeypatch.setattr(driver.interrupt, "check", interrupted)
     with pytest.raises(KeyboardInterrupt):
-        Driver(jobs, executor, History(tmp_path)).run()
+        Driver(jobs, executor, SweepFolder(tmp_path)).run()
     assert executor.stopped
 
 
@@ -133,13 +133,13 @@ def test_a_full_disk_at_the_start_of_a_job_is_tried_again(jobs, tmp_path, monkey
         start(work)
 
     monkeypatch.setattr(executor, "start", once_full)
-    assert Driver(jobs, executor, History(tmp_path)).run()
-    assert [row["cause"] for row in History(tmp_path).attempts()["set"]] == ["disk full", "disk full", "done"]
+    assert Driver(jobs, executor, SweepFolder(tmp_path)).run()
+    assert [row["cause"] for row in SweepFolder(tmp_path).attempts()["set"]] == ["disk full", "disk full", "done"]
 
 
 def test_rows_tell_every_attempt(jobs, tmp_path):
     carry_out(jobs, tmp_path, {"a": ["killed"]})
-    rows = History(tmp_path).attempts()["a"]
+    rows = SweepFolder(tmp_path).attempts()["a"]
     assert [(row["cause"], row["line"], row["slots"]) for row in rows] == [
         ("killed", "its killed line", 1),
         ("done", "", 1),
@@ -147,7 +147,7 @@ def test_rows_tell_every_attempt(jobs, tmp_path):
 
 
 def test_a_row_that_a_full_disk_cut_is_left_out(tmp_path):
-    history = History(tmp_path)
+    history = SweepFolder(tmp_path)
     history.add({"job": "a", "cause": "killed", "step": 0})
     with (tmp_path / "sweep" / "attempts.jsonl").open("a") as file:
         file.write('{"job": "a", "cau\n')

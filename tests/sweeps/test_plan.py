@@ -13,7 +13,7 @@ from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
 from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below
 from vd4rl_pomdp.sweeps.grid import load_grid
-from vd4rl_pomdp.sweeps.plan import Planner
+from vd4rl_pomdp.sweeps.plan import JobPlanner
 from vd4rl_pomdp.sweeps.stages import recorded
 
 GRID = """
@@ -57,7 +57,7 @@ def copy(swept, tmp_path, monkeypatch):
 
 def plan(out: Path, changes=(), kept=None, data=None):
     cells = load_grid(str(out / "grid.toml"), changes).cells()
-    return Planner(out, data, kept or FoundRuns([]), FoundRuns(runs_below(out))).plan(cells)
+    return JobPlanner(out, data, kept or FoundRuns([]), FoundRuns(runs_below(out))).plan(cells)
 
 
 def left(jobs):

@@ -16,7 +16,7 @@ from vd4rl_pomdp.errors import DiskFullError, InUseError, OutOfMemoryError, User
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.ownership import in_use
-from vd4rl_pomdp.sweeps.history import History
+from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.progress import progress_of
 from vd4rl_pomdp.sweeps.work import DIVERGED, DONE, FAILED, INTERRUPTED, KILLED, Ended, Executor
@@ -71,11 +71,11 @@ def given_up(rows: list[Row], largest: int = 1) -> str:
 class Driver:
     """One process's part in a sweep."""
 
-    def __init__(self, jobs: Iterable[Job], executor: Executor, history: History) -> None:
+    def __init__(self, jobs: Iterable[Job], executor: Executor, folder: SweepFolder) -> None:
         """See the module."""
         self._jobs = {job.name: job for job in jobs}
-        self._executor, self._history = executor, history
-        self._rows = history.attempts()
+        self._executor, self._folder = executor, folder
+        self._rows = folder.attempts()
         self._left = {job.name: job for job in self._jobs.values() if not job.finished}
         self._running: dict[str, tuple[float, int]] = {}
         """When each began, and its slots."""
@@ -110,7 +110,7 @@ class Driver:
         self._running[job.name] = (time.monotonic(), slots)
         try:
             with disk_errors(job.folder):
-                self._executor.start(self._history.work(job, slots))
+                self._executor.start(self._folder.work(job, slots))
         except DiskFullError as error:
             self._end(Ended(job.name, error.cause, str(error)))
 
@@ -162,7 +162,7 @@ class Driver:
         row |= {"host": socket.gethostname()}
         self._rows.setdefault(ended.name, []).append(row)
         try:
-            self._history.add(row)
+            self._folder.add(row)
         except DiskFullError as error:
             print(f"warning: {error}", file=sys.stderr)
 

@@ -13,7 +13,7 @@ from vd4rl_pomdp.data.store import open_store
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.files import jsonable, read_json
-from vd4rl_pomdp.sweeps.grid import Cell
+from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.naming import extras
 from vd4rl_pomdp.sweeps.stages import config_of
 
@@ -74,7 +74,7 @@ class DataSet:
         return all(stored.get(name, value) == value for name, value in self.wanted.items())
 
 
-def set_of(cell: Cell, root: Path) -> DataSet:
+def set_of(cell: GridCell, root: Path) -> DataSet:
     """The set of a cell, below `root`; raises UserError if another is there."""
     section = cell.chain[0]
     if section not in ("collect", "navigation_collect"):

@@ -28,8 +28,8 @@ RETRIED = "retried"
 """Cause of a row that says: forget this job's failures."""
 
 
-class History:
-    """The files of a sweep in its folder."""
+class SweepFolder:
+    """The files of a sweep below its folder."""
 
     def __init__(self, out: Path) -> None:
         """Nothing is written."""
