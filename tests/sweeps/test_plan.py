@@ -11,7 +11,7 @@ from vd4rl_pomdp.cli.parsing import parse_stage
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
-from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below
+from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
 from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.plan import JobPlanner
 from vd4rl_pomdp.sweeps.stages import recorded
@@ -124,7 +124,8 @@ def test_a_run_goes_on_in_its_own_folder(copy):
 
 
 def test_rows_that_were_kept_are_finished_runs(copy, tmp_path):
-    kept = FoundRuns(runs_below(copy))
+    main(["results", "add", str(copy), "--out", str(tmp_path / "rows")])
+    kept = FoundRuns(runs_kept([tmp_path / "rows"]))
     new = tmp_path / "new"
     shutil.copytree(copy / "data", new / "data")
     shutil.copy(copy / "grid.toml", new)

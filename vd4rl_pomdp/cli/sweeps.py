@@ -68,7 +68,7 @@ class RunCommand(_ExecutorConfig):
 def _run(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.runs.outputs import refuse_kept
     from vd4rl_pomdp.sweeps.folder import SweepFolder
-    from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below
+    from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
     from vd4rl_pomdp.sweeps.grid import load_grid, narrow
     from vd4rl_pomdp.sweeps.plan import JobPlanner
 
@@ -76,7 +76,7 @@ def _run(words: Arguments, program: str) -> None:
     grid = load_grid(command.grid, command.change, command.testing)
     cells = narrow(grid.cells(), command.only)
     refuse_kept(command.out)
-    here, kept = FoundRuns(runs_below(command.out)), FoundRuns([])
+    here, kept = FoundRuns(runs_below(command.out)), FoundRuns(runs_kept(command.done))
     jobs = JobPlanner(command.out, command.data, kept, here).plan(cells)
     if command.dry_run:
         _print_plan(jobs, [*here.runs, *kept.runs])

@@ -99,7 +99,7 @@ class JobPlanner:
         if key in self._jobs:
             return self._jobs[key]
         run, kept = self._here.of(recipe, data), self._kept.of(recipe, data)
-        if run is not None and run.folder.is_relative_to(self._out):
+        if run is not None:
             name = run.folder.relative_to(self._out).as_posix()
         else:
             name = self._free(run_folder(cell, section, data.name, values), recipe)
