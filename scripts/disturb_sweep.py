@@ -52,7 +52,7 @@ eval_every = 60
 checkpoint_every = 10
 """
 KILLS, DRIVER_KILLS = 20, 2
-DISK_MIB = 1500
+DISK_MIB = 2000
 FULL_S = 20.0
 COMPARED = ("episodes.csv", "metrics.jsonl", "probe.json", "model.safetensors")
 """Files of a run that are its result."""
@@ -185,13 +185,15 @@ def compare(folder: Path, command: DisturbCommand) -> dict[str, Any]:
     code = alone.driver.wait()
     seconds = time.monotonic() - began
     print(f"undisturbed: {seconds:.0f} s, exit code {code}", flush=True)
+    expected = rows(folder / "alone")
+    shutil.rmtree(folder / "alone")
     began, events = time.monotonic(), []
     sweep = Sweep(folder / "disturbed", grid, command.jobs)
     for event in disturb(sweep, seconds, draw):
         events.append(f"{time.monotonic() - began:.1f} s: {event}")
         print(events[-1], flush=True)
     codes = [code, sweep.driver.wait()]
-    expected, found = rows(folder / "alone"), rows(folder / "disturbed")
+    found = rows(folder / "disturbed")
     attempts = [row for tried in SweepFolder(folder / "disturbed").attempts().values() for row in tried]
     return {
         "same": expected == found and bool(expected) and codes == [0, 0],

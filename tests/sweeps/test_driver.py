@@ -159,3 +159,14 @@ def test_a_cause_counts_in_a_row_only():
     rows = [{"cause": cause, "step": 0, "slots": 1} for cause in ["killed"] * 4 + ["interrupted"] + ["killed"] * 4]
     assert given_up(rows) == ""
     assert given_up([*rows, rows[0]]) == "killed"
+
+
+def test_a_job_that_waits_for_its_time_is_not_forgotten(jobs, tmp_path, monkeypatch):
+    monkeypatch.setitem(driver.RETRIES, "disk full", Retry(3, 0.02))
+    finished, executor = carry_out(jobs[:1], tmp_path, {"set": ["disk full"] * 3})
+    assert finished
+    assert len(executor.started) == 4
+
+
+def test_an_attempt_of_another_version_counts_as_final(tmp_path):
+    assert given_up([{"cause": "abducted", "step": 0, "slots": 1}]) == "abducted"

@@ -102,11 +102,9 @@ def _print_plan(jobs: list[Job], past: list[Any]) -> None:
         if not job.done:
             print(f"{PROGRAM} {shlex.join(job.words)}")
             known, unknown = known + (seconds or 0.0), unknown + (seconds is None)
-    done = sum(job.done for job in jobs)
-    print(
-        f"# {len(jobs)} jobs, {done} done, {len(jobs) - done} to do: {told_seconds(known)} of work by past runs", end=""
-    )
-    print(f", {unknown} jobs of unknown length" if unknown else "")
+    left = sum(not job.done for job in jobs)
+    told = f"{told_seconds(known)} of work by past runs" + f", {unknown} jobs of unknown length" * (unknown > 0)
+    print(f"# {len(jobs)} jobs, {len(jobs) - left} done, {left} to do: {told}")
 
 
 def _carry_out(jobs: list[Job], command: _ExecutorConfig, folder: SweepFolder) -> None:
@@ -118,10 +116,8 @@ def _carry_out(jobs: list[Job], command: _ExecutorConfig, folder: SweepFolder) -
         failures = _status(folder, jobs).failures
         for name, row in failures.items():
             print(f"{row['cause']}: {name}: {row['line']}", file=sys.stderr)
-        left = sum(not job.finished for job in jobs)
-        print(
-            f"{left} of {len(jobs)} jobs are not finished, {len(failures)} failed; `sweep retry` takes those up again"
-        )
+        left = f"{sum(not job.finished for job in jobs)} of {len(jobs)} jobs are not finished"
+        print(f"{left}, {len(failures)} failed; `{PROGRAM} sweep retry {folder.out}` takes those up again")
         sys.exit(1)
     print(f"all {len(jobs)} jobs are finished")
 

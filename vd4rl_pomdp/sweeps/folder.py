@@ -50,7 +50,7 @@ class SweepFolder:
             raise UserError(
                 f"{self._folder.parent}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one"
             )
-        jobs = [_job(told) for path in plans for told in _parse(path, read_bytes(path).decode())]
+        jobs = [job for path in plans for job in _read_plan(path)]
         return list({job.name: job for job in jobs}.values())
 
     def work(self, job: Job, slots: int) -> Work:
@@ -94,10 +94,13 @@ def _row(line: str) -> Row:
     return row if isinstance(row, dict) and {"job", "cause"} <= row.keys() else {}
 
 
-def _parse(path: Path, text: str) -> list[dict[str, Any]]:
+def _read_plan(path: Path) -> list[Job]:
     try:
-        return parse_json(text)
-    except ValueError as error:
+        told = parse_json(read_bytes(path).decode())
+        if not isinstance(told, list):
+            raise TypeError("it is no list")
+        return [_job(one) for one in told]
+    except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path}: is damaged ({error}); remove it and start `sweep run` again") from error
 
 
