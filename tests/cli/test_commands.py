@@ -6,7 +6,6 @@ import pytest
 
 from vd4rl_pomdp.cli import COMMANDS, main
 from vd4rl_pomdp.cli.parsing import show
-from vd4rl_pomdp.experiments.demo import demo_commands
 
 NAMES = [
     [name, *([inner] if inner else [])]
@@ -141,10 +140,3 @@ def test_results_stay_on_one_line_each(capsys):
         ["dtypes.reward", "float64"],
         ["seconds", "0.123457"],
     ]
-
-
-@pytest.mark.parametrize("preset", ["cpu", "smoke"])
-def test_the_demo_uses_every_stage(tmp_path, preset):
-    words = list(demo_commands(tmp_path, 1, preset))
-    assert [stage[0] for stage in words] == ["data", *["pretrain", "finetune"] * 3, "report"]
-    assert all(stage[stage.index("--preset") + 1] == preset for stage in words if "--preset" in stage)
