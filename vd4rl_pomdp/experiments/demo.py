@@ -1,4 +1,4 @@
-"""The demo: the grid `quick`, one job after the other, and a report. It shows that all works, not which method is best."""
+"""The demo: the grid `quick`, job after job, and a report. It shows that all works, not which method is best."""
 
 from __future__ import annotations
 
@@ -43,12 +43,10 @@ def demo(out: Path, workers: int, preset: str, run: Callable[[list[str]], None])
     refuse_kept(out)
     started = time.monotonic()
     jobs = demo_jobs(out, preset)
-    for words in (
-        *map(list, demo_commands(jobs, workers)),
-        ["report", str(out / "runs"), "--out", str(out / "report")],
-    ):
+    report = ("report", str(out / "runs"), "--out", str(out / "report"))
+    for words in (*demo_commands(jobs, workers), report):
         print(f"\n$ vd4rl-pomdp {' '.join(words)}", file=sys.stderr)
-        run(words)
+        run(list(words))
     print("\n".join(conclusion(jobs)))
     print(f"demo finished in {(time.monotonic() - started) / 60:.1f} minutes")
 
