@@ -81,6 +81,9 @@ READERS: list[tuple[str, list[str], list[str]]] = [
         ["reports/navigation", "--out", "new", "--no-pictures"],
         ["reports/navigation/rows.csv", "reports/navigation/runs.csv"],
     ),
+    ("sweep run", ["grid.toml", "--out", "new", "--testing", "--dry-run"], ["grid.toml"]),
+    ("sweep status", ["swept"], ["swept/sweep/plans/mine.json", "swept/sweep/attempts.jsonl"]),
+    ("sweep retry", ["swept"], ["swept/sweep/plans/mine.json"]),
     (
         "data table",
         ["--out", "reports/sets", "--tasks", "walker_walk", "--qualities", "random"],
