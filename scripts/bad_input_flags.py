@@ -63,9 +63,11 @@ VALID: dict[str, Words] = {
     "navigation collect": ["--maze", "no_curtain", "--out", "new", *SMOKE],
     "navigation train": ["--data", MAZE, "--out", "new", *SMOKE],
     "navigation policy": ["--out", "new"],
-    "navigation grid": ["--out", "new", "--preset", "smoke", "--mazes", "no_curtain"],
     "navigation report": [NAVIGATED, "--out", "new", "--no-pictures"],
-    "sweep": ["--data", SET, "--out", "new", *SMOKE],
+    "sweep run": ["quick", "--out", "new", "--testing", "--dry-run"],
+    "sweep status": ["swept"],
+    "sweep retry": ["swept"],
+    "sweep list": [],
     "report": ["runs", "--out", "new"],
     "theory": [],
     "control-study": ["--out", "new", *STUDY],
@@ -201,17 +203,9 @@ def _unread() -> Iterator[Case]:
     yield from _unread_by("pretrain", PretrainConfig, "method", METHODS)
     yield from _unread_by("navigation train", NavigationConfig, "method", ["ah", "fj+a", "no_history", "random"])
     yield from _unread_by("finetune", FinetuneConfig, "algorithm", ALGORITHMS)
-    for method, line in {"acro": "--literal-future", "curl": "--max-k 2", "bc mik+a": "--codes 3"}.items():
-        more = ["--methods", *method.split(), f"--pretrain={line}", "--dry-run"]
-        yield Case("sweep", "pretrain", f"{line} for {method}", ["sweep", *VALID["sweep"], *more])
-    for methods, line in {
-        "acro": "--foo",
-        "random acro": "--steps 3",
-        "bc": "--alpha 1",
-        "drq_bc": "--views 2",
-    }.items():
-        more = ["--methods", *methods.split(), f"--finetune={line}", "--dry-run"]
-        yield Case("sweep", "finetune", f"{line} for {methods}", ["sweep", *VALID["sweep"], *more])
+    for line in ("pretrain.literal_future=true", "pretrain.foo=1", "finetune.expectile=0.5", "seed=-1", "preset=huge"):
+        words = ["sweep", "run", *VALID["sweep run"], "--change", line]
+        yield Case("sweep run", "change", line, words)
 
 
 def _unread_by(command: str, config: type[StageConfig], chooser: str, names: Iterable[str]) -> Iterator[Case]:

@@ -26,7 +26,7 @@ CUT: dict[str, tuple[str, list[str]]] = {
 
 def build_world(folder: Path) -> None:
     """Make the valid files that all cases start from: two sets, runs of every kind, and some that are foreign."""
-    from vd4rl_pomdp.cli import run_stage
+    from vd4rl_pomdp.cli.dispatch import run_stage
     from vd4rl_pomdp.data.collect import CollectConfig, collect
 
     folder.mkdir()
@@ -42,6 +42,7 @@ def build_world(folder: Path) -> None:
         shutil.copytree(Path(__file__).parents[1] / "results" / "datasets", "reports/sets")
         _unfinished()
         _policy_run(Path("runs/policy"))
+        _swept(Path("swept"))
         _foreign()
     finally:
         os.chdir(before)
@@ -94,6 +95,19 @@ def _policy_run(folder: Path) -> None:
     shutil.copy(next((folder / "snapshots").iterdir()), "actor.safetensors")
     (folder / "config.json").write_text(json.dumps({"task": "walker_walk", "seed": 0}))
     (folder / "curve.csv").write_text("decisions,return_mean\n5000,400.0\n10000,900.0\n")
+
+
+def _swept(folder: Path) -> None:
+    """A sweep that is finished, and the grid of another."""
+    from vd4rl_pomdp.sweeps.folder import SweepFolder
+    from vd4rl_pomdp.sweeps.plan import Job
+
+    shutil.copytree("runs/pretrained", folder / "acro")
+    sweep = SweepFolder(folder)
+    sweep.keep_plan("mine", [Job("acro", "pretrain", folder / "acro", ("pretrain",))])
+    row = {"job": "acro", "cause": "killed", "line": "", "ended": 1.0, "seconds": 2.0, "slots": 1, "step": 0}
+    sweep.add(row | {"host": "here"})
+    shutil.copy(Path(__file__).parents[1] / "vd4rl_pomdp" / "experiments" / "grids" / "quick.toml", "grid.toml")
 
 
 def _foreign() -> None:

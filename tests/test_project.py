@@ -23,7 +23,7 @@ MAY_IMPORT = {
     "finetune": {"finetune", "vd4rl_pomdp"},
 }
 MAY_CALL_STAGES = (
-    *("vd4rl_pomdp/cli/", "vd4rl_pomdp/testing/"),
+    *("vd4rl_pomdp/cli/", "vd4rl_pomdp/sweeps/", "vd4rl_pomdp/testing/"),
     *("vd4rl_pomdp/experiments/bench/", "vd4rl_pomdp/experiments/control/"),
 )
 """Folders whose functions call the stages, and import them there: what is not called is not loaded."""
@@ -216,11 +216,11 @@ def test_every_flag_of_the_navigation_page_exists():
     from dataclasses import fields
 
     from pretrain.navigation.config import NavigationConfig
-    from vd4rl_pomdp.cli.navigation import GridCommand
+    from vd4rl_pomdp.cli.sweeps import RunCommand
     from vd4rl_pomdp.navigation.config import MazeCollectConfig
     from vd4rl_pomdp.options import option_names
 
-    configs = (NavigationConfig, MazeCollectConfig, GridCommand)
+    configs = (NavigationConfig, MazeCollectConfig, RunCommand)
     flags = {name.replace("_", "-") for c in configs for name in ({f.name for f in fields(c)} | option_names())}
     named = re.findall(r"`--([a-z0-9-]+)", (ROOT / "docs" / "navigation.md").read_text())
     assert len(named) > 20

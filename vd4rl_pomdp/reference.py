@@ -41,9 +41,11 @@ class Reference:
     def read(cls, run: Path) -> Self:
         """What a run keeps, nothing known if it began before runs kept any; raises UserError for a damaged file."""
         path = run / FILE
-        if not path.exists():
-            return cls()
-        stored = read_json(path)
+        return cls.parse(path, read_json(path)) if path.exists() else cls()
+
+    @classmethod
+    def parse(cls, path: Path, stored: dict[str, Any]) -> Self:
+        """What a file's content tells; raises UserError, naming the file, if it is damaged."""
         try:
             numbers = {name: _number(stored[name]) for name in ("data_return", "path_error")}
             return cls(actor=_names(stored["actor"]), **numbers)

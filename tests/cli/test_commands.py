@@ -1,14 +1,11 @@
 import os
-import shlex
 import subprocess
 import sys
 
 import pytest
 
 from vd4rl_pomdp.cli import COMMANDS, main
-from vd4rl_pomdp.cli.dispatch import Command
 from vd4rl_pomdp.cli.parsing import show
-from vd4rl_pomdp.experiments.demo import demo_commands
 
 NAMES = [
     [name, *([inner] if inner else [])]
@@ -26,7 +23,7 @@ def test_every_command_has_help(words, capsys):
 
 
 STUDY = ["--methods", "none", "--episodes", "2", "--decisions", "32", "--updates", "1", "--eval-episodes", "1"]
-SWEPT = ["--data", "x", "--out", "y", "--dry-run"]
+SWEEP = ["sweep", "run", "quick", "--out", "y", "--dry-run"]
 
 
 @pytest.mark.parametrize(
@@ -47,7 +44,6 @@ SWEPT = ["--data", "x", "--out", "y", "--dry-run"]
         (["policy", "train", "--task", "walker_walk", "--out", "x", "--seed", "-1"], "--seed is -1"),
         (["data", "check", "x\ny"], "x y: no such folder"),
         (["pretrain", "--data", "x", "--out", "y", "--precision", "fp8"], "Invalid choice invalid choice 'fp8'"),
-        (["sweep", "--data", "x", "--out", "y", "--pretrain=--steps '1"], "No closing quotation"),
         (["policy", "export", "nowhere", "--out", "x"], "nowhere"),
         (["policy", "train", "--task", "walker_walk", "--out", "file/below"], "file/below"),
         (["theory", "--out", "file/below"], "file/below: cannot be used (not a directory)"),
@@ -62,20 +58,26 @@ SWEPT = ["--data", "x", "--out", "y", "--dry-run"]
         (["pretrain", "--data=", "--out", "y"], "--data= names nothing"),
         (["pretrain", "--data", "x", "--out", os.fsdecode(b"\xff")], "'\\udcff' is not UTF-8"),
         (["evaluate", ""], "the first word names nothing"),
-        (["sweep", "--data", "x", "--out", "y", "--methods"], "--methods names nothing"),
-        (["sweep", "--data", "x", "--out", "y", "--dry-run", "--preset", "foo"], "unknown preset 'foo'"),
-        (["sweep", "--data", "x", "--out", "y", "--dry-run", "--finetune=--foo"], "--foo"),
-        (["sweep", "--data", "x", "--out", "y", "--dry-run", "--seeds", "0", "-1"], "--seed is -1"),
+        (["sweep", "run", "huge", "--out", "x"], "unknown grid 'huge': choose one of control,"),
+        (["sweep", "run", "nowhere.toml", "--out", "x"], "nowhere.toml: cannot be used (no such file or directory)"),
+        (["sweep", "run", "quick"], "Missing from vd4rl-pomdp sweep run: --out"),
+        ([*SWEEP, "--change", "preset=foo"], "unknown preset 'foo'"),
+        ([*SWEEP, "--change", "seed=-1"], "--seed is -1"),
+        ([*SWEEP, "--change", "steps=3"], "'steps' is no setting of a grid"),
+        ([*SWEEP, "--change", "pretrain.method=acor"], "'acor': choose one of"),
         (
-            ["sweep", *SWEPT, "--methods", "random", "acro", "--pretrain=--codes 3"],
+            [*SWEEP, "--change", "pretrain.method=random", "pretrain.codes=3"],
             "--codes is not read by the method random",
         ),
         (
-            ["sweep", *SWEPT, "--methods", "acro", "bc", "--finetune=--alpha 1"],
-            "--alpha is not read by the algorithm bc",
+            [*SWEEP, "--change", "pretrain.method=acro", "finetune.random_histories=0.5"],
+            "--random-histories is not read: acro has no memory",
         ),
-        (["sweep", *SWEPT, "--methods", "acro", "drq_bc", "--finetune=--views 2"], "--views is not read by"),
-        (["navigation", "grid", "--seeds", "-1", "--dry-run"], "--seeds is -1"),
+        ([*SWEEP, "--change", "pretrain.method=drq_bc", "finetune.views=2"], "--views is not read by"),
+        ([*SWEEP, "--only", "method=curl"], "the grid has mik+a, acro, random; write name=value,value"),
+        ([*SWEEP, "--executor", "cloud"], "unknown executor 'cloud': choose one of local"),
+        (["sweep", "status", "file"], "file: holds no sweep; `vd4rl-pomdp sweep run GRID --out file` makes one"),
+        (["sweep", "retry", "x"], "x: holds no sweep"),
         (["control-study"], "Missing from vd4rl-pomdp control-study: --out"),
         (
             ["control-study", "--out", "x", "--methods", "acro"],
@@ -138,45 +140,3 @@ def test_results_stay_on_one_line_each(capsys):
         ["dtypes.reward", "float64"],
         ["seconds", "0.123457"],
     ]
-
-
-@pytest.mark.parametrize("preset", ["cpu", "smoke"])
-def test_the_demo_uses_every_stage(tmp_path, preset):
-    words = list(demo_commands(tmp_path, 1, preset))
-    assert [stage[0] for stage in words] == ["data", *["pretrain", "finetune"] * 3, "report"]
-    assert all(stage[stage.index("--preset") + 1] == preset for stage in words if "--preset" in stage)
-
-
-SWEEP = ["sweep", "--data", "my data", "--out", "runs", "--methods", "acro", "random", "--seeds", "0", "1"]
-
-
-@pytest.fixture
-def executed(monkeypatch) -> list[list[str]]:
-    """Stages are not run here, but their words are kept."""
-    stages: list[list[str]] = []
-    for name in ("pretrain", "finetune"):
-        keep = Command("", lambda words, program: stages.append([*program.split(), *words]))
-        monkeypatch.setitem(COMMANDS, name, keep)
-    return stages
-
-
-def test_a_dry_sweep_prints_a_line_a_run_that_does_the_same(executed, capsys):
-    main([*SWEEP, "--algorithms", "td3_bc", "bc", "--pretrain=--steps 5", "--dry-run"])
-    lines = capsys.readouterr().out.splitlines()
-    assert not executed
-    main([*SWEEP, "--algorithms", "td3_bc", "bc", "--pretrain=--steps 5"])
-    assert [stage[1] for stage in executed] == ["pretrain", "finetune", "finetune"] * 4
-    assert [" && ".join(map(shlex.join, executed[i : i + 3])) for i in range(0, 12, 3)] == lines
-
-
-@pytest.mark.parametrize(
-    "words",
-    [["--methods", "acro", "acor"], ["--corruptions", "none", "fog"], ["--algorithms", "bc", "td3"]],
-    ids=" ".join,
-)
-def test_a_sweep_looks_at_its_names_before_the_first_run(executed, words, capsys):
-    with pytest.raises(SystemExit) as end:
-        main([*SWEEP, *words])
-    assert end.value.code == 2
-    assert f"{words[-1]!r}: choose one of" in capsys.readouterr().err
-    assert not executed

@@ -55,7 +55,7 @@ def test_labels_and_cards_that_are_not_whole_are_named(tmp_path):
     for name in ("config.json", "metrics.jsonl"):
         (tmp_path / "runs" / "b" / name).write_bytes((run / name).read_bytes())
     (tmp_path / "runs" / "b" / "labels.json").write_text("{}")
-    with pytest.raises(UserError, match=r"b/labels\.json: has no 'task'"):
+    with pytest.raises(UserError, match=r"b/labels\.json: has no 'method'"):
         write_report([tmp_path / "runs"], tmp_path / "out")
     (run / "encoder" / "config.json").write_text("{}")
     with pytest.raises(UserError, match="does not say how the encoder was pretrained"):

@@ -126,7 +126,7 @@ def test_an_ablation_is_two_rows_everywhere(tmp_path):
     for name in ("mik+a, max_k 1", "mik+a, max_k 15"):
         assert f"<td>{name}</td>" in text
         assert f"<h3>finetune {name}, walker_walk expert, patch, seed 0</h3>" in text
-    for name in ("summary", "curves", "aggregate", "runs", "episodes"):
+    for name in ("summary", "curves", "aggregate", "runs"):
         with (tmp_path / "out" / f"{name}.csv").open() as file:
             assert {row["variant"] for row in csv.DictReader(file)} == {"max_k 1", "max_k 15"}
     describe(write_run(tmp_path / "runs/twin", "mik+a", 0, {10: [3.0]}), {"max_k": 1})
@@ -208,6 +208,10 @@ def test_a_report_writes_over_nothing_but_an_earlier_report(tmp_path, capsys):
         assert {p: hashlib.sha256(p.read_bytes()).digest() for p in tmp_path.rglob("*") if p.is_file()} == before
     write_report([tmp_path / "runs"], tmp_path / "out")
     first = {p.name for p in (tmp_path / "out").iterdir()}
+    with pytest.raises(UserError, match="the results of 2 runs that would be lost"):
+        write_report([tmp_path / "runs" / "0"], tmp_path / "out")
+    for name in ("runs.jsonl", "episodes.csv"):
+        (tmp_path / "out" / name).unlink()
     write_report([tmp_path / "runs" / "0"], tmp_path / "out")
     again = {p.name for p in (tmp_path / "out").iterdir()}
     assert first - again == {"improvement.csv", "missing.csv"}, "no table of the earlier report is left"

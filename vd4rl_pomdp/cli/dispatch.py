@@ -2,8 +2,6 @@
 
 from __future__ import annotations
 
-import shlex
-import sys
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
@@ -61,12 +59,3 @@ def _overview(commands: Commands, program: str) -> str:
 def run_stage(words: Arguments) -> None:
     """Do what `vd4rl-pomdp WORDS` does, in this process."""
     dispatch(COMMANDS, words, PROGRAM)
-
-
-def run_stages(stages: list[Arguments], dry_run: bool) -> None:
-    """Print the stages of a run as one line of shell, and execute them unless `dry_run`."""
-    line = " && ".join(f"{PROGRAM} {shlex.join(stage)}" for stage in stages)
-    print(line, file=sys.stdout if dry_run else sys.stderr)
-    if not dry_run:
-        for stage in stages:
-            run_stage(stage)

@@ -1,9 +1,10 @@
-"""Commands that measure or summarise: report, theory, control-study, bench."""
+"""Commands that measure or summarise: report, results, theory, control-study, bench."""
 
 from __future__ import annotations
 
 import json
 import sys
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,7 +19,7 @@ class ReportCommand:
     """Write an HTML page and CSV files about fine-tuning runs."""
 
     runs: tyro.conf.Positional[list[Path]]
-    """Run folders, or folders that contain some; a folder that `theory --out` wrote adds its section."""
+    """Run folders, results folders, or folders that contain some; what `theory --out` wrote adds its section."""
     out: Path = Path("report")
     """Folder of the report."""
 
@@ -30,6 +31,27 @@ def _report(words: Arguments, program: str) -> None:
     report = write_report(command.runs, command.out)
     print_summary(report)
     print(f"report: {report.page}")
+
+
+@dataclass(frozen=True)
+class AddCommand:
+    """Append finished runs to a results folder: their small files and raw evaluation rows, without weights and films.
+
+    A run that is there already stays as it is, whatever its rows.
+    """
+
+    runs: tyro.conf.Positional[list[Path]]
+    """Run folders, results folders, or folders that contain some."""
+    out: Path
+    """The results folder, made if missing."""
+
+
+def _add(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.results import add_results
+
+    command = parse(AddCommand, words, program)
+    added = add_results(command.runs, command.out)
+    print(f"{command.out}: {added.in_words}")
 
 
 @dataclass(frozen=True)
@@ -91,8 +113,9 @@ def _control_study(words: Arguments, program: str) -> None:
     print(*summary(rows), sep="\n")
 
 
-COMMANDS = {
+COMMANDS: dict[str, Command | Mapping[str, Command]] = {
     "report": Command("an HTML page and CSV files about runs", _report),
+    "results": {"add": Command("append finished runs to a results folder", _add)},
     "theory": Command("the paper's claims on finite worlds, by enumeration", _theory),
     "control-study": Command("does memory pay? told on simulator states, in minutes", _control_study),
     "bench": Command("speed and memory on this machine", _bench),

@@ -18,7 +18,7 @@ from vd4rl_pomdp.options import NO_OPTIONS, Options, StageConfig
 from vd4rl_pomdp.sweeps.executors import executor_kind
 
 if TYPE_CHECKING:
-    from vd4rl_pomdp.sweeps.history import History
+    from vd4rl_pomdp.sweeps.folder import SweepFolder
     from vd4rl_pomdp.sweeps.plan import Job
 
 
@@ -67,23 +67,23 @@ class RunCommand(_ExecutorConfig):
 
 def _run(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.runs.outputs import refuse_kept
-    from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below
+    from vd4rl_pomdp.sweeps.folder import SweepFolder
+    from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
     from vd4rl_pomdp.sweeps.grid import load_grid, narrow
-    from vd4rl_pomdp.sweeps.history import History
-    from vd4rl_pomdp.sweeps.plan import Planner
+    from vd4rl_pomdp.sweeps.plan import JobPlanner
 
     command = parse_stage(RunCommand, words, program)
     grid = load_grid(command.grid, command.change, command.testing)
     cells = narrow(grid.cells(), command.only)
     refuse_kept(command.out)
-    here, kept = FoundRuns(runs_below(command.out)), FoundRuns([])
-    jobs = Planner(command.out, command.data, kept, here).plan(cells)
+    here, kept = FoundRuns(runs_below(command.out)), FoundRuns(runs_kept(command.done))
+    jobs = JobPlanner(command.out, command.data, kept, here).plan(cells)
     if command.dry_run:
         _print_plan(jobs, [*here.runs, *kept.runs])
         return
-    history = History(command.out)
-    history.keep_plan(grid.name, jobs)
-    _carry_out(jobs, command, history)
+    folder = SweepFolder(command.out)
+    folder.keep_plan(grid.name, jobs)
+    _carry_out(jobs, command, folder)
 
 
 def _print_plan(jobs: list[Job], past: list[Any]) -> None:
@@ -102,37 +102,32 @@ def _print_plan(jobs: list[Job], past: list[Any]) -> None:
         if not job.done:
             print(f"{PROGRAM} {shlex.join(job.words)}")
             known, unknown = known + (seconds or 0.0), unknown + (seconds is None)
-    done = sum(job.done for job in jobs)
-    print(
-        f"# {len(jobs)} jobs, {done} done, {len(jobs) - done} to do: {told_seconds(known)} of work by past runs", end=""
-    )
-    print(f", {unknown} jobs of unknown length" if unknown else "")
+    left = sum(not job.done for job in jobs)
+    told = f"{told_seconds(known)} of work by past runs" + f", {unknown} jobs of unknown length" * (unknown > 0)
+    print(f"# {len(jobs)} jobs, {len(jobs) - left} done, {left} to do: {told}")
 
 
-def _carry_out(jobs: list[Job], command: _ExecutorConfig, history: History) -> None:
+def _carry_out(jobs: list[Job], command: _ExecutorConfig, folder: SweepFolder) -> None:
     """Run jobs to their end; SystemExit 1 if some are not finished."""
     from vd4rl_pomdp.sweeps.driver import Driver
-    from vd4rl_pomdp.sweeps.history import FOLDER
 
-    executor = executor_kind(command.executor).build(command.options, history.out / FOLDER / command.executor)
-    if not Driver(jobs, executor, history).run():
-        failures = _status(history, jobs).failures
+    executor = executor_kind(command.executor).build(command.options, folder.of_executor(command.executor))
+    if not Driver(jobs, executor, folder).run():
+        failures = _status(folder, jobs).failures
         for name, row in failures.items():
             print(f"{row['cause']}: {name}: {row['line']}", file=sys.stderr)
-        left = sum(not job.finished for job in jobs)
-        print(
-            f"{left} of {len(jobs)} jobs are not finished, {len(failures)} failed; `sweep retry` takes those up again"
-        )
+        left = f"{sum(not job.finished for job in jobs)} of {len(jobs)} jobs are not finished"
+        print(f"{left}, {len(failures)} failed; `{PROGRAM} sweep retry {folder.out}` takes those up again")
         sys.exit(1)
     print(f"all {len(jobs)} jobs are finished")
 
 
-def _status(history: History, jobs: list[Job]) -> Any:
+def _status(folder: SweepFolder, jobs: list[Job]) -> Any:
     from vd4rl_pomdp.sweeps.estimate import Estimates
     from vd4rl_pomdp.sweeps.found import runs_below
     from vd4rl_pomdp.sweeps.status import status
 
-    return status(jobs, history.attempts(), Estimates(runs_below(history.out)))
+    return status(jobs, folder.attempts(), Estimates(runs_below(folder.out)))
 
 
 @dataclass(frozen=True)
@@ -146,12 +141,12 @@ class StatusCommand:
 
 
 def _show_status(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.sweeps.history import History
+    from vd4rl_pomdp.sweeps.folder import SweepFolder
     from vd4rl_pomdp.sweeps.status import lines
 
     command = parse(StatusCommand, words, program)
-    history = History(command.out)
-    found = _status(history, history.jobs())
+    folder = SweepFolder(command.out)
+    found = _status(folder, folder.jobs())
     if command.json:
         numbers = {"per_hour": found.per_hour, "seconds_left": found.seconds_left, "finished": found.finished}
         show({"counts": dict(found.counts)} | numbers | {"states": found.states, "failures": found.failures}, True)
@@ -168,25 +163,25 @@ class RetryCommand(_ExecutorConfig):
 
 
 def _retry(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.sweeps.history import History
+    from vd4rl_pomdp.sweeps.folder import SweepFolder
 
     command = parse_stage(RetryCommand, words, program)
-    history = History(command.out)
-    jobs = history.jobs()
-    for name in _status(history, jobs).failures:
-        history.forget(name)
-    _carry_out(jobs, command, history)
+    folder = SweepFolder(command.out)
+    jobs = folder.jobs()
+    for name in _status(folder, jobs).failures:
+        folder.forget(name)
+    _carry_out(jobs, command, folder)
 
 
 @dataclass(frozen=True)
-class ListCommand:
+class GridsCommand:
     """List the grids that ship with the package."""
 
 
 def _list(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.sweeps.grid import load_grid, names
 
-    parse(ListCommand, words, program)
+    parse(GridsCommand, words, program)
     for name in names():
         grid = load_grid(name)
         print(f"{name:<18} {len(grid.cells()):>5} cells  {grid.title}")

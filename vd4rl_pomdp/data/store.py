@@ -134,13 +134,6 @@ def open_store(path: Path, cache: Path | None = None) -> Store:
     return Store(folder, meta)
 
 
-def known_fingerprint(path: Path, cache: Path | None = None) -> str | None:
-    """Fingerprint of the set at `path`, None if it was never decoded; raises UserError if there is no whole set."""
-    folder = (cache or default_cache()) / _key(shard_paths(path))
-    meta = _read_meta(folder)
-    return None if meta is None else Store(folder, meta).fingerprint
-
-
 def verify_store(store: Store) -> None:
     """Recompute every checksum; raises UserError naming the file that has changed since it was decoded."""
     for name, file in store.meta["files"].items():

@@ -1,4 +1,4 @@
-"""The demo: every stage on a small set with real rendering. It shows that all works, not which method is best."""
+"""The demo: the grid `quick`, job after job, and a report. It shows that all works, not which method is best."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import math
 import sys
 import time
 from collections.abc import Callable, Iterator
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -14,45 +13,22 @@ import numpy as np
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import read_episodes
 from vd4rl_pomdp.runs.outputs import refuse_kept
+from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below
+from vd4rl_pomdp.sweeps.grid import load_grid
+from vd4rl_pomdp.sweeps.plan import Job, JobPlanner
 
-METHODS = ("mik+a", "acro", "random")
-CORRUPTION = "patch+zero_frames"
-QUALITY = "expert_noisy"
-"""Where actions are not decided by the state alone, returns tell memories apart soonest."""
-
-
-@dataclass(frozen=True)
-class Size:
-    """What the stages of a demo are told."""
-
-    episodes: int
-    pretrain: str
-    finetune: str
+GRID = "quick"
+PRESETS = {"cpu": False, "smoke": True}
+"""Whether a preset is the grid's testing subset."""
 
 
-PRESETS = {
-    "cpu": Size(
-        20,
-        "--preset cpu --steps 600 --log-every 25 --checkpoint-every 100",
-        "--preset cpu --updates 6000 --update-precision bf16 --views 2 --eval-every 6000 --eval-episodes 8",
-    ),
-    "smoke": Size(2, "--preset smoke", "--preset smoke"),
-}
-
-
-def demo_commands(out: Path, workers: int, preset: str = "cpu") -> Iterator[list[str]]:
-    """Words of every stage's command line, in order."""
-    size = PRESETS[preset]
-    data = str(out / "data" / "walker_walk" / QUALITY)
-    collect = ["--task", "walker_walk", "--quality", QUALITY, "--episodes", str(size.episodes), "--out", data]
-    yield ["data", "collect", *collect, "--workers", str(workers)]
-    for method in METHODS:
-        folder = out / "runs" / method
-        place = ["--data", data, "--out", str(folder / "pretrain")]
-        yield ["pretrain", "--method", method, "--corruption", CORRUPTION, *place, *size.pretrain.split()]
-        place = ["--encoder", str(folder / "pretrain" / "encoder"), "--data", data, "--out", str(folder / "finetune")]
-        yield ["finetune", *place, *size.finetune.split(), "--workers", str(workers)]
-    yield ["report", str(out / "runs"), "--out", str(out / "report")]
+def demo_jobs(out: Path, preset: str = "cpu") -> list[Job]:
+    """The jobs of the demo, in order; UserError for an unknown preset."""
+    if preset not in PRESETS:
+        raise UserError(f"unknown preset {preset!r}: choose one of {', '.join(PRESETS)}")
+    runs = out / "runs"
+    cells = load_grid(GRID, testing=PRESETS[preset]).cells()
+    return JobPlanner(runs, out / "data", FoundRuns([]), FoundRuns(runs_below(runs))).plan(cells)
 
 
 def demo(out: Path, workers: int, preset: str, run: Callable[[list[str]], None]) -> None:
@@ -64,26 +40,34 @@ def demo(out: Path, workers: int, preset: str, run: Callable[[list[str]], None])
         preset: how long the stages take, one of PRESETS; UserError for another.
         run: what carries out one command line.
     """
-    if preset not in PRESETS:
-        raise UserError(f"unknown preset {preset!r}: choose one of {', '.join(PRESETS)}")
     refuse_kept(out)
     started = time.monotonic()
-    for words in demo_commands(out, workers, preset):
+    jobs = demo_jobs(out, preset)
+    report = ("report", str(out / "runs"), "--out", str(out / "report"))
+    for words in (*demo_commands(jobs, workers), report):
         print(f"\n$ vd4rl-pomdp {' '.join(words)}", file=sys.stderr)
-        run(words)
-    print("\n".join(conclusion(out / "runs")))
+        run(list(words))
+    print("\n".join(conclusion(jobs)))
     print(f"demo finished in {(time.monotonic() - started) / 60:.1f} minutes")
 
 
-def conclusion(runs: Path) -> Iterator[str]:
+def demo_commands(jobs: list[Job], workers: int) -> Iterator[tuple[str, ...]]:
+    """Words of every job's command line."""
+    for job in jobs:
+        yield (*job.words, *(() if job.section == "pretrain" else ("--workers", str(workers))))
+
+
+def conclusion(jobs: list[Job]) -> Iterator[str]:
     """What the returns of the demo's methods say, and how sure it is: lines of text."""
-    yield f"Returns under {CORRUPTION}, and where nothing is hidden (mean ± standard error over episodes):"
-    for method in METHODS:
-        rows = read_episodes(runs / method / "finetune" / "episodes.csv")
+    policies = [(dict(job.settings), job.folder) for job in jobs if job.section == "finetune"]
+    corruption = policies[0][0]["corruption"]
+    yield f"Returns under {corruption}, and where nothing is hidden (mean ± standard error over episodes):"
+    for settings, folder in policies:
+        rows = read_episodes(folder / "episodes.csv")
         last = max(row["step"] for row in rows)
         shown = (_mean_and_error([r["return"] for r in rows if (r["step"], r["evaluated_under"]) == (last, under)])
-                 for under in (CORRUPTION, "none"))  # fmt: skip
-        yield f"  {method:<8}" + ", ".join(shown)
+                 for under in (corruption, "none"))  # fmt: skip
+        yield f"  {settings['method']:<8}" + ", ".join(shown)
     yield "One seed each: another may end elsewhere. What several seeds say of 100 episodes is in results/control."
 
 

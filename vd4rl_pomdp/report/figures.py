@@ -82,14 +82,13 @@ def _style(number: int) -> dict[str, Any]:
     return {"color": COLOURS[number % len(COLOURS)], "linestyle": dashes}
 
 
-def loss_figure(series: list[tuple[str, list[dict[str, float]]]], methods: list[str]) -> str:
+def loss_figure(series: list[tuple[str, list[tuple[int, float]]]], methods: list[str]) -> str:
     """Pretraining action loss against steps, one line a run; those of a method look as in the other figures."""
     figure = Figure(figsize=(6.4, 3.2), layout="constrained")
     axes = figure.subplots()
     methods = list(dict.fromkeys([*methods, *(name for name, _ in series)]))
-    for number, (name, metrics) in enumerate(series):
-        steps = [row["step"] for row in metrics if "action_loss" in row]
-        values = [row["action_loss"] for row in metrics if "action_loss" in row]
+    for number, (name, losses) in enumerate(series):
+        steps, values = zip(*losses, strict=True)
         first = name not in (other for other, _ in series[:number])
         entry = plain(name, LEGEND_WIDTH) if first else None
         axes.plot(steps, values, lw=1.2, label=entry, **_style(methods.index(name)))

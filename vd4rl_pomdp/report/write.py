@@ -14,7 +14,6 @@ from rich.text import Text
 
 from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import COLUMNS
 from vd4rl_pomdp.report import figures, tables
 from vd4rl_pomdp.report.gaps import MISSING, find_gaps
 from vd4rl_pomdp.report.gates import gates, unranked
@@ -22,6 +21,7 @@ from vd4rl_pomdp.report.load import LoadedRun, compare, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.report.theory import load_section
+from vd4rl_pomdp.results import RUNS, refuse_loss, write_results
 from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.text import write_text
@@ -43,15 +43,17 @@ class Report(NamedTuple):
 def write_report(paths: list[Path], out: Path) -> Report:
     """Write the report of all runs at or below `paths` into `out`.
 
-    A study that `vd4rl-pomdp theory` wrote at or below `paths` becomes a section of the page.
+    The folder is a results folder, too, so that the report can be made again from it alone. A study that
+    `vd4rl-pomdp theory` wrote at or below `paths` becomes a section of the page.
 
     Raises:
-        UserError: there is nothing to report, a file is damaged, or `out` holds anything but an earlier report.
+        UserError: there is nothing to report, a file is damaged, `out` holds anything but results or an earlier
+            report, or it tells of finished runs that are not reported.
     """
-    refuse_foreign(out, "report", f"{_MARK}.csv")
-    runs = load_runs(paths)
+    refuse_foreign(out, "report", f"{_MARK}.csv", RUNS)
+    runs = load_runs(paths, out)
+    refuse_loss([run.result for run in runs], out)
     rows = [row for run in runs for row in run.rows]
-    everything = [row for run in runs for row in (*run.rows, *run.others)]
     if not rows:
         raise UserError(f"{paths[0]}: holds no evaluated run yet; `vd4rl-pomdp finetune` evaluates")
     final = [row for run in runs if run.finished for row in run.rows]
@@ -76,7 +78,7 @@ def write_report(paths: list[Path], out: Path) -> Report:
             write_csv(path, list(table[0]), table)
         else:
             path.unlink(missing_ok=True)
-    write_csv(out / "episodes.csv", (*COLUMNS, "variant"), everything)
+    write_results(out, [run.result for run in runs])
     write_text(out / "index.html", page)
     return Report(out / "index.html", made[_MARK], gated)
 
@@ -109,10 +111,10 @@ def _terminal_table(setting: str, rows: list[Row]) -> Table:
 
 def _render(runs: list[LoadedRun], rows: list[Row], made: dict[str, list[Row]], theory: str | None) -> str:
     names = list(dict.fromkeys(map(tables.label, (*made[_MARK], *rows))))
-    pretraining: dict[str, list[tuple[str, list[dict[str, float]]]]] = {}
+    pretraining: dict[str, list[tuple[str, list[tuple[int, float]]]]] = {}
     for run in runs:
         if run.stage == "pretrain" and _has_losses(run):
-            pretraining.setdefault(_setting(run.labels), []).append((tables.label(_row(run)), run.metrics))
+            pretraining.setdefault(_setting(run.labels), []).append((tables.label(_row(run)), run.result.losses))
     settings = dict(_by_setting(made[_MARK]))
     return render(
         "page.html",
@@ -158,7 +160,7 @@ def _probe_figures(runs: list[Row], names: list[str]) -> list[tuple[str, str, st
 
 
 def _has_losses(run: LoadedRun) -> bool:
-    return any("action_loss" in row for row in run.metrics)
+    return bool(run.result.losses)
 
 
 def _number(value: float | None, digits: int = 1) -> str:

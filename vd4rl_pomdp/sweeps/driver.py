@@ -16,7 +16,7 @@ from vd4rl_pomdp.errors import DiskFullError, InUseError, OutOfMemoryError, User
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.ownership import in_use
-from vd4rl_pomdp.sweeps.history import History
+from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.progress import progress_of
 from vd4rl_pomdp.sweeps.work import DIVERGED, DONE, FAILED, INTERRUPTED, KILLED, Ended, Executor
@@ -65,26 +65,30 @@ def given_up(rows: list[Row], largest: int = 1) -> str:
             break
         alike += 1
     hopeless = last["cause"] == OutOfMemoryError.cause and last["slots"] >= largest
-    return last["cause"] if hopeless or alike > RETRIES[last["cause"]].times else ""
+    return last["cause"] if hopeless or alike > RETRIES.get(last["cause"], Retry(0)).times else ""
 
 
 class Driver:
     """One process's part in a sweep."""
 
-    def __init__(self, jobs: Iterable[Job], executor: Executor, history: History) -> None:
+    def __init__(self, jobs: Iterable[Job], executor: Executor, folder: SweepFolder) -> None:
         """See the module."""
         self._jobs = {job.name: job for job in jobs}
-        self._executor, self._history = executor, history
-        self._rows = history.attempts()
+        self._executor, self._folder = executor, folder
+        self._rows = folder.attempts()
         self._left = {job.name: job for job in self._jobs.values() if not job.finished}
         self._running: dict[str, tuple[float, int]] = {}
         """When each began, and its slots."""
         self._not_before: dict[str, float] = {}
+        self._lost: set[str] = set()
+        """What is left and will stay so: jobs that were given up, and those that need them."""
+        self._give_up()
 
     def run(self) -> bool:
         """Work until nothing is left that can be done; whether all is finished."""
         try:
-            while self._left and (self._start() or self._running or self._waiting()):
+            while len(self._left) > len(self._lost):
+                self._start()
                 time.sleep(POLL_S)
                 self._collect()
                 interrupt.check("the sweep's jobs have ended")
@@ -94,28 +98,26 @@ class Driver:
             raise
         return not self._left
 
-    def _start(self) -> bool:
-        """Start every job that can be; whether there was one."""
-        before = len(self._running)
+    def _start(self) -> None:
+        """Start every job that can be."""
         for job in list(self._left.values()):
             if not self._executor.fits(1):
                 break
             if self._ready(job) and self._executor.fits(self._slots(job)) and not self._elsewhere(job):
                 self._begin(job)
-        return len(self._running) > before
 
     def _begin(self, job: Job) -> None:
         slots = self._slots(job)
         self._running[job.name] = (time.monotonic(), slots)
         try:
             with disk_errors(job.folder):
-                self._executor.start(self._history.work(job, slots))
+                self._executor.start(self._folder.work(job, slots))
         except DiskFullError as error:
             self._end(Ended(job.name, error.cause, str(error)))
 
     def _ready(self, job: Job) -> bool:
         free = job.name not in self._running and time.monotonic() >= self._not_before.get(job.name, 0)
-        return free and not self._given_up(job) and not any(name in self._left for name in job.needs)
+        return free and job.name not in self._lost and not any(name in self._left for name in job.needs)
 
     def _elsewhere(self, job: Job) -> bool:
         """Whether another process has finished a job, or is at it."""
@@ -126,13 +128,12 @@ class Driver:
             self._not_before[job.name] = time.monotonic() + RETRIES[InUseError.cause].wait_s
         return busy
 
-    def _given_up(self, job: Job) -> bool:
-        return bool(given_up(self._rows.get(job.name, []), self._executor.largest))
-
-    def _waiting(self) -> bool:
-        """Whether a job waits for its time."""
-        now = time.monotonic()
-        return any(self._not_before.get(name, 0) > now and not self._given_up(job) for name, job in self._left.items())
+    def _give_up(self) -> None:
+        """Find out which jobs are lost."""
+        for job in self._left.values():  # a job comes after those it needs
+            rows = self._rows.get(job.name, [])
+            if given_up(rows, self._executor.largest) or not self._lost.isdisjoint(job.needs):
+                self._lost.add(job.name)
 
     def _slots(self, job: Job) -> int:
         """One, or twice as many as when the memory last did not suffice."""
@@ -151,22 +152,22 @@ class Driver:
             del self._left[ended.name]
         else:
             self._not_before[ended.name] = time.monotonic() + RETRIES[ended.cause].wait_s
+            self._give_up()
         self._say(ended, seconds)
 
     def _note(self, ended: Ended, seconds: float, slots: int) -> None:
         """Keep the row of an attempt, here and on the disk, unless that is full."""
-        row: Row = {"job": ended.name, "ended": round(time.time(), 1), "seconds": round(seconds, 1)}
-        row |= {"cause": ended.cause}
-        row |= {"line": ended.line, "step": progress_of(self._jobs[ended.name]), "slots": slots}
-        row |= {"host": socket.gethostname()}
+        row: Row = {"job": ended.name, "cause": ended.cause, "line": ended.line}
+        row |= {"ended": round(time.time(), 1), "seconds": round(seconds, 1), "slots": slots}
+        row |= {"step": progress_of(self._jobs[ended.name]), "host": socket.gethostname()}
         self._rows.setdefault(ended.name, []).append(row)
         try:
-            self._history.add(row)
+            self._folder.add(row)
         except DiskFullError as error:
             print(f"warning: {error}", file=sys.stderr)
 
     def _say(self, ended: Ended, seconds: float) -> None:
         done = len(self._jobs) - len(self._left)
-        line = f"[{done}/{len(self._jobs)}] {ended.cause:<8} {seconds:6.0f} s  {ended.name}"
+        line = f"[{done}/{len(self._jobs)}] {ended.cause:<13} {seconds:6.0f} s  {ended.name}"
         line += f": {ended.line}" if ended.line else ""
         print(line, file=sys.stderr, flush=True)

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.nn.encoder_folder import CONFIG
+from vd4rl_pomdp.results import read_results
 from vd4rl_pomdp.runs.files import Row, read_json
 from vd4rl_pomdp.runs.identity import recipe
 from vd4rl_pomdp.runs.settings import settings_of
@@ -54,6 +55,13 @@ class FoundRuns:
 
     def __contains__(self, folder: Path) -> bool:
         return folder in self._folders
+
+
+def runs_kept(folders: Iterable[Path]) -> Iterator[FoundRun]:
+    """Every run of some results folders; UserError for a folder that is none."""
+    for folder in folders:
+        for run in read_results(folder):
+            yield FoundRun(run.path, run.record, run.card, run.files.get("timing", {}).get("seconds"))
 
 
 def runs_below(out: Path) -> Iterator[FoundRun]:

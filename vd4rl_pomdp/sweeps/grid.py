@@ -42,15 +42,15 @@ MAZES = ("navigation_collect", "navigation_train")
 SECTIONS = (*PIXELS, *MAZES)
 SHARED = ("seed", "preset")
 """Settings outside the sections."""
-Settings = dict[str, Any]
-Sections = dict[str, Settings]
+Values = dict[str, Any]
+Sections = dict[str, Values]
 
 
 @dataclass(frozen=True)
-class Cell:
+class GridCell:
     """One point of a grid: a set, an encoder and a policy, or whatever of the chain a grid asks for."""
 
-    shared: Settings
+    shared: Values
     """Values of SHARED, as far as they are told."""
     sections: Sections
     """Settings by section, without axes."""
@@ -84,16 +84,16 @@ class Grid:
     block_says: list[dict[str, set[str]]]
     """By block and section, the settings that stand in the block itself."""
 
-    def cells(self) -> list[Cell]:
+    def cells(self) -> list[GridCell]:
         """All cells, once each; the first seed of every condition comes before the second of any."""
-        cells: dict[str, Cell] = {}
+        cells: dict[str, GridCell] = {}
         for block, says in zip(self.blocks, self.block_says, strict=True):
             for cell in _product(block, says):
                 cells.setdefault(repr((cell.shared, cell.sections)), cell)
         return sorted(cells.values(), key=lambda cell: cell.seed)
 
 
-def _product(block: Sections, says: dict[str, set[str]]) -> Iterator[Cell]:
+def _product(block: Sections, says: dict[str, set[str]]) -> Iterator[GridCell]:
     axes = [(section, name) for section in block for name, value in block[section].items() if isinstance(value, list)]
     named = {
         section: [name for name in block[section] if (section, name) in axes or name in says.get(section, ())]
@@ -104,7 +104,7 @@ def _product(block: Sections, says: dict[str, set[str]]) -> Iterator[Cell]:
         for (section, name), value in zip(axes, values, strict=True):
             sections[section][name] = value
         shared = sections.pop("")
-        yield Cell(shared, sections, named)
+        yield GridCell(shared, sections, named)
 
 
 def names() -> list[str]:
@@ -131,7 +131,7 @@ def load_grid(name: str, changes: Sequence[str] = (), testing: bool = False) -> 
         raise UserError(f"{name}: {error}") from error
 
 
-def _read(path: Path, name: str) -> Settings:
+def _read(path: Path, name: str) -> Values:
     if path.suffix not in (".toml", ".py"):
         raise UserError(f"unknown grid {name!r}: choose one of {', '.join(names())}, or name a .toml or .py file")
     try:
@@ -147,7 +147,7 @@ def _read(path: Path, name: str) -> Settings:
     return told
 
 
-def _grid_of(name: str, told: Settings, changes: list[Sections], testing: bool) -> Grid:
+def _grid_of(name: str, told: Values, changes: list[Sections], testing: bool) -> Grid:
     told = dict(told)
     title, blocks, tests = told.pop("title", name), told.pop("block", [{}]), told.pop("testing", {})
     if not isinstance(blocks, list) or not blocks:
@@ -214,12 +214,12 @@ def _check_block(block: Sections) -> None:
         raise UserError(f"a block needs sections of {', '.join(PIXELS)}, or of {', '.join(MAZES)}")
     for section, settings in block.items():
         for name, value in settings.items():
-            for one in value if isinstance(value, list) else [value]:
-                if not isinstance(one, str | int | float) or value == []:
-                    raise UserError(f"{section}.{name} is {value!r}: write a number, a word, true or false, or a list")
+            values = value if isinstance(value, list) else [value]
+            if not values or not all(isinstance(one, str | int | float) for one in values):
+                raise UserError(f"{section}.{name} is {value!r}: write a number, a word, true or false, or a list")
 
 
-def narrow(cells: list[Cell], only: Sequence[str]) -> list[Cell]:
+def narrow(cells: list[GridCell], only: Sequence[str]) -> list[GridCell]:
     """The cells whose settings have the named values: "method=mik+a,acro", "seed=0".
 
     Raises:

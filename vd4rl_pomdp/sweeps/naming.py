@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
-from vd4rl_pomdp.sweeps.grid import Cell
+from vd4rl_pomdp.sweeps.grid import GridCell
 
 _OWN = {
     "collect": ("task", "quality"),
@@ -16,13 +16,13 @@ _OWN = {
 """Settings that have a place of their own in a folder's name."""
 
 
-def extras(cell: Cell, section: str) -> str:
+def extras(cell: GridCell, section: str) -> str:
     """The other settings of a section that tell a cell from others: ",history=gru,max_k=1"."""
     named = [name for name in cell.named.get(section, ()) if name not in _OWN[section]]
     return "".join(f",{name}={_word(cell.sections[section][name])}" for name in named)
 
 
-def run_folder(cell: Cell, section: str, data: str, values: dict[str, Any]) -> str:
+def run_folder(cell: GridCell, section: str, data: str, values: dict[str, Any]) -> str:
     """Where a run goes, below the sweep's folder.
 
     Args:

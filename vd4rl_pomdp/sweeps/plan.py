@@ -9,7 +9,7 @@ from typing import Any
 
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.sweeps.found import FoundRuns
-from vd4rl_pomdp.sweeps.grid import Cell
+from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.naming import run_folder
 from vd4rl_pomdp.sweeps.sets import DataSet, set_of
 from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, check_cell, recipe_of, recorded, told, words_of
@@ -49,7 +49,7 @@ class Job:
         return (self.folder / mark).is_file()
 
 
-class Planner:
+class JobPlanner:
     """Makes the jobs of a grid, looking at what is there."""
 
     def __init__(self, out: Path, data: Path | None, kept: FoundRuns, here: FoundRuns) -> None:
@@ -66,7 +66,7 @@ class Planner:
         self._sets: dict[str, DataSet] = {}
         self._taken: set[str] = set()
 
-    def plan(self, cells: Iterable[Cell]) -> list[Job]:
+    def plan(self, cells: Iterable[GridCell]) -> list[Job]:
         """The jobs of some cells, each after those it needs; what only finished jobs would need is left out.
 
         Raises:
@@ -77,7 +77,7 @@ class Planner:
             self._add(cell)
         return _needed(list(self._jobs.values()))
 
-    def _add(self, cell: Cell) -> None:
+    def _add(self, cell: GridCell) -> None:
         found = set_of(cell, self._data)
         data = self._sets.setdefault(found.name, found)
         values: dict[str, Any] = {}
@@ -86,20 +86,20 @@ class Planner:
             values |= recorded(cell, section)
             before.append(self._training(cell, section, data, values, before))
 
-    def _collection(self, cell: Cell, data: DataSet) -> Job:
+    def _collection(self, cell: GridCell, data: DataSet) -> Job:
         words = (*COMMANDS[data.section], *words_of(told(cell, data.section)), "--out", str(data.folder))
         job = Job(
             f"{DATA}/{data.name}", data.section, data.folder, words, done=data.there, settings=cost_of(data.wanted)
         )
         return self._jobs.setdefault((data.section, "", data.name), job)
 
-    def _training(self, cell: Cell, section: str, data: DataSet, values: dict[str, Any], before: list[Job]) -> Job:
+    def _training(self, cell: GridCell, section: str, data: DataSet, values: dict[str, Any], before: list[Job]) -> Job:
         recipe = recipe_of(cell, section)
         key = (section, recipe, data.name)
         if key in self._jobs:
             return self._jobs[key]
         run, kept = self._here.of(recipe, data), self._kept.of(recipe, data)
-        if run is not None and run.folder.is_relative_to(self._out):
+        if run is not None:
             name = run.folder.relative_to(self._out).as_posix()
         else:
             name = self._free(run_folder(cell, section, data.name, values), recipe)

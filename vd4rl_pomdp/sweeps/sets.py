@@ -9,11 +9,11 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.data.format import PLAN, RECORD, SUFFIXES
-from vd4rl_pomdp.data.store import known_fingerprint
+from vd4rl_pomdp.data.store import open_store
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.files import jsonable, read_json
-from vd4rl_pomdp.sweeps.grid import Cell
+from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.naming import extras
 from vd4rl_pomdp.sweeps.stages import config_of
 
@@ -49,9 +49,9 @@ class DataSet:
         return self.collected or self.foreign
 
     @cached_property
-    def fingerprint(self) -> str | None:
-        """Name of its content, None while it is not there or was never opened."""
-        return known_fingerprint(self.folder) if self.there else None
+    def fingerprint(self) -> str:
+        """Name of the content of a set that is there; one that was never opened is decoded first."""
+        return open_store(self.folder).fingerprint
 
     def check(self) -> None:
         """Raise UserError if its folder holds a set that was collected otherwise."""
@@ -65,9 +65,8 @@ class DataSet:
 
     def made(self, record: Mapping[str, Any]) -> bool:
         """Whether a run, as its config.json tells it, was trained on this set."""
-        before = record.get("inputs", {}).get("data")
-        if self.fingerprint is not None:
-            return before == self.fingerprint
+        if self.there:
+            return record.get("inputs", {}).get("data") == self.fingerprint
         collection = record.get("collection") or {}
         return bool(collection) and self._agrees(collection)
 
@@ -75,7 +74,7 @@ class DataSet:
         return all(stored.get(name, value) == value for name, value in self.wanted.items())
 
 
-def set_of(cell: Cell, root: Path) -> DataSet:
+def set_of(cell: GridCell, root: Path) -> DataSet:
     """The set of a cell, below `root`; raises UserError if another is there."""
     section = cell.chain[0]
     if section not in ("collect", "navigation_collect"):

@@ -17,7 +17,7 @@ from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.identity import recipe
 from vd4rl_pomdp.runs.settings import settings_of
-from vd4rl_pomdp.sweeps.grid import Cell, Settings
+from vd4rl_pomdp.sweeps.grid import GridCell, Values
 
 _NOWHERE = "-"
 """Stands for a path while settings are parsed."""
@@ -37,13 +37,13 @@ _TAKES = {"collect": (), "navigation_collect": ("preset",)}
 """What a stage takes of the shared settings, where that is not all of them."""
 
 
-def told(cell: Cell, section: str) -> Settings:
+def told(cell: GridCell, section: str) -> Values:
     """What a cell tells a stage, in the order of its command line."""
     takes = _TAKES.get(section, tuple(cell.shared))
     return {name: value for name, value in cell.shared.items() if name in takes} | cell.sections[section]
 
 
-def words_of(settings: Settings) -> list[str]:
+def words_of(settings: Values) -> list[str]:
     """Settings as words of a command line."""
     words: list[str] = []
     for name, value in settings.items():
@@ -55,7 +55,7 @@ def words_of(settings: Settings) -> list[str]:
     return words
 
 
-def check_cell(cell: Cell) -> None:
+def check_cell(cell: GridCell) -> None:
     """Raise UserError for settings that a stage would refuse."""
     for section in cell.chain:
         config_of(cell, section)
@@ -63,7 +63,7 @@ def check_cell(cell: Cell) -> None:
         _finetuning(cell)
 
 
-def config_of(cell: Cell, section: str) -> Any:
+def config_of(cell: GridCell, section: str) -> Any:
     """A stage's settings, its folders left open."""
     settings = told(cell, section)
     seed = settings.pop("seed", 0)
@@ -120,7 +120,7 @@ _PARSERS: dict[str, Callable[[list[str], str], Any]] = {
 }
 
 
-def recipe_of(cell: Cell, section: str) -> str:
+def recipe_of(cell: GridCell, section: str) -> str:
     """Name of what a training of a cell computes but for the content of its data; as its run's records have it."""
     record = {"format": FORMAT, "stage": STAGES[section], "config": recorded(cell, section)}
     if section != "finetune":
@@ -129,7 +129,7 @@ def recipe_of(cell: Cell, section: str) -> str:
     return recipe(record, {"settings": settings_of(before), "seed": before["seed"]})
 
 
-def recorded(cell: Cell, section: str) -> Settings:
+def recorded(cell: GridCell, section: str) -> Values:
     """The config that a training records, folders aside."""
     config = _finetuning(cell) if section == "finetune" else config_of(cell, section)
     if section == "pretrain":  # its set tells it the task
@@ -137,7 +137,7 @@ def recorded(cell: Cell, section: str) -> Settings:
     return jsonable(flat(config))
 
 
-def _finetuning(cell: Cell) -> Any:
+def _finetuning(cell: GridCell) -> Any:
     """The config that a fine-tuning trains with: what its encoder's method cannot read is no part of it."""
     from finetune.train import as_trained
     from pretrain.config import memory_of

@@ -13,7 +13,7 @@ from vd4rl_pomdp.runs.ownership import in_use
 from vd4rl_pomdp.sweeps.driver import Driver
 from vd4rl_pomdp.sweeps.executors import ray as module
 from vd4rl_pomdp.sweeps.executors.ray import RayExecutor, RayOptions
-from vd4rl_pomdp.sweeps.history import History
+from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.work import DONE, INTERRUPTED, KILLED, Work
 
 ray_is_there = pytest.importorskip("ray")
@@ -96,7 +96,7 @@ def test_all_is_finished_although_a_node_dies(cluster, options, tmp_path):
     """The last test, since the node does not come back."""
     jobs = [waiting_job(tmp_path, f"job{number}") for number in range(4)]
     executor = RayExecutor(options)
-    fits, nodes, history = executor.fits, list(cluster.worker_nodes), History(tmp_path)
+    fits, nodes, history = executor.fits, list(cluster.worker_nodes), SweepFolder(tmp_path)
 
     def interfere(slots: int) -> bool:
         """Kill a node while all jobs run, and let them end once it is known which of them that killed."""

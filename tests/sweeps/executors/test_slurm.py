@@ -13,7 +13,7 @@ from tests.sweeps.executors.waiting import begun, run, until, waiting_job, work_
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.sweeps.executors import slurm as module
 from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor, SlurmOptions
-from vd4rl_pomdp.sweeps.history import History
+from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.work import DONE, INTERRUPTED, KILLED
 
 pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not())
@@ -122,7 +122,7 @@ def test_a_new_driver_waits_for_what_a_killed_one_has_running_and_in_the_queue(o
     assert driver.wait(150) == 0
     assert [len(begun(waiting_job(out, name))) for name in ("job0", "job1")] == [1, 1]
     assert len(list((out / "sweep" / "slurm").iterdir())) == 1
-    assert {row["cause"] for rows in History(out).attempts().values() for row in rows} == {DONE}
+    assert {row["cause"] for rows in SweepFolder(out).attempts().values() for row in rows} == {DONE}
 
 
 def test_an_array_that_slurm_refuses_is_one_line_and_a_later_one_is_tried_again(out, capsys):

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.sweeps.driver import Driver
-from vd4rl_pomdp.sweeps.history import History
+from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.work import Ended, Executor, Work
 
@@ -42,7 +42,7 @@ def waiting_job(out: Path, name: str) -> Job:
 
 
 def work_of(job: Job, slots: int = 1) -> Work:
-    return History(job.folder.parent).work(job, slots)
+    return SweepFolder(job.folder.parent).work(job, slots)
 
 
 def begun(job: Job) -> list[Row]:
@@ -81,7 +81,7 @@ def main() -> None:
     slurm.QUEUE_S, slurm.IDLE_S = 1.0, 4.0
     options = slurm.SlurmOptions(time=30, gpus=0, cpus=8)
     jobs = [waiting_job(out, f"job{index}") for index in range(number)]
-    sys.exit(not Driver(jobs, slurm.SlurmExecutor(options, out / "sweep" / "slurm"), History(out)).run())
+    sys.exit(not Driver(jobs, slurm.SlurmExecutor(options, out / "sweep" / "slurm"), SweepFolder(out)).run())
 
 
 if __name__ == "__main__":

@@ -268,7 +268,7 @@ def _commands(runs: list[NavigationRun]) -> list[str]:
         "## Commands",
         "",
         "Each line computes one run; `navigation collect` makes its data. Seconds are wall-clock.",
-        f"`vd4rl-pomdp navigation grid --grid paper --mazes {' '.join(MAZES)} --dry-run` prints those of every cell.",
+        "`vd4rl-pomdp sweep run navigation --out runs/navigation --dry-run` prints those of every cell.",
     ]
     commands = []
     for maze in dict.fromkeys(run.condition.maze for run in runs):

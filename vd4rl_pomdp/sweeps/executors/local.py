@@ -114,9 +114,13 @@ def _places(options: LocalOptions) -> list[Place]:
             "raise that, or set CUDA_VISIBLE_DEVICES to nothing to run on the CPU"
         )
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    shares = [tuple(cores[number * len(cores) // jobs : (number + 1) * len(cores) // jobs]) for number in range(jobs)]
-    shares = [share or tuple(cores[number % len(cores) :][:1]) if cores else () for number, share in enumerate(shares)]
-    return [Place(share, gpus[number % len(gpus)] if gpus else None) for number, share in enumerate(shares)]
+    return [Place(_share(cores, number, jobs), gpus[number % len(gpus)] if gpus else None) for number in range(jobs)]
+
+
+def _share(cores: list[int], number: int, jobs: int) -> tuple[int, ...]:
+    """The cores of one of several jobs: at least one, unless the system does not tell what there is."""
+    first, end = (place * len(cores) // jobs for place in (number, number + 1))
+    return tuple(cores[first : max(end, first + 1)])
 
 
 def visible_gpus() -> list[str]:

@@ -3,6 +3,7 @@
     OUT/sweep/plans/GRID.json    the jobs of a grid: name, stage, folder, command, needs
     OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, step, slots, host
     OUT/sweep/logs/JOB.log
+    OUT/sweep/slurm/             what the Slurm executor keeps
 
 Rows are appended whole, so that several drivers may share a folder. Whether a job is finished is never read here: its
 own folder says it.
@@ -28,8 +29,8 @@ RETRIED = "retried"
 """Cause of a row that says: forget this job's failures."""
 
 
-class History:
-    """The files of a sweep in its folder."""
+class SweepFolder:
+    """The files of a sweep below its folder."""
 
     def __init__(self, out: Path) -> None:
         """Nothing is written."""
@@ -50,13 +51,17 @@ class History:
             raise UserError(
                 f"{self._folder.parent}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one"
             )
-        jobs = [_job(told) for path in plans for told in _parse(path, read_bytes(path).decode())]
+        jobs = [job for path in plans for job in _read_plan(path)]
         return list({job.name: job for job in jobs}.values())
 
     def work(self, job: Job, slots: int) -> Work:
         """A job as an executor takes it."""
         log = self._folder / "logs" / f"{job.name}.log"
         return Work(job.name, job.words, log, slots)
+
+    def of_executor(self, name: str) -> Path:
+        """Folder of what an executor keeps."""
+        return self._folder / name
 
     def add(self, row: Row) -> None:
         """Append the row of an attempt."""
@@ -94,10 +99,13 @@ def _row(line: str) -> Row:
     return row if isinstance(row, dict) and {"job", "cause"} <= row.keys() else {}
 
 
-def _parse(path: Path, text: str) -> list[dict[str, Any]]:
+def _read_plan(path: Path) -> list[Job]:
     try:
-        return parse_json(text)
-    except ValueError as error:
+        told = parse_json(read_bytes(path).decode())
+        if not isinstance(told, list):
+            raise TypeError("it is no list")
+        return [_job(one) for one in told]
+    except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path}: is damaged ({error}); remove it and start `sweep run` again") from error
 
 

@@ -1,0 +1,177 @@
+"""Results folders: they hold what their runs' files hold, and lose nothing."""
+
+import json
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.helpers_report import describe, grid, write_run
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.evaluation import read_episodes
+from vd4rl_pomdp.reference import Reference
+from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.results import Result, add_results, find_results, folder, read_results, read_run, write_results
+from vd4rl_pomdp.runs.files import read_json, write_json
+from vd4rl_pomdp.runs.identity import identity
+
+
+def whole_run(place: Path, seed: int = 0, score: float = 2.0) -> Path:
+    """A fine-tuning run with every small file."""
+    run = describe(write_run(place, "acro", seed, {5: [1.0], 10: [score]}), {"seed": seed}, data="f00", seed=seed)
+    write_json(run / "machine.json", {"processor": "two cores"})
+    write_json(run / "render.json", {"mujoco": "3.11.0"})
+    write_json(run / "probe.json", {"probe_pose": 12.5, "probe_velocity": None})
+    write_json(run / "pretrain_timing.json", {"seconds": 7.0, "steps": 20})
+    Reference(500.0, None, 0.01).write(run)
+    card = read_json(run / "encoder" / "config.json")
+    write_json(run / "encoder" / "config.json", {"pretrain": card["pretrain"] | {"seed": seed}})
+    return run
+
+
+def pretraining(place: Path) -> Path:
+    """A finished pretraining run."""
+    place.mkdir(parents=True)
+    record = {"stage": "pretrain", "config": {"method": "acro", "seed": 0, "steps": 2}, "inputs": {"data": "f00"}}
+    write_json(place / "config.json", record)
+    lines = [{"step": 1, "action_loss": 0.5, "norm": 3.0}, {"step": 2, "action_loss": 0.25}]
+    (place / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_json(place / "timing.json", {"seconds": 3.0, "steps": 2})
+    return place
+
+
+def content(run: Result) -> tuple:
+    return run.id, run.files, run.step, run.losses, run.rows
+
+
+def test_a_run_comes_back_as_its_files_hold_it(tmp_path):
+    run, before = whole_run(tmp_path / "runs/a"), pretraining(tmp_path / "runs/b")
+    added = add_results([tmp_path / "runs"], tmp_path / "out")
+    assert added.in_words == "2 runs added"
+    (one, other) = read_results(tmp_path / "out")
+    for name in ("config", "labels", "timing", "machine", "render", "probe", "pretrain_timing", "reference"):
+        assert one.files[name] == read_json(run / f"{name}.json"), name
+    assert one.files["encoder"] == read_json(run / "encoder" / "config.json")
+    assert one.rows == read_episodes(run / "episodes.csv")
+    assert one.id == identity(one.record, one.card)
+    assert one.finished
+    assert other.id == identity(read_json(before / "config.json"), {})
+    assert other.losses == [(1, 0.5), (2, 0.25)]
+    assert [content(run) for run in (one, other)] == [content(read_run(path)) for path in (run, before)]
+
+
+def test_runs_are_there_once_and_stay_as_they_are(tmp_path, capsys):
+    run = whole_run(tmp_path / "runs/0")
+    (whole_run(tmp_path / "runs/1", seed=1) / "timing.json").unlink()
+    words = ["results", "add", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
+    main(words)
+    assert capsys.readouterr().out == f"{tmp_path / 'out'}: 1 run added, 1 unfinished and left out\n"
+    before = [content(one) for one in read_results(tmp_path / "out")]
+    shutil.rmtree(run)
+    whole_run(run, score=3.0)
+    write_json(tmp_path / "runs/1/timing.json", {"seconds": 1.0})
+    main(words)
+    assert "1 run added, 1 there already with other rows, which stay" in capsys.readouterr().out
+    assert [content(one) for one in read_results(tmp_path / "out")][:1] == before
+    main(["results", "add", str(tmp_path / "out"), "--out", str(tmp_path / "copy")])
+    main([*words[:3], "--out", str(tmp_path / "copy")])
+    assert (tmp_path / "copy" / "runs.jsonl").read_bytes() == (tmp_path / "out" / "runs.jsonl").read_bytes()
+
+
+def test_a_diverged_run_is_a_result(tmp_path):
+    run = whole_run(tmp_path / "runs/0")
+    (run / "timing.json").unlink()
+    write_json(run / "diverged.json", {"step": 7, "message": "critic_loss is nan"})
+    assert add_results([run], tmp_path / "out").added == 1
+    (found,) = read_results(tmp_path / "out")
+    assert (found.finished, found.settled, found.diverged["step"]) == (False, True, 7)
+
+
+def test_a_writing_that_is_killed_midway_leaves_what_was_there(tmp_path, monkeypatch):
+    add_results([whole_run(tmp_path / "runs/0")], tmp_path / "out")
+    before = [content(run) for run in read_results(tmp_path / "out")]
+    with monkeypatch.context() as patch:
+        patch.setattr(folder, "replacing_file", lambda path: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            add_results([whole_run(tmp_path / "runs/1", seed=1)], tmp_path / "out")
+    assert {row["seed"] for row in read_episodes(tmp_path / "out" / "episodes.csv")} == {0, 1}, "one file was written"
+    assert [content(run) for run in read_results(tmp_path / "out")] == before
+    assert add_results([tmp_path / "runs"], tmp_path / "out") == (1, 1, 0, 0)
+    assert [len(run.rows) for run in read_results(tmp_path / "out")] == [2, 2]
+
+
+def test_an_unfinished_row_gives_way_to_the_finished_run(tmp_path):
+    run = whole_run(tmp_path / "runs/0")
+    (run / "timing.json").rename(tmp_path / "timing.json")
+    write_results(tmp_path / "out", [read_run(run)])
+    assert not read_results(tmp_path / "out")[0].settled
+    (tmp_path / "timing.json").rename(run / "timing.json")
+    assert add_results([run], tmp_path / "out").added == 1
+    assert [one.finished for one in read_results(tmp_path / "out")] == [True]
+
+
+def test_folders_and_results_mix_and_a_run_counts_once(tmp_path):
+    runs = grid(tmp_path)
+    add_results([runs / "acro0", runs / "mik+a1"], tmp_path / "some")
+    assert [run.folder for run in find_results([tmp_path / "some", runs])].count(False) == 0, "folders know more"
+    shutil.rmtree(runs / "acro0")
+    found = find_results([runs, tmp_path / "some"])
+    assert len(found) == len({run.id for run in found}) == 6
+    assert [run.path for run in found if not run.folder] == [tmp_path / "some"]
+
+
+def test_runs_of_early_versions_are_told_apart_by_their_labels(tmp_path):
+    for method in ("acro", "mik"):
+        write_run(tmp_path / f"runs/{method}", method, 0, {10: [1.0]})
+    assert add_results([tmp_path / "runs"], tmp_path / "out").added == 2
+    assert [run.labels["method"] for run in read_results(tmp_path / "out")] == ["acro", "mik"]
+
+
+def test_a_report_of_rows_is_that_of_the_folders(tmp_path):
+    runs = grid(tmp_path)
+    (runs / "acro1" / "timing.json").unlink()
+    pretraining(runs / "pretrain")
+    first = write_report([runs], tmp_path / "one")
+    second = write_report([tmp_path / "one"], tmp_path / "two")
+    assert (second.summary, second.gates) == (first.summary, first.gates)
+    for file in sorted((tmp_path / "one").glob("*.*")):
+        text, other = (path.read_text() for path in (file, tmp_path / "two" / file.name))
+        assert text.replace(str(runs / "acro1"), "HERE") == other.replace(str(tmp_path / "one"), "HERE"), file.name
+
+
+BAD = {
+    "runs.jsonl": [
+        (lambda text: text[:40], "line 1: its files are damaged"),
+        (lambda text: text + text, "names a run twice"),
+        (lambda text: text.replace('"stage"', '"scene"', 1), "line 1: its files are damaged"),
+        (lambda text: text.replace('"data_return": 500.0', '"data_return": "x"'), "reference"),
+        (lambda text: text.replace('"seconds": 3.0', '"seconds": "x"'), "its files are damaged"),
+    ],
+    "episodes.csv": [
+        (lambda text: text.replace("id,", "name,", 1), "has no column 'id'"),
+        (lambda text: text[:-20], "a row is not whole"),
+    ],
+}
+
+
+@pytest.mark.parametrize(("name", "change", "words"), [(name, *case) for name, cases in BAD.items() for case in cases])
+def test_a_damaged_results_folder_is_named(tmp_path, name, change, words):
+    add_results([whole_run(tmp_path / "runs/0")], tmp_path / "out")
+    file = tmp_path / "out" / name
+    file.write_text(change(file.read_text()))
+    with pytest.raises(UserError, match=words) as found:
+        write_report([tmp_path / "out"], tmp_path / "report")
+    assert str(tmp_path / "out") in str(found.value)
+    assert not (tmp_path / "report").exists()
+
+
+def test_results_go_into_no_folder_of_another_kind(tmp_path):
+    run = whole_run(tmp_path / "runs/0")
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "mine.txt").touch()
+    for out in (run, run / "results", tmp_path / "notes"):
+        with pytest.raises(UserError, match="choose another --out"):
+            add_results([run], out)
+    with pytest.raises(UserError, match="holds no runs"):
+        read_results(tmp_path / "notes")

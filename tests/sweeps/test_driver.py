@@ -1,0 +1,172 @@
+"""What is started when, what is tried again, and that nothing is done twice."""
+
+import pytest
+
+from tests.helpers_sweeps import Scripted, job
+from vd4rl_pomdp.runs.files import write_json
+from vd4rl_pomdp.sweeps import driver
+from vd4rl_pomdp.sweeps.driver import Driver, Retry, given_up
+from vd4rl_pomdp.sweeps.folder import SweepFolder
+
+
+@pytest.fixture(autouse=True)
+def quick(monkeypatch):
+    monkeypatch.setattr(driver, "POLL_S", 0.0)
+    without_waits = {cause: Retry(retry.times) for cause, retry in driver.RETRIES.items()}
+    monkeypatch.setattr(driver, "RETRIES", without_waits)
+
+
+@pytest.fixture
+def jobs(tmp_path):
+    return [job(tmp_path, "set"), job(tmp_path, "a", "set"), job(tmp_path, "b", "set", "a"), job(tmp_path, "c", "set")]
+
+
+def carry_out(jobs, tmp_path, script=None, slots=2):
+    executor = Scripted(jobs, script, slots)
+    return Driver(jobs, executor, SweepFolder(tmp_path)).run(), executor
+
+
+def names(executor):
+    return [name for name, _ in executor.started]
+
+
+def test_every_job_runs_once_after_those_it_needs(jobs, tmp_path):
+    finished, executor = carry_out(jobs, tmp_path)
+    assert finished
+    assert names(executor) == ["set", "a", "c", "b"]
+    assert executor.most == 2
+
+
+def test_no_more_run_at_a_time_than_there_are_slots(jobs, tmp_path):
+    assert carry_out(jobs, tmp_path, slots=1)[1].most == 1
+
+
+def test_what_is_finished_is_not_run_again(jobs, tmp_path):
+    carry_out(jobs, tmp_path)
+    assert carry_out(jobs, tmp_path)[1].started == []
+
+
+@pytest.mark.parametrize(
+    ("cause", "attempts"),
+    [("killed", 5), ("failed", 2), ("out of memory", 2), ("disk full", 21), ("refused", 1), ("diverged", 1)],
+)
+def test_a_cause_decides_how_often_a_job_is_tried(jobs, tmp_path, cause, attempts):
+    finished, executor = carry_out(jobs, tmp_path, {"a": [cause] * 99})
+    assert not finished
+    assert names(executor).count("a") == attempts
+    assert "c" in names(executor), "the others go on"
+    assert "b" not in names(executor), "what needs it does not"
+
+
+def test_a_killed_job_that_gets_further_is_tried_as_often_as_it_takes(jobs, tmp_path, monkeypatch):
+    steps = iter(range(100))
+    monkeypatch.setattr(driver, "progress_of", lambda job: next(steps))
+    finished, executor = carry_out(jobs, tmp_path, {"a": ["killed"] * 30})
+    assert finished
+    assert names(executor).count("a") == 31
+
+
+def test_out_of_memory_is_tried_with_twice_the_slots_while_half_as_many_run(jobs, tmp_path):
+    finished, executor = carry_out(jobs, tmp_path, {"a": ["out of memory"]}, slots=4)
+    assert finished
+    assert [slots for name, slots in executor.started if name == "a"] == [1, 2]
+
+
+def test_without_more_slots_out_of_memory_is_final(jobs, tmp_path):
+    _, executor = carry_out(jobs, tmp_path, {"a": ["out of memory"]}, slots=1)
+    assert names(executor).count("a") == 1
+
+
+def test_failures_stay_until_they_are_taken_up_again(jobs, tmp_path):
+    carry_out(jobs, tmp_path, {"a": ["diverged"]})
+    assert "a" not in names(carry_out(jobs, tmp_path)[1])
+    SweepFolder(tmp_path).forget("a")
+    finished, executor = carry_out(jobs, tmp_path)
+    assert finished
+    assert names(executor) == ["a", "b"]
+
+
+def test_a_job_that_another_driver_finished_meanwhile_is_left_alone(jobs, tmp_path):
+    executor = Scripted(jobs)
+    worker = Driver(jobs, executor, SweepFolder(tmp_path))
+    for other in jobs[:2]:
+        other.folder.mkdir(parents=True)
+        write_json(other.folder / "timing.json", {})
+    assert worker.run()
+    assert sorted(names(executor)) == ["b", "c"]
+
+
+def test_a_job_that_another_process_is_at_is_waited_for(jobs, tmp_path, monkeypatch):
+    asked = []
+
+    def busy(folder):
+        asked.append(folder.name)
+        return asked.count("a") < 5 and folder.name == "a"
+
+    monkeypatch.setattr(driver, "in_use", busy)
+    monkeypatch.setitem(driver.RETRIES, "in use", Retry(10**6, 0.01))
+    finished, executor = carry_out(jobs, tmp_path)
+    assert finished
+    assert names(executor).count("a") == 1
+    assert asked.count("a") == 5
+
+
+def test_an_interruption_stops_the_jobs_and_is_told(jobs, tmp_path, monkeypatch):
+    executor = Scripted(jobs)
+
+    def interrupted(*_):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(driver.interrupt, "check", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        Driver(jobs, executor, SweepFolder(tmp_path)).run()
+    assert executor.stopped
+
+
+def test_a_full_disk_at_the_start_of_a_job_is_tried_again(jobs, tmp_path, monkeypatch):
+    executor = Scripted(jobs)
+    start, full = executor.start, [True, True]
+
+    def once_full(work):
+        if full and full.pop():
+            raise OSError(28, "No space left on device")
+        start(work)
+
+    monkeypatch.setattr(executor, "start", once_full)
+    assert Driver(jobs, executor, SweepFolder(tmp_path)).run()
+    assert [row["cause"] for row in SweepFolder(tmp_path).attempts()["set"]] == ["disk full", "disk full", "done"]
+
+
+def test_rows_tell_every_attempt(jobs, tmp_path):
+    carry_out(jobs, tmp_path, {"a": ["killed"]})
+    rows = SweepFolder(tmp_path).attempts()["a"]
+    assert [(row["cause"], row["line"], row["slots"]) for row in rows] == [
+        ("killed", "its killed line", 1),
+        ("done", "", 1),
+    ]
+
+
+def test_a_row_that_a_full_disk_cut_is_left_out(tmp_path):
+    history = SweepFolder(tmp_path)
+    history.add({"job": "a", "cause": "killed", "step": 0})
+    with (tmp_path / "sweep" / "attempts.jsonl").open("a") as file:
+        file.write('{"job": "a", "cau\n')
+    history.add({"job": "a", "cause": "killed", "step": 0})
+    assert len(history.attempts()["a"]) == 2
+
+
+def test_a_cause_counts_in_a_row_only():
+    rows = [{"cause": cause, "step": 0, "slots": 1} for cause in ["killed"] * 4 + ["interrupted"] + ["killed"] * 4]
+    assert given_up(rows) == ""
+    assert given_up([*rows, rows[0]]) == "killed"
+
+
+def test_a_job_that_waits_for_its_time_is_not_forgotten(jobs, tmp_path, monkeypatch):
+    monkeypatch.setitem(driver.RETRIES, "disk full", Retry(3, 0.02))
+    finished, executor = carry_out(jobs[:1], tmp_path, {"set": ["disk full"] * 3})
+    assert finished
+    assert len(executor.started) == 4
+
+
+def test_an_attempt_of_another_version_counts_as_final(tmp_path):
+    assert given_up([{"cause": "abducted", "step": 0, "slots": 1}]) == "abducted"

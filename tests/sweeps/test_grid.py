@@ -1,0 +1,170 @@
+"""Grids: axes, blocks, the testing subset, changes, and what is refused."""
+
+import re
+from pathlib import Path
+
+import pytest
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.experiments.navigation.grid import condition_of, paper_rows
+from vd4rl_pomdp.mazes import MAZES
+from vd4rl_pomdp.sweeps.grid import load_grid, names, narrow
+from vd4rl_pomdp.sweeps.stages import check_cell
+
+PAGE = Path(__file__).parents[2] / "docs" / "sweeps.md"
+TOML = """
+title = "a trial"
+seed = [0, 1]
+[collect]
+task = ["walker_walk", "cheetah_run"]
+quality = "expert"
+[pretrain]
+method = ["mik+a", "acro"]
+corruption = "patch"
+[finetune]
+updates = 40
+"""
+BLOCKS = """
+[[block]]
+[[block]]
+pretrain = { method = "acro", history = "gru" }
+[testing]
+seed = 7
+preset = "smoke"
+collect = { task = "walker_walk" }
+"""
+
+
+@pytest.fixture
+def file(tmp_path):
+    def write(text, name="mine.toml"):
+        (tmp_path / name).write_text(text)
+        return str(tmp_path / name)
+
+    return write
+
+
+def test_lists_are_axes_and_first_seeds_come_first(file):
+    cells = load_grid(file(TOML)).cells()
+    assert len(cells) == 2 * 2 * 2
+    assert [cell.seed for cell in cells] == [0] * 4 + [1] * 4
+    assert cells[0].sections["collect"] == {"task": "walker_walk", "quality": "expert"}
+    assert {cell.value("method") for cell in cells} == {"mik+a", "acro"}
+    assert cells[0].chain == ("collect", "pretrain", "finetune")
+
+
+def test_a_block_replaces_what_stands_above_it(file):
+    cells = load_grid(file(TOML + BLOCKS)).cells()
+    assert len(cells) == 8 + 4
+    own = [cell for cell in cells if cell.value("history") == "gru"]
+    assert {cell.value("method") for cell in own} == {"acro"}
+    assert all(cell.value("corruption") == "patch" for cell in own)
+
+
+def test_cells_that_two_blocks_share_are_one(file):
+    same = '[[block]]\n[[block]]\npretrain = { method = "acro" }\n'
+    assert len(load_grid(file(TOML + same)).cells()) == 8
+
+
+def test_the_testing_subset_replaces_everything(file):
+    cells = load_grid(file(TOML + BLOCKS), testing=True).cells()
+    assert {(cell.seed, cell.value("task"), cell.value("preset")) for cell in cells} == {(7, "walker_walk", "smoke")}
+    assert len(cells) == 3
+
+
+def test_changes_come_last_and_have_the_types_of_toml(file):
+    changes = ["seed=3,4", "pretrain.steps=10", "finetune.learning_rate=1e-3", "pretrain.method=mik"]
+    cells = load_grid(file(TOML + BLOCKS), changes, testing=True).cells()
+    assert {cell.seed for cell in cells} == {3, 4}
+    assert {(cell.value("steps"), cell.value("learning_rate"), cell.value("method")) for cell in cells} == {
+        (10, 1e-3, "mik")
+    }
+
+
+def test_a_python_file_defines_the_same(file):
+    python = "GRID = {'seed': [s for s in range(3)], 'collect': {'task': 'walker_walk', 'quality': 'expert'}}"
+    grid = load_grid(file(python, "mine.py"))
+    assert (grid.name, [cell.seed for cell in grid.cells()]) == ("mine", [0, 1, 2])
+
+
+def test_only_keeps_cells_by_value(file):
+    cells = load_grid(file(TOML)).cells()
+    kept = narrow(cells, ["task=walker_walk", "method=acro,mik+a", "seed=1"])
+    assert [(cell.value("task"), cell.seed) for cell in kept] == [("walker_walk", 1)] * 2
+
+
+@pytest.mark.parametrize(
+    ("text", "message"),
+    [
+        ("seeds = 3", "unknown section or setting 'seeds'"),
+        ("pretrain = 3", "pretrain is no table"),
+        ("seed = 0", "a block needs sections of"),
+        ("[pretrain]\n[navigation_train]", "a block needs sections of"),
+        ("[pretrain]\nmethod = []", r"pretrain\.method is \[\]"),
+        ("[pretrain]\nmethod = [[1]]", r"pretrain\.method is \[\[1\]\]"),
+        ("block = 3", "its blocks are no list of tables"),
+        ("title = ", r"is no grid \(TOMLDecodeError"),
+    ],
+)
+def test_what_is_no_grid_is_refused(file, text, message):
+    with pytest.raises(UserError, match=message):
+        load_grid(file(text)).cells()
+
+
+@pytest.mark.parametrize("text", ["x = 3", "GRID = 3", "import nothing_at_all", "raise SystemError('no')"])
+def test_a_python_file_that_defines_none_is_refused(file, text):
+    with pytest.raises(UserError, match=r"mine\.py"):
+        load_grid(file(text, "mine.py"))
+
+
+@pytest.mark.parametrize("only", ["method", "method=curl", "colour=red"])
+def test_only_names_what_there_is(file, only):
+    with pytest.raises(UserError, match="--only"):
+        narrow(load_grid(file(TOML)).cells(), [only])
+
+
+@pytest.mark.parametrize("testing", [False, True])
+@pytest.mark.parametrize("name", names())
+def test_every_shipped_cell_is_one_that_its_stages_take(name, testing):
+    cells = load_grid(name, testing=testing).cells()
+    assert len(cells) == len({repr((cell.shared, cell.sections)) for cell in cells}) > 0
+    for cell in cells:
+        check_cell(cell)
+    if testing:
+        assert len(cells) <= 33
+        assert {cell.value("preset") for cell in cells} == {"smoke"}
+
+
+def test_the_papers_grids_are_its_figures_over_twelve_methods():
+    for name, corruption in (("paper_patch", "patch"), ("paper_patch_zero", "patch+zero_frames")):
+        cells = [c for c in load_grid(name).cells() if c.value("corruption") == corruption]
+        found = {(c.value("task"), c.value("quality"), c.value("method"), c.seed) for c in cells}
+        assert len(found) == len(cells) == 3 * 3 * 14 * 5, "12 methods, the floor and a ceiling"
+
+
+def test_the_navigation_grid_holds_every_condition_of_the_papers_tables():
+    cells = load_grid("navigation").cells()
+    held = {
+        (
+            cell.value("maze"),
+            cell.value("method"),
+            cell.value("max_k"),
+            cell.value("self_prediction") == 1.0,
+            cell.value("exogenous") == "photographs",
+        )
+        for cell in cells
+        if not cell.value("literal_future")
+    }
+    wanted = [condition_of(row, maze) for row in paper_rows() for maze in MAZES]
+    missing = [c for c in wanted if (c.maze, c.method, c.max_k, c.self_prediction, c.exogenous) not in held]
+    assert missing == []
+
+
+def test_the_pages_grid_is_one(file):
+    (block,) = re.findall(r"^```toml\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
+    cells = load_grid(file(block)).cells()
+    assert len(cells) == 3 * 2 * 2 * 2 + 3 * 2 * 2
+    for cell in (*cells, *load_grid(file(block), testing=True).cells()):
+        check_cell(cell)
+    table = {name for line in PAGE.read_text().splitlines() if line.startswith("| `") for name in line.split("`")[1::2]}
+    assert set(names()) <= table

@@ -1,0 +1,181 @@
+"""Jobs and what is finished: by what runs computed, on which data, wherever they lie."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.helpers_data import write_fake_set
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.cli.parsing import parse_stage
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
+from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
+from vd4rl_pomdp.sweeps.grid import load_grid
+from vd4rl_pomdp.sweeps.plan import JobPlanner
+from vd4rl_pomdp.sweeps.stages import recorded
+
+GRID = """
+seed = 0
+preset = "smoke"
+[collect]
+task = "walker_walk"
+quality = "expert"
+[pretrain]
+corruption = "patch"
+[finetune]
+eval_episodes = 1
+[[block]]
+pretrain = { method = ["mik+a", "acro", "bc"] }
+[[block]]
+pretrain = { method = "random", history = "gru" }
+finetune = { random_histories = 0.5, algorithm = ["td3_bc", "bc"] }
+"""
+
+
+@pytest.fixture(scope="module")
+def swept(tmp_path_factory):
+    """A folder in which the grid's jobs have been carried out, on a set that nothing here collected."""
+    out = tmp_path_factory.mktemp("swept")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VD4RL_POMDP_CACHE", str(out / ".cache"))
+        write_fake_set(out / "data" / "walker_walk" / "expert", [20, 25, 30])
+        (out / "grid.toml").write_text(GRID)
+        for job in plan(out):
+            if not job.done:
+                main(list(job.words))
+    return out
+
+
+@pytest.fixture
+def copy(swept, tmp_path, monkeypatch):
+    shutil.copytree(swept, tmp_path / "copy", dirs_exist_ok=True)
+    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+    return tmp_path / "copy"
+
+
+def plan(out: Path, changes=(), kept=None, data=None):
+    cells = load_grid(str(out / "grid.toml"), changes).cells()
+    return JobPlanner(out, data, kept or FoundRuns([]), FoundRuns(runs_below(out))).plan(cells)
+
+
+def left(jobs):
+    return [job.name for job in jobs if not job.done]
+
+
+def test_what_was_run_is_finished_whatever_its_parts(swept):
+    jobs = plan(swept)
+    assert left(jobs) == []
+    assert [job.name.removeprefix("walker_walk/expert/patch/") for job in jobs] == [
+        "data/walker_walk/expert",
+        "mik+a/seed0/pretrain",
+        "mik+a/seed0/finetune-td3_bc",
+        "acro/seed0/pretrain",
+        "acro/seed0/finetune-td3_bc",
+        "bc/seed0/pretrain",
+        "bc/seed0/finetune-bc",
+        "random,history=gru/seed0/pretrain",
+        "random,history=gru/seed0/finetune-td3_bc,random_histories=0.5",
+        "random,history=gru/seed0/finetune-bc,random_histories=0.5",
+    ]
+
+
+def test_a_run_is_found_by_what_it_computed_not_by_its_name(copy):
+    (copy / "walker_walk" / "expert" / "patch" / "acro").rename(copy / "elsewhere")
+    jobs = plan(copy)
+    assert left(jobs) == []
+    assert {job.name for job in jobs if "elsewhere" in job.name} == {
+        "elsewhere/seed0/pretrain",
+        "elsewhere/seed0/finetune-td3_bc",
+    }
+
+
+def test_a_name_that_another_run_has_is_left_to_it(copy):
+    names = left(plan(copy, ["finetune.updates=20"]))
+    assert len(names) == 5
+    assert all("~" in name for name in names)
+    assert left(plan(copy)) == []
+
+
+def test_an_encoder_is_trained_once_for_all_its_policies(copy):
+    names = left(plan(copy, ["finetune.algorithm=td3_bc,bc,iql"]))
+    assert not any("pretrain" in name for name in names)
+
+
+def test_an_encoder_whose_policies_are_finished_is_not_missed(copy):
+    shutil.rmtree(copy / "walker_walk" / "expert" / "patch" / "mik+a" / "seed0" / "pretrain")
+    assert left(plan(copy)) == []
+    assert len(left(plan(copy, ["seed=0,1"]))) == 9
+
+
+def test_a_run_on_other_data_is_not_the_same(copy):
+    shutil.rmtree(copy / "data" / "walker_walk")
+    write_fake_set(copy / "data" / "walker_walk" / "expert", [20, 25, 31])
+    assert len(left(plan(copy))) == 9
+
+
+def test_a_run_goes_on_in_its_own_folder(copy):
+    folder = copy / "walker_walk" / "expert" / "patch" / "acro" / "seed0" / "finetune-td3_bc"
+    (folder / "timing.json").unlink()
+    folder = folder.rename(copy / "moved")
+    (job,) = (job for job in plan(copy) if not job.done)
+    assert (job.name, job.folder, job.begun) == ("moved", folder, True)
+
+
+def test_rows_that_were_kept_are_finished_runs(copy, tmp_path):
+    main(["results", "add", str(copy), "--out", str(tmp_path / "rows")])
+    kept = FoundRuns(runs_kept([tmp_path / "rows"]))
+    new = tmp_path / "new"
+    shutil.copytree(copy / "data", new / "data")
+    shutil.copy(copy / "grid.toml", new)
+    assert len(left(plan(new))) == 9
+    assert left(plan(new, kept=kept)) == []
+    assert len(left(plan(new, ["seed=0,1"], kept=kept))) == 9, "the other seed's"
+
+
+def test_without_their_set_kept_rows_count_by_how_it_was_collected(copy, tmp_path):
+    for config in copy.rglob("config.json"):
+        if "stage" in (record := read_json(config)):
+            collection = {"task": "walker_walk", "quality": "expert", "episodes": 200, "seed": 0, "render": "fast"}
+            collection |= {"episodes_per_shard": 50, "actor": None, "action_noise": None, "actors": []}
+            write_json(config, record | {"collection": collection})
+    kept, new = FoundRuns(runs_below(copy)), tmp_path / "new"
+    new.mkdir()
+    shutil.copy(copy / "grid.toml", new)
+    assert left(plan(new, kept=kept)) == []
+    assert len(left(plan(new, ["collect.episodes=100"], kept=kept))) == 10
+
+
+def test_a_set_that_was_collected_otherwise_is_refused(copy):
+    write_json(copy / "data" / "walker_walk" / "expert" / "collection.json", {"task": "walker_walk", "episodes": 3})
+    with pytest.raises(UserError, match="a set collected with episodes 3, the grid says 200; choose another --data"):
+        plan(copy)
+
+
+def test_a_downloaded_set_is_found_below_its_size(copy, tmp_path):
+    shutil.move(copy / "data" / "walker_walk" / "expert", tmp_path / "set")
+    shutil.move(tmp_path / "set", copy / "data" / "walker_walk" / "expert" / "84px")
+    jobs = plan(copy)
+    assert left(jobs) == []
+    assert jobs[0].folder == copy / "data" / "walker_walk" / "expert" / "84px"
+
+
+def test_a_grid_without_a_set_is_refused(tmp_path):
+    (tmp_path / "grid.toml").write_text("[pretrain]\nmethod = 'acro'")
+    with pytest.raises(UserError, match="trains on no set: add a section collect"):
+        plan(tmp_path)
+
+
+def test_a_navigation_run_is_planned_as_it_is_recorded():
+    from pretrain.navigation.config import NavigationConfig
+
+    for cell in load_grid("navigation").cells()[::7]:
+        words = ["--preset", "cpu", "--seed", str(cell.seed), "--data", "d", "--out", "o"]
+        for name, value in cell.sections["navigation_train"].items():
+            words += [f"--{name.replace('_', '-')}"] + ([] if value is True else [str(value)])
+        config = jsonable(flat(parse_stage(NavigationConfig, words, "x")))
+        planned = recorded(cell, "navigation_train")
+        assert {k: v for k, v in planned.items() if k not in ("data", "out")} == {
+            k: v for k, v in config.items() if k not in ("data", "out")
+        }

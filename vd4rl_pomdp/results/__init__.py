@@ -1,0 +1,16 @@
+"""Results folders: the small files and raw rows of finished runs, which outlive the run folders."""
+
+from vd4rl_pomdp.results.folder import RUNS, Result, read_results, read_run, write_results
+from vd4rl_pomdp.results.gather import Added, add_results, find_results, refuse_loss
+
+__all__ = [
+    "RUNS",
+    "Added",
+    "Result",
+    "add_results",
+    "find_results",
+    "read_results",
+    "read_run",
+    "refuse_loss",
+    "write_results",
+]

@@ -1,0 +1,196 @@
+"""Results that outlive their run folders: one folder an experiment, small enough to commit.
+
+    runs.jsonl     one JSON object a run: its id, and what its small files hold, by their names
+    episodes.csv   raw evaluation rows, the run's id first
+
+A report of a results folder is the same as one of the run folders, but for films. Both files are written whole, the
+rows first: rows of a run that runs.jsonl does not name were left by a cut writing, and are ignored.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.evaluation import COLUMNS, LABELS, read_episodes
+from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_csv
+from vd4rl_pomdp.runs.identity import identity
+from vd4rl_pomdp.runs.metrics import read_metrics
+from vd4rl_pomdp.runs.reading import parse_json, read_bytes
+from vd4rl_pomdp.runs.settings import settings_of
+
+RUNS, EPISODES = "runs.jsonl", "episodes.csv"
+RECORD, ENCODER = "config", "encoder"
+FILES = {
+    **{name: f"{name}.json" for name in (RECORD, "labels", "timing", "diverged", "machine", "render")},
+    **{name: f"{name}.json" for name in ("pretrain_timing", "probe", "reference")},
+    ENCODER: f"{ENCODER}/config.json",
+}
+"""A run's small files: the name of their content in runs.jsonl, and their place in the run folder."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """One run, finished or not, from its folder or from a results folder."""
+
+    id: str
+    """Name of what it computes, see `runs.identity`."""
+    path: Path
+    """Its folder, or the results folder that tells of it."""
+    files: dict[str, dict[str, Any]]
+    """Content of the FILES that it has."""
+    step: int
+    """The last step of which its metrics tell, 0 before the first."""
+    losses: list[tuple[int, float]]
+    """Step and action loss in the course of a pretraining."""
+    rows: list[Row]
+    """Evaluation rows, one an episode."""
+    folder: bool = False
+    """Whether `path` is its own folder."""
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """config.json: stage, config, inputs, versions, git_commit, command."""
+        return self.files[RECORD]
+
+    @property
+    def encoder(self) -> dict[str, Any]:
+        """What its encoder says of its pretraining; empty where there is none yet."""
+        return self.files.get(ENCODER, {}).get("pretrain", {})
+
+    @property
+    def card(self) -> dict[str, Any]:
+        """The same of the encoder that it started from; empty for a pretraining run."""
+        return self.encoder if self.record["stage"] == "finetune" else {}
+
+    @property
+    def labels(self) -> dict[str, Any]:
+        """Values of LABELS; the task is empty until the run has opened its data."""
+        return {name: self.files["labels"][name] for name in LABELS}
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has come to its end."""
+        return "timing" in self.files
+
+    @property
+    def diverged(self) -> dict[str, Any] | None:
+        """Where it diverged, as `step` and `message`; None if it did not."""
+        return self.files.get("diverged")
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is left to be done: it has finished, or it diverged."""
+        return self.finished or self.diverged is not None
+
+
+def read_run(folder: Path) -> Result:
+    """What a run folder holds; raises UserError for damaged files."""
+    files = {name: read_json(folder / place) for name, place in FILES.items() if (folder / place).exists()}
+    if ENCODER in files and not isinstance(files[ENCODER].get("pretrain"), dict):
+        raise UserError(f"{folder / FILES[ENCODER]}: does not say how the encoder was pretrained; pretrain it again")
+    metrics, rows = read_metrics(folder / "metrics.jsonl"), read_episodes(folder / EPISODES)
+    step = max((int(row["step"]) for row in (*metrics, *rows)), default=0)
+    with _whole(folder):
+        losses = [(int(row["step"]), row["action_loss"]) for row in metrics if "action_loss" in row]
+        run = Result("", folder, files, step, losses if files[RECORD]["stage"] == "pretrain" else [], rows, True)
+        _check(run)
+        files["labels"] = files.get("labels", {}) | _labels(run)
+        return replace(run, id=_id(run))
+
+
+def _labels(run: Result) -> dict[str, Any]:
+    """A run's labels: from its rows, from its labels.json, or else as many as its config tells."""
+    known = run.rows[0] if run.rows else run.files.get("labels")
+    if known is not None:
+        missing = [name for name in LABELS if name not in known]
+        if missing:
+            place = run.path / FILES["labels"]
+            raise UserError(f"{place}: has no {missing[0]!r}; start the same command again, which writes it anew")
+        return {name: known[name] for name in LABELS}
+    told = {"method": run.path.name, "task": run.encoder.get("task"), "quality": run.encoder.get("quality")}
+    told |= run.record["config"]
+    return {name: told.get(name) or "" for name in LABELS if name != "seed"} | {"seed": told["seed"]}
+
+
+def read_results(folder: Path) -> list[Result]:
+    """All runs of a results folder; raises UserError if it is none, or damaged."""
+    path = folder / RUNS
+    by_run: dict[str, list[Row]] = {}
+    for row in read_episodes(folder / EPISODES):
+        if "id" not in row:
+            raise UserError(f"{folder / EPISODES}: has no column 'id'; it was not written beside {RUNS}")
+        by_run.setdefault(row.pop("id"), []).append(row)
+    try:
+        lines = read_bytes(path).decode().splitlines()
+    except FileNotFoundError as error:
+        raise UserError(f"{folder}: holds no {RUNS}, so it is no results folder") from error
+    except ValueError as error:
+        raise UserError(f"{path}: is no UTF-8 ({error}); take another copy") from error
+    runs = [_parse(path, number, line, by_run) for number, line in enumerate(lines, 1)]
+    if len({run.id for run in runs}) != len(runs):
+        raise UserError(f"{path}: names a run twice; remove one of the two lines")
+    return runs
+
+
+def write_results(out: Path, runs: Iterable[Result]) -> None:
+    """Write runs as a results folder that holds nothing else of the kind; a reader sees each file whole."""
+    runs = list(runs)
+    with disk_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    write_csv(out / EPISODES, ("id", *COLUMNS), ({"id": run.id} | row for run in runs for row in run.rows))
+    with replacing_file(out / RUNS) as fresh, fresh.open("w", encoding="utf-8") as file:
+        file.writelines(json.dumps(_object(run)) + "\n" for run in runs)
+
+
+def _object(run: Result) -> dict[str, Any]:
+    """A run's line of runs.jsonl."""
+    files = {name: run.files[name] for name in FILES if name in run.files}
+    return {"id": run.id, **files, "step": run.step} | ({"losses": run.losses} if run.losses else {})
+
+
+def _parse(path: Path, number: int, line: str, rows: dict[str, list[Row]]) -> Result:
+    with _whole(f"{path}: line {number}"):
+        told = parse_json(line)
+        files = {name: told[name] for name in FILES if name in told}
+        losses = [(int(step), float(loss)) for step, loss in told.get("losses", [])]
+        run = Result(told["id"], path.parent, files, int(told["step"]), losses, rows.get(told["id"], []))
+        _check(run)
+        return run
+
+
+@contextmanager
+def _whole(where: Path | str) -> Iterator[None]:
+    """Whatever is wrong with a run's content becomes a sentence that says where."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UserError(f"{where}: its files are damaged ({error}); take another copy, or leave it out") from error
+
+
+def _check(run: Result) -> None:
+    """Look at the parts of a run that everything relies on; raises KeyError, TypeError or AttributeError."""
+    if not all(isinstance(part, dict) for part in (*run.files.values(), run.record["config"], run.encoder)):
+        raise TypeError("a part of it is no JSON object")
+    if "seed" not in run.record["config"]:
+        raise TypeError("its record holds no settings")
+    if not isinstance(run.record["stage"], str):
+        raise TypeError(f"its stage is {run.record['stage']!r}")
+
+
+def _id(run: Result) -> str:
+    """Its identity; of a run that an early version began, which did not record all of that, a hash of what it did."""
+    recorded = {"settings", "seed"} <= run.card.keys() or run.record["stage"] != "finetune"
+    data = run.record.get("inputs", {}).get("data")
+    if recorded and data:
+        return identity(run.record, run.card)
+    told = [run.record["stage"], settings_of(run.record["config"]), run.labels, run.card, data]
+    return hashlib.blake2b(json.dumps(told, sort_keys=True).encode(), digest_size=12).hexdigest()
