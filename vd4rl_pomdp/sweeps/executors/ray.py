@@ -6,6 +6,7 @@ tries nothing again. A task ends with its driver, and the process of its job wit
 
 from __future__ import annotations
 
+import logging
 import os
 import signal
 import subprocess
@@ -177,7 +178,7 @@ def _connected(address: str) -> Any:
         raise UserError("--executor ray needs Ray: pip install 'vd4rl-pomdp[ray]'") from error
     try:
         with _own_signals():
-            ray.init(address, log_to_driver=False, logging_level="warning", ignore_reinit_error=True)
+            ray.init(address, log_to_driver=False, logging_level=logging.WARNING, ignore_reinit_error=True)
     except (ConnectionError, ValueError) as error:
         raise UserError(
             f"no Ray cluster at {address!r} ({_line(error)}): start one with `ray start --head`, or name another "
