@@ -99,12 +99,17 @@ class PretrainTrainer:
 
     def run(self, run: RunFolder, steps: int) -> None:
         """Train up to `steps`, from the newest checkpoint if there is one."""
-        with training(run, self, f"pretrain {self.config.method}", steps) as loop:
+        with training(run, self, f"pretrain {self.config.method}", steps, labels=self._labels(run)) as loop:
             while self.step < steps:
                 loop.add(self.update())
                 if loop.due(self.config.log_every):
                     loop.log("loss")
                 loop.step_done(save=loop.due(self.config.checkpoint_every))
+
+    def _labels(self, run: RunFolder) -> dict[str, str]:
+        """What names the run where it is tracked."""
+        told = {name: run.config[name] for name in ("method", "task", "corruption")}
+        return told | {"quality": self.dataset.quality or "unknown"}
 
     def state(self) -> dict[str, Any]:
         """Everything needed to go on to the bit."""
