@@ -33,7 +33,15 @@ from vd4rl_pomdp.evaluation import (
     read_episodes,
 )
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.encoder_folder import CONFIG, EncoderCard, copy_encoder, encoder_hash, load_encoder, save_encoder
+from vd4rl_pomdp.nn.encoder_folder import (
+    CONFIG,
+    EncoderCard,
+    copy_encoder,
+    encoder_hash,
+    load_encoder,
+    save_encoder,
+    tell_probe,
+)
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.options import NO_OPTIONS, flat
 from vd4rl_pomdp.policies.actor import read_actor
@@ -190,7 +198,9 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     if dataset.physics is None or dataset.task is None or (run.path / "probe.json").exists():
         return
     arrays = features[0, : dataset.num_rows].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
-    write_json(run.path / "probe.json", probe_state(*arrays, layout_of(TASKS.named(dataset.task))))
+    errors = probe_state(*arrays, layout_of(TASKS.named(dataset.task)))
+    tell_probe(run.path / "encoder", errors)
+    write_json(run.path / "probe.json", errors)
 
 
 class FinetuneTrainer:

@@ -57,8 +57,9 @@ def _pretrain(config: PretrainConfig) -> RunFolder:
             trainer = PretrainTrainer(objective.to(device), dataset.to(device), config)
             trainer.run(run, config.steps if method.trained else 0)
             card = _card(config, task, dataset, run)
-            save_encoder(run.path / "encoder", objective.encoder, card)
-            run.finish(steps=trainer.step, frames=trainer.step * config.batch_size * config.window)
+            frames = trainer.step * config.batch_size * config.window
+            save_encoder(run.path / "encoder", objective.encoder, card, frames)
+            run.finish(steps=trainer.step, frames=frames)
     return run
 
 

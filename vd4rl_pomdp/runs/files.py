@@ -42,8 +42,12 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file so that a reader sees it whole or not at all."""
-    with replacing_file(path) as fresh:
-        fresh.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
+    write_bytes(path, json_bytes(value))
+
+
+def json_bytes(value: Any) -> bytes:
+    """A JSON file's content."""
+    return (json.dumps(value, indent=2) + "\n").encode()
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
