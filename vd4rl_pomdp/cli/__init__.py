@@ -6,7 +6,7 @@ import io
 import sys
 from collections.abc import Sequence
 
-from vd4rl_pomdp.cli import data, navigation, parts, policy, stages, studies
+from vd4rl_pomdp.cli import data, hub, navigation, parts, policy, stages, studies
 from vd4rl_pomdp.cli.dispatch import COMMANDS, run_stage
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs import interrupt
@@ -15,6 +15,7 @@ COMMANDS |= {
     "demo": stages.DEMO,
     "list": parts.LIST,
     "data": data.COMMANDS,
+    "hub": hub.COMMANDS,
     "policy": policy.COMMANDS,
     **stages.COMMANDS,
     "navigation": navigation.COMMANDS,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import math
 import os
@@ -86,6 +87,12 @@ def read_csv(path: Path, columns: Sequence[str], words: Collection[str]) -> list
     except (ValueError, TypeError, csv.Error) as error:
         raise UserError(f"{path}: is damaged ({error}); remove it or choose another --out") from error
     return rows
+
+
+def sha256(path: Path) -> str:
+    """Hexadecimal SHA-256 of a file, which is not held in memory."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_bytes(path: Path, content: bytes) -> None:
