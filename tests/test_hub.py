@@ -18,7 +18,7 @@ from tests.helpers_hub import TOKEN, Hub, Repo
 from tests.nn.test_encoder import CARD, make
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.hub import INDEX, Repository, pull, push
+from vd4rl_pomdp.hub import LISTING, Repository, pull, push
 from vd4rl_pomdp.nn import load_encoder, save_encoder
 from vd4rl_pomdp.nn.encoder_folder import encoder_hash
 
@@ -84,7 +84,7 @@ def test_a_set_comes_back_as_it_was(hub, data, tmp_path):
     assert pull(SET, tmp_path / "new")
     assert content(tmp_path / "new") == content(data)
     pushed = hub.files(WHERE[SET])
-    assert set(pushed) == {*content(data), "README.md", INDEX, ".gitattributes"}
+    assert set(pushed) == {*content(data), "README.md", LISTING, ".gitattributes"}
     assert len(hub.large) == len(list(data.glob("*.hdf5"))) + 1
 
 
@@ -186,6 +186,12 @@ def test_only_whole_encoders_and_sets_go_to_repositories_of_their_kind(hub, enco
     (encoder / "model.safetensors").write_bytes(b"damaged")
     with pytest.raises(UserError, match="cannot be read"):
         push(encoder, ENCODER)
+    shard = next(data.glob("*.hdf5"))
+    whole = shard.read_bytes()
+    shard.write_bytes(whole[:-99])
+    with pytest.raises(UserError, match=r"\.hdf5"):
+        push(data, SET)
+    shard.write_bytes(whole)
     (data / "2.hdf5.part").write_bytes(b"")
     with pytest.raises(UserError, match="download is not finished"):
         push(data, SET)
@@ -204,7 +210,7 @@ def test_a_repository_of_something_else_is_neither_written_nor_read(hub, encoder
 
 
 @pytest.mark.parametrize(
-    "index",
+    "listing",
     [
         b"{",
         b"[]",
@@ -216,9 +222,9 @@ def test_a_repository_of_something_else_is_neither_written_nor_read(hub, encoder
         b'{"format": 1, "kind": "an encoder", "sha256": {"config.json": "", "model.safetensors": "", "../x.md": ""}}',
     ],
 )
-def test_an_index_of_another_kind_or_with_other_files_is_refused(hub, encoder, tmp_path, index):
+def test_a_listing_of_another_kind_or_with_other_files_is_refused(hub, encoder, tmp_path, listing):
     push(encoder, ENCODER)
-    hub.repos[WHERE[ENCODER]].commit("main", hub.files(WHERE[ENCODER]) | {INDEX: index})
+    hub.repos[WHERE[ENCODER]].commit("main", hub.files(WHERE[ENCODER]) | {LISTING: listing})
     with pytest.raises(UserError, match=r"lab/encoder: its vd4rl_pomdp\.json is of another version or damaged"):
         pull(ENCODER, tmp_path / "new")
     assert lists(tmp_path) == ["run"]
@@ -229,9 +235,9 @@ def test_an_index_of_another_kind_or_with_other_files_is_refused(hub, encoder, t
 )
 def test_a_set_brings_shards_cards_and_records_only(hub, data, tmp_path, name):
     push(data, SET)
-    index = json.loads(hub.files(WHERE[SET])[INDEX])
-    index["sha256"][name] = "0"
-    hub.repos[WHERE[SET]].commit("main", hub.files(WHERE[SET]) | {INDEX: json.dumps(index).encode(), name: b""})
+    listing = json.loads(hub.files(WHERE[SET])[LISTING])
+    listing["sha256"][name] = "0"
+    hub.repos[WHERE[SET]].commit("main", hub.files(WHERE[SET]) | {LISTING: json.dumps(listing).encode(), name: b""})
     with pytest.raises(UserError, match=r"of another version or damaged"):
         pull(SET, tmp_path / "new")
 
@@ -258,6 +264,14 @@ def test_a_cut_transfer_is_resumed(hub, encoder, tmp_path, monkeypatch):
     pull(ENCODER, tmp_path / "new")
     assert hub.ranges == ["model.safetensors"]
     assert content(tmp_path / "new") == content(encoder)
+
+
+def test_a_set_of_no_shards_is_none(hub, data, tmp_path):
+    push(data, SET)
+    listing = {"format": 1, "kind": "a data set", "sha256": {}}
+    hub.repos[WHERE[SET]].commit("main", hub.files(WHERE[SET]) | {LISTING: json.dumps(listing).encode()})
+    with pytest.raises(UserError, match=r"of another version or damaged"):
+        pull(SET, tmp_path / "new")
 
 
 @pytest.mark.parametrize("what", ["a file", "a folder", "an encoder", "a run", "a link"])
@@ -318,7 +332,7 @@ def test_what_fails_in_a_push_is_one_sentence_and_leaves_no_half(hub, encoder, m
 def test_a_card_that_the_hub_refuses_is_told(hub, encoder):
     with pytest.raises(UserError, match=r'lab/encoder: the Hub does not take it \(.*"license" must be one of \[mit\]'):
         push(encoder, ENCODER, license="nobody's")
-    assert INDEX not in hub.files(WHERE[ENCODER])
+    assert LISTING not in hub.files(WHERE[ENCODER])
 
 
 def test_a_gated_repository_is_told_apart(hub, encoder, tmp_path, monkeypatch):

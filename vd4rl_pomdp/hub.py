@@ -1,6 +1,6 @@
 """Encoders and data sets on the Hugging Face Hub.
 
-A repository that `push` wrote holds an index beside the files: their kind, and the SHA-256 of each, by which `pull`
+A repository that `push` wrote holds a listing beside the files: their kind, and the SHA-256 of each, by which `pull`
 judges what it was sent. Encoders are model repositories, OWNER/NAME; data sets are datasets/OWNER/NAME, as in the Hub's
 own addresses. Endpoint and token are those of huggingface_hub: HF_ENDPOINT, HF_TOKEN, `hf auth login`.
 """
@@ -36,7 +36,8 @@ from huggingface_hub.utils import disable_progress_bars, validate_repo_id
 
 from vd4rl_pomdp import __version__
 from vd4rl_pomdp.data.download import default_endpoint
-from vd4rl_pomdp.data.format import SUFFIXES, check_frames, shard_paths
+from vd4rl_pomdp.data.episodes import join_shards
+from vd4rl_pomdp.data.format import SUFFIXES, check_frames, read_rows, shard_paths
 from vd4rl_pomdp.data.hub_card import set_card
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, WEIGHTS, load_encoder, read_record
@@ -46,7 +47,7 @@ from vd4rl_pomdp.runs.outputs import kept_in, refuse_inside
 from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.reading import build
 
-INDEX = "vd4rl_pomdp.json"
+LISTING = "vd4rl_pomdp.json"
 FORMAT = 1
 ENCODER, SET = "an encoder", "a data set"
 """What a repository holds, in the words of `runs.outputs.kept_in`."""
@@ -89,7 +90,7 @@ class Repository:
 
 
 @dataclass(frozen=True)
-class Index:
+class Listing:
     """What a repository holds."""
 
     format: int
@@ -121,11 +122,11 @@ def push(
             api.create_branch(repository.name, branch=revision, repo_type=repository.type, exist_ok=True)
             info = _info(api, repository, revision)
         held = _held(api, repository, info)
-        index = Index(FORMAT, repository.kind, {file.name: sha256(file) for file in files})
-        texts = {CARD: card.encode(), INDEX: json_bytes(asdict(index))}
+        listing = Listing(FORMAT, repository.kind, {file.name: sha256(file) for file in files})
+        texts = {CARD: card.encode(), LISTING: json_bytes(asdict(listing))}
         adds = [CommitOperationAdd(file.name, file) for file in files]
         adds += [CommitOperationAdd(name, content) for name, content in texts.items()]
-        gone = [CommitOperationDelete(name) for name in sorted(held - index.sha256.keys())]
+        gone = [CommitOperationDelete(name) for name in sorted(held - listing.sha256.keys())]
         message = f"{repository.kind.split()[-1].capitalize()} of vd4rl-pomdp {__version__}"
         commit = api.create_commit(
             repository.name, [*adds, *gone], commit_message=message, repo_type=repository.type, revision=revision
@@ -151,19 +152,19 @@ def pull(repository: Repository, folder: Path, revision: str = "main") -> bool:
     api = _api()
     with _answers(repository, revision):
         info = _info(api, repository, revision)
-        index = _index(api, repository, info)
-    if _is_there(folder, index):
+        listing = _listing(api, repository, info)
+    if _is_there(folder, listing):
         return False
     if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
         raise UserError(f"{folder}: is not empty and holds something else than {repository}; choose another folder")
     with owned(folder.with_name(f".{folder.name}.pull")), disk_errors(folder):
         content = folder.with_name(f".{folder.name}.pull") / "content"
         with _answers(repository, revision):
-            for name in index.sha256:
+            for name in listing.sha256:
                 api.hf_hub_download(
                     repository.name, name, repo_type=repository.type, revision=info.sha, local_dir=content
                 )
-        _accept(content, index, repository)
+        _accept(content, listing, repository)
         content.rename(folder)
     shutil.rmtree(folder.with_name(f".{folder.name}.pull"), ignore_errors=True)
     return True
@@ -189,7 +190,7 @@ def _check_endpoint(endpoint: str) -> None:
 
 def _checked(folder: Path, repository: Repository, license: str) -> tuple[list[Path], str]:
     """The files of what a folder holds, and its card; raises UserError unless it is whole and of the right kind."""
-    kind = kept_in(folder)
+    kind = _kind(folder)
     if kind not in (ENCODER, SET):
         raise UserError(f"{folder}: holds neither an encoder nor a data set; name RUN/encoder or a folder of shards")
     if kind != repository.kind:
@@ -203,12 +204,21 @@ def _checked(folder: Path, repository: Repository, license: str) -> tuple[list[P
     return [folder / name for name in names], set_card(folder, repository.name, license)
 
 
+def _kind(folder: Path) -> str | None:
+    """What a folder holds; files that are called shards make a set, so that it is told what is wrong with them."""
+    kind = kept_in(folder)
+    named = kind is None and folder.is_dir() and any(path.suffix in SUFFIXES for path in folder.iterdir())
+    return SET if named else kind
+
+
 def _check(folder: Path, kind: str) -> None:
-    """Raise UserError for a damaged encoder or set."""
+    """Raise UserError for an encoder that does not load, or a set whose rows, frames apart, are not whole."""
     if kind == ENCODER:
         load_encoder(folder)
     else:
-        check_frames(shard_paths(folder))
+        shards = shard_paths(folder)
+        check_frames(shards)
+        join_shards(shards, [read_rows(shard) for shard in shards])
 
 
 def _is_name_of_set(name: str) -> bool:
@@ -239,59 +249,61 @@ def _provide(api: HfApi, repository: Repository, private: bool) -> ModelInfo | D
 def _held(api: HfApi, repository: Repository, info: ModelInfo | DatasetInfo) -> set[str]:
     """Files that an earlier push left; raises UserError for a repository that holds anything else."""
     names = {file.rfilename for file in info.siblings or []}
-    if INDEX in names:
-        return set(_index(api, repository, info).sha256) & names
+    if LISTING in names:
+        return set(_listing(api, repository, info).sha256) & names
     if names - {".gitattributes", CARD}:
         raise UserError(f"{repository}: holds files that were not pushed by vd4rl-pomdp; choose another name")
     return set()
 
 
-def _index(api: HfApi, repository: Repository, info: ModelInfo | DatasetInfo) -> Index:
-    """A repository's index; raises UserError if it has none, or a damaged one, or one of another kind."""
+def _listing(api: HfApi, repository: Repository, info: ModelInfo | DatasetInfo) -> Listing:
+    """A repository's listing; raises UserError if it has none, or a damaged one, or one of another kind."""
     with tempfile.TemporaryDirectory() as folder:
         try:
             api.hf_hub_download(
-                repository.name, INDEX, repo_type=repository.type, revision=info.sha, local_dir=Path(folder)
+                repository.name, LISTING, repo_type=repository.type, revision=info.sha, local_dir=Path(folder)
             )
         except EntryNotFoundError as error:
             if isinstance(error, LocalEntryNotFoundError):
                 raise
             raise UserError(
-                f"{repository}: holds nothing that `vd4rl-pomdp hub push` wrote, it has no {INDEX}; check the name"
+                f"{repository}: holds nothing that `vd4rl-pomdp hub push` wrote, it has no {LISTING}; check the name"
             ) from error
         try:
-            index = build(Index, read_json(Path(folder) / INDEX))
-            _check_index(index, repository)
+            listing = build(Listing, read_json(Path(folder) / LISTING))
+            _check_listing(listing, repository)
         except (UserError, TypeError, ValueError) as error:
-            raise UserError(f"{repository}: its {INDEX} is of another version or damaged; ask its owner") from error
-    return index
+            raise UserError(f"{repository}: its {LISTING} is of another version or damaged; ask its owner") from error
+    return listing
 
 
-def _check_index(index: Index, repository: Repository) -> None:
-    """Raise ValueError unless an index is of this format, of a repository's kind, and names files of that kind only."""
-    right = all(isinstance(digest, str) for digest in index.sha256.values())
-    if index.kind == ENCODER:
-        right = right and set(index.sha256) == _ENCODER_FILES
+def _check_listing(listing: Listing, repository: Repository) -> None:
+    """Raise ValueError unless a listing is of this format and of a repository's kind, and names what that kind has."""
+    right = all(isinstance(digest, str) for digest in listing.sha256.values())
+    if listing.kind == ENCODER:
+        right = right and set(listing.sha256) == _ENCODER_FILES
     else:
-        right = right and all(map(_is_name_of_set, index.sha256))
-    if (index.format, index.kind) != (FORMAT, repository.kind) or not right:
-        raise ValueError(json.dumps(asdict(index)))
+        right = (
+            right and all(map(_is_name_of_set, listing.sha256)) and any(n.endswith(SUFFIXES) for n in listing.sha256)
+        )
+    if (listing.format, listing.kind) != (FORMAT, repository.kind) or not right:
+        raise ValueError(json.dumps(asdict(listing)))
 
 
-def _is_there(folder: Path, index: Index) -> bool:
-    """Whether a folder holds what an index lists."""
-    return all((folder / n).is_file() and sha256(folder / n) == digest for n, digest in index.sha256.items())
+def _is_there(folder: Path, listing: Listing) -> bool:
+    """Whether a folder holds what a listing lists."""
+    return all((folder / n).is_file() and sha256(folder / n) == digest for n, digest in listing.sha256.items())
 
 
-def _accept(content: Path, index: Index, repository: Repository) -> None:
+def _accept(content: Path, listing: Listing, repository: Repository) -> None:
     """Check what was sent, and complete it; files that are damaged go, so that the next pull fetches them anew."""
-    wrong = [name for name, digest in index.sha256.items() if sha256(content / name) != digest]
+    wrong = [name for name, digest in listing.sha256.items() if sha256(content / name) != digest]
     for name in wrong:
         (content / name).unlink()
     if wrong:
         raise UserError(f"{repository}: {wrong[0]} has a wrong SHA-256 and was removed; pull again, or ask its owner")
-    _check(content, index.kind)
-    if index.kind == ENCODER:
+    _check(content, listing.kind)
+    if listing.kind == ENCODER:
         write_bytes(content / CARD, model_card(read_record(content)).encode())
     shutil.rmtree(content / ".cache", ignore_errors=True)  # what huggingface_hub goes on from
 

@@ -9,8 +9,8 @@ import yaml
 from huggingface_hub import ModelCard
 
 from tests.nn.test_encoder import CARD, make
+from vd4rl_pomdp.nn.encoder_card import EncoderRecord
 from vd4rl_pomdp.nn.encoder_folder import (
-    EncoderRecord,
     copy_encoder,
     encoder_hash,
     read_record,

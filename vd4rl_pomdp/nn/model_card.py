@@ -5,12 +5,9 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import asdict
-from typing import TYPE_CHECKING
 
+from vd4rl_pomdp.nn.encoder_card import EncoderRecord
 from vd4rl_pomdp.text import code, code_block, one_line
-
-if TYPE_CHECKING:
-    from vd4rl_pomdp.nn.encoder_folder import EncoderRecord
 
 CARD = "README.md"
 LICENSE = "mit"
