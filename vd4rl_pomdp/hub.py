@@ -279,14 +279,13 @@ def _listing(api: HfApi, repository: Repository, info: ModelInfo | DatasetInfo) 
 
 def _check_listing(listing: Listing, repository: Repository) -> None:
     """Raise ValueError unless a listing is of this format and of a repository's kind, and names what that kind has."""
-    right = all(isinstance(digest, str) for digest in listing.sha256.values())
+    names = listing.sha256.keys()
     if listing.kind == ENCODER:
-        right = right and set(listing.sha256) == _ENCODER_FILES
+        fits = names == _ENCODER_FILES
     else:
-        right = (
-            right and all(map(_is_name_of_set, listing.sha256)) and any(n.endswith(SUFFIXES) for n in listing.sha256)
-        )
-    if (listing.format, listing.kind) != (FORMAT, repository.kind) or not right:
+        fits = all(map(_is_name_of_set, names)) and any(name.endswith(SUFFIXES) for name in names)
+    told = all(isinstance(digest, str) for digest in listing.sha256.values())
+    if (listing.format, listing.kind) != (FORMAT, repository.kind) or not (fits and told):
         raise ValueError(json.dumps(asdict(listing)))
 
 

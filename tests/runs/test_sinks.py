@@ -190,6 +190,18 @@ def test_what_is_not_installed_is_named_with_what_brings_it(tmp_path, monkeypatc
     assert read_metrics(tmp_path / "metrics.jsonl") == [{"step": 1, "loss": 0.5}]
 
 
+def test_a_run_that_goes_on_online_is_the_same_run_of_wandb(tmp_path, monkeypatch):
+    asked: list[dict[str, Any]] = []
+    monkeypatch.setitem(sys.modules, "wandb", fake := Faulty("nothing"))
+    fake.init = lambda **words: asked.append(words) or fake  # type: ignore[attr-defined]
+    one, other = (run_at(tmp_path / folder, wandb="online") for folder in "ab")
+    for run in (one, one, other):
+        open_sinks(run, 0, LABELS, {})
+    ids = [words["id"] for words in asked]
+    assert ids[0] == ids[1] != ids[2]
+    assert all((words["resume"], words["mode"]) == ("allow", "online") for words in asked)
+
+
 def test_seeds_of_one_experiment_share_a_group_and_other_settings_do_not(tmp_path):
     one, other, wide = (names(run_at(tmp_path, **c), LABELS, {}) for c in ({}, {"seed": 1}, {"max_k": 15}))
     assert one["group"] == other["group"] != wide["group"]
