@@ -274,6 +274,17 @@ def test_a_set_of_no_shards_is_none(hub, data, tmp_path):
         pull(SET, tmp_path / "new")
 
 
+def test_a_cut_pull_of_another_set_leaves_nothing_in_this_one(hub, data, tmp_path):
+    other = Repository.named("datasets/lab/other")
+    push(write_fake_set(tmp_path / "own" / "walker_walk" / "medium", [20, 25]), other)
+    hub.damaged.add("card.md")
+    push(data, SET)
+    with pytest.raises(UserError, match=r"card\.md has a wrong SHA-256"):
+        pull(SET, tmp_path / "new")
+    pull(other, tmp_path / "new")
+    assert content(tmp_path / "new") == content(tmp_path / "own" / "walker_walk" / "medium")
+
+
 @pytest.mark.parametrize("what", ["a file", "a folder", "an encoder", "a run", "a link"])
 def test_nothing_foreign_is_written_over(hub, encoder, tmp_path, what):
     push(encoder, ENCODER)

@@ -301,10 +301,12 @@ def _accept(content: Path, listing: Listing, repository: Repository) -> None:
         (content / name).unlink()
     if wrong:
         raise UserError(f"{repository}: {wrong[0]} has a wrong SHA-256 and was removed; pull again, or ask its owner")
+    for path in list(content.iterdir()):
+        if path.name not in listing.sha256:  # of huggingface_hub, or of a cut pull of another repository
+            shutil.rmtree(path) if path.is_dir() else path.unlink()
     _check(content, listing.kind)
     if listing.kind == ENCODER:
         write_bytes(content / CARD, model_card(read_record(content)).encode())
-    shutil.rmtree(content / ".cache", ignore_errors=True)  # what huggingface_hub goes on from
 
 
 @contextmanager

@@ -101,6 +101,9 @@ def test_wandb_gets_the_whole_config_and_every_row_of_one_run(encoder, data, tmp
     assert config["pretraining"] == pretrained
     assert config["pretraining"]["settings"]["max_k"] == 3
     rows = read_metrics(run / "metrics.jsonl")
+    untracked = contents(run_finetune(smoke_finetune(encoder, data, tmp_path / "untracked", **FINETUNE)).path)
+    del untracked["config.json"]
+    assert untracked.items() <= contents(run).items()
     assert [row for row in rows if row not in before + after] == []
     assert max(row["step"] for row in before) <= 4
     assert after[-1] == rows[-1]
@@ -186,7 +189,7 @@ def test_what_is_not_installed_is_named_with_what_brings_it(tmp_path, monkeypatc
     log = MetricsLog(tmp_path / "metrics.jsonl", 0, open_sinks(run_at(tmp_path, **changes), 0, LABELS, {}))
     log.write(1, {"loss": 0.5})
     log.close()
-    assert "; pip install 'vd4rl-pomdp[tracking]'); the run goes on" in capsys.readouterr().err
+    assert "; `pip install '.[tracking]'` in the package's folder); the run goes on" in capsys.readouterr().err
     assert read_metrics(tmp_path / "metrics.jsonl") == [{"step": 1, "loss": 0.5}]
 
 

@@ -54,7 +54,7 @@ class Forgiving:
             return act()
         except Exception as error:  # whatever a service or its library raises
             reason = " ".join(str(error).split()) or type(error).__name__
-            reason += "; pip install 'vd4rl-pomdp[tracking]'" if isinstance(error, ImportError) else ""
+            reason += "; `pip install '.[tracking]'` in the package's folder" if isinstance(error, ImportError) else ""
             print(
                 f"warning: {self._name} fails ({reason}); the run goes on, {self._folder} has it all", file=sys.stderr
             )
