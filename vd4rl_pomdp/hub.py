@@ -42,7 +42,7 @@ from vd4rl_pomdp.data.hub_card import set_card
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, WEIGHTS, load_encoder, read_record
 from vd4rl_pomdp.nn.model_card import CARD, LICENSE, model_card
-from vd4rl_pomdp.runs.files import json_bytes, read_json, sha256, write_bytes
+from vd4rl_pomdp.runs.files import json_text, read_json, sha256, write_bytes
 from vd4rl_pomdp.runs.outputs import kept_in, refuse_inside
 from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.reading import build
@@ -123,7 +123,7 @@ def push(
             info = _info(api, repository, revision)
         held = _held(api, repository, info)
         listing = Listing(FORMAT, repository.kind, {file.name: sha256(file) for file in files})
-        texts = {CARD: card.encode(), LISTING: json_bytes(asdict(listing))}
+        texts = {CARD: card.encode(), LISTING: json_text(asdict(listing)).encode()}
         adds = [CommitOperationAdd(file.name, file) for file in files]
         adds += [CommitOperationAdd(name, content) for name, content in texts.items()]
         gone = [CommitOperationDelete(name) for name in sorted(held - listing.sha256.keys())]

@@ -21,7 +21,7 @@ from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.encoder_card import EncoderCard, EncoderOrigin, EncoderRecord
 from vd4rl_pomdp.nn.frame import STATE
 from vd4rl_pomdp.nn.model_card import CARD, model_card
-from vd4rl_pomdp.runs.files import json_bytes, write_bytes
+from vd4rl_pomdp.runs.files import json_text, write_bytes, write_json
 from vd4rl_pomdp.runs.provenance import git_commit
 from vd4rl_pomdp.runs.reading import build, parse_json, read_bytes, read_tensors
 
@@ -52,7 +52,7 @@ def _write(folder: Path, weights: bytes, record: EncoderRecord) -> None:
 
 def _write_record(folder: Path, record: EncoderRecord) -> None:
     write_bytes(folder / CARD, model_card(record).encode())
-    write_bytes(folder / CONFIG, json_bytes(asdict(record)))
+    write_json(folder / CONFIG, asdict(record))
 
 
 def copy_encoder(source: Path, target: Path, changes: Mapping[str, Any]) -> None:
@@ -89,7 +89,7 @@ def _without_origin(config: bytes) -> bytes:
         return config
     if not isinstance(told, dict) or "origin" not in told:
         return config
-    return json_bytes({name: value for name, value in told.items() if name != "origin"})
+    return json_text({name: value for name, value in told.items() if name != "origin"}).encode()
 
 
 def load_encoder(

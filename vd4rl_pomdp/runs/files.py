@@ -43,12 +43,13 @@ def read_json(path: Path) -> dict[str, Any]:
 
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file so that a reader sees it whole or not at all."""
-    write_bytes(path, json_bytes(value))
+    with replacing_file(path) as fresh:
+        fresh.write_text(json_text(value), encoding="utf-8")
 
 
-def json_bytes(value: Any) -> bytes:
+def json_text(value: Any) -> str:
     """A JSON file's content."""
-    return (json.dumps(value, indent=2) + "\n").encode()
+    return json.dumps(value, indent=2) + "\n"
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
