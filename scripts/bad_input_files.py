@@ -34,6 +34,8 @@ READERS: list[tuple[str, list[str], list[str]]] = [
         ["--encoder", ENCODER, "--data", SET, "--out", "new", *SMOKE, "--workers", "1"],
         [f"{ENCODER}/config.json", f"{ENCODER}/model.safetensors"],
     ),
+    ("hub push", [ENCODER, "lab/encoder"], [f"{ENCODER}/config.json", f"{ENCODER}/model.safetensors"]),
+    ("hub push", [SET, "datasets/lab/set"], [f"{SET}/0_walker_walk_random.hdf5"]),
     *(
         (command, [*words, "--out", folder], [f"{folder}/config.json", f"{folder}/metrics.jsonl"])
         for command, (folder, words) in CUT.items()

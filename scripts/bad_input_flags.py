@@ -55,6 +55,8 @@ VALID: dict[str, Words] = {
     "data table": ["--out", "new", "--tasks", "walker_walk", "--qualities", "random"],
     "data check": [SET],
     "data parity": [SET],
+    "hub push": [ENCODER, "lab/encoder"],
+    "hub pull": ["lab/encoder", "new"],
     "policy train": ["--task", "walker_walk", "--out", "new", "--decisions", "10"],
     "policy export": ["runs/policy", "--out", "new"],
     "pretrain": ["--data", SET, "--out", "new", *SMOKE, "--corruption", "patch+zero_frames"],

@@ -32,6 +32,7 @@ NOT_RUN = {
     **{f"python {file}": "test_own_parts and test_own_task run them" for file in EXAMPLES},
     "vd4rl-pomdp data collect": "renders whole episodes; data/test_collect runs shorter ones",
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
+    "vd4rl-pomdp hub": "needs a Hub; test_hub has one of its own",
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
     "vd4rl-pomdp policy": "trains for hours; tests/policies trains less",
     "vd4rl-pomdp control-study": "trains for minutes; experiments/control trains less",
