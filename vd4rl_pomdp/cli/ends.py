@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -23,11 +24,16 @@ class End:
     """What the user is told, empty if nothing is."""
 
 
-def run_to_end(words: Sequence[str]) -> End:
-    """Do what `vd4rl-pomdp WORDS` does; only a defect is raised."""
+def run_to_end(words: Sequence[str], second: signal.Handlers = signal.SIG_DFL) -> End:
+    """Do what `vd4rl-pomdp WORDS` does; only a defect is raised.
+
+    Args:
+        words: the command line.
+        second: what a second signal does.
+    """
     try:
         _refuse_undecodable(words)
-        with interrupt.handled(program=True):
+        with interrupt.handled(second):
             run_stage(list(words))
     except UserError as error:
         return End(2, error.cause, f"error: {' '.join(str(error).split())}")

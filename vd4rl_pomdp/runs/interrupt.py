@@ -1,7 +1,7 @@
 """Signals: the first Ctrl-C or SIGTERM ends a run where nothing is lost, a second one ends the process at once.
 
 Outside a training loop the first signal is raised where it arrives; inside one it waits for the end of the running
-step, whose checkpoint is then written.
+step, whose checkpoint is then written. A job of a sweep leaves a second one unanswered.
 """
 
 from __future__ import annotations
@@ -36,12 +36,12 @@ class _Signals:
 
 
 @contextmanager
-def handled(program: bool = False) -> Iterator[None]:
+def handled(second: signal.Handlers | None = None) -> Iterator[None]:
     """Answer signals as the module says. Nested, or outside the main thread, it changes nothing.
 
     Args:
-        program: whether this is the command line, where a second signal kills the process even inside a library's C
-            code; elsewhere a second signal does what it did before this block.
+        second: what a second signal does: SIG_DFL on the command line, which kills the process even inside a library's
+            C code; SIG_IGN where whoever sent the first will kill the process himself; None: what it did before.
     """
     if _Signals.handled or threading.current_thread() is not threading.main_thread():
         yield
@@ -51,7 +51,7 @@ def handled(program: bool = False) -> Iterator[None]:
 
     def answer(number: int, frame: FrameType | None) -> None:
         for other, old in before.items():
-            signal.signal(other, signal.SIG_DFL if program else old)
+            signal.signal(other, old if second is None else second)
         if sys.stderr.isatty():
             sys.stderr.write("\x1b[?25h")  # a second signal leaves nobody to show the cursor again
         _Signals.asked = number

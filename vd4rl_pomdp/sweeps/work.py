@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
@@ -12,6 +13,7 @@ from pathlib import Path
 from typing import Protocol
 
 from vd4rl_pomdp.errors import DiskFullError, InUseError, OutOfMemoryError, UserError, WorkerDiedError
+from vd4rl_pomdp.sweeps.oom import oom_kills
 
 DONE, DIVERGED, INTERRUPTED, FAILED = "done", "diverged", "interrupted", "failed"
 KILLED = WorkerDiedError.cause
@@ -93,10 +95,18 @@ def code_of(cause: str) -> int:
     return 0 if cause == DONE else _FIRST + CAUSES.index(cause)
 
 
-def ended(work: Work, code: int) -> Ended:
-    """How a job's process ended, by its exit code: negative for a signal, as `subprocess` has it."""
+def ended(work: Work, code: int, oom_kills_before: int | None = None) -> Ended:
+    """How a job's process ended.
+
+    Args:
+        work: the job.
+        code: its exit code, negative for a signal, as `subprocess` has it.
+        oom_kills_before: `oom_kills()` when it began; None: not known.
+    """
     if code == 0:
         return Ended(work.name, DONE, "")
+    if code == -signal.SIGKILL and oom_kills_before is not None and oom_kills() > oom_kills_before:
+        return Ended(work.name, OutOfMemoryError.cause, "the kernel killed it for want of memory")
     told = CAUSES[code - _FIRST] if _FIRST <= code < _FIRST + len(CAUSES) else None
     return Ended(work.name, told or (KILLED if code < 0 else FAILED), last_line(work.log))
 

@@ -1,7 +1,8 @@
 """The process that does one job of a sweep: `python -m vd4rl_pomdp.sweeps.worker JSON`.
 
 It ends with the process that started it, and its exit code says why it ended. A code that is none of those comes from a
-signal that cannot be answered, or from a defect, whose traceback is in the log.
+signal that cannot be answered, or from a defect, whose traceback is in the log. A cluster may signal all processes of a
+task at once, and the task's own then asks its jobs to end: the first SIGTERM counts, further ones change nothing.
 """
 
 from __future__ import annotations
@@ -22,6 +23,7 @@ def main() -> None:
     """Do the job that the command line names."""
     told = json.loads(sys.argv[1])
     if sys.platform == "linux":
+        signal.signal(signal.SIGUSR2, signal.SIG_IGN)  # Slurm's warning, which its task answers
         _end_with(told["parent"])
         if told["cores"]:
             os.sched_setaffinity(0, told["cores"])
@@ -29,7 +31,7 @@ def main() -> None:
     sys.argv = ["vd4rl-pomdp", *words]  # what a run records as its command
     from vd4rl_pomdp.cli.ends import run_to_end
 
-    end = run_to_end(words)
+    end = run_to_end(words, signal.SIG_IGN)
     with contextlib.suppress(OSError):  # a full disk
         print(end.line or end.cause, file=sys.stderr, flush=True)
     sys.exit(code_of(end.cause))

@@ -4,11 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.sweeps.executors.local import LocalExecutor, LocalOptions
+from vd4rl_pomdp.sweeps.executors.ray import RayExecutor, RayOptions
+from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor, SlurmOptions
 from vd4rl_pomdp.sweeps.work import Executor
 
 
@@ -17,11 +20,15 @@ class Kind:
     """One kind of executor."""
 
     options: type[Options]
-    build: Callable[[Any], Executor]
-    """Makes it from its options."""
+    build: Callable[[Any, Path], Executor]
+    """Makes it from its options, and a folder for its own files beside the runs."""
 
 
-EXECUTORS = {"local": Kind(LocalOptions, LocalExecutor)}
+EXECUTORS = {
+    "local": Kind(LocalOptions, lambda options, folder: LocalExecutor(options)),
+    "slurm": Kind(SlurmOptions, SlurmExecutor),
+    "ray": Kind(RayOptions, lambda options, folder: RayExecutor(options)),
+}
 
 
 def executor_kind(name: str) -> Kind:

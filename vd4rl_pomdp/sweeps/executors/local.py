@@ -12,6 +12,7 @@ from typing import ClassVar
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import Limits, Options
+from vd4rl_pomdp.sweeps.oom import oom_kills
 from vd4rl_pomdp.sweeps.work import Ended, Work, ended, start_process
 
 PATIENCE_S = 120.0
@@ -44,6 +45,8 @@ class _Running:
     work: Work
     places: list[Place]
     process: subprocess.Popen
+    oom_kills: int
+    """When it began."""
 
 
 class LocalExecutor:
@@ -75,10 +78,10 @@ class LocalExecutor:
         environment = {"OMP_NUM_THREADS": str(max(1, len(cores))), "LP_NUM_THREADS": "1"}
         if chosen[0].gpu is not None:
             environment["CUDA_VISIBLE_DEVICES"] = chosen[0].gpu
-        process = start_process(work, environment, cores)
+        before, process = oom_kills(), start_process(work, environment, cores)
         for place in chosen:
             self._free.remove(place)
-        self._running.append(_Running(work, chosen, process))
+        self._running.append(_Running(work, chosen, process, before))
 
     def ended(self) -> list[Ended]:
         """What has ended since the last call."""
@@ -86,7 +89,7 @@ class LocalExecutor:
         for job in over:
             self._running.remove(job)
             self._free += job.places
-        return [ended(job.work, job.process.returncode) for job in over]
+        return [ended(job.work, job.process.returncode, job.oom_kills) for job in over]
 
     def stop(self) -> None:
         """Ask every job to end where nothing is lost, and wait for it."""
@@ -103,7 +106,7 @@ class LocalExecutor:
 
 def _places(options: LocalOptions) -> list[Place]:
     """The machine's cores and GPUs, shared out among the jobs."""
-    gpus = _gpus()
+    gpus = visible_gpus()
     jobs = options.jobs or max(1, len(gpus) * options.jobs_per_gpu)
     if gpus and jobs > len(gpus) * options.jobs_per_gpu:
         raise UserError(
@@ -120,7 +123,7 @@ def _share(cores: list[int], number: int, jobs: int) -> tuple[int, ...]:
     return tuple(cores[first : max(end, first + 1)])
 
 
-def _gpus() -> list[str]:
+def visible_gpus() -> list[str]:
     """Names of the GPUs that this process may use, as CUDA_VISIBLE_DEVICES has them."""
     import torch
 

@@ -1,0 +1,187 @@
+"""What the Slurm executor makes of the queue's words, and what it asks for, without Slurm."""
+
+import sys
+
+import pytest
+
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.errors import OutOfMemoryError, UserError
+from vd4rl_pomdp.sweeps.executors import slurm as module
+from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor, SlurmOptions, _parameters, _State
+from vd4rl_pomdp.sweeps.work import DONE, FAILED, INTERRUPTED, KILLED, Ended, Work
+
+GRID = 'preset = "smoke"\n[collect]\ntask = "walker_walk"\nquality = "expert"\n'
+
+
+class FakeSlurm:
+    """A queue, and what was submitted."""
+
+    def __init__(self, monkeypatch) -> None:
+        self.queue, self.arrays = {}, []
+        monkeypatch.setattr(module, "_require_slurm", lambda: None)
+        monkeypatch.setattr(module, "_queue", lambda: self.queue)
+        monkeypatch.setattr(module, "_submit", self._submit)
+        monkeypatch.setattr(module, "FILES_S", 0.0)
+        monkeypatch.setattr(module, "QUEUE_S", 0.0)
+
+    def _submit(self, tasks, options) -> None:
+        self.arrays.append([list(task.mine) for task in tasks])
+        self.queue |= {task.key: _State("PENDING", f"7_{task.number}", "Priority") for task in tasks}
+
+    def put(self, name: str, reason: str = "None") -> None:
+        self.queue = {key: _State(name, state.job, reason) for key, state in self.queue.items()}
+
+
+@pytest.fixture
+def fake(monkeypatch) -> FakeSlurm:
+    return FakeSlurm(monkeypatch)
+
+
+def work(tmp_path, name: str, slots: int = 1, words: tuple[str, ...] = ("list",)) -> Work:
+    return Work(name, words, tmp_path / "logs" / f"{name}.log", slots)
+
+
+def executor(tmp_path, **changes) -> SlurmExecutor:
+    return SlurmExecutor(SlurmOptions(**changes), tmp_path / "slurm")
+
+
+@pytest.mark.parametrize(
+    ("state", "cause"),
+    [
+        *[("OUT_OF_MEMORY", OutOfMemoryError.cause), ("PREEMPTED", KILLED), ("NODE_FAIL", KILLED), ("TIMEOUT", KILLED)],
+        *[("CANCELLED", KILLED), ("BOOT_FAIL", KILLED), ("DEADLINE", KILLED), ("COMPLETED", INTERRUPTED)],
+    ],
+)
+def test_a_task_that_ended_without_telling_says_why_by_its_state(fake, tmp_path, state, cause):
+    made = executor(tmp_path)
+    made.start(work(tmp_path, "job"))
+    for waiting in ("PENDING", "RUNNING", "COMPLETING", "REQUEUED"):
+        assert made.ended() == []
+        fake.put(waiting)
+    fake.put(state)
+    assert made.ended() == [Ended("job", cause, f"Slurm says {state} of task 7_0")]
+    assert made.ended() == []
+
+
+def test_a_task_that_failed_is_told_by_its_last_line_and_one_that_slurm_forgot_was_killed(fake, tmp_path):
+    made = executor(tmp_path)
+    made.start(work(tmp_path, "job"))
+    made.ended()
+    made._tasks[0].array.folder.joinpath("7_0_0_log.out").write_text("Traceback\nImportError: no torch\n")
+    fake.put("FAILED")
+    assert made.ended() == [Ended("job", FAILED, "ImportError: no torch")]
+    made.start(work(tmp_path, "job"))
+    made.ended()
+    fake.queue = {}
+    assert [ended.cause for ended in made.ended()] == [KILLED]
+
+
+def test_what_was_told_counts_although_the_task_has_died_since(fake, tmp_path):
+    made = executor(tmp_path)
+    made.start(work(tmp_path, "job"))
+    made.ended()
+    (task,) = made._tasks
+    task.array.end(task.mine["job"], Ended("job", DONE, ""))
+    fake.put("NODE_FAIL")
+    assert made.ended() == [Ended("job", DONE, "")]
+
+
+def test_while_slurm_does_not_answer_nothing_has_ended(fake, tmp_path):
+    made = executor(tmp_path)
+    made.start(work(tmp_path, "job"))
+    made.ended()
+    fake.queue = None
+    assert made.ended() == []
+    with pytest.raises(UserError, match="Slurm does not answer"):
+        executor(tmp_path)
+
+
+def test_jobs_fill_the_places_of_tasks_and_one_that_needs_more_memory_takes_more_of_them(fake, tmp_path):
+    assert executor(tmp_path, jobs_per_task=4, gpus=2).largest == 2, "of one GPU's memory"
+    made = executor(tmp_path, jobs_per_task=4, tasks=2)
+    assert (made.slots, made.largest) == (8, 4)
+    for name, slots in {"a": 1, "b": 1, "large": 2, "c": 1}.items():
+        assert made.fits(slots)
+        made.start(work(tmp_path, name, slots))
+    made.ended()
+    assert fake.arrays == [[["a", "b", "large"], ["c"]]]
+    made.start(work(tmp_path, "d"))
+    made.ended()
+    assert len(fake.arrays) == 1
+    assert (made.fits(2), made.fits(3)) == (True, False)
+
+
+def test_a_new_driver_takes_over_what_is_in_the_queue_but_no_other_command_of_that_name(fake, tmp_path):
+    executor(tmp_path).start(work(tmp_path, "never submitted"))
+    first = executor(tmp_path)
+    first.start(work(tmp_path, "job"))
+    first.ended()
+    second = executor(tmp_path)
+    second.start(work(tmp_path, "job"))
+    second.ended()
+    assert len(fake.arrays) == 1
+    (task,) = first._tasks
+    task.array.end(task.mine["job"], Ended("job", DONE, ""))
+    assert second.ended() == [Ended("job", DONE, "")]
+    first.ended()
+    third = executor(tmp_path, tasks=1)
+    third.start(work(tmp_path, "job", words=("list", "--json")))
+    third.start(work(tmp_path, "never submitted"))
+    third.ended()
+    assert len(third._tasks[0].array.left(0)) == 2, "a task that is there is used"
+
+
+def test_what_a_task_may_wait_for_in_vain_is_told_once(fake, tmp_path, capsys):
+    made = executor(tmp_path)
+    made.start(work(tmp_path, "job"))
+    made.ended()
+    assert capsys.readouterr().err == ""
+    fake.put("PENDING", "PartitionTimeLimit")
+    made.ended()
+    made.ended()
+    assert capsys.readouterr().err == "warning: Slurm keeps task 7_0 waiting: PartitionTimeLimit\n"
+
+
+def test_options_become_what_submitit_takes():
+    asked = SlurmOptions("gpu", "lab", "high", "a100", 90, 2, 16, 62.5, 8, 50, ["--exclusive", "reservation=mine"])
+    found = _parameters(asked)
+    assert {name: found[name] for name in ("partition", "account", "qos", "constraint", "time", "mem")} == {
+        **{"partition": "gpu", "account": "lab", "qos": "high", "constraint": "a100", "time": 90, "mem": "64000M"}
+    }
+    assert (found["gpus_per_node"], found["cpus_per_task"], found["srun_args"]) == (2, 16, ["--cpus-per-task=16"])
+    assert found["additional_parameters"] == {"requeue": True, "exclusive": True, "reservation": "mine"}
+    assert found["signal_delay_s"] > 120, "time to end in"
+    assert (
+        not {"partition", "account", "qos", "constraint", "mem", "gpus_per_node"}
+        & _parameters(SlurmOptions(gpus=0)).keys()
+    )
+
+
+@pytest.mark.parametrize(
+    ("executor", "missing", "told"),
+    [
+        ("slurm", "submitit", "needs submitit: pip install 'vd4rl-pomdp[slurm]'"),
+        ("ray", "ray", "needs Ray: pip install 'vd4rl-pomdp[ray]'"),
+    ],
+)
+def test_a_missing_extra_is_one_line(tmp_path, monkeypatch, capsys, executor, missing, told):
+    (tmp_path / "grid.toml").write_text(GRID)
+    monkeypatch.setitem(sys.modules, missing, None)
+    with pytest.raises(SystemExit) as end:
+        main(["sweep", "run", str(tmp_path / "grid.toml"), "--out", str(tmp_path / "out"), "--executor", executor])
+    assert end.value.code == 2
+    assert capsys.readouterr().err == f"error: --executor {executor} {told}\n"
+
+
+def test_without_slurms_commands_one_is_told_where_to_start(tmp_path, monkeypatch):
+    pytest.importorskip("submitit")
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(UserError, match="--executor slurm finds no sbatch here"):
+        executor(tmp_path)
+
+
+def test_the_package_loads_neither_submitit_nor_ray():
+    import subprocess
+
+    script = "import sys, vd4rl_pomdp.sweeps.executors as e; print({'submitit', 'ray', 'torch'} & sys.modules.keys())"
+    assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True).stdout == "set()\n"
