@@ -103,7 +103,7 @@ def test_jobs_share_out_the_cores(monkeypatch):
 
 
 def test_jobs_share_the_gpus(monkeypatch):
-    monkeypatch.setattr(local, "_gpus", lambda: ["2", "5"])
+    monkeypatch.setattr(local, "visible_gpus", lambda: ["2", "5"])
     places = local._places(LocalOptions(jobs_per_gpu=3))
     assert sorted(place.gpu for place in places) == ["2"] * 3 + ["5"] * 3
     executor = LocalExecutor(LocalOptions(jobs_per_gpu=2))
@@ -115,7 +115,7 @@ def test_jobs_share_the_gpus(monkeypatch):
 
 
 def test_a_job_is_shown_its_share_of_the_machine(tmp_path, monkeypatch):
-    monkeypatch.setattr(local, "_gpus", lambda: ["7"])
+    monkeypatch.setattr(local, "visible_gpus", lambda: ["7"])
     seen = {}
     monkeypatch.setattr(local, "start_process", lambda work, environment, cores: seen.update(environment, cores=cores))
     LocalExecutor(LocalOptions()).start(Work("a", ("list",), tmp_path / "log"))
