@@ -205,7 +205,10 @@ def test_a_repository_of_something_else_is_neither_written_nor_read(hub, encoder
         push(encoder, ENCODER)
     with pytest.raises(UserError, match=r"lab/encoder: holds nothing that `vd4rl-pomdp hub push` wrote"):
         pull(ENCODER, tmp_path / "new")
+    with pytest.raises(UserError, match=r"holds files that were not pushed"):
+        push(encoder, ENCODER, revision="v1")
     assert set(hub.files(WHERE[ENCODER])) == {"pytorch_model.bin", "README.md"}
+    assert set(repo.branches) == {"main"}
     assert not (tmp_path / "new").exists()
 
 
@@ -310,6 +313,14 @@ def test_nothing_foreign_is_written_over(hub, encoder, tmp_path, what):
         with pytest.raises(UserError, match=r"lies inside .* which holds a run"):
             pull(ENCODER, target / "more")
     assert content(tmp_path) == before
+
+
+def test_a_set_with_a_shard_more_is_another_set(hub, data, tmp_path):
+    push(data, SET)
+    pull(SET, tmp_path / "new")
+    (tmp_path / "new" / "9_more.hdf5").write_bytes(b"mine")
+    with pytest.raises(UserError, match="is not empty and holds something else than datasets/lab/set"):
+        pull(SET, tmp_path / "new")
 
 
 def test_an_empty_folder_takes_what_is_pulled(hub, encoder, tmp_path):

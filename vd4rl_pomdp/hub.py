@@ -117,11 +117,10 @@ def push(
     files, card = _checked(folder, repository, license)
     api = _api()
     with _answers(repository, revision):
-        info = _provide(api, repository, private)
+        held = _held(api, repository, _provide(api, repository, private))
         if revision != "main":
             api.create_branch(repository.name, branch=revision, repo_type=repository.type, exist_ok=True)
-            info = _info(api, repository, revision)
-        held = _held(api, repository, info)
+            held = _held(api, repository, _info(api, repository, revision))
         listing = Listing(FORMAT, repository.kind, {file.name: sha256(file) for file in files})
         texts = {CARD: card.encode(), LISTING: json_text(asdict(listing)).encode()}
         adds = [CommitOperationAdd(file.name, file) for file in files]
@@ -157,8 +156,9 @@ def pull(repository: Repository, folder: Path, revision: str = "main") -> bool:
         return False
     if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
         raise UserError(f"{folder}: is not empty and holds something else than {repository}; choose another folder")
-    with owned(folder.with_name(f".{folder.name}.pull")), disk_errors(folder):
-        content = folder.with_name(f".{folder.name}.pull") / "content"
+    beside = folder.with_name(f".{folder.name}.pull")
+    content = beside / "content"
+    with owned(beside), disk_errors(folder):
         with _answers(repository, revision):
             for name in listing.sha256:
                 api.hf_hub_download(
@@ -166,7 +166,7 @@ def pull(repository: Repository, folder: Path, revision: str = "main") -> bool:
                 )
         _accept(content, listing, repository)
         content.rename(folder)
-    shutil.rmtree(folder.with_name(f".{folder.name}.pull"), ignore_errors=True)
+    shutil.rmtree(beside, ignore_errors=True)
     return True
 
 
@@ -290,8 +290,11 @@ def _check_listing(listing: Listing, repository: Repository) -> None:
 
 
 def _is_there(folder: Path, listing: Listing) -> bool:
-    """Whether a folder holds what a listing lists."""
-    return all((folder / n).is_file() and sha256(folder / n) == digest for n, digest in listing.sha256.items())
+    """Whether a folder holds what a listing lists, and no shard that would make it another set."""
+    shards = {path.name for suffix in SUFFIXES for path in folder.glob(f"*{suffix}")}
+    return shards <= listing.sha256.keys() and all(
+        (folder / n).is_file() and sha256(folder / n) == digest for n, digest in listing.sha256.items()
+    )
 
 
 def _accept(content: Path, listing: Listing, repository: Repository) -> None:
