@@ -111,7 +111,7 @@ def _carry_out(jobs: list[Job], command: _ExecutorConfig, folder: SweepFolder) -
     """Run jobs to their end; SystemExit 1 if some are not finished."""
     from vd4rl_pomdp.sweeps.driver import Driver
 
-    executor = executor_kind(command.executor).build(command.options, folder.path / command.executor)
+    executor = executor_kind(command.executor).build(command.options, folder.of_executor(command.executor))
     if not Driver(jobs, executor, folder).run():
         failures = _status(folder, jobs).failures
         for name, row in failures.items():

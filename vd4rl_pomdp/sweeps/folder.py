@@ -3,6 +3,7 @@
     OUT/sweep/plans/GRID.json    the jobs of a grid: name, stage, folder, command, needs
     OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, step, slots, host
     OUT/sweep/logs/JOB.log
+    OUT/sweep/slurm/             what the Slurm executor keeps
 
 Rows are appended whole, so that several drivers may share a folder. Whether a job is finished is never read here: its
 own folder says it.
@@ -58,6 +59,10 @@ class SweepFolder:
         """A job as an executor takes it."""
         log = self.path / "logs" / f"{job.name}.log"
         return Work(job.name, job.words, log, slots)
+
+    def of_executor(self, name: str) -> Path:
+        """Folder of what an executor keeps."""
+        return self._folder / name
 
     def add(self, row: Row) -> None:
         """Append the row of an attempt."""
