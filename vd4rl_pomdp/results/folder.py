@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -121,19 +122,34 @@ def _labels(run: Result) -> dict[str, Any]:
 
 def read_results(folder: Path) -> list[Result]:
     """All runs of a results folder; raises UserError if it is none, or damaged."""
-    path = folder / RUNS
     by_run: dict[str, list[Row]] = {}
     for row in read_episodes(folder / EPISODES):
         if "id" not in row:
             raise UserError(f"{folder / EPISODES}: has no column 'id'; it was not written beside {RUNS}")
-        by_run.setdefault(row.pop("id"), []).append(row)
+        by_run.setdefault(row.pop("id"), []).append(row | {name: _shared(row[name]) for name in LABELS})
+    return _read_runs(folder, by_run)
+
+
+def _shared(value: Any) -> Any:
+    """A word that many rows hold, kept once."""
+    return sys.intern(value) if isinstance(value, str) else value
+
+
+def settled_ids(folder: Path) -> set[str]:
+    """Ids of the runs of a results folder that have finished or diverged; empty if there is none yet."""
+    return {run.id for run in _read_runs(folder, {}) if run.settled} if (folder / RUNS).exists() else set()
+
+
+def _read_runs(folder: Path, rows: dict[str, list[Row]]) -> list[Result]:
+    """All runs of a results folder with their rows."""
+    path = folder / RUNS
     try:
         lines = read_bytes(path).decode().splitlines()
     except FileNotFoundError as error:
         raise UserError(f"{folder}: holds no {RUNS}, so it is no results folder") from error
     except ValueError as error:
         raise UserError(f"{path}: is no UTF-8 ({error}); take another copy") from error
-    runs = [_parse(path, number, line, by_run) for number, line in enumerate(lines, 1)]
+    runs = [_parse(path, number, line, rows) for number, line in enumerate(lines, 1)]
     if len({run.id for run in runs}) != len(runs):
         raise UserError(f"{path}: names a run twice; remove one of the two lines")
     return runs
