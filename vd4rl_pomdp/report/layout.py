@@ -12,7 +12,7 @@ _ESCAPES = {
     **{c: f"\\{c}" for c in "&%$#_{}"},
     **{"\\": r"\textbackslash{}", "~": r"\textasciitilde{}", "^": r"\textasciicircum{}"},
     **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}"},
-    **{"–": "--", "†": r"\dag{}", "±": r"$\pm$", "×": r"$\times$"},
+    **{"–": "--", "†": r"\dag{}", "±": r"$\pm$", "×": r"$\times$", "→": r"$\rightarrow$"},
 }
 
 
