@@ -50,9 +50,6 @@ def _compare(words: Arguments, program: str) -> None:
 def _report(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.report import print_summary, write_report
 
-    if words[:1] == ["compare"]:  # a folder of that name is ./compare
-        _compare(words[1:], f"{program} compare")
-        return
     command = parse(ReportCommand, words, program)
     report = write_report(command.runs, command.out)
     print_summary(report)
@@ -140,7 +137,11 @@ def _control_study(words: Arguments, program: str) -> None:
 
 
 COMMANDS: dict[str, Command | Mapping[str, Command]] = {
-    "report": Command("an HTML page, tables and figures about runs; report compare A B for two sets", _report),
+    "report": Command(
+        "an HTML page, tables and figures about runs; report compare A B for two sets",
+        _report,
+        {"compare": Command("two result sets side by side", _compare)},
+    ),
     "results": {"add": Command("append finished runs to a results folder", _add)},
     "theory": Command("the paper's claims on finite worlds, by enumeration", _theory),
     "control-study": Command("does memory pay? told on simulator states, in minutes", _control_study),
