@@ -117,6 +117,27 @@ QUALITIES = ("expert", "medium_expert", "medium")
 CORRUPTIONS = ("patch", "patch+zero_frames")
 
 
+RECORDED = {
+    "settings": {
+        **{"preset": "paper", "steps": 50_000, "batch_size": 16, "window": 32, "learning_rate": 0.0003, "max_k": 15},
+        **{"frame_encoder": "drq", "precision": "bf16", "feature_dim": 256, "hidden_dim": 256, "gru_layers": 1},
+        **{"shift": 4, "history": "method", "head": "kmeans", "codes": 20, "k_embedding": True, "norm_weight": 0.0},
+        **{"corruption_mode": "resample", "patch_size": 16, "patch_count": 1, "patch_fill": 0, "zeroed_frames": 2},
+    },
+    "config": {
+        **{"preset": "paper", "algorithm": "td3_bc", "batch_size": 256, "hidden_dim": 1024, "learning_rate": 0.0003},
+        **{"views": 4, "shift": 4, "precision": "bf16", "eval_every": 1000, "eval_episodes": 10, "eval_clean": True},
+        **{"workers": 4, "device": "auto", "log_every": 500, "gamma": 0.99, "n_step": 3, "alpha": 2.5},
+    },
+    "versions": dict.fromkeys(("python", "torch", "numpy", "mujoco", "dm-control", "h5py", "gymnasium"), "2.13.0+cpu"),
+    "encoder": {
+        **{"action_dim": 6, "frame_encoder": "drq", "feature_dim": 256, "history": "gru", "use_actions": True},
+        **{"hidden_dim": 256, "gru_layers": 1, "history_window": 0, "readout": "state", "channels": 9, "size": 84},
+    },
+}
+"""Of what a run records, that which is the same for all."""
+
+
 def write_grid(out: Path, seeds: int = 23, evaluations: int = 3, episodes: int = 10) -> int:
     """A results folder of the paper's grid with made-up scores; returns the number of its runs."""
     rng = np.random.default_rng(0)
@@ -151,25 +172,12 @@ def grid_run(out: Path, labels: dict[str, Any], evaluations: int, episodes: int,
             | {"score": score, "evaluated_under": labels["corruption"], "action_error": None}
             for i, score in enumerate(scores)
         ]
-    settings = {
-        "preset": "paper",
-        "method": labels["method"],
-        "steps": 50_000,
-        "max_k": 15,
-        "corruption": labels["corruption"],
-    }
-    settings |= {"batch_size": 16, "window": 32, "patch_size": 16, "feature_dim": 256, "history": "method", "shift": 4}
-    card = {"method": labels["method"], "seed": labels["seed"], "settings": settings, "action_loss": rng.uniform(1, 3)}
-    config = {
-        "preset": "paper",
-        "algorithm": "td3_bc",
-        "seed": labels["seed"],
-        "updates": 1000 * evaluations,
-        "views": 4,
-    }
+    settings = RECORDED["settings"] | {"method": labels["method"], "corruption": labels["corruption"]}
     data = f"{labels['task']}-{labels['quality']}"
-    record = {"format": 3, "stage": "finetune", "config": config, "inputs": {"data": data}, "git_commit": "abc"}
-    record |= {"versions": {"torch": "2.13.0", "numpy": "2.4.6"}, "command": "vd4rl-pomdp finetune --preset paper"}
+    card = {"method": labels["method"], "seed": labels["seed"], "settings": settings, "data": data}
+    config = RECORDED["config"] | {"seed": labels["seed"], "updates": 1000 * evaluations, "out": f"runs/{labels}"}
+    record = {"format": 3, "stage": "finetune", "config": config, "inputs": {"data": data}, "git_commit": "0" * 40}
+    record |= {"versions": RECORDED["versions"], "command": f"vd4rl-pomdp finetune --preset paper {labels}"}
     files = {
         "config": record,
         "labels": labels,
@@ -178,6 +186,6 @@ def grid_run(out: Path, labels: dict[str, Any], evaluations: int, episodes: int,
         "pretrain_timing": {"seconds": rng.uniform(100, 900)},
         "probe": {"probe_pose": rng.uniform(10, 60), "probe_velocity": rng.uniform(10, 60)},
         "reference": {"data_return": 800.0, "actor": None, "path_error": 0.1},
-        "encoder": {"pretrain": card | {"data": data}},
+        "encoder": {"encoder": RECORDED["encoder"], "pretrain": card | {"action_loss": rng.uniform(1, 3)}},
     }
-    return Result(identity(record, card | {"data": data}), out, files, 1000 * evaluations, [], rows)
+    return Result(identity(record, card), out, files, 1000 * evaluations, [], rows)

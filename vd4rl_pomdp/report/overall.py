@@ -14,7 +14,7 @@ from vd4rl_pomdp.runs.files import Row
 SERIES = ("corruption", "algorithm", "method", "variant")
 THRESHOLDS = np.linspace(0, 100, 101)
 """Scores at which a performance profile is computed."""
-MANY = 5_000
+MANY = 2_000
 """Bootstrap samples of each of the many intervals of a profile or a matrix."""
 AGGREGATES = ("iqm", "median", "mean", "optimality_gap")
 _NUMBERS = tuple(f"{name}{end}" for name in AGGREGATES for end in ("", "_low", "_high"))
