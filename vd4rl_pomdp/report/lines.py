@@ -60,7 +60,7 @@ def _curves(axes: Axes, rows: list[Row], looks: dict[str, int]) -> None:
         steps = [row["step"] for row in mine]
         axes.plot(steps, [row["score"] for row in mine], lw=1.3, markersize=4, **look)
         low, high = ([row[end] for row in mine] for end in ("low", "high"))
-        axes.fill_between(steps, low, high, color=look["color"], alpha=0.12, lw=0)
+        axes.fill_between(steps, low, high, color=look["color"], alpha=0.08, lw=0)
     axes.set_xlim(left=0)
     axes.set_ylim(0, 1.05 * max(row["high"] for row in rows) or 1)
     axes.set_xlabel("gradient updates", fontsize=8)
