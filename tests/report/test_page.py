@@ -144,6 +144,8 @@ def test_a_report_of_five_thousand_runs_drops_nothing_and_stays_small(tmp_path):
     assert (tmp_path / "out" / "runs.jsonl").read_bytes() == (tmp_path / "grid" / "runs.jsonl").read_bytes()
     text = page.read_text()
     assert all(f"<td>{method}</td>" in text for method in METHODS)
+    panels = re.findall(r"<!-- cheetah_run (\w+) -->", text)
+    assert panels[:3] == ["expert", "medium_expert", "medium"], "the paper's qualities first, a row each"
 
 
 def test_runs_of_a_condition_share_one_entry(tmp_path):

@@ -246,6 +246,9 @@ def test_a_report_of_rows_is_that_of_the_folders(tmp_path):
     for file in sorted((tmp_path / "one").rglob("*.*")):
         text, other = (path.read_text() for path in (file, tmp_path / "two" / file.relative_to(tmp_path / "one")))
         assert text.replace(str(runs / "acro1"), "HERE") == other.replace(str(tmp_path / "one"), "HERE"), file.name
+    rows = (tmp_path / "two" / "runs.jsonl").read_bytes()
+    assert write_report([tmp_path / "two"], tmp_path / "two").summary == first.summary, "beside the rows"
+    assert (tmp_path / "two" / "runs.jsonl").read_bytes() == rows
 
 
 HOSTILE = '$\\frac$ <b>=1+1</b>, "x"|`y`\n[/red]_\u2028μ'
