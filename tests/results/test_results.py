@@ -118,6 +118,7 @@ def test_runs_of_early_versions_are_told_apart_by_their_labels(tmp_path):
 
 BAD = {
     "runs.jsonl": [
+        (lambda text: "", "is empty"),
         (lambda text: text[:40], "line 1: its files are damaged"),
         (lambda text: text + text, "names a run twice"),
         (lambda text: text.replace('"stage"', '"scene"', 1), "line 1: its files are damaged"),
@@ -125,6 +126,8 @@ BAD = {
         (lambda text: text.replace('"seconds": 3.0', '"seconds": "x"'), "its files are damaged"),
     ],
     "episodes.csv": [
+        (lambda text: "", "has 0 of 2 rows of run"),
+        (lambda text: text.rpartition("\n")[0].rpartition("\n")[0] + "\n", "has 1 of 2 rows of run"),
         (lambda text: text.replace("id,", "name,", 1), "has no column 'id'"),
         (lambda text: text[:-20], "a row is not whole"),
     ],
