@@ -23,6 +23,10 @@ _LEGEND = (
 )
 _PUBLISHED = {"bc": (":", "BC"), "drq_bc": ("--", "DrQ+BC")}
 """Published methods that are drawn as lines: their dashes and their names."""
+_WIDEST = 4
+"""Panels in a row, at most."""
+_KEYS = ("task", "quality", "corruption")
+_COLUMNS = ("kind", *_KEYS, "method", "seed", "score", "low", "high", "seeds", "best_score", "missing")
 
 
 def bar_plots(
@@ -48,7 +52,8 @@ def bar_plots(
 def _plot(
     corruption: str, summary: list[Row], runs: list[Row], looks: dict[str, int], published: list[dict[str, str]]
 ) -> Plot:
-    places, columns = grid_of(summary, _quality_order)
+    places, tasks = grid_of(summary, _quality_order)
+    columns = min(tasks, _WIDEST)
     by_place = {key: members for key, members in grouped(summary, ("task", "quality"))}
     seeds = {key: members for key, members in grouped(runs, ("task", "quality"))}
     names = {label(row) for row in summary}
@@ -62,7 +67,7 @@ def _plot(
         for row in published:
             if (row["env"], row["dataset"]) == place:
                 _lines(panel, row)
-    for panel in axes[::columns] if "" not in titles else axes:
+    for panel in axes if "" in titles else axes[::columns]:
         panel.set_ylabel("score (return / 10)", fontsize=8)
     rows = [_row(row) for row in summary] + [
         {"kind": "seed", **{k: row[k] for k in _KEYS}, "method": label(row), "seed": row["seed"], "score": row["score"]}
@@ -75,10 +80,6 @@ def _plot(
         figure,
         [dict.fromkeys(_COLUMNS) | row for row in rows],
     )
-
-
-_KEYS = ("task", "quality", "corruption")
-_COLUMNS = ("kind", *_KEYS, "method", "seed", "score", "low", "high", "seeds", "best_score", "missing")
 
 
 def _row(row: Row) -> Row:

@@ -6,7 +6,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from vd4rl_pomdp.report.figures import COLOURS, Plot, file_name, panels, style
+from vd4rl_pomdp.report.figures import COLOURS, Plot, file_name, panels, seeds_note, style
 from vd4rl_pomdp.report.measures import COSTS, PROBES
 from vd4rl_pomdp.report.tables import by_label, grouped, label
 from vd4rl_pomdp.runs.files import Row
@@ -94,10 +94,9 @@ def cost_plots(costs: list[Row]) -> list[Plot]:
     axes.set_position((left, place.y0, place.x1 - left, place.height))
     figure.legend(frameon=False, fontsize=8, loc="lower right", ncols=2)
     words = "; ".join(f"{row['method']} {_seconds(row)} seconds" for row in rows)
-    counts = [row["runs"] for row in rows]
     caption = (
-        "Cost of pretraining and fine-tuning, mean wall-clock time over the finished runs of all settings "
-        f"(n = {min(counts)} to {max(counts)} runs a method), on the machines of the table."
+        "Cost of pretraining and fine-tuning: mean wall-clock time over a method's finished runs of all settings, on "
+        f"the machines of the table. {seeds_note(rows, 'runs', 'run')}"
     )
     return [Plot("costs", caption, words, figure, rows)]
 

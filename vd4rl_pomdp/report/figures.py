@@ -9,6 +9,7 @@ from dataclasses import dataclass
 from math import ceil
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import matplotlib as mpl
 from matplotlib.axes import Axes
@@ -151,8 +152,13 @@ def seeds_note(rows: Sequence[Row], name: str = "seeds", noun: str = "seed") -> 
 
 
 def file_name(*words: str) -> str:
-    """A name for files that says what is in them, whatever a corruption is called."""
-    return "_".join(re.sub(r"[^A-Za-z0-9+.-]+", "-", word).strip("-.") or "x" for word in words)
+    """A name for files that says what is in them, whatever a corruption is called, and differs where the words do."""
+    return "_".join(map(_plain_word, filter(None, words)))
+
+
+def _plain_word(word: str) -> str:
+    plain_word = re.sub(r"[^A-Za-z0-9+._-]+", "-", word).strip("-.")
+    return plain_word if plain_word == word else f"{plain_word}-{crc32(word.encode(errors='replace')):08x}"
 
 
 def to_svg(figure: Figure) -> str:
