@@ -36,7 +36,9 @@ class Case:
 
 
 NAMES = [name for name, entry in COMMANDS.items() if not isinstance(entry, Mapping)] + [
-    f"{group} {name}" for group, entry in COMMANDS.items() if isinstance(entry, Mapping) for name in entry
+    f"{group} {name}"
+    for group, entry in COMMANDS.items()
+    for name in (entry if isinstance(entry, Mapping) else entry.inner)
 ]
 """Every command."""
 SET, MAZE, ENCODER = "data/walker_walk/random", "data/no_curtain", "runs/pretrained/encoder"
@@ -71,6 +73,8 @@ VALID: dict[str, Words] = {
     "sweep retry": ["swept"],
     "sweep list": [],
     "report": ["runs", "--out", "new"],
+    "report compare": ["runs", "reports/results", "--out", "new"],
+    "results add": ["runs", "--out", "new"],
     "theory": [],
     "control-study": ["--out", "new", *STUDY],
     "bench": ["--quick"],

@@ -38,6 +38,8 @@ NOT_RUN = {
     "vd4rl-pomdp policy": "trains for hours; tests/policies trains less",
     "vd4rl-pomdp control-study": "trains for minutes; experiments/control trains less",
     "vd4rl-pomdp navigation": "trains for minutes to days; pretrain/navigation/test_train trains less",
+    "vd4rl-pomdp report": "the README's is run; tests/report makes all others",
+    "vd4rl-pomdp results add": "tests/results adds runs",
     "vd4rl-pomdp pretrain --method": "pretrain/test_train runs every method in its smoke size",
     "vd4rl-pomdp finetune --encoder RUN": "as above",
     "vd4rl-pomdp sweep": "trains for minutes; tests/sweeps trains less",

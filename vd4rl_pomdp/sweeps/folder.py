@@ -62,7 +62,7 @@ class SweepFolder:
 
     def of_executor(self, name: str) -> Path:
         """Folder of what an executor keeps."""
-        return self._folder / name
+        return self.path / name
 
     def add(self, row: Row) -> None:
         """Append the row of an attempt."""
