@@ -66,6 +66,8 @@ class FinetuneConfig(StageConfig):
     """Updates between two checkpoints."""
     wandb: WandbMode = "off"
     """Mirror metrics to wandb: off, offline or online."""
+    tensorboard: bool = False
+    """Mirror metrics to TensorBoard, in OUT/tensorboard."""
     options: Annotated[Options, tyro.conf.arg(name="algorithm")] = NO_OPTIONS
     """What the chosen algorithm can be told."""
     memory: Annotated[Options, tyro.conf.arg(name="memory")] = NO_OPTIONS

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import Counter
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -33,7 +33,15 @@ from vd4rl_pomdp.evaluation import (
     read_episodes,
 )
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.encoder_folder import CONFIG, EncoderCard, copy_encoder, encoder_hash, load_encoder, save_encoder
+from vd4rl_pomdp.nn.encoder_folder import (
+    CONFIG,
+    EncoderCard,
+    copy_encoder,
+    encoder_hash,
+    load_encoder,
+    save_encoder,
+    tell_probe,
+)
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.options import NO_OPTIONS, flat
 from vd4rl_pomdp.policies.actor import read_actor
@@ -41,9 +49,10 @@ from vd4rl_pomdp.probes import probe_state
 from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.files import read_json, replacing_file, write_json
+from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.loop import Loop, training
 from vd4rl_pomdp.runs.memory import require_disk, require_memory, telling_memory
+from vd4rl_pomdp.runs.metrics import EVALUATION
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
@@ -187,7 +196,9 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     if dataset.physics is None or dataset.task is None or (run.path / "probe.json").exists():
         return
     arrays = features[0, : dataset.num_rows].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
-    write_json(run.path / "probe.json", probe_state(*arrays, layout_of(TASKS.named(dataset.task))))
+    errors = probe_state(*arrays, layout_of(TASKS.named(dataset.task)))
+    tell_probe(run.path / "encoder", errors)
+    write_json(run.path / "probe.json", errors)
 
 
 class FinetuneTrainer:
@@ -212,8 +223,10 @@ class FinetuneTrainer:
         config = self.config
         title = f"finetune {config.algorithm} on {self.card.method}"
         self.reference.write(run.path)
-        with training(run, self, title, config.updates, "updates") as loop:
-            if self._lacks_evaluation(run, loop):
+        told = {"labels": _labels(config, self.card), "card": asdict(self.card)}
+        with training(run, self, title, config.updates, "updates", **told) as loop:
+            self._drop_evaluations_after(run.path / "episodes.csv")
+            if self.step and loop.due(config.eval_every):
                 self._evaluate(run, loop)
             while self.step < config.updates:
                 loop.add(self.algorithm.update(self.sampler.sample()))  # type: ignore[arg-type]
@@ -238,18 +251,15 @@ class FinetuneTrainer:
         if missing:
             raise UserError(f"{path}: lacks the evaluation at update {missing[0]}; restore it or start another run")
 
-    def _lacks_evaluation(self, run: RunFolder, loop: Loop) -> bool:
-        """Whether the run was cut between a checkpoint and its evaluation; rows that count no more are dropped."""
-        rows = run.path / "episodes.csv"
-        self._require_evaluations(rows)
-        drop_episodes_after(rows, self.step)
-        if not self.step or not loop.due(self.config.eval_every):
-            return False
-        expected = len(self._evaluated_under()) * self.config.eval_episodes
-        if sum(row["step"] == self.step for row in read_episodes(rows)) == expected:
-            return False
-        drop_episodes_after(rows, self.step - 1)
-        return True
+    def _drop_evaluations_after(self, path: Path) -> None:
+        """Drop the rows that count no more, those after the present step; raise UserError if earlier ones are gone."""
+        self._require_evaluations(path)
+        drop_episodes_after(path, self.step)
+
+    def _evaluation(self, path: Path) -> list[Row]:
+        """The rows of the evaluation at the present step; none if there is none or the run was cut while it went on."""
+        rows = [row for row in read_episodes(path) if row["step"] == self.step]
+        return rows if len(rows) == len(self._evaluated_under()) * self.config.eval_episodes else []
 
     def _evaluated_under(self) -> list[CorruptionConfig]:
         """The corruptions of the evaluation at the present step; the run's own comes first."""
@@ -258,12 +268,21 @@ class FinetuneTrainer:
         return own_and_none(own) if clean else [own]
 
     def _evaluate(self, run: RunFolder, loop: Loop) -> None:
-        """Evaluate the present policy, whose checkpoint is kept: here a signal need not wait."""
-        with interrupt.at_once():
-            loop.show(score=self._play(run))
+        """Evaluate the present policy, unless that is done, and log the scores.
 
-    def _play(self, run: RunFolder) -> float:
-        """Keep a film of the first episode, then append the rows of all; returns the mean score as trained."""
+        Its checkpoint is kept: while it plays, a signal need not wait.
+        """
+        path = run.path / "episodes.csv"
+        if not self._evaluation(path):
+            with interrupt.at_once():
+                drop_episodes_after(path, self.step - 1)
+                self._play(run)
+        row = scores_by_corruption(self._evaluation(path))
+        loop.log_evaluation(row)
+        loop.show(score=row[f"{EVALUATION}score/{self._evaluated_under()[0].corruption}"])
+
+    def _play(self, run: RunFolder) -> None:
+        """Keep a film of the first episode, then append the rows of all."""
         config = self.config
         self.algorithm.policy.save(run.path / "policy")
         if isinstance(self.algorithm, EndToEnd):
@@ -290,7 +309,6 @@ class FinetuneTrainer:
             with replacing_file(run.path / "film.npz") as fresh, fresh.open("wb") as file:
                 np.savez_compressed(file, **episodes[0].film)  # type: ignore[arg-type]
         append_episodes(run.path / "episodes.csv", rows)
-        return float(np.mean([row["score"] for row in rows[: config.eval_episodes]]))
 
     def state(self) -> dict[str, Any]:
         """Everything needed to go on to the bit."""
@@ -302,6 +320,17 @@ class FinetuneTrainer:
         self.step = state["step"]
         self.algorithm.load_state_dict(state["algorithm"])
         self.sampler.load_state_dict(state["sampler"])
+
+
+def scores_by_corruption(rows: list[Row]) -> dict[str, float]:
+    """Mean return and score of an evaluation's episodes, by the corruption they were played under: a row of metrics."""
+    return {
+        f"{EVALUATION}{measure}/{under}": float(
+            np.mean([row[measure] for row in rows if row["evaluated_under"] == under])
+        )
+        for under in dict.fromkeys(row["evaluated_under"] for row in rows)
+        for measure in ("return", "score")
+    }
 
 
 def _labels(config: FinetuneConfig, card: EncoderCard) -> dict[str, Any]:

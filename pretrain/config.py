@@ -65,6 +65,8 @@ class TrainingConfig(StageConfig):
     """Steps between two checkpoints."""
     wandb: WandbMode = "off"
     """Mirror metrics to wandb: off, offline or online."""
+    tensorboard: bool = False
+    """Mirror metrics to TensorBoard, in OUT/tensorboard."""
     options: Annotated[Options, tyro.conf.arg(name="method")] = NO_OPTIONS
     """What the chosen method can be told."""
     memory: Options = NO_OPTIONS

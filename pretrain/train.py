@@ -57,8 +57,9 @@ def _pretrain(config: PretrainConfig) -> RunFolder:
             trainer = PretrainTrainer(objective.to(device), dataset.to(device), config)
             trainer.run(run, config.steps if method.trained else 0)
             card = _card(config, task, dataset, run)
-            save_encoder(run.path / "encoder", objective.encoder, card)
-            run.finish(steps=trainer.step, frames=trainer.step * config.batch_size * config.window)
+            frames = trainer.step * config.batch_size * config.window
+            save_encoder(run.path / "encoder", objective.encoder, card, frames)
+            run.finish(steps=trainer.step, frames=frames)
     return run
 
 
@@ -99,12 +100,17 @@ class PretrainTrainer:
 
     def run(self, run: RunFolder, steps: int) -> None:
         """Train up to `steps`, from the newest checkpoint if there is one."""
-        with training(run, self, f"pretrain {self.config.method}", steps) as loop:
+        with training(run, self, f"pretrain {self.config.method}", steps, labels=self._labels(run)) as loop:
             while self.step < steps:
                 loop.add(self.update())
                 if loop.due(self.config.log_every):
                     loop.log("loss")
                 loop.step_done(save=loop.due(self.config.checkpoint_every))
+
+    def _labels(self, run: RunFolder) -> dict[str, str]:
+        """What names the run where it is tracked."""
+        told = {name: run.config[name] for name in ("method", "task", "corruption")}
+        return told | {"quality": self.dataset.quality or "unknown"}
 
     def state(self) -> dict[str, Any]:
         """Everything needed to go on to the bit."""

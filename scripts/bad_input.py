@@ -30,6 +30,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 os.environ.setdefault("MUJOCO_GL", "egl")
+os.environ |= {"HF_ENDPOINT": "http://127.0.0.1:9", "NO_PROXY": "127.0.0.1"}  # where nobody is: nothing is sent
 sys.path.insert(0, str(Path(__file__).parent))
 
 from bad_input_files import FINE, file_cases

@@ -13,6 +13,7 @@ from bad_input_damage import ANY, BY_SUFFIX, JSON, Damage, each_place
 from bad_input_flags import ENCODER, MAZE, NAVIGATED, RUN, SET, SMOKE, STUDY, Case
 from bad_input_world import CUT
 
+ROWS = ["reports/results/runs.jsonl", "reports/results/episodes.csv"]
 READERS: list[tuple[str, list[str], list[str]]] = [
     ("data check", [SET], [f"{SET}/0_walker_walk_random.hdf5"]),
     ("data card", [SET], [f"{SET}/1_walker_walk_random.hdf5", f"{SET}/provenance.json"]),
@@ -34,6 +35,8 @@ READERS: list[tuple[str, list[str], list[str]]] = [
         ["--encoder", ENCODER, "--data", SET, "--out", "new", *SMOKE, "--workers", "1"],
         [f"{ENCODER}/config.json", f"{ENCODER}/model.safetensors"],
     ),
+    ("hub push", [ENCODER, "lab/encoder"], [f"{ENCODER}/config.json", f"{ENCODER}/model.safetensors"]),
+    ("hub push", [SET, "datasets/lab/set"], [f"{SET}/0_walker_walk_random.hdf5"]),
     *(
         (command, [*words, "--out", folder], [f"{folder}/config.json", f"{folder}/metrics.jsonl"])
         for command, (folder, words) in CUT.items()
@@ -67,6 +70,9 @@ READERS: list[tuple[str, list[str], list[str]]] = [
     ),
     ("report", ["runs", "reports/theory", "--out", "new"], ["reports/theory/theory.json"]),
     ("report", ["runs-cut/finetuning", "--out", "new"], ["runs-cut/finetuning/labels.json"]),
+    ("report", ["reports/results", "--out", "new"], ROWS),
+    ("report compare", ["runs", "reports/results", "--out", "new"], ROWS),
+    ("results add", ["runs", "--out", "reports/results"], ROWS),
     ("navigation train", ["--data", MAZE, "--out", "new", *SMOKE], [f"{MAZE}/0_no_curtain.hdf5"]),
     (
         "navigation report",

@@ -36,7 +36,9 @@ class Case:
 
 
 NAMES = [name for name, entry in COMMANDS.items() if not isinstance(entry, Mapping)] + [
-    f"{group} {name}" for group, entry in COMMANDS.items() if isinstance(entry, Mapping) for name in entry
+    f"{group} {name}"
+    for group, entry in COMMANDS.items()
+    for name in (entry if isinstance(entry, Mapping) else entry.inner)
 ]
 """Every command."""
 SET, MAZE, ENCODER = "data/walker_walk/random", "data/no_curtain", "runs/pretrained/encoder"
@@ -55,6 +57,8 @@ VALID: dict[str, Words] = {
     "data table": ["--out", "new", "--tasks", "walker_walk", "--qualities", "random"],
     "data check": [SET],
     "data parity": [SET],
+    "hub push": [ENCODER, "lab/encoder"],
+    "hub pull": ["lab/encoder", "new"],
     "policy train": ["--task", "walker_walk", "--out", "new", "--decisions", "10"],
     "policy export": ["runs/policy", "--out", "new"],
     "pretrain": ["--data", SET, "--out", "new", *SMOKE, "--corruption", "patch+zero_frames"],
@@ -69,6 +73,8 @@ VALID: dict[str, Words] = {
     "sweep retry": ["swept"],
     "sweep list": [],
     "report": ["runs", "--out", "new"],
+    "report compare": ["runs", "reports/results", "--out", "new"],
+    "results add": ["runs", "--out", "new"],
     "theory": [],
     "control-study": ["--out", "new", *STUDY],
     "bench": ["--quick"],

@@ -55,6 +55,7 @@ def _stages() -> Iterator[list[str]]:
     yield ["navigation", "train", "--data", MAZE, "--out", NAVIGATED, *SMOKE]
     yield ["navigation", "report", NAVIGATED, "--out", "reports/navigation", "--no-pictures"]
     yield ["theory", "--out", "reports/theory"]
+    yield ["results", "add", "runs", "--out", "reports/results"]
     yield ["control-study", "--out", "reports/control", *STUDY]
 
 

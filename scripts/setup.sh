@@ -48,7 +48,7 @@ if [ ! -x "$VENV/bin/python" ]; then
 fi
 say "setup: installing Python packages (a few minutes the first time)"
 pip_install() { "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt "$@"; }
-pip_install -e ".[dev,policy]"
+pip_install -e ".[dev,policy,tracking]"
 pip_install --no-deps dm-control # which Python 3.13 gets no other way; elsewhere it is there already
 
 can_render() {

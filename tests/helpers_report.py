@@ -2,6 +2,7 @@
 
 import json
 from collections import Counter
+from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -10,7 +11,9 @@ import numpy as np
 from vd4rl_pomdp.evaluation import append_episodes
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.tables import label
+from vd4rl_pomdp.results import Result, write_results
 from vd4rl_pomdp.runs.files import read_json, write_json
+from vd4rl_pomdp.runs.identity import identity
 
 
 def write_run(
@@ -69,9 +72,21 @@ def describe(run: Path, card: dict[str, Any] | None = None, data: str = "", **co
     return run
 
 
+def pretraining(place: Path) -> Path:
+    """A finished pretraining run."""
+    place.mkdir(parents=True)
+    record = {"stage": "pretrain", "config": {"method": "acro", "seed": 0, "steps": 2}, "inputs": {"data": "f00"}}
+    write_json(place / "config.json", record)
+    lines = [{"step": 1, "action_loss": 0.5, "norm": 3.0}, {"step": 2, "action_loss": 0.25}]
+    (place / "metrics.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    write_json(place / "timing.json", {"seconds": 3.0, "steps": 2})
+    return place
+
+
 def pooled(folder: Path) -> dict[str, int]:
     """Seeds by the label under which a folder's runs are pooled."""
-    return dict(Counter(label(row) for run in load_runs([folder]) for row in run.rows))
+    runs = load_runs([folder])
+    return dict(Counter(label(run.labels | {"variant": run.variant}) for run in runs for _ in run.rows))
 
 
 def grid(tmp_path: Path) -> Path:
@@ -81,3 +96,96 @@ def grid(tmp_path: Path) -> Path:
             describe(write_run(tmp_path / f"runs/{method}{seed}", method, seed, {5: [1.0], 10: [20.0 + seed]}), {})
     describe(write_run(tmp_path / "runs/medium", "acro", 0, {10: [9.0]}, labels={"quality": "medium"}), {})
     return tmp_path / "runs"
+
+
+METHODS = (
+    "mik+a",
+    "mik",
+    "ah+a",
+    "ah",
+    "fj+a",
+    "fj",
+    "no_history",
+    "acro",
+    "one_step_inverse",
+    "curl",
+    "driml",
+    "random",
+)
+TASKS = ("walker_walk", "cheetah_run", "humanoid_walk")
+QUALITIES = ("expert", "medium_expert", "medium")
+CORRUPTIONS = ("patch", "patch+zero_frames")
+
+
+RECORDED = {
+    "settings": {
+        **{"preset": "paper", "steps": 50_000, "batch_size": 16, "window": 32, "learning_rate": 0.0003, "max_k": 15},
+        **{"frame_encoder": "drq", "precision": "bf16", "feature_dim": 256, "hidden_dim": 256, "gru_layers": 1},
+        **{"shift": 4, "history": "method", "head": "kmeans", "codes": 20, "k_embedding": True, "norm_weight": 0.0},
+        **{"corruption_mode": "resample", "patch_size": 16, "patch_count": 1, "patch_fill": 0, "zeroed_frames": 2},
+    },
+    "config": {
+        **{"preset": "paper", "algorithm": "td3_bc", "batch_size": 256, "hidden_dim": 1024, "learning_rate": 0.0003},
+        **{"views": 4, "shift": 4, "precision": "bf16", "eval_every": 1000, "eval_episodes": 10, "eval_clean": True},
+        **{"workers": 4, "device": "auto", "log_every": 500, "gamma": 0.99, "n_step": 3, "alpha": 2.5},
+    },
+    "versions": dict.fromkeys(("python", "torch", "numpy", "mujoco", "dm-control", "h5py", "gymnasium"), "2.13.0+cpu"),
+    "encoder": {
+        **{"action_dim": 6, "frame_encoder": "drq", "feature_dim": 256, "history": "gru", "use_actions": True},
+        **{"hidden_dim": 256, "gru_layers": 1, "history_window": 0, "readout": "state", "channels": 9, "size": 84},
+    },
+}
+"""Of what a run records, that which is the same for all."""
+
+
+def write_grid(out: Path, seeds: int = 23, evaluations: int = 3, episodes: int = 10) -> int:
+    """A results folder of the paper's grid with made-up scores; returns the number of its runs."""
+    rng = np.random.default_rng(0)
+    runs = [
+        grid_run(out, labels, evaluations, episodes, rng)
+        for task, quality, corruption, method in product(TASKS, QUALITIES, CORRUPTIONS, METHODS)
+        for labels in (
+            {
+                "method": method,
+                "task": task,
+                "quality": quality,
+                "corruption": corruption,
+                "algorithm": "td3_bc",
+                "seed": seed,
+            }
+            for seed in range(seeds)
+        )
+    ]
+    write_results(out, runs)
+    return len(runs)
+
+
+def grid_run(out: Path, labels: dict[str, Any], evaluations: int, episodes: int, rng: np.random.Generator) -> Result:
+    """A finished run with scores around a level of its own method, task and quality."""
+    level = 75 - 5 * METHODS.index(labels["method"]) - 4 * QUALITIES.index(labels["quality"]) + rng.normal(0, 6)
+    rows = []
+    for number in range(1, evaluations + 1):
+        scores = np.clip(level * number / evaluations + rng.normal(0, 8, episodes), 0, 100).round(4).tolist()
+        rows += [
+            labels
+            | {"step": 1000 * number, "episode": i, "episode_seed": 20_000 + i, "return": 10 * score, "length": 500}
+            | {"score": score, "evaluated_under": labels["corruption"], "action_error": None}
+            for i, score in enumerate(scores)
+        ]
+    settings = RECORDED["settings"] | {"method": labels["method"], "corruption": labels["corruption"]}
+    data = f"{labels['task']}-{labels['quality']}"
+    card = {"method": labels["method"], "seed": labels["seed"], "settings": settings, "data": data}
+    config = RECORDED["config"] | {"seed": labels["seed"], "updates": 1000 * evaluations, "out": f"runs/{labels}"}
+    record = {"format": 3, "stage": "finetune", "config": config, "inputs": {"data": data}, "git_commit": "0" * 40}
+    record |= {"versions": RECORDED["versions"], "command": f"vd4rl-pomdp finetune --preset paper {labels}"}
+    files = {
+        "config": record,
+        "labels": labels,
+        "timing": {"seconds": rng.uniform(100, 900)},
+        "machine": {"processor": "two cores", "cores": 2},
+        "pretrain_timing": {"seconds": rng.uniform(100, 900)},
+        "probe": {"probe_pose": rng.uniform(10, 60), "probe_velocity": rng.uniform(10, 60)},
+        "reference": {"data_return": 800.0, "actor": None, "path_error": 0.1},
+        "encoder": {"encoder": RECORDED["encoder"], "pretrain": card | {"action_loss": rng.uniform(1, 3)}},
+    }
+    return Result(identity(record, card), out, files, 1000 * evaluations, [], rows)

@@ -152,7 +152,7 @@ def command_of(config: NavigationConfig) -> list[str]:
     words = ["vd4rl-pomdp", "navigation", "train", "--preset", config.preset]
     usual = config.usual() | config.defaults(config.preset)
     for name, value in flat(config).items():
-        if name in ("preset", "device", "wandb") or value == usual.get(name):
+        if name in ("preset", "device", "wandb", "tensorboard") or value == usual.get(name):
             continue
         flag = flag_of(name)
         words += [f"--{'' if value else 'no-'}{flag[2:]}"] if isinstance(value, bool) else [flag, str(value)]

@@ -64,8 +64,8 @@ def _conclude(run: RunFolder, trainer: NavigationTrainer) -> None:
         data=data.dataset.fingerprint,
         settings=settings_of(jsonable(flat(config))),
     )
-    save_encoder(run.path / "encoder", trainer.objective.encoder, card)
+    frames = trainer.step * config.batch_size * config.window
+    save_encoder(run.path / "encoder", trainer.objective.encoder, card, frames)
     record = {"maze": data.maze.name, "set": data.dataset.fingerprint, "command": shlex.join(command_of(config))}
     write_json(run.path / "results.json", record | {"rows": rows})
-    frames = trainer.step * config.batch_size * config.window
     run.finish(seconds=round(trained, 2), steps=trainer.step, frames=frames, total_seconds=round(run.seconds, 2))

@@ -86,7 +86,8 @@ class NavigationTrainer:
 
     def run(self, run: RunFolder, steps: int) -> None:
         """Train up to `steps`, from the newest checkpoint if there is one."""
-        with training(run, self, f"{self.data.maze.name} {self.config.method}", steps) as loop:
+        labels = {"method": self.config.method, "task": self.data.maze.name}
+        with training(run, self, f"{self.data.maze.name} {self.config.method}", steps, labels=labels) as loop:
             while self.step < steps:
                 logs, states = self.update()
                 loop.add(logs)

@@ -10,7 +10,7 @@ from vd4rl_pomdp.cli.parsing import show
 NAMES = [
     [name, *([inner] if inner else [])]
     for name, entry in COMMANDS.items()
-    for inner in (entry if isinstance(entry, dict) else [None])
+    for inner in (entry if isinstance(entry, dict) else [None, *entry.inner])
 ]
 
 

@@ -1,4 +1,5 @@
 import hashlib
+import os
 import re
 import threading
 from collections import Counter
@@ -31,6 +32,8 @@ class Mirror:
         )
         self.requests = []
         """(path, Range header or None) of every request."""
+        self.tokens = []
+        """Authorization header or None, likewise."""
         self.ranges = True
         self.cuts = Counter()
         """How often a path's answer breaks off after 1000 bytes."""
@@ -40,6 +43,7 @@ class Mirror:
     def answer(self, handler):
         path, wanted = handler.path.removeprefix(PREFIX), handler.headers["Range"]
         self.requests.append((path, wanted))
+        self.tokens.append(handler.headers["Authorization"])
         if self.status or path not in self.files:
             return handler.send_error(self.status.pop(0) if self.status else 404)
         body = self.files[path]
@@ -141,6 +145,37 @@ def test_a_wrong_hash_removes_the_file(mirror, tmp_path):
     with pytest.raises(UserError, match=r"1_a_expert\.hdf5: has a wrong SHA-256 and was removed"):
         fetch(mirror, tmp_path)
     assert names(tmp_path / EXPERT) == ["0_a_expert.hdf5"]
+
+
+def test_huggingface_hubs_endpoint_and_token_are_used_and_the_token_goes_nowhere_else(mirror, tmp_path, monkeypatch):
+    monkeypatch.setenv("HF_TOKEN", "hf_mine")
+    monkeypatch.setenv("HF_ENDPOINT", mirror.endpoint)
+    download("walker_walk", "expert", tmp_path / "a")
+    monkeypatch.setenv("HF_ENDPOINT", f"{mirror.endpoint}0")
+    fetch(mirror, tmp_path / "b")
+    assert mirror.tokens == ["Bearer hf_mine"] * 2 + [None] * 2
+    assert (tmp_path / "a" / EXPERT / "0_a_expert.hdf5").read_bytes() == CONTENT["0_a_expert.hdf5"]
+
+
+def test_a_set_has_one_owner_while_it_is_downloaded(mirror, tmp_path, monkeypatch):
+    receive, refused = module._receive, []
+
+    def meanwhile(*arguments):
+        with pytest.raises(UserError, match=rf"84px: is in use by process {os.getpid()} on"):
+            fetch(mirror, tmp_path)
+        refused.append(1)
+        return receive(*arguments)
+
+    monkeypatch.setattr(module, "_receive", meanwhile)
+    fetch(mirror, tmp_path)
+    assert len(refused) == 2
+    assert names(tmp_path / EXPERT) == ["0_a_expert.hdf5", "1_a_expert.hdf5"]
+
+
+def test_a_set_that_is_there_needs_no_folder_that_may_be_written(mirror, tmp_path, monkeypatch):
+    shards = fetch(mirror, tmp_path)
+    monkeypatch.setattr(module, "owned", lambda folder: pytest.fail("owned"))
+    assert fetch(mirror, tmp_path) == shards
 
 
 def test_equal_files_are_fetched_and_stored_once(mirror, tmp_path):

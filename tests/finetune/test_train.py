@@ -22,6 +22,8 @@ from vd4rl_pomdp.runs import memory
 from vd4rl_pomdp.runs.metrics import read_metrics
 
 pytestmark = pytest.mark.usefixtures("own_cache")
+CORRUPTION = "patch+zero_frames"
+"""What `encoder` was pretrained under."""
 
 
 def finetune_cut_and_whole(monkeypatch, encoder: Path, data: Path, out: Path, **changes: object) -> Path:
@@ -144,7 +146,45 @@ def test_a_row_lacks_what_no_step_since_the_row_before_gave(encoder, data, tmp_p
     """The actor learns at every other update only; also where a run is cut in between."""
     changes = {"updates": 6, "log_every": 1, "checkpoint_every": 1, "eval_every": 6, "batch_size": 4, "eval_length": 2}
     whole = finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
-    assert ["actor_loss" in row for row in read_metrics(whole / "metrics.jsonl")] == [False, True] * 3
+    rows = read_metrics(whole / "metrics.jsonl")
+    assert ["actor_loss" in row for row in rows[:-1]] == [False, True] * 3
+    assert set(rows[-1]) == {"step", *(f"eval/{m}/{u}" for m in ("return", "score") for u in (CORRUPTION, "none"))}
+
+
+def test_scores_are_rows_of_metrics_by_what_was_evaluated_under(encoder, data, tmp_path):
+    changes = {"updates": 4, "eval_every": 2, "eval_episodes": 2, "batch_size": 4, "eval_length": 2}
+    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **changes))
+    episodes = list(csv.DictReader((run.path / "episodes.csv").open()))
+    rows = [row for row in read_metrics(run.path / "metrics.jsonl") if any("eval/" in name for name in row)]
+    assert [row["step"] for row in rows] == [2, 4]
+    for row in rows:
+        for under in (CORRUPTION, "none")[: row["step"] // 2]:
+            mine = [e for e in episodes if (int(e["step"]), e["evaluated_under"]) == (row["step"], under)]
+            assert len(mine) == 2
+            for measure in ("return", "score"):
+                expected = np.mean([float(episode[measure]) for episode in mine])
+                assert row[f"eval/{measure}/{under}"] == pytest.approx(expected, abs=1e-12)
+    assert "eval/score/none" not in rows[0]
+
+
+@pytest.mark.parametrize("place", ["append_episodes", "scores_by_corruption", "after the row"])
+def test_a_run_cut_around_an_evaluation_has_the_metrics_of_a_whole_one(encoder, data, tmp_path, monkeypatch, place):
+    changes = {"updates": 4, "eval_every": 2, "checkpoint_every": 2, "batch_size": 4, "eval_length": 2, "log_every": 1}
+    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes))
+    cut = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
+
+    def end(*_, **__):
+        raise CutError
+
+    with monkeypatch.context() as patch:
+        if place == "after the row":
+            patch.setattr("vd4rl_pomdp.runs.loop.Loop.show", lambda self, **shown: end() if "score" in shown else None)
+        else:
+            patch.setattr(f"finetune.train.{place}", end)
+        with pytest.raises(CutError):
+            run_finetune(cut)
+    run_finetune(cut)
+    assert contents(cut.out) == contents(whole.path)
 
 
 def test_features_that_are_a_pipe_are_refused(encoder, data, tmp_path, monkeypatch):

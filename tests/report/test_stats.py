@@ -1,9 +1,19 @@
 """Statistics on scores whose answers are known."""
 
+import json
+from pathlib import Path
+
 import numpy as np
 import pytest
+import scipy.stats
 
 from vd4rl_pomdp.report import stats
+
+RLIABLE = json.loads((Path(__file__).parent / "rliable.json").read_text())
+"""Scores, and what an independent implementation says of them: scripts/reference_statistics.py."""
+METHODS = {name: [np.array(task) for task in tasks] for name, tasks in RLIABLE["scores"].items()}
+AGREES = 0.002
+"""Largest difference from its bootstrap's intervals, of scores between 0 and 1."""
 
 
 def test_iqm_drops_the_outer_quarters():
@@ -16,17 +26,27 @@ def test_iqm_drops_the_outer_quarters():
 
 def test_other_statistics_on_known_values():
     assert stats.optimality_gap(np.array([50.0, 150.0])) == pytest.approx(25.0)
-    assert stats.probability_of_improvement(np.array([1.0, 2.0]), np.array([1.0, 0.0])) == pytest.approx(0.875)
+    assert stats.probability_of_improvement([np.array([1.0, 2.0])], [np.array([1.0, 0.0])]) == pytest.approx(0.875)
+    assert stats.median_of_tasks([2, 1, 1])(np.array([0.0, 4.0, 9.0, 1.0])) == 2.0, "of the tasks' means 2, 9, 1"
     assert stats.performance_profile(np.array([1.0, 3.0]), np.array([0.0, 2.0, 4.0])).tolist() == [1.0, 0.5, 0.0]
 
 
-def test_the_bootstrap_covers_a_known_mean_and_keeps_tasks_apart():
-    rng = np.random.default_rng(0)
-    hits = 0
-    for _ in range(200):
-        low, high = stats.bootstrap_interval([rng.normal(5, 1, 30)], stats.mean, rng, 500)
+@pytest.mark.parametrize("count", [5, 10, 30])
+def test_the_bootstrap_covers_as_theory_predicts(count):
+    rng = np.random.default_rng(count)
+    hits, trials = 0, 2000
+    for _ in range(trials):
+        low, high = stats.bootstrap_interval([rng.normal(5, 1, count)], stats.mean, rng, 1000)
         hits += low <= 5 <= high
-    assert 0.88 <= hits / 200 <= 0.99
+    # resampled means spread by sqrt((n - 1) / n) standard errors, and the true mean is t-distributed about the sample's
+    reach = scipy.stats.norm.ppf(0.975) * np.sqrt((count - 1) / count)
+    expected = 1 - 2 * scipy.stats.t.sf(reach, count - 1)
+    assert hits / trials == pytest.approx(expected, abs=3 * np.sqrt(expected * (1 - expected) / trials))
+    assert expected < 0.95
+
+
+def test_the_bootstrap_keeps_tasks_apart():
+    rng = np.random.default_rng(0)
     # tasks far apart, no spread within: drawing across tasks would give an interval, drawing within gives none
     low, high = stats.bootstrap_interval([np.full(4, 0.0), np.full(4, 100.0)], stats.mean, rng, 500)
     assert low == high == 50.0
@@ -37,3 +57,71 @@ def test_the_bootstrap_of_a_mean_is_as_wide_as_its_standard_error():
     scores = np.arange(100) % 2.0  # a standard deviation of a half
     low, high = stats.bootstrap_interval([scores], stats.mean, np.random.default_rng(0))
     assert (low, high) == pytest.approx((0.5 - 1.96 * 0.05, 0.5 + 1.96 * 0.05), abs=0.006)
+
+
+@pytest.mark.parametrize("name", list(METHODS))
+@pytest.mark.parametrize("statistic", ["iqm", "median", "mean", "optimality_gap"])
+def test_aggregates_are_those_of_an_independent_implementation(name, statistic):
+    strata = METHODS[name]
+    chosen = stats.aggregates(strata)
+    chosen["optimality_gap"] = lambda scores: stats.optimality_gap(scores, 1.0)
+    value, low, high = RLIABLE["statistics"][name][statistic]
+    assert chosen[statistic](np.concatenate(strata)) == pytest.approx(value, abs=1e-9)
+    found = stats.bootstrap_interval(strata, chosen[statistic], np.random.default_rng(0), 100_000)
+    assert found == pytest.approx((low, high), abs=AGREES)
+
+
+@pytest.mark.parametrize("name", list(METHODS))
+def test_profiles_are_those_of_an_independent_implementation(name):
+    told, thresholds = RLIABLE["statistics"][name], np.array(RLIABLE["thresholds"])
+    shares = stats.performance_profile(np.concatenate(METHODS[name]), thresholds)
+    assert shares == pytest.approx(np.array(told["profile"]), abs=1e-9)
+    low, high = stats.profile_band(METHODS[name], thresholds, np.random.default_rng(0))
+    # shares are multiples of 1/32, and so are the ends of both bands: between two of them they may part
+    step = 1 / sum(map(len, METHODS[name]))
+    for found, expected in ((low, told["low"]), (high, told["high"])):
+        assert found == pytest.approx(np.array(expected), abs=step + 1e-9)
+        assert np.mean(np.abs(found - expected) < AGREES) >= 0.8
+
+
+def test_improvement_is_that_of_independent_implementations():
+    one, other = METHODS["one"], METHODS["other"]
+    chance, low, high = RLIABLE["improvement"]
+    found = stats.probability_of_improvement(one, other)
+    assert found == pytest.approx(chance, abs=1e-9)
+    u = [scipy.stats.mannwhitneyu(a, b).statistic / (len(a) * len(b)) for a, b in zip(one, other, strict=True)]
+    assert found == pytest.approx(np.mean(u), abs=1e-12)
+    assert stats.improvement_interval(one, other, np.random.default_rng(0)) == pytest.approx((low, high), abs=0.005)
+
+
+@pytest.mark.parametrize("count", [4, 5, 7, 12, 15])
+def test_iqm_is_scipys_trimmed_mean_where_the_quartiles_fall_between_runs_and_else_within_their_neighbours(count):
+    scores = np.random.default_rng(count).normal(50, 20, count)
+    trimmed = scipy.stats.trim_mean(scores, 0.25)
+    assert (abs(stats.iqm(scores) - trimmed) < 1e-9) == (count % 4 == 0)
+    repeated = scipy.stats.trim_mean(np.repeat(scores, 4), 0.25)
+    assert stats.iqm(scores) == pytest.approx(repeated), "four copies of each run: a quarter is whole runs"
+
+
+def test_one_seed_gives_no_interval_and_a_seed_of_draws_gives_the_same_one():
+    rng = np.random.default_rng
+    one, many, thresholds = [np.array([1.0])], [np.arange(5.0)], np.array([1.0])
+    assert stats.improvement_interval(one, many, rng(0)) is None
+    assert stats.improvement_interval(many, one, rng(0)) is None
+    assert stats.profile_band([*one, *many], thresholds, rng(0)) is None
+    assert stats.difference_interval(one[0], many[0], rng(0)) is None
+    for draw in (
+        lambda seed: stats.bootstrap_interval(many, stats.iqm, rng(seed)),
+        lambda seed: stats.improvement_interval(many, [np.arange(1.0, 6.0)], rng(seed)),
+        lambda seed: stats.difference_interval(many[0], np.arange(1.0, 9.0) ** 2, rng(seed), 50),
+        lambda seed: [*map(float, np.concatenate(stats.profile_band(many, np.arange(4.0), rng(seed), 50)))],
+    ):
+        assert draw(3) == draw(3)
+    assert draw(3) != draw(4)
+
+
+def test_a_difference_of_means_is_as_wide_as_its_standard_error():
+    scores, others = np.arange(100) % 2.0, 3 + np.arange(50) % 2.0
+    error = 0.5 * np.sqrt(1 / 100 + 1 / 50)
+    found = stats.difference_interval(scores, others, np.random.default_rng(0))
+    assert found == pytest.approx((-3 - 1.96 * error, -3 + 1.96 * error), abs=0.01)

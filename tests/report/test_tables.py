@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from vd4rl_pomdp.report import tables
+from vd4rl_pomdp.report import overall, tables
 
 SCORES = {
     # (method, task): {seed: scores of the last evaluation's two episodes}
@@ -17,7 +17,7 @@ SCORES = {
 
 
 def rows() -> list[dict[str, Any]]:
-    """Two evaluations of every run: at step 5 all score 99, at step 10 as above."""
+    """Two evaluations of every run, of two episodes each: at step 5 all score 99, at step 10 as above."""
     return [
         {
             "method": method,
@@ -27,11 +27,10 @@ def rows() -> list[dict[str, Any]]:
             "algorithm": "td3_bc",
             "variant": "",
         }
-        | {"seed": seed, "step": step, "episode": episode, "score": 99.0 if step == 5 else score}
+        | {"seed": seed, "step": step, "score": 99.0 if step == 5 else float(np.mean(scores)), "episodes": len(scores)}
         for (method, task), seeds in SCORES.items()
         for seed, scores in seeds.items()
         for step in (5, 10)
-        for episode, score in enumerate(scores)
     ]
 
 
@@ -53,22 +52,24 @@ def test_curves_show_mean_and_range_over_seeds_at_every_evaluation():
 
 
 def test_aggregates_are_over_the_runs_of_all_tasks_at_their_end():
-    (row,) = of(tables.aggregate(rows(), []), method="acro")
+    (row,) = of(overall.aggregate(rows(), []), method="acro")
     assert row["iqm"] == pytest.approx((40 + 60) / 2), "the middle half of 20, 40, 60, 80"
     assert row["optimality_gap"] == pytest.approx(50.0)
     assert (row["tasks"], row["seeds"]) == (2, 2)
 
 
 def test_profiles_are_shares_of_runs_above_a_score():
-    found = of(tables.profiles(rows(), np.array([0.0, 30.0, 60.0])), method="mik")
-    assert [row["share"] for row in found] == [0.75, 0.25, 0.25], "runs end at 20, 30, 90 and 0"
+    found = of(overall.profiles(rows()), method="mik")
+    shares = {row["threshold"]: row["share"] for row in found}
+    assert [shares[at] for at in (0, 30, 60)] == [0.75, 0.25, 0.25], "runs end at 20, 30, 90 and 0"
+    assert all(row["low"] <= row["share"] <= row["high"] for row in found)
 
 
 def test_improvement_compares_runs_of_one_task_and_averages_over_tasks():
-    (row,) = of(tables.improvement(rows()), method="acro", other="mik")
+    (row,) = of(overall.improvement(rows()), method="acro", other="mik")
     walker = np.mean([0.5, 0.0, 1.0, 1.0])  # 20 and 40 against 20 and 30
     cheetah = np.mean([0.0, 1.0, 0.0, 1.0])  # 60 and 80 against 90 and 0
     assert row["probability"] == pytest.approx((walker + cheetah) / 2)
     assert row["tasks"] == 2
-    (other,) = of(tables.improvement(rows()), method="mik", other="acro")
+    (other,) = of(overall.improvement(rows()), method="mik", other="acro")
     assert row["probability"] + other["probability"] == pytest.approx(1.0)

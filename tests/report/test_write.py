@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers_report import describe, grid, write_run
+from tests.helpers_report import describe, grid, pretraining, write_run
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import append_episodes, drop_episodes_after, read_episodes
@@ -47,15 +47,17 @@ def test_references_with_their_own_algorithm_stand_in_the_same_table(tmp_path):
     (end_to_end / "pretrain_timing.json").write_text('{"seconds": 7.0}')
     page, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
     text = page.read_text()
-    assert text.count("<h3>walker_walk expert, patch</h3>") == 1
+    assert text.count("<h3>walker_walk expert, patch</h3>") == 2, "one table of scores, one of encoders"
     with (tmp_path / "out" / "runs.csv").open() as file:
         acro, bc = csv.DictReader(file)
     assert (acro["method"], acro["return"], acro["probe_pose"]) == ("acro", "500.0", "")
     assert (bc["method"], bc["probe_pose"], bc["probe_velocity"]) == ("bc", "12.5", "34.5")
     assert (bc["pretrain_seconds"], bc["finetune_seconds"]) == ("7.0", "3.0")
     with (tmp_path / "out" / "improvement.csv").open() as file:
-        chances = {(row["method"], row["other"]): float(row["probability"]) for row in csv.DictReader(file)}
-    assert chances == {("acro", "bc"): 1.0, ("bc", "acro"): 0.0}
+        found = {(row["method"], row["other"]): (row["probability"], row["wins"]) for row in csv.DictReader(file)}
+    assert found == {("acro", "bc"): ("", "1.0"), ("bc", "acro"): ("", "0.0")}, "one pair of runs tells no probability"
+    assert '<td class="n">1 of 1</td>' in text
+    assert "1.00" not in text.partition("Probability of improvement</h2>")[2].partition("</table>")[0]
 
 
 def evaluated_clean(run: Path, returns: list[float], errors: tuple[float, float]) -> None:
@@ -110,8 +112,8 @@ def test_returns_are_drawn_against_probes(tmp_path):
     page, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
     text = page.read_text()
     words = "mik, seed 1: return 200, pose 21.0%, velocity 40.0%; acro, seed 0: return 100, pose 20.0%, velocity 40.0%."
-    assert f'aria-label="Return against probe errors. {words}"' in text
-    figure = text[text.index("aria-label") :].partition("</figure>")[0]
+    words = f'Return against probe errors. walker_walk expert: {words}"'
+    figure = text[text.index(words) :].partition("</figure>")[0]
     assert figure.count("clip-path") >= 2
     assert "<!-- mik -->" in figure
     assert "<!-- random -->" not in figure, "without states nothing is known of it"
@@ -144,10 +146,10 @@ def test_missing_cells_and_seeds_are_shown_as_missing(tmp_path):
         ("medium", "mik+a"): (None, "seed 0 missing"),
     }
     text = page.read_text()
-    assert '<tr class="gap"><td>mik+a</td><td colspan="6">seed 0 missing</td></tr>' in text
-    assert '<span class="gap">seed 2 missing</span>' in text
-    for legend in ("mik+a (seed 2 missing)", "mik+a (seed 0 missing)", "mik+a (1 of 2 tasks)"):
-        assert f"<!-- {legend} -->" in text, "a figure's legend says it, too"
+    assert '<tr class="gap"><td>mik+a</td><td colspan="8">seed 0 missing</td></tr>' in text
+    assert "<td>mik+a (seed 2 missing)</td>" in text
+    for remark in ("mik+a: seed 2 missing", "mik+a: seed 0 missing", "mik+a: 1 of 2 tasks", "×1"):
+        assert f"<!-- {remark} -->" in text, "figures say it, too"
     with (tmp_path / "out" / "missing.csv").open() as file:
         assert [(row["quality"], row["seed"], row["state"]) for row in csv.DictReader(file)] == [
             ("expert", "2", "missing"),
@@ -186,6 +188,19 @@ def test_unfinished_runs_are_named_and_kept_out_of_final_scores(tmp_path):
     assert (seeds["expert", "acro", "5"], seeds["expert", "acro", "10"]) == ("3", "2"), "curves show what there is"
 
 
+def test_a_diverged_run_is_shown_and_not_averaged(tmp_path):
+    runs = grid(tmp_path)
+    write_json(runs / "acro2" / "diverged.json", {"step": 7, "message": "critic_loss is nan <b>"})
+    page, summary, _ = write_report([runs], tmp_path / "out")
+    (acro,) = [row for row in summary if (row["quality"], row["method"]) == ("expert", "acro")]
+    assert (acro["score"], acro["seeds"], acro["missing"]) == (20.5, 2, "seed 2 diverged at update 7 of 10")
+    text = page.read_text()
+    assert "5 finished runs, 1 unfinished or diverged" in text
+    assert "<td>diverged at update 7 of 10: critic_loss is nan &lt;b&gt;</td>" in text
+    write_report([tmp_path / "out"], tmp_path / "again")
+    assert (tmp_path / "again" / "summary.csv").read_text() == (tmp_path / "out" / "summary.csv").read_text()
+
+
 def test_a_report_of_unfinished_runs_alone_says_so(tmp_path):
     (describe(write_run(tmp_path / "runs/a", "acro", 0, {5: [1.0]}), {}) / "timing.json").unlink()
     page, summary, _ = write_report([tmp_path / "runs"], tmp_path / "out")
@@ -214,9 +229,26 @@ def test_a_report_writes_over_nothing_but_an_earlier_report(tmp_path, capsys):
         (tmp_path / "out" / name).unlink()
     write_report([tmp_path / "runs" / "0"], tmp_path / "out")
     again = {p.name for p in (tmp_path / "out").iterdir()}
-    assert first - again == {"improvement.csv", "missing.csv"}, "no table of the earlier report is left"
+    assert first - again == {"improvement.csv", "improvement.tex", "missing.csv"}, (
+        "no table of the earlier report is left"
+    )
     write_report([tmp_path / "runs"], tmp_path / "runs" / "report")
     assert len(write_report([tmp_path / "runs"], tmp_path / "runs" / "report")[1]) == 2
+
+
+def test_a_report_of_rows_is_that_of_the_folders(tmp_path):
+    runs = grid(tmp_path)
+    (runs / "acro1" / "timing.json").unlink()
+    pretraining(runs / "pretrain")
+    first = write_report([runs], tmp_path / "one")
+    second = write_report([tmp_path / "one"], tmp_path / "two")
+    assert (second.summary, second.gates) == (first.summary, first.gates)
+    for file in sorted((tmp_path / "one").rglob("*.*")):
+        text, other = (path.read_text() for path in (file, tmp_path / "two" / file.relative_to(tmp_path / "one")))
+        assert text.replace(str(runs / "acro1"), "HERE") == other.replace(str(tmp_path / "one"), "HERE"), file.name
+    rows = (tmp_path / "two" / "runs.jsonl").read_bytes()
+    assert write_report([tmp_path / "two"], tmp_path / "two").summary == first.summary, "beside the rows"
+    assert (tmp_path / "two" / "runs.jsonl").read_bytes() == rows
 
 
 HOSTILE = '$\\frac$ <b>=1+1</b>, "x"|`y`\n[/red]_\u2028μ'

@@ -6,7 +6,7 @@ import io
 import sys
 from collections.abc import Sequence
 
-from vd4rl_pomdp.cli import data, navigation, parts, policy, stages, studies, sweeps
+from vd4rl_pomdp.cli import data, hub, navigation, parts, policy, stages, studies, sweeps
 from vd4rl_pomdp.cli.dispatch import COMMANDS
 from vd4rl_pomdp.cli.ends import run_to_end
 
@@ -14,6 +14,7 @@ COMMANDS |= {
     "demo": stages.DEMO,
     "list": parts.LIST,
     "data": data.COMMANDS,
+    "hub": hub.COMMANDS,
     "policy": policy.COMMANDS,
     **stages.COMMANDS,
     "navigation": navigation.COMMANDS,

@@ -34,8 +34,8 @@ class DownloadCommand:
     """random, medium_replay, medium, medium_expert or expert."""
     out: Path = Path("data/vd4rl")
     """Folder to keep sets in, as OUT/TASK/QUALITY/84px."""
-    endpoint: str = "https://huggingface.co"
-    """The mirror's address."""
+    endpoint: str | None = None
+    """The mirror's address; default: HF_ENDPOINT, else https://huggingface.co."""
     verify: bool = False
     """Compute the SHA-256 of files that are already there, too."""
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from vd4rl_pomdp.errors import UserError
 
@@ -17,6 +17,8 @@ class Command:
 
     summary: str
     run: Callable[[Arguments, str], None]
+    inner: Mapping[str, Command] = field(default_factory=dict)
+    """Commands that its first word may name in its place."""
 
 
 Commands = Mapping[str, Command | Mapping[str, Command]]
@@ -43,6 +45,8 @@ def dispatch(commands: Commands, words: Arguments, program: str) -> None:
     program = f"{program} {words[0]}"
     if isinstance(entry, Mapping):
         dispatch(entry, words[1:], program)
+    elif len(words) > 1 and words[1] in entry.inner:
+        entry.inner[words[1]].run(words[2:], f"{program} {words[1]}")
     else:
         entry.run(words[1:], program)
 

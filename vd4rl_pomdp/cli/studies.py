@@ -16,12 +16,35 @@ from vd4rl_pomdp.cli.parsing import parse, show
 
 @dataclass(frozen=True)
 class ReportCommand:
-    """Write an HTML page and CSV files about fine-tuning runs."""
+    """Write an HTML page, tables and figures about fine-tuning runs; `report compare A B` puts two sets together."""
 
     runs: tyro.conf.Positional[list[Path]]
     """Run folders, results folders, or folders that contain some; what `theory --out` wrote adds its section."""
     out: Path = Path("report")
     """Folder of the report."""
+
+
+@dataclass(frozen=True)
+class CompareCommand:
+    """Compare two result sets, condition by condition: scores, their difference, n, and settings that differ."""
+
+    a: tyro.conf.Positional[Path]
+    """Run folder, results folder, or folder that contains some."""
+    b: tyro.conf.Positional[Path]
+    """What it is compared with, likewise."""
+    out: Path | None = None
+    """Also write an HTML page, CSV and LaTeX into this folder."""
+
+
+def _compare(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.report.compare import compare_results, print_comparison, write_comparison
+
+    command = parse(CompareCommand, words, program)
+    comparison = compare_results(command.a, command.b)
+    page = None if command.out is None else write_comparison(comparison, command.out)
+    print_comparison(comparison)
+    if page is not None:
+        print(f"comparison: {page}")
 
 
 def _report(words: Arguments, program: str) -> None:
@@ -114,7 +137,11 @@ def _control_study(words: Arguments, program: str) -> None:
 
 
 COMMANDS: dict[str, Command | Mapping[str, Command]] = {
-    "report": Command("an HTML page and CSV files about runs", _report),
+    "report": Command(
+        "an HTML page, tables and figures about runs; report compare A B for two sets",
+        _report,
+        {"compare": Command("two result sets side by side", _compare)},
+    ),
     "results": {"add": Command("append finished runs to a results folder", _add)},
     "theory": Command("the paper's claims on finite worlds, by enumeration", _theory),
     "control-study": Command("does memory pay? told on simulator states, in minutes", _control_study),

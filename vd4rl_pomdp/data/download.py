@@ -1,30 +1,39 @@
-"""Fetch the published 84-pixel sets: resumed after an interruption, checked by SHA-256, equal files stored once."""
+"""Fetch the published 84-pixel sets: resumed after an interruption, checked by SHA-256, equal files stored once.
+
+They lie on the Hugging Face Hub. Where, and as whom to ask, is huggingface_hub's: address, HF_ENDPOINT, token. The
+bytes are received here: its own downloads ask a mirror for more than files, try no status of 500 and above again, wait
+for an address where nobody is, and lose up to 10 MB with every connection that breaks.
+"""
 
 from __future__ import annotations
 
 import csv
-import hashlib
 import os
 import shutil
 import time
 from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
 import requests
+from huggingface_hub import hf_hub_url
+from huggingface_hub.utils import build_hf_headers
 from rich.console import Console
 from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeRemainingColumn, TransferSpeedColumn
 from urllib3.exceptions import NewConnectionError
 
+from vd4rl_pomdp import __version__
 from vd4rl_pomdp.errors import UserError, disk_error
-from vd4rl_pomdp.runs.files import replacing_file
+from vd4rl_pomdp.runs.files import replacing_file, sha256
 from vd4rl_pomdp.runs.outputs import refuse_kept
+from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.tasks import QUALITIES
 
-DEFAULT_ENDPOINT = "https://huggingface.co"
-_REPOSITORY = "datasets/conglu/vd4rl/resolve/main"
+HUB = "https://huggingface.co"
+REPOSITORY = "conglu/vd4rl"
 _ATTEMPTS = 5
 _FIRST_WAIT_S = 1.0
 _TIMEOUT_S = (10.0, 60.0)
@@ -55,8 +64,13 @@ def manifest() -> tuple[RemoteFile, ...]:
     return tuple(RemoteFile(row["path"], int(row["bytes"]), row["sha256"]) for row in rows)
 
 
+def default_endpoint() -> str:
+    """The Hub, or the mirror of it that HF_ENDPOINT names, as for everything that uses huggingface_hub."""
+    return os.environ.get("HF_ENDPOINT") or HUB
+
+
 def download(
-    task: str, quality: str, destination: Path, endpoint: str = DEFAULT_ENDPOINT, verify: bool = False
+    task: str, quality: str, destination: Path, endpoint: str | None = None, verify: bool = False
 ) -> list[Path]:
     """Download one set into `destination/{task}/{quality}/84px`; what is there already is not fetched again.
 
@@ -64,30 +78,46 @@ def download(
         task: task name.
         quality: one of `tasks.QUALITIES`.
         destination: folder that holds all downloaded sets; a file that another set in it has is linked, not fetched.
-        endpoint: address of the mirror, up to and without `/datasets`.
+        endpoint: address of the mirror, up to and without `/datasets`; None: `default_endpoint`.
         verify: also compute the SHA-256 of files that are there; otherwise their size is enough.
 
     Returns:
         The set's shards, all of them verified.
 
     Raises:
-        UserError: unknown task or quality, no answer from the mirror, a wrong checksum, or a full disk.
+        UserError: unknown task or quality, no answer from the mirror, a wrong checksum, a full disk, or a set that
+            another process downloads.
     """
     published = list(dict.fromkeys(file.path.split("/")[2] for file in manifest()))
     if task not in published:
         raise UserError(f"unknown task {task!r}: choose one of {', '.join(published)}, of which sets are published")
     if quality not in QUALITIES:
         raise UserError(f"unknown quality {quality!r}: choose one of {', '.join(QUALITIES)}")
+    endpoint = default_endpoint() if endpoint is None else endpoint
     if not endpoint.startswith(("http://", "https://")):
         raise UserError(f"endpoint {endpoint!r} is no address; it starts with https:// or http://")
     refuse_kept(destination)
     wanted = [file for file in manifest() if file.path.split("/")[2:4] == [task, quality]]
-    with _progress_bar() as bar:
-        total = bar.add_task(f"{task} {quality}", total=sum(file.size for file in wanted))
-        for file in wanted:
-            _provide(file, destination, endpoint.rstrip("/"), verify, bar)
-            bar.advance(total, file.size)
+    if lacking := [file for file in wanted if not _is_complete(file, file.target(destination), verify)]:
+        with _owning(lacking[0].target(destination).parent), _progress_bar() as bar:
+            total = bar.add_task(f"{task} {quality}", total=sum(file.size for file in lacking))
+            for file in lacking:
+                _provide(file, destination, endpoint.rstrip("/"), verify, bar)
+                bar.advance(total, file.size)
     return [file.target(destination) for file in wanted]
+
+
+@contextmanager
+def _owning(folder: Path) -> Iterator[None]:
+    """Own a set's folder; what was made for that goes again if nothing has come into it."""
+    made = [place for place in (folder, *folder.parents) if not place.exists()]
+    try:
+        with owned(folder):
+            yield
+    finally:
+        with suppress(OSError):
+            for place in made:
+                place.rmdir()
 
 
 def _progress_bar() -> Progress:
@@ -107,16 +137,26 @@ def _provide(file: RemoteFile, destination: Path, endpoint: str, verify: bool, b
         if twin:
             _link(twin, target)
         else:
-            _fetch(file, target, f"{endpoint}/{_REPOSITORY}/{file.path}", bar)
+            _fetch(file, target, _address(file, endpoint), bar)
     except OSError as error:
         raise disk_error(target, error) from error
+
+
+def _address(file: RemoteFile, endpoint: str) -> str:
+    return hf_hub_url(REPOSITORY, file.path, repo_type="dataset", endpoint=endpoint)
+
+
+def _headers(url: str) -> dict[str, str]:
+    """What huggingface_hub tells of itself, and its user's token if that is meant for an address."""
+    token = None if url.startswith(f"{default_endpoint().rstrip('/')}/") else False
+    return build_hf_headers(token=token, library_name="vd4rl-pomdp", library_version=__version__)
 
 
 def _is_complete(file: RemoteFile, path: Path, verify: bool) -> bool:
     """Only verified files get their final name, so the size suffices unless asked otherwise."""
     if not path.is_file() or path.stat().st_size != file.size:
         return False
-    return not verify or _sha256(path) == file.sha256
+    return not verify or sha256(path) == file.sha256
 
 
 def _link(source: Path, target: Path) -> None:
@@ -158,7 +198,7 @@ def _fetch(file: RemoteFile, target: Path, url: str, bar: Progress) -> None:
             )
         time.sleep(_FIRST_WAIT_S * 2 ** (failures - 1))
     bar.remove_task(row)
-    if _size(part) != file.size or _sha256(part) != file.sha256:
+    if _size(part) != file.size or sha256(part) != file.sha256:
         part.unlink()
         raise UserError(f"{url}: has a wrong SHA-256 and was removed; start again or choose another --endpoint")
     part.replace(target)
@@ -166,7 +206,7 @@ def _fetch(file: RemoteFile, target: Path, url: str, bar: Progress) -> None:
 
 def _receive(url: str, part: Path, offset: int) -> Iterator[int]:
     """Append to `part` from `offset`, or from the start where the server ignores ranges; yields the bytes there."""
-    headers = {"Accept-Encoding": "identity"} | ({"Range": f"bytes={offset}-"} if offset else {})
+    headers = _headers(url) | {"Accept-Encoding": "identity"} | ({"Range": f"bytes={offset}-"} if offset else {})
     with requests.get(url, headers=headers, stream=True, timeout=_TIMEOUT_S) as response:
         if 400 <= response.status_code < 500 and response.status_code not in (408, 429):
             raise UserError(f"{url}: the mirror answers {response.status_code} {response.reason}; check --endpoint")
@@ -196,8 +236,3 @@ def _describe(error: requests.RequestException) -> str:
     if error.response is not None:
         return f"status {error.response.status_code}"
     return type(error).__name__
-
-
-def _sha256(path: Path) -> str:
-    with path.open("rb") as file:
-        return hashlib.file_digest(file, "sha256").hexdigest()

@@ -1,81 +1,95 @@
-"""A pretrained encoder is a folder: config.json and model.safetensors, loadable without the code that trained it."""
+"""A pretrained encoder is a folder: config.json and model.safetensors, loadable without the code that trained it.
+
+README.md beside them says what config.json says, for readers.
+"""
 
 from __future__ import annotations
 
 import hashlib
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
 from safetensors import SafetensorError
 from safetensors.torch import save
 
+from vd4rl_pomdp import __version__
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.nn.encoder_card import EncoderCard, EncoderOrigin, EncoderRecord
 from vd4rl_pomdp.nn.frame import STATE
-from vd4rl_pomdp.runs.files import write_bytes, write_json
+from vd4rl_pomdp.nn.model_card import CARD, model_card
+from vd4rl_pomdp.runs.files import json_text, write_bytes, write_json
+from vd4rl_pomdp.runs.provenance import git_commit
 from vd4rl_pomdp.runs.reading import build, parse_json, read_bytes, read_tensors
 
 WEIGHTS, CONFIG = "model.safetensors", "config.json"
 
 
-@dataclass(frozen=True)
-class EncoderCard:
-    """Where an encoder comes from."""
+def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard, frames: int | None = None) -> None:
+    """Write an encoder folder; whole files only, config last.
 
-    method: str
-    task: str
-    quality: str
-    corruption: dict[str, Any]
-    """The corruption it was pretrained under, as the settings of CorruptionConfig."""
-    seed: int
-    steps: int
-    preset: str
-    end_to_end: str = ""
-    """Fine-tuning algorithm that trains the encoder, too; empty for a frozen encoder."""
-    action_loss: float | None = None
-    """For methods that predict actions: the mean of the last tenth of the pretraining's rows of metrics.
-
-    Each row is the mean over the steps since the row before; all count the same, also where they are of fewer steps.
+    Args:
+        folder: where.
+        encoder: its weights and config.
+        card: where it comes from.
+        frames: how many frames the batches of its pretraining held, if that is known.
     """
-    data: str = ""
-    """Fingerprint of the set it was pretrained on."""
-    settings: dict[str, Any] = field(default_factory=dict)
-    """The pretraining's settings without seed, folders, device and logging; empty if they were not recorded."""
+    weights = {name: value.contiguous().cpu() for name, value in encoder.state_dict().items()}
+    origin = EncoderOrigin(__version__, git_commit(), frames)
+    _write(folder, save(weights), EncoderRecord(encoder.config, card, origin))
 
 
-def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard) -> None:
-    """Write an encoder folder; whole files only, config last."""
+def _write(folder: Path, weights: bytes, record: EncoderRecord) -> None:
+    """Write all files, config.json last: without it the folder is no encoder folder."""
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
-    weights = {name: value.contiguous().cpu() for name, value in encoder.state_dict().items()}
-    write_bytes(folder / WEIGHTS, save(weights))
-    write_json(folder / CONFIG, {"encoder": asdict(encoder.config), "pretrain": asdict(card)})
+    write_bytes(folder / WEIGHTS, weights)
+    _write_record(folder, record)
+
+
+def _write_record(folder: Path, record: EncoderRecord) -> None:
+    write_bytes(folder / CARD, model_card(record).encode())
+    write_json(folder / CONFIG, asdict(record))
 
 
 def copy_encoder(source: Path, target: Path, changes: Mapping[str, Any]) -> None:
-    """Copy an encoder folder, its config.json last: without it a copy is no encoder folder.
+    """Copy an encoder folder.
 
     Args:
         source: an encoder folder.
         target: folder to write.
         changes: fields of the copy's `EncoderConfig` by name.
     """
-    with disk_errors(target):
-        target.mkdir(parents=True, exist_ok=True)
-    write_bytes(target / WEIGHTS, read_bytes(source / WEIGHTS))
-    config = parse_json(read_bytes(source / CONFIG))
-    write_json(target / CONFIG, config | {"encoder": config["encoder"] | changes})
+    record = read_record(source)
+    _write(target, read_bytes(source / WEIGHTS), replace(record, encoder=replace(record.encoder, **changes)))
+
+
+def tell_probe(folder: Path, errors: Mapping[str, float]) -> None:
+    """Add the errors of linear probes, as `EncoderOrigin.probe` has them, to what an encoder folder says of itself."""
+    record = read_record(folder)
+    _write_record(folder, replace(record, origin=replace(record.origin, probe=dict(errors))))
 
 
 def encoder_hash(folder: Path) -> str:
-    """Name of an encoder folder's content: equal for equal files, wherever they lie."""
+    """Name of an encoder: equal for equal weights and configs, wherever they lie and whenever they were written."""
     digest = hashlib.blake2b(digest_size=12)
-    for name in (WEIGHTS, CONFIG):
-        digest.update(hashlib.blake2b(read_bytes(folder / name)).digest())
+    for content in (read_bytes(folder / WEIGHTS), _without_origin(read_bytes(folder / CONFIG))):
+        digest.update(hashlib.blake2b(content).digest())
     return digest.hexdigest()
+
+
+def _without_origin(config: bytes) -> bytes:
+    """A config.json as it is without its origin; one of an earlier version, or a damaged one, as it is."""
+    try:
+        told = parse_json(config)
+    except ValueError:
+        return config
+    if not isinstance(told, dict) or "origin" not in told:
+        return config
+    return json_text({name: value for name, value in told.items() if name != "origin"}).encode()
 
 
 def load_encoder(
@@ -93,7 +107,8 @@ def load_encoder(
         UserError: the folder is missing, damaged, pickled, or of another task or image size.
     """
     folder = Path(folder)
-    encoder_config, card = _read_config(folder)
+    record = read_record(folder)
+    encoder_config, card = record.encoder, record.pretrain
     if action_dim is not None and encoder_config.action_dim != action_dim:
         raise UserError(
             f"{folder}: this encoder was pretrained on {card.task} with {encoder_config.action_dim} action dimensions, "
@@ -135,16 +150,18 @@ def _first_line(error: Exception) -> str:
     return str(error).splitlines()[0]
 
 
-def _read_config(folder: Path) -> tuple[EncoderConfig, EncoderCard]:
+def read_record(folder: Path) -> EncoderRecord:
+    """An encoder folder's config.json; raises UserError if there is none, a damaged one, or a pickle in its place."""
     pickles = [p.name for p in folder.glob("*") if p.suffix in (".pt", ".pth", ".pkl", ".bin", ".ckpt")]
     if pickles and not (folder / "model.safetensors").exists():
         raise UserError(f"{folder}: {pickles[0]} is a pickle, which can run code; only model.safetensors is read")
     try:
         config = parse_json(read_bytes(folder / CONFIG))
-        return build(EncoderConfig, config["encoder"]), build(EncoderCard, config["pretrain"])
+        origin = build(EncoderOrigin, config.get("origin", {}))
+        return EncoderRecord(build(EncoderConfig, config["encoder"]), build(EncoderCard, config["pretrain"]), origin)
     except UserError:
         raise
-    except (FileNotFoundError, ValueError, KeyError, TypeError) as error:
+    except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError) as error:
         raise UserError(
             f"{folder}: not an encoder folder (config.json: {error}); `vd4rl-pomdp pretrain` writes one as RUN/encoder"
         ) from error

@@ -1,148 +1,164 @@
-"""Figures as bytes that an HTML page can carry: curves as SVG, pictures as PNG, an episode as an animated WebP."""
+"""What all figures of a report share: the look of a method, panels with one legend below, and files."""
 
 from __future__ import annotations
 
 import io
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from math import ceil
+from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import matplotlib as mpl
-import numpy as np
+from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from PIL import Image
 
-from vd4rl_pomdp.report.tables import label
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.report import stats
+from vd4rl_pomdp.runs.files import Row, replacing_file, write_csv
 from vd4rl_pomdp.text import plain
 
 mpl.rcParams["svg.hashsalt"] = "vd4rl-pomdp"
+mpl.rcParams["pdf.fonttype"] = 42
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
 """Okabe and Ito's palette, which colour-blind readers can tell apart."""
-LEGEND_WIDTH = 34
-"""Characters in a line of a legend."""
-LEGEND_LINE = 0.17
-"""Its height in inches, spacing included: a figure grows with its legend."""
-STRIP_FRAMES = 8
-"""Frames in a film strip, at most."""
-Film = dict[str, np.ndarray]
+MARKERS = "osD^vPX*<"
+DASHES: tuple[Any, ...] = ("-", (0, (5, 1.5)), (0, (1.2, 1.2)), (0, (6, 1.5, 1.2, 1.5)))
+"""As the numbers of colours, markers and dashes have no common divisor, the first 252 methods differ in their looks."""
+FORMATS: dict[str, dict[str, Any]] = {"png": {"dpi": 150}, "pdf": {"metadata": {"CreationDate": None}}}
+"""Files of a figure, beside the SVG in the page."""
+WIDTH = 10.0
+"""Of a figure with several columns of panels, in inches."""
+_LEFT, _RIGHT, _TOP, _BOTTOM, _GAP, _TITLE = 0.55, 0.1, 0.3, 0.5, 0.45, 0.42
+_ENTRY, _LETTER, _LINE = 0.55, 0.075, 0.2
+"""A legend's entry without its text, one letter of it, and a line, in inches."""
+_TITLE_LETTER, REMARK_LINE = 0.075, 0.11
+"""A letter of a panel's title, and a line of a remark below it, in inches."""
+REMARK_WIDTH = 64
+"""Characters of a remark, of which the rest is in the caption's table."""
+NAME_WIDTH = 34
+"""Characters of a method's name in a figure before it is wrapped."""
 
 
-def curve_figure(rows: list[dict[str, Any]], methods: list[str], summary: list[dict[str, Any]]) -> str:
-    """Score against updates, one line a method, a band from the lowest to the highest seed.
+@dataclass(frozen=True)
+class Plot:
+    """A figure with all that is told of it."""
 
-    The legend has every method of the setting's `summary`, and says of which seeds are missing.
+    name: str
+    """Of its files."""
+    caption: str
+    words: str
+    """What it shows, for those who do not see it."""
+    figure: Figure
+    rows: list[Row]
+    """What it shows, as its CSV file holds it."""
+
+
+def style(number: int) -> dict[str, Any]:
+    """Colour, dashes and marker of the method of this number."""
+    return {
+        "color": COLOURS[number % len(COLOURS)],
+        "linestyle": DASHES[number % len(DASHES)],
+        "marker": MARKERS[number % len(MARKERS)],
+    }
+
+
+def panels(
+    titles: Sequence[str], looks: Mapping[str, int], columns: int, height: float = 2.1, room: float = 0.0
+) -> tuple[Figure, list[Axes]]:
+    """A figure with a panel for each title, row by row, and below them the legend of all methods.
+
+    Args:
+        titles: of the panels; none is drawn where one is empty.
+        looks: entries of the legend, and their numbers in `style`; without any there is no legend.
+        columns: panels in a row.
+        height: of a panel, in inches.
+        room: more space below each row of panels, in inches.
     """
-    figure = Figure(figsize=(6.4, 3.2), layout="constrained")
-    axes = figure.subplots()
-    notes = {label(row): row["missing"] for row in summary if row["missing"]}
-    for method in dict.fromkeys(map(label, rows)):
-        mine = [row for row in rows if label(row) == method]
-        style = _style(methods.index(method))
-        steps = [row["step"] for row in mine]
-        name = _noted(method, notes.pop(method, ""))
-        axes.plot(steps, [row["score"] for row in mine], marker="o", label=name, markersize=4, **style)
-        axes.fill_between(
-            steps, [r["low"] for r in mine], [r["high"] for r in mine], color=style["color"], alpha=0.15, lw=0
-        )
-    _list_absent(axes, methods, notes)
-    axes.set(xlabel="gradient updates", ylabel="score (return / 10)")
-    axes.set_xlim(left=0)
-    axes.set_ylim(0, 1.05 * max(row["high"] for row in rows) or 1)
-    return _svg(figure, axes)
+    columns = min(columns, len(titles))
+    rows = ceil(len(titles) / columns)
+    width = WIDTH if columns > 1 else 0.66 * WIDTH
+    legend, entries = _legend(looks, width)
+    below = _BOTTOM + room
+    full = _TOP + rows * height + (rows - 1) * (_TITLE + below) + below + legend
+    figure = Figure(figsize=(width, full))
+    wide = (width - _LEFT - _RIGHT - (columns - 1) * (_GAP + 0.1)) / columns
+    axes = []
+    for number, title in enumerate(titles):
+        row, column = divmod(number, columns)
+        left, top = _LEFT + column * (wide + _GAP + 0.1), _TOP + row * (height + _TITLE + below)
+        if title:
+            place = (left / width, 1 - (top + height) / full, wide / width, height / full)
+            axes.append(_panel(figure, place, plain(title, int(wide / _TITLE_LETTER))))
+    if looks:
+        figure.legend(**entries, loc="lower center", frameon=False, fontsize=8)
+    return figure, axes
 
 
-def profile_figure(rows: list[dict[str, Any]], methods: list[str], notes: dict[str, str]) -> str:
-    """Share of runs above a score, one line a method; the legend has those of `notes`, too, and the note."""
-    figure = Figure(figsize=(6.4, 3.2), layout="constrained")
-    axes = figure.subplots()
-    for method in dict.fromkeys(row["method"] for row in rows):
-        mine = [row for row in rows if row["method"] == method]
-        style = _style(methods.index(method))
-        name = _noted(method, notes.pop(method, ""))
-        axes.step([r["threshold"] for r in mine], [r["share"] for r in mine], where="post", label=name, **style)
-    _list_absent(axes, methods, notes)
-    axes.set(xlabel="score", ylabel="share of runs above it", xlim=(0, None), ylim=(0, 1.02))
-    return _svg(figure, axes)
+def _legend(looks: Mapping[str, int], width: float) -> tuple[float, dict[str, Any]]:
+    """Height of a legend in inches, and what matplotlib is told of it."""
+    if not looks:
+        return 0.0, {}
+    names = [plain(name, NAME_WIDTH) for name in looks]
+    longest = max(len(line) for name in names for line in name.split("\n"))
+    columns = max(1, min(len(names), int(width / (_ENTRY + _LETTER * longest))))
+    lines = max(1 + name.count("\n") for name in names)
+    handles = [
+        Line2D([], [], markersize=5, label=name, **style(look))
+        for name, look in zip(names, looks.values(), strict=True)
+    ]
+    return 0.15 + _LINE * lines * ceil(len(names) / columns), {"handles": handles, "ncols": columns, "handlelength": 3}
 
 
-def _list_absent(axes: Any, methods: list[str], notes: dict[str, str]) -> None:
-    """Give methods that no line shows their entry in the legend, faint."""
-    for method, note in notes.items():
-        axes.add_line(Line2D([], [], label=_noted(method, note), **_style(methods.index(method)), alpha=0.25))
-
-
-def _noted(method: str, note: str) -> str:
-    """A legend's entry: plain text, whatever a method is called."""
-    return plain(f"{method} ({note})" if note else method, LEGEND_WIDTH)
-
-
-def _style(number: int) -> dict[str, Any]:
-    """Colour and dashes of the line of this number: more lines than colours stay distinct."""
-    dashes = ("-", "--", ":")[number // len(COLOURS) % 3]
-    return {"color": COLOURS[number % len(COLOURS)], "linestyle": dashes}
-
-
-def loss_figure(series: list[tuple[str, list[tuple[int, float]]]], methods: list[str]) -> str:
-    """Pretraining action loss against steps, one line a run; those of a method look as in the other figures."""
-    figure = Figure(figsize=(6.4, 3.2), layout="constrained")
-    axes = figure.subplots()
-    methods = list(dict.fromkeys([*methods, *(name for name, _ in series)]))
-    for number, (name, losses) in enumerate(series):
-        steps, values = zip(*losses, strict=True)
-        first = name not in (other for other, _ in series[:number])
-        entry = plain(name, LEGEND_WIDTH) if first else None
-        axes.plot(steps, values, lw=1.2, label=entry, **_style(methods.index(name)))
-    axes.set(xlabel="gradient steps", ylabel="action loss")
-    return _svg(figure, axes)
-
-
-PROBES = {"probe_pose": "pose", "probe_velocity": "velocity"}
-"""What probes measure, as a figure names it."""
-MARKERS = "osD^vP"
-
-
-def probe_figure(rows: list[Row], methods: list[str]) -> tuple[str, str]:
-    """Return against the probes' errors, pose at the left and velocity at the right, one dot a run.
-
-    Returns:
-        The figure, and in words what it shows.
-    """
-    figure = Figure(figsize=(8.2, 3.4), layout="constrained")
-    panels = figure.subplots(1, 2, sharey=True)
-    for method in dict.fromkeys(map(label, rows)):
-        number = methods.index(method)
-        style = {"color": COLOURS[number % len(COLOURS)], "marker": MARKERS[number // len(COLOURS) % len(MARKERS)]}
-        mine = [row for row in rows if label(row) == method]
-        for axes, probe in zip(panels, PROBES, strict=True):
-            known = [row for row in mine if row[probe] is not None]
-            errors, returns = [row[probe] for row in known], [row["return"] for row in known]
-            axes.scatter(errors, returns, 36, label=plain(method, LEGEND_WIDTH), ec="white", lw=0.6, zorder=3, **style)
-    for axes, name in zip(panels, PROBES.values(), strict=True):
-        axes.set(xlabel=f"{name} error, %")
-        axes.set_xlim(*_with_room(axes.get_xlim()[1]))
-        axes.grid(alpha=0.25)
-        axes.spines[["top", "right"]].set_visible(False)
-    panels[0].set(ylabel="return", ylim=_with_room(panels[0].get_ylim()[1]))
-    return _svg(figure, panels[1]), "; ".join(map(_probe_words, rows))
-
-
-def _with_room(highest: float) -> tuple[float, float]:
-    """Limits of an axis that begins at 0, with room for whole dots at both ends."""
-    return -0.04 * highest, 1.04 * highest
-
-
-def _probe_words(row: Row) -> str:
-    errors = (f"{name} {row[probe]:.1f}%" for probe, name in PROBES.items() if row[probe] is not None)
-    return f"{label(row)}, seed {row['seed']}: return {row['return']:.0f}, {', '.join(errors)}"
-
-
-def _svg(figure: Figure, axes: Any) -> str:
+def _panel(figure: Figure, place: tuple[float, float, float, float], title: str) -> Axes:
+    axes = figure.add_axes(place)
+    axes.set_title(title, fontsize=9)
+    axes.tick_params(labelsize=8)
     axes.grid(alpha=0.25)
+    axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)
-    legend = axes.legend(frameon=False, fontsize=8, loc="center left", bbox_to_anchor=(1.0, 0.5))
-    lines = sum(1 + text.get_text().count("\n") for text in legend.get_texts())
-    figure.set_figheight(max(figure.get_figheight(), 0.4 + LEGEND_LINE * lines))
-    return to_svg(figure)
+    return axes
+
+
+def remark(axes: Axes, notes: Sequence[str]) -> None:
+    """Say below a panel what it does not show; `panels` was given the room."""
+    text = "\n".join(plain(note, REMARK_WIDTH).partition("\n")[0] for note in shortened(notes))
+    axes.annotate(
+        text, (0, 0), (0, -30), "axes fraction", "offset points", va="top", fontsize=6.5, color="#444", linespacing=1.1
+    )
+
+
+def shortened(notes: Sequence[str], most: int = 4) -> list[str]:
+    """The first of some notes, and how many more there are."""
+    return [*notes[:most], *([f"and {len(notes) - most} more"] if len(notes) > most else [])]
+
+
+def room_for(notes: Iterable[Sequence[str]]) -> float:
+    """Inches below each row of panels that the longest of their remarks takes."""
+    return REMARK_LINE * max((len(shortened(part)) for part in notes), default=0)
+
+
+def seeds_note(rows: Sequence[Row], name: str = "seeds", noun: str = "seed") -> str:
+    """n of what a figure or table shows, and a warning where it is small."""
+    counts = [row[name] for row in rows if row[name]]
+    if not counts:
+        return "No finished run."
+    low, high = min(counts), max(counts)
+    text = f"n = {low}{f' to {high}' if high > low else ''} {noun}{'s' * (high > 1)}"
+    few = f" (warning: fewer than {stats.FEW_SEEDS})" if low < stats.FEW_SEEDS else ""
+    return f"{text}{few}."
+
+
+def file_name(*words: str) -> str:
+    """A name for files that says what is in them, whatever a corruption is called, and differs where the words do."""
+    return "_".join(map(_plain_word, filter(None, words)))
+
+
+def _plain_word(word: str) -> str:
+    plain_word = re.sub(r"[^A-Za-z0-9+._-]+", "-", word).strip("-.")
+    return plain_word if plain_word == word else f"{plain_word}-{crc32(word.encode(errors='replace')):08x}"
 
 
 def to_svg(figure: Figure) -> str:
@@ -153,32 +169,24 @@ def to_svg(figure: Figure) -> str:
     return text[text.index("<svg") :]
 
 
-def strip(film: Film) -> bytes:
-    """PNG film strip: clean frames above, the frames of the corrupted stacks (oldest to newest) below."""
-    chosen = np.unique(np.linspace(0, len(film["clean"]) - 1, STRIP_FRAMES).astype(int))
-    stacks = film["corrupted"][chosen].reshape(len(chosen), -1, 3, *film["corrupted"].shape[-2:])
-    rows = [film["clean"][chosen], *stacks.swapaxes(0, 1)]
-    return _png(np.concatenate([np.concatenate(list(_spaced(row)), axis=1) for row in rows], axis=0))
+def save_plot(folder: Path, plot: Plot) -> None:
+    """Write a figure's files into a folder that exists: what it shows as CSV, and itself in all FORMATS."""
+    write_csv(folder / f"{plot.name}.csv", list(plot.rows[0]), plot.rows)
+    for kind, options in FORMATS.items():
+        with replacing_file(folder / f"{plot.name}.{kind}") as fresh:
+            plot.figure.savefig(fresh, format=kind, **options)
 
 
-def _spaced(images: np.ndarray) -> Any:
-    """(N, 3, H, W) -> images (H + 2, W + 2, 3) with a white border."""
-    for image in images:
-        yield np.pad(image.transpose(1, 2, 0), ((1, 1), (1, 1), (0, 0)), constant_values=255)
+def grid_of(rows: Sequence[Row], order: Callable[[str], Any]) -> tuple[list[tuple[str, str]], int]:
+    """Places of panels, row by row, one column a task and one row a quality, and the number of columns.
 
+    Args:
+        rows: with `task` and `quality`.
+        order: of the qualities.
 
-def movie(film: Film, scale: int = 2) -> bytes:
-    """Animated WebP of an episode: clean at the left, the newest corrupted frame at the right."""
-    newest = film["corrupted"][:, -3:]
-    pairs = np.concatenate([film["clean"], newest], axis=3).transpose(0, 2, 3, 1)
-    size = (pairs.shape[2] * scale, pairs.shape[1] * scale)
-    frames = [Image.fromarray(pair).resize(size, Image.Resampling.NEAREST) for pair in pairs]
-    buffer = io.BytesIO()
-    frames[0].save(buffer, "WEBP", save_all=True, append_images=frames[1:], duration=80, loop=0, quality=60)
-    return buffer.getvalue()
-
-
-def _png(image: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG", optimize=True)
-    return buffer.getvalue()
+    Returns:
+        Task and quality of every place, and the number of tasks.
+    """
+    tasks = sorted({str(row["task"]) for row in rows})
+    qualities = sorted({str(row["quality"]) for row in rows}, key=order)
+    return [(task, quality) for quality in qualities for task in tasks], len(tasks)

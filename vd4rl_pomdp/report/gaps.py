@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from itertools import groupby
+from typing import TypeVar
 
 from vd4rl_pomdp.report.load import LABELS, LoadedRun
 from vd4rl_pomdp.runs.files import Row
 
+Key = TypeVar("Key")
 Setting = tuple[str, str, str]
 """Task, quality and corruption: what methods are compared in."""
 MISSING = "missing"
@@ -22,20 +24,25 @@ def find_gaps(runs: list[LoadedRun]) -> list[Row]:
     run has in that setting.
     """
     grid = [run for run in runs if run.stage == "finetune" and run.labels["task"]]
+    by_method = _groups(grid, _method)
     rows = []
-    for setting in dict.fromkeys(map(_setting, grid)):
-        here = [run for run in grid if _setting(run) == setting]
-        for algorithm, method, variant in _expected(grid, setting):
-            mine = {
-                run.labels["seed"]: run
-                for run in here
-                if (run.labels["algorithm"], run.labels["method"], run.variant) == (algorithm, method, variant)
-            }
+    for setting, here in _groups(grid, _setting).items():
+        there = {(*_method(run), run.variant, run.labels["seed"]): run for run in here}
+        seeds = sorted({run.labels["seed"] for run in here})
+        for algorithm, method, variant in _expected(by_method, setting):
             condition = dict(zip(CONDITION, (*setting, algorithm, method, variant), strict=True))
-            for seed in sorted({run.labels["seed"] for run in here}):
-                if seed not in mine or not (mine[seed].finished and mine[seed].rows):
-                    rows.append(condition | {"seed": seed, "state": _state(mine.get(seed))})
+            for seed in seeds:
+                run = there.get((algorithm, method, variant, seed))
+                if run is None or not (run.finished and run.rows):
+                    rows.append(condition | {"seed": seed, "state": _state(run)})
     return rows
+
+
+def _groups(runs: list[LoadedRun], key: Callable[[LoadedRun], Key]) -> dict[Key, list[LoadedRun]]:
+    groups: dict[Key, list[LoadedRun]] = {}
+    for run in runs:
+        groups.setdefault(key(run), []).append(run)
+    return groups
 
 
 def _setting(run: LoadedRun) -> Setting:
@@ -47,14 +54,13 @@ def _state(run: LoadedRun | None) -> str:
     return MISSING if run is None or run.finished else run.progress
 
 
-def _expected(grid: list[LoadedRun], setting: Setting) -> Iterator[tuple[str, str, str]]:
+def _expected(by_method: dict[tuple[str, str], list[LoadedRun]], setting: Setting) -> Iterator[tuple[str, str, str]]:
     """Algorithm, method and variant of every run that is expected in a setting.
 
     Variants by fields of a corruption are expected in all settings with that corruption, variants by data only where
     they are found.
     """
-    for algorithm, method in dict.fromkeys(map(_method, grid)):
-        mine = [run for run in grid if _method(run) == (algorithm, method)]
+    for (algorithm, method), mine in by_method.items():
         for shared in _shared(mine, setting):
             alike = [run for run in mine if run.parts[0] == shared and run.labels["corruption"] == setting[2]]
             for fields in {run.parts[1]: None for run in alike} or [""]:

@@ -37,9 +37,9 @@ class LoadedRun:
     settings: Settings
     """All settings in which runs of its method may differ, in words."""
     rows: list[Row]
-    """Evaluation rows under the corruption of training, numbers parsed, with the run's `variant`."""
+    """Evaluation rows under the corruption of training."""
     others: list[Row]
-    """Evaluation rows under other corruptions, likewise: under none, if it was trained under one."""
+    """Evaluation rows under other corruptions: under none, if it was trained under one."""
     seconds: float | None
     """Wall-clock time; None while the run is unfinished."""
     representation: dict[str, float | None]
@@ -120,7 +120,7 @@ def load_runs(paths: list[Path], but: Path | None = None) -> list[LoadedRun]:
         UserError: there is no run, two have the same identity, or a file of one is damaged.
     """
     runs = [_load(result) for result in find_results(paths, but)]
-    named = [_with_parts(run, parts) for run, parts in zip(runs, compare(runs), strict=True)]
+    named = [replace(run, parts=parts) for run, parts in zip(runs, compare(runs), strict=True)]
     _refuse_twins(named)
     return named
 
@@ -141,12 +141,6 @@ def _groups(runs: Iterable[LoadedRun], key: Callable[[LoadedRun], Any]) -> list[
     for run in runs:
         groups.setdefault(key(run), []).append(run)
     return list(groups.values())
-
-
-def _with_parts(run: LoadedRun, parts: Parts) -> LoadedRun:
-    named = replace(run, parts=parts)
-    rows, others = ([row | {"variant": named.variant} for row in part] for part in (run.rows, run.others))
-    return replace(named, rows=rows, others=others)
 
 
 def _load(result: Result) -> LoadedRun:

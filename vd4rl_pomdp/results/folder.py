@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+import sys
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
@@ -121,19 +122,36 @@ def _labels(run: Result) -> dict[str, Any]:
 
 def read_results(folder: Path) -> list[Result]:
     """All runs of a results folder; raises UserError if it is none, or damaged."""
-    path = folder / RUNS
     by_run: dict[str, list[Row]] = {}
     for row in read_episodes(folder / EPISODES):
         if "id" not in row:
             raise UserError(f"{folder / EPISODES}: has no column 'id'; it was not written beside {RUNS}")
-        by_run.setdefault(row.pop("id"), []).append(row)
+        by_run.setdefault(row.pop("id"), []).append(row | {name: _shared(row[name]) for name in LABELS})
+    return _read_runs(folder, by_run)
+
+
+def _shared(value: Any) -> Any:
+    """A word that many rows hold, kept once."""
+    return sys.intern(value) if isinstance(value, str) else value
+
+
+def settled_ids(folder: Path) -> set[str]:
+    """Ids of the runs of a results folder that have finished or diverged; empty if there is none yet."""
+    return {run.id for run in _read_runs(folder, None) if run.settled} if (folder / RUNS).exists() else set()
+
+
+def _read_runs(folder: Path, rows: dict[str, list[Row]] | None) -> list[Result]:
+    """All runs of a results folder with their rows, by run; without any, if there is None."""
+    path = folder / RUNS
     try:
         lines = read_bytes(path).decode().splitlines()
     except FileNotFoundError as error:
         raise UserError(f"{folder}: holds no {RUNS}, so it is no results folder") from error
     except ValueError as error:
         raise UserError(f"{path}: is no UTF-8 ({error}); take another copy") from error
-    runs = [_parse(path, number, line, by_run) for number, line in enumerate(lines, 1)]
+    if not lines:
+        raise UserError(f"{path}: is empty; take another copy, or remove it")
+    runs = [_parse(path, number, line, rows) for number, line in enumerate(lines, 1)]
     if len({run.id for run in runs}) != len(runs):
         raise UserError(f"{path}: names a run twice; remove one of the two lines")
     return runs
@@ -152,17 +170,29 @@ def write_results(out: Path, runs: Iterable[Result]) -> None:
 def _object(run: Result) -> dict[str, Any]:
     """A run's line of runs.jsonl."""
     files = {name: run.files[name] for name in FILES if name in run.files}
-    return {"id": run.id, **files, "step": run.step} | ({"losses": run.losses} if run.losses else {})
+    told = {"id": run.id, **files, "step": run.step, "episodes": len(run.rows)}
+    return told | ({"losses": run.losses} if run.losses else {})
 
 
-def _parse(path: Path, number: int, line: str, rows: dict[str, list[Row]]) -> Result:
+def _parse(path: Path, number: int, line: str, rows: dict[str, list[Row]] | None) -> Result:
     with _whole(f"{path}: line {number}"):
         told = parse_json(line)
         files = {name: told[name] for name in FILES if name in told}
         losses = [(int(step), float(loss)) for step, loss in told.get("losses", [])]
-        run = Result(told["id"], path.parent, files, int(told["step"]), losses, rows.get(told["id"], []))
+        mine = _rows(path, told["id"], rows, int(told["episodes"]))
+        run = Result(told["id"], path.parent, files, int(told["step"]), losses, mine)
         _check(run)
         return run
+
+
+def _rows(path: Path, run: str, rows: dict[str, list[Row]] | None, count: int) -> list[Row]:
+    """The rows that a run had when its line was written: a cut writing may have added later ones."""
+    if rows is None:
+        return []
+    mine = rows.get(run, [])
+    if len(mine) < count:
+        raise UserError(f"{path.parent / EPISODES}: has {len(mine)} of {count} rows of run {run}; take another copy")
+    return mine[:count]
 
 
 @contextmanager

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.results.folder import RUNS, Result, read_results, read_run, write_results
+from vd4rl_pomdp.results.folder import RUNS, Result, read_results, read_run, settled_ids, write_results
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.ownership import owned
@@ -103,8 +103,7 @@ def add_results(paths: Sequence[Path], out: Path) -> Added:
 
 def refuse_loss(runs: Sequence[Result], out: Path) -> None:
     """Raise UserError if writing runs as the results folder `out` would lose settled ones that it tells of."""
-    there = [run for run in (read_results(out) if (out / RUNS).exists() else []) if run.settled]
-    lost = {run.id for run in there} - {run.id for run in runs if run.settled}
+    lost = settled_ids(out) - {run.id for run in runs if run.settled}
     if lost:
         raise UserError(
             f"{out}: holds the results of {len(lost)} runs that would be lost; name the folder among those to report, "

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import csv
+import hashlib
 import json
 import math
 import os
@@ -43,7 +44,12 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_json(path: Path, value: Any) -> None:
     """Write a JSON file so that a reader sees it whole or not at all."""
     with replacing_file(path) as fresh:
-        fresh.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
+        fresh.write_text(json_text(value), encoding="utf-8")
+
+
+def json_text(value: Any) -> str:
+    """A JSON file's content."""
+    return json.dumps(value, indent=2) + "\n"
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
@@ -82,6 +88,12 @@ def read_csv(path: Path, columns: Sequence[str], words: Collection[str]) -> list
     except (ValueError, TypeError, csv.Error) as error:
         raise UserError(f"{path}: is damaged ({error}); remove it or choose another --out") from error
     return rows
+
+
+def sha256(path: Path) -> str:
+    """Hexadecimal SHA-256 of a file, which is not held in memory."""
+    with path.open("rb") as file:
+        return hashlib.file_digest(file, "sha256").hexdigest()
 
 
 def write_bytes(path: Path, content: bytes) -> None:

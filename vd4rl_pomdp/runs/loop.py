@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
-from typing import Protocol
+from typing import Any, Protocol
 
 from torch import Tensor
 
@@ -13,6 +13,7 @@ from vd4rl_pomdp.runs.checkpoint import State
 from vd4rl_pomdp.runs.metrics import Means, MetricsLog
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.run import RunFolder
+from vd4rl_pomdp.runs.sinks import open_sinks
 
 
 class Learner(Protocol):
@@ -54,6 +55,10 @@ class Loop:
         self._log.write(self._learner.step, row)
         self.show(**{name: row[name] for name in shown or row})
 
+    def log_evaluation(self, row: dict[str, float]) -> None:
+        """Write what an evaluation after the step just done gave, by names that begin with `metrics.EVALUATION`."""
+        self._log.write(self._learner.step, row)
+
     def show(self, **numbers: float) -> None:
         """Show numbers in the progress line."""
         self._progress.advance(0, **numbers)
@@ -68,8 +73,27 @@ class Loop:
 
 
 @contextmanager
-def training(run: RunFolder, learner: Learner, title: str, total: int, unit: str = "steps") -> Iterator[Loop]:
-    """Restore a learner from a run's newest checkpoint and open what its loop writes; signals wait for a step's end."""
+def training(
+    run: RunFolder,
+    learner: Learner,
+    title: str,
+    total: int,
+    unit: str = "steps",
+    *,
+    labels: Mapping[str, Any],
+    card: Mapping[str, Any] | None = None,
+) -> Iterator[Loop]:
+    """Restore a learner from a run's newest checkpoint and open what its loop writes; signals wait for a step's end.
+
+    Args:
+        run: the run.
+        learner: what is trained.
+        title: what the progress line says.
+        total: the step at which the loop ends.
+        unit: what the progress line counts.
+        labels: what names the run where it is tracked: method, task, quality, corruption.
+        card: what the encoder that it started from says of its pretraining, if there is one.
+    """
     means = Means()
 
     def restore(state: State) -> None:
@@ -77,7 +101,7 @@ def training(run: RunFolder, learner: Learner, title: str, total: int, unit: str
         means.load_state_dict(state["means"])
 
     run.restore(restore)
-    log = MetricsLog(run.path / "metrics.jsonl", learner.step, run.config["wandb"], run.config)
+    log = MetricsLog(run.path / "metrics.jsonl", learner.step, open_sinks(run, learner.step, labels, card or {}))
     with closing(log), ProgressLine(title, total, unit, learner.step) as progress, interrupt.deferred():
         try:
             yield Loop(run, learner, means, total, log, progress)

@@ -1,15 +1,12 @@
-"""metrics.jsonl: rows of means, one JSON object a line, appended as a run goes.
-
-wandb may mirror it and can never stop a run.
-"""
+"""metrics.jsonl: rows of means and of evaluations, one JSON object a line, appended as a run goes."""
 
 from __future__ import annotations
 
 import json
 import math
-import sys
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, Literal
+from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
@@ -18,7 +15,12 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.files import appending, write_bytes
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 
+if TYPE_CHECKING:
+    from vd4rl_pomdp.runs.sinks import Sink
+
 WandbMode = Literal["off", "offline", "online"]
+EVALUATION = "eval/"
+"""How the names of an evaluation's numbers begin: eval/return/CORRUPTION, eval/score/CORRUPTION."""
 
 
 class Means:
@@ -51,13 +53,15 @@ class Means:
 
 
 class MetricsLog:
-    """Appends rows {"step": int, name: number, ...}; opening it again at a checkpoint drops the rows after it."""
+    """Appends rows {"step": int, name: number, ...}, which its sinks get, too.
 
-    def __init__(self, path: Path, step: int, wandb: WandbMode = "off", config: dict[str, Any] | None = None) -> None:
-        self._path = path
-        kept = [row for row in read_metrics(path) if row["step"] <= step]
+    Opening it again at a checkpoint drops the rows after it: those of later steps, and an evaluation of its own step.
+    """
+
+    def __init__(self, path: Path, step: int, sinks: Sequence[Sink] = ()) -> None:
+        self._path, self._sinks = path, sinks
+        kept = [row for row in read_metrics(path) if row["step"] < step + (not _is_evaluation(row))]
         write_bytes(path, "".join(json.dumps(row) + "\n" for row in kept).encode())
-        self._wandb = _start_wandb(wandb, path.parent, config or {})
 
     def write(self, step: int, metrics: dict[str, float]) -> None:
         """Append one row; a metric that is not a finite number raises FloatingPointError."""
@@ -66,13 +70,13 @@ class MetricsLog:
             raise FloatingPointError(f"{self._path.parent}: {bad[0]} is {metrics[bad[0]]} in the row of step {step}")
         with appending(self._path) as file:
             file.write(json.dumps({"step": step} | metrics) + "\n")
-        if self._wandb is not None:
-            self._wandb.log(metrics, step=step)
+        for sink in self._sinks:
+            sink.write(step, metrics)
 
     def close(self) -> None:
-        """End the mirror, if there is one."""
-        if self._wandb is not None:
-            self._wandb.finish()
+        """Close the sinks."""
+        for sink in self._sinks:
+            sink.close()
 
 
 def read_metrics(path: Path) -> list[dict[str, float]]:
@@ -98,13 +102,5 @@ def _row(line: str) -> dict[str, float]:
     return row
 
 
-def _start_wandb(mode: WandbMode, folder: Path, config: dict[str, Any]) -> Any:
-    if mode == "off":
-        return None
-    import wandb
-
-    try:
-        return wandb.init(project="vd4rl-pomdp", dir=str(folder), mode=mode, config=config)
-    except wandb.errors.Error as error:
-        print(f"wandb could not start ({error}); the run goes on, metrics are in {folder}", file=sys.stderr)
-        return None
+def _is_evaluation(row: dict[str, float]) -> bool:
+    return any(name.startswith(EVALUATION) for name in row)

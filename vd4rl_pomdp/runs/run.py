@@ -50,7 +50,7 @@ class RunFolder:
         self.path = path
         self.config: dict[str, Any] = jsonable(flat(config))
         self.inputs = inputs
-        self._stage = stage
+        self.stage = stage
         self._checkpoints = Checkpoints(path)
         self._started, self._before = time.monotonic(), 0.0
         self._stack = ExitStack()
@@ -73,7 +73,7 @@ class RunFolder:
         old, inputs = (part if isinstance(part := stored.get(name), dict) else {} for name in ("config", "inputs"))
         keys = set(self.config) - RUNTIME_FIELDS  # an earlier version recorded options that nothing read, too
         differing = sorted(k for k in keys if old.get(k) != self.config[k])
-        if stored["stage"] != self._stage or differing:
+        if stored["stage"] != self.stage or differing:
             what = ", ".join(differing) or f"stage {stored['stage']}"
             raise UserError(f"{self.path}: holds a run with another config ({what}); choose another --out or remove it")
         self._check_inputs(inputs)
@@ -100,7 +100,7 @@ class RunFolder:
 
     def _begin(self) -> None:
         if not (self.path / "config.json").exists():
-            record = {"format": FORMAT, "stage": self._stage, "config": self.config, "inputs": self.inputs}
+            record = {"format": FORMAT, "stage": self.stage, "config": self.config, "inputs": self.inputs}
             origin = {"versions": versions(), "git_commit": git_commit(), "command": command()}
             origin |= {"plugins": origins(self.config), "collection": collection_of(Path(self.config["data"]))}
             write_json(self.path / "config.json", record | origin)

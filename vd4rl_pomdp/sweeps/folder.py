@@ -35,39 +35,40 @@ class SweepFolder:
     def __init__(self, out: Path) -> None:
         """Nothing is written."""
         self.out = out
-        self._folder = out / FOLDER
-        self._attempts = self._folder / "attempts.jsonl"
+        self.path = out / FOLDER
+        """Where they lie."""
+        self._attempts = self.path / "attempts.jsonl"
 
     def keep_plan(self, grid: str, jobs: Iterable[Job]) -> None:
         """Write the jobs of a grid, in place of what was written of it before."""
-        with disk_errors(self._folder):
-            (self._folder / "plans").mkdir(parents=True, exist_ok=True)
-        write_json(self._folder / "plans" / f"{grid}.json", [jsonable(asdict(job)) for job in jobs])
+        with disk_errors(self.path):
+            (self.path / "plans").mkdir(parents=True, exist_ok=True)
+        write_json(self.path / "plans" / f"{grid}.json", [jsonable(asdict(job)) for job in jobs])
 
     def jobs(self) -> list[Job]:
         """The jobs of all plans; UserError if there is none."""
-        plans = sorted((self._folder / "plans").glob("*.json"))
+        plans = sorted((self.path / "plans").glob("*.json"))
         if not plans:
             raise UserError(
-                f"{self._folder.parent}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one"
+                f"{self.path.parent}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one"
             )
         jobs = [job for path in plans for job in _read_plan(path)]
         return list({job.name: job for job in jobs}.values())
 
     def work(self, job: Job, slots: int) -> Work:
         """A job as an executor takes it."""
-        log = self._folder / "logs" / f"{job.name}.log"
+        log = self.path / "logs" / f"{job.name}.log"
         return Work(job.name, job.words, log, slots)
 
     def of_executor(self, name: str) -> Path:
         """Folder of what an executor keeps."""
-        return self._folder / name
+        return self.path / name
 
     def add(self, row: Row) -> None:
         """Append the row of an attempt."""
         line = json.dumps(row) + "\n"
         with disk_errors(self._attempts):
-            self._folder.mkdir(parents=True, exist_ok=True)
+            self.path.mkdir(parents=True, exist_ok=True)
             handle = os.open(self._attempts, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
             try:
                 os.write(handle, line.encode())

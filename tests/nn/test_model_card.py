@@ -1,0 +1,99 @@
+"""An encoder's card: what it says, that a page and YAML take it whatever others called their parts, and its code."""
+
+import json
+import re
+from dataclasses import replace
+
+import pytest
+import yaml
+from huggingface_hub import ModelCard
+
+from tests.nn.test_encoder import CARD, make
+from vd4rl_pomdp.nn.encoder_card import EncoderRecord
+from vd4rl_pomdp.nn.encoder_folder import (
+    copy_encoder,
+    encoder_hash,
+    read_record,
+    save_encoder,
+    tell_probe,
+)
+from vd4rl_pomdp.nn.model_card import model_card
+
+
+def cells(text: str) -> dict[str, str]:
+    return dict(re.findall(r"^\| ([^|]+) \| (.*) \|$", text, re.MULTILINE))
+
+
+@pytest.fixture
+def folder(tmp_path):
+    card = replace(CARD, data="f00d", settings={"max_k": 15}, corruption={"corruption": "patch", "patch_size": 8})
+    save_encoder(tmp_path / "encoder", make("gru", True), card, frames=10 * 2 * 8)
+    return tmp_path / "encoder"
+
+
+def test_the_card_says_what_the_config_says_in_the_hubs_format(folder):
+    card = ModelCard.load(folder / "README.md")
+    assert (card.data.license, card.data.library_name) == ("mit", "vd4rl-pomdp")
+    assert {"mik+a", "walker_walk", "patch", "offline-reinforcement-learning"} <= set(card.data.tags)
+    told = cells(card.text)
+    assert (told["method"], told["data"], told["seed"]) == ("`mik+a`", "fingerprint `f00d`", "0")
+    assert json.loads(told["corruption"].strip("`")) == {"corruption": "patch", "patch_size": 8}
+    assert told["budget"] == "preset `smoke`, 10 gradient steps, 160 frames"
+    assert (told["linear probe"], told["licence"]) == ("not measured", "`mit`")
+    origin = read_record(folder).origin
+    assert told["made by"] == f"vd4rl-pomdp {origin.version}" + (f", commit `{origin.commit}`" if origin.commit else "")
+    settings = json.loads(re.search(r"```json\n(.*)\n```", card.text, re.DOTALL)[1])
+    assert settings == json.loads((folder / "config.json").read_text())["pretrain"]
+
+
+def test_its_code_loads_the_encoder(folder, monkeypatch, capsys):
+    monkeypatch.chdir(folder)
+    block = re.search(r"```python\n(.*?)\n```", (folder / "README.md").read_text(), re.DOTALL)[1]
+    exec(block, {})
+    assert capsys.readouterr().out.split() == ["mik+a", "walker_walk", "12"]
+
+
+def test_an_encoders_name_changes_with_its_weights_and_config_only(folder, tmp_path):
+    name = encoder_hash(folder)
+    tell_probe(folder, {"probe_pose": 12.34, "probe_velocity": 56.0})
+    assert encoder_hash(folder) == name
+    config = json.loads((folder / "config.json").read_text())
+    (folder / "README.md").unlink()
+    earlier = {part: config[part] for part in ("encoder", "pretrain")}  # as versions without an origin wrote it
+    (folder / "config.json").write_text(json.dumps(earlier, indent=2) + "\n")
+    assert encoder_hash(folder) == name
+    (folder / "config.json").write_text(json.dumps(earlier | {"pretrain": config["pretrain"] | {"seed": 1}}, indent=2))
+    assert encoder_hash(folder) != name
+
+
+def test_a_probe_is_told_and_copied(folder, tmp_path):
+    tell_probe(folder, {"probe_pose": 12.34, "probe_velocity": 56.0})
+    copy_encoder(folder, tmp_path / "copy", {"readout": "state"})
+    told = cells((tmp_path / "copy" / "README.md").read_text())["linear probe"]
+    assert told == "error of pose 12.3%, velocity 56.0% of a standard deviation, on held-out episodes"
+    assert read_record(tmp_path / "copy").encoder.readout == "state"
+    assert read_record(tmp_path / "copy").origin == read_record(folder).origin
+
+
+@pytest.mark.parametrize(
+    ("card", "frames", "budget"),
+    [
+        (CARD, None, "preset `smoke`, 10 gradient steps"),
+        (CARD, 0, "none: it is not trained"),
+        (replace(CARD, end_to_end="bc"), 0, "no pretraining: `bc` trains it with the policy"),
+    ],
+)
+def test_a_budget_is_what_was_spent(folder, card, frames, budget):
+    record = read_record(folder)
+    text = model_card(EncoderRecord(record.encoder, card, replace(record.origin, frames=frames)))
+    assert cells(text)["budget"] == budget
+
+
+def test_names_of_others_break_neither_the_page_nor_its_front_matter(folder):
+    record = read_record(folder)
+    name = 'my: "method" | `x`\n---\n'
+    text = model_card(replace(record, pretrain=replace(record.pretrain, method=name)), license="apache-2.0")
+    front = yaml.safe_load(text.split("---\n")[1])
+    assert front["license"] == "apache-2.0"
+    assert front["tags"][-3] == 'my: "method" | `x` ---'
+    assert cells(text.replace(r"\|", "/"))["method"].strip("` ") == 'my: "method" / `x` ---'

@@ -1,0 +1,90 @@
+"""Two result sets side by side."""
+
+import csv
+from pathlib import Path
+
+import pytest
+
+from tests.helpers_report import describe, write_run
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.report.compare import compare_results
+from vd4rl_pomdp.results import add_results
+
+
+def two_sets(folder: Path) -> tuple[Path, Path]:
+    """Two seeds of acro in both, longer pretrained in the second; mik+a in the first, curl in the second alone."""
+    for seed in (0, 1):
+        describe(write_run(folder / f"a/acro{seed}", "acro", seed, {5: [90.0], 10: [20.0 + seed]}), {})
+        describe(write_run(folder / f"b/acro{seed}", "acro", seed, {10: [26.0 + seed]}), {"steps": 60}, views=1)
+        describe(write_run(folder / f"a/mik{seed}", "mik+a", seed, {10: [30.0]}), {})
+    describe(write_run(folder / "b/curl", "curl", 0, {10: [50.0]}), {})
+    (describe(write_run(folder / "b/late", "curl", 1, {10: [99.0]}), {}) / "timing.json").unlink()
+    return folder / "a", folder / "b"
+
+
+def test_conditions_are_told_side_by_side_with_what_differs(tmp_path):
+    found = compare_results(*two_sets(tmp_path))
+    acro, curl, mik = found.rows
+    assert (acro["score_a"], acro["score_b"], acro["difference"]) == (20.5, 26.5, 6.0)
+    assert (acro["low"], acro["high"]) == (5.0, 7.0), "the ends of 25 and 27 less 20 and 21, rarely drawn further apart"
+    assert (acro["low_a"], acro["high_a"], acro["seeds_a"], acro["seeds_b"]) == (20.0, 21.0, 2, 2)
+    assert acro["settings"] == "views 4 → 1, steps 20 → 60"
+    assert (curl["score_a"], curl["score_b"], curl["seeds_b"], curl["difference"]) == (None, 50.0, 1, None)
+    assert (mik["score_a"], mik["score_b"], mik["settings"]) == (30.0, None, "")
+    assert [side.others for side in found.sides] == [0, 1], "an unfinished run has no score"
+
+
+def test_a_set_against_itself_differs_in_nothing(tmp_path):
+    runs, _ = two_sets(tmp_path)
+    add_results([runs], tmp_path / "rows")
+    for row in compare_results(runs, tmp_path / "rows").rows:
+        assert (row["difference"], row["settings"]) == (0.0, "")
+        assert row["score_a"] == row["score_b"]
+
+
+def test_variants_are_compared_by_name_and_a_lone_one_with_the_other_sets(tmp_path):
+    for k in (1, 15):
+        describe(write_run(tmp_path / f"a/{k}", "mik+a", 0, {10: [k]}), {"max_k": k})
+        describe(write_run(tmp_path / f"b/{k}", "mik+a", 0, {10: [2.0 * k]}), {"max_k": k})
+    both = compare_results(tmp_path / "a", tmp_path / "b").rows
+    assert {row["variant"]: row["difference"] for row in both} == {"max_k 1": 1.0, "max_k 15": 15.0}
+    lone = compare_results(tmp_path / "a" / "15", tmp_path / "b" / "1").rows
+    assert [(row["difference"], row["settings"]) for row in lone] == [(-13.0, "max_k 15 → 1")]
+    some = compare_results(tmp_path / "a", tmp_path / "b" / "1").rows
+    assert [row["difference"] for row in some] == [None] * 3, "which of two it is compared with is not told"
+
+
+def test_the_command_prints_and_writes_a_page(tmp_path, capsys):
+    a, b = two_sets(tmp_path)
+    main(["report", "compare", str(a), str(b), "--out", str(tmp_path / "out")])
+    shown = capsys.readouterr().out
+    assert "only in A" in shown
+    assert f"comparison: {tmp_path / 'out' / 'index.html'}" in shown
+    page = (tmp_path / "out" / "index.html").read_text()
+    for text in ("<td>acro</td>", ">+6.0<", "[5.0, 7.0]", "2 | 2", "views 4 → 1, steps 20 → 60", "only in B", str(a)):
+        assert text in page
+    with (tmp_path / "out" / "comparison.csv").open() as file:
+        assert [row["method"] for row in csv.DictReader(file)] == ["acro", "curl", "mik+a"]
+    assert r"steps 20 $\rightarrow$ 60" in (tmp_path / "out" / "comparison.tex").read_text()
+    with pytest.raises(SystemExit):
+        main(["report", "compare", "--help"])
+    assert "report compare" in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["a"], "error: "),
+        (["a", "nowhere"], "nowhere: no such folder"),
+        (["a", "b/late"], "late: holds no finished and evaluated run to compare"),
+        (["a", "b", "--out", "a"], "choose another --out"),
+        (["a", "b", "--out", "a/acro0"], "choose another --out"),
+    ],
+)
+def test_bad_input_is_one_line(tmp_path, capsys, monkeypatch, words, message):
+    two_sets(tmp_path)
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit) as end:
+        main(["report", "compare", *words])
+    assert end.value.code == 2
+    assert message in capsys.readouterr().err

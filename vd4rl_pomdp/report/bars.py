@@ -1,0 +1,149 @@
+"""The paper's figures of returns: one for each corruption, a panel for each task and quality, a bar for each method."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+
+from vd4rl_pomdp.report.figures import COLOURS, Plot, file_name, grid_of, panels, seeds_note
+from vd4rl_pomdp.report.tables import by_label, grouped, label
+from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.text import plain
+
+PAPER_QUALITIES = ("expert", "medium_expert")
+"""Those of the paper's figures, which come first; its appendix adds medium."""
+_HATCHES = ("", "////", "....")
+_NAME_WIDTH = 22
+_LEGEND = (
+    "Methods in the order of their names. Bars: mean over seeds at the last evaluation, with 95% interval; dots: "
+    "seeds; open diamonds: mean at the best evaluation; a cross with a number: so many seeds are missing, unfinished "
+    "or diverged."
+)
+_PUBLISHED = {"bc": (":", "BC"), "drq_bc": ("--", "DrQ+BC")}
+"""Published methods that are drawn as lines: their dashes and their names."""
+_WIDEST = 4
+"""Panels in a row, at most."""
+_KEYS = ("task", "quality", "corruption")
+_COLUMNS = ("kind", *_KEYS, "method", "seed", "score", "low", "high", "seeds", "best_score", "missing")
+
+
+def bar_plots(
+    summary: list[Row], runs: list[Row], looks: dict[str, int], published: list[dict[str, str]]
+) -> list[Plot]:
+    """One figure a corruption.
+
+    Args:
+        summary: scores of every condition.
+        runs: table of runs, whose final scores are the dots.
+        looks: numbers of all methods of the report in `style`.
+        published: scores by `env` and `dataset` that were reached on the very sets of a panel; drawn where the
+            corruption is none.
+    """
+    plots = []
+    for (corruption,), members in grouped(summary, ("corruption",)):
+        mine = [row for row in runs if row["corruption"] == corruption and row["score"] is not None]
+        lines = published if corruption == "none" else []
+        plots.append(_plot(corruption, members, mine, looks, lines))
+    return plots
+
+
+def _plot(
+    corruption: str, summary: list[Row], runs: list[Row], looks: dict[str, int], published: list[dict[str, str]]
+) -> Plot:
+    places, tasks = grid_of(summary, _quality_order)
+    columns = min(tasks, _WIDEST)
+    by_place = {key: members for key, members in grouped(summary, ("task", "quality"))}
+    seeds = {key: members for key, members in grouped(runs, ("task", "quality"))}
+    names = {label(row) for row in summary}
+    looks = {name: look for name, look in looks.items() if name in names}
+    longest = max(len(line) for name in names for line in plain(name, _NAME_WIDTH).split("\n"))
+    titles = [f"{task} {quality}" if (task, quality) in by_place else "" for task, quality in places]
+    figure, axes = panels(titles, {}, columns, room=max(0.0, 0.06 * longest - 0.25))
+    shown = [place for place in places if place in by_place]
+    for panel, place in zip(axes, shown, strict=True):
+        _bars(panel, by_place[place], seeds.get(place, []), looks)
+        for row in published:
+            if (row["env"], row["dataset"]) == place:
+                _lines(panel, row)
+    for panel in axes if "" in titles else axes[::columns]:
+        panel.set_ylabel("score (return / 10)", fontsize=8)
+    rows = [_row(row) for row in summary] + [
+        {"kind": "seed", **{k: row[k] for k in _KEYS}, "method": label(row), "seed": row["seed"], "score": row["score"]}
+        for row in runs
+    ]
+    return Plot(
+        file_name("scores", corruption),
+        f"Final scores under {corruption}. {_LEGEND} {seeds_note(summary)}{_published_note(published)}",
+        "; ".join(map(_words, summary)),
+        figure,
+        [dict.fromkeys(_COLUMNS) | row for row in rows],
+    )
+
+
+def _row(row: Row) -> Row:
+    return {"kind": "mean", "method": label(row)} | {k: row[k] for k in _COLUMNS if k in row and k != "method"}
+
+
+def _quality_order(quality: str) -> tuple[int, str]:
+    return (PAPER_QUALITIES.index(quality) if quality in PAPER_QUALITIES else len(PAPER_QUALITIES), quality)
+
+
+def _bars(axes: Axes, summary: list[Row], runs: list[Row], looks: dict[str, int]) -> None:
+    """A panel's bars, at the same place for each method in all panels, and coloured by the numbers of their looks."""
+    places = {name: place for place, name in enumerate(looks)}
+    scored = [row | {"place": places[label(row)]} for row in summary if row["score"] is not None]
+    _draw(axes, scored, [looks[label(row)] for row in scored])
+    _dots(axes, runs, places, looks)
+    for row in summary:
+        if row["absent"]:
+            crossed: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 6.5, "weight": "bold", "zorder": 5}
+            axes.text(places[label(row)], 0, f"×{row['absent']}", **crossed)
+    axes.set_xticks(range(len(looks)), [plain(name, _NAME_WIDTH) for name in looks], rotation=90, fontsize=7)
+    axes.set_xlim(-0.6, len(looks) - 0.4)
+    axes.set_ylim(bottom=0)
+    axes.grid(axis="x", visible=False)
+
+
+def _draw(axes: Axes, rows: list[Row], looks: list[int]) -> None:
+    """Bars with their intervals and best evaluations."""
+    places = [row["place"] for row in rows]
+    hatches = [_HATCHES[look // len(COLOURS) % len(_HATCHES)] for look in looks]
+    colours = [COLOURS[look % len(COLOURS)] for look in looks]
+    bar: dict[str, Any] = {"color": colours, "hatch": hatches, "edgecolor": "white", "linewidth": 0, "alpha": 0.55}
+    axes.bar(places, [row["score"] for row in rows], 0.8, **bar)
+    known = [row for row in rows if row["low"] is not None]
+    middles, lows, highs = ([row[name] for row in known] for name in ("place", "low", "high"))
+    axes.vlines(middles, lows, highs, color="black", lw=1.4, zorder=3)
+    axes.scatter(places, [row["best_score"] for row in rows], 16, marker="D", fc="none", ec="black", lw=0.7, zorder=4)
+
+
+def _dots(axes: Axes, runs: list[Row], places: dict[str, int], looks: dict[str, int]) -> None:
+    """One dot a seed, side by side."""
+    x, y, colours = [], [], []
+    for name, members in by_label(runs):
+        spread = np.linspace(-0.25, 0.25, len(members)) if len(members) > 1 else np.zeros(1)
+        x += (places[name] + spread).tolist()
+        y += [row["score"] for row in sorted(members, key=lambda row: row["seed"])]
+        colours += [COLOURS[looks[name] % len(COLOURS)]] * len(members)
+    axes.scatter(x, y, 7, color=colours, ec="black", lw=0.4, zorder=4)
+
+
+def _lines(axes: Axes, row: dict[str, str]) -> None:
+    """Published scores as lines, named at their right end."""
+    for name, (dashes, shown) in _PUBLISHED.items():
+        value = float(row[name])
+        axes.axhline(value, color="black", lw=0.9, linestyle=dashes, zorder=1)
+        axes.text(1.0, value, shown, transform=axes.get_yaxis_transform(), fontsize=6, ha="right", va="bottom")
+
+
+def _published_note(published: list[dict[str, str]]) -> str:
+    return " Lines: V-D4RL's published scores, on the same sets, with nothing hidden." if published else ""
+
+
+def _words(row: Row) -> str:
+    place = f"{row['task']} {row['quality']}: {label(row)}"
+    if row["score"] is None:
+        return f"{place} {row['missing']}"
+    return f"{place} {row['score']:.1f} (n = {row['seeds']})"

@@ -1,0 +1,187 @@
+"""Two result sets side by side: scores, differences, what only one of them has, and settings that are not the same."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.console import Console
+from rich.table import Table as TerminalTable
+from rich.text import Text
+
+from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.report import stats
+from vd4rl_pomdp.report.figures import seeds_note
+from vd4rl_pomdp.report.gaps import CONDITION
+from vd4rl_pomdp.report.layout import Line, Table, interval, latex, with_interval
+from vd4rl_pomdp.report.load import LoadedRun, load_runs
+from vd4rl_pomdp.report.measures import machine
+from vd4rl_pomdp.report.present import by_setting
+from vd4rl_pomdp.report.tables import evaluations, final_scores, grouped, label
+from vd4rl_pomdp.report.templates import render
+from vd4rl_pomdp.runs.files import Row, write_bytes, write_csv
+from vd4rl_pomdp.runs.outputs import refuse_foreign
+from vd4rl_pomdp.text import write_text
+
+FILE = "comparison"
+"""Its files' name, which tells a comparison's folder."""
+_KEY = CONDITION[:-1]
+"""What two conditions share, however their variants are called."""
+_COLUMNS = ("method", "A", "B", "B – A", "95% interval", "seeds", "settings, A → B")
+
+
+class Side(NamedTuple):
+    """One of the two result sets."""
+
+    path: Path
+    finished: int
+    """Runs with scores."""
+    others: int
+    """Unfinished and diverged runs, of which no score is compared."""
+    commits: str
+    machines: str
+
+
+class Comparison(NamedTuple):
+    """Two result sets side by side."""
+
+    sides: tuple[Side, Side]
+    rows: list[Row]
+    """One a condition: scores with intervals and n of both, difference with interval, settings that differ."""
+
+
+def compare_results(one: Path, other: Path) -> Comparison:
+    """Compare the final scores of all finished runs at or below two paths, run folders or results folders.
+
+    Conditions are those of a report of each set. A method that has a single variant in either set is compared whatever
+    its settings; a method with several is compared where both sets have a variant of the same name.
+
+    Raises:
+        UserError: a path holds no evaluated run, or a file is damaged.
+    """
+    runs = [_loaded(path) for path in (one, other)]
+    first, second = (dict(_conditions(part)) for part in runs)
+    pairs: list[tuple[tuple | None, tuple | None]] = [(mine, _partner(mine, first, second)) for mine in first]
+    matched = {theirs for _, theirs in pairs}
+    pairs += [(None, theirs) for theirs in second if theirs not in matched]
+    rows = [_row(first.get(mine or ()), second.get(theirs or ()), mine or theirs or ()) for mine, theirs in pairs]
+    sides = _side(one, runs[0]), _side(other, runs[1])
+    return Comparison(sides, sorted(rows, key=lambda row: [str(row[name]) for name in CONDITION]))
+
+
+def _loaded(path: Path) -> list[LoadedRun]:
+    runs = [run for run in load_runs([path]) if run.stage == "finetune"]
+    if not any(run.rows and run.finished for run in runs):
+        raise UserError(f"{path}: holds no finished and evaluated run to compare")
+    return runs
+
+
+def _conditions(runs: list[LoadedRun]) -> Iterable[tuple[tuple, list[LoadedRun]]]:
+    """Finished runs by the values of CONDITION."""
+    finished = [{**run.labels, "variant": run.variant, "run": run} for run in runs if run.rows and run.finished]
+    return ((key, [row["run"] for row in members]) for key, members in grouped(finished, CONDITION))
+
+
+def _partner(mine: tuple, first: dict[tuple, Any], second: dict[tuple, Any]) -> tuple | None:
+    """The condition of the second set that one of the first is compared with."""
+    if mine in second:
+        return mine
+    (alike, theirs) = ([key for key in part if key[: len(_KEY)] == mine[: len(_KEY)]] for part in (first, second))
+    return theirs[0] if len(alike) == len(theirs) == 1 else None
+
+
+def _row(one: list[LoadedRun] | None, other: list[LoadedRun] | None, key: tuple) -> Row:
+    """A condition's row; what a set does not have is None."""
+    scores = [None if runs is None else final_scores(evaluations(runs)) for runs in (one, other)]
+    row: Row = dict(zip(CONDITION, key, strict=True))
+    for side, values in zip("ab", scores, strict=True):
+        row |= _score(side, values)
+    found: tuple[float | None, ...] = (None, None, None)
+    if scores[0] is not None and scores[1] is not None:
+        ends = stats.difference_interval(scores[1], scores[0], np.random.default_rng(0)) or (None, None)
+        found = (float(scores[1].mean() - scores[0].mean()), *ends)
+    row |= dict(zip(("difference", "low", "high"), found, strict=True))
+    return row | {"settings": _differing(one, other) if one and other else ""}
+
+
+def _score(side: str, scores: np.ndarray | None) -> Row:
+    if scores is None:
+        return {f"score_{side}": None, f"low_{side}": None, f"high_{side}": None, f"seeds_{side}": 0}
+    low, high = stats.bootstrap_interval([scores], stats.mean, np.random.default_rng(0)) or (None, None)
+    ends = {f"low_{side}": low, f"high_{side}": high}
+    return {f"score_{side}": float(scores.mean())} | ends | {f"seeds_{side}": len(scores)}
+
+
+def _differing(one: list[LoadedRun], other: list[LoadedRun]) -> str:
+    """Settings whose values are not the same in both sets: "steps 20 → 60, views 4 → 1"."""
+    names = dict.fromkeys(name for run in (*one, *other) for name in run.settings)
+    told = []
+    for name in names:
+        mine, theirs = (sorted({run.settings.get(name, "unset") for run in runs}) for runs in (one, other))
+        if mine != theirs:
+            told.append(f"{name} {' or '.join(mine)} → {' or '.join(theirs)}")
+    return ", ".join(told)
+
+
+def _side(path: Path, runs: list[LoadedRun]) -> Side:
+    finished = [run for run in runs if run.rows and run.finished]
+    commits = dict.fromkeys(str(run.record.get("git_commit") or "unknown") for run in finished)
+    machines = dict.fromkeys(machine(run) or "not recorded" for run in finished)
+    return Side(path, len(finished), len(runs) - len(finished), ", ".join(commits), "; ".join(machines))
+
+
+def tables(comparison: Comparison) -> list[Table]:
+    """The comparison as the page shows it, one table a setting."""
+    return [
+        Table(name, _COLUMNS, [Line(_cells(row)) for row in members], note=_note(members))
+        for name, members in by_setting(comparison.rows)
+    ]
+
+
+def _note(rows: list[Row]) -> str:
+    return seeds_note([{"seeds": row[name]} for row in rows for name in ("seeds_a", "seeds_b")])
+
+
+def _cells(row: Row) -> tuple[str, ...]:
+    scores = (with_interval(row[f"score_{s}"], row[f"low_{s}"], row[f"high_{s}"]) for s in "ab")
+    difference = "–" if row["difference"] is None else f"{row['difference']:+.1f}"
+    if row["difference"] is None:
+        told = f"only in {'B' if row['score_a'] is None else 'A'}"
+    else:
+        told = row["settings"] or "the same"
+    seeds = f"{row['seeds_a']} | {row['seeds_b']}"
+    return label(row), *scores, difference, interval(row["low"], row["high"]), seeds, told
+
+
+def print_comparison(comparison: Comparison, console: Console | None = None) -> None:
+    """The comparison on the terminal, one table a setting."""
+    console = console or Console()
+    for name, side in zip("AB", comparison.sides, strict=True):
+        others = f", {side.others} unfinished or diverged" if side.others else ""
+        console.print(f"{name}: {side.path}, {side.finished} finished runs{others}", markup=False, highlight=False)
+    for table in tables(comparison):
+        shown = TerminalTable(title=Text(table.title), title_justify="left")
+        for name in table.columns:
+            shown.add_column(name, overflow="fold", justify="left" if name in (_COLUMNS[0], _COLUMNS[-1]) else "right")
+        for line in table.lines:
+            shown.add_row(*map(Text, line.cells))
+        console.print(shown)
+
+
+def write_comparison(comparison: Comparison, out: Path) -> Path:
+    """Write the comparison as page, CSV and LaTeX into a folder; returns the page.
+
+    Raises:
+        UserError: the folder holds anything but an earlier comparison.
+    """
+    refuse_foreign(out, "comparison", f"{FILE}.csv")
+    with disk_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    shown = tables(comparison)
+    write_csv(out / f"{FILE}.csv", list(comparison.rows[0]), comparison.rows)
+    note = "Score = return / 10, mean over seeds; 95% percentile bootstrap intervals."
+    write_bytes(out / f"{FILE}.tex", latex(shown, note).encode(errors="backslashreplace"))
+    write_text(out / "index.html", render("compare.html", sides=comparison.sides, tables=shown, file=FILE))
+    return out / "index.html"

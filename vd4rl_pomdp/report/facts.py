@@ -1,0 +1,74 @@
+"""What a page says of its runs beside numbers: how they were made, how far they are, and where they differ."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+from vd4rl_pomdp.report.load import LoadedRun, compare
+from vd4rl_pomdp.report.measures import machine
+from vd4rl_pomdp.report.tables import label, setting
+from vd4rl_pomdp.runs.settings import settings_of
+
+_SEEDS = 12
+"""Seeds that are named one by one, at most."""
+
+
+def title(run: LoadedRun) -> str:
+    """A run's stage, method and setting, all but its seed."""
+    return f"{run.stage} {label(_row(run))}, {setting(run.labels)}"
+
+
+def unfinished(runs: list[LoadedRun]) -> list[tuple[str, str, str]]:
+    """Title, folder and state of every run that is unfinished or diverged."""
+    return [
+        (f"{title(run)}, seed {run.labels['seed']}", str(run.path), _state(run)) for run in runs if not run.finished
+    ]
+
+
+def _state(run: LoadedRun) -> str:
+    """How far it is, and why no further."""
+    message = (run.result.diverged or {}).get("message")
+    return f"{run.progress}: {message}" if message else run.progress
+
+
+def differing(runs: list[LoadedRun]) -> list[tuple[str, str]]:
+    """Each method of which there are several variants, and all settings that differ, those of a preset included."""
+    told = zip(runs, compare(runs, brief=False), strict=True)
+    named = {
+        label(_row(run)): ", ".join(filter(None, parts))
+        for run, parts in told
+        if run.stage == "finetune" and run.variant
+    }
+    return list(named.items())
+
+
+def facts(runs: list[LoadedRun]) -> list[dict[str, str]]:
+    """One entry for all seeds of a condition: what they share, and what they were computed with."""
+    groups: dict[str, list[LoadedRun]] = {}
+    for run in runs:
+        groups.setdefault(title(run), []).append(run)
+    return [_facts(name, members) for name, members in groups.items()]
+
+
+def _facts(name: str, runs: list[LoadedRun]) -> dict[str, str]:
+    seeds = sorted({str(run.labels["seed"]) for run in runs}, key=lambda seed: (len(seed), seed))
+    shown = seeds if len(seeds) <= _SEEDS else [*seeds[:3], "...", seeds[-1]]
+    seconds = [run.seconds for run in runs if run.seconds is not None]
+    first = runs[0].record
+    return {
+        "title": f"{name}, {'seeds' if len(seeds) > 1 else 'seed'} {', '.join(shown)}",
+        "commits": ", ".join(_distinct(run.record.get("git_commit") or "unknown" for run in runs)),
+        "machines": "; ".join(_distinct(machine(run) or "not recorded" for run in runs)),
+        "time": f"{min(seconds):.0f} to {max(seconds):.0f} s" if seconds else runs[0].progress,
+        "command": first.get("command", ""),
+        "config": json.dumps({"config": settings_of(first["config"]), "versions": first.get("versions")}, indent=1),
+    }
+
+
+def _distinct(words: Any) -> list[str]:
+    return list(dict.fromkeys(map(str, words)))
+
+
+def _row(run: LoadedRun) -> dict[str, Any]:
+    return run.labels | {"variant": run.variant}

@@ -1,0 +1,120 @@
+"""Tables about what is not a score: each run's encoder and provenance, what policies do, and what runs cost."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+
+import numpy as np
+
+from vd4rl_pomdp.evaluation import summarise
+from vd4rl_pomdp.report.gaps import CONDITION, in_words
+from vd4rl_pomdp.report.load import IDENTITY, LoadedRun
+from vd4rl_pomdp.report.tables import by_label, grouped, table_order
+from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.tasks import SCORE_DIVISOR
+
+PROBES = ("probe_pose", "probe_velocity")
+COSTS = ("pretrain_seconds", "finetune_seconds")
+_RUN = (
+    *("id", *IDENTITY, "action_loss", *PROBES, "score", "return", "best_score", "best_step"),
+    *(*COSTS, "git_commit", "machine", "state"),
+)
+_EVALUATED = {"return": "return_mean", "share_above_80": "share_above_80", "action_error": "action_error"}
+"""Columns of `control` that tell of an evaluation, and what `summarise` calls them."""
+_CONTROL = ("data_return", *_EVALUATED, *(f"clean_{name}" for name in _EVALUATED), "path_error")
+_MEANS = ("action_loss", *PROBES, "return", *COSTS)
+
+
+def run_table(runs: list[LoadedRun], evaluated: list[Row], gaps: list[Row]) -> list[Row]:
+    """One row for every finished and evaluated run: its encoder's measures, its scores, costs and provenance.
+
+    Rows of missing, unfinished and diverged runs have a state but no numbers.
+
+    Args:
+        runs: all of the report.
+        evaluated: their evaluations.
+        gaps: of `find_gaps`.
+    """
+    curves = dict(grouped(evaluated, IDENTITY))
+    table = []
+    for run in runs:
+        if run.rows and run.finished:
+            curve = curves[tuple((run.labels | {"variant": run.variant})[name] for name in IDENTITY)]
+            table.append(_run(run, curve))
+    return sorted([*table, *(dict.fromkeys(_RUN) | gap for gap in gaps)], key=table_order)
+
+
+def _run(run: LoadedRun, curve: list[Row]) -> Row:
+    """Values of _RUN of one run."""
+    last, best = max(curve, key=lambda row: row["step"]), max(curve, key=lambda row: row["score"])
+    found = run.labels | run.representation | {"id": run.result.id, "variant": run.variant, "state": run.progress}
+    found |= {"score": last["score"], "return": last["score"] * SCORE_DIVISOR}
+    found |= {"best_score": best["score"], "best_step": best["step"], "finetune_seconds": run.seconds}
+    found |= {"git_commit": run.record.get("git_commit", ""), "machine": machine(run)}
+    return {name: found[name] for name in _RUN}
+
+
+def machine(run: LoadedRun) -> str:
+    """What a run was computed on: its GPU, or its processor and cores; empty if it is not known."""
+    told = run.result.files.get("machine", {})
+    if told.get("gpu"):
+        return str(told["gpu"])
+    return f"{told['processor']}, {told.get('cores', '?')} cores" if told.get("processor") else ""
+
+
+def representations(table: list[Row]) -> list[Row]:
+    """Means over the finished seeds of every condition in a table of runs: encoder, return, costs; and the gaps."""
+    found = []
+    for group, members in grouped(table, CONDITION):
+        finished = [row for row in members if row["score"] is not None]
+        means = {name: _known_mean(row[name] for row in finished) for name in _MEANS}
+        states = in_words([row for row in members if row["score"] is None])
+        found.append(dict(zip(CONDITION, group, strict=True)) | means | {"seeds": len(finished), "missing": states})
+    return sorted(found, key=table_order)
+
+
+def costs(table: list[Row]) -> list[Row]:
+    """Mean, least and most seconds of both stages by method, over all finished runs of a table, and their machines."""
+    found = []
+    finished = [row for row in table if row["score"] is not None]
+    for name, members in by_label(finished):
+        row: Row = {"method": name, "runs": len(members)}
+        for cost in COSTS:
+            known = [member[cost] for member in members if member[cost] is not None]
+            row |= {cost: _known_mean(known), f"{cost}_min": min(known, default=None)}
+            row[f"{cost}_max"] = max(known, default=None)
+        found.append(row | {"machines": "; ".join(sorted({member["machine"] for member in members} - {""}))})
+    return found
+
+
+def control(runs: list[LoadedRun]) -> list[Row]:
+    """What the policies of every condition do, beside the data they learned from: means over the finished seeds.
+
+    Return, share of episodes above 80% of the data's return, and action error in closed loop are those of the last
+    evaluation: as trained, and under no corruption (`clean_`). What no seed knows is None.
+    """
+    finished = [run for run in runs if run.rows and run.finished]
+    measured = [run.labels | {"variant": run.variant} | _control(run) for run in finished]
+    table = [
+        dict(zip(CONDITION, group, strict=True))
+        | {name: _known_mean(row[name] for row in members) for name in _CONTROL}
+        | {"seeds": len(members)}
+        for group, members in grouped(measured, CONDITION)
+    ]
+    return sorted(table, key=table_order)
+
+
+def _control(run: LoadedRun) -> Row:
+    """Values of _CONTROL of one run."""
+    found: Row = {"data_return": run.reference.data_return, "path_error": run.reference.path_error}
+    final = max(row["step"] for row in run.rows)
+    for prefix, rows in (("", run.rows), ("clean_", run.clean)):
+        last = [row for row in rows if row["step"] == final]
+        summed = summarise(last, run.reference) if last else {}
+        found |= {prefix + name: summed.get(key) for name, key in _EVALUATED.items()}
+    return found
+
+
+def _known_mean(values: Iterable[float | None]) -> float | None:
+    known = [value for value in values if value is not None]
+    return float(np.mean(known)) if known else None
