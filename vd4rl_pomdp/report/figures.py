@@ -31,7 +31,7 @@ FORMATS: dict[str, dict[str, Any]] = {"png": {"dpi": 150}, "pdf": {"metadata": {
 """Files of a figure, beside the SVG in the page."""
 WIDTH = 10.0
 """Of a figure with several columns of panels, in inches."""
-_LEFT, _RIGHT, _TOP, _BOTTOM, _GAP, _TITLE = 0.55, 0.1, 0.3, 0.5, 0.45, 0.42
+_LEFT, _RIGHT, _TOP, _BOTTOM, _GAP, _TITLE = 0.55, 0.1, 0.42, 0.5, 0.45, 0.42
 _ENTRY, _LETTER, _LINE = 0.55, 0.075, 0.2
 """A legend's entry without its text, one letter of it, and a line, in inches."""
 _TITLE_LETTER, REMARK_LINE = 0.075, 0.11
