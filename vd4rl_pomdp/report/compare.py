@@ -29,7 +29,9 @@ FILE = "comparison"
 """Its files' name, which tells a comparison's folder."""
 _KEY = CONDITION[:-1]
 """What two conditions share, however their variants are called."""
-_COLUMNS = ("method", "A", "B", "B – A", "95% interval", "seeds", "settings, A → B")
+_COLUMNS = ("method", "settings, A → B", "A", "B", "B – A", "95% interval", "seeds")
+_WORDS = 2
+"""Columns that hold words."""
 
 
 class Side(NamedTuple):
@@ -135,7 +137,7 @@ def _side(path: Path, runs: list[LoadedRun]) -> Side:
 def tables(comparison: SideBySide) -> list[ShownTable]:
     """The comparison as the page shows it, one table a setting."""
     return [
-        ShownTable(name, _COLUMNS, [Line(_cells(row)) for row in members], note=_note(members))
+        ShownTable(name, _COLUMNS, [Line(_cells(row)) for row in members], _WORDS, _note(members))
         for name, members in by_setting(comparison.rows)
     ]
 
@@ -152,7 +154,7 @@ def _cells(row: Row) -> tuple[str, ...]:
     else:
         told = row["settings"] or "the same"
     seeds = f"{row['seeds_a']} | {row['seeds_b']}"
-    return label(row), *scores, difference, interval(row["low"], row["high"]), seeds, told
+    return label(row), told, *scores, difference, interval(row["low"], row["high"]), seeds
 
 
 def print_comparison(comparison: SideBySide, console: Console | None = None) -> None:
@@ -163,8 +165,8 @@ def print_comparison(comparison: SideBySide, console: Console | None = None) -> 
         console.print(f"{name}: {side.path}, {side.finished} finished runs{others}", markup=False, highlight=False)
     for table in tables(comparison):
         shown = TerminalTable(title=Text(table.title), title_justify="left")
-        for name in table.columns:
-            shown.add_column(name, overflow="fold", justify="left" if name in (_COLUMNS[0], _COLUMNS[-1]) else "right")
+        for place, name in enumerate(table.columns):
+            shown.add_column(name, overflow="fold", justify="left" if place < _WORDS else "right")
         for line in table.lines:
             shown.add_row(*map(Text, line.cells))
         console.print(shown)
