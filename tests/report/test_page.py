@@ -96,7 +96,7 @@ def test_published_scores_are_lines_where_the_set_is_theirs_and_nothing_is_hidde
 
 
 def test_latex_sets_any_text():
-    table = layout.Table(
+    table = layout.ShownTable(
         "50% & $x_1$", ("a", "b#"), [layout.Line(("{~^\\}", "–")), layout.Line(("x",), "seed_2 <missing>")]
     )
     found = layout.latex([table], "n")

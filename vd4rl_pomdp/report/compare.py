@@ -15,7 +15,7 @@ from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.figures import seeds_note
 from vd4rl_pomdp.report.gaps import CONDITION
-from vd4rl_pomdp.report.layout import Line, Table, interval, latex, with_interval
+from vd4rl_pomdp.report.layout import Line, ShownTable, interval, latex, with_interval
 from vd4rl_pomdp.report.load import LoadedRun, load_runs
 from vd4rl_pomdp.report.measures import machine
 from vd4rl_pomdp.report.present import by_setting
@@ -29,7 +29,9 @@ FILE = "comparison"
 """Its files' name, which tells a comparison's folder."""
 _KEY = CONDITION[:-1]
 """What two conditions share, however their variants are called."""
-_COLUMNS = ("method", "A", "B", "B – A", "95% interval", "seeds", "settings, A → B")
+_COLUMNS = ("method", "settings, A → B", "A", "B", "B – A", "95% interval", "seeds")
+_WORDS = 2
+"""Columns that hold words."""
 
 
 class Side(NamedTuple):
@@ -44,7 +46,7 @@ class Side(NamedTuple):
     machines: str
 
 
-class Comparison(NamedTuple):
+class SideBySide(NamedTuple):
     """Two result sets side by side."""
 
     sides: tuple[Side, Side]
@@ -52,7 +54,7 @@ class Comparison(NamedTuple):
     """One a condition: scores with intervals and n of both, difference with interval, settings that differ."""
 
 
-def compare_results(one: Path, other: Path) -> Comparison:
+def compare_results(one: Path, other: Path) -> SideBySide:
     """Compare the final scores of all finished runs at or below two paths, run folders or results folders.
 
     Conditions are those of a report of each set. A method that has a single variant in either set is compared whatever
@@ -68,7 +70,7 @@ def compare_results(one: Path, other: Path) -> Comparison:
     pairs += [(None, theirs) for theirs in second if theirs not in matched]
     rows = [_row(first.get(mine or ()), second.get(theirs or ()), mine or theirs or ()) for mine, theirs in pairs]
     sides = _side(one, runs[0]), _side(other, runs[1])
-    return Comparison(sides, sorted(rows, key=lambda row: [str(row[name]) for name in CONDITION]))
+    return SideBySide(sides, sorted(rows, key=lambda row: [str(row[name]) for name in CONDITION]))
 
 
 def _loaded(path: Path) -> list[LoadedRun]:
@@ -132,10 +134,10 @@ def _side(path: Path, runs: list[LoadedRun]) -> Side:
     return Side(path, len(finished), len(runs) - len(finished), ", ".join(commits), "; ".join(machines))
 
 
-def tables(comparison: Comparison) -> list[Table]:
+def tables(comparison: SideBySide) -> list[ShownTable]:
     """The comparison as the page shows it, one table a setting."""
     return [
-        Table(name, _COLUMNS, [Line(_cells(row)) for row in members], note=_note(members))
+        ShownTable(name, _COLUMNS, [Line(_cells(row)) for row in members], _WORDS, _note(members))
         for name, members in by_setting(comparison.rows)
     ]
 
@@ -152,10 +154,10 @@ def _cells(row: Row) -> tuple[str, ...]:
     else:
         told = row["settings"] or "the same"
     seeds = f"{row['seeds_a']} | {row['seeds_b']}"
-    return label(row), *scores, difference, interval(row["low"], row["high"]), seeds, told
+    return label(row), told, *scores, difference, interval(row["low"], row["high"]), seeds
 
 
-def print_comparison(comparison: Comparison, console: Console | None = None) -> None:
+def print_comparison(comparison: SideBySide, console: Console | None = None) -> None:
     """The comparison on the terminal, one table a setting."""
     console = console or Console()
     for name, side in zip("AB", comparison.sides, strict=True):
@@ -163,14 +165,14 @@ def print_comparison(comparison: Comparison, console: Console | None = None) -> 
         console.print(f"{name}: {side.path}, {side.finished} finished runs{others}", markup=False, highlight=False)
     for table in tables(comparison):
         shown = TerminalTable(title=Text(table.title), title_justify="left")
-        for name in table.columns:
-            shown.add_column(name, overflow="fold", justify="left" if name in (_COLUMNS[0], _COLUMNS[-1]) else "right")
+        for place, name in enumerate(table.columns):
+            shown.add_column(name, overflow="fold", justify="left" if place < _WORDS else "right")
         for line in table.lines:
             shown.add_row(*map(Text, line.cells))
         console.print(shown)
 
 
-def write_comparison(comparison: Comparison, out: Path) -> Path:
+def write_comparison(comparison: SideBySide, out: Path) -> Path:
     """Write the comparison as page, CSV and LaTeX into a folder; returns the page.
 
     Raises:

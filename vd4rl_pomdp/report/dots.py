@@ -55,7 +55,8 @@ def _dots(axes: Axes, rows: list[Row], probe: str, looks: dict[str, int], raster
     for method, mine in by_label(known):
         look = {name: value for name, value in style(looks[method]).items() if name != "linestyle"}
         errors, returns = [row[probe] for row in mine], [row["return"] for row in mine]
-        axes.scatter(errors, returns, 26, ec="white", lw=0.5, zorder=3, rasterized=rasterized, **look)
+        axes.scatter(errors, returns, 26, ec="white", lw=0.5, zorder=-1 if rasterized else 3, **look)
+    axes.set_rasterization_zorder(0)
     for set_limits, name in ((axes.set_xlim, probe), (axes.set_ylim, "return")):
         highest = max((row[name] for row in known), default=0) or 1
         set_limits(-0.04 * highest, 1.06 * highest)

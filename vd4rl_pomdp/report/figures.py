@@ -31,7 +31,7 @@ FORMATS: dict[str, dict[str, Any]] = {"png": {"dpi": 150}, "pdf": {"metadata": {
 """Files of a figure, beside the SVG in the page."""
 WIDTH = 10.0
 """Of a figure with several columns of panels, in inches."""
-_LEFT, _RIGHT, _TOP, _BOTTOM, _GAP, _TITLE = 0.55, 0.1, 0.3, 0.5, 0.45, 0.42
+_LEFT, _RIGHT, _TOP, _BOTTOM, _GAP, _TITLE = 0.55, 0.1, 0.42, 0.5, 0.45, 0.42
 _ENTRY, _LETTER, _LINE = 0.55, 0.075, 0.2
 """A legend's entry without its text, one letter of it, and a line, in inches."""
 _TITLE_LETTER, REMARK_LINE = 0.075, 0.11
@@ -116,6 +116,7 @@ def _panel(figure: Figure, place: tuple[float, float, float, float], title: str)
     axes = figure.add_axes(place)
     axes.set_title(title, fontsize=9)
     axes.tick_params(labelsize=8)
+    axes.locator_params(nbins=5)
     axes.grid(alpha=0.25)
     axes.set_axisbelow(True)
     axes.spines[["top", "right"]].set_visible(False)

@@ -25,7 +25,7 @@ class Line(NamedTuple):
 
 
 @dataclass(frozen=True)
-class Table:
+class ShownTable:
     """A table with its title."""
 
     title: str
@@ -52,12 +52,12 @@ def with_interval(value: float | None, low: float | None, high: float | None, di
     return number(value, digits) if low is None else f"{number(value, digits)} {interval(low, high, digits)}"
 
 
-def latex(tables: Sequence[Table], note: str) -> str:
+def latex(tables: Sequence[ShownTable], note: str) -> str:
     """Tables in LaTeX, one float each with its title and a note as caption; they need the package booktabs."""
     return "% \\usepackage{booktabs}\n" + "\n".join(_float(table, note) for table in tables)
 
 
-def _float(table: Table, note: str) -> str:
+def _float(table: ShownTable, note: str) -> str:
     form = "l" * table.words + "r" * (len(table.columns) - table.words)
     caption = " ".join(filter(None, (f"{table.title}." if table.title else "", note, table.note)))
     lines = [_line(line, len(table.columns)) for line in table.lines]

@@ -8,7 +8,7 @@ from math import ceil
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.figures import seeds_note
 from vd4rl_pomdp.report.gaps import MISSING
-from vd4rl_pomdp.report.layout import Line, Table, interval, number, with_interval
+from vd4rl_pomdp.report.layout import Line, ShownTable, interval, number, with_interval
 from vd4rl_pomdp.report.tables import grouped, label, setting
 from vd4rl_pomdp.runs.files import Row
 
@@ -16,7 +16,7 @@ WIDEST = 6
 """Methods side by side in a matrix, at most: the others are put below."""
 
 
-def gates(rows: list[Row]) -> list[Table]:
+def gates(rows: list[Row]) -> list[ShownTable]:
     """What has to hold before methods are ranked."""
     columns = ("setting", "verdict", "data's return", "state", "acro, none", "best – random")
     lines = []
@@ -24,10 +24,10 @@ def gates(rows: list[Row]) -> list[Table]:
         above = number(row["above_random"], 0) + ("" if row["error"] is None else f" ± {row['error']:.0f}")
         shares = (number(row[name], 2) for name in ("state_share", "acro_share"))
         lines.append(Line((setting(row), row["verdict"], number(row["data_return"], 0), *shares, above)))
-    return [Table("", columns, lines, words=2)]
+    return [ShownTable("", columns, lines, words=2)]
 
 
-def scores(rows: list[Row]) -> list[Table]:
+def scores(rows: list[Row]) -> list[ShownTable]:
     """Final and best scores, one table a setting."""
     columns = (
         *("method", "last evaluation", "95% interval", "at update"),
@@ -51,7 +51,7 @@ def _count(seeds: int) -> str:
     return f"{seeds}†" if seeds < stats.FEW_SEEDS else str(seeds)
 
 
-def aggregates(rows: list[Row]) -> list[Table]:
+def aggregates(rows: list[Row]) -> list[ShownTable]:
     """Statistics over tasks, one table a corruption."""
     columns = ("method", "IQM", "median", "mean", "optimality gap", "tasks", "seeds")
     return [
@@ -71,7 +71,7 @@ def _aggregate_line(row: Row) -> Line:
     return Line((label(row), *found, tasks, _count(row["seeds"])))
 
 
-def improvements(rows: list[Row]) -> list[Table]:
+def improvements(rows: list[Row]) -> list[ShownTable]:
     """Probabilities of improvement as matrices, one or more a corruption: the row's method beats the column's."""
     tables = []
     for (corruption,), members in grouped(rows, ("corruption",)):
@@ -83,7 +83,7 @@ def improvements(rows: list[Row]) -> list[Table]:
             lines = [
                 Line((name, *(cells.get((name, other), _nothing(name, other)) for other in others))) for name in names
             ]
-            tables.append(Table(corruption, ("row beats column", *others), lines, note=seeds_note(members)))
+            tables.append(ShownTable(corruption, ("row beats column", *others), lines, note=seeds_note(members)))
     return tables
 
 
@@ -99,7 +99,7 @@ def _chance(row: Row) -> str:
     return with_interval(row["probability"], row["low"], row["high"], 2) + few
 
 
-def representations(rows: list[Row]) -> list[Table]:
+def representations(rows: list[Row]) -> list[ShownTable]:
     """Encoders' measures beside returns, one table a setting."""
     columns = ("method", "action loss", "pose, %", "velocity, %", "return", "seeds")
     return [_counted(name, columns, _measure_line, members) for name, members in by_setting(rows)]
@@ -112,10 +112,10 @@ def _measure_line(row: Row) -> Line:
     return Line((label(row), number(row["action_loss"], 3), *probes, number(row["return"], 0), str(row["seeds"])))
 
 
-def costs(rows: list[Row]) -> list[Table]:
+def costs(rows: list[Row]) -> list[ShownTable]:
     """What both stages cost, by method."""
     columns = ("method", "machines", "pretraining, s", "fine-tuning, s", "runs")
-    return [Table("", columns, list(map(_cost_line, rows)), words=2, note=seeds_note(rows, "runs", "run"))]
+    return [ShownTable("", columns, list(map(_cost_line, rows)), words=2, note=seeds_note(rows, "runs", "run"))]
 
 
 def _cost_line(row: Row) -> Line:
@@ -126,7 +126,7 @@ def _cost_line(row: Row) -> Line:
     return Line((row["method"], row["machines"] or "not recorded", *spans, str(row["runs"])))
 
 
-def control(rows: list[Row]) -> list[Table]:
+def control(rows: list[Row]) -> list[ShownTable]:
     """What policies do beside their data, one table a setting."""
     columns = (
         *("method", "data's return", "return", "return, clean", "above 80%", "above 80%, clean"),
@@ -142,14 +142,14 @@ def _control_line(row: Row) -> Line:
     return Line((label(row), *returns, *shares, *errors, str(row["seeds"])))
 
 
-def published(rows: list[dict[str, str]]) -> list[Table]:
+def published(rows: list[dict[str, str]]) -> list[ShownTable]:
     """Scores that others have published."""
-    return [Table("", tuple(rows[0]), [Line(tuple(row.values())) for row in rows], words=2)] if rows else []
+    return [ShownTable("", tuple(rows[0]), [Line(tuple(row.values())) for row in rows], words=2)] if rows else []
 
 
-def _counted(title: str, columns: tuple[str, ...], line: Callable[[Row], Line], rows: list[Row]) -> Table:
+def _counted(title: str, columns: tuple[str, ...], line: Callable[[Row], Line], rows: list[Row]) -> ShownTable:
     """A table of rows with `seeds`, whose least and greatest number its note tells."""
-    return Table(title, columns, list(map(line, rows)), note=seeds_note(rows))
+    return ShownTable(title, columns, list(map(line, rows)), note=seeds_note(rows))
 
 
 def by_setting(rows: list[Row]) -> list[tuple[str, list[Row]]]:

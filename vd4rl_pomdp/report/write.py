@@ -19,7 +19,7 @@ from vd4rl_pomdp.report.figures import Plot, save_plot, to_svg
 from vd4rl_pomdp.report.films import shown_films
 from vd4rl_pomdp.report.gaps import find_gaps
 from vd4rl_pomdp.report.gates import gates, unranked
-from vd4rl_pomdp.report.layout import Table, latex
+from vd4rl_pomdp.report.layout import ShownTable, latex
 from vd4rl_pomdp.report.load import LoadedRun, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.templates import render
@@ -94,7 +94,7 @@ def _tables(runs: list[LoadedRun]) -> dict[str, list[Row]]:
     }
 
 
-def _shown(made: dict[str, list[Row]]) -> dict[str, list[Table]]:
+def _shown(made: dict[str, list[Row]]) -> dict[str, list[ShownTable]]:
     """The tables that the page shows, by the name of their rows' file."""
     return {
         "gates": present.gates(made["gates"]),
@@ -145,7 +145,7 @@ def _published_here(runs: list[LoadedRun]) -> list[dict[str, str]]:
 def _render(
     runs: list[LoadedRun],
     made: dict[str, list[Row]],
-    shown: dict[str, list[Table]],
+    shown: dict[str, list[ShownTable]],
     plots: dict[str, list[Plot]],
     theory: str | None,
 ) -> str:
@@ -177,7 +177,7 @@ _NOTES = {
 _DAGGER = f"†: fewer than {FEW_SEEDS} seeds."
 
 
-def _write_tables(out: Path, made: dict[str, list[Row]], shown: dict[str, list[Table]]) -> None:
+def _write_tables(out: Path, made: dict[str, list[Row]], shown: dict[str, list[ShownTable]]) -> None:
     """Every table as CSV and LaTeX; those that an earlier report had and this one has not are removed."""
     for name, rows in made.items():
         path = out / f"{name}.csv"
