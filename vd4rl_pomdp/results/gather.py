@@ -88,7 +88,7 @@ def add_results(paths: Sequence[Path], out: Path) -> Added:
     Raises:
         UserError: as `find_results`, or `out` holds something else, is damaged or is in use.
     """
-    refuse_foreign(out, "results", RUNS)
+    refuse_foreign(out, "results", RUNS, "README.md")  # whose page may be there before the first run
     found = find_results(paths, out)
     with owned(out):
         there = {run.id: run for run in (read_results(out) if (out / RUNS).exists() else [])}
