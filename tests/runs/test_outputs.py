@@ -89,6 +89,8 @@ def commands(data: Path, run: Path) -> dict[str, list[str]]:
         "navigation report": ["navigation", "report", str(run)],
         "sweep run": ["sweep", "run", "quick", "--testing", "--dry-run"],
         "report": ["report", str(run)],
+        "report compare": ["report", "compare", str(run), str(run)],
+        "results add": ["results", "add", str(run)],
         "theory": ["theory"],
         "control-study": ["control-study", "--methods", "none", "--seeds", "0"],
     }
@@ -123,7 +125,8 @@ def test_every_command_with_an_out_is_tried(capsys):
     from vd4rl_pomdp.cli import COMMANDS
 
     flat = {f"{name} {inner}" for name, entry in COMMANDS.items() if isinstance(entry, dict) for inner in entry}
-    flat |= {name for name, entry in COMMANDS.items() if not isinstance(entry, dict)}
+    single = {name: entry for name, entry in COMMANDS.items() if not isinstance(entry, dict)}
+    flat |= {*single, *(f"{name} {inner}" for name, entry in single.items() for inner in entry.inner)}
     with_out = set()
     for name in flat:
         with pytest.raises(SystemExit):

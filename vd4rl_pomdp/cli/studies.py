@@ -37,9 +37,11 @@ class CompareCommand:
 
 
 def _compare(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.report.compare import compare_results, print_comparison, write_comparison
+    from vd4rl_pomdp.report.compare import check_out, compare_results, print_comparison, write_comparison
 
     command = parse(CompareCommand, words, program)
+    if command.out is not None:
+        check_out(command.out)
     comparison = compare_results(command.a, command.b)
     page = None if command.out is None else write_comparison(comparison, command.out)
     print_comparison(comparison)

@@ -172,13 +172,13 @@ def print_comparison(comparison: SideBySide, console: Console | None = None) -> 
         console.print(shown)
 
 
-def write_comparison(comparison: SideBySide, out: Path) -> Path:
-    """Write the comparison as page, CSV and LaTeX into a folder; returns the page.
-
-    Raises:
-        UserError: the folder holds anything but an earlier comparison.
-    """
+def check_out(out: Path) -> None:
+    """Raise UserError for a folder that holds anything but an earlier comparison."""
     refuse_foreign(out, "comparison", f"{FILE}.csv")
+
+
+def write_comparison(comparison: SideBySide, out: Path) -> Path:
+    """Write the comparison as page, CSV and LaTeX into a folder that `check_out` accepts; returns the page."""
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
     shown = tables(comparison)
