@@ -272,7 +272,16 @@ def _hdf5() -> dict[str, Damage]:
     return kinds
 
 
+TOML: dict[str, Damage] = {
+    "a list": _text("[[3]]\n"),
+    "another section": lambda path: path.write_text(path.read_text() + "\n[other]\nx = 1\n") and None,
+    "an empty axis": _text("[collect]\ntask = []\n"),
+    "a section for a value": _text("seed = { a = 1 }\n[collect]\ntask = 'walker_walk'\nquality = 'expert'\n"),
+    "a word for a number": _text("seed = 'many'\n[collect]\ntask = 'walker_walk'\nquality = 'expert'\n[pretrain]\n"),
+    "an unknown setting": _text("[collect]\ntask = 'walker_walk'\nquality = 'expert'\nsize = 3\n"),
+}
 BY_SUFFIX: dict[str, dict[str, Damage]] = {
+    ".toml": TOML,
     ".json": JSON,
     ".jsonl": JSONL,
     ".csv": CSV,

@@ -3,7 +3,7 @@
 import pytest
 
 from finetune.config import FinetuneConfig
-from finetune.train import end_to_end
+from finetune.train import as_trained
 from pretrain.config import PretrainConfig
 from pretrain.navigation.config import NavigationConfig
 from pretrain.objectives import METHODS
@@ -158,7 +158,7 @@ def test_cloning_reads_no_option_of_the_critic(name):
     config = FinetuneConfig.of("smoke", algorithm="drqv2_bc", **given)
     for refused in (
         lambda: FinetuneConfig.of("smoke", algorithm="bc", **given),
-        lambda: end_to_end(config, "bc"),
+        lambda: as_trained(config, "bc", "bc", False),
     ):
         with pytest.raises(UserError, match=f"--{name.replace('_', '-')} is not read by the algorithm bc"):
             refused()
@@ -180,4 +180,4 @@ def test_an_algorithm_reads_its_own_options_only(algorithm, reads):
 
 def test_an_encoder_that_is_trained_has_no_views():
     with pytest.raises(UserError, match="--views is not read by the algorithm drqv2_bc"):
-        end_to_end(FinetuneConfig.of("smoke", views=3), "drqv2_bc")
+        as_trained(FinetuneConfig.of("smoke", views=3), "drq_bc", "drqv2_bc", False)

@@ -34,6 +34,7 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.runs.reading import read_bytes, regular
 
 GRIDS = Path(__file__).parents[1] / "experiments" / "grids"
 """The grids that ship with the package."""
@@ -136,8 +137,10 @@ def _read(path: Path, name: str) -> Values:
         raise UserError(f"unknown grid {name!r}: choose one of {', '.join(names())}, or name a .toml or .py file")
     try:
         if path.suffix == ".toml":
-            return tomllib.loads(path.read_text(encoding="utf-8"))
-        told = runpy.run_path(str(path)).get("GRID")
+            return tomllib.loads(read_bytes(path).decode())
+        told = runpy.run_path(str(regular(path))).get("GRID")
+    except UserError:
+        raise
     except OSError as error:
         raise disk_error(path, error) from error
     except Exception as error:
