@@ -217,6 +217,8 @@ class FinetuneTrainer:
         self.config, self.card = config, card
         self.reference, self.path = reference, path
         self.step = 0
+        self._episodes: Path | None = None
+        """Rows of the run that it is part of."""
 
     def run(self, run: RunFolder) -> None:
         """Train to the end, from the newest checkpoint if there is one."""
@@ -224,8 +226,9 @@ class FinetuneTrainer:
         title = f"finetune {config.algorithm} on {self.card.method}"
         self.reference.write(run.path)
         told = {"labels": _labels(config, self.card), "card": asdict(self.card)}
+        self._episodes = run.path / "episodes.csv"
         with training(run, self, title, config.updates, "updates", **told) as loop:
-            self._drop_evaluations_after(run.path / "episodes.csv")
+            drop_episodes_after(self._episodes, self.step)
             if self.step and loop.due(config.eval_every):
                 self._evaluate(run, loop)
             while self.step < config.updates:
@@ -250,11 +253,6 @@ class FinetuneTrainer:
         missing = [step for step in due if found[step] < self.config.eval_episodes]
         if missing:
             raise UserError(f"{path}: lacks the evaluation at update {missing[0]}; restore it or start another run")
-
-    def _drop_evaluations_after(self, path: Path) -> None:
-        """Drop the rows that count no more, those after the present step; raise UserError if earlier ones are gone."""
-        self._require_evaluations(path)
-        drop_episodes_after(path, self.step)
 
     def _evaluation(self, path: Path) -> list[Row]:
         """The rows of the evaluation at the present step; none if there is none or the run was cut while it went on."""
@@ -318,6 +316,8 @@ class FinetuneTrainer:
     def restore(self, state: dict[str, Any]) -> None:
         """Go on from `state`."""
         self.step = state["step"]
+        if self._episodes is not None:  # before anything of the run is changed
+            self._require_evaluations(self._episodes)
         self.algorithm.load_state_dict(state["algorithm"])
         self.sampler.load_state_dict(state["sampler"])
 

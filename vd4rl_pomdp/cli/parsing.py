@@ -42,7 +42,7 @@ def parse(config: Any, words: Arguments, program: str, default: Any = None) -> A
 def _refuse_empty(config: Any, words: Arguments) -> None:
     """Refuse a flag that names nothing: an empty list, or an empty word where the default is none."""
     for field in fields(config):
-        if getattr(config, field.name) == [] and field.default_factory is not list:
+        if getattr(config, field.name) == [] and (field.default_factory is not list or flag_of(field.name) in words):
             raise UserError(f"{flag_of(field.name)} names nothing: give at least one or leave it out")
     free = {flag_of(field.name) for field in fields(config) if field.default == ""}
     for flag, word in pairwise(["", *words]):

@@ -66,6 +66,7 @@ class RunCommand(_ExecutorConfig):
 
 
 def _run(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.errors import refuse_no_folder
     from vd4rl_pomdp.runs.outputs import refuse_kept
     from vd4rl_pomdp.sweeps.folder import SweepFolder
     from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
@@ -75,6 +76,8 @@ def _run(words: Arguments, program: str) -> None:
     command = parse_stage(RunCommand, words, program)
     grid = load_grid(command.grid, command.change, command.testing)
     cells = narrow(grid.cells(), command.only)
+    for place in (command.out, command.data or command.out):
+        refuse_no_folder(place)
     refuse_kept(command.out)
     here, kept = FoundRuns(runs_below(command.out)), FoundRuns(runs_kept(command.done))
     jobs = JobPlanner(command.out, command.data, kept, here).plan(cells)

@@ -103,8 +103,8 @@ def _row(line: str) -> Row:
 def _read_plan(path: Path) -> list[Job]:
     try:
         told = parse_json(read_bytes(path).decode())
-        if not isinstance(told, list):
-            raise TypeError("it is no list")
+        if not isinstance(told, list) or not told:
+            raise TypeError("it lists no jobs")
         return [_job(one) for one in told]
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path}: is damaged ({error}); remove it and start `sweep run` again") from error

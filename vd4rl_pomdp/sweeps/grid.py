@@ -218,8 +218,13 @@ def _check_block(block: Sections) -> None:
     for section, settings in block.items():
         for name, value in settings.items():
             values = value if isinstance(value, list) else [value]
-            if not values or not all(isinstance(one, str | int | float) for one in values):
-                raise UserError(f"{section}.{name} is {value!r}: write a number, a word, true or false, or a list")
+            kinds = int if name == "seed" else str | int | float
+            if not values or not all(isinstance(one, kinds) for one in values):
+                where, wanted = (
+                    f"{section}.{name}".lstrip("."),
+                    "a number" if kinds is int else "a number, a word, true or false",
+                )
+                raise UserError(f"{where} is {value!r}: write {wanted}, or a list of such")
 
 
 def narrow(cells: list[GridCell], only: Sequence[str]) -> list[GridCell]:

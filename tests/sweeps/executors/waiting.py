@@ -36,7 +36,8 @@ def waiting_job(out: Path, name: str) -> Job:
     """A job that is finished soon after OUT/go or OUT/NAME/go is there."""
     folder = out / name
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "grid.py").write_text(GRID)
+    if not (folder / "grid.py").exists():  # or a process might read half of it
+        (folder / "grid.py").write_text(GRID)
     words = ("sweep", "run", str(folder / "grid.py"), "--out", str(folder / "runs"), "--dry-run")
     return Job(name, "collect", folder, words)
 

@@ -1,0 +1,29 @@
+"""Cells of the shipped grids' testing subsets, carried out as a user would: collected, trained, evaluated."""
+
+import pytest
+
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.results import read_run
+from vd4rl_pomdp.runs.files import read_json
+
+
+@pytest.mark.parametrize(
+    ("grid", "only", "jobs", "last"),
+    [
+        ("quick", ["method=acro"], 3, "walker_walk/expert_noisy/patch+zero_frames/acro/seed0/finetune-td3_bc"),
+        ("navigation", ["method=ah", "self_prediction=1.0"], 2, "no_curtain/ah,max_k=3,self_prediction=1.0/seed0"),
+    ],
+)
+def test_a_cell_runs_from_its_set_to_its_result(tmp_path, monkeypatch, capsys, grid, only, jobs, last):
+    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+    words = ["sweep", "run", grid, "--testing", "--only", *only, "--out", str(tmp_path / "out")]
+    main(words)
+    assert f"all {jobs} jobs are finished" in capsys.readouterr().out
+    assert read_json(tmp_path / "out" / last / "timing.json")["seconds"] > 0
+    if grid == "quick":
+        assert {row["evaluated_under"] for row in read_run(tmp_path / "out" / last).rows} == {
+            "patch+zero_frames",
+            "none",
+        }
+    main(["sweep", "status", str(tmp_path / "out")])
+    assert f"{jobs} jobs: {jobs} done" in capsys.readouterr().out
