@@ -109,14 +109,18 @@ def test_what_is_stopped_ends_in_peace_and_what_is_cancelled_was_killed(out):
     assert not begun(waiting)
 
 
-def test_a_new_driver_waits_for_what_a_killed_one_has_running_and_in_the_queue(out):
-    command = [sys.executable, "-m", "tests.sweeps.executors.waiting", str(out), "2"]
-    driver = subprocess.Popen(command)
+def test_a_new_driver_waits_for_what_a_killed_one_has_running_and_in_the_queue(out, request):
+    def start_driver():
+        driver = subprocess.Popen([sys.executable, "-m", "tests.sweeps.executors.waiting", str(out), "2"])
+        request.addfinalizer(driver.kill)
+        return driver
+
+    driver = start_driver()
     until(lambda: len(queue()) == 2)  # of which the machine takes one at a time
     until(lambda: begun(waiting_job(out, "job0")))
     os.kill(driver.pid, signal.SIGKILL)
     driver.wait()
-    driver = subprocess.Popen(command)
+    driver = start_driver()
     until(lambda: (out / "sweep" / "slurm").is_dir())
     (out / "go").touch()
     assert driver.wait(150) == 0
