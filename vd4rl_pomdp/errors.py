@@ -13,6 +13,9 @@ from pathlib import Path
 from stat import S_ISDIR
 from typing import Any
 
+DONE, DIVERGED, INTERRUPTED = "done", "diverged", "interrupted"
+"""Why a command ended that raised no UserError, which has a `cause` of its own."""
+
 
 class UserError(ValueError):
     """Bad input: the message is one line that says what is wrong, where, and what to do.

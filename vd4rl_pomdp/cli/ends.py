@@ -7,10 +7,8 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vd4rl_pomdp.cli.dispatch import run_stage
-from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.errors import DIVERGED, DONE, INTERRUPTED, UserError, disk_error
 from vd4rl_pomdp.runs import interrupt
-
-DONE, DIVERGED, INTERRUPTED = "done", "diverged", "interrupted"
 
 
 @dataclass(frozen=True)

@@ -49,9 +49,7 @@ class SweepFolder:
         """The jobs of all plans; UserError if there is none."""
         plans = sorted((self.path / "plans").glob("*.json"))
         if not plans:
-            raise UserError(
-                f"{self.path.parent}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one"
-            )
+            raise UserError(f"{self.out}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one")
         jobs = [job for path in plans for job in _read_plan(path)]
         return list({job.name: job for job in jobs}.values())
 

@@ -55,8 +55,8 @@ class DataSet:
 
     def check(self) -> None:
         """Raise UserError if its folder holds a set that was collected otherwise."""
-        if (self.folder / PLAN).exists() and not self._agrees(read_json(self.folder / PLAN)):
-            stored = read_json(self.folder / PLAN)
+        stored = read_json(self.folder / PLAN) if (self.folder / PLAN).exists() else {}
+        if not self._agrees(stored):
             name = next(n for n, v in self.wanted.items() if stored.get(n, v) != v)
             raise UserError(
                 f"{self.folder}: holds a set collected with {name} {stored[name]}, the grid says {self.wanted[name]}; "

@@ -12,10 +12,19 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Protocol
 
-from vd4rl_pomdp.errors import DiskFullError, InUseError, OutOfMemoryError, UserError, WorkerDiedError
+from vd4rl_pomdp.errors import (
+    DIVERGED,
+    DONE,
+    INTERRUPTED,
+    DiskFullError,
+    InUseError,
+    OutOfMemoryError,
+    UserError,
+    WorkerDiedError,
+)
 from vd4rl_pomdp.sweeps.oom import oom_kills
 
-DONE, DIVERGED, INTERRUPTED, FAILED = "done", "diverged", "interrupted", "failed"
+FAILED = "failed"
 KILLED = WorkerDiedError.cause
 _FIRST = 64
 _CAUSES = (UserError, OutOfMemoryError, DiskFullError, InUseError, WorkerDiedError)

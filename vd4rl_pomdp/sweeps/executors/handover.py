@@ -57,11 +57,6 @@ class Handover:
         """How one of them did."""
         return Ended(**read_json(self.folder / "ended" / f"{attempt}.json"))
 
-    def tasks(self) -> list[int]:
-        """Numbers of the tasks that were handed anything."""
-        work = self.folder / "work"
-        return sorted(int(path.name) for path in work.iterdir()) if work.is_dir() else []
-
     def _work(self, task: int) -> Path:
         return self.folder / "work" / str(task)
 
