@@ -23,7 +23,7 @@ from disturb_sweep import GRID
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.found import FoundRuns
-from vd4rl_pomdp.sweeps.grid import load_grid
+from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.plan import JobPlanner
 
 

@@ -8,7 +8,8 @@ import pytest
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.grid import condition_of, paper_rows
 from vd4rl_pomdp.mazes import MAZES
-from vd4rl_pomdp.sweeps.grid import load_grid, names, narrow
+from vd4rl_pomdp.sweeps.grid import narrow
+from vd4rl_pomdp.sweeps.grid_file import load_grid, names
 from vd4rl_pomdp.sweeps.stages import check_cell
 
 PAGE = Path(__file__).parents[2] / "docs" / "sweeps.md"
@@ -103,6 +104,7 @@ def test_only_keeps_cells_by_value(file):
         ("[pretrain]\nmethod = []", r"pretrain\.method is \[\]"),
         ("[pretrain]\nmethod = [[1]]", r"pretrain\.method is \[\[1\]\]"),
         ("block = 3", "its blocks are no list of tables"),
+        ("where = 3", "its wheres are no list of tables"),
         ("title = ", r"is no grid \(TOMLDecodeError"),
     ],
 )
@@ -117,9 +119,51 @@ def test_a_python_file_that_defines_none_is_refused(file, text):
         load_grid(file(text, "mine.py"))
 
 
+WHERE = """
+[[where]]
+only = ["task=cheetah_run", "method=acro"]
+preset = "smoke"
+finetune = { updates = 80 }
+"""
+
+
+def test_where_sets_what_the_cells_that_meet_all_conditions_have(file):
+    cells = load_grid(file(TOML + WHERE)).cells()
+    assert len(cells) == 8
+    for cell in cells:
+        meets = (cell.value("task"), cell.value("method")) == ("cheetah_run", "acro")
+        assert (cell.value("updates"), cell.value("preset")) == ((80, "smoke") if meets else (40, None))
+
+
+def test_where_yields_to_the_testing_subset_and_to_changes(file):
+    path = file(TOML + WHERE + '[testing]\npreset = "cpu"\n')
+    cells = load_grid(path, ["finetune.updates=20"], testing=True).cells()
+    assert {(cell.value("updates"), cell.value("preset")) for cell in cells} == {(20, "cpu")}
+
+
+@pytest.mark.parametrize(
+    ("table", "message"),
+    [
+        ("finetune = { updates = 80 }", "has no conditions"),
+        ('only = ["task"]', "'task' is no condition"),
+        ('only = ["task=humanoid_walk"]', "no cell has 'task=humanoid_walk': the grid has walker_walk, cheetah_run"),
+        ('only = ["colour=red"]', "sets nothing of that name"),
+        (
+            'only = ["task=cheetah_run"]\nfinetune = { updates = [1, 2] }',
+            r"finetune\.updates is \[1, 2\]: write a number",
+        ),
+        ('only = ["task=cheetah_run"]\nnavigation_train = { steps = 2 }', "not every block has"),
+        ('only = ["task=cheetah_run"]\ntitle = "x"', "unknown section or setting 'title'"),
+    ],
+)
+def test_a_where_that_says_nothing_is_refused(file, table, message):
+    with pytest.raises(UserError, match=message):
+        load_grid(file(f"{TOML}[[where]]\n{table}\n"))
+
+
 @pytest.mark.parametrize("only", ["method", "method=curl", "colour=red"])
 def test_only_names_what_there_is(file, only):
-    with pytest.raises(UserError, match="--only"):
+    with pytest.raises(UserError, match=f"'{only}'"):
         narrow(load_grid(file(TOML)).cells(), [only])
 
 

@@ -12,7 +12,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
 from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
-from vd4rl_pomdp.sweeps.grid import load_grid
+from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.plan import JobPlanner
 from vd4rl_pomdp.sweeps.stages import recorded
 

@@ -70,7 +70,8 @@ def _run(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.runs.outputs import refuse_kept
     from vd4rl_pomdp.sweeps.folder import SweepFolder
     from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
-    from vd4rl_pomdp.sweeps.grid import load_grid, narrow
+    from vd4rl_pomdp.sweeps.grid import narrow
+    from vd4rl_pomdp.sweeps.grid_file import load_grid
     from vd4rl_pomdp.sweeps.plan import JobPlanner
 
     command = parse_stage(RunCommand, words, program)
@@ -182,7 +183,7 @@ class GridsCommand:
 
 
 def _list(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.sweeps.grid import load_grid, names
+    from vd4rl_pomdp.sweeps.grid_file import load_grid, names
 
     parse(GridsCommand, words, program)
     for name in names():
