@@ -8,6 +8,7 @@ import pytest
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.cli.parsing import parse_stage
+from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
@@ -147,9 +148,38 @@ def test_without_their_set_kept_rows_count_by_how_it_was_collected(copy, tmp_pat
     assert len(left(plan(new, ["collect.episodes=100"], kept=kept))) == 10
 
 
-def test_a_set_that_was_collected_otherwise_is_refused(copy):
-    write_json(copy / "data" / "walker_walk" / "expert" / "collection.json", {"task": "walker_walk", "episodes": 3})
-    with pytest.raises(UserError, match="a set collected with episodes 3, the grid says 200; choose another --data"):
+def collected(**settings):
+    """A collection.json."""
+    return collection(CollectConfig(task="walker_walk", quality="expert", out=Path("-"), **settings)) | {
+        "actors": ["x"]
+    }
+
+
+@pytest.mark.parametrize(
+    ("stored", "asked", "message"),
+    [
+        ({"episodes": 3}, "collect.episodes=200", "a set of episodes 3, the grid says episodes 200; choose another"),
+        ({}, "collect.frame_size=48", "a set of frame_size None, the grid says frame_size 48"),
+        ({"frame_size": 48}, "collect.seed=0", "a set of frame_size 48, the grid says frame_size None"),
+    ],
+)
+def test_a_set_that_was_collected_otherwise_is_refused(copy, stored, asked, message):
+    write_json(copy / "data" / "walker_walk" / "expert" / "collection.json", collected(**stored))
+    with pytest.raises(UserError, match=message):
+        plan(copy, [asked])
+
+
+@pytest.mark.parametrize("size", [48, 84])
+def test_a_set_that_was_collected_so_is_taken(copy, size):
+    write_json(copy / "data" / "walker_walk" / "expert" / "collection.json", collected(frame_size=size))
+    (copy / "data" / "walker_walk" / "expert" / "provenance.json").write_text("{}")
+    assert left(plan(copy, [f"collect.frame_size={size}"])) == []
+
+
+def test_one_folder_is_not_asked_for_two_sets(copy):
+    with (copy / "grid.toml").open("a") as file:
+        file.write('[[where]]\nonly = ["method=acro"]\ncollect = { episodes = 3 }\n')
+    with pytest.raises(UserError, match="walker_walk/expert is asked for with two values of episodes"):
         plan(copy)
 
 

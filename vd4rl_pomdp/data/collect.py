@@ -109,12 +109,20 @@ def collect(config: CollectConfig, length: int | None = None) -> list[Path]:
         for path, episodes, collector in plan
     ]
     with owned(config.out):
-        _claim(config, _hashes(plan))
+        claim_set(config.out, collection(config) | {"actors": _hashes(plan)})
         collect_shards(config.out, shards, _roll_out, config.workers, ("collect", "episodes"), config.task)
         from vd4rl_pomdp.data.card import write_card  # draws; the processes that render need it not
 
         write_card(config.out)
     return [shard.path for shard in shards]
+
+
+def collection(config: CollectConfig) -> dict[str, Any]:
+    """What tells a set from others: the settings in its collection.json, where its actors' hashes stand beside them."""
+    settings = {name: value for name, value in jsonable(asdict(config)).items() if name not in _RUNTIME_FIELDS}
+    if config.frame_size == FRAME_SIZE:
+        settings["frame_size"] = None  # as in the files that say nothing of it
+    return settings
 
 
 def _check(config: CollectConfig) -> None:
@@ -276,11 +284,3 @@ def _attributes(config: CollectConfig, path: Path, collector: Collector) -> dict
         **({"action_noise": noise} if (noise := _noise(config)) else {}),
         "versions": {k: v for k, v in versions().items() if k in ("mujoco", "dm-control", "vd4rl-pomdp")},
     }
-
-
-def _claim(config: CollectConfig, actors: list[str]) -> None:
-    settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS}
-    settings["actors"] = actors
-    if config.frame_size == FRAME_SIZE:
-        settings["frame_size"] = None  # as in the plans that say nothing of it
-    claim_set(config.out, settings)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -66,13 +66,17 @@ def claim_set(out: Path, settings: dict[str, Any]) -> None:
     path = out / PLAN
     if path.exists():
         stored = read_json(path)
-        differing = sorted(k for k in settings if stored.get(k) != settings[k])
-        if differing:
-            raise UserError(f"{out}: holds a set collected with another {', '.join(differing)}; choose another --out")
+        if others := differing(stored, settings):
+            raise UserError(f"{out}: holds a set collected with another {', '.join(others)}; choose another --out")
         return
     if holds_anything(out):
         raise UserError(f"{out}: is not empty and holds no collected set; choose another --out")
     write_json(path, settings)
+
+
+def differing(stored: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
+    """Names of the settings that a collection.json has otherwise."""
+    return sorted(name for name, value in settings.items() if stored.get(name) != value)
 
 
 def join_rollouts(rollouts: list[Columns]) -> Columns:

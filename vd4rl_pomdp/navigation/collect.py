@@ -46,16 +46,20 @@ def collect(config: MazeCollectConfig) -> list[Path]:
     """Collect the set, or what is missing of it; returns its shards."""
     _check(config)
     refuse_inside(config.out)
-    settings = {k: v for k, v in jsonable(asdict(config)).items() if k not in _RUNTIME_FIELDS}
     shards = [
         Shard(path, [_job(config, i) for i in trajectories], _attributes(config))
         for path, trajectories in _plan(config)
     ]
     with owned(config.out):
-        claim_set(config.out, settings)
+        claim_set(config.out, collection(config))
         title = f"collect {config.maze}", "trajectories"
         collect_shards(config.out, shards, _roll_out, config.workers, title, config.maze)
     return [shard.path for shard in shards]
+
+
+def collection(config: MazeCollectConfig) -> dict[str, Any]:
+    """What tells a set from others: the settings in its collection.json."""
+    return {name: value for name, value in jsonable(asdict(config)).items() if name not in _RUNTIME_FIELDS}
 
 
 def drive(maze: str, rows: int, action_repeat: int = 5, noise: float = 0.5, seed: int = 0) -> Columns:

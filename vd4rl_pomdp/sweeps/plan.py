@@ -7,6 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vd4rl_pomdp.data.shards import differing
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.sweeps.found import FoundRuns
 from vd4rl_pomdp.sweeps.grid import GridCell
@@ -78,13 +80,21 @@ class JobPlanner:
         return _needed(list(self._jobs.values()))
 
     def _add(self, cell: GridCell) -> None:
-        found = set_of(cell, self._data)
-        data = self._sets.setdefault(found.name, found)
+        data = self._set(cell)
         values: dict[str, Any] = {}
         before = [self._collection(cell, data)]
         for section in cell.chain[1:]:
             values |= recorded(cell, section)
             before.append(self._training(cell, section, data, values, before))
+
+    def _set(self, cell: GridCell) -> DataSet:
+        found = set_of(cell, self._data)
+        if found.name not in self._sets:
+            found.check()
+        data = self._sets.setdefault(found.name, found)
+        if others := differing(data.wanted, found.wanted):
+            raise UserError(f"{found.name} is asked for with two values of {others[0]}: make it an axis or a block's")
+        return data
 
     def _collection(self, cell: GridCell, data: DataSet) -> Job:
         words = (*COMMANDS[data.section], *words_of(told(cell, data.section)), "--out", str(data.folder))

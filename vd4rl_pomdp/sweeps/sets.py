@@ -9,17 +9,16 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.data.format import PLAN, RECORD, SUFFIXES
+from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.data.store import open_store
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.options import flat
-from vd4rl_pomdp.runs.files import jsonable, read_json
+from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.naming import extras
-from vd4rl_pomdp.sweeps.stages import config_of
+from vd4rl_pomdp.sweeps.stages import collection_of
 
 _DOWNLOADED = "84px"
 """Folder in which a downloaded set has its shards."""
-_NOT_COMPARED = ("out", "workers", "frame_size")
 
 
 @dataclass(frozen=True)
@@ -55,39 +54,30 @@ class DataSet:
 
     def check(self) -> None:
         """Raise UserError if its folder holds a set that was collected otherwise."""
-        stored = read_json(self.folder / PLAN) if (self.folder / PLAN).exists() else {}
-        if not self._agrees(stored):
-            name = next(n for n, v in self.wanted.items() if stored.get(n, v) != v)
-            raise UserError(
-                f"{self.folder}: holds a set collected with {name} {stored[name]}, the grid says {self.wanted[name]}; "
-                "choose another --data"
-            )
+        stored = read_json(self.folder / PLAN) if (self.folder / PLAN).exists() else self.wanted
+        if others := differing(stored, self.wanted):
+            has, asked = (f"{others[0]} {values.get(others[0])}" for values in (stored, self.wanted))
+            raise UserError(f"{self.folder}: holds a set of {has}, the grid says {asked}; choose another --data")
 
     def made(self, record: Mapping[str, Any]) -> bool:
         """Whether a run, as its config.json tells it, was trained on this set."""
         if self.there:
             return record.get("inputs", {}).get("data") == self.fingerprint
         collection = record.get("collection") or {}
-        return bool(collection) and self._agrees(collection)
-
-    def _agrees(self, stored: Mapping[str, Any]) -> bool:
-        return all(stored.get(name, value) == value for name, value in self.wanted.items())
+        return bool(collection) and not differing(collection, self.wanted)
 
 
 def set_of(cell: GridCell, root: Path) -> DataSet:
-    """The set of a cell, below `root`; raises UserError if another is there."""
+    """The set of a cell, below `root`; raises UserError if it trains on none."""
     section = cell.chain[0]
     if section not in ("collect", "navigation_collect"):
         raise UserError(f"a block trains on no set: add a section {'navigation_' * ('navigation' in section)}collect")
-    config = config_of(cell, section)
-    place = "/".join((config.task, config.quality) if section == "collect" else (config.maze,))
+    wanted = collection_of(cell)
+    place = "/".join(wanted[name] for name in (("task", "quality") if section == "collect" else ("maze",)))
     name = place + extras(cell, section)
-    wanted = {name: value for name, value in jsonable(flat(config)).items() if name not in _NOT_COMPARED}
     folder = root / name
     inner = folder / _DOWNLOADED
-    found = DataSet(name, inner if _has_shards(inner) else folder, section, wanted)
-    found.check()
-    return found
+    return DataSet(name, inner if _has_shards(inner) else folder, section, wanted)
 
 
 def _has_shards(folder: Path) -> bool:

@@ -120,6 +120,18 @@ _PARSERS: dict[str, Callable[[list[str], str], Any]] = {
 }
 
 
+def collection_of(cell: GridCell) -> Values:
+    """What tells the set of a cell from others, as its collection.json has it."""
+    section = cell.chain[0]
+    if section == "collect":
+        from vd4rl_pomdp.data.collect import collection
+
+        return collection(config_of(cell, section))
+    from vd4rl_pomdp.navigation.collect import collection as maze_collection
+
+    return maze_collection(config_of(cell, section))
+
+
 def recipe_of(cell: GridCell, section: str) -> str:
     """Name of what a training of a cell computes but for the content of its data; as its run's records have it."""
     record = {"format": FORMAT, "stage": STAGES[section], "config": recorded(cell, section)}
