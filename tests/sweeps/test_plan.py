@@ -12,6 +12,7 @@ from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
+from vd4rl_pomdp.sweeps.estimate import Estimates
 from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.plan import JobPlanner
@@ -125,13 +126,17 @@ def test_a_run_goes_on_in_its_own_folder(copy):
 
 
 def test_rows_that_were_kept_are_finished_runs(copy, tmp_path):
-    main(["results", "add", str(copy), "--out", str(tmp_path / "rows")])
+    policies = [str(path) for path in sorted(copy.rglob("finetune-*"))]
+    main(["results", "add", *policies, "--out", str(tmp_path / "rows")])
     kept = FoundRuns(runs_kept([tmp_path / "rows"]))
     new = tmp_path / "new"
     shutil.copytree(copy / "data", new / "data")
     shutil.copy(copy / "grid.toml", new)
-    assert len(left(plan(new))) == 9
+    missing = plan(new)
+    assert len(left(missing)) == 9
     assert left(plan(new, kept=kept)) == []
+    estimates, encoder = Estimates(kept.runs), next(job for job in missing if job.section == "pretrain")
+    assert estimates.seconds(encoder) == read_json(copy / encoder.name / "timing.json")["seconds"]
     assert len(left(plan(new, ["seed=0,1"], kept=kept))) == 9, "the other seed's"
 
 

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from statistics import median
+from typing import Any
 
 from vd4rl_pomdp.sweeps.found import FoundRun
 from vd4rl_pomdp.sweeps.plan import Job, cost_of
@@ -22,10 +23,14 @@ class Estimates:
         self._exact: dict[tuple, list[float]] = {}
         self._by_stage: dict[str, list[tuple[float, float]]] = {}
         for run in runs:
-            if run.seconds is not None and (section := _SECTIONS.get(run.record["stage"])):
-                self._exact.setdefault((section, cost_of(run.settings)), []).append(run.seconds)
-                amount = float(run.record["config"].get(_SCALE[section]) or 1)
-                self._by_stage.setdefault(section, []).append((amount, run.seconds))
+            self._note(_SECTIONS.get(run.record["stage"]), run.settings, run.seconds)
+            self._note("pretrain", run.card.get("settings", {}), run.encoder_seconds)
+
+    def _note(self, section: str | None, settings: Mapping[str, Any], seconds: float | None) -> None:
+        if section and seconds is not None:
+            self._exact.setdefault((section, cost_of(settings)), []).append(seconds)
+            amount = float(settings.get(_SCALE[section]) or 1)
+            self._by_stage.setdefault(section, []).append((amount, seconds))
 
     def seconds(self, job: Job) -> float | None:
         """What a job takes from its beginning; None if no run tells."""

@@ -26,6 +26,8 @@ class FoundRun:
     """What its encoder says of its pretraining, empty where it has none."""
     seconds: float | None
     """Wall-clock time; None while it is unfinished."""
+    encoder_seconds: float | None = None
+    """Wall-clock time of its encoder's pretraining, as far as a fine-tuning tells."""
 
     @property
     def recipe(self) -> str:
@@ -61,7 +63,8 @@ def runs_kept(folders: Iterable[Path]) -> Iterator[FoundRun]:
     """Every run of some results folders; UserError for a folder that is none."""
     for folder in folders:
         for run in read_results(folder):
-            yield FoundRun(run.path, run.record, run.card, run.files.get("timing", {}).get("seconds"))
+            seconds = (run.files.get(name, {}).get("seconds") for name in ("timing", "pretrain_timing"))
+            yield FoundRun(run.path, run.record, run.card, *seconds)
 
 
 def runs_below(out: Path) -> Iterator[FoundRun]:
