@@ -55,6 +55,29 @@ def test_runs_that_differ_are_rows_of_their_own(tmp_path, one, other, names):
     assert pooled(tmp_path / "runs") == dict.fromkeys(names, 2) | {"random": 1}
 
 
+def by_task(tmp_path, budgets):
+    """Runs of two methods on two tasks, with budgets by method and task."""
+    for (method, task), updates in budgets.items():
+        run = write_run(tmp_path / f"runs/{method}-{task}", method, 0, {10: [1.0]}, labels={"task": task})
+        describe(run, {}, data=task, updates=updates)
+    return tmp_path / "runs"
+
+
+def test_a_setting_that_goes_by_the_task_makes_no_variants_and_the_page_tells_it(tmp_path):
+    tasks = {"walker_walk": 20, "cheetah_run": 60}
+    runs = by_task(tmp_path, {(method, task): tasks[task] for method in ("acro", "mik+a") for task in tasks})
+    assert pooled(runs) == {"acro": 2, "mik+a": 2}
+    page = write_report([runs], tmp_path / "report")[0].read_text()
+    assert "<td>walker_walk</td><td>updates 20</td>" in page
+    assert "<td>cheetah_run</td><td>updates 60</td>" in page
+
+
+def test_a_budget_of_one_method_alone_is_no_tasks_own(tmp_path):
+    budgets = {("acro", "walker_walk"): 20, ("acro", "cheetah_run"): 60, ("mik+a", "cheetah_run"): 20}
+    runs = by_task(tmp_path, budgets)
+    assert pooled(runs) == {"acro, updates 20": 1, "acro, updates 60": 1, "mik+a": 1}
+
+
 def test_a_preset_stands_for_what_it_decides_and_the_page_says_all(tmp_path):
     for preset, k in (("cpu", 15), ("cpu", 1), ("smoke", 3)):
         run = write_run(tmp_path / f"runs/{preset}{k}", "acro", 0, {10: [1.0]})

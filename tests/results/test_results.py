@@ -109,6 +109,16 @@ def test_folders_and_results_mix_and_a_run_counts_once(tmp_path):
     assert [run.path for run in found if not run.folder] == [tmp_path / "some"]
 
 
+def test_a_results_folder_within_another_is_another_experiment(tmp_path):
+    for name, seed in (("outer", 0), ("outer/inner", 1)):
+        run = write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [1.0]})
+        add_results([run], tmp_path / name)
+    shutil.rmtree(tmp_path / "runs")
+    for paths, seeds in ((".",), {0}), (("outer",), {0}), (("outer/inner",), {1}), (("outer", "outer/inner"), {0, 1}):
+        found = find_results([tmp_path / path for path in paths])
+        assert {run.labels["seed"] for run in found} == seeds
+
+
 def test_runs_of_early_versions_are_told_apart_by_their_labels(tmp_path):
     for method in ("acro", "mik"):
         write_run(tmp_path / f"runs/{method}", method, 0, {10: [1.0]})

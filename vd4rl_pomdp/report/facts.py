@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from vd4rl_pomdp.report.load import LoadedRun, compare
+from vd4rl_pomdp.report.load import LoadedRun, compare, own_to_tasks
 from vd4rl_pomdp.report.measures import machine
 from vd4rl_pomdp.report.tables import label, setting
 from vd4rl_pomdp.runs.settings import settings_of
@@ -33,14 +33,26 @@ def _state(run: LoadedRun) -> str:
 
 
 def differing(runs: list[LoadedRun]) -> list[tuple[str, str]]:
-    """Each method of which there are several variants, and all settings that differ, those of a preset included."""
+    """Each method of which there are several variants, and all settings that differ, those of a preset included.
+
+    Each task with settings of its own comes first.
+    """
     told = zip(runs, compare(runs, brief=False), strict=True)
     named = {
         label(_row(run)): ", ".join(filter(None, parts))
         for run, parts in told
         if run.stage == "finetune" and run.variant
     }
-    return list(named.items())
+    return [*_own_to_tasks(runs).items(), *named.items()]
+
+
+def _own_to_tasks(runs: list[LoadedRun]) -> dict[str, str]:
+    """Settings that go by the task, in words."""
+    words: dict[str, list[str]] = {}
+    for (stage, _), by_task in own_to_tasks(runs).items():
+        for task, settings in by_task.items() if stage == "finetune" else ():
+            words.setdefault(task, []).extend(f"{name} {value}" for name, value in settings.items())
+    return {task: ", ".join(dict.fromkeys(texts)) for task, texts in words.items() if texts}
 
 
 def facts(runs: list[LoadedRun]) -> list[dict[str, str]]:

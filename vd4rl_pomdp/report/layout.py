@@ -14,6 +14,8 @@ _ESCAPES = {
     **{"<": r"\textless{}", ">": r"\textgreater{}", "|": r"\textbar{}", '"': r"\textquotedbl{}"},
     **{"–": "--", "†": r"\dag{}", "±": r"$\pm$", "×": r"$\times$", "→": r"$\rightarrow$"},
 }
+_SENTENCE = 48
+"""Letters from which on a cell does not fit on a page beside others."""
 
 
 class Line(NamedTuple):
@@ -58,7 +60,8 @@ def latex(tables: Sequence[ShownTable], note: str) -> str:
 
 
 def _float(table: ShownTable, note: str) -> str:
-    form = "l" * table.words + "r" * (len(table.columns) - table.words)
+    words = "".join(_words_column([line.cells[i] for line in table.lines]) for i in range(table.words))
+    form = words + "r" * (len(table.columns) - table.words)
     caption = " ".join(filter(None, (f"{table.title}." if table.title else "", note, table.note)))
     lines = [_line(line, len(table.columns)) for line in table.lines]
     return "\n".join(
@@ -68,6 +71,11 @@ def _float(table: ShownTable, note: str) -> str:
             *(r"\end{tabular}", r"\end{table}", ""),
         ]
     )
+
+
+def _words_column(texts: list[str]) -> str:
+    """Sentences are broken into lines."""
+    return r"p{0.4\linewidth}" if any(len(text) > _SENTENCE for text in texts) else "l"
 
 
 def _line(line: Line, columns: int) -> str:

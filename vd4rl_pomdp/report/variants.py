@@ -58,13 +58,35 @@ def _words(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
+def of_tasks(settings: Sequence[Settings], tasks: Sequence[str]) -> dict[str, Settings]:
+    """Settings that go by the task: every run of a task has them so, and those of another task otherwise.
+
+    Args:
+        settings: of all runs of one stage and algorithm.
+        tasks: the task of each run.
+
+    Returns:
+        By task, its values of these settings.
+    """
+    found: dict[str, dict[str, set[str]]] = {}
+    for one, task in zip(settings, tasks, strict=True):
+        for name in one.keys() - {UNKNOWN, *_DATA}:
+            found.setdefault(name, {}).setdefault(task, set()).add(one[name])
+    own = {
+        name: {task: min(values) for task, values in by_task.items()}
+        for name, by_task in found.items()
+        if all(len(values) == 1 for values in by_task.values()) and len(set().union(*by_task.values())) > 1
+    }
+    return {task: {name: own[name][task] for name in sorted(own) if task in own[name]} for task in dict.fromkeys(tasks)}
+
+
 def differences(
     settings: list[Settings], corruption: list[str], setting: list[tuple], brief: bool = True
 ) -> list[Parts]:
     """Words for what differs among runs of one method, run by run.
 
     Args:
-        settings: of the runs.
+        settings: of the runs, without those that go by the task.
         corruption: the name of each run's corruption: other fields of it are told apart within one name.
         setting: task, quality and corruption of each run: data are told apart within one setting.
         brief: whether a preset is named in place of the settings that it decides.

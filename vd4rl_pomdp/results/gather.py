@@ -16,6 +16,8 @@ from vd4rl_pomdp.runs.ownership import owned
 def find_results(paths: Sequence[Path], but: Path | None = None) -> list[Result]:
     """Every run at or below some paths, each once: of a run folder, or else of a results folder.
 
+    Results folders within a results folder are other experiments: they are read where they are named themselves.
+
     Args:
         paths: run folders, results folders, and folders that contain some.
         but: a results folder that is not read unless it is named itself.
@@ -43,10 +45,16 @@ def _found(paths: Sequence[Path], but: Path | None) -> Iterator[Result]:
             raise UserError(f"{path}: no such folder")
     files = [p for path in paths for p in sorted(path.rglob("config.json"))]
     yield from (read_run(file.parent) for file in dict.fromkeys(files) if "stage" in read_json(file))
-    places = [file.parent for path in paths for file in sorted(path.rglob(RUNS))]
+    places = [place for path in paths for place in _outermost(path)]
     for place in dict.fromkeys(places):
         if but is None or place in paths or place.resolve() != but.resolve():
             yield from read_results(place)
+
+
+def _outermost(path: Path) -> Iterator[Path]:
+    """Results folders at or below a path that lie in no other one there."""
+    places = {file.parent for file in path.rglob(RUNS)}
+    return (place for place in sorted(places) if places.isdisjoint(place.parents))
 
 
 def _better(one: Result, other: Result) -> Result:
