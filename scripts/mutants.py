@@ -1,12 +1,13 @@
 """Break the code on purpose, one claim at a time, and see which test notices.
 
     python scripts/mutants.py                      all of them; writes docs/mutants.md
-    python scripts/mutants.py --only td3 k-means   those whose name, file or section contains a word; prints their rows
+    python scripts/mutants.py --only td3 k-means   those whose name, file or section contains a word
+    python scripts/mutants.py --new                those without a row on the page, or whose test is gone
     python scripts/mutants.py --whole-suite        survivors of the tests named for them meet all the others, too
 
 A mutant is one edit of one file, listed in mutants.toml with the claim that it breaks and the tests that should notice,
-the fastest first. Each is tried in a copy of the tree; the checkout itself is never touched. A survivor deserves a test
-of its claim.
+the fastest first. Each is tried in a copy of the tree; the checkout itself is never touched. Rows of mutants that are
+not tried stay on the page. A survivor deserves a test of its claim.
 """
 
 from __future__ import annotations
@@ -57,6 +58,11 @@ class Mutant:
     """What is no longer true."""
     tests: tuple[str, ...]
     """Test files, or tests in them, fastest first."""
+
+    @property
+    def words(self) -> str:
+        """What `--only` looks into."""
+        return f"{self.section} {self.name} {self.file}".lower()
 
     def apply(self, tree: Path) -> str:
         """Text of its file with the edit; raises ValueError if the old text is not there exactly once."""
@@ -168,6 +174,18 @@ def page(tried: list[tuple[Mutant, str]]) -> str:
     return "\n".join(lines) + "\n"
 
 
+def told(text: str) -> dict[str, str]:
+    """Verdicts by name, as a page tells them; only such whose test is still there."""
+    cells = [re.split(r"(?<!\\\\) \| ", line[2:-2]) for line in text.splitlines() if re.match(r"\| (?!broken)", line)]
+    return {name.replace("\\|", "|"): verdict for name, _, verdict in cells if verdict == SURVIVED or _is_test(verdict)}
+
+
+def _is_test(verdict: str) -> bool:
+    file, _, function = verdict.strip("`").partition("::")
+    path = ROOT / file
+    return path.is_file() and f"def {function.partition('[')[0]}(" in path.read_text(encoding="utf-8")
+
+
 def _tried(mutants: list[Mutant], limit: float, whole_suite: bool) -> Iterator[tuple[Mutant, str]]:
     """Try all, after the unchanged tree has passed their tests."""
     for mutant in mutants:
@@ -187,25 +205,27 @@ def main() -> int:
     parser.add_argument(
         "--only", nargs="+", default=[], metavar="WORD", help="try those that contain one of these words"
     )
+    parser.add_argument("--new", action="store_true", help="try those without a row on the page, or whose test is gone")
     parser.add_argument("--whole-suite", action="store_true", help="let survivors meet all tests")
     parser.add_argument("--limit", type=float, default=600, help="seconds for one run of pytest")
     words = parser.parse_args()
     for name, value in (("MUJOCO_GL", "egl"), ("OMP_NUM_THREADS", "1"), ("LP_NUM_THREADS", "1")):
         os.environ.setdefault(name, value)
     _CONTEXT.set_forkserver_preload(list(_LIBRARIES))
-    mutants = [
-        m for m in load_mutants()
-        if not words.only or any(w.lower() in f"{m.section} {m.name} {m.file}".lower() for w in words.only)
-    ]  # fmt: skip
+    listed, kept = load_mutants(), told(PAGE.read_text(encoding="utf-8")) if PAGE.exists() else {}
+    chosen = [
+        mutant
+        for mutant in listed
+        if not (words.new and mutant.name in kept)
+        and (not words.only or any(word.lower() in mutant.words for word in words.only))
+    ]
     try:
-        tried = list(_tried(mutants, words.limit, words.whole_suite))
+        tried = list(_tried(chosen, words.limit, words.whole_suite))
     except ValueError as error:
         print(error, file=sys.stderr)
         return 2
-    if words.only:
-        print(_COLUMNS, *(row(*one) for one in tried), sep="\n")
-    else:
-        PAGE.write_text(page(tried), encoding="utf-8")
+    verdicts = kept | {mutant.name: verdict for mutant, verdict in tried}
+    PAGE.write_text(page([(m, verdicts[m.name]) for m in listed if m.name in verdicts]), encoding="utf-8")
     return int(any(verdict == SURVIVED for _, verdict in tried))
 
 

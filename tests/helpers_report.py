@@ -8,10 +8,10 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.evaluation import append_episodes
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.tables import label
 from vd4rl_pomdp.results import Result, write_results
+from vd4rl_pomdp.runs.episodes import append_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.identity import identity
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import torch
 
-import finetune.train
+import finetune.evaluations
 import pretrain.navigation.trainer
 import pretrain.train
 from finetune.algorithms import bc, td3_bc
@@ -26,7 +26,7 @@ from tests.helpers_data import write_fake_set
 from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import read_episodes
+from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
 from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
@@ -328,7 +328,7 @@ def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
     changes = FINETUNE | {"eval_episodes": 2}
     whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes))
     config = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
-    append, evaluations = finetune.train.append_episodes, []
+    append, evaluations = finetune.evaluations.append_episodes, []
 
     def cut(path: Path, rows: list[dict[str, Any]]) -> None:
         evaluations.append(rows)
@@ -339,7 +339,7 @@ def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(finetune.train, "append_episodes", cut)
+        patch.setattr(finetune.evaluations, "append_episodes", cut)
         with pytest.raises(KeyboardInterrupt):
             run_finetune(config)
     monkeypatch.setattr(td3_bc.TD3BC, "update", _fail if evaluation == 2 else td3_bc.TD3BC.update)

@@ -47,6 +47,14 @@ def test_the_page_has_a_row_for_each_mutant_and_names_a_test_that_caught_it(scri
     assert [verdict for verdict in verdicts if not is_test(verdict.strip("`"))] == []
 
 
+def test_a_page_tells_what_it_was_made_of_but_for_tests_that_are_gone(script):
+    here = "`tests/test_mutants.py::test_a_page_tells_what_it_was_made_of_but_for_tests_that_are_gone`"
+    verdicts = {"a | b": here, "gone": "`tests/test_mutants.py::test_of_old`", "no": script.SURVIVED}
+    mutants = [script.Mutant("Numbers", name, "x.py", "1", "2", "c | d", ()) for name in verdicts]
+    page = script.page(list(zip(mutants, verdicts.values(), strict=True)))
+    assert script.told(page) == {name: verdict for name, verdict in verdicts.items() if name != "gone"}
+
+
 @pytest.fixture
 def tree(tmp_path) -> Path:
     """A checkout of a single function with its test."""

@@ -22,11 +22,12 @@ from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import read_shard
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import Episode, episode_rows, evaluate_run, read_episodes
+from vd4rl_pomdp.evaluation import Episode, episode_rows, evaluate_run
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.policies.config import PolicyConfig, recipes
 from vd4rl_pomdp.policies.train import train_policy
 from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.tasks import TASKS
 
 PAGE = Path(__file__).parents[1] / "docs" / "add_a_task.md"

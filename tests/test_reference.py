@@ -12,7 +12,7 @@ from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies import load_actor
 from vd4rl_pomdp.policies.actor import ASSETS
-from vd4rl_pomdp.reference import FILE, Reference
+from vd4rl_pomdp.reference import FILE, Reference, summarise
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 EXPERT, MEDIUM = (load_actor("walker_walk", quality).sha256 for quality in ("expert", "medium"))
@@ -78,3 +78,22 @@ def test_a_damaged_reference_is_one_line(tmp_path, change):
     with pytest.raises(UserError, match=r"reference\.json: is damaged") as caught:
         Reference.read(Path(tmp_path))
     assert "\n" not in str(caught.value)
+
+
+def test_a_summary_counts_episodes_above_four_fifths_of_the_datas_return():
+    rows = [
+        {"return": total, "score": total / 10, "action_error": error}
+        for total, error in ((90.0, 0.2), (80.0, 0.4), (100.0, None))
+    ]
+    summary = summarise(rows, Reference(data_return=100.0))
+    assert summary == {
+        "score_mean": 9.0,
+        "score_min": 8.0,
+        "score_max": 10.0,
+        "return_mean": 90.0,
+        "share_above_80": 2 / 3,
+        "action_error": pytest.approx(0.3),
+    }
+    assert summarise(rows[2:], Reference())["share_above_80"] is None
+    assert summarise(rows[2:], Reference(data_return=-5.0))["share_above_80"] is None, "80% of what is lost is no aim"
+    assert summarise(rows[2:], Reference())["action_error"] is None

@@ -101,3 +101,21 @@ def _names(actor: Any) -> dict[str, str] | None:
     if not isinstance(actor, dict):
         raise TypeError(f"{actor!r} names no actor")
     return {name: str(actor[name]) for name in ("task", "quality", "sha256")}
+
+
+def summarise(rows: list[dict[str, Any]], reference: Reference) -> dict[str, float | None]:
+    """What the episodes of one policy under one corruption come to; None is unknown.
+
+    Returns:
+        `score_mean`, `score_min`, `score_max`, `return_mean`, `share_above_80` (see `Reference`), `action_error`.
+    """
+    scores, returns = ([row[name] for row in rows] for name in ("score", "return"))
+    errors = [row["action_error"] for row in rows if row["action_error"] is not None]
+    return {
+        "score_mean": float(np.mean(scores)),
+        "score_min": min(scores),
+        "score_max": max(scores),
+        "return_mean": float(np.mean(returns)),
+        "share_above_80": reference.share_above_80(returns),
+        "action_error": float(np.mean(errors)) if errors else None,
+    }

@@ -1,7 +1,7 @@
 import pytest
 
-from vd4rl_pomdp.evaluation import append_episodes
 from vd4rl_pomdp.experiments.demo import conclusion, demo_commands, demo_jobs
+from vd4rl_pomdp.runs.episodes import append_episodes
 
 METHODS = ("mik+a", "acro", "random")
 

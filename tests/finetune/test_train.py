@@ -180,7 +180,7 @@ def test_a_run_cut_around_an_evaluation_has_the_metrics_of_a_whole_one(encoder, 
         if place == "after the row":
             patch.setattr("vd4rl_pomdp.runs.loop.Loop.show", lambda self, **shown: end() if "score" in shown else None)
         else:
-            patch.setattr(f"finetune.train.{place}", end)
+            patch.setattr(f"finetune.evaluations.{place}", end)
         with pytest.raises(CutError):
             run_finetune(cut)
     run_finetune(cut)

@@ -3,7 +3,7 @@
 import pytest
 
 from finetune.config import FinetuneConfig
-from finetune.train import as_trained
+from finetune.settings import as_trained
 from pretrain.config import PretrainConfig
 from pretrain.navigation.config import NavigationConfig
 from pretrain.objectives import METHODS

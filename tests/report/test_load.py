@@ -4,8 +4,8 @@ import pytest
 
 from tests.helpers_report import describe, write_run
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import append_episodes, read_episodes
 from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 
 
 def test_bad_input_is_one_line(tmp_path):

@@ -8,10 +8,10 @@ import pytest
 from tests.helpers_report import describe, grid, pretraining, write_run
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import read_episodes
 from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.results import Result, add_results, find_results, folder, read_results, read_run, write_results
+from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.identity import identity
 

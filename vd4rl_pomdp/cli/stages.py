@@ -46,8 +46,9 @@ class EvaluateCommand:
 
 
 def _evaluate(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.evaluation import append_episodes, begin_episodes, evaluate_run, summarise
-    from vd4rl_pomdp.reference import Reference
+    from vd4rl_pomdp.evaluation import evaluate_run
+    from vd4rl_pomdp.reference import Reference, summarise
+    from vd4rl_pomdp.runs.episodes import append_episodes, begin_episodes
     from vd4rl_pomdp.runs.files import flatten
     from vd4rl_pomdp.runs.outputs import refuse_inside
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import read_episodes
+from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.outputs import refuse_kept
 from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below
 from vd4rl_pomdp.sweeps.grid_file import load_grid

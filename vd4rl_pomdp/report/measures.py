@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from vd4rl_pomdp.evaluation import summarise
+from vd4rl_pomdp.reference import summarise
 from vd4rl_pomdp.report.gaps import CONDITION, in_words
 from vd4rl_pomdp.report.load import IDENTITY, LoadedRun
 from vd4rl_pomdp.report.tables import by_label, grouped, table_order

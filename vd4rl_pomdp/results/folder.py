@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.evaluation import COLUMNS, LABELS, read_episodes
+from vd4rl_pomdp.runs.episodes import COLUMNS, LABELS, read_episodes
 from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_csv
 from vd4rl_pomdp.runs.identity import identity
 from vd4rl_pomdp.runs.metrics import read_metrics

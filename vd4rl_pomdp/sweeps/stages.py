@@ -151,7 +151,7 @@ def recorded(cell: GridCell, section: str) -> Values:
 
 def _finetuning(cell: GridCell) -> Any:
     """The config that a fine-tuning trains with: what its encoder's method cannot read is no part of it."""
-    from finetune.train import as_trained
+    from finetune.settings import as_trained
     from pretrain.config import memory_of
     from pretrain.objectives import METHODS
 

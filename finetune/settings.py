@@ -1,0 +1,72 @@
+"""A fine-tuning's settings as its encoder and its set let them be."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import torch
+
+from finetune.algorithms import ReturnOptions
+from finetune.config import FinetuneConfig
+from finetune.histories import Histories
+from vd4rl_pomdp.data import Dataset
+from vd4rl_pomdp.errors import UserError, flag_of, refuse_number
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.options import NO_OPTIONS, flat
+from vd4rl_pomdp.runs.memory import require_disk, require_memory
+
+
+def as_trained(config: FinetuneConfig, method: str, algorithm: str, remembers: bool) -> FinetuneConfig:
+    """The settings as an encoder's policy is trained with them: what it cannot read is no part of them.
+
+    Args:
+        config: the settings that were told.
+        method: the encoder's.
+        algorithm: the algorithm that the method brings along, if it has no frozen stage; else empty.
+        remembers: whether the encoder has a memory.
+
+    Raises:
+        UserError: a setting that was not the default is not read.
+    """
+    if algorithm:
+        config = _end_to_end(config, algorithm)
+    return config if remembers and not algorithm else _without_memory(config, method)
+
+
+def _end_to_end(config: FinetuneConfig, algorithm: str) -> FinetuneConfig:
+    if config.views != config.usual()["views"]:
+        raise UserError(f"--views is not read by the algorithm {algorithm}, which trains the encoder: leave it out")
+    return config.altered(algorithm=algorithm, views=0)
+
+
+def _without_memory(config: FinetuneConfig, method: str) -> FinetuneConfig:
+    usual = config.usual()
+    for name, value in flat(config.memory).items():
+        if value != usual[name]:
+            raise UserError(f"{flag_of(name)} is not read: {method} has no memory; leave it out")
+    return replace(config, memory=NO_OPTIONS)
+
+
+def check_n_step(config: FinetuneConfig, dataset: Dataset) -> None:
+    """Raise UserError for returns over more steps than an episode has."""
+    longest = int((dataset.episode_end - dataset.episode_start).max()) - 1
+    refuse_number("n_step", returns_of(config).n_step, 1, max(longest, ReturnOptions.n_step))
+
+
+def require_room(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, device: torch.device, kept: bool) -> None:
+    """Refuse what plainly exceeds the memory or the disk: all views' features, or one batch through the networks.
+
+    Features that are `kept` on the disk already take no more of it.
+    """
+    histories = Histories(dataset, config.memory, 1, config.seed)
+    features = config.views * histories.features * encoder.dim * 2
+    require_memory(features, device, config, "views")
+    if not kept:
+        require_disk(features, config.out, config, "views")
+    row, weights = 2 * encoder.dim + 4 * config.hidden_dim, 15 * config.hidden_dim**2  # of float32 numbers
+    require_memory(4 * (config.batch_size * row + weights), device, config, "batch_size", "hidden_dim")
+
+
+def returns_of(config: FinetuneConfig) -> ReturnOptions:
+    """How returns are summed, also for an algorithm that does not look at them."""
+    return config.options if isinstance(config.options, ReturnOptions) else ReturnOptions()
