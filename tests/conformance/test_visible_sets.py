@@ -142,7 +142,7 @@ ROW_OF: dict[str, Seen] = {
     "fj": lambda j, t, u, m, n: t - m <= j <= t or u - m <= j <= u,
     "mik": lambda j, t, u, m, n: t - m <= j <= t or u <= j <= u + n,
 }
-"""Rows j of o_j in the paper's Table 1, for a past of m and a future of n rows."""
+"""Rows j of o_j in the paper's Table 1, or a memoryless method's own; m rows of the past, n of the future."""
 ACTION_OF: dict[str, Seen] = {
     "ah+a": lambda j, t, u, m, n: t - m <= j < t or u - m <= j < u,
     "fj+a": lambda j, t, u, m, n: t - m <= j < t or u - m <= j < u,

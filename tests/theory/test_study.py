@@ -68,6 +68,7 @@ def test_every_printed_claim_that_fails_where_its_assumptions_hold_is_an_instanc
     """Twenty rows, of which the facts make four kinds; what the paper does not claim is not among them."""
     study, _ = shown
     counts = {fact["name"]: len(fact["in_table"]) for fact in study["facts"] if fact["in_table"]}
+    assert sum(counts.values()) == 20
     assert counts == {"reaches_back": 14, "leaked_mask": 2, "merged_states": 2, "merged_phases": 1, "needed_noise": 1}
     failed = [
         (world, row["method"], column)
