@@ -6,6 +6,7 @@ from dataclasses import replace
 import pytest
 import torch
 
+from finetune.histories import read_both_ends, read_whole
 from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
@@ -102,7 +103,8 @@ STORED = {
 @pytest.fixture
 def dataset(tmp_path) -> Dataset:
     found = open_dataset(write_fake_set(tmp_path / "set", EPISODES, action_dim=2), tmp_path / "cache")
-    found.frames = torch.randint(0, 256, (*found.frames.shape[:2], 6, 6), dtype=torch.uint8)
+    g = torch.Generator().manual_seed(0)
+    found.frames = torch.randint(0, 256, (*found.frames.shape[:2], 6, 6), dtype=torch.uint8, generator=g)
     return found
 
 
@@ -151,3 +153,47 @@ def test_predictions_depend_on_their_own_episodes_stored_rows_alone(dataset: Dat
             actions = {begin + j + 1 for j, (_, action) in enumerate(told) if action and j + 1 < rows}
             assert {row for row, touched in enumerate(by_frame) if touched[b, p]} == frames
             assert {row for row, touched in enumerate(by_action) if touched[b, p]} == actions
+
+
+GIVEN = {
+    ("whole", "state", 0): (range(7, 11), range(8, 11)),
+    ("whole", "state", 2): (range(9, 11), range(10, 11)),
+    ("whole", "frame", 0): (range(10, 11), range(0)),
+    ("whole", "frame+state", 2): (range(9, 11), range(10, 11)),
+    ("first end", "state", 0): (range(8, 11), range(9, 11)),
+    ("first end", "frame", 0): (range(10, 11), range(0)),
+    ("last end", "state", 0): (range(8, 13), range(9, 13)),
+    ("last end", "state", 2): (range(11, 13), range(12, 13)),
+    ("last end", "frame+state", 0): (range(8, 13), range(9, 13)),
+}
+"""By hand: rows of the set whose frames, and whose stored actions, a policy of mik+a is given at row 10, or at 12.
+
+The second episode is rows 7 to 12. Its whole history begins at row 7, the random one of both ends at row 8; a history's
+first row shows its frame alone.
+"""
+
+
+@pytest.mark.parametrize(("end", "readout", "window"), GIVEN, ids=str)
+@torch.no_grad()
+def test_what_a_policy_is_given_depends_on_its_history_alone(dataset: Dataset, end: str, readout: str, window: int):
+    trained = build_inverse("mik+a").encoder
+    encoder = Encoder(replace(trained.config, readout=readout, history_window=window)).double().eval()
+    encoder.load_state_dict(trained.state_dict())
+    g = torch.Generator().manual_seed(0)
+    features = torch.rand(2, dataset.num_rows, trained.config.feature_dim, generator=g, dtype=torch.float64)
+
+    def given(frames: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        dataset.action = actions
+        if end == "whole":
+            return read_whole(encoder, frames[7:], dataset, 1)[10 - 7]
+        rows = [torch.tensor([row]) for row in (8, 10, 12)]
+        return read_both_ends(encoder, lambda rows: frames[rows], dataset, *rows)[end == "last end"][0]
+
+    def touched(exchanged: Callable[[torch.Tensor], torch.Tensor]) -> set[int]:
+        return {row for row in range(len(stored)) if (exchanged(torch.tensor([row])) != plain).any()}
+
+    (frames, others), stored = features, dataset.action
+    plain = given(frames, stored)
+    by_frame = touched(lambda row: given(frames.index_copy(0, row, others[row]), stored))
+    by_action = touched(lambda row: given(frames, stored.index_fill(0, row, 0.5)))
+    assert (by_frame, by_action) == tuple(map(set, GIVEN[end, readout, window]))
