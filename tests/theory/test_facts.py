@@ -10,7 +10,7 @@ from tests.theory.random_worlds import worlds
 from vd4rl_pomdp.theory import contradictions, remainders
 from vd4rl_pomdp.theory.classifiers import Memory, clash, compare
 from vd4rl_pomdp.theory.counterexample import inverse_examples
-from vd4rl_pomdp.theory.decodability import past_memory
+from vd4rl_pomdp.theory.decodability import future_memory, past_memory
 from vd4rl_pomdp.theory.facts import FACTS, explanation
 from vd4rl_pomdp.theory.gallery import counterexample, echo, momentum
 from vd4rl_pomdp.theory.small import (
@@ -95,6 +95,13 @@ def test_the_family_is_all_there_is():
     assert counts[1, 3] == 2 * 5
     assert counts[3, 1] == 5 * sum(1 for step in product(range(3), repeat=6) if connects(step))
     assert list(SIZES) == sorted(SIZES, key=lambda size: (size[0] * size[1], size[1]))
+
+
+def test_no_window_of_the_family_is_too_long_to_be_computed():
+    worlds = [world for size in SIZES for world in small_worlds(size)]
+    for memory in (past_memory, future_memory):
+        for actions in (True, False):
+            assert max(memory(world, actions) or 0 for world in worlds) <= contradictions.LONGEST
 
 
 def connects(step):

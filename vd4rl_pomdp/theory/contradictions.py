@@ -17,7 +17,9 @@ from vd4rl_pomdp.theory.views import VIEWS
 from vd4rl_pomdp.theory.world import AgentState, World, diameter
 
 LONGEST = 3
-"""Windows beyond this are not computed."""
+"""Largest m and n that are computed; no world of `small.FAMILY` that decodes needs more."""
+GAPS = 4
+"""How many k are tried, from the first one that a claim is about."""
 
 
 def forward_jump(world: World, method: str = "fj+a") -> Row | None:
@@ -25,7 +27,7 @@ def forward_jump(world: World, method: str = "fj+a") -> Row | None:
     m = past_memory(world, VIEWS[method].actions)
     if m is None or not 0 < m <= LONGEST:
         return None
-    return _first_clash(world, method, Memory(m, 0), m + 1, m + 2)
+    return _first_clash(world, method, Memory(m, 0), range(m + 1, m + 1 + GAPS))
 
 
 def no_future(world: World) -> Row | None:
@@ -33,22 +35,22 @@ def no_future(world: World) -> Row | None:
     memory = decoded(world, literal=True)
     if memory is None or future_memory(world, actions=True) is not None:
         return None
-    return _first_clash(world, "mik+a", memory, 1, 2)
+    return _first_clash(world, "mik+a", memory, range(1, 1 + GAPS))
 
 
 def leaked_target(world: World) -> Row | None:
     """Decodable worlds where the literal MIK+A, at k = 1, is not the multi-step inverse."""
-    return _literal(world, 1, 1)
+    return _literal(world, range(1, 2))
 
 
 def leaked_mask(world: World) -> Row | None:
     """Decodable worlds where the literal MIK+A, at some k > 1, is not the multi-step inverse."""
-    return _literal(world, 2, 3)
+    return _literal(world, range(2, 2 + GAPS))
 
 
-def _literal(world: World, low: int, high: int) -> Row | None:
+def _literal(world: World, ks: range) -> Row | None:
     memory = decoded(world)
-    return None if memory is None else _first_clash(world, "mik+a literal", memory, low, high)
+    return None if memory is None else _first_clash(world, "mik+a literal", memory, ks)
 
 
 def merged_states(world: World) -> Row | None:
@@ -140,8 +142,8 @@ def _reach(world: World) -> int:
     return max(1, reach)
 
 
-def _first_clash(world: World, method: str, memory: Memory, low: int, high: int) -> Row | None:
-    for k in range(low, high + 1):
+def _first_clash(world: World, method: str, memory: Memory, ks: range) -> Row | None:
+    for k in ks:
         found = clash(world, VIEWS[method], memory, k)
         if found is not None:
             return {"m": memory.m, "n": memory.n, "k": k} | _told(world, found)
