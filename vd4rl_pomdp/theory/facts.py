@@ -83,7 +83,7 @@ FACTS = (
     ),
     Fact(
         "no_future",
-        "The counterexample breaks an assumption of MIK+A",
+        "Without the leak, the counterexample breaks an assumption of MIK+A",
         ("mik+a",),
         "the counterexample sets MIK+A apart from FJ and FJ+A (section 3.2); MIK+A assumes that the future decodes "
         "(Table 1)",
@@ -159,7 +159,7 @@ FACTS = (
         (),
         "all k up to the diameter recover the state of a deterministic world (appendix), and k = 1 to 3 that of the "
         "counterexample (section 3.2)",
-        "for {states} states, one encoder on true states needs with k up to {max_k} this many codes: {codes}",
+        "codes that one encoder on true states needs, with k up to {max_k}: {codes} for {states} states",
         "states that can occur in the same row are told apart",
         (alternator, counterexample),
         contradictions.merged_phases,

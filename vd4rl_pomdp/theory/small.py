@@ -22,7 +22,7 @@ FAMILY = (
 
 
 def idle() -> World:
-    """One state: actions do nothing, and nothing is seen."""
+    """Actions do nothing, and nothing is seen."""
     return _world("idle", [0], {0: (0, 0)}, {0: BLANK})
 
 
