@@ -1,4 +1,4 @@
-"""No history, AH and AH+A: multi-step inverse models on states of the whole past (Wu et al. 2024, section 3, Table 1).
+"""No history, AH and AH+A: inverse models on one observation or on the whole past (Wu et al. 2024, sections 3 and 4).
 
     no_history   P(a_t | e(o_t), e(o_{t+k}))
     AH           P(a_t | f(o_0..o_t), f(o_0..o_{t+k})),   k in 1..K

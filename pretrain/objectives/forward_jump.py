@@ -4,8 +4,8 @@
     FJ+A   the same with the actions inside each window: a_{t-m}..a_{t-1} and a_{t+k-m}..a_{t+k-1}
 
 Each state is computed anew, from zero, over its own m+1 rows. A window's first row carries no earlier action. For
-k <= m the later window of FJ+A contains a_t; for k > m + 1 neither window sees the steps between, and what they miss
-is the paper's counterexample.
+k <= m the later window of FJ+A contains a_t: the paper's counterexample rests on that. For k > m both windows show what
+MIK+A sees at the gap k-m with a future of m rows.
 
 Authors' code: not published.
 

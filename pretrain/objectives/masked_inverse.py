@@ -13,7 +13,8 @@ Differences and readings:
   literal reading, to measure what it does.
 - An episode's last row has no action: b reads zeros and a flag there.
 - The future reaches to the window's end, or n rows beyond t+k (the paper's n is not stated for these experiments);
-  the past to the window's start, or m rows before t.
+  the past to the window's start, or m rows before t. Of n+1 rows of the future b reads n+1 actions, not n: each row is
+  whole, and given s_{t+k} the last action says nothing more about a_t.
 """
 
 from __future__ import annotations

@@ -130,36 +130,6 @@ def test_frame_encoders_mix_no_rows(name: str):
     assert wrong_pairs(inverse("mik+a", frame_encoder=name, max_k=1), [4, 4, 3], rows=4) == []
 
 
-M, N = 2, 1
-PAPERS: dict[str, Callable[[int, int, int], tuple]] = {
-    "no_history": lambda t, k, end: ({t, t + k}, set()),
-    "acro": lambda t, k, end: ({t, t + k}, set()),
-    "one_step_inverse": lambda t, k, end: ({t, t + 1}, set()),
-    "ah": lambda t, k, end: (set(range(t + k + 1)), set()),
-    "ah+a": lambda t, k, end: (set(range(t + k + 1)), set(range(t + k))),
-    "fj": lambda t, k, end: (window(t) | window(t + k), set()),
-    "fj+a": lambda t, k, end: (window(t) | window(t + k), window(t) - {t} | window(t + k) - {t + k}),
-    "mik": lambda t, k, end: (window(t) | set(range(t + k, min(end, t + k + N + 1))), set()),
-    "mik+a": lambda t, k, end: (
-        window(t) | set(range(t + k, min(end, t + k + N + 1))),
-        window(t) - {t} | set(range(t + k, min(end, t + k + N + 1))),
-    ),
-}
-"""What the paper's Table 1 conditions on: rows j of o_j, indices j of a_j, for a past of m and a future of n rows."""
-
-
-def window(row: int) -> set[int]:
-    return set(range(max(0, row - M), row + 1))
-
-
-@pytest.mark.parametrize("method", INVERSE)
-def test_declarations_and_predictions_are_those_of_the_papers_table(method: str):
-    bounded = {"fj": {"m": M}, "mik": {"m": M, "n": N}}.get(method.removesuffix("+a"), {})
-    objective = inverse(method, **bounded)
-    for (_, t, k), seen in response(objective, [ROWS]).items():
-        assert seen == declared(objective, t, k, ROWS, True) == PAPERS[method](t, k, ROWS), (t, k)
-
-
 def leak(objective: InverseObjective, what: Callable[[Windows], torch.Tensor]) -> None:
     """Add something (B, T, 1) to the past representations."""
     real = objective.representations

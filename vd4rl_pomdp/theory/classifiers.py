@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from collections.abc import Hashable
 from dataclasses import dataclass
 
-from vd4rl_pomdp.theory.law import joint_law
+from vd4rl_pomdp.theory.law import Prediction, Variable, in_order, joint_law
 from vd4rl_pomdp.theory.views import ObjectiveView
-from vd4rl_pomdp.theory.world import World
+from vd4rl_pomdp.theory.world import AgentState, World
 
 
 @dataclass(frozen=True)
@@ -45,6 +46,36 @@ class Comparison:
 def first_row(view: ObjectiveView, memory: Memory) -> int:
     """The t of a pair that has a whole past window: literal windows reach one action further back."""
     return memory.m + (1 if view.literal and not view.masked else 0)
+
+
+@dataclass(frozen=True)
+class Clash:
+    """One sequence on which an objective's classifier is not the multi-step inverse."""
+
+    t: int
+    seen: dict[Variable, Hashable]
+    """What the objective is given."""
+    states: tuple[AgentState, AgentState]
+    """s_t and s_{t+k}."""
+    exact: Prediction
+    """The Bayes-optimal classifier given what is seen."""
+    multi_step: Prediction
+    """P(a_t | s_t, s_{t+k})."""
+
+
+def clash(world: World, view: ObjectiveView, memory: Memory, k: int) -> Clash | None:
+    """The sequence on which one objective's classifier is farthest from the multi-step inverse; None if it is that."""
+    t = first_row(view, memory)
+    visible = view.visible(t, k, memory.m, memory.n, t + k + memory.n + 1)
+    ends = [("s", t), ("s", t + k)]
+    law = joint_law(world, visible | {("a", t), *ends})
+    exact, multi = (law.given(group, ("a", t)).by_row() for group in (visible, ends))
+    apart = [max(abs(p - q) for p, q in zip(*both, strict=True)) for both in zip(exact, multi, strict=True)]
+    row = apart.index(max(apart))
+    if not apart[row]:
+        return None
+    (seen,), ((start, end),) = law.values(visible, [row]), law.values(ends, [row])
+    return Clash(t, dict(zip(in_order(visible), seen, strict=True)), (start, end), exact[row], multi[row])
 
 
 def compare(world: World, view: ObjectiveView, memory: Memory, k: int) -> Comparison:

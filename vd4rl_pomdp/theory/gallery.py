@@ -14,7 +14,7 @@ NOISE: dict[Exogenous, Distribution] = {"dark": {"dark": HALF, "light": HALF}, "
 
 
 def counterexample(actions: tuple[int, int] = (-1, 1), every: int = 4) -> World:
-    """The paper's Forward-Jump counterexample (section 3.2 and appendix).
+    """The paper's own, against forward jumps (section 3.2 and appendix).
 
     s = (s^A, s^B): s^A in Z_4 moves by the action, s^B is the last action. A counter c runs by itself and the state
     is shown when c = 0 alone.

@@ -40,15 +40,14 @@ class Law:
     names: dict[str, tuple[Hashable, ...]]
     """What the codes of a kind of variable stand for."""
 
-    def values(self, group: Iterable[Variable], rows: np.ndarray) -> list[tuple]:
-        """Joint values of a group of variables, by row and in the order of `KINDS`, at some of the N rows."""
-        chosen = sorted(group, key=_order)
-        columns = [[self.names[kind][c] for c in self.column((kind, j))[rows]] for kind, j in chosen]
-        return list(zip(*columns, strict=True)) if columns else [()] * len(rows)
+    def values(self, group: Iterable[Variable], rows: np.ndarray | slice | list[int]) -> list[tuple]:
+        """Joint values of a group of variables, `in_order`, at some of the N rows."""
+        columns = [[self.names[kind][c] for c in self.column((kind, j))[rows]] for kind, j in in_order(group)]
+        return list(zip(*columns, strict=True)) if columns else [()] * len(self.counts[rows])
 
     def numbered(self, group: Iterable[Variable]) -> tuple[np.ndarray, np.ndarray]:
         """The number of the joint value of a group at each row, (N,) int64, and the first row that has each."""
-        return number_rows([self.column(v) for v in sorted(group, key=_order)])
+        return number_rows([self.column(v) for v in in_order(group)])
 
     def given(self, group: Iterable[Variable], action: Variable) -> Conditional:
         """The conditional law of an action given a group of variables."""
@@ -86,6 +85,11 @@ class Conditional:
         distinct = [tuple(Fraction(n, sum(row)) for n in row) for row in self.counts[first].astype(object).tolist()]
         return kinds, distinct
 
+    def by_row(self) -> list[Prediction]:
+        """The prediction at each of the law's N rows."""
+        kinds, distinct = self.kinds
+        return [distinct[kind] for kind in kinds[self.ids]]
+
     def agrees(self, other: Conditional) -> bool:
         """Whether two classifiers say the same wherever their views occur together."""
         (mine, one), (theirs, two) = self.kinds, other.kinds
@@ -112,7 +116,7 @@ class Conditional:
 
 def joint_law(world: World, variables: Iterable[Variable]) -> Law:
     """Exact joint law of some variables of a sequence that starts in the world's initial law."""
-    wanted = sorted(set(variables), key=_order)
+    wanted = in_order(set(variables))
     rows = 1 + max(row for _, row in wanted)
     walk = _Walk(world, rows)
     for row in range(rows):
@@ -219,6 +223,6 @@ def number_rows(columns: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
     return ids, first
 
 
-def _order(variable: Variable) -> tuple[int, int]:
-    kind, row = variable
-    return row, KINDS.index(kind)
+def in_order(group: Iterable[Variable]) -> list[Variable]:
+    """Variables by row, and within a row in the order of `KINDS`."""
+    return sorted(group, key=lambda variable: (variable[1], KINDS.index(variable[0])))

@@ -5,8 +5,10 @@ from __future__ import annotations
 from typing import Any
 
 from vd4rl_pomdp.theory import counterexample, table
+from vd4rl_pomdp.theory.facts import FACTS, main_text, told
 from vd4rl_pomdp.theory.gallery import WORLDS
 from vd4rl_pomdp.theory.partition import Relation, forced_shares, relation, state_classes, state_relation
+from vd4rl_pomdp.theory.small import FAMILY
 from vd4rl_pomdp.theory.views import VIEWS
 
 DIAGRAMS = (
@@ -20,7 +22,7 @@ DIAGRAMS = (
 
 
 def theory_study() -> dict[str, Any]:
-    """Compute the counterexample's numbers, Table 1, the equations, all disagreements and the merged states."""
+    """Compute the counterexample's numbers, Table 1, the equations, the facts and the merged states."""
     cases = {name: table.make_case(name) for name in WORLDS}
     rows = [row for case in cases.values() for row in table.comparisons(case)]
     needs = [row for case in cases.values() for row in table.representations(case)]
@@ -29,16 +31,17 @@ def theory_study() -> dict[str, Any]:
         for name in cases
     }
     equations = table.compare_equations(rows, {name: case.memory for name, case in cases.items()})
+    worlds = {name: table.describe(case) for name, case in cases.items()}
+    differences = table.disagreements(tables, equations, worlds)
     world = cases["counterexample"].worlds[False, False]
-    appendix, main_text = counterexample.study((-1, 1)), counterexample.study((0, 1))
     return {
-        "counterexample": {"appendix": appendix, "main_text": main_text},
-        "counterexample_differences": counterexample.differences(appendix, main_text),
-        "worlds": {name: table.describe(case) for name, case in cases.items()},
+        "facts": [told(fact, differences) for fact in FACTS],
+        "family": FAMILY,
+        "counterexample": {"appendix": counterexample.study(world), "main_text": counterexample.study(main_text())},
+        "worlds": worlds,
         "printed": table.PRINTED,
         "tables": tables,
         "equations": equations,
-        "disagreements": table.disagreements(tables, equations),
         "comparisons": rows,
         "representations": needs,
         "states": [list(s) for s in world.states],  # type: ignore[call-overload]

@@ -16,11 +16,7 @@ from vd4rl_pomdp.theory.world import World, diameter, period
 Properties = dict[str, bool]
 """Which of COLUMNS hold for a method."""
 COLUMNS = ("correct", "complete", "discards")
-TITLES = {
-    "correct": "correct Bayes-optimal classifier",
-    "complete": "complete agent-centric state",
-    "discards": "discards exogenous noise",
-}
+"""Correct Bayes-optimal classifier, complete agent-centric state, discards exogenous noise."""
 PRINTED: dict[str, Properties] = {
     "ah": {"correct": False, "complete": False, "discards": True},
     "ah+a": {"correct": False, "complete": False, "discards": True},
@@ -196,36 +192,34 @@ def compare_equations(rows: list[Row], memories: dict[str, Memory]) -> list[Row]
     return found
 
 
-def disagreements(tables: dict[str, list[Row]], equations: list[Row]) -> list[Row]:
-    """Every printed yes and every equation that some world contradicts, and whether the assumptions hold there.
+def disagreements(tables: dict[str, list[Row]], equations: list[Row], worlds: dict[str, Row]) -> list[Row]:
+    """Every printed yes and every equation that some world contradicts which meets the method's assumptions.
 
     A printed no says that a property is not guaranteed, so a world that has the property does not contradict it.
     """
     found = []
     for world, table in tables.items():
         for row in table:
-            for column in COLUMNS:
-                if printed(row["method"])[column] and not row[column]:
-                    found.append(_property_difference(world, row, column))
+            if row["decodes_past"] and row["decodes_end"]:
+                failed = [column for column in COLUMNS if printed(row["method"])[column] and not row[column]]
+                found += [_difference(worlds, world, row["method"], column, _detail(row, column)) for column in failed]
     for entry in equations:
-        if entry["fails_k"]:
-            text = f"the equation {FORMS[entry['form']]} for {entry['where']} fails at k = {_list(entry['fails_k'])}"
-            found.append(_difference(entry["world"], entry["method"], text, entry["decodes"], f"m = {entry['m']}"))
+        if entry["fails_k"] and entry["decodes"]:
+            text = f"{FORMS[entry['form']]} for {entry['where']} fails at k = {_list(entry['fails_k'])}"
+            found.append(_difference(worlds, entry["world"], entry["method"], "equation", text))
     return found
 
 
-def _property_difference(world: str, row: Row, column: str) -> Row:
-    text = f"'{TITLES[column]}' is printed yes, computed no"
-    detail = {
+def _detail(row: Row, column: str) -> str:
+    return {
         "correct": f"wrong at k = {_list(row['wrong_k'])}",
         "complete": f"{row['forced']} of {row['pairs']} pairs of states are always told apart",
         "discards": "the past's code must carry part of the exogenous state",
     }[column]
-    return _difference(world, row["method"], text, row["decodes_past"] and row["decodes_end"], detail)
 
 
-def _difference(world: str, method: str, text: str, decodes: bool, detail: str) -> Row:
-    return {"world": world, "method": method, "difference": text, "detail": detail, "assumptions_hold": decodes}
+def _difference(worlds: dict[str, Row], world: str, method: str, claim: str, detail: str) -> Row:
+    return {"world": world, "method": method, "claim": claim, "detail": detail, "period": worlds[world]["period"]}
 
 
 def _list(ks: Iterable[int]) -> str:

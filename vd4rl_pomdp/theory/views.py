@@ -31,7 +31,10 @@ class ObjectiveView:
         return self._before(t, m)
 
     def end(self, t: int, k: int, m: int, n: int, rows: int) -> frozenset[Variable]:
-        """What the representation of row t+k is computed from, in a window of `rows` rows."""
+        """What the representation of row t+k is computed from, in a window of `rows` rows.
+
+        A future of n rows beyond t+k holds n+1 actions, as `MaskedInverse` reads it.
+        """
         if not self.masked:
             return self._before(t + k, m)
         last = min(rows, t + k + n + 1)

@@ -1,0 +1,196 @@
+"""What predictions depend on, against sets written from the paper's Table 1, not from the code.
+
+Twice: drawn by hand for single pairs, and as formulas for all pairs of all windows. What a prediction
+depends on is found by changing one input at a time, and by gradients; `visible`, which reads the code's own settings,
+must say the same.
+"""
+
+from collections.abc import Callable
+from functools import cache
+
+import pytest
+
+from pretrain.objectives import METHODS
+from vd4rl_pomdp.objective import InverseObjective
+from vd4rl_pomdp.testing.methods import ROWS, build_inverse, predicts_actions
+from vd4rl_pomdp.visibility import declared, dependence, response
+
+INSIDE, END, SHORT = 0, 1, 2
+LENGTHS = [ROWS, ROWS, 4]
+"""A window that ends inside its episode, whose last row has an action; one that ends with it; one with padding."""
+OPTIONS: dict[str, dict] = {
+    "gru": {"history": "gru"},
+    "layers": {"gru_layers": 2},
+    "literal": {"literal_future": True},
+    "m=0": {"m": 0},
+    "m=1": {"m": 1},
+    "m=2": {"m": 2},
+    "m=9": {"m": 9},
+    "n=0": {"n": 0},
+    "n=1": {"n": 1},
+    "n=9": {"n": 9},
+}
+WINDOWS = {"inside": INSIDE, "end": END, "short": SHORT}
+DRAWN = """
+method            options        window  t k   o_012345  a_012345
+
+no_history        -              inside  1 3     .#..#.    ......
+no_history        -              end     0 5     #....#    ......
+no_history        gru            inside  1 3     #####.    ......
+acro              -              inside  1 3     .#..#.    ......
+acro              -              short   0 3     #..#..    ......
+acro              gru            inside  1 3     #####.    ......
+acro              gru,m=1        inside  2 3     .##.##    ......
+one_step_inverse  -              inside  2 1     ..##..    ......
+one_step_inverse  gru            inside  2 1     ####..    ......
+
+ah                -              inside  1 3     #####.    ......
+ah                -              end     0 5     ######    ......
+ah                m=1            inside  2 3     .##.##    ......
+ah+a              -              inside  1 3     #####.    ####..
+ah+a              -              end     0 5     ######    #####.
+ah+a              m=1            inside  2 3     .##.##    .#..#.
+
+fj                m=0            inside  2 3     ..#..#    ......
+fj                m=1            inside  2 3     .##.##    ......
+fj                m=1            inside  0 4     #..##.    ......
+fj                m=2            inside  1 2     ####..    ......
+fj                -              end     1 3     #####.    ......
+fj+a              m=0            inside  2 3     ..#..#    ......
+fj+a              m=1            inside  0 1     ##....    #.....
+fj+a              m=1            inside  2 3     .##.##    .#..#.
+fj+a              m=2            inside  2 2     #####.    ####..
+fj+a              m=2            inside  2 3     ######    ##.##.
+fj+a              m=2            short   0 3     ####..    .##...
+fj+a              -              inside  1 3     #####.    ####..
+
+mik               -              inside  1 2     ##.###    ......
+mik               -              end     0 5     #....#    ......
+mik               m=0,n=1        inside  3 1     ...###    ......
+mik               m=0,n=0        inside  1 3     .#..#.    ......
+mik               m=1,n=0        inside  2 2     .##.#.    ......
+mik               n=9            inside  1 2     ##.###    ......
+mik               n=1            short   0 2     #.##..    ......
+mik+a             -              inside  2 2     ###.##    ##..##
+mik+a             -              inside  0 1     ######    .#####
+mik+a             -              inside  0 5     #....#    .....#
+mik+a             -              end     2 2     ###.##    ##..#.
+mik+a             -              end     0 5     #....#    ......
+mik+a             -              short   1 1     ####..    #.#...
+mik+a             layers         inside  2 2     ###.##    ##..##
+mik+a             m=0,n=0        inside  1 1     .##...    ..#...
+mik+a             m=1,n=0        inside  2 2     .##.#.    .#..#.
+mik+a             m=1,n=1        inside  2 2     .##.##    .#..##
+mik+a             m=1,n=1        end     2 2     .##.##    .#..#.
+mik+a             m=9,n=9        inside  2 2     ###.##    ##..##
+mik+a             literal        inside  2 2     ###.##    ##.##.
+mik+a             literal        inside  2 1     ######    #####.
+mik+a             literal        end     0 5     #....#    ....#.
+mik+a             literal        short   1 1     ####..    ###...
+mik+a             literal,n=1    inside  1 2     ##.##.    #.##..
+mik+a             literal,n=0    inside  1 2     ##.#..    #.#...
+"""
+"""By hand: # is seen, . is not. Columns: rows j of o_j and indices j of a_j; a_5 exists if the window ends inside."""
+Case = tuple[str, tuple[str, ...]]
+LINES = [line.split() for line in DRAWN.strip().splitlines()[2:] if line]
+
+
+def test_every_inverse_method_is_drawn():
+    assert {line[0] for line in LINES} == {name for name in METHODS if predicts_actions(name)}
+
+
+def settings(words: tuple[str, ...]) -> dict:
+    return {key: value for word in words for key, value in OPTIONS[word].items()}
+
+
+@cache
+def seen_by(method: str, words: tuple[str, ...]) -> tuple[InverseObjective, dict, dict]:
+    """An objective, and what its predictions change with and have gradients to, pair by pair of every window."""
+    largest = {} if method == "one_step_inverse" else {"max_k": ROWS - 1}
+    objective = build_inverse(method, **largest, **settings(words)).eval()
+    return objective, response(objective, LENGTHS), dependence(objective, LENGTHS)
+
+
+@pytest.mark.parametrize("line", LINES, ids=" ".join)
+def test_a_prediction_depends_on_what_is_drawn(line: list[str]):
+    method, options, window, t, k, rows, actions = line
+    objective, felt, followed = seen_by(method, words_of(options))
+    place = WINDOWS[window], int(t), int(k)
+    drawn = marked(rows), marked(actions)
+    assert felt[place] == drawn
+    assert followed[place] == drawn
+    assert declared(objective, *place[1:], LENGTHS[place[0]], last_action=place[0] == INSIDE) == drawn
+
+
+def words_of(options: str) -> tuple[str, ...]:
+    return () if options == "-" else tuple(options.split(","))
+
+
+def marked(drawing: str) -> set[int]:
+    return {place for place, mark in enumerate(drawing) if mark == "#"}
+
+
+FAR = 99
+"""m or n of a past or future without a bound."""
+Seen = Callable[[int, int, int, int, int], bool]
+"""(j, t, u = t+k, m, n) -> whether row or action j is seen."""
+ROW_OF: dict[str, Seen] = {
+    "no_history": lambda j, t, u, m, n: j in (t, u),
+    "acro": lambda j, t, u, m, n: j in (t, u),
+    "one_step_inverse": lambda j, t, u, m, n: j in (t, t + 1),
+    "ah": lambda j, t, u, m, n: t - m <= j <= t or u - m <= j <= u,
+    "fj": lambda j, t, u, m, n: t - m <= j <= t or u - m <= j <= u,
+    "mik": lambda j, t, u, m, n: t - m <= j <= t or u <= j <= u + n,
+}
+"""Rows j of o_j in the paper's Table 1, or a memoryless method's own; m rows of the past, n of the future."""
+ACTION_OF: dict[str, Seen] = {
+    "ah+a": lambda j, t, u, m, n: t - m <= j < t or u - m <= j < u,
+    "fj+a": lambda j, t, u, m, n: t - m <= j < t or u - m <= j < u,
+    "mik+a": lambda j, t, u, m, n: t - m <= j < t or u <= j <= u + n,
+    "mik+a literal": lambda j, t, u, m, n: t - m <= j < t or u <= j + 1 <= u + n,
+}
+"""Indices j of a_j, likewise; methods that are not named see none. Read literally, each row of the future comes with
+the action before it."""
+BOUNDED = [
+    *((name, ()) for name in METHODS if predicts_actions(name)),
+    *((name, (m,)) for name in ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a") for m in ("m=0", "m=1", "m=2")),
+    *((name, ("gru", *m)) for name in ("no_history", "acro", "one_step_inverse") for m in ((), ("m=1",))),
+    *((name, (m, n)) for name in ("mik", "mik+a") for m in ("m=0", "m=2") for n in ("n=0", "n=1")),
+    *(("mik+a", ("literal", *n)) for n in ((), ("n=0",), ("n=1",), ("m=1", "n=1"))),
+]
+
+
+def from_the_paper(method: str, words: tuple[str, ...], t: int, k: int, last: int, acts: int) -> tuple:
+    """Table 1's sets: rows up to `last`, actions up to `acts`. A memoryless method with a GRU sees what AH does."""
+    told = settings(words)
+    m, n = told.get("m", FAR if METHODS.named(method).past is None else 8), told.get("n", FAR)
+    table = "ah" if told.get("history") == "gru" else method.removesuffix("+a")
+    row = ROW_OF[table]
+    action = ACTION_OF.get(method + " literal" * told.get("literal_future", False), lambda *_: False)
+    return (
+        {j for j in range(last + 1) if row(j, t, t + k, m, n)},
+        {j for j in range(acts + 1) if action(j, t, t + k, m, n)},
+    )
+
+
+@pytest.mark.parametrize(
+    ("method", "words"), BOUNDED, ids=lambda value: value if isinstance(value, str) else ",".join(value)
+)
+def test_every_pair_sees_what_the_papers_table_says(method: str, words: tuple[str, ...]):
+    objective, felt, followed = seen_by(method, words)
+    assert len(felt) == sum(len(objective.pairs(length)) for length in LENGTHS)
+    for (window, t, k), seen in felt.items():
+        last = LENGTHS[window] - 1
+        acts = last if window == INSIDE and "literal" not in words else last - 1
+        table = from_the_paper(method, words, t, k, last, acts)
+        assert seen == followed[window, t, k] == table, (window, t, k)
+        assert declared(objective, t, k, LENGTHS[window], last_action=window == INSIDE) == table, (window, t, k)
+
+
+@pytest.mark.parametrize("method", [name for name in METHODS if predicts_actions(name)])
+def test_leaks_of_the_target_are_those_of_the_papers_table(method: str):
+    """a_t itself: AH+A always, FJ+A up to m, the literal MIK+A at k = 1, and nobody else."""
+    for words in ((), ("literal",)) if method == "mik+a" else (("m=2",),) if method.startswith("fj") else ((),):
+        leaks = {k for (_, t, k), (_, actions) in seen_by(method, words)[1].items() if t in actions}
+        expected = {("ah+a", ()): {1, 2, 3, 4, 5}, ("fj+a", ("m=2",)): {1, 2}, ("mik+a", ("literal",)): {1}}
+        assert leaks == expected.get((method, words), set())

@@ -1,0 +1,199 @@
+"""What representations depend on, and what predictions depend on in a set: closed forms against changed inputs."""
+
+from collections.abc import Callable
+from dataclasses import replace
+
+import pytest
+import torch
+
+from finetune.histories import read_both_ends, read_whole
+from pretrain.build import build_objective, build_target
+from pretrain.config import PretrainConfig
+from pretrain.objectives import METHODS
+from tests.helpers_data import write_fake_set
+from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.objective import InverseObjective
+from vd4rl_pomdp.testing.methods import ROWS, build_inverse
+
+MEMORIES: list[tuple[str, dict]] = [
+    *((name, {}) for name in METHODS if not METHODS.named(name).reads_state),
+    *((name, {"history": "gru"}) for name in ("no_history", "acro", "one_step_inverse", "curl", "driml", "homer")),
+    *((name, {"m": m}) for name in ("ah+a", "fj", "fj+a", "mik", "mik+a", "supervised+a") for m in (0, 2)),
+]
+"""Every method that reads pixels, the memoryless ones with a GRU, too, and bounded pasts."""
+ALL = 99
+"""m of a past without a bound."""
+
+
+def states_of(encoder: Encoder, obs: torch.Tensor, actions: torch.Tensor) -> tuple[torch.Tensor, torch.Tensor]:
+    """(T, D) representations of one window of rows o_j and actions a_j: of the whole, and row by row."""
+    before = torch.cat([torch.zeros_like(actions[:1]), actions[:-1]])
+    whole = encoder.from_features(encoder.frame(obs[None]), before[None])[0]
+    state, rows = encoder.initial_state(1), []
+    for j in range(len(obs)):
+        z, state = encoder.step(obs[None, j], before[None, j], state)
+        rows.append(z[0])
+    return whole, torch.stack(rows)
+
+
+@torch.no_grad()
+def read_by(encoder: Encoder) -> list[tuple[set[int], set[int]]]:
+    """For each row, the observations and actions that its representation changes with, by either way of reading."""
+    shape, g = encoder.config, torch.Generator().manual_seed(0)
+    obs = torch.rand(2, ROWS, shape.channels, shape.size, shape.size, generator=g, dtype=torch.float64) * 255
+    actions = torch.rand(2, ROWS, shape.action_dim, generator=g, dtype=torch.float64) - 0.5
+    plain = states_of(encoder, obs[0], actions[0])
+    found: list = []
+    for kind in (0, 1):
+        touched = [set() for _ in range(ROWS)]
+        for j in range(ROWS):
+            inputs = [obs[0].clone(), actions[0].clone()]
+            inputs[kind][j] = (obs, actions)[kind][1, j]
+            both = [(new != old).any(-1) for new, old in zip(states_of(encoder, *inputs), plain, strict=True)]
+            assert torch.equal(*both), "a stream depends on other rows than a window"
+            for t in torch.nonzero(both[0])[:, 0].tolist():
+                touched[t].add(j)
+        found.append(touched)
+    return list(zip(*found, strict=True))
+
+
+def past(t: int, method: str, told: dict) -> tuple[set[int], set[int]]:
+    """What s_t is computed from: o_t, or the last m+1 rows, with the actions between them if past actions are read."""
+    remembers = method.removesuffix("+a") in ("ah", "fj", "mik", "supervised") or "history" in told
+    if not remembers:
+        return {t}, set()
+    m = told.get("m", 8 if method.startswith("fj") else ALL)
+    rows = {j for j in range(ROWS) if t - m <= j <= t}
+    return rows, {j for j in rows if j < t and method.endswith("+a")}
+
+
+@pytest.mark.parametrize(("method", "told"), MEMORIES, ids=str)
+def test_a_representation_depends_on_its_past_alone(method: str, told: dict):
+    encoder = build_inverse(method, **told).encoder.eval()
+    assert read_by(encoder) == [past(t, method, told) for t in range(ROWS)]
+
+
+@pytest.mark.parametrize("method", ["mik+a", "fj", "supervised", "acro"])
+def test_a_readout_depends_on_the_frame_the_state_or_both(method: str):
+    encoder = build_inverse(method).encoder.eval()
+    widths = {"state": encoder.dim, "frame": encoder.config.feature_dim}
+    for readout in ("state", "frame", "frame+state"):
+        other = Encoder(replace(encoder.config, readout=readout)).double().eval()
+        other.load_state_dict(encoder.state_dict())
+        assert read_by(other) == [({t}, set()) if readout == "frame" else past(t, method, {}) for t in range(ROWS)]
+        parts = readout.split("+") if encoder.gru else ["frame"]
+        assert other.dim == sum(widths[part] for part in parts)
+
+
+EPISODES, SPAN = (7, 6), 4
+"""Rows of a set's episodes, and of the windows that are drawn from it."""
+STORED = {
+    "mik+a": lambda j, t, u, first: (first <= j <= t or u <= j, first <= j < t or u <= j),
+    "ah+a": lambda j, t, u, first: (first <= j <= u, first <= j < u),
+    "fj+a": lambda j, t, u, first: (
+        first <= j and (t - 1 <= j <= t or u - 1 <= j <= u),
+        first <= j and (j == t - 1 or j == u - 1),
+    ),
+    "acro": lambda j, t, u, first: (j in (t, u), False),
+}
+"""Whether o_j and a_j of an episode are seen through a window that begins at its row `first`, at m = 1 for FJ+A."""
+
+
+@pytest.fixture
+def dataset(tmp_path) -> Dataset:
+    found = open_dataset(write_fake_set(tmp_path / "set", EPISODES, action_dim=2), tmp_path / "cache")
+    g = torch.Generator().manual_seed(0)
+    found.frames = torch.randint(0, 256, (*found.frames.shape[:2], 6, 6), dtype=torch.uint8, generator=g)
+    return found
+
+
+def changed_rows(dataset: Dataset, name: str, stored: torch.Tensor, logits: Callable[[], torch.Tensor]) -> list:
+    """For each row of the set, the (B, P) predictions that differ when what the set stores in it is another."""
+    plain, found = logits(), []
+    for row in range(dataset.num_rows):
+        other = stored.clone()
+        other[row] = 255 - other[row] if other.dtype == torch.uint8 else other[row] + 0.3
+        setattr(dataset, name, other)
+        found.append((logits() != plain).any(-1))
+    setattr(dataset, name, stored)
+    return found
+
+
+def on_frames(dataset: Dataset, method: str, stack: int) -> InverseObjective:
+    """A small objective in float64 that reads stacks of a set's frames."""
+    torch.manual_seed(0)
+    changes = {"max_k": SPAN - 1, "feature_dim": 6, "hidden_dim": 5, "head_dim": 32}
+    changes |= {"m": 1} if method == "fj+a" else {}
+    config = PretrainConfig.of("smoke", method=method, frame_encoder="flat").with_known(**changes)
+    target = build_target(config, dataset.action.numpy())
+    objective = build_objective(config, 2, target, observation=(3 * stack, dataset.frame_size)).double().eval()
+    assert isinstance(objective, InverseObjective)
+    return objective
+
+
+@pytest.mark.parametrize("stack", [1, 3])
+@pytest.mark.parametrize("method", STORED)
+@torch.no_grad()
+def test_predictions_depend_on_their_own_episodes_stored_rows_alone(dataset: Dataset, method: str, stack: int):
+    """Frames of the stacks that are seen, which may begin before the window, and a_j, which row j+1 stores."""
+    objective = on_frames(dataset, method, stack)
+    starts = [(e, first) for e, rows in enumerate(EPISODES) for first in range(rows - SPAN + 1)]
+
+    def logits() -> torch.Tensor:
+        return objective.action_logits(dataset.windows(list(range(len(starts))), SPAN, stack))
+
+    by_frame = changed_rows(dataset, "frames", dataset.frames, logits)
+    by_action = changed_rows(dataset, "action", dataset.action, logits)
+    for b, (episode, first) in enumerate(starts):
+        begin, rows = sum(EPISODES[:episode]), EPISODES[episode]
+        for p, (t, k) in enumerate(objective.pairs(SPAN).tolist()):
+            told = [STORED[method](j, first + t, first + t + k, first) for j in range(first + SPAN)]
+            frames = {begin + max(0, j - back) for j, (row, _) in enumerate(told) if row for back in range(stack)}
+            actions = {begin + j + 1 for j, (_, action) in enumerate(told) if action and j + 1 < rows}
+            assert {row for row, touched in enumerate(by_frame) if touched[b, p]} == frames
+            assert {row for row, touched in enumerate(by_action) if touched[b, p]} == actions
+
+
+GIVEN = {
+    ("whole", "state", 0): (range(7, 11), range(8, 11)),
+    ("whole", "state", 2): (range(9, 11), range(10, 11)),
+    ("whole", "frame", 0): (range(10, 11), range(0)),
+    ("whole", "frame+state", 2): (range(9, 11), range(10, 11)),
+    ("first end", "state", 0): (range(8, 11), range(9, 11)),
+    ("first end", "frame", 0): (range(10, 11), range(0)),
+    ("last end", "state", 0): (range(8, 13), range(9, 13)),
+    ("last end", "state", 2): (range(11, 13), range(12, 13)),
+    ("last end", "frame+state", 0): (range(8, 13), range(9, 13)),
+}
+"""By hand: rows of the set whose frames, and whose stored actions, a policy of mik+a is given at row 10, or at 12.
+
+The second episode is rows 7 to 12. Its whole history begins at row 7, the random one of both ends at row 8; a history's
+first row shows its frame alone.
+"""
+
+
+@pytest.mark.parametrize(("end", "readout", "window"), GIVEN, ids=str)
+@torch.no_grad()
+def test_what_a_policy_is_given_depends_on_its_history_alone(dataset: Dataset, end: str, readout: str, window: int):
+    trained = build_inverse("mik+a").encoder
+    encoder = Encoder(replace(trained.config, readout=readout, history_window=window)).double().eval()
+    encoder.load_state_dict(trained.state_dict())
+    g = torch.Generator().manual_seed(0)
+    features = torch.rand(2, dataset.num_rows, trained.config.feature_dim, generator=g, dtype=torch.float64)
+
+    def given(frames: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
+        dataset.action = actions
+        if end == "whole":
+            return read_whole(encoder, frames[7:], dataset, 1)[10 - 7]
+        rows = [torch.tensor([row]) for row in (8, 10, 12)]
+        return read_both_ends(encoder, lambda rows: frames[rows], dataset, *rows)[end == "last end"][0]
+
+    def touched(exchanged: Callable[[torch.Tensor], torch.Tensor]) -> set[int]:
+        return {row for row in range(len(stored)) if (exchanged(torch.tensor([row])) != plain).any()}
+
+    (frames, others), stored = features, dataset.action
+    plain = given(frames, stored)
+    by_frame = touched(lambda row: given(frames.index_copy(0, row, others[row]), stored))
+    by_action = touched(lambda row: given(frames, stored.index_fill(0, row, 0.5)))
+    assert (by_frame, by_action) == tuple(map(set, GIVEN[end, readout, window]))
