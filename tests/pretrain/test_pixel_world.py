@@ -35,12 +35,13 @@ def test_a_baseline_halves_the_untrained_encoders_error(ball: Dataset, method: s
 
 
 def test_homer_leaves_chance_where_patches_hide_the_ball_now_and_then(ball: Dataset):
-    trainer = trainer_on(ball, "homer", corruption="patch", patch_size=8)
+    """Patches of the benchmark's share of a picture, 6 of 32 pixels wide."""
+    trainer = trainer_on(ball, "homer", corruption="patch", patch_size=6, batch_size=16)
     untrained = position_error(trainer)
-    losses = [trainer.update()["loss"].item() for _ in range(250)]
+    losses = [trainer.update()["loss"].item() for _ in range(160)]
     assert sum(losses[:20]) / 20 > 0.97 * math.log(2), "it begins there"
     assert sum(losses[-20:]) / 20 < 0.9 * math.log(2)
-    assert position_error(trainer) < 0.6 * untrained
+    assert position_error(trainer) < 0.5 * untrained
 
 
 @pytest.mark.parametrize("method", ["curl", "driml", "homer"])
