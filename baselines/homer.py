@@ -12,8 +12,8 @@ Differences:
 - One encoder for o_t and o_{t+1}; the authors share the convolutions and give each its own last layer, of which the
   second is kept.
 - Imposters come from the batch, each a uniformly drawn next observation of it; one for each real transition.
-- Every observation is shifted by itself; the authors do not augment (`--shift 0`). A shift shared by a window would tell
-  real transitions from imposters of other windows.
+- Every observation is shifted by itself; the authors do not augment (`--shift 0`). A shift shared by a window would
+  tell real transitions from imposters of other windows.
 - The authors train without the bottleneck first and go on with it; here it is there from the beginning or not at all.
 - The bottleneck is an option (`--homer-codes`), since TD3+BC needs a continuous state; the kept z is before it.
 - With `--history gru` the state of row t+1 remembers row t, which makes imposters easy: use it knowing that.
