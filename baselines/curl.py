@@ -10,9 +10,13 @@ Authors' code: github.com/MishaLaskin/curl.
 Differences:
 - The contrastive loss alone: the paper trains it together with SAC on the same encoder.
 - Augmentation is a random shift by up to 4 pixels, as everywhere in this benchmark, not a random crop of a larger
-  frame; both copies are shifted anew from one corrupted observation: hiding is the world's doing, no augmentation.
+  frame; both copies are shifted from one corrupted observation, which is not shifted itself: hiding is the world's
+  doing, no augmentation, and a shift that both copies share would tell them from the negatives.
 - The paper subtracts each row's largest logit before the softmax; here log-softmax does it.
-- Observations of the anchor's own window are no negatives (see `info_nce`).
+- Observations of the anchor's own window are no negatives: the authors draw their batch one by one, from a buffer in
+  which hardly two are neighbours.
+- The authors contrast 50 features that pass through a layer norm and no tanh; here it is the encoder's own output.
+- They move e' at every second step (both with 0.05) and let two optimisers step the encoder; here it is one each step.
 - With `--history gru` the GRU is part of e and e', and one shift serves a whole window.
 """
 

@@ -2,17 +2,23 @@
 
     L = sum over N, M in {local, global} of InfoNCE[ psi_N(s_t, a_t), phi_M(s_{t+k}) ]
 
-A state and its action must tell the state k steps later from other states. "Global" is the encoder's output, "local"
-its feature map, place by place; all four combinations are trained. Scores are inner products of projections.
+A state and its action must tell the state k steps later from all other states of the batch, those of its own window
+among them. "Global" is the encoder's output, "local" its feature map, place by place; all four combinations are
+trained, each with projections of its own. A score is the inner product of projections, softly clipped to -20..20.
 
 Authors' code: github.com/bmazoure/DRIML (within a C51 agent for Procgen).
 
 Differences:
-- The contrastive loss alone, without the reward-driven agent.
-- k is drawn anew from 1..K for every batch; the paper fixes it or adapts it to the game.
+- The contrastive loss alone, without the reward-driven agent; the mean of all four terms, which the authors weigh.
+- Every observation is shifted by itself; the authors do not augment (`--shift 0`). A shift that a window shares would
+  tell the positive from all negatives of other windows, and the loss would fall without any knowledge of the state.
+- k is drawn for every batch, from 1..2 as the authors' variant with random k draws it for every transition;
+  `--max-k` sets another K. Their other variants fix it or adapt it to the game.
 - Actions are continuous and enter psi by concatenation; the paper embeds discrete ones.
 - Feature maps larger than 7x7 are averaged to 7x7 (DrQ's convolutions leave 35x35 places).
-- States of the anchor's own window are no negatives (see `info_nce`).
+- A batch is windows of consecutive rows, so that many negatives are near the positive in time; the authors draw theirs
+  one by one.
+- Batches of windows whose encoder has a memory (`--history gru`) are shifted row by row, too, for the same reason.
 """
 
 from __future__ import annotations
@@ -37,13 +43,17 @@ from vd4rl_pomdp.types import Windows
 PLACES = 7
 """Largest height and width of the local maps."""
 SCORE_DIM = 64
+TERMS = (("g", "g"), ("g", "l"), ("l", "g"), ("l", "l"))
+"""What is contrasted, the anchor's feature and the candidate's: g global, l local."""
+LARGEST_SCORE = 20.0
+"""Scores are clipped to this by a tanh."""
 
 
 @dataclass(frozen=True)
 class DRIMLOptions(Options):
     """Options of DRIML."""
 
-    max_k: int = 15
+    max_k: int = 2
     """Largest gap K between the two states; k is drawn from 1..K for every batch."""
 
     limits: ClassVar[Limits] = {"max_k": 1}
@@ -57,28 +67,23 @@ class DRIML(Objective):
         self.encoder = encoder
         self.max_k = options.max_k
         channels, actions = self._frame.map_shape[0], encoder.config.action_dim
-        widths = {"global": encoder.dim, "local": channels}
-        self.anchors = nn.ModuleDict({n: mlp(w + actions, 256, SCORE_DIM, layers=1) for n, w in widths.items()})
-        self.candidates = nn.ModuleDict({n: mlp(w, 256, SCORE_DIM, layers=1) for n, w in widths.items()})
+        widths = {"g": encoder.dim, "l": channels}
+        self.anchors = nn.ModuleDict({n + m: mlp(widths[n] + actions, 256, SCORE_DIM, layers=1) for n, m in TERMS})
+        self.candidates = nn.ModuleDict({n + m: mlp(widths[m], 256, SCORE_DIM, layers=1) for n, m in TERMS})
         self.draws = Draws(seed, "driml", "k")
 
     def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean of the four InfoNCE terms at one k; `loss_gl` is a global anchor with local candidates."""
-        batch, rows = window.obs.shape[:2]
+        rows = window.obs.shape[1]
         k = 1 + int(self.draws.integers(min(self.max_k, rows - 1), 1))
         maps = self._frame.maps(window.obs)
         states = self.encoder.from_features(self._frame.from_maps(maps), window.prev_action)
-        features = {"global": states[:, :, None], "local": self._places(maps)}
         real = window.real[:, k:]
-        group = torch.arange(batch, device=states.device)[:, None].expand(-1, rows - k)[real]
         action = window.action[:, :-k][real]
-        anchors = {n: self._anchor(n, x[:, :-k][real], action) for n, x in features.items()}
-        candidates = {n: self.candidates[n](x[:, k:][real]) for n, x in features.items()}
-        terms = {
-            f"loss_{n[0]}{m[0]}": info_nce(_scores(anchors[n], candidates[m]), group)
-            for n in features
-            for m in features
-        }
+        features = {"g": states[:, :, None], "l": self._places(maps)}
+        now = {n: x[:, :-k][real] for n, x in features.items()}
+        later = {m: x[:, k:][real] for m, x in features.items()}
+        terms = {f"loss_{n}{m}": info_nce(self._scores(n + m, now[n], action, later[m])) for n, m in TERMS}
         loss = torch.stack(list(terms.values())).mean()
         return loss, {"loss": loss.detach(), "k": torch.tensor(float(k))} | {n: t.detach() for n, t in terms.items()}
 
@@ -93,12 +98,9 @@ class DRIML(Objective):
         pooled = F.adaptive_avg_pool2d(maps.float().flatten(0, 1), size)
         return pooled.flatten(2).transpose(1, 2).unflatten(0, maps.shape[:2])
 
-    def _anchor(self, name: str, features: Tensor, action: Tensor) -> Tensor:
-        """(N, L, F) features with (N, A) actions -> (N, L, S)."""
-        both = torch.cat([features, action[:, None].expand(-1, features.shape[1], -1).to(features)], dim=-1)
-        return self.anchors[name](both)
-
-
-def _scores(anchors: Tensor, candidates: Tensor) -> Tensor:
-    """(N, L or 1, S) and (N, L or 1, S) -> (L, N, N): place against the same place, or against the whole."""
-    return anchors.transpose(0, 1) @ candidates.permute(1, 2, 0) / SCORE_DIM**0.5
+    def _scores(self, term: str, now: Tensor, action: Tensor, later: Tensor) -> Tensor:
+        """(N, L or 1, F), (N, A), (N, L or 1, F') -> (L, N, N): place against the same place, or against the whole."""
+        both = torch.cat([now, action[:, None].expand(-1, now.shape[1], -1).to(now)], dim=-1)
+        anchors, candidates = self.anchors[term](both), self.candidates[term](later)
+        scores = anchors.transpose(0, 1) @ candidates.permute(1, 2, 0) / SCORE_DIM**0.5
+        return LARGEST_SCORE * (scores.float() / LARGEST_SCORE).tanh()

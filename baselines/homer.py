@@ -5,12 +5,16 @@
 The Bayes-optimal classifier is p(o'|o,a) / (p(o'|o,a) + p(o')): observations that no (o, a) can tell apart may share a
 code. c is a discrete bottleneck, Gumbel-softmax over a few codes, or the identity.
 
-Authors' code: github.com/cereb-rl (Homer).
+Authors' code: github.com/microsoft/Intrepid (Homer).
 
 Differences:
 - The abstraction alone: no exploration policies, no tabular planning on the codes.
-- One encoder for o_t and o_{t+1}; the paper has one for each direction and keeps the second.
-- Imposters come from the batch, each a uniformly drawn next observation of it.
+- One encoder for o_t and o_{t+1}; the authors share the convolutions and give each its own last layer, of which the
+  second is kept.
+- Imposters come from the batch, each a uniformly drawn next observation of it; one for each real transition.
+- Every observation is shifted by itself; the authors do not augment (`--shift 0`). A shift shared by a window would
+  tell real transitions from imposters of other windows.
+- The authors train without the bottleneck first and go on with it; here it is there from the beginning or not at all.
 - The bottleneck is an option (`--homer-codes`), since TD3+BC needs a continuous state; the kept z is before it.
 - With `--history gru` the state of row t+1 remembers row t, which makes imposters easy: use it knowing that.
 """

@@ -5,8 +5,11 @@ gradient stops at the representation.
 
 Authors' code: github.com/conglu1997/v-d4rl (drqbc).
 
-Differences: actor and critic share the encoder's Linear-LayerNorm-Tanh layer, where V-D4RL has one for each; the target
-critic reads the present encoder's representations, as there.
+Differences: actor, critic and target critic share the encoder's last layer (Linear, LayerNorm, Tanh). In V-D4RL each
+has one of its own on the convolutions' output: the actor's learns from the actor's loss, and the target critic's is
+averaged like the rest of the target. Here the layer learns from the critic's loss alone, and targets are computed from
+the present one. In `bc`, whose only loss trains it all, nothing of that differs. Initial weights are PyTorch's (theirs:
+orthogonal).
 """
 
 from __future__ import annotations

@@ -93,7 +93,7 @@ class PretrainConfig(TrainingConfig):
     task: str = ""
     """The set's task, where neither its shards nor its folder's name tell."""
     shift: int = 4
-    """Random shift in pixels, one for each window."""
+    """Random shift in pixels; whether observations or windows share one is the method's choice."""
     history: Literal["method", "gru"] = "method"
     """Memory of the encoder: what the method has, or a GRU over the past also for methods that have none."""
     corruption: CorruptionConfig = NO_CORRUPTION
@@ -134,9 +134,11 @@ class PretrainConfig(TrainingConfig):
     def check(self) -> None:
         """Refuse settings that cannot work, before anything is read or written."""
         super().check()
-        usual = self.defaults(self.preset)["frame_encoder"]
-        if METHODS.named(self.method).reads_state and self.frame_encoder != usual:
+        usual, method = self.defaults(self.preset), METHODS.named(self.method)
+        if method.reads_state and self.frame_encoder != usual["frame_encoder"]:
             raise UserError(f"--frame-encoder is not read by the method {self.method}: leave it out")
+        if method.shift == "own" and self.shift != usual["shift"]:
+            raise UserError(f"--shift is not read by the method {self.method}, which shifts by itself: leave it out")
 
 
 def memory_of(name: str, method: Method, history: str) -> str:

@@ -73,7 +73,7 @@ class PretrainTrainer:
         self.objective, self.dataset, self.config = objective, dataset, config
         self.device = dataset.t.device
         self.states = dataset.states() if METHODS.named(config.method).regresses_state else None
-        view = view or View(dataset, config.corruption, config.shift, config.seed, STAGE)
+        view = view or view_of(dataset, config)
         batches = stream_generator(config.seed, STAGE, "batches")
         self.sampler = WindowSampler(view, config.batch_size, config.window, batches)
         self.optimiser = torch.optim.Adam(objective.parameters(), lr=config.learning_rate)
@@ -164,6 +164,14 @@ def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
     objective = build_objective(config, dataset.action_dim, target, states, (3 * FRAME_STACK, dataset.frame_size))
     dataset.check_windows(config.window)
     return objective
+
+
+def view_of(dataset: Dataset, config: PretrainConfig) -> View:
+    """What is seen of a set, shifted as the method has it."""
+    shared = METHODS.named(config.method).shift
+    if shared == "own":
+        return View(dataset, config.corruption, 0, config.seed, STAGE)
+    return View(dataset, config.corruption, config.shift, config.seed, STAGE, shared=shared)
 
 
 def _task_of(dataset: Dataset, config: PretrainConfig) -> str:

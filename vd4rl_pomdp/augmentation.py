@@ -2,10 +2,15 @@
 
 from __future__ import annotations
 
+from typing import Literal
+
 import torch
 from torch import Tensor
 
 from vd4rl_pomdp import _shift
+
+Sharing = Literal["window", "observation"]
+"""What of a batch of windows one random shift is shared by: all observations of a window, or the frames of one."""
 
 
 def random_shift(obs: Tensor, key: Tensor, pad: int = 4) -> Tensor:

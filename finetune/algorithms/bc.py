@@ -1,4 +1,17 @@
-"""Behaviour cloning on frozen representations: min (pi(z) - a)^2. The reference that uses no reward."""
+"""Behaviour cloning on frozen representations, as V-D4RL's baseline does it (Lu et al. 2022, arXiv 2206.04779).
+
+    min  (a~ - a)^2,   a~ = pi(z) + clipped noise of a scheduled std
+
+The reference that uses no reward. The noise is that of `drqv2_bc`: noisy actions are cut off at -1 and 1, and the
+gradient passes there as if they were not, so that a policy near a bound is pulled inwards while the noise is large.
+
+Authors' code: github.com/conglu1997/v-d4rl (drqbc/bcagent.py).
+
+Differences:
+- Representations are standardised and go straight into the policy; the authors' actor begins with a trunk (Linear,
+  LayerNorm, Tanh), with which the encoder here ends, frozen or not (see `end_to_end`).
+- Initial weights are PyTorch's (theirs: orthogonal); V-D4RL's learning rate is 1e-4 (`--learning-rate`).
+"""
 
 from __future__ import annotations
 
@@ -9,6 +22,7 @@ import torch
 import torch.nn.functional as F
 
 from finetune.algorithms.algorithm import Algorithm, Loss
+from finetune.algorithms.noise import noise_at, with_noise
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.options import Options
@@ -22,14 +36,27 @@ class BC(Algorithm):
     def __init__(
         self, policy: Policy, options: Options, learning_rate: float, updates: int, generator: torch.Generator
     ) -> None:
-        self.policy = policy
+        self.policy, self.generator = policy, generator
         self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=learning_rate, fused=True)
+        self.updates = 0
 
     def losses(self, batch: FeatureBatch) -> Iterator[Loss]:
         """See the module."""
-        loss = F.mse_loss(self.policy(batch.z), batch.action)
+        chosen = with_noise(self.policy(batch.z), noise_at(self.updates), self.generator)
+        loss = F.mse_loss(chosen, batch.action)
         yield Loss(loss, self.optimiser, {"bc_loss": loss.detach()})
+        self.updates += 1
 
     def parts(self) -> dict[str, Any]:
         """The policy and its optimiser."""
         return {"policy": self.policy, "optimiser": self.optimiser}
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on."""
+        return super().state_dict() | {"updates": self.updates, "noise": self.generator.get_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        super().load_state_dict(state)
+        self.updates = state["updates"]
+        self.generator.set_state(state["noise"])

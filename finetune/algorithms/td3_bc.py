@@ -63,10 +63,10 @@ class TD3BC(Algorithm):
         """The critics', and every other time the actor's."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         yield self._critic_loss(z, batch, next_z)
-        self.updates += 1
-        if self.updates % self.policy_delay == 0:
+        if (self.updates + 1) % self.policy_delay == 0:
             yield self._policy_loss(z.detach(), batch.action)
             self._move_targets()
+        self.updates += 1
 
     def _critic_loss(self, z: Tensor, batch: FeatureBatch, next_z: Tensor) -> Loss:
         with torch.no_grad():
@@ -78,11 +78,9 @@ class TD3BC(Algorithm):
 
     def _next_action(self, next_z: Tensor) -> Tensor:
         """Action of the target policy, smoothed by clipped noise."""
-        return self._noisy(self.target_policy.from_standardised(next_z), TARGET_NOISE, NOISE_CLIP)
-
-    def _noisy(self, action: Tensor, std: float, clip: float) -> Tensor:
-        noise = torch.randn(action.shape, generator=self.generator).to(action.device) * std
-        return (action + noise.clamp(-clip, clip)).clamp(-1, 1)
+        action = self.target_policy.from_standardised(next_z)
+        noise = torch.randn(action.shape, generator=self.generator).to(action.device) * TARGET_NOISE
+        return (action + noise.clamp(-NOISE_CLIP, NOISE_CLIP)).clamp(-1, 1)
 
     def _policy_value(self, z: Tensor, action: Tensor) -> Tensor:
         """What the actor maximises."""

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Literal
 
 from baselines import ACRO, CURL, DRIML, HOMER, DRIMLOptions, HOMEROptions, OneStepInverse
 from pretrain.objectives.all_history import AllHistory
@@ -11,6 +12,7 @@ from pretrain.objectives.forward_jump import ForwardJump
 from pretrain.objectives.masked_inverse import MaskedActionOptions, MaskedInverse, MaskedOptions
 from pretrain.objectives.supervised import Supervised, SupervisedOptions
 from pretrain.objectives.untrained import StateOptions, Untrained
+from vd4rl_pomdp.augmentation import Sharing
 from vd4rl_pomdp.objective import ActionOptions, InverseOptions, Objective
 from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.registry import Registry
@@ -30,6 +32,9 @@ class Method:
     """Whether the GRU reads past actions."""
     past: int | None = None
     """Rows before t that a state is computed from unless the user chooses m; None: all."""
+    shift: Sharing | Literal["own"] = "window"
+    """What shares one random shift: the observations of a window, or the frames of one observation, where what a window
+    shares would give the answer away; own: the objective shifts by itself, and what it is given is not shifted."""
     trained: bool = True
     """False for references that take no gradient step."""
     end_to_end: str = ""
@@ -84,11 +89,14 @@ _OWN = {
     "one_step_inverse": Method(
         OneStepInverse, options=ActionOptions, summary="inverse model on the observations t and t+1"
     ),
-    "curl": Method(CURL, summary="contrastive: two augmentations of one observation find each other"),
+    "curl": Method(CURL, shift="own", summary="contrastive: two augmentations of one observation find each other"),
     "driml": Method(
-        DRIML, options=DRIMLOptions, summary="contrastive: (s_t, a_t) finds s_{t+k}, globally and by place"
+        DRIML,
+        shift="observation",
+        options=DRIMLOptions,
+        summary="contrastive: (s_t, a_t) finds s_{t+k}, globally and by place",
     ),
-    "homer": Method(HOMER, options=HOMEROptions, summary="tells real transitions from imposters"),
+    "homer": Method(HOMER, shift="observation", options=HOMEROptions, summary="tells real transitions from imposters"),
     "random": Method(Untrained, trained=False, summary="no training: the floor"),
     "supervised": Method(
         Supervised,

@@ -112,6 +112,10 @@ def test_candidates_of_the_anchors_own_group_are_no_negatives():
     assert info_nce(scores, torch.tensor([0, 0, 0, 1, 1, 1])).item() == pytest.approx(math.log(4))
     assert info_nce(scores[None].expand(5, -1, -1), torch.arange(6)).item() == pytest.approx(math.log(6))
     assert torch.isfinite(info_nce(torch.eye(6) * 1e30, torch.arange(6))), "large scores do not overflow"
+    assert info_nce(scores).item() == pytest.approx(math.log(6)), "without groups all others are negatives"
+    assert info_nce(torch.arange(6.0).expand(6, 6)).item() == pytest.approx(
+        math.log(sum(math.exp(j) for j in range(6))) - 2.5
+    )
 
 
 def test_driml_reaches_the_loss_of_the_true_density_ratio_and_needs_the_action():
@@ -124,8 +128,8 @@ def test_driml_reaches_the_loss_of_the_true_density_ratio_and_needs_the_action()
     assert reached == pytest.approx(copies, rel=0.03)
 
     blind = DRIML(encoder(), None, DRIMLOptions(1), 0)
-    anchor = blind._anchor
-    blind._anchor = lambda name, features, action: anchor(name, features, action * 0)
+    scores = blind._scores
+    blind._scores = lambda term, now, action, later: scores(term, now, action * 0, later)
     assert train(blind, 400, 0.0, batch, rows) > copies + 0.5 * math.log(2)
 
 
@@ -151,6 +155,41 @@ def test_driml_draws_every_gap_equally_often():
     with torch.no_grad():
         drawn = torch.stack([objective.loss(window, 0.0)[1]["k"] for _ in range(300)])
     assert torch.bincount(drawn.long(), minlength=4).tolist() == pytest.approx([0, 100, 100, 100], abs=30)
+
+
+@pytest.mark.parametrize("term", ["gg", "gl", "lg", "ll"])
+def test_each_term_of_driml_has_projections_of_its_own(term: str):
+    objective, (window, _) = (
+        DRIML(encoder(), None, DRIMLOptions(1), 0),
+        finite_windows(4, 3, 0.0, torch.Generator().manual_seed(0)),
+    )
+    plain = objective.loss(window, 0.0)[1]
+    with torch.no_grad():
+        for projections in (objective.anchors, objective.candidates):
+            projections[term][-1].weight.normal_()
+    changed = objective.loss(window, 0.0)[1]
+    assert {name for name in plain if plain[name] != changed[name]} == {f"loss_{term}", "loss"}
+
+
+def test_drimls_scores_are_softly_clipped_and_its_negatives_are_all_others():
+    """With scores of one size, 20, for every candidate but 18 for the own, the loss tells how many others there are."""
+    objective, (window, _) = (
+        DRIML(encoder(), None, DRIMLOptions(1), 0),
+        finite_windows(4, 6, 0.0, torch.Generator().manual_seed(0)),
+    )
+    seen = []
+    real = objective._scores
+    objective._scores = lambda *given: seen.append(real(*given)) or seen[-1]
+    for module in (*objective.anchors.values(), *objective.candidates.values()):
+        with torch.no_grad():
+            module[-1].bias.fill_(100.0)
+    objective.loss(window, 0.0)
+    for scores in seen:
+        assert scores.shape[1:] == (20, 20), "anchors and candidates are those of all windows"
+        assert 19.9 < scores.min() <= scores.max() <= 20
+    objective._scores = lambda *given: torch.full((1, 20, 20), 20.0) - 2 * torch.eye(20)
+    expected = math.log(19 * math.exp(2.0) + 1)
+    assert objective.loss(window, 0.0)[0].item() == pytest.approx(expected), "those of the own window count, too"
 
 
 def test_driml_scores_places_against_the_same_place():

@@ -4,8 +4,10 @@ import pytest
 import torch
 
 from tests.helpers_data import fake_action, write_fake_set
-from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp import _shift
+from vd4rl_pomdp.corruptions import CorruptionConfig, KeyStream
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, WindowSampler, open_dataset
+from vd4rl_pomdp.seeding import stream_seed
 from vd4rl_pomdp.types import row_key, unpack_row_key
 
 LENGTHS = (9, 5)
@@ -58,6 +60,25 @@ def test_a_window_is_shifted_as_one_and_the_next_one_anew(dataset):
     assert torch.equal(seen[0, 0], seen[0, 2])
     assert not torch.equal(seen[0, 0], seen[1, 0])
     assert not torch.equal(view.observe(rows), seen)
+
+
+@pytest.mark.parametrize("corruption", ["none", "zero_frames"])
+@pytest.mark.parametrize("by_lines", [True, False])
+def test_observations_of_a_window_can_be_shifted_each_by_itself(dataset, monkeypatch, corruption, by_lines):
+    """The frames of one observation still share a shift, and the two ways to shift agree."""
+    dataset.frames = torch.randint(0, 256, dataset.frames.shape, dtype=torch.uint8, generator=generator())
+    if not by_lines:
+        monkeypatch.setattr(_shift, "by_lines", lambda images, pad: False)
+    view = View(dataset, CorruptionConfig.of(corruption), 4, shared="observation")
+    rows = torch.tensor([[2, 2, 2], [2, 3, 2]])
+    seen = view.observe(rows).clone()
+    keys = KeyStream(stream_seed(0, "shift")).take((6,))
+    alone = View(dataset, CorruptionConfig.of(corruption), 4).observe(rows.flatten(), keys)
+    assert torch.equal(seen.flatten(0, 1), alone)
+    if corruption == "none":
+        same = [torch.equal(seen[0, 0], other) for other in (seen[0, 1], seen[0, 2], seen[1, 0], seen[1, 2])]
+        assert same.count(True) <= 1
+    assert not torch.equal(view.observe(rows), seen), "the next ones are others"
 
 
 def test_the_plain_view_is_the_set_itself(dataset):

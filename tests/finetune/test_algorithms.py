@@ -7,7 +7,7 @@ import pytest
 import torch
 import torch.nn.functional as F
 
-from finetune.algorithms import ALGORITHMS, Loss, drqv2_bc, td3_bc
+from finetune.algorithms import ALGORITHMS, Loss, noise, td3_bc
 from finetune.algorithms.bc import BC
 from finetune.algorithms.critic import TwinCritic
 from finetune.algorithms.drqv2_bc import DrQv2BC
@@ -46,8 +46,8 @@ def batch(seed: int = 0) -> FeatureBatch:
 def silent(monkeypatch):
     """No noise on any action."""
     monkeypatch.setattr(td3_bc, "TARGET_NOISE", 0.0)
-    monkeypatch.setattr(drqv2_bc, "NOISE_START", 0.0)
-    monkeypatch.setattr(drqv2_bc, "NOISE_END", 0.0)
+    monkeypatch.setattr(noise, "NOISE_START", 0.0)
+    monkeypatch.setattr(noise, "NOISE_END", 0.0)
 
 
 @pytest.mark.parametrize("kind", [TD3BC, DrQv2BC])
@@ -71,7 +71,7 @@ def test_critics_learn_the_reward_and_the_smaller_discounted_value_of_the_next_a
 @pytest.mark.parametrize(("kind", "clip"), [(TD3BC, 0.5), (DrQv2BC, 0.3)])
 def test_noise_on_the_next_action_is_clipped_and_so_is_the_action(monkeypatch, kind, clip):
     monkeypatch.setattr(td3_bc, "TARGET_NOISE", 1e6)
-    monkeypatch.setattr(drqv2_bc, "NOISE_START", 1e6)
+    monkeypatch.setattr(noise, "NOISE_START", 1e6)
     algorithm, given, seen = make(kind), batch(), []
     real = algorithm.target_critic.forward
     algorithm.target_critic.forward = lambda z, action: (seen.append(action), real(z, action))[1]
@@ -120,15 +120,24 @@ def test_actor_and_targets_move_at_every_so_many_updates_and_targets_slowly(kind
 
 
 def test_drqv2s_noise_decays_linearly_and_then_stays():
-    algorithm = make(DrQv2BC)
-    found = []
-    for updates in (0, 125_000, 250_000, 10**6):
-        algorithm.updates = updates
-        found.append(algorithm.noise)
+    found = [noise.noise_at(updates) for updates in (0, 125_000, 250_000, 10**6)]
     assert found == pytest.approx([1.0, 0.55, 0.1, 0.1])
 
 
-def test_cloning_is_the_squared_error_of_the_policys_action():
+def test_noise_is_cut_off_with_the_action_and_lets_the_whole_gradient_pass():
+    action = torch.linspace(-1, 1, 2001).requires_grad_()
+    noisy = noise.with_noise(action, 10.0, torch.Generator().manual_seed(0))
+    noisy.sum().backward()
+    assert torch.equal(action.grad, torch.ones_like(action))
+    moved = noisy.detach() - action.detach()
+    assert noisy.abs().max().item() == pytest.approx(1 - 1e-6, abs=2e-7)
+    assert (moved.abs() < 0.3 + 1e-6).all()
+    inside = action.detach().abs() < 0.6
+    assert (moved[inside].abs() > 0.29).float().mean() > 0.9, "noise of ten is nearly always clipped"
+    assert moved[inside].mean().abs() < 0.05
+
+
+def test_cloning_is_the_squared_error_of_the_policys_action(silent):
     algorithm, given = make(BC), batch()
     expected = F.mse_loss(algorithm.policy(given.z), given.action).item()
     assert algorithm.update(given)["bc_loss"].item() == pytest.approx(expected)

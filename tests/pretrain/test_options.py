@@ -45,6 +45,12 @@ def test_the_states_frame_encoder_cannot_be_chosen():
         PretrainConfig.of("smoke", method="state", frame_encoder="drq").check()
 
 
+def test_a_method_that_shifts_by_itself_is_told_no_shift():
+    with pytest.raises(UserError, match="--shift is not read by the method curl, which shifts by itself: leave it out"):
+        PretrainConfig.of("smoke", method="curl", shift=0).check()
+    PretrainConfig.of("smoke", method="driml", shift=0).check()
+
+
 @pytest.mark.parametrize(
     "settings",
     [
@@ -81,7 +87,7 @@ def test_a_presets_own_defaults_are_never_refused(method, preset):
 
 def test_a_preset_decides_options_of_whatever_part_has_them():
     smoke, paper = (PretrainConfig.of(preset, method="driml") for preset in ("smoke", "paper"))
-    assert (smoke.options.max_k, paper.options.max_k) == (3, 15)
+    assert (smoke.options.max_k, paper.options.max_k) == (3, 2)
     assert set(PretrainConfig.presets["smoke"]) <= {*flat(PretrainConfig()), *option_names()}
 
 

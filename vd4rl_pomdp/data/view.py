@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp import _shift
-from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.augmentation import Sharing, random_shift
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream
 from vd4rl_pomdp.data.dataset import Dataset, Index
 from vd4rl_pomdp.seeding import stream_seed
@@ -27,6 +27,7 @@ class View:
         seed: int = 0,
         *name: str | int,
         frame_stack: int = FRAME_STACK,
+        shared: Sharing = "window",
     ) -> None:
         """See the class.
 
@@ -37,29 +38,33 @@ class View:
             seed: the run's seed.
             name: tells the views of a run apart: each draws from streams of its own.
             frame_stack: frames in an observation.
+            shared: what one shift is shared by.
         """
         self.dataset = dataset
         self.corruption = BatchCorruption(corruption or CorruptionConfig(), seed, *name)
         self.shifts = KeyStream(stream_seed(seed, "shift", *name))
-        self._pad, self._frame_stack = shift, frame_stack
+        self._pad, self._frame_stack, self._shared = shift, frame_stack, shared
 
     def observe(self, rows: Tensor, shift_key: Tensor | None = None) -> Tensor:
         """Observations of rows. On a CPU, frames that the corruption zeroes are never read.
 
         Args:
-            rows: (N, ...) int64; everything under one leading index is shifted alike.
+            rows: (N, ...) int64; everything under one leading index is shifted alike, unless shifts are shared by the
+                frames of one observation alone.
             shift_key: (N,) int64, what the shifts are drawn from; None: the next keys of the view's stream.
 
         Returns:
             (N, ..., C, H, W) uint8, C = 3 * frame_stack.
         """
         if shift_key is None:
-            shift_key = self.shifts.take((len(rows),), rows.device)
+            shifts = len(rows) if self._shared == "window" else rows.numel()
+            shift_key = self.shifts.take((shifts,), rows.device)
         keys = self.corruption.keys(self.dataset.keys(rows))
         if _shift.by_lines(self.dataset.frames, self._pad):
             return self._observe_by_lines(rows, shift_key, keys)
-        stacks = random_shift(self.dataset.stacks(rows, self._frame_stack), shift_key, self._pad)
-        return self.corruption.corruption.apply_(stacks, keys)
+        stacks = self.dataset.stacks(rows, self._frame_stack)
+        shifted = random_shift(stacks.view(len(shift_key), -1, *stacks.shape[-2:]), shift_key, self._pad)
+        return self.corruption.corruption.apply_(shifted.view(stacks.shape), keys)
 
     def windows(self, index: Index, length: int) -> Windows:
         """`Dataset.windows` of what the agent sees."""

@@ -7,19 +7,19 @@ import torch.nn.functional as F
 from torch import Tensor
 
 
-def info_nce(scores: Tensor, group: Tensor) -> Tensor:
-    """Cross-entropy of telling each anchor's own candidate from those of other groups.
+def info_nce(scores: Tensor, group: Tensor | None = None) -> Tensor:
+    """Cross-entropy of telling each anchor's own candidate from the others.
 
     Args:
         scores: (..., N, N), anchors by candidates; the diagonal holds the true pairs.
-        group: (N,) int64. Candidates of an anchor's own group are no negatives: in one window they look alike, and
-            the papers draw their batches independently.
+        group: (N,) int64; the other candidates of an anchor's own group are no negatives. None: all others are.
 
     Returns:
         Mean over anchors and leading dimensions, in nats. It is log(candidates) when scores tell nothing.
     """
-    own = torch.eye(len(group), dtype=torch.bool, device=scores.device)
-    barred = (group[:, None] == group[None, :]) & ~own
-    logits = scores.float().masked_fill(barred, -torch.inf)
-    truth = torch.arange(len(group), device=scores.device).expand(logits.shape[:-1])
+    logits = scores.float()
+    if group is not None:
+        own = torch.eye(len(group), dtype=torch.bool, device=scores.device)
+        logits = logits.masked_fill((group[:, None] == group[None, :]) & ~own, -torch.inf)
+    truth = torch.arange(scores.shape[-1], device=scores.device).expand(logits.shape[:-1])
     return F.cross_entropy(logits.flatten(0, -2), truth.reshape(-1))

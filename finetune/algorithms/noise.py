@@ -1,0 +1,29 @@
+"""V-D4RL's action noise (Lu et al. 2022, arXiv 2206.04779): normal, of a scheduled size, clipped, kept within bounds.
+
+Authors' code: github.com/conglu1997/v-d4rl (drqbc/utils.py, `TruncatedNormal` and `schedule`).
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+NOISE_CLIP = 0.3
+"""Largest noise on a dimension of an action."""
+NOISE_START, NOISE_END, NOISE_UPDATES = 1.0, 0.1, 250_000
+"""Standard deviation at the first update, from the last of these updates on, and how many these are."""
+MARGIN = 1e-6
+"""How far from -1 and 1 a noisy action stays."""
+
+
+def noise_at(update: int) -> float:
+    """Standard deviation of the noise after so many updates: it falls linearly, then stays."""
+    done = min(1.0, update / NOISE_UPDATES)
+    return NOISE_START + done * (NOISE_END - NOISE_START)
+
+
+def with_noise(action: Tensor, std: float, generator: torch.Generator) -> Tensor:
+    """Noisy copy of (B, A) actions, within -1..1; the gradient passes as if nothing had been cut off."""
+    noise = torch.randn(action.shape, generator=generator, dtype=action.dtype).to(action.device) * std
+    noisy = action + noise.clamp(-NOISE_CLIP, NOISE_CLIP)
+    return noisy + (noisy.clamp(MARGIN - 1, 1 - MARGIN) - noisy).detach()

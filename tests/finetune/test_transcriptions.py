@@ -1,0 +1,144 @@
+"""Twenty updates end in the weights that the authors' rules end in, written out here line by line, in float64."""
+
+import copy
+from collections.abc import Callable
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from finetune.algorithms import ALGORITHMS
+from finetune.algorithms.td3_bc import TD3BC
+from finetune.features import FeatureBatch
+from vd4rl_pomdp.nn import policy as policies
+from vd4rl_pomdp.nn.policy import Policy
+
+DIM, ACTIONS, SIZE, UPDATES = 3, 2, 64, 20
+BEGUN = {"drqv2_bc": 249_990, "bc": 249_990, "td3_bc": 0}
+"""Updates before the first: the noise of V-D4RL ends to fall at the tenth of those made here."""
+
+
+@pytest.fixture(autouse=True)
+def _in_float64(monkeypatch):
+    torch.set_default_dtype(torch.float64)
+    monkeypatch.setattr(policies.Standardise, "forward", lambda self, z: (z - self.mean) / self.std)
+    yield
+    torch.set_default_dtype(torch.float32)
+
+
+def batch(number: int) -> FeatureBatch:
+    g = torch.Generator().manual_seed(number)
+    z, next_z = (torch.randn(SIZE, DIM, generator=g) for _ in range(2))
+    action = torch.rand(SIZE, ACTIONS, generator=g) * 2 - 1
+    return FeatureBatch(z, action, torch.randn(SIZE, generator=g), torch.rand(SIZE, generator=g), next_z)
+
+
+def started(name: str) -> TD3BC:
+    """An algorithm whose policy chooses many actions near the bounds."""
+    torch.manual_seed(0)
+    policy = Policy(DIM, ACTIONS, 16)
+    with torch.no_grad():
+        policy.net[-1].weight.mul_(30)
+    options = ALGORITHMS[name].options.fill({"gamma": 0.9, "alpha": 1.5})
+    algorithm = ALGORITHMS[name](policy, options, 1e-3, 40, torch.Generator().manual_seed(7))
+    algorithm.updates = BEGUN[name]
+    return algorithm
+
+
+class Nets:
+    """Copies of an algorithm's networks, each with plain Adam, and the same stream of noise."""
+
+    def __init__(self, algorithm: TD3BC) -> None:
+        self.actor = copy.deepcopy(algorithm.policy.net)
+        self.actor_steps = torch.optim.Adam(self.actor.parameters(), lr=1e-3)
+        self.noise = torch.Generator().manual_seed(7)
+        if isinstance(algorithm, TD3BC):
+            self.critics = nn.ModuleList(
+                [copy.deepcopy(algorithm.critic.first), copy.deepcopy(algorithm.critic.second)]
+            )
+            self.critic_steps = torch.optim.Adam(self.critics.parameters(), lr=1e-3)
+            self.target_critics, self.target_actor = copy.deepcopy(self.critics), copy.deepcopy(self.actor)
+
+    def normal(self) -> Tensor:
+        return torch.randn(SIZE, ACTIONS, generator=self.noise)
+
+    def learn_values(self, b: FeatureBatch, next_action: Tensor) -> None:
+        with torch.no_grad():
+            following = torch.cat([b.next_z, next_action], 1)
+            q1, q2 = (q(following)[:, 0] for q in self.target_critics)
+            target = b.reward + 0.9 * b.discount * torch.min(q1, q2)
+        values = [q(torch.cat([b.z, b.action], 1))[:, 0] for q in self.critics]
+        loss = sum(((q - target) ** 2).mean() for q in values)
+        self.critic_steps.zero_grad()
+        loss.backward()
+        self.critic_steps.step()
+
+    def improve(self, loss: Tensor) -> None:
+        self.actor_steps.zero_grad()
+        loss.backward()
+        self.actor_steps.step()
+
+    def follow(self, target: nn.Module, online: nn.Module, tau: float) -> None:
+        for p, q in zip(online.parameters(), target.parameters(), strict=True):
+            q.data.copy_(tau * p.data + (1 - tau) * q.data)
+
+
+def truncated(mean: Tensor, std: float, noise: Tensor) -> Tensor:
+    """A sample of V-D4RL's truncated normal: its value is cut off, its gradient is not."""
+    x = mean + torch.clamp(noise * std, -0.3, 0.3)
+    cut = torch.clamp(x, -1.0 + 1e-6, 1.0 - 1e-6)
+    return x - x.detach() + cut.detach()
+
+
+def scheduled(step: int) -> float:
+    mix = min(max(step / 250_000, 0.0), 1.0)
+    return (1.0 - mix) * 1.0 + mix * 0.1
+
+
+def drqv2_bc(nets: Nets, b: FeatureBatch, step: int) -> None:
+    std = scheduled(step)
+    with torch.no_grad():
+        next_action = truncated(torch.tanh(nets.actor(b.next_z)), std, nets.normal())
+    nets.learn_values(b, next_action)
+    action = truncated(torch.tanh(nets.actor(b.z)), std, nets.normal())
+    q1, q2 = (q(torch.cat([b.z, action], 1))[:, 0] for q in nets.critics)
+    q = torch.min(q1, q2)
+    nets.improve(-q.mean() * 1.5 / q.detach().abs().mean() + ((action - b.action) ** 2).mean())
+    nets.follow(nets.target_critics, nets.critics, 0.01)
+
+
+def bc(nets: Nets, b: FeatureBatch, step: int) -> None:
+    action = truncated(torch.tanh(nets.actor(b.z)), scheduled(step), nets.normal())
+    nets.improve(((action - b.action) ** 2).mean())
+
+
+def td3_bc(nets: Nets, b: FeatureBatch, step: int) -> None:
+    with torch.no_grad():
+        noise = (nets.normal() * 0.2).clamp(-0.5, 0.5)
+        next_action = (torch.tanh(nets.target_actor(b.next_z)) + noise).clamp(-1, 1)
+    nets.learn_values(b, next_action)
+    if (step + 1) % 2:
+        return
+    action = torch.tanh(nets.actor(b.z))
+    q = nets.critics[0](torch.cat([b.z, action], 1))
+    nets.improve(-1.5 / q.abs().mean().detach() * q.mean() + ((action - b.action) ** 2).mean())
+    nets.follow(nets.target_critics, nets.critics, 0.005)
+    nets.follow(nets.target_actor, nets.actor, 0.005)
+
+
+@pytest.mark.parametrize("theirs", [drqv2_bc, bc, td3_bc])
+def test_updates_end_in_the_weights_of_the_authors_rule(theirs: Callable):
+    name = theirs.__name__
+    algorithm = started(name)
+    nets = Nets(algorithm)
+    near = torch.tanh(nets.actor(batch(0).z)).abs() > 0.7  # where the noise may reach beyond a bound
+    assert 0.2 < near.double().mean() < 0.9, "many actions are near a bound, and not all"
+    for number in range(UPDATES):
+        algorithm.update(batch(number))
+        theirs(nets, batch(number), BEGUN[name] + number)
+    pairs = [(algorithm.policy.net, nets.actor)]
+    if name != "bc":
+        pairs += [(algorithm.critic.first, nets.critics[0]), (algorithm.target_critic.second, nets.target_critics[1])]
+    for mine, their in pairs:
+        for p, q in zip(mine.parameters(), their.parameters(), strict=True):
+            torch.testing.assert_close(p, q, atol=1e-12, rtol=1e-12)
