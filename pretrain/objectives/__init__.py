@@ -62,7 +62,7 @@ _OWN = {
         summary="ah whose pasts hold actions, the predicted one among them",
     ),
     "fj": Method(
-        ForwardJump, "gru", past=8, options=InverseOptions, summary="inverse model on m rows of the past at t and t+k"
+        ForwardJump, "gru", past=8, options=InverseOptions, summary="inverse model on t, t+k and the m rows before each"
     ),
     "fj+a": Method(
         ForwardJump,
