@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -14,7 +13,7 @@ from matplotlib.patches import Rectangle
 
 from vd4rl_pomdp.experiments.navigation.claims import paper_number
 from vd4rl_pomdp.experiments.navigation.grid import Condition, condition_of, paper_rows
-from vd4rl_pomdp.experiments.navigation.runs import NavigationRun, is_missing
+from vd4rl_pomdp.experiments.navigation.runs import NavigationRun, is_missing, read_trajectory
 from vd4rl_pomdp.mazes import FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
 from vd4rl_pomdp.navigation.measures import Measure
 from vd4rl_pomdp.navigation.methods import OBJECTIVES, REFERENCES
@@ -113,12 +112,10 @@ def _first(runs: list[NavigationRun], condition: Condition) -> NavigationRun | N
 
 def _draw_trajectory(axes: Any, run: NavigationRun, rows: int = 100) -> None:
     assert run.trajectory is not None
-    with run.trajectory.open(newline="", encoding="utf-8") as file:
-        table = list(csv.DictReader(file))[:rows]
+    table = read_trajectory(run.trajectory)
     draw_maze(axes, MAZES[run.condition.maze])
     for names, colour, label in ((("x", "y"), "black", "true"), (("estimated_x", "estimated_y"), _ESTIMATE, "probe")):
-        points = np.array([[float(row[name]) for name in names] for row in table])
-        axes.plot(*points.T, color=colour, lw=1, marker=".", markersize=2.5, label=label)
+        axes.plot(*(table[name][:rows] for name in names), color=colour, lw=1, marker=".", markersize=2.5, label=label)
     axes.set_title(f"{run.condition.maze}: {run.condition.method}", fontsize=9)
     axes.legend(fontsize=7, loc="center left", framealpha=0.9)
 
