@@ -10,7 +10,7 @@ from vd4rl_pomdp.experiments.navigation.grid import Condition, condition_of, pap
 from vd4rl_pomdp.experiments.navigation.runs import NavigationRun
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.navigation.measures import Measure, held_out_loss, online_error, refitted_error
-from vd4rl_pomdp.navigation.methods import SUPERVISED, UNTRAINED
+from vd4rl_pomdp.navigation.methods import UNTRAINED, WITH_MEMORY
 
 RECURRENT = ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
 NEAR_ZERO = 5.0
@@ -184,7 +184,7 @@ def _ceiling_lines(mazes: Sequence[str], runs: Sequence[NavigationRun]) -> list[
     """What the same networks reach when they are trained on the true states, without and with past actions."""
     position = refitted_error("position")
     sides = [
-        (maze, [_by_seed((Condition(maze, method), position), runs).values() for method in SUPERVISED])
+        (maze, [_by_seed((Condition(maze, method), position), runs).values() for method in WITH_MEMORY])
         for maze in mazes
     ]
     reached = [
