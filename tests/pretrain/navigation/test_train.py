@@ -182,6 +182,18 @@ def test_errors_leave_out_the_burn_in_and_count_hidden_rows_apart():
     assert "position_hidden" not in sums.percent()
 
 
+def test_raw_errors_are_in_the_simulators_units():
+    errors = ErrorSums()
+    estimate = torch.tensor([0.1, 0.3, 0.2, 0.6]).expand(1, 3, 4)
+    errors.add(estimate, torch.zeros(1, 3, 4), torch.tensor([[False, True, True]]), burn_in=1)
+    found = errors.both(torch.tensor([2.0, 1.0, 3.0, 0.5]))
+    expected = {"position": (20, 25), "velocity": (40, 45), "state": (30, 35)}
+    for name, (percent, raw) in expected.items():
+        for suffix in ("", "_hidden"):
+            assert found[f"{name}{suffix}"] == pytest.approx(percent)
+            assert found[f"raw_{name}{suffix}"] == pytest.approx(raw)
+
+
 def test_a_refitted_probe_reads_what_is_there_and_nothing_else():
     generator = torch.Generator().manual_seed(0)
     features = torch.randn(4000, 6, generator=generator)
