@@ -51,3 +51,16 @@ def test_waypoints_lie_between_the_centre_of_a_cell_and_its_point():
     assert beside.max() <= 0.2
     assert np.ptp(beside, axis=0).min() > 0.15
     np.testing.assert_array_equal(np.array(ahead)[:, 2], np.tile([1.2, -0.2], (50, 1)))
+
+
+def test_a_waypoint_is_passed_at_walking_pace_only():
+    env = MazeEnv("no_curtain", 5, pixels=False)
+    env.reset(seed=0)
+    goal = np.array([1.2, -0.2])
+    for travel, passed in ((0.2, 0), (0.05, 1)):
+        planner = WaypointPlanner(env, np.random.default_rng(0))
+        planner.act(np.array([-1.0, 1.0, 0.0, 0.0]), goal)
+        waypoint, left = planner._ahead[0], len(planner._ahead)
+        for place in (waypoint - [0, 0.09 + travel], waypoint - [0, 0.09]):
+            planner.act(np.array([*place, 0.0, 0.0]), goal)
+        assert left - len(planner._ahead) == passed, travel

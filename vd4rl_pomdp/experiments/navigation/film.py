@@ -14,10 +14,12 @@ from vd4rl_pomdp.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, MazeSpec
 SIDE, HEAD = 240, 22
 """Pixels of a panel's maze, and of the line above it."""
 _FINE = 2
+_SHOWN = 1.75
+"""How far from the centre is shown: the free cells, and some of the walls around them."""
 _MILLISECONDS = 80
 """Of a frame: a little slower than the mass is."""
 _WALL, _FLOOR, _PAPER, _INK = (228, 201, 168), (58, 82, 110), (255, 255, 255), (30, 30, 30)
-_CURTAIN, _TRUE, _ESTIMATE = (200, 140, 85, 215), (90, 200, 90), (255, 90, 0)
+_CURTAIN, _TRUE, _ESTIMATE = (200, 140, 85, 165), (90, 200, 90), (255, 90, 0)
 
 
 def write_film(trajectories: Mapping[str, Path], maze: MazeSpec, path: Path) -> None:
@@ -41,7 +43,7 @@ def write_film(trajectories: Mapping[str, Path], maze: MazeSpec, path: Path) -> 
 
 def to_pixels(x: float, y: float) -> tuple[float, float]:
     """Column and row within a panel of a position in the maze."""
-    return (x + HALF_SIZE) / (2 * HALF_SIZE) * SIDE, HEAD + (HALF_SIZE - y) / (2 * HALF_SIZE) * SIDE
+    return (x + _SHOWN) / (2 * _SHOWN) * SIDE, HEAD + (_SHOWN - y) / (2 * _SHOWN) * SIDE
 
 
 def _panel(name: str, table: Mapping[str, np.ndarray], row: int, maze: MazeSpec, ground: Image.Image) -> Image.Image:
