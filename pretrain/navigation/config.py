@@ -56,7 +56,7 @@ _SMOKE: dict[str, Any] = {
     "log_every": 5,
     "checkpoint_every": 10,
 }
-_NETWORK_OF = dict(zip(REFERENCES, ("mik+a", "ah", "ah+a"), strict=True))
+_NETWORK_OF = dict(zip(REFERENCES, ("mik+a", "no_history", "ah", "ah+a"), strict=True))
 
 
 def network_of(method: str) -> str:
@@ -87,7 +87,8 @@ class NavigationConfig(TrainingConfig):
     """Settings of `vd4rl-pomdp navigation train`.
 
     Methods are no_history, ah, ah+a, fj, fj+a, mik, mik+a, others that predict actions, random (mik+a, untrained), and
-    supervised and supervised+a (the networks of ah and ah+a, trained on the true states).
+    supervised_picture, supervised and supervised+a (the networks of no_history, ah and ah+a, trained on the true
+    states).
     """
 
     average_last: int = 10_000
@@ -97,7 +98,7 @@ class NavigationConfig(TrainingConfig):
     warm_up: int = 0
     """Steps in which the learning rate rises linearly."""
     picture: Picture = "rgb100"
-    """rgb100: pictures as stored; grey50: their luminance, averaged over 2x2 pixels."""
+    """rgb100: pictures as stored; rgb50: averaged over 2x2 pixels; grey50: the luminance of these."""
     exogenous: str = "none"
     """Images added to every picture: none, photographs, or a folder of CIFAR-10's files or of PNG and JPEG files."""
     noise: Options = NO_OPTIONS

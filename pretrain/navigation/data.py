@@ -49,8 +49,8 @@ class MazeData:
 
     def on(self, device: torch.device) -> MazeData:
         """Prepare the observations and move everything to a device."""
-        if isinstance(self._view, MazeView) and self._config.picture == "grey50":
-            self._view = self._view.shrunk()
+        if isinstance(self._view, MazeView) and self._config.picture != "rgb100":
+            self._view = self._view.shrunk(self._config.picture)
         self.dataset.to(device)
         self.states = self.states.to(device)
         return self

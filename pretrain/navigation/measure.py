@@ -17,7 +17,7 @@ from pretrain.navigation.config import NavigationConfig
 from pretrain.navigation.probe import COMPONENTS, ErrorSums, StateProbe, refit
 from pretrain.navigation.trainer import NavigationTrainer
 from vd4rl_pomdp.data import Dataset
-from vd4rl_pomdp.navigation.measures import Measure, measure_rows
+from vd4rl_pomdp.navigation.measures import RAW_PREFIX, Measure, measure_rows
 from vd4rl_pomdp.navigation.methods import UNTRAINED
 from vd4rl_pomdp.runs.device import autocast
 from vd4rl_pomdp.runs.files import replacing_file
@@ -40,7 +40,7 @@ def evaluate(trainer: NavigationTrainer) -> tuple[dict[str, float], dict[str, fl
         count += len(number)
         for name, value in logs.items():
             sums[name] += float(value) * len(number)
-    return {name: value / count for name, value in sums.items()}, errors.percent()
+    return {name: value / count for name, value in sums.items()}, errors.both(trainer.data.states.std)
 
 
 @torch.no_grad()
@@ -64,7 +64,7 @@ def refitted_errors(trainer: NavigationTrainer) -> tuple[StateProbe, dict[str, d
         for number in trainer.data.spread(config.evaluation_windows, held_out):
             past, at = encode(trainer, number)
             errors.add(probe(past), states.values[at], states.hidden[at], config.burn_in)
-        found[split] = errors.percent()
+        found[split] = errors.both(states.std)
     return probe, found
 
 
@@ -85,13 +85,13 @@ def measure(trainer: NavigationTrainer, log: Path) -> tuple[StateProbe, list[dic
 
 
 def _errors(split: str, probe: str, logs: dict[str, float]) -> dict[Measure, float]:
-    """Errors among the numbers that are logged: `state`, `position`, `velocity`, and the same with `_hidden`."""
+    """Errors among the numbers that are logged: those that `ErrorSums.both` names."""
     values = {}
     for name, value in logs.items():
-        component = name.removesuffix("_hidden")
-        if component in COMPONENTS:
+        error = name.removesuffix("_hidden")
+        if error.removeprefix(RAW_PREFIX) in COMPONENTS:
             rows = "hidden" if name.endswith("_hidden") else "all"
-            values[Measure(f"{component}_error", split, probe, rows)] = value
+            values[Measure(f"{error}_error", split, probe, rows)] = value
     return values
 
 

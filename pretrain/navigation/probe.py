@@ -1,7 +1,7 @@
 """State probes: an MLP estimates the true state from a representation, trained beside it or refitted on it frozen.
 
-States are the standardised position and velocity, (x, y, vx, vy). Errors are mean absolute errors in percent of a
-standard deviation, so predicting the mean gives some 80 to 100.
+States are the standardised position and velocity, (x, y, vx, vy). Errors are mean absolute errors in two units: percent
+of a standard deviation, where predicting the mean gives some 65 to 100, and the simulator's own, times 100.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.mazes import MazeSpec
+from vd4rl_pomdp.navigation.measures import RAW_PREFIX
 from vd4rl_pomdp.nn.heads import mlp
 from vd4rl_pomdp.nn.policy import Standardise
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
@@ -95,10 +96,18 @@ class ErrorSums:
 
     def percent(self) -> dict[str, float]:
         """`state`, `position`, `velocity`, and the same with `_hidden` where any counted row was hidden."""
+        return self._times(torch.ones(STATE_DIM))
+
+    def both(self, std: Tensor) -> dict[str, float]:
+        """The same, and after RAW_PREFIX in units of the simulator x 100, by the states' (4,) standard deviations."""
+        raw = self._times(std.cpu())
+        return self.percent() | {f"{RAW_PREFIX}{name}": value for name, value in raw.items()}
+
+    def _times(self, scale: Tensor) -> dict[str, float]:
         named: dict[str, float] = {}
         for number, suffix in enumerate(("", "_hidden")):
             if self._counts[number]:
-                means = 100 * self._sums[number] / self._counts[number]
+                means = 100 * scale * self._sums[number] / self._counts[number]
                 named |= {f"{name}{suffix}": float(means[part].mean()) for name, part in COMPONENTS.items()}
         return named
 

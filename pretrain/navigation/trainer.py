@@ -93,7 +93,7 @@ class NavigationTrainer:
                 loop.add(logs)
                 self.errors.add(*states, self.config.burn_in)
                 if loop.due(self.config.log_every):
-                    loop.log("loss", "state", **self.errors.percent())
+                    loop.log("loss", "state", **self.errors.both(self.data.states.std))
                     self.errors = ErrorSums()
                 loop.step_done(save=loop.due(self.config.checkpoint_every))
 

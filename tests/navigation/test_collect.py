@@ -11,7 +11,8 @@ from vd4rl_pomdp.data import open_dataset, shards
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.envs.maze import MazeEnv
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.navigation.collect import collect
+from vd4rl_pomdp.mazes import MAZES
+from vd4rl_pomdp.navigation.collect import _explore, _Job, _roll_out, collect
 from vd4rl_pomdp.navigation.config import PRESETS, MazeCollectConfig
 
 
@@ -78,30 +79,41 @@ def test_an_interrupted_collection_ends_in_the_same_files(maze_set, tmp_path, mo
     assert hashes(tmp_path / "set") == hashes(maze_set)
 
 
-def test_noise_repeat_and_seed_change_the_set(maze_set, tmp_path):
+def test_repeat_and_seed_change_the_set(maze_set, tmp_path):
     found = [hashes(maze_set)]
-    for i, changes in enumerate([{"noise": 0.1}, {"action_repeat": 2}, {"seed": 1}]):
+    for i, changes in enumerate([{"action_repeat": 2}, {"seed": 1}]):
         collect(small(tmp_path / str(i), trajectories=2, **changes))
         found.append(hashes(tmp_path / str(i)))
     firsts = [files["0_three_curtains.hdf5"] for files in found]
-    assert len(set(firsts)) == 4
+    assert len(set(firsts)) == 3
 
 
-def test_every_trajectory_has_noise_of_its_own(tmp_path):
-    """Under noise that drowns the planner, actions are the noise's signs."""
-    collect(small(tmp_path / "set", trajectories=3, noise=1e4))
-    dataset = open_dataset(tmp_path / "set", tmp_path)
-    actions = dataset.action.view(3, 30, 2)[:, 1:]
-    assert (actions.abs() == 1).all()
+@pytest.mark.parametrize(
+    ("maze", "changes"), [("hard_no_curtain", {"noise": 1e4}), ("no_curtain", {"random_share": 1})]
+)
+def test_every_trajectory_has_noise_of_its_own(maze, changes, tmp_path, monkeypatch):
+    """Under noise that drowns the planner, or in its place, actions are the noise's signs."""
+    loud = replace(MAZES[maze].style, zero_share=0.0, **changes)
+    monkeypatch.setitem(MAZES, maze, replace(MAZES[maze], style=loud))
+    signs = np.sign([_roll_out(_Job(maze, i, 0, 30, 5))["action"][1:] for i in range(3)])
     for one, other in ((0, 1), (1, 2), (0, 2)):
-        assert 0.2 < (actions[one] == actions[other]).float().mean() < 0.8
+        assert 0.2 < (signs[one] == signs[other]).mean() < 0.8
+
+
+def test_actions_are_the_planners_but_for_a_tenth_zero_and_a_tenth_random_ones():
+    rng, style, wanted = np.random.default_rng(0), MAZES["no_curtain"].style, np.array([3.0, -0.25])
+    actions = np.array([_explore(wanted, style, rng) for _ in range(4000)])
+    assert (actions == 0).all(1).mean() == pytest.approx(0.1, abs=0.015)
+    assert (actions == [1.0, -0.25]).all(1).mean() == pytest.approx(0.8, abs=0.02)
+    noisy = np.array([_explore(np.zeros(2), MAZES["hard_no_curtain"].style, rng) for _ in range(4000)])
+    assert noisy.std(0) == pytest.approx(0.48, abs=0.03)
+    assert not (noisy == 0).all(1).any()
 
 
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
         ({"maze": "spiral"}, "unknown maze 'spiral'"),
-        ({"noise": -1.0}, "--noise is -1.0"),
         ({"trajectory_rows": 1}, "--trajectory-rows is 1"),
         ({"action_repeat": 0}, "--action-repeat is 0"),
         ({"seed": -1}, "--seed is -1"),
@@ -114,8 +126,8 @@ def test_wrong_settings_are_named(changes, message, tmp_path):
 
 
 def test_another_collection_is_refused(maze_set):
-    with pytest.raises(UserError, match="collected with another noise"):
-        collect(small(maze_set, noise=0.2))
+    with pytest.raises(UserError, match="collected with another seed"):
+        collect(small(maze_set, seed=2))
 
 
 def test_first_person_data_holds_headings_and_moves(tmp_path):

@@ -4,17 +4,31 @@ import numpy as np
 import pytest
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.navigation.first_person import SHIPPED, FirstPersonConfig, goals_reached, train_first_person
+from vd4rl_pomdp.mazes import MAZES
+from vd4rl_pomdp.navigation.first_person import FirstPersonConfig, goals_reached, shipped_actor, train_first_person
 from vd4rl_pomdp.policies.actor import read_actor
 
 
-def test_the_shipped_first_person_policy_reaches_goals_and_an_idle_one_does_not():
-    actor = read_actor(SHIPPED)
+@pytest.mark.parametrize("maze", ["first_person", "hard_first_person"])
+def test_the_shipped_first_person_policy_reaches_goals_and_an_idle_one_does_not(maze):
+    actor = shipped_actor(MAZES[maze])
     assert actor.card["algorithm"] == "PPO"
-    reached = goals_reached(actor, actor.card["action_repeat"], 3)
+    reached = goals_reached(actor, maze, actor.card["action_repeat"], 3)
     idle = replace(actor, weights={name: value * 0 for name, value in actor.weights.items()})
-    assert reached >= 12
-    assert goals_reached(idle, actor.card["action_repeat"], 3) < reached / 3
+    assert reached >= 11
+    assert goals_reached(idle, maze, actor.card["action_repeat"], 3) < reached / 3
+
+
+def test_every_first_person_maze_is_driven_by_an_actor_of_its_kinematics():
+    actors = {name: shipped_actor(spec) for name, spec in MAZES.items() if spec.first_person}
+    assert actors["compass_first_person"].card == actors["first_person"].card
+    means = [actors[name].weights["mean.weight"] for name in ("first_person", "hard_first_person")]
+    assert not np.array_equal(*means)
+
+
+def test_a_maze_that_a_planner_drives_through_trains_no_actor(tmp_path):
+    with pytest.raises(UserError, match="--maze is no_curtain, which a planner drives through"):
+        train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", maze="no_curtain"))
 
 
 def test_a_policy_of_no_decisions_is_refused(tmp_path):

@@ -7,7 +7,7 @@ import pytest
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.grid import condition_of, paper_rows
-from vd4rl_pomdp.mazes import MAZES
+from vd4rl_pomdp.mazes import PAPER_MAZES
 from vd4rl_pomdp.sweeps.grid import narrow
 from vd4rl_pomdp.sweeps.grid_file import load_grid, names
 from vd4rl_pomdp.sweeps.stages import check_cell
@@ -199,7 +199,7 @@ def test_the_navigation_grid_holds_every_condition_of_the_papers_tables():
         for cell in cells
         if not cell.value("literal_future")
     }
-    wanted = [condition_of(row, maze) for row in paper_rows() for maze in MAZES]
+    wanted = [condition_of(row, maze) for row in paper_rows() for maze in PAPER_MAZES]
     missing = [c for c in wanted if (c.maze, c.method, c.max_k, c.self_prediction, c.exogenous) not in held]
     assert missing == []
 

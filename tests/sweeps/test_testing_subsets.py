@@ -12,6 +12,7 @@ from vd4rl_pomdp.runs.files import read_json
     [
         ("quick", ["method=acro"], 3, "walker_walk/expert_noisy/patch+zero_frames/acro/seed0/finetune-td3_bc"),
         ("navigation", ["method=ah", "self_prediction=1.0"], 2, "no_curtain/ah,max_k=3,self_prediction=1.0/seed0"),
+        ("quick_navigation", ["method=no_history"], 2, "three_curtains/no_history/seed0"),
     ],
 )
 def test_a_cell_runs_from_its_set_to_its_result(tmp_path, monkeypatch, capsys, grid, only, jobs, last):

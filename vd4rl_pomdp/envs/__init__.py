@@ -1,11 +1,11 @@
-"""Environments: tasks as the data shows them, with the corruptions of the benchmark; and four mazes.
+"""Environments: tasks as the data shows them, with the corruptions of the benchmark; and the mazes.
 
 Importing this package registers every task and corruption with Gymnasium, as `vd4rl_pomdp/WalkerWalk-v0`,
 `vd4rl_pomdp/WalkerWalk-Patch16-v0`, `vd4rl_pomdp/WalkerWalk-ZeroFrames-v0`,
 `vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0`, and likewise for `CheetahRun`, `HumanoidWalk` and every other
 task that a call has registered by then (for others there is `vd4rl_pomdp.envs.gym.GymEnv("its_name")`); the mazes as
-`vd4rl_pomdp/MazeNoCurtain-v0`, `MazeOneCurtain`, `MazeThreeCurtains` and `MazeFirstPerson`; and the paper's finite
-counterexample, `vd4rl_pomdp/ForwardJumpCounterexample-v0`.
+`vd4rl_pomdp/MazeNoCurtain-v0`, `MazeOneCurtain`, `MazeThreeCurtains`, `MazeFirstPerson` and their variants; and the
+paper's finite counterexample, `vd4rl_pomdp/ForwardJumpCounterexample-v0`.
 
 Gymnasium's time limit truncates their episodes (`gymnasium.make(..., max_episode_steps=100)` chooses another); a step
 after the end is refused. Tasks take the corruption's fields, too: `gymnasium.make("vd4rl_pomdp/WalkerWalk-v0",

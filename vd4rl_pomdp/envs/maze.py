@@ -8,26 +8,29 @@ import gymnasium
 import numpy as np
 
 from vd4rl_pomdp.envs import Info
-from vd4rl_pomdp.envs.maze_model import COLLISION_RADIUS, TIMESTEP, build_simulator
+from vd4rl_pomdp.envs.maze_model import COLLISION_RADIUS, HEADING, TIMESTEP, build_simulator
 from vd4rl_pomdp.envs.maze_renderers import ExactRenderer, MazeRenderer, make_renderer
 from vd4rl_pomdp.envs.rendering import Render, mujoco
 from vd4rl_pomdp.mazes import PICTURE_SIZE, get_maze
 
-GOAL_RADIUS = 0.2
-"""A goal is reached, and another drawn, within this distance."""
 ACTION_REPEAT = 5
-"""Simulator steps of 0.01 s for one action: enough to see what an action does."""
-ACCELERATION, ANGULAR_VELOCITY = 10.0, 4.0
-"""first_person: units/s^2 along the heading and radians/s for an action of 1 (from the top it is 23.9 units/s^2)."""
+"""Simulator steps of 0.01 s for one action."""
+ACCELERATION = 10.0
+"""first_person without a `push`: units/s^2 along the heading for an action of 1 (from the top it is 23.9)."""
+FASTEST = 5.0
+"""Velocities are limited to this on each axis, as in PointMaze."""
+CELL_OFFSET = np.array([0.2, -0.2])
+"""From a cell's centre to the point that stands for it as a goal: the generator's grid lies beside its walls."""
 
 
 class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """A point mass in a U-shaped maze, seen from the top (with curtains or not) or in first person.
 
     Observations: (3, 100, 100) uint8. Actions: (2,) float32 in [-1, 1]: accelerations in x and y, or along the heading
-    and the angular velocity. The reward is 1 whenever a goal is reached; nothing terminates. `info` holds `state`
-    (qpos, then qvel: x, y, vx, vy; in first person x, y, heading, vx, vy, angular velocity), `goal` (2,) and `hidden`,
-    whether a curtain covers the whole mass. A seed fixes all starts and goals that follow it.
+    and the turning rate. The reward is 1 whenever a goal is reached; nothing terminates. `info` holds `state` (qpos,
+    then qvel: x, y, vx, vy; in first person x, y, heading, vx, vy, angular velocity), `goal` (2,) and `hidden`,
+    whether a curtain covers the whole mass. What differs between mazes is in their `style`. A seed fixes all starts
+    and goals that follow it.
     """
 
     metadata = {"render_modes": ["rgb_array"]}  # noqa: RUF012 (Gymnasium's own name and type)
@@ -53,6 +56,8 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self._picture = np.zeros((3, PICTURE_SIZE, PICTURE_SIZE), np.uint8)
         self.goal = np.zeros(2)
         """(2,) position to go to."""
+        self._decisions = 0
+        """Since the goal was drawn."""
 
     @property
     def state(self) -> np.ndarray:
@@ -69,15 +74,17 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
             qpos[2] = self.np_random.uniform(-np.pi, np.pi)
         state = np.concatenate([qpos, np.zeros(self._point.model.nv)])
         self.set_state((options or {}).get("state", state))
-        self.goal = self._free_place()
+        self._draw_goal()
         return self._observation_and_info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Apply one action for the action repeat."""
+        before = self.state[:2]
         self._simulate(np.clip(np.asarray(action, np.float64), -1, 1))
-        reached = bool(np.linalg.norm(self.state[:2] - self.goal) <= GOAL_RADIUS)
-        if reached:
-            self.goal = self._free_place()
+        reached = self._at_goal(before)
+        self._decisions += 1
+        if reached or self._decisions == self.maze_spec.style.goal_decisions:
+            self._draw_goal()
         observation, info = self._observation_and_info()
         return observation, float(reached), False, False, info
 
@@ -95,29 +102,57 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if isinstance(self._renderer, ExactRenderer):
             self._renderer.close()
 
-    def is_free(self, place: np.ndarray) -> bool:
-        """Whether the mass fits at a (2,) position."""
-        corners = place + COLLISION_RADIUS * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
+    def is_free(self, place: np.ndarray, room: float = 0.0) -> bool:
+        """Whether the mass fits at a (2,) position, with room around it."""
+        corners = place + (COLLISION_RADIUS + room) * np.array([[-1, -1], [-1, 1], [1, -1], [1, 1]])
         cells = [self.maze.cell_xy_to_rowcol(corner) for corner in corners]
         return all(self.maze.maze_map[row][column] != 1 for row, column in cells)
+
+    def goal_point(self, place: np.ndarray) -> np.ndarray:
+        """The goal (2,) that a free place stands for: the point of its cell, or itself."""
+        if not self.maze_spec.style.goals_are_cells:
+            return place
+        return np.round(place - CELL_OFFSET) + CELL_OFFSET
+
+    def _at_goal(self, before: np.ndarray) -> bool:
+        """Whether the goal is reached by a mass that was at a (2,) position when the decision began."""
+        place, style = self.state[:2], self.maze_spec.style
+        near = np.linalg.norm(place - self.goal) <= style.goal_radius
+        return bool(near and np.linalg.norm(place - before) < style.goal_travel)
+
+    def _draw_goal(self) -> None:
+        self.goal, self._decisions = self.goal_point(self._free_place(self.maze_spec.style.goal_margin)), 0
 
     def _simulate(self, action: np.ndarray) -> None:
         """PointMaze's own steps; in first person the velocities are changed first, and no motor runs."""
         if self.maze_spec.first_person:
-            qpos, qvel = self._point.data.qpos.copy(), self._point.data.qvel.copy()
-            gain = action[0] * ACCELERATION * TIMESTEP * self._repeat
-            qvel[:2] += gain * np.array([np.cos(qpos[2]), np.sin(qpos[2])])
-            qvel[2] = action[1] * ANGULAR_VELOCITY
-            self._point.set_state(qpos, qvel)
+            self._steer(action)
             action = np.zeros(2)
-        for _ in range(self._repeat):
-            self._point.step(action)
+        if self.maze_spec.style.limited_every_step:
+            for _ in range(self._repeat):
+                self._point.step(action)
+            return
+        qvel = self._point.data.qvel.copy()
+        qvel[:2] = np.clip(qvel[:2], -FASTEST, FASTEST)
+        self._point.set_state(self._point.data.qpos.copy(), qvel)
+        self._point.do_simulation(action, self._repeat)
 
-    def _free_place(self) -> np.ndarray:
-        """A position drawn uniformly from where the mass fits."""
+    def _steer(self, action: np.ndarray) -> None:
+        """Set the turning rate and push the mass along its heading."""
+        style = self.maze_spec.style
+        if style.push is not None and not action.any():
+            return  # the generator leaves velocities alone
+        push = ACCELERATION * TIMESTEP * self._repeat if style.push is None else style.push
+        qpos, qvel = self._point.data.qpos.copy(), self._point.data.qvel.copy()
+        qvel[:2] += action[0] * push * np.array([np.cos(qpos[HEADING]), np.sin(qpos[HEADING])])
+        qvel[HEADING] = action[1] * style.turning_rate
+        self._point.set_state(qpos, qvel)
+
+    def _free_place(self, room: float = 0.0) -> np.ndarray:
+        """A position drawn uniformly from where the mass fits, with room around it."""
         while True:
             place = self.np_random.uniform(-1.5, 1.5, 2)
-            if self.is_free(place):
+            if self.is_free(place, room):
                 return place
 
     def draw(self) -> np.ndarray:

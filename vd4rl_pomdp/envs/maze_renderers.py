@@ -5,7 +5,8 @@ the ball is then a sphere cut by 40x40 rays of the same camera, shaded like MuJo
 is nearer than what MuJoCo drew. A ball that is wholly behind a curtain therefore changes no pixel.
 
 In first person a ray for each column finds the nearest wall. The light shines where the camera looks, so a wall's face
-has one shade, the floor none but the ambient one, and the picture is made of five colours, averaged over 2x2 rays.
+has one shade, the floor none but the ambient one, and the picture is made of five colours and the sky's, which are
+looked up by azimuth, averaged over 2x2 rays.
 """
 
 from __future__ import annotations
@@ -16,9 +17,9 @@ import weakref
 
 import numpy as np
 
-from vd4rl_pomdp.envs.maze_model import CAMERA_HEIGHT, EYE_FOVY, EYE_HEIGHT, TOP_FOVY, WALL_HEIGHT
+from vd4rl_pomdp.envs.maze_sky import BINS, panorama, sky_texture
 from vd4rl_pomdp.envs.rendering import Render, gl_error, mujoco, refuse_after_fork
-from vd4rl_pomdp.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, PICTURE_SIZE, MazeSpec
+from vd4rl_pomdp.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, PICTURE_SIZE, MazeSpec, Style
 
 _FINE = 4
 """Rays for each pixel, in each direction."""
@@ -42,7 +43,6 @@ class ExactRenderer:
             self._renderer = mujoco.Renderer(model, PICTURE_SIZE * fine, PICTURE_SIZE * fine)
         except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
             raise gl_error(error) from error
-        self._renderer.scene.flags[mujoco.mjtRndFlag.mjRND_SKYBOX] = 0
         _keep_display()
         atexit.register(_close, weakref.ref(self._renderer))  # before OpenGL itself ends
 
@@ -92,24 +92,25 @@ def average(fine: np.ndarray, by: int) -> np.ndarray:
 class TopRenderer:
     """The fast picture from the top."""
 
-    _WINDOW = 48
-    """Rays across the square in which the ball is drawn: a multiple of _FINE with room for the whole ball."""
-
-    def __init__(self, model: mujoco.MjModel) -> None:
+    def __init__(self, model: mujoco.MjModel, style: Style) -> None:
         self._colors, self._depths = _static_picture(model)
         self._picture = average(self._colors, _FINE)
-        side = PICTURE_SIZE * _FINE
-        self._slope = ((np.arange(side) + 0.5) / side * 2 - 1) * np.tan(np.radians(TOP_FOVY) / 2)
+        self._height = style.camera_height
+        side, half = PICTURE_SIZE * _FINE, np.tan(np.radians(style.camera_fovy) / 2)
+        self._slope = ((np.arange(side) + 0.5) / side * 2 - 1) * half
         """(side,) sideways travel of a ray for each unit of depth, by column."""
+        across = 2 * 1.05 * BALL_RADIUS / self._height / half * side / 2
+        self._window = int(np.ceil(across / _FINE) + 2) * _FINE
+        """Rays across the square in which the ball is drawn: a multiple of _FINE with room for the whole ball."""
 
     def __call__(self, data: mujoco.MjData) -> np.ndarray:
         """Picture of a state."""
         picture = self._picture.copy()
         x, y = float(data.qpos[0]), float(data.qpos[1])
         left, top = self._corner(x), self._corner(-y)
-        cells = slice(top, top + self._WINDOW), slice(left, left + self._WINDOW)
+        cells = slice(top, top + self._window), slice(left, left + self._window)
         right, down = self._slope[cells[1]][None, :], self._slope[cells[0]][:, None]
-        depth, facing = _hit_sphere(right, -down, x, y)
+        depth, facing = _hit_sphere(right, -down, x, y, self._height)
         drawn = depth < self._depths[cells]
         if not drawn.any():
             return picture
@@ -117,16 +118,16 @@ class TopRenderer:
         colors = _BALL_COLOR * shade + (_SPECULAR * facing**_SHININESS)[..., None]
         patch = self._colors[cells].copy()
         patch[drawn] = np.minimum(colors[drawn] * 255 + 0.5, 255).astype(np.uint8)
-        size = self._WINDOW // _FINE
+        size = self._window // _FINE
         row, column = top // _FINE, left // _FINE
         picture[:, row : row + size, column : column + size] = average(patch, _FINE)
         return picture
 
     def _corner(self, sideways: float) -> int:
         """First ray, a multiple of _FINE, of a window around a coordinate."""
-        center = np.searchsorted(self._slope, sideways / CAMERA_HEIGHT)
-        first = (int(center) - self._WINDOW // 2) // _FINE * _FINE
-        return min(max(first, 0), PICTURE_SIZE * _FINE - self._WINDOW)
+        center = np.searchsorted(self._slope, sideways / self._height)
+        first = (int(center) - self._window // 2) // _FINE * _FINE
+        return min(max(first, 0), PICTURE_SIZE * _FINE - self._window)
 
 
 def _static_picture(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
@@ -142,15 +143,15 @@ def _static_picture(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
     return picture
 
 
-def _hit_sphere(right: np.ndarray, up: np.ndarray, x: float, y: float) -> tuple[np.ndarray, np.ndarray]:
-    """Where rays (right, up, -1) from the camera first meet the ball at (x, y, 0).
+def _hit_sphere(right: np.ndarray, up: np.ndarray, x: float, y: float, height: float) -> tuple[np.ndarray, np.ndarray]:
+    """Where rays (right, up, -1) from the camera at (0, 0, height) first meet the ball at (x, y, 0).
 
     Returns:
         Depths (inf where a ray misses), and cosines between the ball's surface and the direction to the camera.
     """
     squared = right**2 + up**2 + 1
-    along = right * x + up * y + CAMERA_HEIGHT
-    inside = along**2 - squared * (x**2 + y**2 + CAMERA_HEIGHT**2 - BALL_RADIUS**2)
+    along = right * x + up * y + height
+    inside = along**2 - squared * (x**2 + y**2 + height**2 - BALL_RADIUS**2)
     depth = np.where(inside > 0, (along - np.sqrt(np.maximum(inside, 0))) / squared, np.inf)
     return depth, np.sqrt(np.maximum(inside, 0) / squared) / BALL_RADIUS
 
@@ -163,12 +164,15 @@ class FirstPersonRenderer:
     _OFFSET = 64
     """An even number of floor squares that makes all places positive."""
 
-    def __init__(self) -> None:
+    def __init__(self, style: Style) -> None:
         side = PICTURE_SIZE * self._FINE
-        steps = ((np.arange(side) + 0.5) / side * 2 - 1) * np.tan(np.radians(EYE_FOVY) / 2)
+        steps = ((np.arange(side) + 0.5) / side * 2 - 1) * np.tan(np.radians(style.eye_fovy) / 2)
         self._left, self._up = -steps, -steps[:, None]
         """(side,) and (side, 1) slopes of the rays, by column and by row."""
-        self._to_floor = (EYE_HEIGHT - _GROUND) / steps[side // 2 :, None]
+        self._eye, self._wall_top = style.eye_height, style.walls[1]
+        self._wall_bottom = max(style.walls[0], _GROUND)
+        self._sky = _SkyTable(style, self._left, self._up[: side // 2])
+        self._to_floor = (self._eye - _GROUND) / steps[side // 2 :, None]
         """(side / 2, 1) distance ahead at which the rays of the lower half meet the floor."""
         cells = [(row, column) for row in range(5) for column in range(5) if (row, column) not in FREE_CELLS]
         self._walls = np.array([(c + 0.5 - HALF_SIZE, HALF_SIZE - r - 0.5) for r, c in cells])[:, None]
@@ -182,11 +186,13 @@ class FirstPersonRenderer:
         distance, axis = self._nearest_wall(place, rays)
         lit = rays[np.arange(len(rays)), axis] * ahead[axis] > 0
         faces = np.where(lit, self._WALL_X + axis, self._SHADED).astype(np.uint8)
-        height = EYE_HEIGHT + self._up * distance
-        kinds = np.where(height <= WALL_HEIGHT, faces, np.uint8(self._SKY))
+        height = self._eye + self._up * distance
+        kinds = np.where(height <= self._wall_top, faces, np.uint8(self._SKY))
         lower = len(kinds) // 2
-        np.copyto(kinds[lower:], self._floor(place, rays), where=height[lower:] < 0)
-        return self._color(kinds, ahead)
+        np.copyto(kinds[lower:], self._floor(place, rays), where=height[lower:] < self._wall_bottom)
+        picture = self._color(kinds, ahead)
+        self._sky.add_to(picture[:, : PICTURE_SIZE // 2], kinds[:lower] == self._SKY, heading)
+        return picture
 
     def _floor(self, place: np.ndarray, rays: np.ndarray) -> np.ndarray:
         """Kinds (rows of the lower half, columns) of the floor's squares."""
@@ -216,6 +222,30 @@ class FirstPersonRenderer:
         return ((np.stack(sums) + self._FINE) // self._FINE**2).astype(np.uint8)
 
 
+class _SkyTable:
+    """The sky of a panorama, for the rays of a picture's upper half."""
+
+    _STEP = 2 * np.pi / BINS
+
+    def __init__(self, style: Style, left: np.ndarray, up: np.ndarray) -> None:
+        """For rays (1, left, up) by (columns,) and (rows, 1) slopes."""
+        self._black = style.sky == "none"
+        elevation = np.arctan2(up, np.hypot(1, left))
+        levels = np.arange(0, elevation.max() + self._STEP, self._STEP)
+        self._panorama = panorama(sky_texture(style.sky), levels)
+        self._level = (elevation / self._STEP + 0.5).astype(np.int32)
+        """(rows, columns) entry of the panorama's second axis."""
+        self._azimuth = np.arctan(left)
+
+    def add_to(self, picture: np.ndarray, seen: np.ndarray, heading: float) -> None:
+        """Add the sky to a (3, H / 2, H) picture that is black there, where (rows, columns) finer rays see it."""
+        if self._black or not seen.any():
+            return
+        column = ((heading + self._azimuth + np.pi) / self._STEP).astype(np.int32) % BINS
+        colors = self._panorama[column, self._level] * seen[..., None]
+        picture += average(colors, seen.shape[0] * 2 // picture.shape[2])
+
+
 MazeRenderer = ExactRenderer | TopRenderer | FirstPersonRenderer
 
 
@@ -223,4 +253,4 @@ def make_renderer(spec: MazeSpec, model: mujoco.MjModel, render: Render) -> Maze
     """What draws a maze: `exact` is MuJoCo alone with smooth edges, `fast` the rays."""
     if render == "exact":
         return ExactRenderer(model)
-    return FirstPersonRenderer() if spec.first_person else TopRenderer(model)
+    return FirstPersonRenderer(spec.style) if spec.first_person else TopRenderer(model, spec.style)

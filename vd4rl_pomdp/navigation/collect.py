@@ -10,13 +10,13 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
 from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
-from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, check_maze, get_maze
+from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, Style, check_maze, get_maze
 from vd4rl_pomdp.navigation.config import MazeCollectConfig
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.memory import CPU, require_memory
@@ -26,6 +26,9 @@ from vd4rl_pomdp.runs.provenance import versions
 from vd4rl_pomdp.seeding import episode_seed
 from vd4rl_pomdp.tasks import MOST_EPISODES
 from vd4rl_pomdp.types import StepType
+
+if TYPE_CHECKING:
+    from vd4rl_pomdp.envs.maze import MazeEnv
 
 _RUNTIME_FIELDS = ("out", "workers", "preset")
 
@@ -39,7 +42,6 @@ class _Job:
     seed: int
     rows: int
     action_repeat: int
-    noise: float
 
 
 def collect(config: MazeCollectConfig) -> list[Path]:
@@ -62,16 +64,16 @@ def collection(config: MazeCollectConfig) -> dict[str, Any]:
     return {name: value for name, value in jsonable(asdict(config)).items() if name not in _RUNTIME_FIELDS}
 
 
-def drive(maze: str, rows: int, action_repeat: int = 5, noise: float = 0.5, seed: int = 0) -> Columns:
+def drive(maze: str, rows: int, action_repeat: int = 5, seed: int = 0) -> Columns:
     """Rows of one trajectory, by key, without writing anything."""
     check_maze(maze)
-    return _roll_out(_Job(maze, 0, seed, rows, action_repeat, noise))
+    return _roll_out(_Job(maze, 0, seed, rows, action_repeat))
 
 
 def _check(config: MazeCollectConfig) -> None:
     check_maze(config.maze)
     refuse_outside(
-        config, trajectories=(1, MOST_EPISODES), trajectory_rows=2, action_repeat=(1, MOST_STEPS), noise=0,
+        config, trajectories=(1, MOST_EPISODES), trajectory_rows=2, action_repeat=(1, MOST_STEPS),
         seed=(0, MAX_SEED), trajectories_per_shard=1, workers=0,
     )  # fmt: skip
     rows = config.trajectory_rows * min(config.trajectories, config.trajectories_per_shard)
@@ -86,19 +88,18 @@ def _plan(config: MazeCollectConfig) -> Iterator[tuple[Path, range]]:
 
 
 def _job(config: MazeCollectConfig, trajectory: int) -> _Job:
-    rows, repeat = config.trajectory_rows, config.action_repeat
-    return _Job(config.maze, trajectory, config.seed, rows, repeat, config.noise)
+    return _Job(config.maze, trajectory, config.seed, config.trajectory_rows, config.action_repeat)
 
 
 def _roll_out(job: _Job) -> Columns:
     """Rows of one trajectory, by key."""
-    env, act = _environment(job.maze, job.action_repeat)
+    env = _environment(job.maze, job.action_repeat)
     rng = np.random.default_rng([job.seed, job.trajectory])
+    act = _controller(env, rng)
     frame, info = env.reset(seed=episode_seed(job.seed, job.trajectory))
     rows: list[tuple[Any, ...]] = [(frame, np.zeros(2, np.float32), 0.0, info["state"])]
     while len(rows) < job.rows:
-        action = act(info["state"], info["goal"]) + rng.normal(0, job.noise, 2)
-        action = np.clip(action, -1, 1).astype(np.float32)
+        action = _explore(act(info["state"], info["goal"]), env.maze_spec.style, rng)
         frame, reward, _, _, info = env.step(action)
         rows.append((frame, action, reward, info["state"]))
     frames, actions, rewards, states = zip(*rows, strict=True)
@@ -114,29 +115,51 @@ def _roll_out(job: _Job) -> Columns:
     }
 
 
-_ENVIRONMENTS: dict[tuple[str, int], Any] = {}
+def _explore(action: np.ndarray, style: Style, rng: np.random.Generator) -> np.ndarray:
+    """The action (2,) float32 that is executed in place of a controller's."""
+    if style.noise:
+        action = action + rng.normal(0, style.noise, 2)
+    if style.zero_share + style.random_share > 0:
+        kind = rng.random()
+        if kind < style.zero_share:
+            action = np.zeros(2)
+        elif kind < style.zero_share + style.random_share:
+            action = rng.uniform(-1, 1, 2)
+    return np.clip(action, -1, 1).astype(np.float32)
 
 
-def _environment(maze: str, action_repeat: int) -> tuple[Any, Callable[[np.ndarray, np.ndarray], np.ndarray]]:
-    """The process's environment and controller for these arguments: one GL context serves all its trajectories."""
-    from vd4rl_pomdp.envs.maze import MazeEnv
+def _controller(env: MazeEnv, rng: np.random.Generator) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """What drives: the action for a state and a goal."""
     from vd4rl_pomdp.navigation.first_person import FirstPersonController
-    from vd4rl_pomdp.navigation.planner import Planner
+    from vd4rl_pomdp.navigation.planner import Planner, WaypointPlanner
+
+    if env.maze_spec.first_person:
+        return FirstPersonController(env).act
+    return (WaypointPlanner(env, rng) if env.maze_spec.style.goals_are_cells else Planner(env)).act
+
+
+_ENVIRONMENTS: dict[tuple[str, int], MazeEnv] = {}
+
+
+def _environment(maze: str, action_repeat: int) -> MazeEnv:
+    """The process's environment for these arguments: one GL context serves all its trajectories."""
+    from vd4rl_pomdp.envs.maze import MazeEnv
 
     if (maze, action_repeat) not in _ENVIRONMENTS:
-        env = MazeEnv(maze, action_repeat)
-        controller = FirstPersonController(env) if env.maze_spec.first_person else Planner(env)
-        _ENVIRONMENTS[maze, action_repeat] = env, controller.act
+        _ENVIRONMENTS[maze, action_repeat] = MazeEnv(maze, action_repeat)
     return _ENVIRONMENTS[maze, action_repeat]
 
 
 def _attributes(config: MazeCollectConfig) -> dict[str, Any]:
+    style = get_maze(config.maze).style
     packages = ("mujoco", "gymnasium-robotics", "vd4rl-pomdp")
     return {
         "task": config.maze,
         "policy": "ppo" if get_maze(config.maze).first_person else "planner",
         "seed": config.seed,
         "action_repeat": config.action_repeat,
-        "noise": config.noise,
+        "noise": style.noise,
+        "zero_share": style.zero_share,
+        "random_share": style.random_share,
         "versions": {k: v for k, v in versions().items() if k in packages},
     }

@@ -11,7 +11,7 @@ class MazeCollectConfig:
     """Settings of `vd4rl-pomdp navigation collect`."""
 
     maze: str
-    """no_curtain, one_curtain, three_curtains or first_person."""
+    """no_curtain, one_curtain, three_curtains or first_person; compass_first_person; or one of the four after hard_."""
     out: Path
     """Folder of the set."""
     preset: str = "paper"
@@ -20,22 +20,20 @@ class MazeCollectConfig:
     """Trajectories in all; the last tenth is held out from training."""
     trajectory_rows: int = 1000
     """Rows of each trajectory."""
-    action_repeat: int = 1
-    """Simulator steps of 0.01 s for one action (D4RL's is 1)."""
-    noise: float = 0.5
-    """Standard deviation of the Gaussian noise on actions in [-1, 1]."""
+    action_repeat: int = 5
+    """Simulator steps of 0.01 s for one action."""
     seed: int = 0
-    """Seed of starts, goals and noise."""
+    """Seed of starts, goals and what is random about actions."""
     workers: int = 0
     """Processes that simulate and draw; 0 uses every core."""
     trajectories_per_shard: int = 5
     """Trajectories in a shard."""
 
 
-_CPU = MazeCollectConfig("", Path(), preset="cpu", trajectories=100, action_repeat=5)
+_CPU = MazeCollectConfig("", Path(), preset="cpu", trajectories=100)
 PRESETS = {
     "paper": MazeCollectConfig("", Path()),
     "cpu": _CPU,
     "smoke": replace(_CPU, preset="smoke", trajectories=10, trajectory_rows=120),
 }
-"""Defaults by preset: 500k rows as in the paper, 100k rows whose actions move the mass visibly, and 1,200 rows."""
+"""Defaults by preset: 500k rows as in the paper, 100k, and 1,200 rows."""

@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_no_folder, refuse_outside
-from vd4rl_pomdp.mazes import MOST_STEPS
+from vd4rl_pomdp.mazes import HARD, MOST_STEPS, MazeSpec, get_maze
 from vd4rl_pomdp.navigation.planner import Planner
 from vd4rl_pomdp.policies.actor import Actor, check_actor, read_actor
 from vd4rl_pomdp.runs.outputs import refuse_inside
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
     from vd4rl_pomdp.envs.maze import MazeEnv
 
-SHIPPED = Path(__file__).parent / "assets" / "first_person.safetensors"
+_ASSETS = Path(__file__).parent / "assets"
 FEATURES = 4
 _EPISODE = 200
 _LARGEST = 4.0
@@ -41,12 +41,19 @@ class FirstPersonConfig:
 
     out: Path
     """File of the actor."""
+    maze: str = "first_person"
+    """first_person, or hard_first_person."""
     decisions: int = 200_000
     """Environment decisions in all."""
     action_repeat: int = 5
     """Simulator steps of 0.01 s for one action."""
     seed: int = 0
     """Seed of the networks and the episodes."""
+
+
+def shipped_actor(maze: MazeSpec) -> Actor:
+    """What drives through a first-person maze: one actor for each kind of kinematics."""
+    return read_actor(_ASSETS / f"{'hard_' if maze.style is HARD else ''}first_person.safetensors")
 
 
 def features(state: np.ndarray, waypoint: np.ndarray) -> np.ndarray:
@@ -62,7 +69,7 @@ class FirstPersonController:
 
     def __init__(self, env: MazeEnv, actor: Actor | None = None) -> None:
         self._planner = Planner(env)
-        self._actor = actor or read_actor(SHIPPED)
+        self._actor = actor or shipped_actor(env.maze_spec)
 
     def act(self, state: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """Action (2,) for a (6,) state and a (2,) goal."""
@@ -72,10 +79,10 @@ class FirstPersonController:
 class FirstPersonEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     """The first-person maze as a task on states, for PPO."""
 
-    def __init__(self, action_repeat: int) -> None:
+    def __init__(self, maze: str, action_repeat: int) -> None:
         from vd4rl_pomdp.envs.maze import MazeEnv
 
-        self._env = MazeEnv("first_person", action_repeat, pixels=False)
+        self._env = MazeEnv(maze, action_repeat, pixels=False)
         self._planner = Planner(self._env)
         self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (FEATURES,), np.float32)
         self.action_space = gymnasium.spaces.Box(-_LARGEST, _LARGEST, (2,), np.float32)
@@ -114,6 +121,8 @@ def _refuse_other(path: Path) -> None:
 
 def train_first_person(config: FirstPersonConfig) -> Actor:
     """Train and write the actor; its card holds the number of goals that it reaches in 20 episodes."""
+    if not get_maze(config.maze).first_person:
+        raise UserError(f"--maze is {config.maze}, which a planner drives through; choose first_person")
     refuse_outside(config, decisions=1, action_repeat=(1, MOST_STEPS), seed=(0, MAX_SEED))
     refuse_no_folder(config.out.parent)
     refuse_inside(config.out)
@@ -135,7 +144,7 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
             progress.advance(_PARALLEL)
             return True
 
-    environments = DummyVecEnv([lambda: FirstPersonEnv(config.action_repeat) for _ in range(_PARALLEL)])
+    environments = DummyVecEnv([lambda: FirstPersonEnv(config.maze, config.action_repeat) for _ in range(_PARALLEL)])
     model = PPO(
         "MlpPolicy",
         environments,
@@ -147,19 +156,19 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
         device="cpu",
         policy_kwargs={"net_arch": [64, 64], "activation_fn": nn.ReLU},
     )
-    with ProgressLine("PPO first_person", config.decisions, "decisions") as progress:
+    with ProgressLine(f"PPO {config.maze}", config.decisions, "decisions") as progress:
         model.learn(config.decisions, callback=Report())
     actor = _export(model, config)
-    actor.card["goals_in_20_episodes"] = goals_reached(actor, config.action_repeat, 20)
+    actor.card["goals_in_20_episodes"] = goals_reached(actor, config.maze, config.action_repeat, 20)
     actor.save(config.out)
     return actor
 
 
-def goals_reached(actor: Actor, action_repeat: int, episodes: int) -> int:
+def goals_reached(actor: Actor, maze: str, action_repeat: int, episodes: int) -> int:
     """Goals that the mean action reaches in episodes of 200 decisions from fixed seeds."""
     from vd4rl_pomdp.envs.maze import MazeEnv
 
-    env = MazeEnv("first_person", action_repeat, pixels=False)
+    env = MazeEnv(maze, action_repeat, pixels=False)
     controller, reached = FirstPersonController(env, actor), 0
     for episode in range(episodes):
         _, info = env.reset(seed=10_000 + episode)
@@ -179,7 +188,7 @@ def _export(model: PPO, config: FirstPersonConfig) -> Actor:
     log_std = policy.log_std.detach().numpy().copy()
     arrays |= {"log_std.weight": np.zeros((layers[-1].out_features, len(log_std)), np.float32), "log_std.bias": log_std}
     card = {
-        "task": "first_person",
+        "task": config.maze,
         "algorithm": "PPO",
         "decisions": config.decisions,
         "action_repeat": config.action_repeat,

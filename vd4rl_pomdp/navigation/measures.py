@@ -5,12 +5,16 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any, NamedTuple
 
+RAW_PREFIX = "raw_"
+"""Before an error's name: it is in the simulator's units x 100, which the paper's numbers seem to be."""
+
 
 class Measure(NamedTuple):
     """Which number of a run this is; its fields are the columns that name a value in results.json and rows.csv."""
 
     measure: str
-    """state_error, position_error or velocity_error (%), or action_loss (nats x 100)."""
+    """state_error, position_error or velocity_error (% of a standard deviation), the same after RAW_PREFIX, or
+    action_loss (nats x 100)."""
     split: str
     """Trajectories: training or held_out."""
     probe: str
@@ -20,14 +24,34 @@ class Measure(NamedTuple):
     k: int = 0
     """Pairs (t, t+k) that an action loss is over; 0 is the mean over all k, and stands in every error."""
 
+    @property
+    def paper(self) -> str:
+        """What the paper has in its tables under this name: state, position, velocity or action_loss; "" for none."""
+        if self.k or self.rows != "all":
+            return ""
+        if self.measure == "action_loss":
+            return self.measure
+        return self.measure.removeprefix(RAW_PREFIX).removesuffix("_error") if self.is_raw else ""
+
+    @property
+    def is_raw(self) -> bool:
+        """Whether it is an error in the simulator's units."""
+        return self.measure.startswith(RAW_PREFIX)
+
+    def raw(self) -> Measure:
+        """The same error in the simulator's units x 100; an action loss is itself."""
+        if self.is_raw or self.measure == "action_loss":
+            return self
+        return self._replace(measure=f"{RAW_PREFIX}{self.measure}")
+
 
 def refitted_error(component: str, rows: str = "all") -> Measure:
-    """Error of a component (state, position or velocity) on held-out trajectories, by the refitted probe."""
+    """Error (%) of a component (state, position or velocity) on held-out trajectories, by the refitted probe."""
     return Measure(f"{component}_error", "held_out", "refit", rows)
 
 
 def online_error(component: str) -> Measure:
-    """Error of a component as the paper has it: training averages of the probe that is trained beside the model."""
+    """Error (%) of a component by the paper's protocol: training averages of the probe beside the model."""
     return Measure(f"{component}_error", "training", "online")
 
 

@@ -2,8 +2,9 @@
 
 OBJECTIVES = ("no_history", "ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
 UNTRAINED = "random"
-SUPERVISED = ("supervised", "supervised+a")
+WITH_MEMORY = ("supervised", "supervised+a")
+SUPERVISED = ("supervised_picture", *WITH_MEMORY)
 REFERENCES = (UNTRAINED, *SUPERVISED)
-"""What a table is read against: mik+a's network untrained; ah's and ah+a's trained on the true states themselves."""
+"""What a table is read against: mik+a's network untrained; no_history's, ah's and ah+a's trained on the true states."""
 METHOD_NAMES = (*OBJECTIVES, *REFERENCES)
 """The paper's objectives, the floor and the ceilings."""

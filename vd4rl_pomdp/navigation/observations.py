@@ -13,8 +13,9 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.mazes import MAZES, PICTURE_SIZE, MazeSpec
 from vd4rl_pomdp.navigation.exogenous import ExogenousNoise
 
-Picture = Literal["rgb100", "grey50"]
-SHAPES: dict[Picture, tuple[int, int]] = {"rgb100": (3, PICTURE_SIZE), "grey50": (1, PICTURE_SIZE // 2)}
+Picture = Literal["rgb100", "rgb50", "grey50"]
+_HALF = PICTURE_SIZE // 2
+SHAPES: dict[Picture, tuple[int, int]] = {"rgb100": (3, PICTURE_SIZE), "rgb50": (3, _HALF), "grey50": (1, _HALF)}
 """Channels and size of an observation."""
 _LUMA = (0.299, 0.587, 0.114)
 _BLOCK = 1000
@@ -44,10 +45,19 @@ def open_maze_set(path: Path, cache: Path | None = None) -> tuple[Dataset, MazeS
 
 def to_grey50(pictures: Tensor) -> Tensor:
     """Area averages of the luminance: (N, 3, 100, 100) uint8 -> (N, 1, 50, 50) uint8."""
-    corners = [pictures[..., row::2, column::2].short() for row in (0, 1) for column in (0, 1)]
-    sums = corners[0] + corners[1] + corners[2] + corners[3]
     weights = torch.tensor(_LUMA, device=pictures.device) / 4
-    return torch.einsum("nchw,c->nhw", sums.float(), weights).round_().to(torch.uint8)[:, None]
+    return torch.einsum("nchw,c->nhw", _sums(pictures).float(), weights).round_().to(torch.uint8)[:, None]
+
+
+def to_rgb50(pictures: Tensor) -> Tensor:
+    """Area averages: (N, 3, 100, 100) uint8 -> (N, 3, 50, 50) uint8."""
+    return ((_sums(pictures) + 2) // 4).to(torch.uint8)
+
+
+def _sums(pictures: Tensor) -> Tensor:
+    """Sums over 2x2 pixels, int16."""
+    corners = [pictures[..., row::2, column::2].short() for row in (0, 1) for column in (0, 1)]
+    return corners[0] + corners[1] + corners[2] + corners[3]
 
 
 class MazeView(View):
@@ -65,11 +75,12 @@ class MazeView(View):
         noisy = self._noise(pictures.flatten(0, -4), self.dataset.keys(rows).flatten())
         return noisy.view(pictures.shape)
 
-    def shrunk(self) -> View:
-        """The same at 50x50 in grey, drawn once for all: training then never touches the large pictures."""
-        channels, size = SHAPES["grey50"]
+    def shrunk(self, picture: Picture) -> View:
+        """The same at 50x50, drawn once for all: training then never touches the large pictures."""
+        channels, size = SHAPES[picture]
+        shrink = to_grey50 if channels == 1 else to_rgb50
         small = torch.empty(self.dataset.num_rows, channels, size, size, dtype=torch.uint8)
         for rows in torch.arange(self.dataset.num_rows).split(_BLOCK):
-            small[rows] = to_grey50(self.observe(rows))
+            small[rows] = shrink(self.observe(rows))
         self.dataset.frames = small
         return View(self.dataset, frame_stack=1)

@@ -15,15 +15,15 @@ from vd4rl_pomdp.experiments.navigation.grid import Condition, condition_of, pap
 from vd4rl_pomdp.experiments.navigation.report import write_report
 from vd4rl_pomdp.experiments.navigation.runs import load_runs
 from vd4rl_pomdp.mazes import FREE_CELLS, MAZES
-from vd4rl_pomdp.navigation.measures import Measure, refitted_error
+from vd4rl_pomdp.navigation.measures import RAW_PREFIX, Measure, refitted_error
 from vd4rl_pomdp.navigation.methods import OBJECTIVES
 
 ROOT = Path(__file__).parents[3]
 STATE = refitted_error("state")
 
 
-def write_run(base: Path, condition: Condition, seed: int, level: float) -> Path:
-    """A finished run whose every error is `level` and whose losses grow with k."""
+def write_run(base: Path, condition: Condition, seed: int, level: float, raw: bool = True) -> Path:
+    """A finished run whose every error is `level`, in raw units 1.5 times that, and whose losses grow with k."""
     folder = base / condition.name / f"seed{seed}"
     folder.mkdir(parents=True)
     config = {
@@ -39,7 +39,9 @@ def write_run(base: Path, condition: Condition, seed: int, level: float) -> Path
     record = {"stage": "navigation", "config": config, "git_commit": "abc", "command": command}
     common = {"rows": "all", "k": 0, "value": level}
     rows = [
-        common | {"measure": f"{name}_error", "split": split, "probe": probe, "rows": shown}
+        common
+        | {"measure": f"{unit}{name}_error", "split": split, "probe": probe, "rows": shown, "value": level * times}
+        for unit, times in (("", 1), (RAW_PREFIX, 1.5))[: 1 + raw]
         for name in ("state", "position", "velocity")
         for split, probe in (("held_out", "refit"), ("training", "online"))
         for shown in ("all", "hidden")
@@ -76,11 +78,16 @@ def test_every_line_of_the_papers_tables_is_a_condition_with_its_own_number():
     for line in paper_rows():
         component = line["component"]
         name = component if component == "action_loss" else f"{component}_error"
-        for maze in MAZES:
-            assert paper_number(condition_of(line, maze), Measure(name, "training", "online")) == float(line[maze])
-    assert paper_number(Condition("no_curtain", "mik+a"), STATE) == 3.4
-    assert paper_number(Condition("no_curtain", "mik+a", literal_future=True), STATE) is None
-    assert paper_number(Condition("no_curtain", "random"), STATE) is None
+        for maze, spec in MAZES.items():
+            measure = Measure(name, "training", "online")
+            assert paper_number(condition_of(line, maze), measure.raw()) == float(line[spec.paper])
+            assert measure == measure.raw() or paper_number(condition_of(line, maze), measure) is None
+    assert paper_number(Condition("no_curtain", "mik+a"), STATE.raw()) == 3.4
+    assert paper_number(Condition("hard_no_curtain", "mik+a"), STATE.raw()) == 3.4
+    assert paper_number(Condition("no_curtain", "mik+a"), STATE) is None, "it is no share of a standard deviation"
+    assert paper_number(Condition("no_curtain", "mik+a"), refitted_error("state", "hidden").raw()) is None
+    assert paper_number(Condition("no_curtain", "mik+a", literal_future=True), STATE.raw()) is None
+    assert paper_number(Condition("no_curtain", "random"), STATE.raw()) is None
 
 
 def test_the_page_says_what_training_on_the_true_states_reaches(runs, tmp_path):
@@ -99,16 +106,19 @@ def verdicts_of(runs: Path) -> str:
 def test_the_report_shows_means_seeds_and_the_papers_numbers(runs, tmp_path):
     page = write_report([runs], tmp_path / "out").read_text()
     numbers = {
-        (row["table"], row["view"][:8], row["row"], row["maze"]): row
+        (row["table"], row["view"][:8], "raw" in row["view"], row["row"], row["maze"]): row
         for row in csv.DictReader((tmp_path / "out" / "tables.csv").open())
     }
-    best = numbers["state_error", "held-out", "MIK+A, K=15", "three_curtains"]
-    assert (best["mean"], best["seeds"], best["paper"]) == ("21", "3", "6.0")
+    best = numbers["state_error", "held-out", False, "MIK+A, K=15", "three_curtains"]
+    assert (best["mean"], best["seeds"], best["paper"]) == ("21", "3", "")
     assert float(best["low"]) < 21 < float(best["high"])
-    assert "**21.0** [20.0, 22.0] n=3 (6.0)" in page
+    raw = numbers["state_error", "held-out", True, "MIK+A, K=15", "three_curtains"]
+    assert (raw["mean"], raw["seeds"], raw["paper"]) == ("31.5", "3", "6.0")
+    assert "| **21.0** [20.0, 22.0] n=3 |" in page
+    assert "**31.5** [30.0, 33.0] n=3 (6.0)" in page
     assert "(-)" not in page
     assert page.count("--seed 1  # ") == 10, "one command for every run of seed 1"
-    for name in ("accuracy.png", "trajectories.png"):
+    for name in ("accuracy.png", "accuracy_raw.png", "trajectories.png"):
         assert (tmp_path / "out" / "figures" / name).stat().st_size > 5_000
 
 
@@ -185,7 +195,7 @@ def test_missing_cells_seeds_and_unfinished_runs_are_shown(runs, tmp_path, monke
     (runs / "three_curtains" / "mik-K15" / "seed1" / "config.json").write_text(json.dumps(config))
     page = write_report([runs], tmp_path / "out").read_text()
     assert f"`{runs}/three_curtains/mik-K15/seed1` at 40 of 2500 steps." in page
-    line = next(line for line in page.splitlines() if line.startswith("| MIK, K=15 |"))
+    line = next(line for line in page.splitlines() if line.startswith("| MIK, K=15 |") and "(13.1)" in line)
     assert "n=2 of 3 (13.1)" in line
     assert line.startswith("| MIK, K=15 | no run (6.6) | (12.3) |"), "nobody has been in the other mazes"
     rows = list(csv.DictReader((tmp_path / "out" / "tables.csv").open()))
@@ -194,7 +204,8 @@ def test_missing_cells_seeds_and_unfinished_runs_are_shown(runs, tmp_path, monke
     marked = []
     monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda axes, *at, **style: marked.append(style.get("marker")))
     figures.accuracy_bars(load_runs([runs]), STATE, tmp_path / "bars.png")
-    assert marked.count("x") == 9, "in no_curtain: six objectives and random at K = 15, two at K = 1"
+    in_the_paper, ran = 19, 9
+    assert marked.count("x") == (in_the_paper - ran) + (in_the_paper - 1) + 1, "three_curtains, no_curtain, its random"
 
 
 def test_a_navigation_report_writes_over_nothing_but_an_earlier_one(runs, tmp_path):
@@ -229,8 +240,10 @@ def test_claims_are_judged_by_means_and_seed_by_seed(runs):
     found = load_runs([runs])
     verdicts = {claim.text: judge(claim, found) for claim in claims("three_curtains")}
     k1 = verdicts["K=1: ah+a's state error, of mik+a's"]
-    assert (k1.seeds_holding, k1.seeds, k1.holds, k1.paper) == (2, 3, True, (46.8, 8.0))
+    assert (k1.seeds_holding, k1.seeds, k1.holds, k1.paper) == (2, 3, True, None)
     assert k1.left == pytest.approx(44)
+    raw = judge(k1.claim.raw(), found)
+    assert (raw.left, raw.paper) == (pytest.approx(66), (46.8, 8.0))
     gate = verdicts["gate: mik+a's action loss at k=1, of that at k=15"]
     assert gate.holds == ((21 + 1) <= 0.85 * (21 + 15))
     assert gate.paper is None
@@ -243,17 +256,56 @@ def test_the_page_says_which_statements_hold_and_what_the_paper_has(runs, tmp_pa
     page = write_report([runs], tmp_path / "out").read_text()
     rows = {line.split(" | ")[1]: line for line in page.splitlines() if line.startswith("| three_curtains | ")}
     assert rows["no_history's velocity error, of mik+a's >= 3 x"].endswith(
-        "| 81.0 / 21.0 | **yes** | 3 of 3 | 91.9 / 5.7: yes |"
+        "| 81.0 / 21.0 | **yes** | 3 of 3 | 121.5 / 31.5 | **yes** | 91.9 / 5.7: yes |"
     )
-    assert rows["ah+a's position error, of the untrained one's < 0.5 x"].endswith("| **no** | 0 of 3 | none |")
+    assert rows["ah+a's position error, of the untrained one's < 0.5 x"].endswith("| **no** | none |")
+    assert rows["K=1: ah+a's action loss is near zero <= 5"].endswith("| no error | - | none |")
     assert rows["K=1: mik+a's state error with the literal future, of the default's >= 2 x"].endswith(
-        "| no run yet | - | - | none |"
+        "| no run yet | - | - | - | - | none |"
     )
-    answers = page.count("| **yes** |"), page.count("| **no** |"), page.count("| no run yet |")
-    assert f"{answers[0]} of {answers[0] + answers[1]} hold, {answers[2]} wait for runs." in page
+    answers = [sum(f"| **{word}** |" in row for row in rows.values()) for word in ("yes", "no")]
+    waiting = page.count("| no run yet |")
+    assert f"{answers[0]} of {sum(answers)} hold, {waiting} wait for runs." in page
+    assert f"Of {sum(answers) - 2} that are judged in both units, none changes." in page
     assert "Budget: 2,500 gradient steps on 100,000 samples, 5 to 5 minutes a run (some, no GPU)." in page
     headings = [line for line in page.splitlines() if line.startswith("## ")]
     assert len(headings) == len(set(headings))
+
+
+def test_what_raw_units_change_is_said(runs, tmp_path):
+    """In raw units no_history's errors shrink to a tenth: the statement about its velocity holds no more."""
+    for seed in range(3):
+        results = runs / "three_curtains" / "no_history-K15" / f"seed{seed}" / "results.json"
+        stored = json.loads(results.read_text())
+        for row in stored["rows"]:
+            row["value"] *= 0.1 if row["measure"].startswith(RAW_PREFIX) else 1
+        results.write_text(json.dumps(stored))
+    page = write_report([runs], tmp_path / "out").read_text()
+    assert "1 change (three_curtains: no_history's velocity error, of mik+a's)." in page
+
+
+def test_runs_without_raw_numbers_say_so_and_stand_beside_no_number_of_the_paper(tmp_path):
+    for method in ("mik+a", "no_history"):
+        write_run(tmp_path / "runs", Condition("hard_three_curtains", method), 0, 9.0, raw=False)
+    page = write_report([tmp_path / "runs"], tmp_path / "out").read_text()
+    assert "What holds in raw units is not known: the runs kept neither raw numbers nor deviations." in page
+    assert "raw units x 100, beside the paper*: no run yet." in page
+    assert "`hard_` mazes are variants of the paper's" in page
+    assert not (tmp_path / "out" / "figures" / "accuracy_raw.png").exists()
+    assert "--maze hard_three_curtains --out data/hard_three_curtains" in page
+    for line in page.splitlines():
+        assert not (line.startswith("| MIK+A") and "(6.0)" in line)
+
+
+def test_the_papers_marks_stand_beside_raw_units_alone(runs, tmp_path, monkeypatch):
+    def marks(measure: Measure) -> int:
+        drawn = []
+        monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda axes, *at, **style: drawn.append(style.get("marker")))
+        figures.accuracy_bars(load_runs([runs]), measure, tmp_path / "bars.png")
+        return drawn.count("_")
+
+    assert marks(STATE) == 0
+    assert marks(STATE.raw()) == 19, "the paper has seven objectives, five at K = 1 too, seven with self-prediction"
 
 
 def test_the_bar_plot_has_the_papers_variants(runs, tmp_path, monkeypatch):

@@ -52,7 +52,7 @@ def test_every_objective_of_the_paper_trains_and_is_measured(maze_set, tmp_path,
     encoder, card = load_encoder(tmp_path / "run" / "encoder")
     assert (card.method, card.task) == (method, "three_curtains")
     assert (encoder.config.channels, encoder.config.size) == (1, 50)
-    assert encoder.config.history == ("none" if method == "no_history" else "gru")
+    assert encoder.config.history == ("none" if method in ("no_history", "supervised_picture") else "gru")
     lines = (tmp_path / "run" / "trajectory.csv").read_text().splitlines()
     assert len(lines) == 41
 
@@ -122,6 +122,19 @@ def test_a_supervised_reference_learns_from_the_states_alone(maze_set, tmp_path)
     assert not trainer_of(smoke(maze_set, tmp_path / "run", method="supervised")).objective.encoder.config.use_actions
 
 
+def test_a_single_picture_is_told_apart_from_memory(maze_set, tmp_path):
+    """The estimate of a row depends on its own picture alone, or on those before it, too."""
+    for method, remembers in (("supervised_picture", False), ("supervised", True)):
+        trainer = trainer_of(smoke(maze_set, tmp_path / "run", method=method))
+        window = trainer.batch()
+        before = trainer.losses(window)[2][0]
+        window.obs[:, 2] = 255 - window.obs[:, 2]
+        changed = (trainer.losses(window)[2][0] != before).any(-1).any(0)
+        assert changed[2]
+        assert not changed[:2].any()
+        assert changed[3:].any() == remembers
+
+
 def test_frames_of_a_window_are_encoded_once(maze_set, tmp_path):
     trainer = trainer_of(smoke(maze_set, tmp_path / "run"))
     calls = []
@@ -169,6 +182,18 @@ def test_errors_leave_out_the_burn_in_and_count_hidden_rows_apart():
     assert "position_hidden" not in sums.percent()
 
 
+def test_raw_errors_are_in_the_simulators_units():
+    errors = ErrorSums()
+    estimate = torch.tensor([0.1, 0.3, 0.2, 0.6]).expand(1, 3, 4)
+    errors.add(estimate, torch.zeros(1, 3, 4), torch.tensor([[False, True, True]]), burn_in=1)
+    found = errors.both(torch.tensor([2.0, 1.0, 3.0, 0.5]))
+    expected = {"position": (20, 25), "velocity": (40, 45), "state": (30, 35)}
+    for name, (percent, raw) in expected.items():
+        for suffix in ("", "_hidden"):
+            assert found[f"{name}{suffix}"] == pytest.approx(percent)
+            assert found[f"raw_{name}{suffix}"] == pytest.approx(raw)
+
+
 def test_a_refitted_probe_reads_what_is_there_and_nothing_else():
     generator = torch.Generator().manual_seed(0)
     features = torch.randn(4000, 6, generator=generator)
@@ -195,12 +220,12 @@ def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
     from vd4rl_pomdp.navigation.exogenous import ExogenousNoise
 
     noise = ExogenousNoise("photographs", 0.5, 0)
-    for picture, size in (("grey50", 50), ("rgb100", 100)):
+    for picture, shape in (("grey50", (1, 50, 50)), ("rgb50", (3, 50, 50)), ("rgb100", (3, 100, 100))):
         config = smoke(maze_set, tmp_path / "run", picture=picture, frame_encoder="nature")
         clean, noisy = (MazeData(*open_maze_set(maze_set), config, n).on(torch.device("cpu")) for n in (None, noise))
         number = torch.tensor([0, 40])
         first, second = clean.windows(number), noisy.windows(number)
-        assert first.obs.shape[-2:] == (size, size)
+        assert first.obs.shape[-3:] == shape
         assert (second.obs.float() - first.obs.float()).abs().mean() > 5
         torch.testing.assert_close(second.obs, noisy.windows(number).obs)
 

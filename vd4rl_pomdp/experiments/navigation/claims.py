@@ -4,13 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-from vd4rl_pomdp.experiments.navigation.grid import Condition, paper_rows
+from vd4rl_pomdp.experiments.navigation.grid import Condition, condition_of, paper_rows
 from vd4rl_pomdp.experiments.navigation.runs import NavigationRun
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.navigation.measures import Measure, held_out_loss, online_error, refitted_error
-from vd4rl_pomdp.navigation.methods import SUPERVISED, UNTRAINED
+from vd4rl_pomdp.navigation.methods import UNTRAINED, WITH_MEMORY
 
 RECURRENT = ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
 NEAR_ZERO = 5.0
@@ -27,6 +27,12 @@ class Claim:
     relation: str
     factor: float
     right: tuple[Condition, Measure] | None = None
+
+    def raw(self) -> Claim:
+        """The same statement about errors in the simulator's units."""
+        left, right = ((side[0], side[1].raw()) if side else None for side in (self.left, self.right))
+        assert left is not None
+        return replace(self, left=left, right=right)
 
     def holds(self, left: float, right: float) -> bool:
         """Whether two numbers are in the relation."""
@@ -45,7 +51,7 @@ class Verdict:
     """Seeds for which both numbers exist."""
     seeds_holding: int
     paper: tuple[float, float] | None
-    """The paper's own two numbers; None where it has none."""
+    """The paper's own two numbers, where it has them and the claim is in its units."""
 
     @property
     def holds(self) -> bool:
@@ -81,7 +87,7 @@ def claims(maze: str) -> list[Claim]:
         ),
         Claim("ah+a's position error, of mik+a's", (recorder, position), ">=", 1.5, (best, position)),
     ]
-    if maze == "three_curtains":
+    if MAZES[maze].paper == "three_curtains":
         found += [
             Claim("mik's velocity error, of mik+a's", (Condition(maze, "mik"), velocity), ">=", 1.5, (best, velocity)),
             Claim("ah's state error, of mik+a's", (Condition(maze, "ah"), state), ">", 1, (best, state)),
@@ -122,37 +128,30 @@ def _paper_numbers(claim: Claim) -> tuple[float, float] | None:
 
 
 def paper_number(condition: Condition, measure: Measure) -> float | None:
-    """The paper's number for a condition and a measure, where it has one."""
-    if condition.literal_future or measure.k != 0 or measure.rows != "all":
-        return None
-    component = measure.measure.removesuffix("_error")
+    """The paper's number for a condition, whatever the variant of its maze, and a measure in its units."""
+    maze = MAZES[condition.maze].paper
     for row in paper_rows():
-        name = row["objective"].lower().replace(" ", "_"), int(row["k_max"]), row["component"]
-        options = row["self_prediction"] == "Y", row["exogenous"] == "Y"
-        if name == (condition.method, condition.max_k, component) and options == (
-            condition.self_prediction,
-            condition.exogenous,
-        ):
-            return float(row[condition.maze])
+        if row["component"] == measure.paper and condition_of(row, maze) == replace(condition, maze=maze):
+            return float(row[maze])
     return None
 
 
 def verdict_lines(runs: Sequence[NavigationRun]) -> list[str]:
     """A section of a page: all statements about the mazes of some runs, whether they hold, and the paper's numbers."""
     mazes = [maze for maze in MAZES if any(run.condition.maze == maze for run in runs)]
-    verdicts = [(maze, judge(claim, runs)) for maze in mazes for claim in claims(maze)]
-    position = online_error("position")
-    judged = [verdict for _, verdict in verdicts if verdict.seeds]
-    lines = ["## Which statements hold", ""]
-    recorder = ", ".join(f"{paper_number(Condition(maze, 'ah+a'), position):.1f} ({maze})" for maze in mazes)
+    pairs = [(maze, judge(claim, runs), judge(claim.raw(), runs)) for maze in mazes for claim in claims(maze)]
+    judged = [percent for _, percent, _ in pairs if percent.seeds]
+    recorder = ", ".join(f"{_paper_position(maze):.1f} ({maze})" for maze in mazes)
     return [
-        *lines,
-        f"{sum(v.holds for v in judged)} of {len(judged)} hold, {len(verdicts) - len(judged)} wait for runs.",
+        "## Which statements hold",
+        "",
+        f"{sum(v.holds for v in judged)} of {len(judged)} hold, {len(pairs) - len(judged)} wait for runs. "
+        f"{_units_line(pairs)}",
         "Means over seeds, held-out trajectories, probe refitted on frozen states; `seeds` says how many hold alone.",
         "",
-        "| maze | statement | here | holds | seeds | the paper's numbers |",
-        "|---|---|---|---|---|---|",
-        *(_verdict_row(maze, verdict) for maze, verdict in verdicts),
+        "| maze | statement | here, % of std | holds | seeds | here, raw x 100 | holds | the paper's numbers |",
+        "|---|---|---|---|---|---|---|---|",
+        *(_verdict_row(*pair) for pair in pairs),
         "",
         "That ah+a beats the untrained encoder is not to be expected: it tells an action from its record of past ones",
         f"and need not keep the state. In the paper its position error is {recorder}.",
@@ -161,11 +160,31 @@ def verdict_lines(runs: Sequence[NavigationRun]) -> list[str]:
     ]
 
 
+def _paper_position(maze: str) -> float:
+    found = paper_number(Condition(maze, "ah+a"), online_error("position").raw())
+    assert found is not None
+    return found
+
+
+def _units_line(pairs: Sequence[tuple[str, Verdict, Verdict]]) -> str:
+    """What the raw units change: a sentence."""
+    both = [pair for pair in pairs if pair[1].seeds and pair[2].seeds and pair[2].claim != pair[1].claim]
+    missing = sum(bool(percent.seeds and not raw.seeds) for _, percent, raw in pairs)
+    unknown = f" For {missing} it is not known: their runs kept no raw numbers." if missing else ""
+    if not both:
+        return (
+            "What holds in raw units is not known: the runs kept neither raw numbers nor deviations." if missing else ""
+        )
+    other = [f"{maze}: {percent.claim.text}" for maze, percent, raw in both if percent.holds != raw.holds]
+    changes = f"{len(other)} change ({'; '.join(other)})" if other else "none changes"
+    return f"Of {len(both)} that are judged in both units, {changes}.{unknown}"
+
+
 def _ceiling_lines(mazes: Sequence[str], runs: Sequence[NavigationRun]) -> list[str]:
     """What the same networks reach when they are trained on the true states, without and with past actions."""
     position = refitted_error("position")
     sides = [
-        (maze, [_by_seed((Condition(maze, method), position), runs).values() for method in SUPERVISED])
+        (maze, [_by_seed((Condition(maze, method), position), runs).values() for method in WITH_MEMORY])
         for maze in mazes
     ]
     reached = [
@@ -180,21 +199,24 @@ def _ceiling_lines(mazes: Sequence[str], runs: Sequence[NavigationRun]) -> list[
     ]
 
 
-def _verdict_row(maze: str, verdict: Verdict) -> str:
-    claim = verdict.claim
+def _verdict_row(maze: str, percent: Verdict, raw: Verdict) -> str:
+    claim = percent.claim
     bound = f"{claim.relation} {claim.factor:g}" + (" x" if claim.right else "")
-    columns = [maze, f"{claim.text} {bound}", "no run yet", "-", "-"]
-    if verdict.seeds:
-        answer = "**yes**" if verdict.holds else "**no**"
-        columns[2:] = [
-            _sides(claim, verdict.left, verdict.right),
-            answer,
-            f"{verdict.seeds_holding} of {verdict.seeds}",
-        ]
+    columns = [maze, f"{claim.text} {bound}", "no run yet", "-", "-", "-", "-"]
+    if percent.seeds:
+        columns[2:5] = [*_answer(percent), f"{percent.seeds_holding} of {percent.seeds}"]
+    if raw.claim == claim:
+        columns[5:] = ["no error", "-"]
+    elif raw.seeds:
+        columns[5:] = _answer(raw)
     paper = "none"
-    if verdict.paper:
-        paper = f"{_sides(claim, *verdict.paper)}: {'yes' if claim.holds(*verdict.paper) else 'no'}"
+    if raw.paper:
+        paper = f"{_sides(claim, *raw.paper)}: {'yes' if claim.holds(*raw.paper) else 'no'}"
     return f"| {' | '.join([*columns, paper])} |"
+
+
+def _answer(verdict: Verdict) -> list[str]:
+    return [_sides(verdict.claim, verdict.left, verdict.right), "**yes**" if verdict.holds else "**no**"]
 
 
 def _sides(claim: Claim, left: float, right: float) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import csv
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -13,10 +12,10 @@ from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
 
 from vd4rl_pomdp.experiments.navigation.claims import paper_number
-from vd4rl_pomdp.experiments.navigation.grid import Condition
-from vd4rl_pomdp.experiments.navigation.runs import NavigationRun, is_missing
+from vd4rl_pomdp.experiments.navigation.grid import Condition, condition_of, paper_rows
+from vd4rl_pomdp.experiments.navigation.runs import NavigationRun, is_missing, read_trajectory
 from vd4rl_pomdp.mazes import FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
-from vd4rl_pomdp.navigation.measures import Measure, online_error
+from vd4rl_pomdp.navigation.measures import Measure
 from vd4rl_pomdp.navigation.methods import OBJECTIVES, REFERENCES
 
 _ESTIMATE = "#d55e00"
@@ -33,7 +32,10 @@ _NO_RUN: dict[str, Any] = {"color": "#999999", "linestyle": "", "marker": "x", "
 
 
 def accuracy_bars(runs: list[NavigationRun], measure: Measure, path: Path) -> None:
-    """State prediction accuracy, 100 - error, of every objective and maze beside the paper's, as in its bar plot."""
+    """State prediction accuracy, 100 - error, of every objective and maze, as in the paper's bar plot.
+
+    The paper's marks stand beside raw units alone. What the paper or another maze has and a maze lacks is crossed.
+    """
     mazes = [maze for maze in MAZES if any(run.condition.maze == maze for run in runs)]
     columns = min(2, len(mazes))
     rows = -(-len(mazes) // columns)
@@ -52,10 +54,11 @@ def accuracy_bars(runs: list[NavigationRun], measure: Measure, path: Path) -> No
         axes.set_xlim(-0.6, len(methods) - 0.4)
         axes.set_ylim(0, 100)
     for axes in panels[:, 0]:
-        axes.set_ylabel("100 - state error (%)")
+        axes.set_ylabel(f"100 - state error ({'raw x 100' if measure.is_raw else '% of std'})")
     handles: list[Any] = [Rectangle((0, 0), 1, 1, color=colour) for *_, colour in _VARIANTS.values()]
-    handles += [Line2D([], [], **style) for style in (_SEED, _MARK, _NO_RUN)]
-    names = [*_VARIANTS, "a seed", "the paper", "no run"]
+    marks = {"a seed": _SEED, **({"the paper": _MARK} if measure.is_raw else {}), "no run": _NO_RUN}
+    handles += [Line2D([], [], **style) for style in marks.values()]
+    names = [*_VARIANTS, *marks]
     figure.legend(handles, names, loc="outside upper center", ncols=3 if columns == 1 else 6, frameon=False)
     figure.savefig(path, dpi=130, metadata={"Software": None})
 
@@ -67,11 +70,16 @@ def _bar(
     if accuracy:
         axes.bar(place, np.mean(accuracy), _WIDTH, color=colour)
         axes.plot([place] * len(accuracy), accuracy, **_SEED)
-    elif is_missing(condition, runs):
+    elif is_missing(condition, runs) or _in_the_paper(condition):
         axes.plot(place, 2, **_NO_RUN)
-    paper = paper_number(condition, online_error("state"))
+    paper = paper_number(condition, measure)
     if paper is not None:
         axes.plot(place, 100 - paper, **_MARK)
+
+
+def _in_the_paper(condition: Condition) -> bool:
+    """Whether the paper's tables have it."""
+    return condition in {condition_of(row, condition.maze) for row in paper_rows()}
 
 
 def trajectories(
@@ -104,12 +112,10 @@ def _first(runs: list[NavigationRun], condition: Condition) -> NavigationRun | N
 
 def _draw_trajectory(axes: Any, run: NavigationRun, rows: int = 100) -> None:
     assert run.trajectory is not None
-    with run.trajectory.open(newline="", encoding="utf-8") as file:
-        table = list(csv.DictReader(file))[:rows]
+    table = read_trajectory(run.trajectory)
     draw_maze(axes, MAZES[run.condition.maze])
     for names, colour, label in ((("x", "y"), "black", "true"), (("estimated_x", "estimated_y"), _ESTIMATE, "probe")):
-        points = np.array([[float(row[name]) for name in names] for row in table])
-        axes.plot(*points.T, color=colour, lw=1, marker=".", markersize=2.5, label=label)
+        axes.plot(*(table[name][:rows] for name in names), color=colour, lw=1, marker=".", markersize=2.5, label=label)
     axes.set_title(f"{run.condition.maze}: {run.condition.method}", fontsize=9)
     axes.legend(fontsize=7, loc="center left", framealpha=0.9)
 

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.grid import Condition
 from vd4rl_pomdp.navigation.measures import Measure, measure_of, measure_rows
@@ -62,6 +64,15 @@ class NavigationRun:
     def file_name(self) -> str:
         """Name of its trajectory beside the CSV files."""
         return f"{self.condition.name.replace('/', '-')}-seed{self.seed}.csv"
+
+
+def read_trajectory(path: Path) -> dict[str, np.ndarray]:
+    """Columns of a run's trajectory.csv by name, each (T,) float64; raises UserError for a file that is none."""
+    try:
+        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"), newline="")))
+        return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+    except (OSError, IndexError, KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{path}: is no trajectory of a run ({error}); train the run again") from error
 
 
 def flags_of(command: str) -> dict[str, str]:
