@@ -13,7 +13,8 @@ Differences and readings:
   literal reading, to measure what it does.
 - An episode's last row has no action: b reads zeros and a flag there.
 - The future reaches to the window's end, or n rows beyond t+k (the paper's n is not stated for these experiments);
-  the past to the window's start, or m rows before t.
+  the past to the window's start, or m rows before t. Each of the future's n+1 rows has the action that follows it, so
+  that the last is a_{t+k+n}, chosen in a row that is seen; the paper's n+1 rows begin with the masked a_{t+k-1}.
 """
 
 from __future__ import annotations
