@@ -47,8 +47,8 @@ def test_homer_leaves_chance_where_patches_hide_the_ball_now_and_then(ball: Data
 @pytest.mark.parametrize("method", ["curl", "driml", "homer"])
 def test_where_all_pictures_are_one_nothing_tells_the_positive(nothing: Dataset, method: str):
     """Shifts that positives share and negatives do not would: the loss then falls without knowledge of the state."""
-    trainer = trainer_on(nothing, method, learning_rate=3e-3)
-    losses = [trainer.update()["loss"].item() for _ in range(120)]
-    window, rows = trainer.config.window, trainer.config.batch_size * trainer.config.window
-    chance = {"curl": math.log(rows - window + 1), "driml": math.log(rows), "homer": math.log(2)}[method]
-    assert sum(losses[-20:]) / 20 > 0.9 * chance
+    trainer = trainer_on(nothing, method, batch_size=16)
+    losses = [trainer.update()["loss"].item() for _ in range(100)]
+    batch, rows = trainer.config.batch_size, trainer.config.window
+    candidates = {"curl": (batch - 1) * rows + 1, "driml": batch * (rows - 2), "homer": 2}[method]  # DRIML's at least
+    assert sum(losses[-20:]) / 20 > 0.98 * math.log(candidates)

@@ -63,8 +63,9 @@ class View:
         if _shift.by_lines(self.dataset.frames, self._pad):
             return self._observe_by_lines(rows, shift_key, keys)
         stacks = self.dataset.stacks(rows, self._frame_stack)
-        shifted = random_shift(stacks.view(len(shift_key), -1, *stacks.shape[-2:]), shift_key, self._pad)
-        return self.corruption.corruption.apply_(shifted.view(stacks.shape), keys)
+        shifted_alike = stacks if len(shift_key) == len(rows) else stacks.flatten(0, rows.ndim - 1)
+        shifted = random_shift(shifted_alike, shift_key, self._pad).view(stacks.shape)
+        return self.corruption.corruption.apply_(shifted, keys)
 
     def windows(self, index: Index, length: int) -> Windows:
         """`Dataset.windows` of what the agent sees."""
