@@ -140,6 +140,18 @@ def test_rows_that_were_kept_are_finished_runs(copy, tmp_path):
     assert len(left(plan(new, ["seed=0,1"], kept=kept))) == 9, "the other seed's"
 
 
+def test_an_encoder_whose_row_was_kept_is_made_again_for_a_new_policy(copy, tmp_path):
+    main(["results", "add", str(copy), "--out", str(tmp_path / "rows")])
+    kept, new = FoundRuns(runs_kept([tmp_path / "rows"])), tmp_path / "new"
+    assert "pretrain" in {run.record["stage"] for run in kept.runs}
+    shutil.copytree(copy / "data", new / "data")
+    shutil.copy(copy / "grid.toml", new)
+    assert left(plan(new, kept=kept)) == []
+    jobs = plan(new, ["finetune.updates=7"], kept=kept)
+    assert {job.section for job in jobs if not job.done} == {"pretrain", "finetune"}
+    assert len(left(jobs)) == 9
+
+
 def test_without_their_set_kept_rows_count_by_how_it_was_collected(copy, tmp_path):
     for config in copy.rglob("config.json"):
         if "stage" in (record := read_json(config)):

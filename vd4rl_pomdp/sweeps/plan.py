@@ -108,7 +108,8 @@ class JobPlanner:
         key = (section, recipe, data.name)
         if key in self._jobs:
             return self._jobs[key]
-        run, kept = self._here.of(recipe, data), self._kept.of(recipe, data)
+        run, last = self._here.of(recipe, data), section == cell.chain[-1]
+        kept = self._kept.of(recipe, data) if last else None  # a kept row is no encoder to train on
         if run is not None:
             name = run.folder.relative_to(self._out).as_posix()
         else:
