@@ -26,6 +26,7 @@ from tests.helpers_data import write_fake_set
 from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.navigation.measures import RAW_PREFIX
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
@@ -162,7 +163,8 @@ def test_rows_are_means_over_the_steps_since_the_row_before(stage, tmp_path, mon
     assert {name for logs in steps for name in logs} == {name for row in expected for name in row} - {"step"}
     for row, means in zip(found, expected, strict=True):
         assert {name: row[name] for name in means} == pytest.approx(means, rel=1e-5)
-        assert set(row) - set(means) <= {f"{what}{rows}" for what in COMPONENTS for rows in ("", "_hidden")}
+        errors = {f"{what}{rows}" for what in COMPONENTS for rows in ("", "_hidden")}
+        assert set(row) - set(means) <= errors | {f"{RAW_PREFIX}{error}" for error in errors}
 
 
 def test_one_step_whose_loss_is_no_number_ends_the_run(stage, tmp_path, monkeypatch):
