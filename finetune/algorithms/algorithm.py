@@ -112,6 +112,25 @@ class Algorithm(ABC):
             part.load_state_dict(state[name])
 
 
+class NoisyAlgorithm(Algorithm):
+    """One whose noise is drawn anew in every update, by a schedule or not."""
+
+    generator: torch.Generator
+    """What the noise is drawn from."""
+    updates: int = 0
+    """Updates that were made."""
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on."""
+        return super().state_dict() | {"updates": self.updates, "noise": self.generator.get_state()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        super().load_state_dict(state)
+        self.updates = state["updates"]
+        self.generator.set_state(state["noise"])
+
+
 def _step(loss: Tensor, optimisers: list[Optimizer]) -> None:
     for optimiser in optimisers:
         optimiser.zero_grad(set_to_none=True)

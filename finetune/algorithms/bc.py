@@ -21,14 +21,14 @@ from typing import Any
 import torch
 import torch.nn.functional as F
 
-from finetune.algorithms.algorithm import Algorithm, Loss
+from finetune.algorithms.algorithm import Loss, NoisyAlgorithm
 from finetune.algorithms.noise import noise_at, with_noise
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.options import Options
 
 
-class BC(Algorithm):
+class BC(NoisyAlgorithm):
     """See the module."""
 
     summary = "behaviour cloning, which uses no reward"
@@ -38,7 +38,6 @@ class BC(Algorithm):
     ) -> None:
         self.policy, self.generator = policy, generator
         self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=learning_rate, fused=True)
-        self.updates = 0
 
     def losses(self, batch: FeatureBatch) -> Iterator[Loss]:
         """See the module."""
@@ -50,13 +49,3 @@ class BC(Algorithm):
     def parts(self) -> dict[str, Any]:
         """The policy and its optimiser."""
         return {"policy": self.policy, "optimiser": self.optimiser}
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on."""
-        return super().state_dict() | {"updates": self.updates, "noise": self.generator.get_state()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
-        super().load_state_dict(state)
-        self.updates = state["updates"]
-        self.generator.set_state(state["noise"])

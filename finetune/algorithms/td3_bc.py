@@ -19,7 +19,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor
 
-from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
+from finetune.algorithms.algorithm import Loss, NoisyAlgorithm, ReturnOptions
 from finetune.algorithms.critic import TwinCritic
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.heads import move_target
@@ -39,7 +39,7 @@ class TD3BCOptions(ReturnOptions):
     limits: ClassVar[Limits] = {"alpha": 0}
 
 
-class TD3BC(Algorithm):
+class TD3BC(NoisyAlgorithm):
     """See the module."""
 
     options: type[Options] = TD3BCOptions
@@ -57,7 +57,6 @@ class TD3BC(Algorithm):
         self.target_policy, self.target_critic = copy.deepcopy(policy), copy.deepcopy(self.critic)
         self.policy_optimiser = torch.optim.Adam(policy.net.parameters(), lr=learning_rate, fused=True)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=learning_rate, fused=True)
-        self.updates = 0
 
     def losses(self, batch: FeatureBatch) -> Iterator[Loss]:
         """The critics', and every other time the actor's."""
@@ -101,16 +100,6 @@ class TD3BC(Algorithm):
     def _move_targets(self) -> None:
         move_target(self.target_critic, self.critic, self.tau)
         move_target(self.target_policy.net, self.policy.net, self.tau)
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on."""
-        return super().state_dict() | {"updates": self.updates, "noise": self.generator.get_state()}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
-        super().load_state_dict(state)
-        self.updates = state["updates"]
-        self.generator.set_state(state["noise"])
 
     def parts(self) -> dict[str, Any]:
         """Networks, targets and optimisers."""
