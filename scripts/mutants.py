@@ -176,14 +176,19 @@ def page(tried: list[tuple[Mutant, str]]) -> str:
 
 def told(text: str) -> dict[str, str]:
     """Verdicts by name, as a page tells them; only such whose test is still there."""
-    cells = [re.split(r"(?<!\\\\) \| ", line[2:-2]) for line in text.splitlines() if re.match(r"\| (?!broken)", line)]
-    return {name.replace("\\|", "|"): verdict for name, _, verdict in cells if verdict == SURVIVED or _is_test(verdict)}
+    cells = [line[2:-2].split(" | ") for line in text.splitlines() if re.match(r"\| (?!broken)", line)]
+    return {
+        name.replace("\\|", "|"): verdict
+        for name, _, verdict in cells
+        if verdict == SURVIVED or is_test(verdict.strip("`"))
+    }
 
 
-def _is_test(verdict: str) -> bool:
-    file, _, function = verdict.strip("`").partition("::")
+def is_test(name: str) -> bool:
+    """Whether `file`, `file::function` or `file::function[case]` is a test."""
+    file, _, function = name.partition("::")
     path = ROOT / file
-    return path.is_file() and f"def {function.partition('[')[0]}(" in path.read_text(encoding="utf-8")
+    return path.is_file() and f"def {function.partition('[')[0]}" in path.read_text(encoding="utf-8")
 
 
 def _tried(mutants: list[Mutant], limit: float, whole_suite: bool) -> Iterator[tuple[Mutant, str]]:

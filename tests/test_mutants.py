@@ -18,13 +18,6 @@ def script(monkeypatch) -> ModuleType:
     return importlib.import_module("mutants")
 
 
-def is_test(name: str) -> bool:
-    """Whether `file`, `file::function` or `file::function[case]` is a test."""
-    file, _, function = name.partition("::")
-    path = ROOT / file
-    return path.is_file() and f"def {function.partition('[')[0]}" in path.read_text()
-
-
 def test_every_mutant_still_applies_exactly_once_and_is_python(script):
     for mutant in script.load_mutants():
         text = mutant.apply(ROOT)
@@ -35,7 +28,7 @@ def test_every_mutant_still_applies_exactly_once_and_is_python(script):
 def test_every_mutant_has_its_own_name_and_tests_that_exist(script):
     mutants = script.load_mutants()
     assert len({mutant.name for mutant in mutants}) == len(mutants) > 38
-    assert [test for mutant in mutants for test in mutant.tests if not is_test(test)] == []
+    assert [test for mutant in mutants for test in mutant.tests if not script.is_test(test)] == []
     assert all(mutant.tests for mutant in mutants)
 
 
@@ -44,7 +37,7 @@ def test_the_page_has_a_row_for_each_mutant_and_names_a_test_that_caught_it(scri
     lines = [line for line in text.splitlines() if re.match(r"\| (?!broken)", line)]
     verdicts = [line.rsplit(" | ", 1)[1].removesuffix(" |") for line in lines]
     assert script.page(list(zip(script.load_mutants(), verdicts, strict=True))) == text
-    assert [verdict for verdict in verdicts if not is_test(verdict.strip("`"))] == []
+    assert [verdict for verdict in verdicts if not script.is_test(verdict.strip("`"))] == []
 
 
 def test_a_page_tells_what_it_was_made_of_but_for_tests_that_are_gone(script):
