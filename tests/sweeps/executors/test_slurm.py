@@ -12,7 +12,8 @@ from tests.sweeps.executors.slurm_cluster import slurm, why_not
 from tests.sweeps.executors.waiting import begun, run, until, waiting_job, work_of
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.sweeps.executors import slurm as module
-from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor, SlurmOptions
+from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor
+from vd4rl_pomdp.sweeps.executors.slurm_queue import SlurmOptions
 from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.work import DONE, INTERRUPTED, KILLED
 

@@ -7,7 +7,9 @@ import pytest
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import OutOfMemoryError, UserError
 from vd4rl_pomdp.sweeps.executors import slurm as module
-from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor, SlurmOptions, _parameters, _State
+from vd4rl_pomdp.sweeps.executors.handover import Handover
+from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor
+from vd4rl_pomdp.sweeps.executors.slurm_queue import SlurmOptions, State, parameters
 from vd4rl_pomdp.sweeps.work import DONE, FAILED, INTERRUPTED, KILLED, Ended, Work
 
 GRID = 'preset = "smoke"\n[collect]\ntask = "walker_walk"\nquality = "expert"\n'
@@ -18,18 +20,18 @@ class FakeSlurm:
 
     def __init__(self, monkeypatch) -> None:
         self.queue, self.arrays = {}, []
-        monkeypatch.setattr(module, "_require_slurm", lambda: None)
-        monkeypatch.setattr(module, "_queue", lambda: self.queue)
-        monkeypatch.setattr(module, "_submit", self._submit)
+        monkeypatch.setattr(module, "require_slurm", lambda: None)
+        monkeypatch.setattr(module, "read_queue", lambda: self.queue)
+        monkeypatch.setattr(module, "submit", self._submit)
         monkeypatch.setattr(module, "FILES_S", 0.0)
         monkeypatch.setattr(module, "QUEUE_S", 0.0)
 
-    def _submit(self, tasks, options) -> None:
-        self.arrays.append([list(task.mine) for task in tasks])
-        self.queue |= {task.key: _State("PENDING", f"7_{task.number}", "Priority") for task in tasks}
+    def _submit(self, folder, tasks, options) -> None:
+        self.arrays.append([[work.name for work in Handover(folder).left(task.number).values()] for task in tasks])
+        self.queue |= {(folder.name, task.number): State("PENDING", f"7_{task.number}", "Priority") for task in tasks}
 
     def put(self, name: str, reason: str = "None") -> None:
-        self.queue = {key: _State(name, state.job, reason) for key, state in self.queue.items()}
+        self.queue = {key: State(name, state.job, reason) for key, state in self.queue.items()}
 
 
 @pytest.fixture
@@ -144,7 +146,7 @@ def test_what_a_task_may_wait_for_in_vain_is_told_once(fake, tmp_path, capsys):
 
 def test_options_become_what_submitit_takes():
     asked = SlurmOptions("gpu", "lab", "high", "a100", 90, 2, 16, 62.5, 8, 50, ["--exclusive", "reservation=mine"])
-    found = _parameters(asked)
+    found = parameters(asked)
     assert {name: found[name] for name in ("partition", "account", "qos", "constraint", "time", "mem")} == {
         **{"partition": "gpu", "account": "lab", "qos": "high", "constraint": "a100", "time": 90, "mem": "64000M"}
     }
@@ -153,7 +155,7 @@ def test_options_become_what_submitit_takes():
     assert found["signal_delay_s"] > 120, "time to end in"
     assert (
         not {"partition", "account", "qos", "constraint", "mem", "gpus_per_node"}
-        & _parameters(SlurmOptions(gpus=0)).keys()
+        & parameters(SlurmOptions(gpus=0)).keys()
     )
 
 

@@ -11,7 +11,8 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.sweeps.executors.local import LocalExecutor, LocalOptions
 from vd4rl_pomdp.sweeps.executors.ray import RayExecutor, RayOptions
-from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor, SlurmOptions
+from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor
+from vd4rl_pomdp.sweeps.executors.slurm_queue import SlurmOptions
 from vd4rl_pomdp.sweeps.work import Executor
 
 

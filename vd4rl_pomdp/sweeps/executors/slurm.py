@@ -7,31 +7,36 @@ submitted, also what still waits in the queue, and waits for it instead of submi
 
 from __future__ import annotations
 
-import shutil
-import subprocess
 import sys
 import time
 from collections.abc import Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
 from secrets import token_hex
-from typing import Any, ClassVar, NamedTuple
 
 from vd4rl_pomdp.errors import OutOfMemoryError, UserError
-from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.sweeps.executors.allocation import IDLE_S, Allocation
 from vd4rl_pomdp.sweeps.executors.handover import Handover
 from vd4rl_pomdp.sweeps.executors.local import PATIENCE_S
+from vd4rl_pomdp.sweeps.executors.slurm_queue import (
+    PREFIX,
+    QUEUE_S,
+    Queue,
+    SlurmOptions,
+    State,
+    cancel,
+    read_queue,
+    require_slurm,
+    submit,
+)
 from vd4rl_pomdp.sweeps.work import FAILED, INTERRUPTED, KILLED, Ended, Work, last_line
 
-QUEUE_S = 15.0
-"""Seconds between two looks at the queue; how jobs ended is read from files, at once."""
 FILES_S = 1.0
+"""Seconds between two looks at the files that tell how jobs ended; the queue is asked less often."""
 AGAIN_S = 60.0
 """Seconds until an array is submitted again that Slurm did not take."""
-REQUEUES = 100
-"""How often a task goes on after its time limit before its driver is asked."""
-_NAME, _GONE = "vd4rl-pomdp-", "gone"
+_GONE = "gone"
+"""State of a task that the queue does not know."""
 _USUAL = ("None", "Priority", "Resources", "BeginTime", "Cleaning", "JobArrayTaskLimit")
 """What a task waits for that comes by itself."""
 OVER = {
@@ -40,55 +45,7 @@ OVER = {
 }
 """Slurm's states of a task that has ended, and why the jobs in it did that have not told themselves. A task that ends
 in peace with jobs left was asked to."""
-
-
-@dataclass(frozen=True)
-class SlurmOptions(Options):
-    """Options of the Slurm executor; an array task is one allocation of sbatch."""
-
-    partition: str | None = None
-    """Partition of the tasks; default: the cluster's."""
-    account: str | None = None
-    """Account that pays."""
-    qos: str | None = None
-    """Quality of service."""
-    constraint: str | None = None
-    """Features that the nodes must have: "a100|h100"."""
-    time: int = 240
-    """Time limit of a task, minutes; jobs that it cuts go on in the same task, started again."""
-    gpus: int = 1
-    """GPUs of a task."""
-    cpus: int = 8
-    """CPU cores of a task."""
-    memory: float | None = None
-    """Memory of a task, GB; default: the cluster's."""
-    jobs_per_task: int = 1
-    """Jobs at a time in a task, which share its GPUs, cores and memory."""
-    tasks: int = 100
-    """Tasks in the queue or running at a time."""
-    sbatch: list[str] = field(default_factory=list)
-    """Further parameters of sbatch: reservation=mine exclusive."""
-
-    limits: ClassVar[Limits] = {
-        **{"time": (5, 60 * 24 * 365), "gpus": (0, 64), "cpus": (1, 4096), "memory": (0.01, 10**6)},
-        **{"jobs_per_task": (1, 1024), "tasks": (1, 1000)},
-    }
-
-
-class _State(NamedTuple):
-    """What the queue says of a task."""
-
-    name: str
-    """Slurm's word."""
-    job: str
-    """Its number, with the task's for one of an array."""
-    reason: str = ""
-    """What it waits for."""
-
-
-_Queue = dict[tuple[str, int], _State]
-"""By array and number of the task."""
-_UNKNOWN = _State(_GONE, "unknown")
+_UNKNOWN = State(_GONE, "unknown")
 
 
 @dataclass(eq=False)
@@ -141,7 +98,7 @@ class _Task:
                 del self.mine[name]
                 yield self.array.end_of(attempt)
 
-    def untold(self, state: _State) -> list[Ended]:
+    def untold(self, state: State) -> list[Ended]:
         """How its jobs ended when it has ended itself."""
         line = last_line(self.array.folder / f"{state.job}_0_log.out") if state.name == "FAILED" else ""
         line = line or f"Slurm says {state.name} of task {state.job}"
@@ -161,7 +118,7 @@ class SlurmExecutor:
         Raises:
             UserError: submitit or Slurm's commands are missing, or Slurm does not answer.
         """
-        _require_slurm()
+        require_slurm()
         self._options, self._folder = options, folder
         self.largest = -(-options.jobs_per_task // max(1, options.gpus))
         self.slots = options.tasks * options.jobs_per_task
@@ -188,7 +145,7 @@ class SlurmExecutor:
         best = max(tasks, key=lambda task: task.free, default=None)
         if best is not None and (best.free >= slots or len(tasks) >= self._options.tasks):
             return best
-        array = self._fresh[0].array if self._fresh else Handover(self._folder / f"{_NAME}{token_hex(4)}")
+        array = self._fresh[0].array if self._fresh else Handover(self._folder / f"{PREFIX}{token_hex(4)}")
         self._fresh.append(_Task(array, len(self._fresh), self._options.jobs_per_task))
         return self._fresh[-1]
 
@@ -203,7 +160,7 @@ class SlurmExecutor:
             self._submit()
         queue = None
         if now >= self._next_queue:
-            self._next_queue, queue = now + QUEUE_S, _queue()
+            self._next_queue, queue = now + QUEUE_S, read_queue()
             self._warn(queue or {})
         if queue is None and now < self._next_files:
             return []
@@ -211,14 +168,14 @@ class SlurmExecutor:
         found = [ended for task in self._tasks for ended in task.told()]  # after the queue: none is overlooked
         return found if queue is None else found + self._gone(queue)
 
-    def _warn(self, queue: _Queue) -> None:
+    def _warn(self, queue: Queue) -> None:
         """Say, once each, what tasks wait for that may never come."""
         for state in (queue.get(task.key, _UNKNOWN) for task in self._tasks):
             if state.name == "PENDING" and state.reason not in (*_USUAL, *self._warned):
                 self._warned.append(state.reason)
                 print(f"warning: Slurm keeps task {state.job} waiting: {state.reason}", file=sys.stderr)
 
-    def _gone(self, queue: _Queue) -> list[Ended]:
+    def _gone(self, queue: Queue) -> list[Ended]:
         """Jobs in tasks that have ended without telling of them."""
         over = [task for task in self._tasks if queue.get(task.key, _UNKNOWN).name in OVER]
         self._tasks = [task for task in self._tasks if task not in over]
@@ -227,7 +184,8 @@ class SlurmExecutor:
     def _submit(self) -> None:
         """Submit what was gathered; where Slurm took such an array before, a failure is waited out."""
         try:
-            _submit(self._fresh, self._options)
+            array = self._fresh[0].array.folder
+            submit(array, [Allocation(array, task.number, task.places) for task in self._fresh], self._options)
         except UserError as error:
             if not self._accepted:
                 raise
@@ -240,44 +198,24 @@ class SlurmExecutor:
     def stop(self) -> None:
         """Take what waits out of the queue, ask every job to end where nothing is lost, and wait for it."""
         self._fresh = []
-        _cancel(self._live(), "--state=PENDING")
-        _cancel(self._live(), "--signal=TERM")
+        cancel(self._live(), "--state=PENDING")
+        cancel(self._live(), "--signal=TERM")
         until = time.monotonic() + PATIENCE_S + QUEUE_S
         while self._live() and time.monotonic() < until:
             time.sleep(FILES_S)
-        _cancel(self._live())
+        cancel(self._live())
         self._next_queue = 0.0
 
     def _live(self) -> list[str]:
         """Slurm's numbers of this sweep's tasks that have not ended."""
-        queue = _queue() or {}
+        queue = read_queue() or {}
         states = [queue.get(task.key, _UNKNOWN) for task in self._tasks]
         return [state.job for state in states if state.name not in OVER]
 
 
-def _require_slurm() -> None:
-    try:
-        import submitit  # noqa: F401
-    except ImportError as error:
-        raise UserError("--executor slurm needs submitit: pip install 'vd4rl-pomdp[slurm]'") from error
-    for name in ("sbatch", "squeue", "scancel", "srun"):
-        if shutil.which(name) is None:
-            raise UserError(f"--executor slurm finds no {name} here: start the sweep where Slurm's commands are")
-
-
-def _queue() -> _Queue | None:
-    """This user's arrays of sweeps in the queue, those that ended of late included; None if Slurm does not answer."""
-    command = ["squeue", "--me", "--array", "--states=all", "--noheader", "--format=%j|%K|%T|%i|%r"]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False)
-    if answer.returncode:
-        return None
-    rows = [line.split("|") for line in answer.stdout.splitlines() if line.startswith(_NAME)]
-    return {(name, int(number) if number.isdigit() else 0): _State(*state) for name, number, *state in rows}
-
-
 def _known(folder: Path, places: int) -> list[_Task]:
     """Tasks that earlier drivers have in the queue."""
-    queue = _queue()
+    queue = read_queue()
     if queue is None:
         raise UserError("Slurm does not answer: see what squeue says")
     found = []
@@ -286,45 +224,3 @@ def _known(folder: Path, places: int) -> list[_Task]:
         if state.name not in OVER and array.folder.is_dir():
             found.append(_Task(array, number, places, array.left(number)))
     return found
-
-
-def _submit(tasks: list[_Task], options: SlurmOptions) -> None:
-    """Submit tasks as one array.
-
-    Raises:
-        UserError: Slurm did not take it.
-    """
-    import submitit
-
-    folder = tasks[0].array.folder
-    executor = submitit.SlurmExecutor(folder, max_num_timeout=REQUEUES)
-    executor.update_parameters(job_name=folder.name, **_parameters(options))
-    try:
-        executor.submit_array([Allocation(folder, task.number, task.places, IDLE_S) for task in tasks])
-    except RuntimeError as error:  # submitit's for a command that failed
-        told = str(error).strip().splitlines()
-        raise UserError(f"Slurm took no array ({told[-1] if told else 'it does not say why'})") from error
-
-
-def _parameters(options: SlurmOptions) -> dict[str, Any]:
-    """What submitit is told."""
-    names = ("partition", "account", "qos", "constraint", "time")
-    found = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
-    if options.gpus:
-        found["gpus_per_node"] = options.gpus
-    if options.memory is not None:
-        found["mem"] = f"{options.memory * 1024:.0f}M"
-    further = [parameter.removeprefix("--").partition("=") for parameter in options.sbatch]
-    return found | {
-        "cpus_per_task": options.cpus,
-        "srun_args": [f"--cpus-per-task={options.cpus}"],  # which some versions do not take from sbatch
-        "array_parallelism": options.tasks,
-        "signal_delay_s": round(PATIENCE_S + QUEUE_S),
-        "stderr_to_stdout": True,
-        "additional_parameters": {"requeue": True} | {name: value or True for name, _, value in further},
-    }
-
-
-def _cancel(jobs: list[str], *how: str) -> None:
-    if jobs:
-        subprocess.run(["scancel", "--quiet", *how, *jobs], capture_output=True, check=False)
