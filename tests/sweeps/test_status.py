@@ -79,6 +79,21 @@ def test_other_settings_take_as_long_a_step_as_their_stage(tmp_path):
     assert estimates.seconds(Job("s", "collect", tmp_path, ())) is None
 
 
+def test_sets_that_were_collected_tell_what_others_take_by_their_episodes(tmp_path):
+    def collecting(name, task, episodes):
+        return Job(name, "collect", tmp_path / name, (), settings=cost_of({"task": task, "episodes": episodes}))
+
+    there, begun = collecting("there", "walker_walk", 10), collecting("begun", "walker_walk", 40)
+    there.folder.mkdir()
+    begun.folder.mkdir()
+    write_json(there.folder / "provenance.json", {"seconds": 50.0})
+    write_json(begun.folder / "collection.json", {})
+    estimates = Estimates([], [there, begun])
+    assert estimates.seconds(there) == 50.0
+    assert estimates.seconds(begun) == pytest.approx(200.0)
+    assert estimates.seconds(collecting("new", "cheetah_run", 100)) == pytest.approx(500.0)
+
+
 def test_time_left_is_shared_by_the_jobs_that_run(jobs, tmp_path):
     estimates = Estimates([past(tmp_path, 30.0)])
     found = status(jobs, attempts(), estimates)

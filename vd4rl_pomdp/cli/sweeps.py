@@ -95,7 +95,7 @@ def _print_plan(jobs: list[Job], past: list[Any]) -> None:
     from vd4rl_pomdp.sweeps.estimate import Estimates
     from vd4rl_pomdp.sweeps.work import told_seconds
 
-    estimates, users = Estimates(past), Counter(name for job in jobs for name in job.needs)
+    estimates, users = Estimates(past, jobs), Counter(name for job in jobs for name in job.needs)
     known, unknown = 0.0, 0
     for job in jobs:
         seconds = estimates.seconds(job)
@@ -131,7 +131,7 @@ def _status(folder: SweepFolder, jobs: list[Job]) -> Any:
     from vd4rl_pomdp.sweeps.found import runs_below
     from vd4rl_pomdp.sweeps.status import status
 
-    return status(jobs, folder.attempts(), Estimates(runs_below(folder.out)))
+    return status(jobs, folder.attempts(), Estimates(runs_below(folder.out), jobs))
 
 
 @dataclass(frozen=True)

@@ -1,4 +1,4 @@
-"""What jobs will take, judging by runs that were finished: an estimate, for machines like those."""
+"""What jobs will take, judging by runs and sets that were finished: an estimate, for machines like those."""
 
 from __future__ import annotations
 
@@ -6,25 +6,38 @@ from collections.abc import Iterable, Mapping
 from statistics import median
 from typing import Any
 
+from vd4rl_pomdp.data.format import RECORD
+from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.sweeps.found import FoundRun
 from vd4rl_pomdp.sweeps.plan import Job, cost_of
 from vd4rl_pomdp.sweeps.stages import STAGES
 
 _SECTIONS = {stage: section for section, stage in STAGES.items()}
-_SCALE = {"pretrain": "steps", "finetune": "updates", "navigation_train": "steps"}
+_SCALE = {
+    **{"collect": "episodes", "navigation_collect": "trajectories"},
+    **{"pretrain": "steps", "finetune": "updates", "navigation_train": "steps"},
+}
 """Setting that the time of a stage is about proportional to."""
 
 
 class Estimates:
-    """Seconds by stage and settings, from past runs."""
+    """Seconds by stage and settings, from past runs and sets."""
 
-    def __init__(self, runs: Iterable[FoundRun]) -> None:
-        """Args: runs: those to judge by; unfinished ones tell nothing."""
+    def __init__(self, runs: Iterable[FoundRun], jobs: Iterable[Job] = ()) -> None:
+        """Unfinished work tells nothing.
+
+        Args:
+            runs: past runs to judge by.
+            jobs: a plan's jobs: the sets that they collected tell, too.
+        """
         self._exact: dict[tuple, list[float]] = {}
         self._by_stage: dict[str, list[tuple[float, float]]] = {}
         for run in runs:
             self._note(_SECTIONS.get(run.record["stage"]), run.settings, run.seconds)
             self._note("pretrain", run.card.get("settings", {}), run.encoder_seconds)
+        for job in jobs:
+            if job.section not in STAGES and (job.folder / RECORD).is_file():
+                self._note(job.section, dict(job.settings), read_json(job.folder / RECORD).get("seconds"))
 
     def _note(self, section: str | None, settings: Mapping[str, Any], seconds: float | None) -> None:
         if section and seconds is not None:

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from vd4rl_pomdp.data.format import PLAN, RECORD
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.settings import settings_of
@@ -41,13 +42,13 @@ class Job:
     @property
     def finished(self) -> bool:
         """Whether there is nothing left to do now."""
-        mark = "timing.json" if self.section in STAGES else "provenance.json"
+        mark = "timing.json" if self.section in STAGES else RECORD
         return self.done or (self.folder / mark).is_file()
 
     @property
     def begun(self) -> bool:
         """Whether something of it is there."""
-        mark = "config.json" if self.section in STAGES else "collection.json"
+        mark = "config.json" if self.section in STAGES else PLAN
         return (self.folder / mark).is_file()
 
 
