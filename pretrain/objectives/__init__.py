@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal
+from typing import Literal, get_args
 
 from baselines import ACRO, CURL, DRIML, HOMER, DRIMLOptions, HOMEROptions, OneStepInverse
 from pretrain.objectives.all_history import AllHistory
@@ -13,6 +13,7 @@ from pretrain.objectives.masked_inverse import MaskedActionOptions, MaskedInvers
 from pretrain.objectives.supervised import Supervised, SupervisedOptions
 from pretrain.objectives.untrained import StateOptions, Untrained
 from vd4rl_pomdp.augmentation import Sharing
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.objective import ActionOptions, InverseOptions, Objective
 from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.registry import Registry
@@ -47,6 +48,12 @@ class Method:
     """Class of its options."""
     summary: str = ""
     """One line that says what it is."""
+
+    def __post_init__(self) -> None:
+        """Raise UserError for a word that this class does not know."""
+        for name, words in (("history", ("none", "gru")), ("shift", (*get_args(Sharing), "own"))):
+            if (value := getattr(self, name)) not in words:
+                raise UserError(f"a Method's {name} is {value!r}: choose one of {', '.join(words)}")
 
 
 _OWN = {

@@ -205,3 +205,9 @@ def test_a_method_that_keeps_all_promises_passes_and_unknown_ones_and_settings_a
         check_method("mine", max_k=2)
     with pytest.raises(UserError, match="unknown method 'yours'"):
         check_method("yours")
+
+
+@pytest.mark.parametrize("word", [{"shift": "windows"}, {"history": "lstm"}])
+def test_a_method_that_asks_for_what_there_is_not_is_refused_where_it_is_made(word):
+    with pytest.raises(UserError, match=f"a Method's {next(iter(word))} is .*: choose one of .*"):
+        Method(Mean, **word)
