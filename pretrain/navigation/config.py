@@ -100,7 +100,8 @@ class NavigationConfig(TrainingConfig):
     picture: Picture = "rgb100"
     """rgb100: pictures as stored; rgb50: averaged over 2x2 pixels; grey50: the luminance of these."""
     exogenous: str = "none"
-    """Images added to every picture: none, photographs, or a folder of CIFAR-10's files or of PNG and JPEG files."""
+    """Images added to every picture: none, textures, photographs, or a folder of CIFAR-10's or of PNG
+    and JPEG files."""
     noise: Options = NO_OPTIONS
     """How the images are added."""
     burn_in: int = 10

@@ -15,11 +15,15 @@ def noise() -> ExogenousNoise:
     return ExogenousNoise("photographs", 0.5, 0)
 
 
-def test_the_shipped_pool_is_many_different_natural_images(noise):
-    assert noise.pool.shape == (POOL, 3, 100, 100)
-    assert len({picture.numpy().tobytes() for picture in noise.pool}) == POOL
-    neighbours = (noise.pool[..., 1:].float() - noise.pool[..., :-1].float()).abs().mean()
-    strangers = (noise.pool[1:].float() - noise.pool[:-1].float()).abs().mean()
+@pytest.mark.parametrize("name", ["photographs", "textures"])
+def test_a_pool_that_needs_no_files_is_many_different_images_like_natural_ones(name):
+    pool = load_pool(name, 0)
+    assert pool.shape == (POOL, 3, 100, 100)
+    assert len({picture.numpy().tobytes() for picture in pool}) == POOL
+    assert torch.equal(pool, load_pool(name, 0))
+    assert not torch.equal(pool, load_pool(name, 1))
+    neighbours = (pool[..., 1:].float() - pool[..., :-1].float()).abs().mean()
+    strangers = (pool[1:].float() - pool[:-1].float()).abs().mean()
     assert neighbours < strangers / 3, "pixels of natural images resemble their neighbours"
 
 
@@ -111,3 +115,13 @@ def test_folders_without_usable_images_are_named(tmp_path, name, content, messag
     with pytest.raises(UserError, match=message) as caught:
         load_pool(str(tmp_path), 0)
     assert len(str(caught.value).splitlines()) == 1
+
+
+def test_textures_have_the_spectrum_of_natural_images():
+    pool = load_pool("textures", 0)[:200].float().mean(1)
+    power = (torch.fft.fft2(pool - pool.mean((1, 2), keepdim=True)).abs() ** 2).mean(0)
+    frequency = torch.fft.fftfreq(100)[:, None].hypot(torch.fft.fftfreq(100)[None])
+    chosen = (frequency > 0.02) & (frequency < 0.2)
+    x, y = frequency[chosen].log(), power[chosen].log()
+    slope = ((x - x.mean()) * (y - y.mean())).sum() / ((x - x.mean()) ** 2).sum()
+    assert -3.2 < slope < -1.6, "power falls about as the square of the frequency (Field 1987)"

@@ -194,7 +194,7 @@ def test_the_navigation_grid_holds_every_condition_of_the_papers_tables():
             cell.value("method"),
             cell.value("max_k"),
             cell.value("self_prediction") == 1.0,
-            cell.value("exogenous") == "photographs",
+            cell.value("exogenous") == "textures",
         )
         for cell in cells
         if not cell.value("literal_future")

@@ -1,7 +1,8 @@
 """Exogenous noise: an image from a pool is added to each observation, and has nothing to do with the agent.
 
 A row's key chooses its image, so that a row always shows the same one, as in a real environment. The pool consists of
-crops of the photographs that scikit-learn ships, or of a folder's images: CIFAR-10's python or binary files, PNG, JPEG.
+generated textures, of crops of the two photographs that scikit-learn ships, or of a folder's images: CIFAR-10's python
+or binary files, PNG, JPEG.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from pickletools import genops
 import numpy as np
 import torch
 import torch.nn.functional as F
-from PIL import Image
+from PIL import Image, ImageDraw
 from torch import Tensor
 
 from vd4rl_pomdp.corruptions.keys import derive_keys, draw_integers
@@ -22,14 +23,16 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.mazes import PICTURE_SIZE
 from vd4rl_pomdp.seeding import stream_seed
 
-PHOTOGRAPHS = "photographs"
-"""Name of the pool that needs no files."""
+TEXTURES, PHOTOGRAPHS = "textures", "photographs"
+"""Names of the pools that need no files."""
 POOL = 1024
 """Images in a pool at most."""
 _CIFAR_SIDE, _CIFAR_CLASSES = 32, 10
 _CIFAR_BYTES = 3 * _CIFAR_SIDE**2
 _CROPS = (120, 400)
 """Least and greatest side of a photograph's crop, in its pixels."""
+_DISCS, _RADII, _CONTRAST = 300, (4.0, 60.0), 60.0
+"""Discs of a texture, their least and greatest radius in pixels, and the standard deviation of their colours."""
 
 
 class ExogenousNoise:
@@ -44,9 +47,9 @@ class ExogenousNoise:
         """(P, 3, 100, 100) uint8."""
 
     def fingerprint(self) -> str:
-        """Hash of the files of the pool; for photographs, which come with a package, only the name of that pool."""
-        if self._source == PHOTOGRAPHS:
-            return PHOTOGRAPHS
+        """Hash of the files of the pool; for a pool that needs none, only its name."""
+        if self._source in (TEXTURES, PHOTOGRAPHS):
+            return self._source
         digest = hashlib.blake2b(digest_size=12)
         for path in _files(Path(self._source)):
             digest.update(hashlib.blake2b(path.read_bytes()).digest())
@@ -63,16 +66,35 @@ class ExogenousNoise:
 def load_pool(source: str, seed: int) -> Tensor:
     """Images to add: (P, 3, 100, 100) uint8; raises UserError if there is none."""
     rng = np.random.default_rng(stream_seed(seed, "exogenous", "images"))
+    if source == TEXTURES:
+        return _to_size(np.stack([_dead_leaves(rng) for _ in range(POOL)]))
     if source == PHOTOGRAPHS:
         return _photographs(rng)
     images = list(_resized(Path(source)))
     if not images:
         raise UserError(
             f"{source}: no readable image; name a folder with CIFAR-10's data_batch files (python or binary), with PNG "
-            f"or JPEG files, or use --exogenous {PHOTOGRAPHS}"
+            f"or JPEG files, or use --exogenous {TEXTURES}"
         )
     pool = torch.cat(images)
     return pool[torch.from_numpy(rng.permutation(len(pool))[:POOL])]
+
+
+def _dead_leaves(rng: np.random.Generator) -> np.ndarray:
+    """(100, 100, 3) uint8: discs that cover each other, radii with density r^-3, colours around the image's own.
+
+    Edges and scales are those of natural images (Lee, Mumford, Huang 2001, "Occlusion models for natural images").
+    """
+    own = rng.uniform(0, 255) + rng.normal(0, _CONTRAST / 2, 3)
+    image = Image.new("RGB", (PICTURE_SIZE, PICTURE_SIZE), tuple(own.clip(0, 255).astype(int).tolist()))
+    draw = ImageDraw.Draw(image)
+    centres = rng.uniform(0, PICTURE_SIZE, (_DISCS, 2))
+    least, greatest = _RADII
+    radii = least / np.sqrt(1 - rng.random(_DISCS) * (1 - (least / greatest) ** 2))
+    colours = rng.normal(own, _CONTRAST, (_DISCS, 3)).clip(0, 255).astype(int)
+    for (x, y), r, colour in zip(centres.tolist(), radii.tolist(), colours.tolist(), strict=True):
+        draw.ellipse((x - r, y - r, x + r, y + r), fill=tuple(colour))
+    return np.asarray(image)
 
 
 def _photographs(rng: np.random.Generator) -> Tensor:
@@ -93,7 +115,7 @@ def _photographs(rng: np.random.Generator) -> Tensor:
 def _resized(folder: Path) -> Iterator[Tensor]:
     """Batches of a folder's images, at most POOL of each file."""
     if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; name one with images or use --exogenous {PHOTOGRAPHS}")
+        raise UserError(f"{folder}: no such folder; name one with images or use --exogenous {TEXTURES}")
     for path in _files(folder):
         if _is_cifar(path):
             yield _to_size(_read_cifar(path)[:POOL])
