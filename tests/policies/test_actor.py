@@ -22,9 +22,12 @@ AT_LEAST = {
     "humanoid_walk_medium": 350,
 }
 
+PLAYED = 8
+"""Episodes of a card that are played again."""
+
 
 @pytest.mark.parametrize("name", ACTORS)
-def test_twenty_episodes_return_what_the_card_says(name):
+def test_an_actor_returns_what_its_card_says(name):
     """To the digit, but for an episode or two: processors differ in a state's last bit, which a fall magnifies."""
     task, quality = name.rsplit("_", 1)
     shipped = load_actor(task, quality)
@@ -35,9 +38,9 @@ def test_twenty_episodes_return_what_the_card_says(name):
     differing = [k for k in ("mujoco", "dm-control") if version(k) != card["versions"][k]]
     if differing:
         pytest.skip(f"the card was written with another {' and '.join(differing)}")
-    found = np.array(episode_returns(shipped, TASKS.named(task), CARD_EPISODES))
-    assert (found == card["returns"]).sum() >= CARD_EPISODES - 2
-    assert found.mean() == pytest.approx(card["return_mean"], rel=0.02)
+    found, said = np.array(episode_returns(shipped, TASKS.named(task), PLAYED)), np.array(card["returns"][:PLAYED])
+    assert (found == said).sum() >= PLAYED - 2
+    assert found.mean() == pytest.approx(said.mean(), rel=0.02)
 
 
 def test_the_required_actors_ship_and_all_stay_small():

@@ -19,10 +19,11 @@ SETTINGS = {
 @pytest.fixture
 def configure(monkeypatch):
     """Settings of a run that trains after 40 decisions and lasts seconds."""
-    from vd4rl_pomdp.policies import learner
+    from vd4rl_pomdp.policies import export, learner
     from vd4rl_pomdp.policies.config import PolicyConfig
 
     monkeypatch.setattr(learner, "RANDOM_DECISIONS", 20)
+    monkeypatch.setattr(export, "CARD_EPISODES", 2)
     small = {"hidden": 16, "batch_size": 32, "replay_size": 2_000, "eval_every": 40, "eval_episodes": 1}
     small |= {"normalise": True, "refill": 20, "critic_warmup": 8}
     return lambda out, **more: PolicyConfig("walker_walk", Path(out), **(small | more))
