@@ -9,7 +9,7 @@ from vd4rl_pomdp.errors import OutOfMemoryError, UserError
 from vd4rl_pomdp.sweeps.executors import slurm as module
 from vd4rl_pomdp.sweeps.executors.handover import Handover
 from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor
-from vd4rl_pomdp.sweeps.executors.slurm_queue import SlurmOptions, State, parameters
+from vd4rl_pomdp.sweeps.executors.slurm_queue import SlurmOptions, TaskState, parameters
 from vd4rl_pomdp.sweeps.work import DONE, FAILED, INTERRUPTED, KILLED, Ended, Work
 
 GRID = 'preset = "smoke"\n[collect]\ntask = "walker_walk"\nquality = "expert"\n'
@@ -28,10 +28,12 @@ class FakeSlurm:
 
     def _submit(self, folder, tasks, options) -> None:
         self.arrays.append([[work.name for work in Handover(folder).left(task.number).values()] for task in tasks])
-        self.queue |= {(folder.name, task.number): State("PENDING", f"7_{task.number}", "Priority") for task in tasks}
+        self.queue |= {
+            (folder.name, task.number): TaskState("PENDING", f"7_{task.number}", "Priority") for task in tasks
+        }
 
     def put(self, name: str, reason: str = "None") -> None:
-        self.queue = {key: State(name, state.job, reason) for key, state in self.queue.items()}
+        self.queue = {key: TaskState(name, state.job, reason) for key, state in self.queue.items()}
 
 
 @pytest.fixture

@@ -23,7 +23,7 @@ from vd4rl_pomdp.sweeps.executors.slurm_queue import (
     QUEUE_S,
     Queue,
     SlurmOptions,
-    State,
+    TaskState,
     cancel,
     read_queue,
     require_slurm,
@@ -36,7 +36,7 @@ FILES_S = 1.0
 AGAIN_S = 60.0
 """Seconds until an array is submitted again that Slurm did not take."""
 _GONE = "gone"
-"""State of a task that the queue does not know."""
+"""TaskState of a task that the queue does not know."""
 _USUAL = ("None", "Priority", "Resources", "BeginTime", "Cleaning", "JobArrayTaskLimit")
 """What a task waits for that comes by itself."""
 OVER = {
@@ -45,7 +45,7 @@ OVER = {
 }
 """Slurm's states of a task that has ended, and why the jobs in it did that have not told themselves. A task that ends
 in peace with jobs left was asked to."""
-_UNKNOWN = State(_GONE, "unknown")
+_UNKNOWN = TaskState(_GONE, "unknown")
 
 
 @dataclass(eq=False)
@@ -98,7 +98,7 @@ class _Task:
                 del self.mine[name]
                 yield self.array.end_of(attempt)
 
-    def untold(self, state: State) -> list[Ended]:
+    def untold(self, state: TaskState) -> list[Ended]:
         """How its jobs ended when it has ended itself."""
         line = last_line(self.array.folder / f"{state.job}_0_log.out") if state.name == "FAILED" else ""
         line = line or f"Slurm says {state.name} of task {state.job}"

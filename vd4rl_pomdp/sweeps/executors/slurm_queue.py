@@ -54,7 +54,7 @@ class SlurmOptions(Options):
     }
 
 
-class State(NamedTuple):
+class TaskState(NamedTuple):
     """What the queue says of a task."""
 
     name: str
@@ -65,7 +65,7 @@ class State(NamedTuple):
     """What it waits for."""
 
 
-Queue = dict[tuple[str, int], State]
+Queue = dict[tuple[str, int], TaskState]
 """By array and number of the task."""
 
 
@@ -87,7 +87,7 @@ def read_queue() -> Queue | None:
     if answer.returncode:
         return None
     rows = [line.split("|") for line in answer.stdout.splitlines() if line.startswith(PREFIX)]
-    return {(name, int(number) if number.isdigit() else 0): State(*state) for name, number, *state in rows}
+    return {(name, int(number) if number.isdigit() else 0): TaskState(*state) for name, number, *state in rows}
 
 
 def submit(folder: Path, tasks: list[Allocation], options: SlurmOptions) -> None:
