@@ -26,5 +26,8 @@ def test_a_cell_runs_from_its_set_to_its_result(tmp_path, monkeypatch, capsys, g
             "patch+zero_frames",
             "none",
         }
+    else:
+        main(["navigation", "report", str(tmp_path / "out"), "--out", str(tmp_path / "report"), "--no-pictures"])
+        assert (tmp_path / "report" / "tables.csv").is_file()
     main(["sweep", "status", str(tmp_path / "out")])
     assert f"{jobs} jobs: {jobs} done" in capsys.readouterr().out

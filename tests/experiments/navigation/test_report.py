@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from pretrain.navigation.config import NavigationConfig
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation import figures
@@ -17,6 +18,7 @@ from vd4rl_pomdp.experiments.navigation.runs import load_runs
 from vd4rl_pomdp.mazes import FREE_CELLS, MAZES
 from vd4rl_pomdp.navigation.measures import RAW_PREFIX, Measure, refitted_error
 from vd4rl_pomdp.navigation.methods import OBJECTIVES
+from vd4rl_pomdp.options import flat
 
 ROOT = Path(__file__).parents[3]
 STATE = refitted_error("state")
@@ -26,15 +28,12 @@ def write_run(base: Path, condition: Condition, seed: int, level: float, raw: bo
     """A finished run whose every error is `level`, in raw units 1.5 times that, and whose losses grow with k."""
     folder = base / condition.name / f"seed{seed}"
     folder.mkdir(parents=True)
-    config = {
-        "method": condition.method,
-        "max_k": condition.max_k,
-        "self_prediction": float(condition.self_prediction),
-        "exogenous": "photographs" if condition.exogenous else "none",
-        "literal_future": condition.literal_future,
-        "preset": "cpu",
-        "seed": seed,
+    asked = {"self_prediction": float(condition.self_prediction), "literal_future": condition.literal_future}
+    asked |= {"exogenous": "photographs"} if condition.exogenous else {}
+    settings = {"method": condition.method, "max_k": condition.max_k, "seed": seed} | {
+        k: v for k, v in asked.items() if v
     }
+    config = flat(NavigationConfig.of("cpu", data="data", out="out", **settings))
     command = f"vd4rl-pomdp navigation train --data data/{condition.maze} --method {condition.method} --seed {seed}"
     record = {"stage": "navigation", "config": config, "git_commit": "abc", "command": command}
     common = {"rows": "all", "k": 0, "value": level}

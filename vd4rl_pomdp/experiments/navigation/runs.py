@@ -211,9 +211,10 @@ def _run_of(folder: Path) -> NavigationRun:
     config, timing, machine = record["config"], read_json(folder / "timing.json"), read_json(folder / "machine.json")
     named = {
         "maze": results["maze"],
-        **{name: config[name] for name in ("method", "max_k", "literal_future")},
-        "self_prediction": config["self_prediction"] > 0,
+        **{name: config[name] for name in ("method", "max_k")},
         "exogenous": config["exogenous"] != "none",
+        "self_prediction": config.get("self_prediction", 0.0) > 0,  # these two are options of some methods alone
+        "literal_future": config.get("literal_future", False),
     }
     condition = build(Condition, named)
     if not isinstance(config["preset"], str):
