@@ -187,8 +187,8 @@ def told(text: str) -> dict[str, str]:
 def is_test(name: str) -> bool:
     """Whether `file`, `file::function` or `file::function[case]` is a test."""
     file, _, function = name.partition("::")
-    path = ROOT / file
-    return path.is_file() and f"def {function.partition('[')[0]}" in path.read_text(encoding="utf-8")
+    path, wanted = ROOT / file, f"def {function.partition('[')[0]}(" if function else "def "
+    return path.is_file() and wanted in path.read_text(encoding="utf-8")
 
 
 def _tried(mutants: list[Mutant], limit: float, whole_suite: bool) -> Iterator[tuple[Mutant, str]]:

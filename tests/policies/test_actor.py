@@ -28,7 +28,7 @@ PLAYED = 8
 
 @pytest.mark.parametrize("name", ACTORS)
 def test_an_actor_returns_what_its_card_says(name):
-    """To the digit, but for an episode or two: processors differ in a state's last bit, which a fall magnifies."""
+    """To the digit, but for an episode: processors differ in a state's last bit, which a fall magnifies."""
     task, quality = name.rsplit("_", 1)
     shipped = load_actor(task, quality)
     card = json.loads((actor.ASSETS / f"{name}.json").read_text())
@@ -39,7 +39,7 @@ def test_an_actor_returns_what_its_card_says(name):
     if differing:
         pytest.skip(f"the card was written with another {' and '.join(differing)}")
     found, said = np.array(episode_returns(shipped, TASKS.named(task), PLAYED)), np.array(card["returns"][:PLAYED])
-    assert (found == said).sum() >= PLAYED - 2
+    assert (found == said).sum() >= PLAYED - 1
     assert found.mean() == pytest.approx(said.mean(), rel=0.02)
 
 

@@ -48,7 +48,7 @@ class ExogenousNoise:
 
     def fingerprint(self) -> str:
         """Hash of the files of the pool; for a pool that needs none, only its name."""
-        if self._source in (TEXTURES, PHOTOGRAPHS):
+        if self._source in _MADE:
             return self._source
         digest = hashlib.blake2b(digest_size=12)
         for path in _files(Path(self._source)):
@@ -66,10 +66,8 @@ class ExogenousNoise:
 def load_pool(source: str, seed: int) -> Tensor:
     """Images to add: (P, 3, 100, 100) uint8; raises UserError if there is none."""
     rng = np.random.default_rng(stream_seed(seed, "exogenous", "images"))
-    if source == TEXTURES:
-        return _to_size(np.stack([_dead_leaves(rng) for _ in range(POOL)]))
-    if source == PHOTOGRAPHS:
-        return _photographs(rng)
+    if source in _MADE:
+        return _MADE[source](rng)
     images = list(_resized(Path(source)))
     if not images:
         raise UserError(
@@ -78,6 +76,11 @@ def load_pool(source: str, seed: int) -> Tensor:
         )
     pool = torch.cat(images)
     return pool[torch.from_numpy(rng.permutation(len(pool))[:POOL])]
+
+
+def _textures(rng: np.random.Generator) -> Tensor:
+    """Pictures of discs."""
+    return _to_size(np.stack([_dead_leaves(rng) for _ in range(POOL)]))
 
 
 def _dead_leaves(rng: np.random.Generator) -> np.ndarray:
@@ -110,6 +113,10 @@ def _photographs(rng: np.random.Generator) -> Tensor:
         crop = photograph[top : top + side, left : left + side]
         crops.append(_to_size(np.ascontiguousarray(crop[:, ::-1] if rng.random() < 0.5 else crop)[None]))
     return torch.cat(crops)
+
+
+_MADE = {TEXTURES: _textures, PHOTOGRAPHS: _photographs}
+"""Pools that need no files: what makes them, by name."""
 
 
 def _resized(folder: Path) -> Iterator[Tensor]:

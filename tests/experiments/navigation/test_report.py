@@ -28,12 +28,14 @@ def write_run(base: Path, condition: Condition, seed: int, level: float, raw: bo
     """A finished run whose every error is `level`, in raw units 1.5 times that, and whose losses grow with k."""
     folder = base / condition.name / f"seed{seed}"
     folder.mkdir(parents=True)
-    asked = {"self_prediction": float(condition.self_prediction), "literal_future": condition.literal_future}
-    asked |= {"exogenous": "photographs"} if condition.exogenous else {}
-    settings = {"method": condition.method, "max_k": condition.max_k, "seed": seed} | {
-        k: v for k, v in asked.items() if v
+    asked = {
+        **{"data": "data", "out": "out", "method": condition.method, "max_k": condition.max_k},
+        "self_prediction": float(condition.self_prediction),
+        "literal_future": condition.literal_future,
+        "exogenous": condition.exogenous and "photographs",
     }
-    config = flat(NavigationConfig.of("cpu", data="data", out="out", **settings))
+    given = {name: value for name, value in asked.items() if value}  # not every method knows all of them
+    config = flat(NavigationConfig.of("cpu", seed=seed, **given))
     command = f"vd4rl-pomdp navigation train --data data/{condition.maze} --method {condition.method} --seed {seed}"
     record = {"stage": "navigation", "config": config, "git_commit": "abc", "command": command}
     common = {"rows": "all", "k": 0, "value": level}
