@@ -77,17 +77,18 @@ class DemoCommand:
 
     out: Path = Path("runs/demo")
     """Folder of the demo's data and runs; the same command continues where it was cut."""
-    workers: int = 0
-    """Processes; 0 uses every core."""
+    jobs: int = 0
+    """Commands at a time; 0: as many as the GPUs take, or one a core, up to 4."""
     preset: str = "cpu"
     """cpu: minutes; smoke: only that every stage runs."""
 
 
 def _demo(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.cli.sweeps import carry_out
     from vd4rl_pomdp.experiments.demo import demo
 
     command = parse(DemoCommand, words, program)
-    demo(command.out, command.workers, command.preset, run_stage)
+    demo(command.out, command.jobs, command.preset, carry_out, run_stage)
 
 
 DEMO = Command("every stage on a small set, in minutes", _demo)

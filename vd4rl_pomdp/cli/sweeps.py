@@ -112,10 +112,15 @@ def _print_plan(jobs: list[Job], past: list[Any]) -> None:
 
 
 def _carry_out(jobs: list[Job], command: _ExecutorConfig, folder: SweepFolder) -> None:
-    """Run jobs to their end; SystemExit 1 if some are not finished."""
+    carry_out(jobs, folder, command.executor, command.options)
+    print(f"all {len(jobs)} jobs are finished")
+
+
+def carry_out(jobs: list[Job], folder: SweepFolder, kind: str, options: Options) -> None:
+    """Run jobs to their end on an executor of a kind; SystemExit 1 if some are not finished."""
     from vd4rl_pomdp.sweeps.driver import Driver
 
-    executor = executor_kind(command.executor).build(command.options, folder.of_executor(command.executor))
+    executor = executor_kind(kind).build(options, folder.of_executor(kind))
     if not Driver(jobs, executor, folder).run():
         failures = _status(folder, jobs).failures
         for name, row in failures.items():
@@ -123,7 +128,6 @@ def _carry_out(jobs: list[Job], command: _ExecutorConfig, folder: SweepFolder) -
         left = f"{sum(not job.finished for job in jobs)} of {len(jobs)} jobs are not finished"
         print(f"{left}, {len(failures)} failed; `{PROGRAM} sweep retry {folder.out}` takes those up again")
         sys.exit(1)
-    print(f"all {len(jobs)} jobs are finished")
 
 
 def _status(folder: SweepFolder, jobs: list[Job]) -> Any:

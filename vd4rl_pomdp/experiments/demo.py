@@ -1,4 +1,4 @@
-"""The demo: the grids `quick` and `quick_navigation`, job after job, a report and a film.
+"""The demo: the grids `quick` and `quick_navigation` as one sweep, a report and a film.
 
 It shows that all works, not which method is best.
 """
@@ -6,6 +6,7 @@ It shows that all works, not which method is best.
 from __future__ import annotations
 
 import math
+import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
@@ -13,13 +14,17 @@ from pathlib import Path
 
 import numpy as np
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_no_folder
 from vd4rl_pomdp.experiments.navigation.film import write_film
 from vd4rl_pomdp.experiments.navigation.runs import load_runs
 from vd4rl_pomdp.mazes import get_maze
 from vd4rl_pomdp.navigation.measures import refitted_error
+from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.outputs import refuse_kept
+from vd4rl_pomdp.runs.workers import count_workers
+from vd4rl_pomdp.sweeps.executors.local import LocalOptions, visible_gpus
+from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.plan import Job, JobPlanner
@@ -27,9 +32,10 @@ from vd4rl_pomdp.sweeps.plan import Job, JobPlanner
 GRIDS = {"runs": "quick", "navigation": "quick_navigation"}
 """What is carried out, by the folder that it goes to."""
 FILM = "navigation.gif"
-_WITHOUT_WORKERS = ("pretrain", "navigation_train")
 PRESETS = {"cpu": False, "smoke": True}
 """Whether a preset is the grid's testing subset."""
+MOST_AT_ONCE = 4
+"""More jobs at a time than this would end no sooner."""
 
 
 def demo_jobs(out: Path, preset: str = "cpu") -> list[Job]:
@@ -43,30 +49,45 @@ def demo_jobs(out: Path, preset: str = "cpu") -> list[Job]:
     return jobs
 
 
-def demo(out: Path, workers: int, preset: str, run: Callable[[list[str]], None]) -> None:
-    """Run every command of the demo, printing each so that it can be run by hand.
+def demo(
+    out: Path,
+    at_once: int,
+    preset: str,
+    carry_out: Callable[[list[Job], SweepFolder, str, Options], None],
+    run: Callable[[list[str]], None],
+) -> None:
+    """Run every command of the demo, after printing them so that they can be run by hand.
 
     Args:
         out: folder of data, runs and report.
-        workers: processes, 0 for every core.
-        preset: how long the stages take, one of PRESETS; UserError for another.
+        at_once: jobs at a time, 0 for what the machine takes.
+        preset: how long the stages take, one of PRESETS.
+        carry_out: what runs jobs on an executor of a kind with options.
         run: what carries out one command line.
+
+    Raises:
+        UserError: an unknown preset, a number of jobs that cannot be, or a folder that is something else.
     """
-    refuse_kept(out)
     started = time.monotonic()
-    jobs = demo_jobs(out, preset)
+    options = LocalOptions(jobs=at_once or _jobs_at_once())
+    options.check()
+    refuse_no_folder(out)
+    refuse_kept(out)
+    jobs, folder = demo_jobs(out, preset), SweepFolder(out)
     report = ("report", str(out / "runs"), "--out", str(out / "report"))
-    for words in (*demo_commands(jobs, workers), report):
-        print(f"\n$ vd4rl-pomdp {' '.join(words)}", file=sys.stderr)
-        run(list(words))
+    for words in (*(job.words for job in jobs if not job.finished), report):
+        print(f"$ vd4rl-pomdp {shlex.join(words)}", file=sys.stderr)
+    print(f"Where this stands: vd4rl-pomdp sweep status {out}; what it prints: {folder.path / 'logs'}", file=sys.stderr)
+    folder.keep_plan("demo", jobs)
+    carry_out(jobs, folder, "local", options)
+    run(list(report))
     print("\n".join([*conclusion(jobs), *show_navigation(jobs, out / FILM)]))
     print(f"demo finished in {(time.monotonic() - started) / 60:.1f} minutes")
 
 
-def demo_commands(jobs: list[Job], workers: int) -> Iterator[tuple[str, ...]]:
-    """Words of every job's command line."""
-    for job in jobs:
-        yield (*job.words, *(() if job.section in _WITHOUT_WORKERS else ("--workers", str(workers))))
+def _jobs_at_once() -> int:
+    """One a core, or 0, which the executor takes for one a GPU."""
+    return 0 if visible_gpus() else min(count_workers(0), MOST_AT_ONCE)
 
 
 def conclusion(jobs: list[Job]) -> Iterator[str]:
