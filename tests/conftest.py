@@ -1,8 +1,10 @@
 """One thread a process: the tests run on several processes, and small tensors gain nothing from more.
 
-Ctrl-C is answered, also where the tests were started in the background of a shell, which lets its jobs ignore it.
+JAX compiles without most optimisations: the tests compile much and run little of it. Ctrl-C is answered, also where
+the tests were started in the background of a shell, which lets its jobs ignore it.
 """
 
+import os
 import signal
 from pathlib import Path
 
@@ -11,6 +13,7 @@ import torch
 
 from tests.helpers_data import write_fake_set
 
+os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
 torch.set_num_threads(1)
 signal.signal(signal.SIGINT, signal.default_int_handler)
 

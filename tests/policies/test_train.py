@@ -1,6 +1,7 @@
 import json
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,10 +19,11 @@ SETTINGS = {
 
 @pytest.fixture
 def configure(monkeypatch):
-    """Settings of a run that trains after 40 decisions and lasts seconds."""
+    """Settings of a run with short episodes that trains after 40 decisions and lasts seconds."""
     from vd4rl_pomdp.policies import export, learner
     from vd4rl_pomdp.policies.config import PolicyConfig
 
+    monkeypatch.setitem(TASKS._parts, "walker_walk", replace(TASKS["walker_walk"], decisions=100))
     monkeypatch.setattr(learner, "RANDOM_DECISIONS", 20)
     monkeypatch.setattr(export, "CARD_EPISODES", 2)
     small = {"hidden": 16, "batch_size": 32, "replay_size": 2_000, "eval_every": 40, "eval_episodes": 1}
@@ -75,8 +77,6 @@ def test_a_checkpoint_brings_everything_back(configure, tmp_path):
 
 
 def test_a_run_goes_on_and_forgets_what_it_wrote_after_its_checkpoint(configure, tmp_path, monkeypatch):
-    from dataclasses import replace
-
     from vd4rl_pomdp.policies import learner
     from vd4rl_pomdp.policies.export import read_curve
     from vd4rl_pomdp.policies.train import decisions_made, train_policy
