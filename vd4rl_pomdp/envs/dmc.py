@@ -21,13 +21,13 @@ class DMCEnv(PixelEnv):
         self, task: DMCTask, render: Render = "fast", size: int | None = FRAME_SIZE, length: int | None = None
     ) -> None:
         super().__init__(task, size, length)
-        self._camera = task.camera
         self._random = np.random.RandomState(0)
         self.simulator = _load(task, self._random)
         """The dm_control environment."""
-        self._layout = task.layout or self._found_layout()
+        self._layout = task.layout or self._found_layout(task.camera)
         if size is not None:
             rendering.prepare(self.physics, render, size)
+            self._view = rendering.View(self.physics, size, task.camera)
 
     @property
     def physics(self) -> Any:
@@ -39,12 +39,12 @@ class DMCEnv(PixelEnv):
         """The task's own, else what the model has."""
         return self._layout
 
-    def _found_layout(self) -> Layout:
+    def _found_layout(self, camera: int) -> Layout:
         """Widths of a model; a camera that tracks its subject does not show where it is."""
         model = self.physics.model
         self.simulator.reset()  # an episode of its own: some tasks observe nothing before
         state = flat_state(self.simulator.task.get_observation(self.physics))
-        travel = _ground_travel(model) if _tracks(model, self._camera) else ()
+        travel = _ground_travel(model) if _tracks(model, camera) else ()
         turning, quaternions = _free_joints(model)
         return Layout(self.simulator.action_spec().shape[0], len(state), model.nq, travel, turning, quaternions)
 
@@ -63,7 +63,7 @@ class DMCEnv(PixelEnv):
 
     def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
         return TimeStep(
-            frame=rendering.frame(self.physics, self.size, self._camera) if self.size and self.drawing else None,
+            frame=self._view.frame() if self.size and self.drawing else None,
             state=flat_state(self.simulator.task.get_observation(self.physics)),
             physics=self.physics.get_state(),
             reward=reward,

@@ -34,6 +34,7 @@ def gl_error(error: Exception) -> UserError:
 try:  # both load the OpenGL library that MUJOCO_GL names, and fail in many ways where it is missing
     import mujoco
     from dm_control import suite
+    from dm_control.mujoco import Camera
 except (ImportError, AttributeError, RuntimeError, ctypes.ArgumentError) as _error:
     if getattr(_error, "name", None) == "dm_control":
         raise UserError("dm-control is not installed: `pip install --no-deps dm-control==1.0.44`") from _error
@@ -41,8 +42,8 @@ except (ImportError, AttributeError, RuntimeError, ctypes.ArgumentError) as _err
 
 __all__ = [
     "Render",
+    "View",
     "check_mujoco",
-    "frame",
     "frames_hash",
     "gl_error",
     "gl_strings",
@@ -101,14 +102,27 @@ def refuse_after_fork() -> None:
         )
 
 
-def frame(physics: Any, size: int = FRAME_SIZE, camera: int = 0) -> np.ndarray:
-    """What a camera shows, as V-D4RL stores it: (3, size, size) uint8."""
-    refuse_after_fork()
-    try:
-        image = physics.render(size, size, camera_id=camera)
-    except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
-        raise gl_error(error) from error
-    return np.ascontiguousarray(image.transpose(2, 0, 1))
+class View:
+    """What a camera shows of a simulator, as V-D4RL stores it.
+
+    `physics.render` would set up a camera for every picture, which takes a sixth of the time of drawing it.
+    """
+
+    def __init__(self, physics: Any, size: int = FRAME_SIZE, camera: int = 0) -> None:
+        """Nothing is drawn, and no OpenGL context made."""
+        self._physics, self._size, self._number = physics, size, camera
+        self._camera: Camera | None = None
+
+    def frame(self) -> np.ndarray:
+        """The present state: (3, size, size) uint8."""
+        refuse_after_fork()
+        try:
+            if self._camera is None:
+                self._camera = Camera(self._physics, self._size, self._size, self._number)
+            image = self._camera.render()
+        except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
+            raise gl_error(error) from error
+        return np.array(image.transpose(2, 0, 1), order="C")  # a copy: the camera draws into one buffer
 
 
 @cache
