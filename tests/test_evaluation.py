@@ -18,7 +18,7 @@ from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.envs.corrupted import Observation
 from vd4rl_pomdp.envs.pixels import TimeStep
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import EVALUATION_SEED, EpisodeJob, episode_rows, evaluate, evaluate_run
+from vd4rl_pomdp.evaluation import EVALUATION_SEED, Episode, EpisodeJob, by_part, episode_rows, evaluate, evaluate_run
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.policies.actor import ASSETS, load_actor
@@ -122,7 +122,7 @@ def test_episode_i_has_the_environment_seed_20000_plus_i_and_its_own_corruption(
 
 def test_a_return_is_the_sum_of_all_rewards_and_a_score_a_tenth_of_it(world, agent, tmp_path):
     (episode,) = play(tmp_path, 0)
-    assert (episode.total, episode.length) == (sum(REWARDS), LENGTH)
+    assert (episode.total, len(episode.rewards)) == (sum(REWARDS), LENGTH)
     (row,) = episode_rows([episode], {"task": "walker_walk"})
     assert (row["return"], row["score"], row["length"]) == (11.75, 1.175, LENGTH)
 
@@ -139,17 +139,31 @@ def test_the_action_error_is_to_what_the_datas_actor_does_where_the_policy_is(wo
     assert (row["evaluated_under"], row["action_error"]) == ("patch", round(episode.action_error, 6))
 
 
+def test_parts_of_episodes_tell_where_reward_and_errors_are():
+    whole = Episode("none", 0, [0.0, 1.0, 2.0, 3.0, 4.0], None, [0.1, 0.2, 0.3, 0.4, 0.5])
+    short = Episode("none", 1, [6.0], None, [0.5])
+    assert by_part([whole, short], 2) == {
+        "0-1": {"reward": pytest.approx(7 / 3), "action_error": pytest.approx(0.8 / 3)},
+        "2-4": {"reward": pytest.approx(3.0), "action_error": pytest.approx(0.4)},
+    }
+    assert list(by_part([whole], 99)) == ["0-0", "1-1", "2-2", "3-3", "4-4"], "no part is empty"
+    assert by_part([Episode("none", 0, [1.0], None)], 1) == {"0-0": {"reward": 1.0, "action_error": None}}
+
+
 def test_a_run_is_evaluated_as_it_was_trained_and_under_none_or_as_one_says(world, encoder, data, tmp_path, capsys):
     config = smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2)
     run = finetune(config).path
     for asked, expected in ((None, ["patch+zero_frames", "none"]), ("patch", ["patch"])):
-        rows = evaluate_run(run, asked, 1, 1)
+        rows = evaluate_run(run, asked, 1, 1).rows
         assert [row["evaluated_under"] for row in rows] == expected
         assert {row["corruption"] for row in rows} == {"patch+zero_frames"}, "what it was trained under"
-    main(["evaluate", str(run), "--episodes", "1", "--workers", "1", "--out", str(tmp_path / "rows.csv")])
+    rest = ["--parts", "2", "--out", str(tmp_path / "rows.csv")]
+    main(["evaluate", str(run), "--episodes", "1", "--workers", "1", *rest])
     told = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
     assert told["data_return"] == f"{open_dataset(data).returns.mean():.6g}"
     assert (told["path_error"], told["under.none.action_error"]) == ("unknown", "unknown")
+    halves = [float(told[f"under.none.parts.{part}.reward"]) for part in ("0-1", "2-4")]
+    assert halves == pytest.approx([np.mean(REWARDS[:2]), np.mean(REWARDS[2:])], rel=1e-5)
     written = read_episodes(tmp_path / "rows.csv")
     for row in written:
         assert told[f"under.{row['evaluated_under']}.return_mean"] == f"{row['return']:.6g}"
@@ -168,7 +182,7 @@ def test_an_evaluation_names_its_step_and_touches_no_other_file(world, encoder, 
         evaluate_run(run.path, "fog", 1, 1)
     with pytest.raises(UserError, match="holds no evaluated run"):
         evaluate_run(encoder.parent, None, 1, 1)
-    assert [row["step"] for row in evaluate_run(run.path, None, 1, 1)] == [2, 2]
+    assert [row["step"] for row in evaluate_run(run.path, None, 1, 1).rows] == [2, 2]
     (run.path / "labels.json").write_text("{}")
     with pytest.raises(UserError, match=r"labels\.json: has no 'method'"):
         evaluate_run(run.path, None, 1, 1)

@@ -82,7 +82,7 @@ def test_tasks_of_both_kinds_and_any_size_go_through_every_stage(tasks, tmp_path
     run = stages(data, tmp_path / "runs")
     assert load_encoder(run / "encoder")[0].config.size == size
     assert {row["task"] for row in read_episodes(run / "episodes.csv")} == {name}
-    assert {row["task"] for row in evaluate_run(run, "patch", 1, 1)} == {name}
+    assert {row["task"] for row in evaluate_run(run, "patch", 1, 1).rows} == {name}
     assert np.load(run / "film.npz")["corrupted"].shape[1:] == (9, size, size)
     assert (run / "probe.json").exists() == (name != "centre")
     write_report([tmp_path / "runs"], tmp_path / "report")
@@ -179,7 +179,7 @@ def test_an_evaluation_is_never_longer_than_the_task(tasks, tmp_path):
 
 def test_a_score_is_divided_by_the_tasks_own_number(tasks):
     tasks.register("games", replace(tasks["centre"], score_divisor=4.0))
-    (row,) = episode_rows([Episode("none", 0, 2.0, 1, None)], {"task": "games"})
+    (row,) = episode_rows([Episode("none", 0, [2.0], None)], {"task": "games"})
     assert (row["return"], row["score"]) == (2.0, 0.5)
 
 

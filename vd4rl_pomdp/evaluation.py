@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
 from functools import cache
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -95,13 +96,23 @@ class Episode:
     evaluated_under: str
     """Name of the corruption that it was played under."""
     episode: int
-    total: float
-    length: int
+    rewards: list[float]
+    """One a decision."""
     film: dict[str, np.ndarray] | None
     """`clean` (F, 3, S, S) and `corrupted` (F, C, S, S) uint8 pictures, `return` (F,) so far."""
-    action_error: float | None = None
-    """In closed loop: mean over its decisions of the mean squared difference between the policy's action and the mean
-    action of the data's actor at the state it is in."""
+    action_errors: list[np.floating] | None = None
+    """In closed loop, one a decision: mean squared difference between the policy's action and the mean action of the
+    data's actor at the state it is in; None: the actor is not known."""
+
+    @property
+    def total(self) -> float:
+        """Its return, added up in order."""
+        return float(np.cumsum(self.rewards)[-1])
+
+    @property
+    def action_error(self) -> float | None:
+        """Mean over its decisions."""
+        return float(np.mean(self.action_errors)) if self.action_errors else None
 
 
 def evaluate(
@@ -125,7 +136,7 @@ def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[s
             "episode": e.episode,
             "episode_seed": EVALUATION_SEED + e.episode,
             "return": round(e.total, 4),
-            "length": e.length,
+            "length": len(e.rewards),
             "score": round(e.total / divisor, 4),
             "evaluated_under": e.evaluated_under,
             "action_error": None if e.action_error is None else round(e.action_error, 6),
@@ -160,19 +171,19 @@ def _draws(agent: Agent, job: EpisodeJob) -> Drawn:
 def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
     agent.reset()
     now = env.reset(EVALUATION_SEED + job.episode, EVALUATION_SEED, job.episode)
-    total, length, film = 0.0, 0, [(now, 0.0)]
-    actor, errors = job.actor and _actor(job.actor), []
+    film = [(now, 0.0)]
+    actor = _actor(job.actor) if job.actor else None
+    rewards: list[float] = []
+    errors: list[np.floating] | None = [] if actor else None
     while not now.time_step.last:
         action = agent.act(agent.encoder_input(now, job.task))
-        if actor:
+        if actor and errors is not None:
             errors.append(action_error(action, actor.act(now.time_step.state)))
         now = env.step(action)
-        total += now.time_step.reward
-        length += 1
-        if job.film and length % FILM_EVERY == 0:
-            film.append((now, total))
-    error = float(np.mean(errors)) if errors else None
-    return Episode(job.corruption.corruption, job.episode, total, length, _film(film) if job.film else None, error)
+        rewards.append(now.time_step.reward)
+        if job.film and len(rewards) % FILM_EVERY == 0:
+            film.append((now, float(np.cumsum(rewards)[-1])))
+    return Episode(job.corruption.corruption, job.episode, rewards, _film(film) if job.film else None, errors)
 
 
 @cache
@@ -188,7 +199,44 @@ def _film(shots: list[tuple[Observation, float]]) -> dict[str, np.ndarray]:
     }
 
 
-def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int) -> list[dict[str, Any]]:
+def by_part(episodes: list[Episode], parts: int) -> dict[str, dict[str, float | None]]:
+    """Where in time policies lose their way.
+
+    Args:
+        episodes: some that share a task; one that ended early is in the parts that it reached.
+        parts: into how many the longest is cut, at least 1; more than it has decisions are as many as these.
+
+    Returns:
+        By first and last decision ("0-49"): mean `reward` and `action_error` (None: unknown) of a decision.
+    """
+    longest = max(len(episode.rewards) for episode in episodes)
+    parts = min(parts, longest)
+    edges = [longest * part // parts for part in range(parts + 1)]
+    return {
+        f"{first}-{end - 1}": {
+            "reward": _mean(value for episode in episodes for value in episode.rewards[first:end]),
+            "action_error": _mean(value for e in episodes for value in (e.action_errors or [])[first:end]),
+        }
+        for first, end in pairwise(edges)
+    }
+
+
+def _mean(values: Iterable[Any]) -> float | None:
+    found = list(values)
+    return float(np.mean(found)) if found else None
+
+
+@dataclass(frozen=True)
+class Evaluation:
+    """A policy played again."""
+
+    rows: list[dict[str, Any]]
+    """Of `episodes.csv`; `corruption` is that of training, `step` that of the run's newest policy."""
+    episodes: list[Episode]
+    """Their episodes, in the same order."""
+
+
+def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int) -> Evaluation:
     """Evaluate a fine-tuning run's policy.
 
     Args:
@@ -199,8 +247,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
         workers: processes, 0 for every core.
 
     Returns:
-        Rows of `episodes.csv`, `episodes` of them under each corruption; `corruption` is that of training, `step`
-        that of the run's newest policy.
+        `episodes` of them under each corruption.
 
     Raises:
         UserError: an unknown corruption, no episode, or a folder without an evaluated run.
@@ -228,7 +275,8 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
         for episode in range(episodes)
     ]
     step = max(row["step"] for row in evaluated)
-    return episode_rows(evaluate(jobs, workers), labels | {"step": step})
+    played = evaluate(jobs, workers)
+    return Evaluation(episode_rows(played, labels | {"step": step}), played)
 
 
 def own_and_none(corruption: CorruptionConfig) -> list[CorruptionConfig]:

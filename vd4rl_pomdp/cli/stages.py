@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
@@ -37,6 +38,8 @@ class EvaluateCommand:
     """Corruption at evaluation; default: the one it was trained under, and then none, which takes as long again."""
     episodes: int = 10
     """Episodes under each corruption."""
+    parts: int = 1
+    """Also tell reward and action error in so many equal parts of the episodes: when a policy loses its way."""
     workers: int = 0
     """Processes; 0 uses every core."""
     out: Path | None = None
@@ -46,7 +49,8 @@ class EvaluateCommand:
 
 
 def _evaluate(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.evaluation import evaluate_run
+    from vd4rl_pomdp.errors import refuse_number
+    from vd4rl_pomdp.evaluation import by_part, evaluate_run
     from vd4rl_pomdp.reference import Reference, summarise
     from vd4rl_pomdp.runs.episodes import append_episodes, begin_episodes
     from vd4rl_pomdp.runs.files import flatten
@@ -56,16 +60,20 @@ def _evaluate(words: Arguments, program: str) -> None:
     if command.out is not None:
         refuse_inside(command.out)
         begin_episodes(command.out)  # before any episode is played
-    rows = evaluate_run(command.run, command.corruption, command.episodes, command.workers)
+    refuse_number("parts", command.parts, 1)
+    played = evaluate_run(command.run, command.corruption, command.episodes, command.workers)
+    rows = played.rows
     if command.out is not None:
         append_episodes(command.out, rows)
     reference = Reference.read(command.run)
     labels = {k: rows[0][k] for k in ("method", "task", "quality", "corruption", "algorithm", "seed", "step")}
     known = {"data_return": reference.data_return, "path_error": reference.path_error}
-    under = {}
+    under: dict[str, dict[str, Any]] = {}
     for name in dict.fromkeys(row["evaluated_under"] for row in rows):
         mine = [row for row in rows if row["evaluated_under"] == name]
         under[name] = summarise(mine, reference) | {"episodes": mine if command.json else len(mine)}
+        if command.parts > 1:
+            under[name]["parts"] = by_part([e for e in played.episodes if e.evaluated_under == name], command.parts)
     result = labels | known | {"under": under}
     told = {name: "unknown" if value is None else value for name, value in flatten(result).items()}
     show(result if command.json else told, command.json)
