@@ -49,6 +49,11 @@ def test_a_setting_discriminates_if_state_acro_and_the_best_method_hold(tmp_path
     assert row["error"] == pytest.approx((800 / 2 + 800 / 2) ** 0.5)
 
 
+def test_the_best_method_is_one_whose_seeds_tell_how_sure_it_is(tmp_path):
+    row = patch_gate(grid(tmp_path, GOOD | {("mik", "patch"): (99,)}))
+    assert (row["verdict"], row["above_random"]) == ("discriminates", pytest.approx(520 - 120))
+
+
 @pytest.mark.parametrize(
     ("changes", "verdict"),
     [

@@ -81,7 +81,7 @@ def _evaluate(words: Arguments, program: str) -> None:
 
 @dataclass(frozen=True)
 class DemoCommand:
-    """Every stage on a small walker_walk set with real rendering, in minutes, ending with a table and a report."""
+    """Every stage, in minutes: three methods on a small walker_walk set, two in a maze; a table, a report, a film."""
 
     out: Path = Path("runs/demo")
     """Folder of the demo's data and runs; the same command continues where it was cut."""

@@ -50,7 +50,7 @@ def _gate(key: tuple[str, ...], runs: list[LoadedRun]) -> Row:
     clean = [run for run in alike if run.labels["corruption"] == "none"]
     data = next((value for run in here if (value := run.reference.data_return)), None)
     state, acro = (_best(_named(runs, name)) for runs, name in ((alike, "state"), (clean, "acro")))
-    learned = _best(run for run in here if run.labels["method"] not in REFERENCES)
+    learned = _best((run for run in here if run.labels["method"] not in REFERENCES), seeds=2)
     difference, error = _above(learned, _best(_named(here, "random")))
     row = dict(zip(SETTING, key, strict=True)) | {
         "data_return": data,
@@ -66,14 +66,18 @@ def _named(runs: Iterable[LoadedRun], method: str) -> Iterable[LoadedRun]:
     return (run for run in runs if run.labels["method"] == method)
 
 
-def _best(runs: Iterable[LoadedRun]) -> np.ndarray:
-    """Final returns by seed (n,) of the method and variant whose mean is highest, (0,) if there is no run."""
+def _best(runs: Iterable[LoadedRun], seeds: int = 1) -> np.ndarray:
+    """Final returns by seed (n,) of the method and variant whose mean is highest, (0,) if there is no run.
+
+    One with fewer seeds than asked for is taken only where none has as many.
+    """
     groups: dict[tuple[str, str], list[float]] = {}
     for run in runs:
         final = max(row["step"] for row in run.rows)
         mean = float(np.mean([row["return"] for row in run.rows if row["step"] == final]))
         groups.setdefault((str(run.labels["method"]), run.variant), []).append(mean)
-    return np.array(max(groups.values(), key=np.mean, default=[]))
+    enough = [means for means in groups.values() if len(means) >= seeds]
+    return np.array(max(enough or groups.values(), key=np.mean, default=[]))
 
 
 def _share(returns: np.ndarray, data: float | None) -> float | None:
