@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache
 from itertools import pairwise
 from pathlib import Path
@@ -100,9 +100,9 @@ class Episode:
     """One a decision."""
     film: dict[str, np.ndarray] | None
     """`clean` (F, 3, S, S) and `corrupted` (F, C, S, S) uint8 pictures, `return` (F,) so far."""
-    action_errors: list[np.floating] | None = None
+    action_errors: list[np.floating] = field(default_factory=list)
     """In closed loop, one a decision: mean squared difference between the policy's action and the mean action of the
-    data's actor at the state it is in; None: the actor is not known."""
+    data's actor at the state it is in; empty: the actor is not known."""
 
     @property
     def total(self) -> float:
@@ -111,7 +111,7 @@ class Episode:
 
     @property
     def action_error(self) -> float | None:
-        """Mean over its decisions."""
+        """Mean over its decisions, None if they are unknown."""
         return float(np.mean(self.action_errors)) if self.action_errors else None
 
 
@@ -172,12 +172,12 @@ def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
     agent.reset()
     now = env.reset(EVALUATION_SEED + job.episode, EVALUATION_SEED, job.episode)
     film = [(now, 0.0)]
-    actor = _actor(job.actor) if job.actor else None
+    actor = job.actor and _actor(job.actor)
     rewards: list[float] = []
-    errors: list[np.floating] | None = [] if actor else None
+    errors: list[np.floating] = []
     while not now.time_step.last:
         action = agent.act(agent.encoder_input(now, job.task))
-        if actor and errors is not None:
+        if actor:
             errors.append(action_error(action, actor.act(now.time_step.state)))
         now = env.step(action)
         rewards.append(now.time_step.reward)
@@ -215,7 +215,7 @@ def by_part(episodes: list[Episode], parts: int) -> dict[str, dict[str, float | 
     return {
         f"{first}-{end - 1}": {
             "reward": _mean(value for episode in episodes for value in episode.rewards[first:end]),
-            "action_error": _mean(value for e in episodes for value in (e.action_errors or [])[first:end]),
+            "action_error": _mean(value for episode in episodes for value in episode.action_errors[first:end]),
         }
         for first, end in pairwise(edges)
     }
@@ -227,7 +227,7 @@ def _mean(values: Iterable[Any]) -> float | None:
 
 
 @dataclass(frozen=True)
-class Evaluation:
+class EvaluatedRun:
     """A policy played again."""
 
     rows: list[dict[str, Any]]
@@ -236,7 +236,7 @@ class Evaluation:
     """Their episodes, in the same order."""
 
 
-def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int) -> Evaluation:
+def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int) -> EvaluatedRun:
     """Evaluate a fine-tuning run's policy.
 
     Args:
@@ -276,7 +276,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     ]
     step = max(row["step"] for row in evaluated)
     played = evaluate(jobs, workers)
-    return Evaluation(episode_rows(played, labels | {"step": step}), played)
+    return EvaluatedRun(episode_rows(played, labels | {"step": step}), played)
 
 
 def own_and_none(corruption: CorruptionConfig) -> list[CorruptionConfig]:

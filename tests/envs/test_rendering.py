@@ -51,4 +51,4 @@ def test_pictures_do_not_depend_on_the_size_of_the_buffer_they_are_drawn_in(task
     start = env.physics.get_state()
     with other.reset_context():
         other.set_state(start)
-    np.testing.assert_array_equal(rendering.View(other).frame(), frame)
+    np.testing.assert_array_equal(rendering.FrameCamera(other).frame(), frame)

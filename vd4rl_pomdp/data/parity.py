@@ -13,7 +13,7 @@ from vd4rl_pomdp.data.dataset import open_dataset
 from vd4rl_pomdp.envs.dmc import DMCEnv, start_from
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.envs.pixels import Render
-from vd4rl_pomdp.envs.rendering import View, frames_hash, gl_strings, mujoco
+from vd4rl_pomdp.envs.rendering import FrameCamera, frames_hash, gl_strings, mujoco
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import TASKS, DMCTask
 
@@ -117,10 +117,10 @@ def _golden_env(task: str, render: Render) -> DMCEnv:
 
 
 def _show_golden_states(task: str, env: DMCEnv) -> np.ndarray:
-    view, frames = View(env.physics), []
+    camera, frames = FrameCamera(env.physics), []
     for state in _golden()[f"{task}/physics"]:
         start_from(env.simulator, state)
-        frames.append(view.frame())
+        frames.append(camera.frame())
     return np.stack(frames)
 
 

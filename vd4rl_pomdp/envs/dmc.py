@@ -27,7 +27,7 @@ class DMCEnv(PixelEnv):
         self._layout = task.layout or self._found_layout(task.camera)
         if size is not None:
             rendering.prepare(self.physics, render, size)
-            self._view = rendering.View(self.physics, size, task.camera)
+            self._frame_camera = rendering.FrameCamera(self.physics, size, task.camera)
 
     @property
     def physics(self) -> Any:
@@ -63,7 +63,7 @@ class DMCEnv(PixelEnv):
 
     def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
         return TimeStep(
-            frame=self._view.frame() if self.size and self.drawing else None,
+            frame=self._frame_camera.frame() if self.size and self.drawing else None,
             state=flat_state(self.simulator.task.get_observation(self.physics)),
             physics=self.physics.get_state(),
             reward=reward,

@@ -41,8 +41,8 @@ except (ImportError, AttributeError, RuntimeError, ctypes.ArgumentError) as _err
     raise gl_error(_error) from _error
 
 __all__ = [
+    "FrameCamera",
     "Render",
-    "View",
     "check_mujoco",
     "frames_hash",
     "gl_error",
@@ -102,7 +102,7 @@ def refuse_after_fork() -> None:
         )
 
 
-class View:
+class FrameCamera:
     """What a camera shows of a simulator, as V-D4RL stores it.
 
     `physics.render` would set up a camera for every picture, which takes a sixth of the time of drawing it.
