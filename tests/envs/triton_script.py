@@ -45,7 +45,7 @@ def stages() -> None:
     job = EpisodeJob(
         encoder, Path("finetune/policy"), 0, TASKS["walker_walk"], CorruptionConfig(), 0, film=False, length=4
     )
-    assert evaluate([job], workers=1)[0].rewards[3:]
+    assert len(evaluate([job], workers=1)[0].rewards) == 4
 
 
 if __name__ == "__main__":
