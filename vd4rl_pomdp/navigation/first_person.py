@@ -130,6 +130,7 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
     try:
         from stable_baselines3 import PPO
         from stable_baselines3.common.callbacks import BaseCallback
+        from stable_baselines3.common.logger import Logger
         from stable_baselines3.common.vec_env import DummyVecEnv
         from torch import nn
     except ImportError as error:
@@ -156,6 +157,7 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
         device="cpu",
         policy_kwargs={"net_arch": [64, 64], "activation_fn": nn.ReLU},
     )
+    model.set_logger(Logger(None, []))  # its own would leave an empty folder among the temporary files
     with ProgressLine(f"PPO {config.maze}", config.decisions, "decisions") as progress:
         model.learn(config.decisions, callback=Report())
     actor = _export(model, config)

@@ -40,6 +40,7 @@ def build(config: PolicyConfig, task: Task) -> SAC:
     """A new learner; its environments standardise observations only if the config says so."""
     try:
         from sbx import SAC
+        from stable_baselines3.common.logger import Logger
         from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
     except ImportError as error:
         raise UserError(
@@ -64,6 +65,7 @@ def build(config: PolicyConfig, task: Task) -> SAC:
         policy_kwargs=network | ({"layer_norm": True} if config.critic_norm else {}),
         seed=config.seed,
     )
+    model.set_logger(Logger(None, []))  # its own would leave an empty folder among the temporary files
     _set_temperature_rate(model, config.temperature_rate)
     return model
 
