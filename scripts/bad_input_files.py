@@ -85,7 +85,7 @@ READERS: list[tuple[str, list[str], list[str]]] = [
     (
         "navigation report",
         ["reports/navigation", "--out", "new", "--no-pictures"],
-        ["reports/navigation/rows.csv", "reports/navigation/runs.csv"],
+        ["reports/navigation/runs.jsonl"],
     ),
     ("sweep run", ["grid.toml", "--out", "new", "--testing", "--dry-run"], ["grid.toml"]),
     ("sweep status", ["swept"], ["swept/sweep/plans/mine.json", "swept/sweep/attempts.jsonl"]),
@@ -120,9 +120,6 @@ FINE: dict[str, str] = {
         for kind in ("missing", "a dangling link")
     },
     "report | runs-cut/finetuning/labels.json | *": "a run that has rows is named by them",
-    "navigation report | */runs.csv | a word for a number": "the last column is a command",
-    "navigation report | */runs.csv | nan": "the last column is a command",
-    "navigation report | */runs.csv | inf": "the last column is a command",
     "report | */timing.json | missing": "a run that is not finished has none",
     "report | */timing.json | a dangling link": "a run that is not finished has none",
     "report | */probe.json | missing": "a set without states gives none",

@@ -26,5 +26,7 @@ def test_a_cell_runs_from_its_set_to_its_result(tmp_path, monkeypatch, capsys, g
     else:
         main(["navigation", "report", str(tmp_path / "out"), "--out", str(tmp_path / "report"), "--no-pictures"])
         assert (tmp_path / "report" / "tables.csv").is_file()
+        main([*words[:-1], str(tmp_path / "elsewhere"), "--done", str(tmp_path / "report"), "--dry-run"])
+        assert f"{last}: done" in capsys.readouterr().out, "a grid goes on from the report's rows"
     main(["sweep", "status", str(tmp_path / "out")])
     assert f"{jobs} jobs: {jobs} done" in capsys.readouterr().out

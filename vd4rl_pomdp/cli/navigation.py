@@ -40,7 +40,7 @@ class NavigationReportCommand:
     """Write the paper's navigation tables and figures about finished runs."""
 
     runs: tyro.conf.Positional[list[Path]]
-    """Run folders, folders that contain some, or a folder that holds an earlier report's rows.csv."""
+    """Run folders, results folders, or folders that contain some."""
     out: Path = Path("navigation-report")
     """Folder of the report."""
     pictures: bool = True

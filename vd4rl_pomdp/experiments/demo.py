@@ -16,7 +16,7 @@ import numpy as np
 
 from vd4rl_pomdp.errors import UserError, refuse_no_folder
 from vd4rl_pomdp.experiments.navigation.film import write_film
-from vd4rl_pomdp.experiments.navigation.runs import load_runs
+from vd4rl_pomdp.experiments.navigation.runs import find_navigation, load_runs
 from vd4rl_pomdp.mazes import get_maze
 from vd4rl_pomdp.navigation.measures import refitted_error
 from vd4rl_pomdp.options import Options
@@ -104,7 +104,7 @@ def conclusion(jobs: list[Job]) -> Iterator[str]:
 
 def show_navigation(jobs: list[Job], film: Path) -> Iterator[str]:
     """Write the film, and say how far each method misses the mass while a curtain hides it: lines of text."""
-    runs = load_runs([job.folder for job in jobs if job.section == "navigation_train"])
+    runs = load_runs(find_navigation([job.folder for job in jobs if job.section == "navigation_train"]))
     trajectories = {run.condition.method: run.trajectory for run in runs if run.trajectory is not None}
     write_film(trajectories, get_maze(runs[0].condition.maze), film)
     yield "Error of the position while a curtain hides the mass, in % of a standard deviation (held out, one seed):"

@@ -30,7 +30,7 @@ RUNS, EPISODES = "runs.jsonl", "episodes.csv"
 RECORD, ENCODER = "config", "encoder"
 FILES = {
     **{name: f"{name}.json" for name in (RECORD, "labels", "timing", "diverged", "machine", "render")},
-    **{name: f"{name}.json" for name in ("pretrain_timing", "probe", "reference")},
+    **{name: f"{name}.json" for name in ("pretrain_timing", "probe", "reference", "results")},
     ENCODER: f"{ENCODER}/config.json",
 }
 """A run's small files: the name of their content in runs.jsonl, and their place in the run folder."""
@@ -74,6 +74,11 @@ class Result:
     def labels(self) -> dict[str, Any]:
         """Values of LABELS; the task is empty until the run has opened its data."""
         return {name: self.files["labels"][name] for name in LABELS}
+
+    @property
+    def measured(self) -> list[Row]:
+        """What it found: evaluation rows, or the measures of a navigation run."""
+        return self.rows or self.files.get("results", {}).get("rows", [])
 
     @property
     def finished(self) -> bool:

@@ -59,9 +59,9 @@ def _outermost(path: Path) -> Iterator[Path]:
 
 def _better(one: Result, other: Result) -> Result:
     """Of two tales of one run the one that is settled, then that of its folder, then the one that is further."""
-    if one.settled and other.settled and one.rows != other.rows:
+    if one.settled and other.settled and one.measured != other.measured:
         raise UserError(f"{other.path} and {one.path}: two runs of one method, setting and seed; name one of them")
-    return max(one, other, key=lambda run: (run.settled, run.folder, len(run.rows), run.step))
+    return max(one, other, key=lambda run: (run.settled, run.folder, len(run.measured), run.step))
 
 
 class Added(NamedTuple):
@@ -105,7 +105,7 @@ def add_results(paths: Sequence[Path], out: Path) -> Added:
         if fresh:
             write_results(out, (there | fresh).values())
     again = [run for run in settled if run.id not in fresh]
-    known = sum(run.rows == there[run.id].rows for run in again)
+    known = sum(run.measured == there[run.id].measured for run in again)
     return Added(len(fresh), known, len(again) - known, len(found) - len(settled))
 
 

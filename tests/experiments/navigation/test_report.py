@@ -1,5 +1,6 @@
 import csv
 import json
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,13 +15,15 @@ from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import claims, judge, paper_number, verdict_lines
 from vd4rl_pomdp.experiments.navigation.grid import Condition, condition_of, paper_rows
 from vd4rl_pomdp.experiments.navigation.report import write_report
-from vd4rl_pomdp.experiments.navigation.runs import load_runs
+from vd4rl_pomdp.experiments.navigation.runs import NavigationRun, find_navigation, load_runs
 from vd4rl_pomdp.mazes import FREE_CELLS, MAZES
 from vd4rl_pomdp.navigation.measures import RAW_PREFIX, Measure, refitted_error
 from vd4rl_pomdp.navigation.methods import OBJECTIVES
 from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.results import add_results
 
 ROOT = Path(__file__).parents[3]
+TRAJECTORY = "three_curtains-mik-K15-seed0.csv"
 STATE = refitted_error("state")
 
 
@@ -37,7 +40,8 @@ def write_run(base: Path, condition: Condition, seed: int, level: float, raw: bo
     given = {name: value for name, value in asked.items() if value}  # not every method knows all of them
     config = flat(NavigationConfig.of("cpu", seed=seed, **given))
     command = f"vd4rl-pomdp navigation train --data data/{condition.maze} --method {condition.method} --seed {seed}"
-    record = {"stage": "navigation", "config": config, "git_commit": "abc", "command": command}
+    inputs = {"data": f"set of {condition.maze}"}
+    record = {"stage": "navigation", "config": config, "inputs": inputs, "git_commit": "abc", "command": command}
     common = {"rows": "all", "k": 0, "value": level}
     rows = [
         common
@@ -75,6 +79,10 @@ def runs(tmp_path) -> Path:
     return tmp_path / "runs"
 
 
+def loaded(*paths: Path) -> list[NavigationRun]:
+    return load_runs(find_navigation(paths))
+
+
 def test_every_line_of_the_papers_tables_is_a_condition_with_its_own_number():
     for line in paper_rows():
         component = line["component"]
@@ -101,7 +109,7 @@ def test_the_page_says_what_training_on_the_true_states_reaches(runs, tmp_path):
 
 
 def verdicts_of(runs: Path) -> str:
-    return "\n".join(verdict_lines(load_runs([runs])))
+    return "\n".join(verdict_lines(loaded(runs)))
 
 
 def test_the_report_shows_means_seeds_and_the_papers_numbers(runs, tmp_path):
@@ -127,26 +135,42 @@ def test_the_report_made_from_its_own_rows_is_the_same(runs, tmp_path):
     first = write_report([runs], tmp_path / "first")
     again = write_report([tmp_path / "first"], tmp_path / "again")
     assert first.read_text() == again.read_text()
-    for name in ("rows.csv", "runs.csv", "tables.csv"):
+    for name in ("runs.jsonl", "rows.csv", "tables.csv", f"trajectories/{TRAJECTORY}"):
         assert (first.parent / name).read_bytes() == (again.parent / name).read_bytes()
-    assert load_runs([tmp_path / "first", runs]) != []
+    twice = loaded(tmp_path / "first", runs)
+    assert len(twice) == len(loaded(runs)), "a run that is told of twice counts once"
+
+
+def test_runs_are_added_to_an_earlier_report_and_none_is_lost(runs, tmp_path):
+    out = tmp_path / "out"
+    write_report([runs], out)
+    write_run(tmp_path / "more", Condition("three_curtains", "supervised"), 0, 8.0)
+    with pytest.raises(UserError, match="30 runs that would be lost"):
+        write_report([tmp_path / "more"], out)
+    write_report([out, tmp_path / "more"], out)
+    assert len(loaded(out)) == 31
+    write_run(tmp_path / "later", Condition("three_curtains", "supervised"), 1, 9.0)
+    assert add_results([tmp_path / "later"], out).added == 1
+    assert [run.trajectory is None for run in loaded(out)].count(True) == 1, "the report alone keeps trajectories"
 
 
 def test_damaged_reports_and_runs_are_named(runs, tmp_path):
     whole = tmp_path / "whole"
     write_report([runs], whole)
-    lines = (whole / "rows.csv").read_text().splitlines(keepends=True)
-    for damaged in (lines[:5], [*lines[:4], lines[4].replace("80", "eighty")], ["a,b\n", "1,2\n"]):
-        (whole / "rows.csv").write_text("".join(damaged))
-        with pytest.raises(UserError, match=r"whole: rows.csv and runs.csv do not fit together") as caught:
-            load_runs([whole])
+    first, rest = (whole / "runs.jsonl").read_text().split("\n", 1)
+    for damaged in (first[:500], first.replace('"value": 80', '"value": "eighty"', 1), '{"a": 1}'):
+        (whole / "runs.jsonl").write_text(f"{damaged}\n{rest}")
+        with pytest.raises(
+            UserError, match=r"whole.*: (line 1|run [0-9a-f]{24}): its (files|results) are damaged"
+        ) as caught:
+            loaded(whole)
         assert len(str(caught.value).splitlines()) == 1
     folder = runs / "three_curtains" / "ah-K15" / "seed0"
     (folder / "results.json").write_text("{}")
     with pytest.raises(UserError, match="seed0: its results are damaged"):
-        load_runs([runs])
-    with pytest.raises(UserError, match="no runs to report"):
-        load_runs([])
+        loaded(runs)
+    with pytest.raises(UserError, match="name at least one run folder"):
+        loaded()
 
 
 def test_seeds_of_another_budget_or_set_make_no_mean(tmp_path):
@@ -156,9 +180,9 @@ def test_seeds_of_another_budget_or_set_make_no_mean(tmp_path):
         before = json.loads((folder / name).read_text())
         (folder / name).write_text(json.dumps(before | fact))
         with pytest.raises(UserError, match=f"seeds 0 and 1 differ in their {next(iter(fact))}"):
-            load_runs([tmp_path / "runs"])
+            loaded(tmp_path / "runs")
         (folder / name).write_text(json.dumps(before))
-    assert len(load_runs([tmp_path / "runs"])) == 2
+    assert len(loaded(tmp_path / "runs")) == 2
 
 
 def test_seeds_of_other_settings_make_no_mean_and_other_logging_does(tmp_path):
@@ -173,17 +197,17 @@ def test_seeds_of_other_settings_make_no_mean_and_other_logging_does(tmp_path):
     for one, other in (("--codes 6", ""), ("--codes 6", "--codes 20"), ("--no-k-embedding", ""), ("", "--window=16")):
         say(one, other)
         with pytest.raises(UserError, match=r"seeds 0 and 1 differ in their (codes|no_k_embedding|window)"):
-            load_runs([tmp_path / "runs"])
+            loaded(tmp_path / "runs")
     say("--learning-rate 1e-3 --device cpu --log-every 10 --wandb=off", "--learning-rate=0.001 --data elsewhere")
-    assert len(load_runs([tmp_path / "runs"])) == 2
+    assert len(loaded(tmp_path / "runs")) == 2
     say("--codes '6", "")
     with pytest.raises(UserError, match="command is damaged"):
-        load_runs([tmp_path / "runs"])
+        loaded(tmp_path / "runs")
 
 
 @pytest.mark.parametrize("folder", ["navigation", "navigation/longer"])
 def test_the_committed_rows_make_a_report(folder):
-    assert len(load_runs([ROOT / "results" / folder])) >= 2
+    assert len(loaded(ROOT / "results" / folder)) >= 2
 
 
 def test_missing_cells_seeds_and_unfinished_runs_are_shown(runs, tmp_path, monkeypatch):
@@ -204,7 +228,7 @@ def test_missing_cells_seeds_and_unfinished_runs_are_shown(runs, tmp_path, monke
     assert {(row["seeds"], row["mean"]) for row in missing} == {("0", "")}
     marked = []
     monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda axes, *at, **style: marked.append(style.get("marker")))
-    figures.accuracy_bars(load_runs([runs]), STATE, tmp_path / "bars.png")
+    figures.accuracy_bars(loaded(runs), STATE, tmp_path / "bars.png")
     in_the_paper, ran = 19, 9
     assert marked.count("x") == (in_the_paper - ran) + (in_the_paper - 1) + 1, "three_curtains, no_curtain, its random"
 
@@ -224,21 +248,20 @@ def test_a_navigation_report_writes_over_nothing_but_an_earlier_one(runs, tmp_pa
 @pytest.mark.parametrize("value", ["nan", "inf"])
 def test_a_result_that_is_no_number_is_refused(runs, tmp_path, value):
     write_report([runs], tmp_path / "out")
-    lines = (tmp_path / "out" / "rows.csv").read_text().splitlines(keepends=True)
-    lines[4] = lines[4].rpartition(",")[0] + f",{value}\n"
-    (tmp_path / "out" / "rows.csv").write_text("".join(lines))
-    with pytest.raises(UserError, match=f"rows.csv: a [a-z_]+ is {value}: the run has diverged"):
-        load_runs([tmp_path / "out"])
+    kept = tmp_path / "out" / "runs.jsonl"
+    kept.write_text(re.sub(r'"value": [0-9.]+', f'"value": {json.dumps(float(value))}', kept.read_text(), count=1))
+    with pytest.raises(UserError, match=f"out: run [0-9a-f]{{24}}: a [a-z_]+ is {value}: the run has diverged"):
+        loaded(tmp_path / "out")
     results = runs / "three_curtains" / "mik-K15" / "seed0" / "results.json"
     stored = json.loads(results.read_text())
     stored["rows"][0]["value"] = float(value)
     results.write_text(json.dumps(stored))
-    with pytest.raises(UserError, match=r"results\.json: a state_error is"):
-        load_runs([runs])
+    with pytest.raises(UserError, match=r"seed0: a state_error is"):
+        loaded(runs)
 
 
 def test_claims_are_judged_by_means_and_seed_by_seed(runs):
-    found = load_runs([runs])
+    found = loaded(runs)
     verdicts = {claim.text: judge(claim, found) for claim in claims("three_curtains")}
     k1 = verdicts["K=1: ah+a's state error, of mik+a's"]
     assert (k1.seeds_holding, k1.seeds, k1.holds, k1.paper) == (2, 3, True, None)
@@ -302,7 +325,7 @@ def test_the_papers_marks_stand_beside_raw_units_alone(runs, tmp_path, monkeypat
     def marks(measure: Measure) -> int:
         drawn = []
         monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda axes, *at, **style: drawn.append(style.get("marker")))
-        figures.accuracy_bars(load_runs([runs]), measure, tmp_path / "bars.png")
+        figures.accuracy_bars(loaded(runs), measure, tmp_path / "bars.png")
         return drawn.count("_")
 
     assert marks(STATE) == 0
@@ -312,7 +335,7 @@ def test_the_papers_marks_stand_beside_raw_units_alone(runs, tmp_path, monkeypat
 def test_the_bar_plot_has_the_papers_variants(runs, tmp_path, monkeypatch):
     drawn = []
     monkeypatch.setattr(figures, "_bar", lambda axes, place, condition, *rest: drawn.append(condition))
-    figures.accuracy_bars(load_runs([runs]), STATE, tmp_path / "bars.png")
+    figures.accuracy_bars(loaded(runs), STATE, tmp_path / "bars.png")
     paper = {condition_of(line, "three_curtains") for line in paper_rows() if line["exogenous"] == "N"}
     assert paper < set(drawn)
 
@@ -332,14 +355,18 @@ def test_free_cells_are_the_librarys():
 
 def test_what_cannot_be_reported_is_named(runs, tmp_path):
     (tmp_path / "empty").mkdir()
-    for source, message in (("nowhere", "no such folder"), ("empty", "holds no finished run")):
+    for source, message in (("nowhere", "no such folder"), ("empty", "contains no runs")):
         with pytest.raises(UserError, match=message):
             write_report([tmp_path / source], tmp_path / "out")
     write_run(tmp_path / "other", Condition("three_curtains", "mik"), 0, 99.0)
-    with pytest.raises(UserError, match="twice with other results"):
+    with pytest.raises(UserError, match="two runs of one method, setting and seed"):
         write_report([runs, tmp_path / "other"], tmp_path / "out")
     config = next((tmp_path / "other").rglob("config.json"))
     record = json.loads(config.read_text())
+    record["config"]["batch_size"] = 7
+    config.write_text(json.dumps(record))
+    with pytest.raises(UserError, match="three_curtains/mik-K15 seed 0 is there twice; keep one"):
+        write_report([runs, tmp_path / "other"], tmp_path / "out")
     record["config"] |= {"preset": "paper", "seed": 7}
     config.write_text(json.dumps(record))
     with pytest.raises(UserError, match="different presets"):

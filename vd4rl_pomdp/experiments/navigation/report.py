@@ -1,7 +1,8 @@
 """The navigation report: the paper's tables from raw rows, each number beside the paper's, and what they say.
 
 OUT/README.md     tables, verdicts, figures, and the command of every condition
-OUT/rows.csv, runs.csv, trajectories/     raw numbers; `navigation report OUT` makes everything again from them
+OUT/runs.jsonl, episodes.csv, trajectories/     a results folder; `navigation report OUT` makes everything again from it
+OUT/rows.csv      every number of every run
 OUT/tables.csv    every number: mean, interval, seeds, the paper's number
 OUT/figures/      accuracy.png, accuracy_raw.png (beside the paper's numbers), trajectories.png, observations.png
 """
@@ -17,18 +18,19 @@ import numpy as np
 from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import verdict_lines
 from vd4rl_pomdp.experiments.navigation.runs import (
-    ROWS,
     NavigationRun,
+    find_navigation,
     flags_of,
     load_runs,
+    progress,
     save_runs,
-    unfinished_runs,
 )
 from vd4rl_pomdp.experiments.navigation.tables import Table, make_tables, table_sections, write_tables
 from vd4rl_pomdp.mazes import HARD, MAZES
 from vd4rl_pomdp.navigation.config import PRESETS
 from vd4rl_pomdp.navigation.measures import refitted_error
 from vd4rl_pomdp.navigation.methods import UNTRAINED
+from vd4rl_pomdp.results import RUNS, Result
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.text import code, code_block, markdown, write_text
 
@@ -40,12 +42,13 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
     """Write the report of all runs in `sources` to `out`; returns the page.
 
     Args:
-        sources: run folders, folders of them, or a folder that this function wrote.
+        sources: run folders, results folders, or folders that contain some.
         out: where to.
         samples: draws the sample observations, which needs OpenGL; None leaves them out.
     """
-    refuse_foreign(out, "navigation report", ROWS)
-    runs, unfinished = load_runs(sources), unfinished_runs(sources)
+    refuse_foreign(out, "navigation report", RUNS)
+    found = find_navigation(sources, out)
+    runs, unfinished = load_runs(found), [result for result in found if not result.finished]
     save_runs(runs, out)
     (out / "figures").mkdir(exist_ok=True)
     pictures = _draw(runs, out / "figures")
@@ -77,9 +80,7 @@ _CAPTIONS = {
 }
 
 
-def _page(
-    runs: list[NavigationRun], unfinished: list[tuple[Path, str]], tables: list[Table], pictures: list[str]
-) -> list[str]:
+def _page(runs: list[NavigationRun], unfinished: list[Result], tables: list[Table], pictures: list[str]) -> list[str]:
     preset, seeds = runs[0].preset, sorted({run.seed for run in runs})
     bars = [name for name in pictures if name.startswith("accuracy")]
     lines = ["# Navigation: what the objectives know of the state", ""]
@@ -87,7 +88,7 @@ def _page(
         f"Runs: {len(runs)}. Preset: {code(preset)}. Seeds: {', '.join(map(str, seeds))}. {_budget(runs)}",
         "",
         *_variants(runs),
-        *(f"Unfinished, in no table: {code(str(path))} {state}.  " for path, state in unfinished),
+        *(f"Unfinished, in no table: {code(str(result.path))} {progress(result)}.  " for result in unfinished),
         *([""] if unfinished else []),
         *_UNITS,
         "",

@@ -1,4 +1,4 @@
-"""Finished navigation runs: read from run folders or from a report's CSV files, and written as CSV files."""
+"""Finished navigation runs: read from run folders or results folders, and kept as a results folder."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ import io
 import math
 import shlex
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -17,22 +17,24 @@ import numpy as np
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.grid import Condition
 from vd4rl_pomdp.navigation.measures import Measure, measure_of, measure_rows
-from vd4rl_pomdp.runs.files import read_json, write_csv
-from vd4rl_pomdp.runs.metrics import read_metrics
-from vd4rl_pomdp.runs.reading import build, regular
+from vd4rl_pomdp.results import Result, find_results, refuse_loss, write_results
+from vd4rl_pomdp.runs.files import write_csv
+from vd4rl_pomdp.runs.reading import build
 from vd4rl_pomdp.runs.settings import settings_of
 
-ROWS, RUNS, TRAJECTORIES = "rows.csv", "runs.csv", "trajectories"
+ROWS, TRAJECTORIES = "rows.csv", "trajectories"
 
 _IDENTITY = ("maze", "method", "max_k", "self_prediction", "exogenous", "literal_future", "preset", "seed")
 _MEASURED = (*Measure._fields, "value")
-_FACTS = ("steps", "seconds", "set", "git_commit", "processor", "gpu", "command")
+_FILES = ("results", "timing", "machine")
 
 
 @dataclass(frozen=True)
 class NavigationRun:
     """One finished run."""
 
+    result: Result
+    """Its files."""
     condition: Condition
     preset: str
     seed: int
@@ -106,29 +108,26 @@ def _number(word: str) -> str:
         return word
 
 
-def load_runs(sources: Iterable[Path]) -> list[NavigationRun]:
-    """Finished runs of all sources: run folders, folders that hold some, or folders with `rows.csv` and `runs.csv`.
+def find_navigation(sources: Sequence[Path], but: Path | None = None) -> list[Result]:
+    """Runs of `navigation train` at or below some paths, finished or not; `but` and errors as in `find_results`."""
+    return [result for result in find_results(sources, but) if result.record["stage"] == "navigation"]
+
+
+def load_runs(results: Sequence[Result]) -> list[NavigationRun]:
+    """The finished ones among some runs, in order.
 
     Raises:
-        UserError: there is no source, one is missing, damaged or holds nothing, the same run comes with two results,
-            seeds of one condition differ in their steps, data or settings, or a value is not finite.
+        UserError: none is finished, one is damaged, two results are of the same run, seeds of one condition differ in
+            their steps, data or settings, or a value is not finite.
     """
     runs: dict[tuple[Any, ...], NavigationRun] = {}
-    for source in sources:
-        if not source.exists():
-            raise UserError(f"{source}: no such folder; name runs of `vd4rl-pomdp navigation train`")
-        found = _from_csv(source) if (source / ROWS).exists() else _from_folders(source)
-        if not found:
-            raise UserError(f"{source}: holds no finished run of `vd4rl-pomdp navigation train`")
-        for run in found:
-            key = tuple(run.identity.values())
-            if key in runs and runs[key].values != run.values:
-                raise UserError(
-                    f"{source}: {run.condition.name} seed {run.seed} is there twice with other results; keep one"
-                )
-            runs.setdefault(key, run)
+    for run in (_read_run(result) for result in results if result.finished):
+        other = runs.setdefault(tuple(run.identity.values()), run)
+        if other is not run:
+            places = f"{other.result.path} and {run.result.path}"
+            raise UserError(f"{places}: {run.condition.name} seed {run.seed} is there twice; keep one")
     if not runs:
-        raise UserError("no runs to report: name folders of `vd4rl-pomdp navigation train`, or an earlier report's")
+        raise UserError("no finished run of `vd4rl-pomdp navigation train` is there; name folders of some")
     presets = sorted({run.preset for run in runs.values()})
     if len(presets) > 1:
         raise UserError(f"runs of different presets ({', '.join(presets)}) do not make one table; report them apart")
@@ -146,19 +145,9 @@ def is_missing(condition: Condition, runs: Iterable[NavigationRun]) -> bool:
     )
 
 
-def unfinished_runs(sources: Iterable[Path]) -> list[tuple[Path, str]]:
-    """Unfinished runs at or below the sources, and how far each is: "at 10 of 30 steps"."""
-    configs = {path for source in sources for path in source.rglob("config.json") if _is_unfinished(path.parent)}
-    return [(path.parent, _progress(path.parent)) for path in sorted(configs)]
-
-
-def _is_unfinished(folder: Path) -> bool:
-    return not (folder / "timing.json").exists() and read_json(folder / "config.json").get("stage") == "navigation"
-
-
-def _progress(folder: Path) -> str:
-    done = max((int(row["step"]) for row in read_metrics(folder / "metrics.jsonl")), default=0)
-    return f"at {done} of {read_json(folder / 'config.json').get('config', {}).get('steps', '?')} steps"
+def progress(result: Result) -> str:
+    """How far an unfinished run is: "at 10 of 30 steps"."""
+    return f"at {result.step} of {result.record['config'].get('steps', '?')} steps"
 
 
 def _refuse_mixtures(runs: Iterable[NavigationRun]) -> None:
@@ -177,11 +166,15 @@ def _refuse_mixtures(runs: Iterable[NavigationRun]) -> None:
 
 
 def save_runs(runs: list[NavigationRun], out: Path) -> None:
-    """Write `rows.csv`, `runs.csv` and `trajectories/`, from which the report can be made again."""
-    out.mkdir(parents=True, exist_ok=True)
+    """Write runs as a results folder, from which the report can be made again, with their `trajectories/`.
+
+    Beside it, `rows.csv` has every value for whoever wants to read them as a table.
+    """
+    results = [run.result for run in runs]
+    refuse_loss(results, out)
+    write_results(out, results)
     rows = [run.identity | row | {"value": f"{row['value']:.6g}"} for run in runs for row in measure_rows(run.values)]
     write_csv(out / ROWS, (*_IDENTITY, *_MEASURED), rows)
-    write_csv(out / RUNS, (*_IDENTITY, *_FACTS), [run.identity | run.facts for run in runs])
     (out / TRAJECTORIES).mkdir(exist_ok=True)
     for run in runs:
         target = out / TRAJECTORIES / run.file_name
@@ -189,26 +182,19 @@ def save_runs(runs: list[NavigationRun], out: Path) -> None:
             shutil.copyfile(run.trajectory, target)
 
 
-def _from_folders(source: Path) -> list[NavigationRun]:
-    return [_read_run(path.parent) for path in sorted(source.rglob("timing.json")) if _is_navigation(path.parent)]
-
-
-def _is_navigation(folder: Path) -> bool:
-    return (folder / "results.json").exists() and read_json(folder / "config.json").get("stage") == "navigation"
-
-
-def _read_run(folder: Path) -> NavigationRun:
+def _read_run(result: Result) -> NavigationRun:
+    place = result.path if result.folder else f"{result.path}: run {result.id}"
     try:
-        return _run_of(folder)
+        return _with_trajectory(_run_of(result, place))
     except UserError:
         raise
     except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{folder}: its results are damaged ({error}); train it again") from error
+        raise UserError(f"{place}: its results are damaged ({error}); train it again") from error
 
 
-def _run_of(folder: Path) -> NavigationRun:
-    record, results = read_json(folder / "config.json"), read_json(folder / "results.json")
-    config, timing, machine = record["config"], read_json(folder / "timing.json"), read_json(folder / "machine.json")
+def _run_of(result: Result, place: Path | str) -> NavigationRun:
+    record, (results, timing, machine) = result.record, (result.files[name] for name in _FILES)
+    config = record["config"]
     named = {
         "maze": results["maze"],
         **{name: config[name] for name in ("method", "max_k")},
@@ -221,7 +207,7 @@ def _run_of(folder: Path) -> NavigationRun:
         raise TypeError(f"its preset is {config['preset']!r}")
     if not all(isinstance(timing[name], int | float) for name in ("steps", "seconds")):
         raise TypeError("timing.json holds no numbers")
-    facts = {
+    facts: dict[str, Any] = {
         "steps": timing["steps"],
         "seconds": timing["seconds"],
         "set": results["set"],
@@ -230,54 +216,23 @@ def _run_of(folder: Path) -> NavigationRun:
         "gpu": machine["gpu"] or "",
         "command": results.get("command", record["command"]),
     }
-    values = {measure_of(row): _finite(folder / "results.json", row, f"{row['value']:.6g}") for row in results["rows"]}
-    trajectory = folder / "trajectory.csv"
-    if not trajectory.is_file():
-        raise UserError(f"{trajectory}: is missing or no file; train it again")
-    return NavigationRun(
-        condition, config["preset"], config["seed"], values, {k: str(v) for k, v in facts.items()}, trajectory
-    )
+    values = {measure_of(row): _finite(place, row, f"{row['value']:.6g}") for row in results["rows"]}
+    told = {name: str(fact) for name, fact in facts.items()}
+    return NavigationRun(result, condition, config["preset"], config["seed"], values, told, None)
 
 
-def _finite(path: Path, row: dict[str, Any], value: str) -> float:
+def _with_trajectory(run: NavigationRun) -> NavigationRun:
+    """A run with its trajectory: a run folder has one, a results folder may have it."""
+    folder = run.result.path
+    path = folder / "trajectory.csv" if run.result.folder else folder / TRAJECTORIES / run.file_name
+    if path.is_file():
+        return replace(run, trajectory=path)
+    if run.result.folder:
+        raise UserError(f"{path}: is missing or no file; train it again")
+    return run
+
+
+def _finite(place: Path | str, row: dict[str, Any], value: str) -> float:
     if not math.isfinite(float(value)):
-        raise UserError(f"{path}: a {row['measure']} is {value}: the run has diverged; train it again or leave it out")
+        raise UserError(f"{place}: a {row['measure']} is {value}: the run has diverged; train it again or leave it out")
     return float(value)
-
-
-def _from_csv(source: Path) -> list[NavigationRun]:
-    try:
-        return _runs_of(source)
-    except (KeyError, TypeError, ValueError, csv.Error) as error:
-        if isinstance(error, UserError):
-            raise
-        raise UserError(f"{source}: {ROWS} and {RUNS} do not fit together ({error}); make the report anew") from error
-
-
-def _runs_of(source: Path) -> list[NavigationRun]:
-    values: dict[tuple[str, ...], dict[Measure, float]] = {}
-    for row in _read(source / ROWS):
-        values.setdefault(_identity(row), {})[measure_of(row)] = _finite(source / ROWS, row, row["value"])
-    runs = []
-    for row in _read(source / RUNS):
-        flags = {name: row[name] == "1" for name in ("self_prediction", "exogenous", "literal_future")}
-        condition = Condition(row["maze"], row["method"], int(row["max_k"]), **flags)
-        facts = {name: row[name] for name in _FACTS}
-        run = NavigationRun(condition, row["preset"], int(row["seed"]), values[_identity(row)], facts, None)
-        trajectory = source / TRAJECTORIES / run.file_name
-        runs.append(replace(run, trajectory=trajectory) if trajectory.exists() else run)
-    return runs
-
-
-def _identity(row: dict[str, str]) -> tuple[str, ...]:
-    return tuple(row[name] for name in _IDENTITY)
-
-
-def _read(path: Path) -> list[dict[str, str]]:
-    try:
-        text = regular(path).read_bytes().decode()
-    except OSError as error:
-        raise UserError(f"{path}: cannot be read ({error.strerror}); it is written by the report") from error
-    if not text.endswith("\n"):
-        raise UserError(f"{path}: is cut in its last line; make the report anew")
-    return list(csv.DictReader(io.StringIO(text, newline="")))
