@@ -15,6 +15,8 @@ from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.identity import identity
 
+COMMITTED = Path(__file__).parents[2] / "results"
+
 
 def whole_run(place: Path, seed: int = 0, score: float = 2.0) -> Path:
     """A fine-tuning run with every small file."""
@@ -164,3 +166,14 @@ def test_results_go_into_no_folder_of_another_kind(tmp_path):
             add_results([run], out)
     with pytest.raises(UserError, match="holds no runs"):
         read_results(tmp_path / "notes")
+
+
+@pytest.mark.parametrize("place", sorted(COMMITTED.rglob("runs.jsonl")), ids=lambda place: place.parent.name)
+def test_committed_runs_say_what_they_were_made_with(place):
+    for run in read_results(place.parent):
+        assert run.settled
+        assert run.measured or run.losses
+        assert run.labels["task"]
+        assert run.record["command"]
+        assert run.record["git_commit"]
+        assert run.files["machine"]["processor"]

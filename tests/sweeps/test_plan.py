@@ -18,6 +18,7 @@ from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.plan import JobPlanner
 from vd4rl_pomdp.sweeps.stages import recorded
 
+ROOT = Path(__file__).parents[2]
 GRID = """
 seed = 0
 preset = "smoke"
@@ -138,6 +139,12 @@ def test_rows_that_were_kept_are_finished_runs(copy, tmp_path):
     estimates, encoder = Estimates(kept.runs), next(job for job in missing if job.section == "pretrain")
     assert estimates.seconds(encoder) == read_json(copy / encoder.name / "timing.json")["seconds"]
     assert len(left(plan(new, ["seed=0,1"], kept=kept))) == 9, "the other seed's"
+
+
+def test_rows_of_early_versions_finish_nothing(copy):
+    kept = FoundRuns(runs_kept([ROOT / "results" / "control" / "earlier"]))
+    assert [run.card for run in kept.runs] == [{}] * 10
+    assert left(plan(copy, ["seed=0,1"], kept=kept)) == left(plan(copy, ["seed=0,1"]))
 
 
 def test_an_encoder_whose_row_was_kept_is_made_again_for_a_new_policy(copy, tmp_path):

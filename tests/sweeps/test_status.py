@@ -79,6 +79,18 @@ def test_other_settings_take_as_long_a_step_as_their_stage(tmp_path):
     assert estimates.seconds(Job("s", "collect", tmp_path, ())) is None
 
 
+def test_runs_of_the_same_method_tell_more_than_others(tmp_path):
+    estimates = Estimates([past(tmp_path, 30.0), past(tmp_path, 0.1, method="random")])
+    assert estimates.seconds(planned(tmp_path, method="random", steps=100)) == pytest.approx(1.0)
+    assert estimates.seconds(planned(tmp_path, steps=100)) == pytest.approx(300.0)
+
+
+def test_a_run_that_does_not_say_its_steps_tells_no_pace(tmp_path):
+    estimates = Estimates([past(tmp_path, 30.0, steps=None), past(tmp_path, 20.0, steps=0)])
+    assert estimates.seconds(planned(tmp_path)) is None
+    assert estimates.seconds(planned(tmp_path, steps=0)) == 20.0
+
+
 def test_sets_that_were_collected_tell_what_others_take_by_their_episodes(tmp_path):
     def collecting(name, task, episodes):
         return Job(name, "collect", tmp_path / name, (), settings=cost_of({"task": task, "episodes": episodes}))

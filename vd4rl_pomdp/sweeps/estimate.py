@@ -31,7 +31,7 @@ class Estimates:
             jobs: a plan's jobs: the sets that they collected tell, too.
         """
         self._exact: dict[tuple, list[float]] = {}
-        self._by_stage: dict[str, list[tuple[float, float]]] = {}
+        self._rates: dict[tuple, list[float]] = {}
         for run in runs:
             self._note(_SECTIONS.get(run.record["stage"]), run.settings, run.seconds)
             self._note("pretrain", run.card.get("settings", {}), run.encoder_seconds)
@@ -42,13 +42,19 @@ class Estimates:
     def _note(self, section: str | None, settings: Mapping[str, Any], seconds: float | None) -> None:
         if section and seconds is not None:
             self._exact.setdefault((section, cost_of(settings)), []).append(seconds)
-            amount = float(settings.get(_SCALE[section]) or 1)
-            self._by_stage.setdefault(section, []).append((amount, seconds))
+            if amount := settings.get(_SCALE[section]):
+                for kind in _kinds(section, settings):
+                    self._rates.setdefault(kind, []).append(seconds / float(amount))
 
     def seconds(self, job: Job) -> float | None:
         """What a job takes from its beginning; None if no run tells."""
         if known := self._exact.get((job.section, job.settings)):
             return median(known)
-        rates = [seconds / amount for amount, seconds in self._by_stage.get(job.section, ())]
         amounts = dict(job.settings)
+        rates = next((self._rates[kind] for kind in _kinds(job.section, amounts) if kind in self._rates), None)
         return median(rates) * float(amounts.get(_SCALE[job.section], 1)) if rates else None
+
+
+def _kinds(section: str, settings: Mapping[str, Any]) -> tuple[tuple, tuple]:
+    """What a job's pace goes by: its stage with its method, for some train nothing, or else its stage alone."""
+    return (section, settings.get("method")), (section,)

@@ -64,7 +64,7 @@ def runs_kept(folders: Iterable[Path]) -> Iterator[FoundRun]:
     for folder in folders:
         for run in read_results(folder):
             seconds = (run.files.get(name, {}).get("seconds") for name in ("timing", "pretrain_timing"))
-            yield FoundRun(run.path, run.record, run.card, *seconds)
+            yield FoundRun(run.path, run.record, _whole(run.card), *seconds)
 
 
 def runs_below(out: Path) -> Iterator[FoundRun]:
@@ -75,4 +75,9 @@ def runs_below(out: Path) -> Iterator[FoundRun]:
             timing, encoder = path.with_name("timing.json"), path.parent / "encoder" / CONFIG
             seconds = read_json(timing).get("seconds") if timing.exists() else None
             card = read_json(encoder).get("pretrain") if encoder.exists() else None
-            yield FoundRun(path.parent, record, card if isinstance(card, dict) and "settings" in card else {}, seconds)
+            yield FoundRun(path.parent, record, _whole(card), seconds)
+
+
+def _whole(card: Any) -> Row:
+    """What an encoder says of its pretraining, nothing if it is of an early version, which no plan asks for."""
+    return card if isinstance(card, dict) and {"settings", "seed"} <= card.keys() else {}
