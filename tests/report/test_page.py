@@ -69,7 +69,7 @@ def test_lines_of_many_methods_differ_in_more_than_colour():
 def test_last_and_best_evaluation_stand_apart(tmp_path):
     for seed in range(2):
         write_run(tmp_path / f"runs/{seed}", "acro", seed, {5: [90.0 + seed], 10: [20.0 + seed]})
-    page, summary, _ = write_report([tmp_path / "runs"], tmp_path / "out")
+    page, summary, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
     cells = re.findall(r"<td[^>]*>([^<]*)</td>", page.read_text().partition("<h3>walker_walk")[2])[:9]
     assert cells == ["acro", "20.5", "[20.0, 21.0]", "10", "90.5", "[90.0, 91.0]", "5", "2†", "2"]
     assert summary[0]["best_low"] == 90.0
@@ -132,7 +132,7 @@ def test_a_film_is_read_once_and_those_beyond_the_pages_room_are_counted(tmp_pat
 def test_a_report_of_five_thousand_runs_drops_nothing_and_stays_small(tmp_path):
     runs = write_grid(tmp_path / "grid", episodes=2)
     assert runs > 4900
-    page, summary, _ = write_report([tmp_path / "grid"], tmp_path / "out")
+    page, summary, *_ = write_report([tmp_path / "grid"], tmp_path / "out")
     assert page.stat().st_size < 10 * 2**20
     assert sum(row["seeds"] for row in summary) == runs
     for name, expected in (("runs.csv", runs), ("episodes.csv", 6 * runs)):

@@ -23,7 +23,7 @@ def test_a_report_counts_seeds_not_episodes(tmp_path):
     for seed, scores in enumerate([[10.0, 30.0], [40.0, 40.0]]):
         write_run(tmp_path / f"runs/acro/{seed}", "acro", seed, {5: [90.0, 90.0], 10: scores}, film=seed == 0)
     write_run(tmp_path / "runs/random/0", "random", 0, {10: [95.0]})
-    page, summary, _ = write_report([tmp_path / "runs"], tmp_path / "out")
+    page, summary, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
     assert [row["method"] for row in summary] == ["acro", "random"], "references come last, whatever their score"
     acro = summary[0]
     assert acro["score"] == pytest.approx(30.0)
@@ -75,7 +75,7 @@ def test_scores_are_as_trained_and_the_control_table_tells_of_both(tmp_path):
         Reference(500.0, None, 0.01 * (seed + 1)).write(run)
         evaluated_clean(run, [401.0, 399.0, 900.0], (0.1, 0.2))
     write_run(tmp_path / "runs/earlier", "mik", 0, {10: [70.0]})
-    page, summary, _ = write_report([tmp_path / "runs"], tmp_path / "out")
+    page, summary, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
     assert {row["method"]: (row["score"], row["episodes"]) for row in summary} == {"acro": (65.0, 4), "mik": (70.0, 1)}
     tables = {}
     for name in ("control", "runs", "curves", "episodes"):
@@ -122,7 +122,7 @@ def test_returns_are_drawn_against_probes(tmp_path):
 def test_an_ablation_is_two_rows_everywhere(tmp_path):
     for k in (1, 15):
         describe(write_run(tmp_path / f"runs/{k}", "mik+a", 0, {5: [k], 10: [k]}, film=True), {"max_k": k})
-    page, summary, _ = write_report([tmp_path / "runs"], tmp_path / "out")
+    page, summary, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
     assert {row["variant"]: row["score"] for row in summary} == {"max_k 15": 15.0, "max_k 1": 1.0}
     text = page.read_text()
     for name in ("mik+a, max_k 1", "mik+a, max_k 15"):
@@ -137,7 +137,7 @@ def test_an_ablation_is_two_rows_everywhere(tmp_path):
 
 
 def test_missing_cells_and_seeds_are_shown_as_missing(tmp_path):
-    page, summary, _ = write_report([grid(tmp_path)], tmp_path / "out")
+    page, summary, *_ = write_report([grid(tmp_path)], tmp_path / "out")
     found = {(row["quality"], row["method"]): (row["score"], row["missing"]) for row in summary}
     assert found == {
         ("expert", "acro"): (21.0, ""),
@@ -174,7 +174,7 @@ def test_unfinished_runs_are_named_and_kept_out_of_final_scores(tmp_path):
     begun = describe(write_run(runs / "begun", "mik+a", 2, {}), {})
     (begun / "timing.json").unlink()
     (begun / "metrics.jsonl").unlink()
-    page, summary, _ = write_report([runs], tmp_path / "out")
+    page, summary, *_ = write_report([runs], tmp_path / "out")
     found = {(row["quality"], row["method"]): (row["score"], row["seeds"], row["missing"]) for row in summary}
     assert found["expert", "acro"] == (20.5, 2, "seed 2 unfinished at 7 of 10 updates")
     assert found["expert", "mik+a"] == (20.5, 2, "seed 2 unfinished at 0 of 10 updates")
@@ -191,7 +191,7 @@ def test_unfinished_runs_are_named_and_kept_out_of_final_scores(tmp_path):
 def test_a_diverged_run_is_shown_and_not_averaged(tmp_path):
     runs = grid(tmp_path)
     write_json(runs / "acro2" / "diverged.json", {"step": 7, "message": "critic_loss is nan <b>"})
-    page, summary, _ = write_report([runs], tmp_path / "out")
+    page, summary, *_ = write_report([runs], tmp_path / "out")
     (acro,) = [row for row in summary if (row["quality"], row["method"]) == ("expert", "acro")]
     assert (acro["score"], acro["seeds"], acro["missing"]) == (20.5, 2, "seed 2 diverged at update 7 of 10")
     text = page.read_text()
@@ -203,7 +203,7 @@ def test_a_diverged_run_is_shown_and_not_averaged(tmp_path):
 
 def test_a_report_of_unfinished_runs_alone_says_so(tmp_path):
     (describe(write_run(tmp_path / "runs/a", "acro", 0, {5: [1.0]}), {}) / "timing.json").unlink()
-    page, summary, _ = write_report([tmp_path / "runs"], tmp_path / "out")
+    page, summary, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
     assert [(row["score"], row["missing"]) for row in summary] == [(None, "seed 0 unfinished at 10 of 10 updates")]
     assert "0 finished runs, 1 unfinished" in page.read_text()
 

@@ -49,14 +49,14 @@ def _gate(key: tuple[str, ...], runs: list[LoadedRun]) -> Row:
     here = [run for run in alike if run.labels["corruption"] == corruption]
     clean = [run for run in alike if run.labels["corruption"] == "none"]
     data = next((value for run in here if (value := run.reference.data_return)), None)
-    state, acro = (_best(_named(runs, name)) for runs, name in ((alike, "state"), (clean, "acro")))
-    learned = _best((run for run in here if run.labels["method"] not in REFERENCES), seeds=2)
-    difference, error = _above(learned, _best(_named(here, "random")))
+    state, acro = (best_of(_named(runs, name)) for runs, name in ((alike, "state"), (clean, "acro")))
+    learned = best_of((run for run in here if run.labels["method"] not in REFERENCES), seeds=2)
+    above, error = difference(learned, best_of(_named(here, "random")))
     row = dict(zip(SETTING, key, strict=True)) | {
         "data_return": data,
         "state_share": _share(state, data),
         "acro_share": _share(acro, data),
-        "above_random": difference,
+        "above_random": above,
         "error": error,
     }
     return row | {"verdict": _verdict(row)}
@@ -66,30 +66,38 @@ def _named(runs: Iterable[LoadedRun], method: str) -> Iterable[LoadedRun]:
     return (run for run in runs if run.labels["method"] == method)
 
 
-def _best(runs: Iterable[LoadedRun], seeds: int = 1) -> np.ndarray:
-    """Final returns by seed (n,) of the method and variant whose mean is highest, (0,) if there is no run.
+def best_of(runs: Iterable[LoadedRun], seeds: int = 1) -> list[LoadedRun]:
+    """The seeds of the method and variant whose mean return is highest, none if there is no run.
 
     One with fewer seeds than asked for is taken only where none has as many.
     """
-    groups: dict[tuple[str, str], list[float]] = {}
+    groups: dict[tuple[str, str], list[LoadedRun]] = {}
     for run in runs:
-        final = max(row["step"] for row in run.rows)
-        mean = float(np.mean([row["return"] for row in run.rows if row["step"] == final]))
-        groups.setdefault((str(run.labels["method"]), run.variant), []).append(mean)
-    enough = [means for means in groups.values() if len(means) >= seeds]
-    return np.array(max(enough or groups.values(), key=np.mean, default=[]))
+        groups.setdefault((str(run.labels["method"]), run.variant), []).append(run)
+    enough = [members for members in groups.values() if len(members) >= seeds]
+    return max(enough or groups.values(), key=lambda members: returns_of(members).mean(), default=[])
 
 
-def _share(returns: np.ndarray, data: float | None) -> float | None:
-    return float(returns.mean() / data) if len(returns) and data else None
+def returns_of(runs: list[LoadedRun]) -> np.ndarray:
+    """Mean return of each run's last evaluation, (n,)."""
+    finals = [(run.rows, max(row["step"] for row in run.rows)) for run in runs]
+    return np.array([np.mean([row["return"] for row in rows if row["step"] == final]) for rows, final in finals])
 
 
-def _above(best: np.ndarray, floor: np.ndarray) -> tuple[float | None, float | None]:
-    """Difference of two means and its standard error; None where a method has no run, or a single one."""
-    difference = float(best.mean() - floor.mean()) if len(best) and len(floor) else None
+def difference(runs: list[LoadedRun], others: list[LoadedRun]) -> tuple[float | None, float | None]:
+    """Mean return of some seeds less that of others, and its standard error over seeds.
+
+    None where a side has no run; no error where one has a single seed.
+    """
+    best, floor = returns_of(runs), returns_of(others)
+    above = float(best.mean() - floor.mean()) if len(best) and len(floor) else None
     if min(len(best), len(floor)) < 2:
-        return difference, None
-    return difference, math.sqrt(best.var(ddof=1) / len(best) + floor.var(ddof=1) / len(floor))
+        return above, None
+    return above, math.sqrt(best.var(ddof=1) / len(best) + floor.var(ddof=1) / len(floor))
+
+
+def _share(runs: list[LoadedRun], data: float | None) -> float | None:
+    return float(returns_of(runs).mean() / data) if runs and data else None
 
 
 def _verdict(row: Row) -> str:

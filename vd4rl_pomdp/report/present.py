@@ -6,6 +6,7 @@ from collections.abc import Callable
 from math import ceil
 
 from vd4rl_pomdp.report import stats
+from vd4rl_pomdp.report.claims import tally
 from vd4rl_pomdp.report.figures import seeds_note
 from vd4rl_pomdp.report.gaps import MISSING
 from vd4rl_pomdp.report.layout import Line, ShownTable, interval, number, with_interval
@@ -25,6 +26,21 @@ def gates(rows: list[Row]) -> list[ShownTable]:
         shares = (number(row[name], 2) for name in ("state_share", "acro_share"))
         lines.append(Line((setting(row), row["verdict"], number(row["data_return"], 0), *shares, above)))
     return [ShownTable("", columns, lines, words=2)]
+
+
+def claims(rows: list[Row]) -> list[ShownTable]:
+    """What becomes of the paper's claims, one table a claim."""
+    columns = ("setting", "verdict", "left", "right", "difference")
+    return [
+        ShownTable(claim, columns, list(map(_claim_line, members)), words=4, note=tally(members))
+        for (claim,), members in grouped(rows, ("claim",))
+    ]
+
+
+def _claim_line(row: Row) -> Line:
+    sides = (f"{row[side]}: {row[f'{side}_return']:.0f} (n = {row[f'{side}_seeds']})" for side in ("left", "right"))
+    error = "" if row["error"] is None else f" ± {row['error']:.0f}"
+    return Line((setting(row), row["verdict"] or "–", *sides, number(row["difference"], 0) + error))
 
 
 def scores(rows: list[Row]) -> list[ShownTable]:

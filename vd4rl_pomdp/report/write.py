@@ -14,6 +14,7 @@ from typing import Any, NamedTuple
 from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.report import bars, dots, lines, measures, overall, present, tables
+from vd4rl_pomdp.report.claims import judge_claims
 from vd4rl_pomdp.report.facts import differing, facts, unfinished
 from vd4rl_pomdp.report.figures import Plot, save_plot, to_svg
 from vd4rl_pomdp.report.films import shown_films
@@ -42,6 +43,8 @@ class Report(NamedTuple):
     """Table of final scores."""
     gates: list[Row]
     """Table of what has to hold before methods are ranked."""
+    claims: list[Row]
+    """Table of the paper's claims and what becomes of them."""
 
 
 def write_report(paths: list[Path], out: Path) -> Report:
@@ -69,7 +72,7 @@ def write_report(paths: list[Path], out: Path) -> Report:
     _write_plots(out / FIGURES, plots)
     write_results(out, [run.result for run in runs])
     write_text(out / "index.html", page)
-    return Report(out / "index.html", made[_MARK], made["gates"])
+    return Report(out / "index.html", made[_MARK], made["gates"], made["claims"])
 
 
 def _tables(runs: list[LoadedRun]) -> dict[str, list[Row]]:
@@ -82,6 +85,7 @@ def _tables(runs: list[LoadedRun]) -> dict[str, list[Row]]:
     return {
         _MARK: tables.summary(final, gaps, unranked(gated)),
         "gates": gated,
+        "claims": judge_claims(runs, unranked(gated)),
         "curves": tables.curves(evaluated),
         "aggregate": overall.aggregate(final, gaps),
         "runs": of_runs,
@@ -98,6 +102,7 @@ def _shown(made: dict[str, list[Row]]) -> dict[str, list[ShownTable]]:
     """The tables that the page shows, by the name of their rows' file."""
     return {
         "gates": present.gates(made["gates"]),
+        "claims": present.claims(made["claims"]),
         _MARK: present.scores(made[_MARK]),
         "aggregate": present.aggregates(made["aggregate"]),
         "improvement": present.improvements(made["improvement"]),

@@ -1,0 +1,115 @@
+"""What becomes of the paper's claims, on runs whose returns are given."""
+
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from tests.helpers_report import describe, write_run
+from vd4rl_pomdp.reference import Reference
+from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.report.claims import CLAIMS, judge_claims, tally
+from vd4rl_pomdp.report.load import load_runs
+from vd4rl_pomdp.report.terminal import print_summary
+
+DATA = 600.0
+GOOD = {
+    ("state", "none"): (75, 77),
+    ("acro", "none"): (60, 62),
+    ("mik+a", "none"): (58, 60),
+    ("acro", "patch"): (20, 22),
+    ("mik", "patch"): (31, 33),
+    ("mik+a", "patch"): (50, 54),
+    ("random", "patch"): (10, 14),
+    ("supervised+a", "patch"): (70, 71),
+}
+"""Scores of two seeds of every method under a corruption: a tenth of their returns."""
+MEMORY, ACTIONS, FIRST, CLEAN = (CLAIMS[i].text for i in (1, 3, 4, 5))
+
+
+def write(folder: Path, scores: dict[tuple[str, str], tuple[float, ...]], **settings: Any) -> Path:
+    for (method, corruption), seeds in scores.items():
+        for seed, score in enumerate(seeds):
+            place = folder / "-".join(map(str, (method, corruption, seed, *settings.values())))
+            run = write_run(place, method, seed, {5: [99.0], 10: [score]}, labels={"corruption": corruption})
+            Reference(DATA).write(describe(run, {"history": "method"} | settings, seed=seed))
+    return folder
+
+
+def judged(folder: Path) -> dict[str, dict[str, Any]]:
+    return {row["claim"]: row for row in judge_claims(load_runs([folder]))}
+
+
+def test_every_claim_is_a_difference_of_means_with_its_error(tmp_path):
+    rows = judged(write(tmp_path, GOOD))
+    shown = {claim: (round(row["left_return"]), round(row["right_return"])) for claim, row in rows.items()}
+    assert shown == {
+        "acro returns less where pixels are hidden": (610, 210),
+        "a memory pays: mik above acro": (320, 210),
+        "past actions pay: mik+a above mik": (520, 320),
+        "mik+a is above every other method": (520, 320),
+        "a memory costs nothing where nothing is hidden: mik+a not below acro": (590, 610),
+        "what is left to a memory that was told the states": (705, 520),
+        "what is left to the states themselves": (760, 520),
+    }
+    assert rows[ACTIONS]["difference"] == pytest.approx(200)
+    assert rows[ACTIONS]["error"] == pytest.approx((800 / 2 + 200 / 2) ** 0.5)
+    assert [row["verdict"] for row in rows.values()] == ["holds"] * 5 + ["", ""]
+
+
+@pytest.mark.parametrize(
+    ("changes", "claim", "verdict"),
+    [
+        ({("mik", "patch"): (21, 23)}, MEMORY, "not told apart"),
+        ({("mik", "patch"): (1, 3)}, MEMORY, "does not hold"),
+        ({("mik", "patch"): (60,)}, MEMORY, "too few seeds"),
+        ({("driml", "patch"): (80, 82)}, FIRST, "does not hold"),
+        ({("random", "patch"): (80, 82)}, FIRST, "holds"),
+        ({("mik+a", "none"): (50, 52)}, CLEAN, "does not hold"),
+        ({("mik+a", "none"): (50, 70)}, CLEAN, "holds"),
+        ({("acro", "none"): (60,)}, CLEAN, "too few seeds"),
+    ],
+)
+def test_what_is_beyond_two_standard_errors_is_told(tmp_path, changes, claim, verdict):
+    assert judged(write(tmp_path, GOOD | changes))[claim]["verdict"] == verdict
+
+
+def test_a_claim_of_which_a_side_was_not_run_has_no_row(tmp_path):
+    assert MEMORY not in judged(write(tmp_path, GOOD | {("mik", "patch"): ()}))
+
+
+def test_claims_are_about_methods_as_they_are_and_not_about_their_variants(tmp_path):
+    write(tmp_path, GOOD)
+    write(tmp_path, {("acro", "patch"): (40, 42)}, history="gru")
+    rows = judged(write(tmp_path, {("mik+a", "patch"): (90, 92)}, random_histories=0.5))
+    assert rows[MEMORY]["right_return"] == pytest.approx(210)
+    assert rows[ACTIONS]["left_return"] == pytest.approx(520)
+    assert rows["a memory pays: acro with a GRU above acro"]["left_return"] == pytest.approx(410)
+    assert "history gru" in rows[FIRST]["right"], "the best other one, whatever its variant"
+
+
+def test_nothing_is_judged_where_a_gate_is_missed(tmp_path):
+    report = write_report([write(tmp_path / "runs", GOOD | {("state", "none"): (9, 9)})], tmp_path / "out")
+    verdicts = {row["verdict"] for row in report.claims if row["kind"] != "distance"}
+    assert verdicts == {"not judged: the setting does not discriminate"}
+
+
+def test_the_page_and_the_terminal_tell_what_becomes_of_the_claims(tmp_path, capsys):
+    write(tmp_path / "runs", GOOD | {("mik", "patch"): (60,)})
+    report = write_report([tmp_path / "runs"], tmp_path / "out")
+    page = report.page.read_text()
+    assert "<h2>Claims</h2>" in page
+    assert "mik+a: 520 (n = 2)" in page
+    assert (tmp_path / "out" / "claims.csv").exists()
+    assert r"310 $\pm$ 22" in (tmp_path / "out" / "claims.tex").read_text(), "acro is the best with two seeds"
+    print_summary(report)
+    shown = " ".join(capsys.readouterr().out.split())
+    assert f"{FIRST}: holds in 1 of 1 setting" in shown
+    assert f"{ACTIONS}: holds in 0 of 1 setting; too few seeds in 1" in shown
+    assert "told the states" not in shown
+
+
+def test_a_tally_counts_settings_by_verdict():
+    rows = [{"verdict": verdict} for verdict in ("holds", "too few seeds", "holds", "not told apart")]
+    assert tally(rows) == "holds in 2 of 4 settings; too few seeds in 1; not told apart in 1"
+    assert tally([{"verdict": ""}]) == ""
