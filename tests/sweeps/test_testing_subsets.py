@@ -18,7 +18,7 @@ from vd4rl_pomdp.runs.files import read_json
 def test_a_cell_runs_from_its_set_to_its_result(tmp_path, monkeypatch, capsys, grid, only, jobs, last):
     monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
     words = ["sweep", "run", grid, "--testing", "--only", *only, "--out", str(tmp_path / "out")]
-    main(words)
+    main([*words, "--jobs", "2"])  # a thread each: two of one job wait long for each other beside other tests
     assert f"all {jobs} jobs are finished" in capsys.readouterr().out
     assert read_json(tmp_path / "out" / last / "timing.json")["seconds"] > 0
     if grid == "quick":
