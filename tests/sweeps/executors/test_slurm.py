@@ -4,6 +4,7 @@ import os
 import signal
 import subprocess
 import sys
+import time
 from dataclasses import replace
 
 import pytest
@@ -18,6 +19,8 @@ from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.work import DONE, INTERRUPTED, KILLED
 
 pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not())
+SETTLED_S = 5.0
+"""Time for Slurm to hear how an interrupted task's script ended: told of it after the new start, it fails the task."""
 OPTIONS = SlurmOptions(time=30, gpus=0, cpus=2, tasks=4)
 
 
@@ -79,9 +82,11 @@ def test_a_task_that_slurm_interrupts_starts_again_with_its_jobs(out, how):
     until(lambda: begun(job))
     subprocess.run([*how.split(), *queue()], check=True)
     update = ["scontrol", "update", "StartTime=now", f"JobId={queue()[0]}"]  # Slurm has it wait else
+    settled = time.monotonic() + SETTLED_S
 
     def hurry(found):
-        subprocess.run(update, capture_output=True, check=False)
+        if time.monotonic() > settled:
+            subprocess.run(update, capture_output=True, check=False)
         if len(begun(job)) == 2:
             (out / "go").touch()
 
