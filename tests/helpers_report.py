@@ -8,6 +8,7 @@ from typing import Any
 
 import numpy as np
 
+from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.tables import label
 from vd4rl_pomdp.results import Result, write_results
@@ -70,6 +71,25 @@ def describe(run: Path, card: dict[str, Any] | None = None, data: str = "", **co
             run / "encoder" / "config.json", {"pretrain": facts | {"settings": settings, "data": card.get("data", "")}}
         )
     return run
+
+
+def write_seeds(
+    folder: Path, scores: dict[tuple[str, str], tuple[float, ...]], data_return: float, **settings: Any
+) -> Path:
+    """Runs that end with the given scores, by method and corruption a seed each, beside data of a mean return.
+
+    Args:
+        folder: where to.
+        scores: by method and corruption.
+        data_return: of the data that they learned from.
+        settings: of their encoders.
+    """
+    for (method, corruption), seeds in scores.items():
+        for seed, score in enumerate(seeds):
+            place = folder / "-".join(map(str, (method, corruption, seed, *settings.values())))
+            run = write_run(place, method, seed, {5: [99.0], 10: [score]}, labels={"corruption": corruption})
+            Reference(data_return).write(describe(run, {"history": "method"} | settings, seed=seed))
+    return folder
 
 
 def pretraining(place: Path) -> Path:

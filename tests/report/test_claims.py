@@ -5,8 +5,7 @@ from typing import Any
 
 import pytest
 
-from tests.helpers_report import describe, write_run
-from vd4rl_pomdp.reference import Reference
+from tests.helpers_report import write_seeds
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.report.claims import CLAIMS, judge_claims, tally
 from vd4rl_pomdp.report.load import load_runs
@@ -28,12 +27,7 @@ MEMORY, ACTIONS, FIRST, CLEAN = (CLAIMS[i].text for i in (1, 3, 4, 5))
 
 
 def write(folder: Path, scores: dict[tuple[str, str], tuple[float, ...]], **settings: Any) -> Path:
-    for (method, corruption), seeds in scores.items():
-        for seed, score in enumerate(seeds):
-            place = folder / "-".join(map(str, (method, corruption, seed, *settings.values())))
-            run = write_run(place, method, seed, {5: [99.0], 10: [score]}, labels={"corruption": corruption})
-            Reference(DATA).write(describe(run, {"history": "method"} | settings, seed=seed))
-    return folder
+    return write_seeds(folder, scores, DATA, **settings)
 
 
 def judged(folder: Path) -> dict[str, dict[str, Any]]:

@@ -5,8 +5,7 @@ from typing import Any
 
 import pytest
 
-from tests.helpers_report import write_run
-from vd4rl_pomdp.reference import Reference
+from tests.helpers_report import write_seeds
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.report.gates import gates, unranked
 from vd4rl_pomdp.report.load import load_runs
@@ -24,14 +23,7 @@ GOOD = {
 
 
 def grid(folder: Path, scores: dict[tuple[str, str], tuple[float, ...]]) -> Path:
-    for (method, corruption), seeds in scores.items():
-        for seed, score in enumerate(seeds):
-            labels = {"corruption": corruption}
-            run = write_run(
-                folder / method / corruption / str(seed), method, seed, {5: [99.0], 10: [score]}, labels=labels
-            )
-            Reference(DATA).write(run)
-    return folder
+    return write_seeds(folder, scores, DATA)
 
 
 def patch_gate(folder: Path) -> dict[str, Any]:

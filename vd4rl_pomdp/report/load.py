@@ -177,8 +177,9 @@ def _load(result: Result) -> LoadedRun:
     except UserError:
         raise
     except (KeyError, TypeError, ValueError, AttributeError) as error:
-        where = result.path if result.folder else f"{result.path}: run {result.id}"
-        raise UserError(f"{where}: its files are damaged ({error}); take another copy, or leave it out") from error
+        raise UserError(
+            f"{result.place}: its files are damaged ({error}); take another copy, or leave it out"
+        ) from error
 
 
 def _reference(result: Result) -> Reference:

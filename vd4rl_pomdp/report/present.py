@@ -22,8 +22,8 @@ def gates(rows: list[Row]) -> list[ShownTable]:
     columns = ("setting", "verdict", "data's return", "state", "acro, none", "best – random")
     lines = []
     for row in rows:
-        above = number(row["above_random"], 0) + ("" if row["error"] is None else f" ± {row['error']:.0f}")
         shares = (number(row[name], 2) for name in ("state_share", "acro_share"))
+        above = _with_error(row["above_random"], row["error"])
         lines.append(Line((setting(row), row["verdict"], number(row["data_return"], 0), *shares, above)))
     return [ShownTable("", columns, lines, words=2)]
 
@@ -39,8 +39,12 @@ def claims(rows: list[Row]) -> list[ShownTable]:
 
 def _claim_line(row: Row) -> Line:
     sides = (f"{row[side]}: {row[f'{side}_return']:.0f} (n = {row[f'{side}_seeds']})" for side in ("left", "right"))
-    error = "" if row["error"] is None else f" ± {row['error']:.0f}"
-    return Line((setting(row), row["verdict"] or "–", *sides, number(row["difference"], 0) + error))
+    return Line((setting(row), row["verdict"] or "–", *sides, _with_error(row["difference"], row["error"])))
+
+
+def _with_error(difference: float | None, error: float | None) -> str:
+    """A difference of returns and its standard error, as far as they are known."""
+    return number(difference, 0) + ("" if error is None else f" ± {error:.0f}")
 
 
 def scores(rows: list[Row]) -> list[ShownTable]:

@@ -56,6 +56,11 @@ class Result:
     """Whether `path` is its own folder."""
 
     @property
+    def place(self) -> str:
+        """Where it is told of, for a message."""
+        return str(self.path) if self.folder else f"{self.path}: run {self.id}"
+
+    @property
     def record(self) -> dict[str, Any]:
         """config.json: stage, config, inputs, versions, git_commit, command."""
         return self.files[RECORD]

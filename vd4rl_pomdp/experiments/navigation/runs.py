@@ -183,16 +183,15 @@ def save_runs(runs: list[NavigationRun], out: Path) -> None:
 
 
 def _read_run(result: Result) -> NavigationRun:
-    place = result.path if result.folder else f"{result.path}: run {result.id}"
     try:
-        return _with_trajectory(_run_of(result, place))
+        return _with_trajectory(_run_of(result))
     except UserError:
         raise
     except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{place}: its results are damaged ({error}); train it again") from error
+        raise UserError(f"{result.place}: its results are damaged ({error}); train it again") from error
 
 
-def _run_of(result: Result, place: Path | str) -> NavigationRun:
+def _run_of(result: Result) -> NavigationRun:
     record, (results, timing, machine) = result.record, (result.files[name] for name in _FILES)
     config = record["config"]
     named = {
@@ -216,7 +215,7 @@ def _run_of(result: Result, place: Path | str) -> NavigationRun:
         "gpu": machine["gpu"] or "",
         "command": results.get("command", record["command"]),
     }
-    values = {measure_of(row): _finite(place, row, f"{row['value']:.6g}") for row in results["rows"]}
+    values = {measure_of(row): _finite(result.place, row, f"{row['value']:.6g}") for row in results["rows"]}
     told = {name: str(fact) for name, fact in facts.items()}
     return NavigationRun(result, condition, config["preset"], config["seed"], values, told, None)
 
@@ -232,7 +231,7 @@ def _with_trajectory(run: NavigationRun) -> NavigationRun:
     return run
 
 
-def _finite(place: Path | str, row: dict[str, Any], value: str) -> float:
+def _finite(place: str, row: dict[str, Any], value: str) -> float:
     if not math.isfinite(float(value)):
         raise UserError(f"{place}: a {row['measure']} is {value}: the run has diverged; train it again or leave it out")
     return float(value)
