@@ -14,6 +14,8 @@ from vd4rl_pomdp.report.tables import grouped, label, setting
 from vd4rl_pomdp.report.write import Report
 from vd4rl_pomdp.runs.files import Row
 
+_LONGEST = 24
+
 
 def print_summary(report: Report, console: Console | None = None) -> None:
     """The verdicts of the gates and claims, then the tables of final scores, one a setting."""
@@ -28,9 +30,14 @@ def print_summary(report: Report, console: Console | None = None) -> None:
         console.print(_table(place, members))
 
 
+def _longest_word(rows: list[Row]) -> int:
+    """Width at which no label is broken within a word, as far as it leaves room for the numbers."""
+    return min(_LONGEST, max(len(word) for row in rows for word in label(row).split()))
+
+
 def _table(title: str, rows: list[Row]) -> Table:
     table = Table(title=Text(title), title_justify="left")
-    table.add_column("method", overflow="fold")
+    table.add_column("method", overflow="fold", min_width=_longest_word(rows))
     for name in ("score", "interval", "seeds", "episodes"):
         table.add_column(name, justify="right", no_wrap=True)
     gaps = any(row["missing"] for row in rows)
