@@ -17,3 +17,5 @@ def test_no_label_is_broken_within_a_word_at_eighty_columns(tmp_path):
     print_summary(write_report([runs], tmp_path / "out"), Console(file=shown, width=80))
     assert "seeds 0, 1, 2" in shown.getvalue(), "a column that takes room"
     assert shown.getvalue().count("random_histories") == 2, "a line in each table"
+    borders = [line[-1] for line in shown.getvalue().splitlines() if line[:1] in tuple("┏┃┡│└")]
+    assert set(borders) == set("┓┃┩│┘"), "a table that is wider than the terminal loses its right border"

@@ -14,8 +14,6 @@ from vd4rl_pomdp.report.tables import grouped, label, setting
 from vd4rl_pomdp.report.write import Report
 from vd4rl_pomdp.runs.files import Row
 
-_LONGEST = 24
-
 
 def print_summary(report: Report, console: Console | None = None) -> None:
     """The verdicts of the gates and claims, then the tables of final scores, one a setting."""
@@ -30,14 +28,9 @@ def print_summary(report: Report, console: Console | None = None) -> None:
         console.print(_table(place, members))
 
 
-def _longest_word(rows: list[Row]) -> int:
-    """Width at which no label is broken within a word, as far as it leaves room for the numbers."""
-    return min(_LONGEST, max(len(word) for row in rows for word in label(row).split()))
-
-
 def _table(title: str, rows: list[Row]) -> Table:
     table = Table(title=Text(title), title_justify="left")
-    table.add_column("method", overflow="fold", min_width=_longest_word(rows))
+    table.add_column("method", overflow="fold")
     for name in ("score", "interval", "seeds", "episodes"):
         table.add_column(name, justify="right", no_wrap=True)
     gaps = any(row["missing"] for row in rows)
@@ -46,5 +39,6 @@ def _table(title: str, rows: list[Row]) -> Table:
     for row in rows:
         score = MISSING if row["score"] is None else number(row["score"])
         texts = (label(row), score, interval(row["low"], row["high"]), str(row["seeds"]), str(row["episodes"]))
-        table.add_row(*map(Text, (*texts, row["missing"]) if gaps else texts))
+        gap = row["missing"].removesuffix(f" {MISSING}")  # its column's title says so, and labels need the room
+        table.add_row(*map(Text, (*texts, gap) if gaps else texts))
     return table
