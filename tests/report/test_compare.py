@@ -1,13 +1,15 @@
 """Two result sets side by side."""
 
 import csv
+import io
 from pathlib import Path
 
 import pytest
+from rich.console import Console
 
 from tests.helpers_report import describe, write_run
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.report.compare import compare_results
+from vd4rl_pomdp.report.compare import compare_results, print_comparison
 from vd4rl_pomdp.results import add_results
 
 
@@ -52,6 +54,19 @@ def test_variants_are_compared_by_name_and_a_lone_one_with_the_other_sets(tmp_pa
     assert [(row["difference"], row["settings"]) for row in lone] == [(-13.0, "max_k 15 → 1")]
     some = compare_results(tmp_path / "a", tmp_path / "b" / "1").rows
     assert [row["difference"] for row in some] == [None] * 3, "which of two it is compared with is not told"
+
+
+def test_no_word_is_broken_at_eighty_columns(tmp_path):
+    for seed in (0, 1):
+        for share in (0.0, 0.5):
+            path = write_run(tmp_path / f"a/{share}{seed}", "mik+a", seed, {10: [50.0 + seed]})
+            describe(path, {}, random_histories=share)
+    shown = io.StringIO()
+    print_comparison(compare_results(tmp_path / "a", tmp_path / "a"), Console(file=shown, width=80))
+    text = shown.getvalue()
+    assert text.count("mik+a, random_histories") == 2
+    for words in ("[50.0, 51.0]", "[-1.0, 1.0]", "2 | 2"):
+        assert text.count(words) >= 2, words
 
 
 def test_the_command_prints_and_writes_a_page(tmp_path, capsys):

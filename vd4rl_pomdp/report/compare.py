@@ -164,12 +164,21 @@ def print_comparison(comparison: SideBySide, console: Console | None = None) -> 
         others = f", {side.others} unfinished or diverged" if side.others else ""
         console.print(f"{name}: {side.path}, {side.finished} finished runs{others}", markup=False, highlight=False)
     for table in tables(comparison):
-        shown = TerminalTable(title=Text(table.title), title_justify="left")
-        for place, name in enumerate(table.columns):
-            shown.add_column(name, overflow="fold", justify="left" if place < _WORDS else "right")
-        for line in table.lines:
-            shown.add_row(*map(Text, line.cells))
-        console.print(shown)
+        console.print(_terminal(table))
+
+
+def _terminal(table: ShownTable) -> TerminalTable:
+    """Narrow enough for 80 columns: settings stand under the method's label, intervals under their numbers."""
+    shown = TerminalTable(title=Text(table.title), title_justify="left")
+    shown.add_column("method\n  settings, A → B", overflow="fold")
+    for name in ("A", "B", "B – A\n95% interval", "seeds"):
+        shown.add_column(name, justify="right", no_wrap=True)
+    for line in table.lines:
+        name, told, *scores, difference, between, seeds = line.cells
+        stacked = (score.replace(" [", "\n[") for score in scores)
+        apart = f"{difference}\n{between}".removesuffix(f"\n{interval(None, None)}")
+        shown.add_row(*map(Text, (f"{name}\n  {told}", *stacked, apart, seeds)))
+    return shown
 
 
 def check_out(out: Path) -> None:
