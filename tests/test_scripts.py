@@ -1,3 +1,4 @@
+import csv
 import importlib
 from pathlib import Path
 
@@ -8,10 +9,11 @@ import torch
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import Agent
+from vd4rl_pomdp.evaluation import EVALUATION_SEED, Agent
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.policies.actor import load_actor
+from vd4rl_pomdp.policies.export import episode_returns
 from vd4rl_pomdp.tasks import TASKS
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
@@ -47,3 +49,33 @@ def test_the_comparison_writes_over_no_run(tmp_path, monkeypatch):
     (tmp_path / "config.json").write_text('{"stage": "finetune"}')
     with pytest.raises(UserError, match=r"lies inside .* which holds a run"):
         script.main(script.Config((tmp_path,), out=tmp_path / "episodes.csv"))
+
+
+def test_the_expert_on_noisy_states_plays_its_own_episodes_and_loses_return(tmp_path, monkeypatch, capsys):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    script = importlib.import_module("noisy_expert")
+    noises = {"pose_noises": (0, 34), "velocity_noises": (0, 49)}
+    script.main(script.Config(("cheetah_run",), **noises, episodes=2, out=tmp_path / "table.csv"))
+    with (tmp_path / "table.csv").open() as file:
+        rows = [(row["pose_noise"], float(row["return"])) for row in csv.DictReader(file)]
+    task = TASKS["cheetah_run"]
+    exact = episode_returns(load_actor("cheetah_run", "expert"), task, 2, EVALUATION_SEED)
+    assert rows[:2] == [("0", round(value, 4)) for value in exact]
+    assert all(noise == "34" and value < 0.2 * exact[0] for noise, value in rows[2:])
+    alone, noisy = (line.split(": ")[1].split() for line in capsys.readouterr().out.splitlines()[:2])
+    assert float(noisy[0]) > 2 * float(alone[0]), "falls, which only the noisy episodes have, vary the height"
+
+
+@pytest.mark.parametrize(
+    ("settings", "message"),
+    [
+        ({"pose_noises": (1,)}, "give as many of one as of the other"),
+        ({"tasks": ("humanoid_walk",)}, "choose a planar task"),
+        ({"tasks": ("walker",)}, "unknown task"),
+    ],
+)
+def test_the_measurement_is_refused_in_a_line(tmp_path, monkeypatch, settings, message):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    script = importlib.import_module("noisy_expert")
+    with pytest.raises(UserError, match=message):
+        script.main(script.Config(**settings, out=tmp_path / "table.csv"))
