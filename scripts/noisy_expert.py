@@ -19,14 +19,14 @@ import torch
 import tyro
 
 from vd4rl_pomdp.envs.make import layout_of
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_number, refuse_outside
 from vd4rl_pomdp.evaluation import EVALUATION_SEED
 from vd4rl_pomdp.policies.actor import Actor, load_actor
 from vd4rl_pomdp.policies.state_env import StateEnv
 from vd4rl_pomdp.runs.files import write_csv
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.state_scale import StateScale
-from vd4rl_pomdp.tasks import TASKS
+from vd4rl_pomdp.tasks import MOST_EPISODES, TASKS
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,12 @@ def main(config: Config) -> None:
     """Play all episodes and write the table."""
     if len(config.pose_noises) != len(config.velocity_noises):
         raise UserError("--pose-noises and --velocity-noises: give as many of one as of the other")
+    if not (config.tasks and config.pose_noises):
+        raise UserError("--tasks, --pose-noises: name at least one of each")
+    refuse_outside(config, episodes=(1, MOST_EPISODES))
+    for flag in ("pose_noises", "velocity_noises"):
+        for noise in getattr(config, flag):
+            refuse_number(flag, noise, 0)
     refuse_inside(config.out)
     rows = [row for name in config.tasks for row in measure(name, config)]
     write_csv(config.out, list(rows[0]), rows)

@@ -70,6 +70,9 @@ def test_the_expert_on_noisy_states_plays_its_own_episodes_and_loses_return(tmp_
     ("settings", "message"),
     [
         ({"pose_noises": (1,)}, "give as many of one as of the other"),
+        ({"pose_noises": (0, -1, 0, 0, 0)}, "--pose-noises is -1"),
+        ({"tasks": ()}, "name at least one"),
+        ({"episodes": 0}, "--episodes is 0"),
         ({"tasks": ("humanoid_walk",)}, "choose a planar task"),
         ({"tasks": ("walker",)}, "unknown task"),
     ],
