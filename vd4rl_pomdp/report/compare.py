@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -170,15 +170,17 @@ def print_comparison(comparison: SideBySide, console: Console | None = None) -> 
 def _terminal(table: ShownTable) -> TerminalTable:
     """Narrow enough for 80 columns: settings stand under the method's label, intervals under their numbers."""
     shown = TerminalTable(title=Text(table.title), title_justify="left")
-    shown.add_column("method\n  settings, A → B", overflow="fold")
-    for name in ("A", "B", "B – A\n95% interval", "seeds"):
-        shown.add_column(name, justify="right", no_wrap=True)
+    for place, name in enumerate(_stacked(table.columns)):
+        shown.add_column(name, overflow="fold", justify="right" if place else "left", no_wrap=place > 0)
     for line in table.lines:
-        name, told, *scores, difference, between, seeds = line.cells
-        stacked = (score.replace(" [", "\n[") for score in scores)
-        apart = f"{difference}\n{between}".removesuffix(f"\n{interval(None, None)}")
-        shown.add_row(*map(Text, (f"{name}\n  {told}", *stacked, apart, seeds)))
+        shown.add_row(*map(Text, _stacked(line.cells)))
     return shown
+
+
+def _stacked(cells: Sequence[str]) -> tuple[str, ...]:
+    name, told, *scores, difference, between, seeds = cells
+    apart = f"{difference}\n{between}".removesuffix(f"\n{interval(None, None)}")
+    return f"{name}\n  {told}", *(score.replace(" [", "\n[") for score in scores), apart, seeds
 
 
 def check_out(out: Path) -> None:
