@@ -52,8 +52,8 @@ def test_jobs_share_gpus_and_a_cancelled_one_ends_in_peace(options, tmp_path):
     executor.start(work_of(small))
     executor.start(work_of(large, 3))
     assert not executor.fits(1)
+    until(lambda: begun(small) and begun(large))  # before the third, which Ray might else place ahead of the large one
     executor.start(work_of(waiting))  # which Ray keeps until there is room
-    until(lambda: begun(small) and begun(large))
     (seen,) = begun(small)
     assert (seen["CUDA_VISIBLE_DEVICES"], seen["OMP_NUM_THREADS"], seen["cwd"]) == ("0", "1", os.getcwd())
     (small.folder / "go").touch()
