@@ -4,6 +4,7 @@ import pytest
 
 from tests.helpers_sweeps import job
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs import files
 from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.work import CAUSES, DONE, FAILED, Work, code_of, ended, told_seconds
@@ -16,6 +17,23 @@ def test_jobs_are_read_as_they_were_written_each_once(tmp_path):
     folder.keep_plan("one", [first])
     folder.keep_plan("two", [first, second])
     assert folder.jobs() == [first, second]
+
+
+def test_two_drivers_write_a_plan_at_once(tmp_path, monkeypatch):
+    """The second begins and ends while the first has written its file, and not yet put it in place."""
+    folder, jobs, rest = SweepFolder(tmp_path), [job(tmp_path, "a"), job(tmp_path, "b")], []
+    synchronise = files.synchronise
+
+    def another(path):
+        synchronise(path)
+        if not rest:
+            rest.append(1)
+            folder.keep_plan("one", jobs[1:])
+
+    monkeypatch.setattr(files, "synchronise", another)
+    folder.keep_plan("one", jobs[:1])
+    assert folder.jobs() == jobs[:1]
+    assert [path.name for path in (tmp_path / "sweep" / "plans").iterdir()] == ["one.json"]
 
 
 def test_a_damaged_plan_is_named(tmp_path):

@@ -7,6 +7,7 @@ import hashlib
 import json
 import math
 import os
+import secrets
 from collections.abc import Collection, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
@@ -41,9 +42,9 @@ def read_json(path: Path) -> dict[str, Any]:
     return value
 
 
-def write_json(path: Path, value: Any) -> None:
-    """Write a JSON file so that a reader sees it whole or not at all."""
-    with replacing_file(path) as fresh:
+def write_json(path: Path, value: Any, shared: bool = False) -> None:
+    """Write a JSON file so that a reader sees it whole or not at all; `shared` as in `replacing_file`."""
+    with replacing_file(path, shared) as fresh:
         fresh.write_text(json_text(value), encoding="utf-8")
 
 
@@ -103,13 +104,19 @@ def write_bytes(path: Path, content: bytes) -> None:
 
 
 @contextmanager
-def replacing_file(path: Path) -> Iterator[Path]:
+def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
     """A hidden name beside `path` to write, which takes `path`'s place when the block ends, or goes if it fails.
+
+    Args:
+        path: the file.
+        shared: whether other processes may write it at the same time, so that each needs a hidden name of its own; what
+            a killed one leaves is then not written over.
 
     Raises:
         UserError: the disk is full, or the system refuses otherwise.
     """
-    fresh = path.with_name(f".{path.name}.tmp")
+    own = f".{secrets.token_hex(4)}" if shared else ""
+    fresh = path.with_name(f".{path.name}{own}.tmp")
     with disk_errors(path):
         try:
             yield fresh

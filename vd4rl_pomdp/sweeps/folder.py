@@ -40,10 +40,10 @@ class SweepFolder:
         self._attempts = self.path / "attempts.jsonl"
 
     def keep_plan(self, grid: str, jobs: Iterable[Job]) -> None:
-        """Write the jobs of a grid, in place of what was written of it before."""
+        """Write the jobs of a grid, in place of what was written of it before; other drivers may do so at once."""
         with disk_errors(self.path):
             (self.path / "plans").mkdir(parents=True, exist_ok=True)
-        write_json(self.path / "plans" / f"{grid}.json", [jsonable(asdict(job)) for job in jobs])
+        write_json(self.path / "plans" / f"{grid}.json", [jsonable(asdict(job)) for job in jobs], shared=True)
 
     def jobs(self) -> list[Job]:
         """The jobs of all plans; UserError if there is none."""
