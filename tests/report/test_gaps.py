@@ -27,3 +27,18 @@ def test_an_ablation_is_missing_elsewhere_but_a_budget_for_every_task_is_not(tmp
         ("expert", "none", "acro", "steps 20"),
         ("expert", "none", "acro", "steps 60"),
     }
+
+
+def test_the_state_is_not_missing_where_other_pixels_of_the_same_set_are_hidden(tmp_path):
+    runs = tmp_path / "runs"
+    for method, quality, corruption in (
+        *(("acro", quality, corruption) for quality in ("expert", "medium") for corruption in ("none", "patch")),
+        ("state", "expert", "none"),
+    ):
+        labels = {"quality": quality, "corruption": corruption}
+        describe(write_run(runs / f"{method}-{quality}-{corruption}", method, 0, {10: [1.0]}, labels=labels), {})
+    names = ("quality", "corruption", "method")
+    assert {tuple(row[name] for name in names) for row in find_gaps(load_runs([runs]))} == {
+        ("medium", "none", "state"),
+        ("medium", "patch", "state"),
+    }

@@ -38,6 +38,12 @@ def test_runs_pool_whatever_their_seed_folder_device_and_logging(tmp_path):
         ({"card": {}}, {"card": {}, "data": "f00"}, ["acro, data not recorded", "acro, data f00"]),
         ({"card": {}, "views": 4}, {"card": {}, "views": None}, ["acro, views 4", "acro, views none"]),
         ({"card": {"m": 8}}, {"card": {}}, ["acro, m 8", "acro, m unset"]),
+        ({"card": {"history": "method"}}, {"card": {"history": "gru"}}, ["acro", "acro, history gru"]),
+        (
+            {"card": {}, "random_histories": 0.0, "views": 4},
+            {"card": {}, "random_histories": 0.5, "views": 8},
+            ["acro, views 4", "acro, views 8, random_histories 0.5"],
+        ),
         ({"card": {}}, {}, ["acro", "acro, pretraining not recorded"]),
         (
             {"card": {"preset": "cpu", "steps": 20}, "preset": "cpu", "views": 4},
@@ -45,7 +51,21 @@ def test_runs_pool_whatever_their_seed_folder_device_and_logging(tmp_path):
             ["acro, preset cpu", "acro, preset smoke"],
         ),
     ],
-    ids=["patch", "steps", "updates", "same name", "data", "data before", "old", "none", "new", "no card", "preset"],
+    ids=[
+        "patch",
+        "steps",
+        "updates",
+        "same name",
+        "data",
+        "data before",
+        "old",
+        "none",
+        "new",
+        "plain",
+        "two",
+        "no card",
+        "preset",
+    ],
 )
 def test_runs_that_differ_are_rows_of_their_own(tmp_path, one, other, names):
     for seed in (0, 1):

@@ -10,17 +10,14 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
+from vd4rl_pomdp.report.gaps import STATE
 from vd4rl_pomdp.report.gates import FAILED, SETTING, STANDARD_ERRORS, best_of, difference, returns_of
 from vd4rl_pomdp.report.load import LoadedRun
 from vd4rl_pomdp.report.tables import END_TO_END, REFERENCES, grouped, label
+from vd4rl_pomdp.report.variants import PLAIN
 from vd4rl_pomdp.runs.files import Row
 
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "not told apart", "too few seeds"
-_PLAIN = {
-    **{"random_histories": "0", "history_window": "0", "readout": "state"},
-    **{"pose_noise": "0", "velocity_noise": "0"},
-}
-"""Settings that a method's own runs have; others are variants of it."""
 
 
 class Contender(NamedTuple):
@@ -120,14 +117,14 @@ def _at(run: LoadedRun, *place: str) -> bool:
 def _runs_of(side: Contender, other: Contender, corruption: str, runs: Iterable[LoadedRun]) -> list[LoadedRun]:
     """Seeds of one side: of the variant that has two of them, and returns most."""
     wanted = "none" if side.clean else corruption
-    seen = [run for run in runs if run.labels["corruption"] == wanted or run.labels["method"] == "state"]
+    seen = [run for run in runs if run.labels["corruption"] == wanted or run.labels["method"] == STATE]
     if not side.method:
         return best_of((run for run in seen if run.labels["method"] not in (other.method, *REFERENCES)), seeds=2)
     return best_of((run for run in seen if run.labels["method"] == side.method and _plain(run, side.history)), seeds=2)
 
 
 def _plain(run: LoadedRun, history: str) -> bool:
-    wanted = _PLAIN | {"history": history}
+    wanted = PLAIN | {"history": history}
     return all(run.settings.get(name, value) == value for name, value in wanted.items())
 
 

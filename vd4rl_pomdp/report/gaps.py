@@ -13,6 +13,8 @@ Key = TypeVar("Key")
 Setting = tuple[str, str, str]
 """Task, quality and corruption: what methods are compared in."""
 MISSING = "missing"
+STATE = "state"
+"""The method that sees the simulator's state, whatever a setting hides."""
 CONDITION = ("task", "quality", "corruption", "algorithm", "method", "variant")
 """What all seeds of an experiment share: the columns that tell it from others."""
 
@@ -72,12 +74,15 @@ def _expected(by_method: dict[tuple[str, str], list[LoadedRun]], setting: Settin
 def _shared(mine: list[LoadedRun], setting: Setting) -> Iterable[str]:
     """Variants of a method that are expected in a setting: those of all settings that share a variant with it.
 
-    Where each setting has variants of its own, such as a budget for every task, nothing is missing.
+    Where each setting has variants of its own, such as a budget for every task, nothing is missing; nor is `state`
+    where other pixels of the same set are hidden.
     """
     by_setting: dict[Setting, dict[str, None]] = {}
     for run in mine:
         by_setting.setdefault(_setting(run), {})[run.parts[0]] = None
     own = by_setting.get(setting)
+    if own is None and mine[0].labels["method"] == STATE and any(there[:2] == setting[:2] for there in by_setting):
+        return ()
     wanted = [there for there in by_setting.values() if own is None or own.keys() & there.keys()]
     return {variant: None for there in wanted for variant in there}
 

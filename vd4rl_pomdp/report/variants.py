@@ -23,6 +23,11 @@ _NOT_RECORDED = "not recorded"
 _UNSET = "unset"
 _PRESETS = ("preset", "pretraining preset")
 _DATA = ("data", "pretraining data")
+PLAIN = {
+    **{"history": "method", "random_histories": "0", "history_window": "0", "readout": "state"},
+    **{"pose_noise": "0", "velocity_noise": "0"},
+}
+"""Values that add nothing to a method: what has them goes by the method's name, and others are its variants."""
 _LABELS = ("method", "task", "quality")
 """Fields that are a run's labels, not its settings."""
 
@@ -113,7 +118,7 @@ def _by_scope(settings: list[Settings], scope: Sequence[Any], wanted: Callable[[
 
 
 def _name(settings: list[Settings], wanted: Callable[[str], bool], brief: bool) -> list[str]:
-    """What differs among some settings: "max_k 1, steps 20"."""
+    """What differs among some settings: "max_k 1, steps 20"; nothing for a value that adds nothing."""
     known = filter(wanted, dict.fromkeys(name for one in settings for name in one))
     names = [name for name in known if _differs(settings, name)]
     # An option of a chosen part is not there without the part: naming the part says it all.
@@ -124,7 +129,8 @@ def _name(settings: list[Settings], wanted: Callable[[str], bool], brief: bool) 
         if preset in names and not _decided(settings, preset, deciding):
             deciding.append(preset)
     names = [name for name in names if name in deciding or not _decided(settings, name, deciding)]
-    return [", ".join(f"{name} {value}" for name in names if (value := _value(one, name))) for one in settings]
+    values = ({name: _value(one, name) for name in names} for one in settings)
+    return [", ".join(f"{k} {v}" for k, v in one.items() if v not in ("", PLAIN.get(k))) for one in values]
 
 
 def _value(settings: Settings, name: str) -> str:
