@@ -12,6 +12,7 @@ from typing import Any
 from zlib import crc32
 
 import matplotlib as mpl
+import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
@@ -104,12 +105,13 @@ def _legend(looks: Mapping[str, int], width: float) -> tuple[float, dict[str, An
     names = [plain(name, NAME_WIDTH) for name in looks]
     longest = max(len(line) for name in names for line in name.split("\n"))
     columns = max(1, min(len(names), int(width / (_ENTRY + _LETTER * longest))))
-    lines = max(1 + name.count("\n") for name in names)
+    lines = [1 + name.count("\n") for name in names]
+    tallest = max(map(sum, np.array_split(lines, columns)))  # matplotlib fills column by column, as evenly
     handles = [
         Line2D([], [], markersize=5, label=name, **style(look))
         for name, look in zip(names, looks.values(), strict=True)
     ]
-    return 0.15 + _LINE * lines * ceil(len(names) / columns), {"handles": handles, "ncols": columns, "handlelength": 3}
+    return 0.15 + _LINE * tallest, {"handles": handles, "ncols": columns, "handlelength": 3}
 
 
 def _panel(figure: Figure, place: tuple[float, float, float, float], title: str) -> Axes:
