@@ -1,5 +1,6 @@
 import subprocess
 import sys
+import tempfile
 
 import gymnasium
 import numpy as np
@@ -48,10 +49,11 @@ def test_a_seed_fixes_everything(maze):
 
 
 @pytest.mark.parametrize("maze", ["three_curtains", "hard_three_curtains"])
-def test_seen_from_the_top_the_dynamics_are_pointmazes_own(maze):
+def test_seen_from_the_top_the_dynamics_are_pointmazes_own(maze, tmp_path, monkeypatch):
     """The generator limits velocities once a decision, PointMaze and the hard mazes before every step."""
     import gymnasium_robotics
 
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))  # where PointMaze leaves its model
     gymnasium.register_envs(gymnasium_robotics)
     theirs = gymnasium.make("PointMaze_UMaze-v3").unwrapped
     theirs.reset(seed=0)
