@@ -29,7 +29,7 @@ SCORE_DIVISOR = 10.0
 Quality = Literal["random", "medium_replay", "medium", "medium_expert", "expert"]
 QUALITIES: tuple[Quality, ...] = get_args(Quality)
 """V-D4RL's."""
-NoisyQuality = Literal["expert_noisy", "medium_expert_noisy"]
+NoisyQuality = Literal["medium_noisy", "medium_expert_noisy", "expert_noisy"]
 NOISY_QUALITIES: tuple[NoisyQuality, ...] = get_args(NoisyQuality)
 """This package's own: where actions are not decided by the state, an inverse model can tell them from what they did."""
 SET_QUALITIES = (*QUALITIES, *NOISY_QUALITIES)

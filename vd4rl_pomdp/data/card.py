@@ -35,6 +35,7 @@ HOW = {
         "each episode is played anew, with the run's exploration noise, by the actor saved nearest to the moment of "
         "the run that the episode stands for, in proportion and in order; the earliest by uniformly random actions."
     ),
+    "medium_noisy": "The medium actor's sampled actions, with Gaussian noise added. Not one of V-D4RL's sets.",
     "expert_noisy": "The expert actor's sampled actions, with Gaussian noise added. Not one of V-D4RL's sets.",
     "medium_expert_noisy": (
         "The first half of the episodes by the medium actor, the second half by the expert actor, with Gaussian noise "
