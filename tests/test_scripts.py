@@ -51,17 +51,18 @@ def test_the_comparison_writes_over_no_run(tmp_path, monkeypatch):
         script.main(script.Config((tmp_path,), out=tmp_path / "episodes.csv"))
 
 
-def test_the_expert_on_noisy_states_plays_its_own_episodes_and_loses_return(tmp_path, monkeypatch, capsys):
+def test_actors_on_noisy_states_play_their_own_episodes_and_lose_return(tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(SCRIPTS)
-    script = importlib.import_module("noisy_expert")
+    script = importlib.import_module("noisy_states")
     noises = {"pose_noises": (0, 34), "velocity_noises": (0, 49)}
     script.main(script.Config(("cheetah_run",), **noises, episodes=2, out=tmp_path / "table.csv"))
     with (tmp_path / "table.csv").open() as file:
-        rows = [(row["pose_noise"], float(row["return"])) for row in csv.DictReader(file)]
-    task = TASKS["cheetah_run"]
-    exact = episode_returns(load_actor("cheetah_run", "expert"), task, 2, EVALUATION_SEED)
-    assert rows[:2] == [("0", round(value, 4)) for value in exact]
-    assert all(noise == "34" and value < 0.2 * exact[0] for noise, value in rows[2:])
+        rows = [(row["actor"], row["pose_noise"], float(row["return"])) for row in csv.DictReader(file)]
+    for actor, mine in (("expert", rows[:4]), ("medium", rows[4:])):
+        exact = episode_returns(load_actor("cheetah_run", actor), TASKS["cheetah_run"], 2, EVALUATION_SEED)
+        assert mine[:2] == [(actor, "0", round(value, 4)) for value in exact]
+        assert all(row[:2] == (actor, "34") and row[2] < 0.8 * exact[0] for row in mine[2:])
+    assert all(value < 0.2 * rows[0][2] for *_, value in rows[2:4]), "the expert's gait asks for more than the medium's"
     alone, noisy = (line.split(": ")[1].split() for line in capsys.readouterr().out.splitlines()[:2])
     assert float(noisy[0]) > 2 * float(alone[0]), "falls, which only the noisy episodes have, vary the height"
 
@@ -79,6 +80,6 @@ def test_the_expert_on_noisy_states_plays_its_own_episodes_and_loses_return(tmp_
 )
 def test_the_measurement_is_refused_in_a_line(tmp_path, monkeypatch, settings, message):
     monkeypatch.syspath_prepend(SCRIPTS)
-    script = importlib.import_module("noisy_expert")
+    script = importlib.import_module("noisy_states")
     with pytest.raises(UserError, match=message):
         script.main(script.Config(**settings, out=tmp_path / "table.csv"))

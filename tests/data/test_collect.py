@@ -251,6 +251,7 @@ def test_a_full_disk_at_the_start_is_a_sentence(tmp_path, monkeypatch):
     ("changes", "name", "std"),
     [
         ({"quality": "expert_noisy"}, "expert_noisy", 0.5),
+        ({"quality": "medium_noisy"}, "medium_noisy", 0.5),
         ({"quality": "medium_expert_noisy"}, "medium_expert_noisy", 0.5),
         ({"quality": "expert", "action_noise": 0.25}, "expert_noise0.25", 0.25),
     ],
