@@ -75,26 +75,27 @@ def test_runs_that_differ_are_rows_of_their_own(tmp_path, one, other, names):
     assert pooled(tmp_path / "runs") == dict.fromkeys(names, 2) | {"random": 1}
 
 
-def by_task(tmp_path, budgets):
-    """Runs of two methods on two tasks, with budgets by method and task."""
-    for (method, task), updates in budgets.items():
-        run = write_run(tmp_path / f"runs/{method}-{task}", method, 0, {10: [1.0]}, labels={"task": task})
-        describe(run, {}, data=task, updates=updates)
+def by_set(tmp_path, budgets):
+    """Runs of two methods on several sets, with budgets by method and set."""
+    for (method, name), updates in budgets.items():
+        labels = dict(zip(("task", "quality"), name.split(), strict=True))
+        run = write_run(tmp_path / f"runs/{method}-{name}", method, 0, {10: [1.0]}, labels=labels)
+        describe(run, {}, data=name, updates=updates)
     return tmp_path / "runs"
 
 
-def test_a_setting_that_goes_by_the_task_makes_no_variants_and_the_page_tells_it(tmp_path):
-    tasks = {"walker_walk": 20, "cheetah_run": 60}
-    runs = by_task(tmp_path, {(method, task): tasks[task] for method in ("acro", "mik+a") for task in tasks})
-    assert pooled(runs) == {"acro": 2, "mik+a": 2}
+def test_a_setting_that_goes_by_the_set_makes_no_variants_and_the_page_tells_it(tmp_path):
+    sets = {"walker_walk expert": 20, "cheetah_run expert": 60, "cheetah_run medium": 20}
+    runs = by_set(tmp_path, {(method, name): sets[name] for method in ("acro", "mik+a") for name in sets})
+    assert pooled(runs) == {"acro": 3, "mik+a": 3}
     page = write_report([runs], tmp_path / "report")[0].read_text()
-    assert "<td>walker_walk</td><td>updates 20</td>" in page
-    assert "<td>cheetah_run</td><td>updates 60</td>" in page
+    for name, updates in sets.items():
+        assert f"<td>{name}</td><td>updates {updates}</td>" in page
 
 
-def test_a_budget_of_one_method_alone_is_no_tasks_own(tmp_path):
-    budgets = {("acro", "walker_walk"): 20, ("acro", "cheetah_run"): 60, ("mik+a", "cheetah_run"): 20}
-    runs = by_task(tmp_path, budgets)
+def test_a_budget_of_one_method_alone_is_no_sets_own(tmp_path):
+    expert, medium = "walker_walk expert", "walker_walk medium"
+    runs = by_set(tmp_path, {("acro", expert): 20, ("acro", medium): 60, ("mik+a", medium): 20})
     assert pooled(runs) == {"acro, updates 20": 1, "acro, updates 60": 1, "mik+a": 1}
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from vd4rl_pomdp.report.load import LoadedRun, compare, own_to_tasks
+from vd4rl_pomdp.report.load import LoadedRun, compare, own_to_sets
 from vd4rl_pomdp.report.measures import machine
 from vd4rl_pomdp.report.tables import label, setting
 from vd4rl_pomdp.runs.settings import settings_of
@@ -35,7 +35,7 @@ def _state(run: LoadedRun) -> str:
 def differing(runs: list[LoadedRun]) -> list[tuple[str, str]]:
     """Each method of which there are several variants, and all settings that differ, those of a preset included.
 
-    Each task with settings of its own comes first.
+    Each set with settings of its own comes first.
     """
     told = zip(runs, compare(runs, brief=False), strict=True)
     named = {
@@ -43,16 +43,16 @@ def differing(runs: list[LoadedRun]) -> list[tuple[str, str]]:
         for run, parts in told
         if run.stage == "finetune" and run.variant
     }
-    return [*_own_to_tasks(runs).items(), *named.items()]
+    return [*_own_to_sets(runs).items(), *named.items()]
 
 
-def _own_to_tasks(runs: list[LoadedRun]) -> dict[str, str]:
-    """Settings that go by the task, in words."""
+def _own_to_sets(runs: list[LoadedRun]) -> dict[str, str]:
+    """Settings that go by the set, in words."""
     words: dict[str, list[str]] = {}
-    for (stage, _), by_task in own_to_tasks(runs).items():
-        for task, settings in by_task.items() if stage == "finetune" else ():
-            words.setdefault(task, []).extend(f"{name} {value}" for name, value in settings.items())
-    return {task: ", ".join(dict.fromkeys(texts)) for task, texts in words.items() if texts}
+    for (stage, _), by_set in own_to_sets(runs).items():
+        for place, settings in by_set.items() if stage == "finetune" else ():
+            words.setdefault(place, []).extend(f"{name} {value}" for name, value in settings.items())
+    return {place: ", ".join(dict.fromkeys(texts)) for place, texts in words.items() if texts}
 
 
 def facts(runs: list[LoadedRun]) -> list[dict[str, str]]:

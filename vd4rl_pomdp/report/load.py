@@ -13,7 +13,7 @@ import numpy as np
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.reference import FILE as REFERENCE
 from vd4rl_pomdp.reference import Reference
-from vd4rl_pomdp.report.variants import Parts, Settings, differences, of_tasks, read_settings
+from vd4rl_pomdp.report.variants import Parts, Settings, differences, of_sets, read_settings
 from vd4rl_pomdp.results import Result, find_results
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.reading import regular
@@ -128,22 +128,26 @@ def load_runs(paths: list[Path], but: Path | None = None) -> list[LoadedRun]:
 def compare(runs: list[LoadedRun], brief: bool = True) -> list[Parts]:
     """The settings in which each run differs from others of its stage, method and algorithm."""
     parts: dict[str, Parts] = {}
-    own = own_to_tasks(runs)
+    own = own_to_sets(runs)
     for members in _groups(runs, lambda run: (run.stage, run.labels["method"], run.labels["algorithm"])):
         corruption = [str(run.labels["corruption"]) for run in members]
         setting = [tuple(run.labels[name] for name in ("task", "quality", "corruption")) for run in members]
-        rest = [_without(run.settings, own[_kind(run)][str(run.labels["task"])]) for run in members]
+        rest = [_without(run.settings, own[_kind(run)][_set(run)]) for run in members]
         words = differences(rest, corruption, setting, brief)
         parts |= dict(zip((run.result.id for run in members), words, strict=True))
     return [parts[run.result.id] for run in runs]
 
 
-def own_to_tasks(runs: list[LoadedRun]) -> dict[tuple[str, str], dict[str, Settings]]:
-    """By stage and algorithm, and by task: settings that go by the task, such as a budget; they make no variants."""
+def own_to_sets(runs: list[LoadedRun]) -> dict[tuple[str, str], dict[str, Settings]]:
+    """By stage and algorithm, and by set: settings that go by the set, such as a budget; they make no variants."""
     return {
-        _kind(members[0]): of_tasks([run.settings for run in members], [str(run.labels["task"]) for run in members])
+        _kind(members[0]): of_sets([run.settings for run in members], list(map(_set, members)))
         for members in _groups(runs, _kind)
     }
+
+
+def _set(run: LoadedRun) -> str:
+    return f"{run.labels['task']} {run.labels['quality']}"
 
 
 def _kind(run: LoadedRun) -> tuple[str, str]:

@@ -63,26 +63,28 @@ def _words(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def of_tasks(settings: Sequence[Settings], tasks: Sequence[str]) -> dict[str, Settings]:
-    """Settings that go by the task: every run of a task has them so, and those of another task otherwise.
+def of_sets(settings: Sequence[Settings], sets: Sequence[str]) -> dict[str, Settings]:
+    """Settings that go by the set, such as a budget: every run on a set has them so, and those on another otherwise.
 
     Args:
         settings: of all runs of one stage and algorithm.
-        tasks: the task of each run.
+        sets: task and quality of each run.
 
     Returns:
-        By task, its values of these settings.
+        By set, its values of these settings.
     """
     found: dict[str, dict[str, set[str]]] = {}
-    for one, task in zip(settings, tasks, strict=True):
+    for one, place in zip(settings, sets, strict=True):
         for name in one.keys() - {UNKNOWN, *_DATA}:
-            found.setdefault(name, {}).setdefault(task, set()).add(one[name])
+            found.setdefault(name, {}).setdefault(place, set()).add(one[name])
     own = {
-        name: {task: min(values) for task, values in by_task.items()}
-        for name, by_task in found.items()
-        if all(len(values) == 1 for values in by_task.values()) and len(set().union(*by_task.values())) > 1
+        name: {place: min(values) for place, values in by_set.items()}
+        for name, by_set in found.items()
+        if all(len(values) == 1 for values in by_set.values()) and len(set().union(*by_set.values())) > 1
     }
-    return {task: {name: own[name][task] for name in sorted(own) if task in own[name]} for task in dict.fromkeys(tasks)}
+    return {
+        place: {name: own[name][place] for name in sorted(own) if place in own[name]} for place in dict.fromkeys(sets)
+    }
 
 
 def differences(
@@ -91,7 +93,7 @@ def differences(
     """Words for what differs among runs of one method, run by run.
 
     Args:
-        settings: of the runs, without those that go by the task.
+        settings: of the runs, without those that go by the set.
         corruption: the name of each run's corruption: other fields of it are told apart within one name.
         setting: task, quality and corruption of each run: data are told apart within one setting.
         brief: whether a preset is named in place of the settings that it decides.
