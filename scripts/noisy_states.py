@@ -9,14 +9,13 @@ is lost is lost to the errors. Columns: what was asked for, the episode and its 
 
 from __future__ import annotations
 
-import sys
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
 import torch
-import tyro
+from script import run_script
 
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError, refuse_number, refuse_outside
@@ -54,7 +53,7 @@ def play(actor: Actor, env: StateEnv, seed: int, std: np.ndarray, action_std: fl
         actor: who acts.
         env: where.
         seed: of the episode and of its noise.
-        std: (D,) noise on what the expert sees.
+        std: (D,) noise on what the actor sees.
         action_std: noise on what it does.
     """
     rng = np.random.default_rng(seed)
@@ -110,8 +109,4 @@ def main(config: Config) -> None:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config))
-    except UserError as error:
-        print(f"error: {error}", file=sys.stderr)
-        sys.exit(2)
+    run_script(main, Config)
