@@ -1,11 +1,12 @@
-"""Where does a policy fail: on the expert's path, or on the way there? The data's expert acts first, then hands over.
+"""Where does a policy fail: on the data's path, or on the way there? The data's actor acts first, then hands over.
 
     python scripts/hand_over.py RUN... --after 0 60 --episodes 5 --out hand_over.csv
 
-For every fine-tuning run and hand-over time it plays evaluation episodes in which the shipped expert acts on the true
-state for the first rows while the run's policy watches; then the policy acts. Columns: `reward` is the mean reward of
-a decision after the hand-over (2 at most), `error_0_10`, `error_10_50` and `error_50_end` the mean squared difference
-between the policy's action and the expert's at these rows, whoever acts.
+For every fine-tuning run and hand-over time it plays evaluation episodes in which the actor that made the run's data
+acts on the true state, without noise, for the first rows while the run's policy watches; then the policy acts. Columns:
+`reward` is the mean reward of a decision after the hand-over (2 at most), `error_after` the mean squared difference
+between the policy's action and the actor's from there on, `error_0_10`, `error_10_50` and `error_50_end` the same at
+these rows, whoever acts.
 """
 
 from __future__ import annotations
@@ -24,7 +25,8 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import EVALUATION_SEED, Agent
 from vd4rl_pomdp.nn.encoder_folder import load_encoder
 from vd4rl_pomdp.nn.policy import load_policy
-from vd4rl_pomdp.policies.actor import Actor, load_actor
+from vd4rl_pomdp.policies.actor import Actor, read_actor
+from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.runs.files import read_json, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.tasks import TASKS, Task
@@ -39,28 +41,41 @@ class Config:
     runs: tyro.conf.Positional[tuple[Path, ...]]
     """Fine-tuning run folders."""
     after: tuple[int, ...] = (0, 60)
-    """Rows that the expert acts in before it hands over."""
+    """Rows that the actor acts in before it hands over; fewer than an episode has."""
     episodes: int = 5
     """Episodes for each run and hand-over time."""
     out: Path = Path("hand_over.csv")
     """CSV file to write."""
 
 
-def play(agent: Agent, expert: Actor, env: CorruptedEnv, task: Task, after: int, episode: int) -> dict[str, float]:
+def actor_of(run: Path) -> Actor:
+    """The actor that made the run's data; raises UserError if it is not known."""
+    file = Reference.read(run).actor_file
+    if file is None:
+        raise UserError(f"{run}: the one actor of its data is not known; name runs on sets of one shipped actor")
+    return read_actor(file)
+
+
+def play(agent: Agent, actor: Actor, env: CorruptedEnv, task: Task, after: int, episode: int) -> dict[str, float]:
     """Measurements of one episode."""
     agent.reset()
     now = env.reset(EVALUATION_SEED + episode, EVALUATION_SEED, episode)
     rewards, errors = [], []
     while not now.time_step.last:
-        action, shown = agent.act(agent.encoder_input(now, task)), expert.act(now.time_step.state)
+        action, shown = agent.act(agent.encoder_input(now, task)), actor.act(now.time_step.state)
         errors.append(float(np.square(action - shown).mean()))
         if len(errors) <= after:
             action = shown
             agent.set_last_action(action)
         now = env.step(action)
         rewards.append(now.time_step.reward)
+    if not 0 <= after < len(rewards):
+        raise UserError(
+            f"--after is {after}, and an episode has {len(rewards)} decisions; take 0 to {len(rewards) - 1}"
+        )
     spans = {f"error_{a}_{b or 'end'}": round(float(np.mean(errors[a:b])), 4) for a, b in SPANS}
-    return {"reward": round(float(np.mean(rewards[after:])), 4)} | spans
+    after_it = {"reward": rewards[after:], "error_after": errors[after:]}
+    return {name: round(float(np.mean(values)), 4) for name, values in after_it.items()} | spans
 
 
 def main(config: Config) -> None:
@@ -72,13 +87,13 @@ def main(config: Config) -> None:
     for run in config.runs:
         labels = read_json(run / "labels.json")
         encoder, card = load_encoder(run / "encoder")
-        agent, expert = Agent(encoder, load_policy(run / "policy")), load_actor(card.task, "expert")
+        agent, actor = Agent(encoder, load_policy(run / "policy")), actor_of(run)
         task = TASKS.named(card.task)
         env = CorruptedEnv(task, CorruptionConfig.fill(card.corruption), size=agent.picture_size)
         for after in config.after:
             for episode in range(config.episodes):
                 row = labels | {"after": after, "episode": episode}
-                rows.append(row | play(agent, expert, env, task, after, episode))
+                rows.append(row | play(agent, actor, env, task, after, episode))
                 print(" ".join(f"{k} {v}" for k, v in rows[-1].items()), flush=True)
     write_csv(config.out, list(rows[0]), rows)
 

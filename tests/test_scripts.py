@@ -14,12 +14,13 @@ from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.policies.actor import load_actor
 from vd4rl_pomdp.policies.export import episode_returns
+from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.tasks import TASKS
 
 SCRIPTS = Path(__file__).parents[1] / "scripts"
 
 
-def test_the_expert_acts_first_and_the_policy_remembers_its_actions(monkeypatch):
+def test_the_actor_acts_first_and_the_policy_remembers_its_actions(monkeypatch):
     monkeypatch.syspath_prepend(SCRIPTS)
     script = importlib.import_module("hand_over")
     torch.manual_seed(0)
@@ -39,8 +40,23 @@ def test_the_expert_acts_first_and_the_policy_remembers_its_actions(monkeypatch)
     for action in executed[:59]:
         np.testing.assert_array_equal(action, expert.act(now.time_step.state))
         now = watched.step(action)
-    assert not np.allclose(executed[59], expert.act(now.time_step.state))
+    shown = expert.act(now.time_step.state)
+    assert not np.allclose(executed[59], shown)
+    assert result["error_after"] == round(float(np.square(executed[59] - shown).mean()), 4)
     assert result["reward"] == round(float(watched.step(executed[59]).time_step.reward), 4)
+
+    with pytest.raises(UserError, match="--after is 60, and an episode has 60 decisions"):
+        script.play(agent, expert, env, TASKS["walker_walk"], after=60, episode=0)
+
+
+def test_who_hands_over_is_the_actor_of_the_data(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    script, medium = importlib.import_module("hand_over"), load_actor("cheetah_run", "medium")
+    Reference(294.0, {"task": "cheetah_run", "quality": "medium", "sha256": medium.sha256}).write(tmp_path)
+    assert script.actor_of(tmp_path).sha256 == medium.sha256
+    Reference(294.0).write(tmp_path)
+    with pytest.raises(UserError, match="the one actor of its data is not known"):
+        script.actor_of(tmp_path)
 
 
 def test_the_comparison_writes_over_no_run(tmp_path, monkeypatch):
