@@ -21,15 +21,15 @@ from script import run_script
 
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_number, refuse_outside
 from vd4rl_pomdp.evaluation import EVALUATION_SEED, Agent
 from vd4rl_pomdp.nn.encoder_folder import load_encoder
 from vd4rl_pomdp.nn.policy import load_policy
 from vd4rl_pomdp.policies.actor import Actor, read_actor
-from vd4rl_pomdp.reference import Reference
+from vd4rl_pomdp.reference import Reference, action_error
 from vd4rl_pomdp.runs.files import read_json, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_inside
-from vd4rl_pomdp.tasks import TASKS, Task
+from vd4rl_pomdp.tasks import MOST_EPISODES, TASKS, Task
 
 SPANS = ((0, 10), (10, 50), (50, None))
 
@@ -63,7 +63,7 @@ def play(agent: Agent, actor: Actor, env: CorruptedEnv, task: Task, after: int, 
     rewards, errors = [], []
     while not now.time_step.last:
         action, shown = agent.act(agent.encoder_input(now, task)), actor.act(now.time_step.state)
-        errors.append(float(np.square(action - shown).mean()))
+        errors.append(float(action_error(action, shown)))
         if len(errors) <= after:
             action = shown
             agent.set_last_action(action)
@@ -82,6 +82,7 @@ def main(config: Config) -> None:
     """Play all episodes and write the table."""
     if not config.runs:
         raise UserError("no runs given; name fine-tuning run folders")
+    refuse_outside(config, episodes=(1, MOST_EPISODES))
     refuse_inside(config.out)
     rows: list[dict[str, Any]] = []
     for run in config.runs:
@@ -89,6 +90,8 @@ def main(config: Config) -> None:
         encoder, card = load_encoder(run / "encoder")
         agent, actor = Agent(encoder, load_policy(run / "policy")), actor_of(run)
         task = TASKS.named(card.task)
+        for after in config.after:
+            refuse_number("after", after, 0, task.decisions - 1)
         env = CorruptedEnv(task, CorruptionConfig.fill(card.corruption), size=agent.picture_size)
         for after in config.after:
             for episode in range(config.episodes):
