@@ -159,17 +159,35 @@ def test_an_encoder_whose_row_was_kept_is_made_again_for_a_new_policy(copy, tmp_
     assert len(left(jobs)) == 9
 
 
-def test_without_their_set_kept_rows_count_by_how_it_was_collected(copy, tmp_path):
-    for config in copy.rglob("config.json"):
+def tell_collection(folder: Path) -> None:
+    """Write into every run how its set was collected."""
+    for config in folder.rglob("config.json"):
         if "stage" in (record := read_json(config)):
             collection = {"task": "walker_walk", "quality": "expert", "episodes": 200, "seed": 0, "render": "fast"}
             collection |= {"episodes_per_shard": 50, "actor": None, "action_noise": None, "actors": []}
             write_json(config, record | {"collection": collection})
+
+
+def test_without_their_set_kept_rows_count_by_how_it_was_collected(copy, tmp_path):
+    tell_collection(copy)
     kept, new = FoundRuns(runs_below(copy)), tmp_path / "new"
     new.mkdir()
     shutil.copy(copy / "grid.toml", new)
     assert left(plan(new, kept=kept)) == []
     assert len(left(plan(new, ["collect.episodes=100"], kept=kept))) == 10
+
+
+@pytest.mark.parametrize(("lengths", "told"), [([20, 25, 31], True), ([20, 25, 30], False)])
+def test_kept_rows_of_a_set_collected_alike_with_other_content_are_told(copy, tmp_path, capsys, lengths, told):
+    tell_collection(copy)
+    rows, new = tmp_path / "rows", tmp_path / "new"
+    main(["results", "add", str(copy), "--out", str(rows)])
+    write_fake_set(new / "data" / "walker_walk" / "expert", lengths)
+    main(["sweep", "run", str(copy / "grid.toml"), "--out", str(new), "--done", str(rows), "--dry-run"])
+    shown = capsys.readouterr()
+    warning = "warning: walker_walk/expert: 5 kept runs are of a set collected alike, but with other content"
+    assert (warning in shown.err) == told
+    assert f"{1 if told else 6} done" in shown.out
 
 
 def collected(**settings):

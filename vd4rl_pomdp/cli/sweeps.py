@@ -81,7 +81,11 @@ def _run(words: Arguments, program: str) -> None:
         refuse_no_folder(place)
     refuse_kept(command.out)
     here, kept = FoundRuns(runs_below(command.out)), FoundRuns(runs_kept(command.done))
-    jobs = JobPlanner(command.out, command.data, kept, here).plan(cells)
+    planner = JobPlanner(command.out, command.data, kept, here)
+    jobs = planner.plan(cells)
+    for name, number in planner.of_other_content.items():
+        line = f"{number} kept runs are of a set collected alike, but with other content (from another machine?)"
+        print(f"warning: {name}: {line}: they do not count", file=sys.stderr)
     if command.dry_run:
         _print_plan(jobs, [*here.runs, *kept.runs])
         return

@@ -55,6 +55,10 @@ class FoundRuns:
         fitting = [run for run in self._by_recipe.get(name, ()) if data.made(run.record)]
         return max(fitting, key=lambda run: run.seconds is not None, default=None)
 
+    def alike(self, name: str, data: DataSet) -> bool:
+        """Whether there is a run of a recipe on a set that was collected as this one is."""
+        return any(data.alike(run.record) for run in self._by_recipe.get(name, ()))
+
     def __contains__(self, folder: Path) -> bool:
         return folder in self._folders
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
@@ -68,6 +69,8 @@ class JobPlanner:
         self._jobs: dict[tuple[str, str, str], Job] = {}
         self._sets: dict[str, DataSet] = {}
         self._taken: set[str] = set()
+        self.of_other_content: Counter[str] = Counter()
+        """Kept runs that do not count, by set: theirs was collected alike, and its content is another."""
 
     def plan(self, cells: Iterable[GridCell]) -> list[Job]:
         """The jobs of some cells, each after those it needs; what only finished jobs would need is left out.
@@ -111,6 +114,8 @@ class JobPlanner:
             return self._jobs[key]
         run, last = self._here.of(recipe, data), section == cell.chain[-1]
         kept = self._kept.of(recipe, data) if last else None  # a kept row is no encoder to train on
+        if last and kept is None and self._kept.alike(recipe, data):
+            self.of_other_content[data.name] += 1
         if run is not None:
             name = run.folder.relative_to(self._out).as_posix()
         else:

@@ -63,6 +63,10 @@ class DataSet:
         """Whether a run, as its config.json tells it, was trained on this set."""
         if self.there:
             return record.get("inputs", {}).get("data") == self.fingerprint
+        return self.alike(record)
+
+    def alike(self, record: Mapping[str, Any]) -> bool:
+        """Whether a run was trained on a set that was collected as this one is, whatever came of it."""
         collection = record.get("collection") or {}
         return bool(collection) and not differing(collection, self.wanted)
 
