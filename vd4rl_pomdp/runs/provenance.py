@@ -76,11 +76,14 @@ def machine() -> dict[str, Any]:
     """The hardware a run had: processor, cores, memory and GPU, without host or user names."""
     import torch
 
+    from vd4rl_pomdp.runs.device import has_bf16_kernels
+
     gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
+        "bf16_kernels": has_bf16_kernels(),
         "memory_gib": round(memory / 2**30, 1),
         "gpu": gpu,
         "system": platform.system(),

@@ -36,7 +36,7 @@ GOALS: dict[str, tuple[str, float]] = {
     "mazes.first_person_over_default": (">=", 5.0),
     "mazes.training_overhead_share": ("<=", 0.2),
 }
-"""What this package promises on two cores without a GPU; of bf16 over fp32, where the CPU has kernels for bf16."""
+"""What this package promises on two cores without a GPU; of bf16 over fp32, where `machine.bf16_kernels` says yes."""
 
 
 def bench(quick: bool = False) -> dict[str, Any]:

@@ -16,7 +16,7 @@ from vd4rl_pomdp.experiments.bench.memory import make_trainer
 from vd4rl_pomdp.experiments.bench.timing import alternating, seconds_of
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.options import NO_OPTIONS
-from vd4rl_pomdp.runs.device import Precision, has_bf16_kernels, pick_device
+from vd4rl_pomdp.runs.device import Precision, pick_device
 
 HISTORY_WINDOW = 32
 
@@ -26,7 +26,7 @@ def pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
     from pretrain.config import PretrainConfig
 
     device = pick_device("auto")
-    results: dict[str, Any] = {"device": str(device), "bf16_kernels": device.type != "cpu" or has_bf16_kernels()}
+    results: dict[str, Any] = {"device": str(device)}
     steps: dict[str, float] = {}
     for precision in ("fp32", "bf16"):
         given = {"data": folder, "out": folder, "batch_size": 8, "precision": precision}
