@@ -8,6 +8,7 @@ from vd4rl_pomdp.experiments import demo as demos
 from vd4rl_pomdp.experiments.demo import conclusion, demo, demo_jobs, show_navigation
 from vd4rl_pomdp.experiments.navigation.grid import Condition
 from vd4rl_pomdp.runs.episodes import append_episodes
+from vd4rl_pomdp.runs.files import write_json
 
 METHODS = ("mik+a", "acro", "random")
 LABELS = {"task": "walker_walk", "quality": "expert_noisy", "corruption": "patch+zero_frames"}
@@ -26,6 +27,7 @@ def write_returns(jobs):
         ]
         job.folder.mkdir(parents=True)
         append_episodes(job.folder / "episodes.csv", rows)
+        write_json(job.folder / "probe.json", {"probe_pose": 39.4, "probe_velocity": 53.6})
 
 
 LEVELS = {"no_history": 80.0, "mik+a": 7.4}
@@ -86,12 +88,12 @@ def stop():
     raise RuntimeError("far enough")
 
 
-def test_the_demo_ends_with_means_of_the_last_evaluation_and_how_sure_they_are(tmp_path):
+def test_the_demo_ends_with_the_last_evaluation_what_is_known_and_how_sure_it_is(tmp_path):
     jobs = demo_jobs(tmp_path)
     write_returns(jobs)
-    head, *lines, caveat = conclusion(jobs)
+    head, _, *lines, caveat, _ = conclusion(jobs)
     assert LABELS["corruption"] in head
-    assert [line.split(maxsplit=1) for line in lines] == [[method, "120 ± 20 (n = 2)"] for method in METHODS]
+    assert [" ".join(line.split()) for line in lines] == [f"{method} 120 ± 20 (n = 2) 39, 54" for method in METHODS]
     assert "One seed each" in caveat
 
 

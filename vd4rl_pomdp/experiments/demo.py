@@ -20,7 +20,9 @@ from vd4rl_pomdp.experiments.navigation.runs import find_navigation, load_runs
 from vd4rl_pomdp.mazes import get_maze
 from vd4rl_pomdp.navigation.measures import refitted_error
 from vd4rl_pomdp.options import Options
+from vd4rl_pomdp.report.measures import PROBES
 from vd4rl_pomdp.runs.episodes import read_episodes
+from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.outputs import refuse_kept
 from vd4rl_pomdp.runs.workers import count_workers
 from vd4rl_pomdp.sweeps.executors.local import LocalOptions, visible_gpus
@@ -91,15 +93,19 @@ def _jobs_at_once() -> int:
 
 
 def conclusion(jobs: list[Job]) -> Iterator[str]:
-    """What the returns of the demo's methods say, and how sure it is: lines of text."""
+    """What the demo's methods know and return, and how sure it is: lines of text."""
     policies = [(dict(job.settings), job.folder) for job in jobs if job.section == "finetune"]
     corruption = policies[0][0]["corruption"]
-    yield f"Returns under {corruption} (mean ± standard error over episodes):"
+    yield f"Under {corruption}: return (mean ± standard error over episodes), and what is not known of pose and"
+    yield "velocity (error of a linear probe in % of a standard deviation; 100 knows nothing):"
     for settings, folder in policies:
         rows = read_episodes(folder / "episodes.csv")
         last = max(row["step"] for row in rows)
-        yield f"  {settings['method']:<8}{_mean_and_error([row['return'] for row in rows if row['step'] == last])}"
-    yield "One seed each: another may end elsewhere. What several seeds say of 100 episodes is in results/control."
+        told = _mean_and_error([row["return"] for row in rows if row["step"] == last])
+        probe = read_json(folder / "probe.json")
+        yield f"  {settings['method']:<8}{told:<20}{', '.join(f'{probe[name]:.0f}' for name in PROBES)}"
+    yield "One seed each: with another, returns may end elsewhere, what is known hardly does."
+    yield "What three seeds say of 100 episodes is in results/control."
 
 
 def show_navigation(jobs: list[Job], film: Path) -> Iterator[str]:
