@@ -99,3 +99,12 @@ def test_the_measurement_is_refused_in_a_line(tmp_path, monkeypatch, settings, m
     script = importlib.import_module("noisy_states")
     with pytest.raises(UserError, match=message):
         script.main(script.Config(**settings, out=tmp_path / "table.csv"))
+
+
+def test_the_control_studys_page_shows_the_table_of_its_rows(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    script = importlib.import_module("control_table")
+    lines = list(script.table_lines(script.RESULTS))
+    assert len(lines) > 30
+    page = (script.RESULTS / "README.md").read_text()
+    assert "\n\n" + "\n".join(lines) + "\n\n" in page, "run `python scripts/control_table.py`, and put it on the page"
