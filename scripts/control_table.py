@@ -7,17 +7,14 @@ A test holds the page against it.
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from pathlib import Path
 
-import numpy as np
-
-from vd4rl_pomdp.report.gaps import CONDITION
+from vd4rl_pomdp.report.gaps import CONDITION, condition_of
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.measures import PROBES, control, representations, run_table
+from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.report.tables import evaluations, grouped, label
-from vd4rl_pomdp.runs.files import Row
 
 RESULTS = Path(__file__).parents[1] / "results" / "control"
 HEAD = """\
@@ -29,28 +26,22 @@ def table_lines(folder: Path) -> Iterator[str]:
     """Lines of the table, a row for every method of a set and a corruption, in the order of the report."""
     runs = load_runs([folder])
     of_runs = run_table(runs, evaluations(runs), [])
-    seeds, encoders = dict(grouped(of_runs, CONDITION)), {_key(row): row for row in representations(of_runs)}
+    seeds, encoders = dict(grouped(of_runs, CONDITION)), {condition_of(row): row for row in representations(of_runs)}
     yield HEAD
     for policy in control(runs):
-        key = _key(policy)
+        key = condition_of(policy)
         returns = [row["return"] for row in sorted(seeds[key], key=lambda row: row["seed"])]
         clean = "–" if policy["clean_return"] is None else f"{policy['clean_return']:.0f}"
         errors = f"{policy['path_error']:.3f}, {policy['action_error']:.3f}"
         probes = ", ".join(f"{encoders[key][name]:.1f}" for name in PROBES)
         place = f"{policy['task']} {policy['quality']} | {policy['corruption']} | {label(policy)}"
-        yield f"| {place} | {len(returns)} | {_mean(returns)} | {clean} | {errors} | {probes} |"
+        yield f"| {place} | {len(returns)} | {_told(returns)} | {clean} | {errors} | {probes} |"
 
 
-def _key(row: Row) -> tuple:
-    return tuple(row[name] for name in CONDITION)
-
-
-def _mean(returns: list[float]) -> str:
-    """Mean ± standard error over seeds, and each of them; one seed has no error."""
-    if len(returns) == 1:
-        return f"{returns[0]:.0f}"
-    error = np.std(returns, ddof=1) / math.sqrt(len(returns))
-    return f"{np.mean(returns):.0f} ± {error:.0f} ({', '.join(f'{value:.0f}' for value in returns)})"
+def _told(returns: list[float]) -> str:
+    """Mean and error over seeds, and each of them where there are several."""
+    each = f" ({', '.join(f'{value:.0f}' for value in returns)})" if len(returns) > 1 else ""
+    return mean_and_error(returns) + each
 
 
 if __name__ == "__main__":

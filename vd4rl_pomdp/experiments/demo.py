@@ -5,14 +5,11 @@ It shows that all works, not which method is best.
 
 from __future__ import annotations
 
-import math
 import shlex
 import sys
 import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
-
-import numpy as np
 
 from vd4rl_pomdp.errors import UserError, refuse_no_folder
 from vd4rl_pomdp.experiments.navigation.film import write_film
@@ -21,6 +18,7 @@ from vd4rl_pomdp.mazes import get_maze
 from vd4rl_pomdp.navigation.measures import refitted_error
 from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.report.measures import PROBES
+from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.outputs import refuse_kept
@@ -101,7 +99,8 @@ def conclusion(jobs: list[Job]) -> Iterator[str]:
     for settings, folder in policies:
         rows = read_episodes(folder / "episodes.csv")
         last = max(row["step"] for row in rows)
-        told = _mean_and_error([row["return"] for row in rows if row["step"] == last])
+        returns = [row["return"] for row in rows if row["step"] == last]
+        told = f"{mean_and_error(returns)} (n = {len(returns)})"
         probe = read_json(folder / "probe.json")
         yield f"  {settings['method']:<8}{told:<20}{', '.join(f'{probe[name]:.0f}' for name in PROBES)}"
     yield "One seed each: with another, returns may end elsewhere, what is known hardly does."
@@ -118,8 +117,3 @@ def show_navigation(jobs: list[Job], film: Path) -> Iterator[str]:
         error = run.values.get(refitted_error("position", rows="hidden"))
         yield f"  {run.condition.method:<12}{'no hidden step' if error is None else f'{error:.0f}'}"
     yield f"The mass, and where each takes it to be: {film}"
-
-
-def _mean_and_error(returns: list[float]) -> str:
-    error = f" ± {np.std(returns, ddof=1) / math.sqrt(len(returns)):.0f}" if len(returns) > 1 else ""
-    return f"{np.mean(returns):.0f}{error} (n = {len(returns)})"

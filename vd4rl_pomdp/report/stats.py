@@ -8,6 +8,7 @@ with replacement. All intervals are 95% percentile intervals. They cover less th
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
@@ -164,3 +165,9 @@ def _shares(count: int, rng: np.random.Generator, replicates: int) -> np.ndarray
 def _ends(values: np.ndarray) -> Interval:
     low, high = np.percentile(values, _LEVELS)
     return float(low), float(high)
+
+
+def mean_and_error(values: Sequence[float]) -> str:
+    """Whole numbers in words: the mean and its standard error, or the mean alone of a single value."""
+    error = f" ± {np.std(values, ddof=1) / math.sqrt(len(values)):.0f}" if len(values) > 1 else ""
+    return f"{np.mean(values):.0f}{error}"

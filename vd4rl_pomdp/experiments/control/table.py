@@ -11,6 +11,7 @@ import numpy as np
 
 from vd4rl_pomdp.experiments.control.config import MEASURED, NO_MEMORY, SETTING, UNTRAINED
 from vd4rl_pomdp.report.gates import FAILED, STANDARD_ERRORS, STATE_SHARE
+from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs.files import Row
 
 COLUMNS = ("method", "seeds", "return", "episodes", "good", "error: data", "in loop", "pose", "velocity")
@@ -108,8 +109,7 @@ def _table(rows: list[Row], methods: list[str]) -> Iterator[str]:
 
 def _method_row(rows: list[Row], method: str) -> tuple[str, ...]:
     mine = [row for row in rows if name_of(row) == method]
-    returns = np.array([float(row["return"]) for row in mine])
-    error = f" ± {returns.std(ddof=1) / math.sqrt(len(mine)):.0f}" if len(mine) > 1 else ""
+    returns = mean_and_error([float(row["return"]) for row in mine])
     low, high = min(float(row["return_min"]) for row in mine), max(float(row["return_max"]) for row in mine)
 
     def mean(name: str) -> float:
@@ -118,7 +118,7 @@ def _method_row(rows: list[Row], method: str) -> tuple[str, ...]:
     errors = (f"{mean(name):.3f}" for name in ("error_on_data", "error_in_loop"))
     probes = (f"{mean(name):.1f}" for name in ("probe_pose", "probe_velocity"))
     span, good = f"{low:.0f} to {high:.0f}", f"{100 * mean('good_share'):.0f}%"
-    return (method, str(len(mine)), f"{returns.mean():.0f}{error}", span, good, *errors, *probes)
+    return (method, str(len(mine)), returns, span, good, *errors, *probes)
 
 
 def _gates(rows: list[Row], every: list[Row]) -> Iterator[tuple[str, bool | None, str]]:
