@@ -1,4 +1,6 @@
 import errno
+import hashlib
+import json
 import multiprocessing
 import os
 import signal
@@ -37,6 +39,15 @@ def test_rows_in_memory_are_a_set_without_pixels(tmp_path):
     assert rows["action"].any(), "a set's rows are its own"
     names = [store.fingerprint for store in stores]
     assert names[0] == names[1] != names[2]
+    shaken = PlayedStore(tmp_path, {"attributes": []}, rows | {"reward": last_bits_changed(rows["reward"])})
+    assert shaken.fingerprint == names[0]
+
+
+def last_bits_changed(reward):
+    """The same rewards as another processor computes them: one unit in the last place of a float64 away."""
+    changed = np.nextafter(reward, np.inf)
+    assert (changed != reward).all()
+    return changed
 
 
 def slow_frames(log, seconds):
@@ -89,6 +100,28 @@ def test_the_fingerprint_names_the_content(tmp_path, cache):
     one, two, other = (write_fake_set(tmp_path / n, (4,), action_dim=d) for n, d in (("a", 2), ("b", 2), ("c", 3)))
     assert open_store(one, cache).fingerprint == open_store(two, cache).fingerprint
     assert open_store(one, cache).fingerprint != open_store(other, cache).fingerprint
+
+
+def test_the_fingerprint_reads_rewards_as_training_does(tmp_path, cache):
+    def name(folder, reward):
+        (tmp_path / folder).mkdir()
+        write_shard(tmp_path / folder / "0_fake.hdf5", rows | {"reward": reward}, {})
+        return open_store(tmp_path / folder, cache).fingerprint
+
+    rows = fake_rows((5, 4))
+    reward = rows["reward"] / 3
+    assert name("one", reward) == name("two", last_bits_changed(reward))
+    assert name("three", np.nextafter(reward.astype(np.float32), np.inf, dtype=np.float32)) != name("four", reward)
+
+
+def test_rewards_that_float32_holds_are_named_as_they_are_stored(tmp_path, cache):
+    (tmp_path / "set").mkdir()
+    rows = fake_rows((4,))
+    write_shard(tmp_path / "set" / "0_fake.hdf5", rows | {"reward": np.rint(rows["reward"] * 1000)}, {})
+    store = open_store(tmp_path / "set", cache)
+    checksums = {name: file["blake2b"] for name, file in store.meta["files"].items()}
+    stored = hashlib.blake2b(json.dumps(checksums, sort_keys=True).encode(), digest_size=12).hexdigest()
+    assert store.fingerprint == stored
 
 
 def test_the_cache_folder_follows_the_environment(tmp_path, monkeypatch):

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import fcntl
 import hashlib
+import io
 import json
 import math
 import os
@@ -45,8 +46,13 @@ class Store:
 
     @property
     def fingerprint(self) -> str:
-        """Name of the set's content: equal for equal rows, wherever and whenever they were written."""
+        """Name of the set's content as training reads it: equal for equal rows, wherever and whenever they were made.
+
+        Rewards count as float32, which is what `Dataset` trains on. The last bits of a float64 are the processor's:
+        dm_control's rewards call numpy's exp, which has code of its own where there is AVX-512.
+        """
         checksums = {name: file["blake2b"] for name, file in self.meta["files"].items()}
+        checksums["reward.npy"] = _checksum_of(_trained(self.array("reward")))
         return hashlib.blake2b(json.dumps(checksums, sort_keys=True).encode(), digest_size=12).hexdigest()
 
     @property
@@ -91,8 +97,8 @@ class PlayedStore(Store):
     def fingerprint(self) -> str:
         """Name of the rows' content."""
         digest = hashlib.blake2b(digest_size=12)
-        for key in sorted(self.rows):
-            digest.update(np.ascontiguousarray(self.rows[key]).tobytes())
+        for _, value in sorted((dict(self.rows) | {"reward": _trained(self.rows["reward"])}).items()):
+            digest.update(np.ascontiguousarray(value).tobytes())
         return digest.hexdigest()
 
     @property
@@ -223,3 +229,15 @@ def _describe(shards: Sequence[Path], scratch: Path, rows: int) -> dict[str, Any
 def _checksum(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
+
+
+def _checksum_of(value: np.ndarray) -> str:
+    """Checksum of the file that `value` would be saved to."""
+    file = io.BytesIO()
+    np.save(file, value)
+    return hashlib.blake2b(file.getbuffer(), digest_size=16).hexdigest()
+
+
+def _trained(reward: np.ndarray) -> np.ndarray:
+    """Rewards in the precision of training, in the dtype they came in."""
+    return reward.astype(np.float32).astype(reward.dtype)
