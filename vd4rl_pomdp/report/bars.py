@@ -96,10 +96,7 @@ def _bars(axes: Axes, summary: list[Row], runs: list[Row], looks: dict[str, int]
     scored = [row | {"place": places[label(row)]} for row in summary if row["score"] is not None]
     _draw(axes, scored, [looks[label(row)] for row in scored])
     _dots(axes, runs, places, looks)
-    for row in summary:
-        if row["absent"]:
-            crossed: dict[str, Any] = {"ha": "center", "va": "bottom", "fontsize": 6.5, "weight": "bold", "zorder": 5}
-            axes.text(places[label(row)], 0, f"×{row['absent']}", **crossed)
+    _crosses(axes, summary, runs, places)
     axes.set_xticks(range(len(looks)), [plain(name, _NAME_WIDTH) for name in looks], rotation=90, fontsize=7)
     axes.set_xlim(-0.6, len(looks) - 0.4)
     axes.set_ylim(bottom=0)
@@ -128,6 +125,17 @@ def _dots(axes: Axes, runs: list[Row], places: dict[str, int], looks: dict[str, 
         y += [row["score"] for row in sorted(members, key=lambda row: row["seed"])]
         colours += [COLOURS[looks[name] % len(COLOURS)]] * len(members)
     axes.scatter(x, y, 7, color=colours, ec="black", lw=0.4, zorder=4)
+
+
+def _crosses(axes: Axes, summary: list[Row], runs: list[Row], places: dict[str, int]) -> None:
+    """How many seeds are missing, above all that is drawn of a method."""
+    seeds = {name: [row["score"] for row in members] for name, members in by_label(runs)}
+    crossed: dict[str, Any] = {"ha": "center", "fontsize": 6.5, "weight": "bold", "textcoords": "offset points"}
+    for row in summary:
+        if row["absent"]:
+            drawn = [row["high"], row["best_score"], *seeds.get(label(row), [])]
+            top = max((value for value in drawn if value is not None), default=0.0)
+            axes.annotate(f"×{row['absent']}", (places[label(row)], top), (0, 4), **crossed)
 
 
 def _lines(axes: Axes, row: dict[str, str]) -> None:
