@@ -1,17 +1,23 @@
 """One thread a process: the tests run on several processes, and small tensors gain nothing from more.
 
 JAX compiles without most optimisations: the tests compile much and run little of it. Ctrl-C is answered, also where
-the tests were started in the background of a shell, which lets its jobs ignore it.
+the tests were started in the background of a shell, which lets its jobs ignore it. Submitit is loaded first:
+it sets up logging, which closes the stream of absl's handler unless that is stderr. Within a test that captures stderr
+itself it is not, but pytest's own, and every later test would fail.
 """
 
 import os
 import signal
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 import torch
 
 from tests.helpers_data import write_fake_set
+
+with suppress(ImportError):
+    import submitit  # noqa: F401
 
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
 torch.set_num_threads(1)
