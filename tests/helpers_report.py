@@ -74,7 +74,11 @@ def describe(run: Path, card: dict[str, Any] | None = None, data: str = "", **co
 
 
 def write_seeds(
-    folder: Path, scores: dict[tuple[str, str], tuple[float, ...]], data_return: float, **settings: Any
+    folder: Path,
+    scores: dict[tuple[str, str], tuple[float, ...]],
+    data_return: float | None,
+    algorithm: str = "td3_bc",
+    **settings: Any,
 ) -> Path:
     """Runs that end with the given scores, by method and corruption a seed each, beside data of a mean return.
 
@@ -82,12 +86,14 @@ def write_seeds(
         folder: where to.
         scores: by method and corruption.
         data_return: of the data that they learned from.
+        algorithm: that fine-tuned them.
         settings: of their encoders.
     """
     for (method, corruption), seeds in scores.items():
         for seed, score in enumerate(seeds):
-            place = folder / "-".join(map(str, (method, corruption, seed, *settings.values())))
-            run = write_run(place, method, seed, {5: [99.0], 10: [score]}, labels={"corruption": corruption})
+            place = folder / "-".join(map(str, (method, corruption, seed, algorithm, *settings.values())))
+            labels = {"corruption": corruption, "algorithm": algorithm}
+            run = write_run(place, method, seed, {5: [99.0], 10: [score]}, labels=labels)
             Reference(data_return).write(describe(run, {"history": "method"} | settings, seed=seed))
     return folder
 

@@ -3,12 +3,22 @@
 from pathlib import Path
 
 from vd4rl_pomdp.runs.files import write_json
+from vd4rl_pomdp.runs.identity import recipe
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.work import DONE, Ended, Work
 
+_RECORD = {"stage": "pretrain", "config": {"seed": 0}}
+
 
 def job(out: Path, name: str, *needs: str, section: str = "pretrain") -> Job:
-    return Job(name, section, out / name, ("list",), needs)
+    return Job(name, section, out / name, ("list",), needs, recipe=recipe(_RECORD, {}))
+
+
+def finish(folder: Path, seed: int = 0) -> None:
+    """Leave what a finished run leaves, one of another recipe for another seed."""
+    folder.mkdir(parents=True, exist_ok=True)
+    write_json(folder / "config.json", _RECORD | {"config": {"seed": seed}})
+    write_json(folder / "timing.json", {"seconds": 1.0})
 
 
 class Scripted:
@@ -39,8 +49,7 @@ class Scripted:
         causes = self.script.get(name, [])
         cause = causes.pop(0) if causes else DONE
         if cause == DONE:
-            self.folders[name].mkdir(parents=True, exist_ok=True)
-            write_json(self.folders[name] / "timing.json", {"seconds": 1.0})
+            finish(self.folders[name])
         return Ended(name, cause, "" if cause == DONE else f"its {cause} line")
 
     def stop(self) -> None:

@@ -9,6 +9,7 @@ import pytest
 
 from vd4rl_pomdp.data import download as module
 from vd4rl_pomdp.data.download import RemoteFile, download, manifest
+from vd4rl_pomdp.data.format import shard_paths
 from vd4rl_pomdp.errors import UserError
 
 CONTENT = {"0_a_expert.hdf5": bytes(range(256)) * 40, "1_a_expert.hdf5": b"second" * 999, "0_a_medium.hdf5": b"m" * 500}
@@ -115,6 +116,17 @@ def test_a_cut_connection_is_resumed(mirror, tmp_path):
     fetch(mirror, tmp_path)
     assert [r for p, r in mirror.requests if p == path] == [None, "bytes=1000-", "bytes=2000-"]
     assert (tmp_path / path).read_bytes() == CONTENT["0_a_expert.hdf5"]
+
+
+def test_a_set_of_which_files_are_missing_is_not_taken_for_whole(mirror, tmp_path):
+    missing = f"{EXPERT}/1_a_expert.hdf5"
+    body = mirror.files.pop(missing)
+    with pytest.raises(UserError, match="404"):
+        fetch(mirror, tmp_path)
+    with pytest.raises(UserError, match=r"1_a_expert\.hdf5\.part: the set's download is not finished"):
+        shard_paths(tmp_path / EXPERT)
+    mirror.files[missing] = body
+    assert fetch(mirror, tmp_path) == shard_paths(tmp_path / EXPERT)
 
 
 def test_a_partial_file_of_an_earlier_run_is_continued(mirror, tmp_path):

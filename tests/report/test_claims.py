@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from tests.helpers_report import write_seeds
+from tests.helpers_report import describe, write_run, write_seeds
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.report.claims import CLAIMS, judge_claims, tally
 from vd4rl_pomdp.report.load import load_runs
@@ -80,6 +80,18 @@ def test_claims_are_about_methods_as_they_are_and_not_about_their_variants(tmp_p
     assert rows[ACTIONS]["left_return"] == pytest.approx(520)
     assert rows["a memory pays: acro with a GRU above acro"]["left_return"] == pytest.approx(410)
     assert "history gru" in rows[FIRST]["right"], "the best other one, whatever its variant"
+
+
+def test_a_setting_that_early_runs_do_not_record_is_the_methods_own(tmp_path):
+    for seed in (0, 1):
+        describe(write_run(tmp_path / f"acro{seed}", "acro", seed, {10: [20.0 + seed]}), seed=seed)
+    assert judged(tmp_path) == {}, "no acro with a GRU was run"
+
+
+def test_the_states_count_once_a_seed_whatever_is_hidden(tmp_path):
+    row = judged(write(tmp_path, GOOD | {("state", "patch"): (30, 50)}))["what is left to the states themselves"]
+    assert (row["left_seeds"], row["left_return"]) == (2, pytest.approx(760)), "those that saw everything"
+    assert row["error"] == pytest.approx((200 / 2 + 800 / 2) ** 0.5)
 
 
 def test_nothing_is_judged_where_a_gate_is_missed(tmp_path):

@@ -9,6 +9,7 @@ from tests.helpers_report import write_seeds
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.report.gates import gates, unranked
 from vd4rl_pomdp.report.load import load_runs
+from vd4rl_pomdp.report.terminal import print_summary
 
 DATA = 800.0
 GOOD = {
@@ -22,13 +23,17 @@ GOOD = {
 """Scores of two seeds of every method under a corruption: a tenth of their returns."""
 
 
-def grid(folder: Path, scores: dict[tuple[str, str], tuple[float, ...]]) -> Path:
-    return write_seeds(folder, scores, DATA)
+def grid(folder: Path, scores: dict[tuple[str, str], tuple[float, ...]], **settings: Any) -> Path:
+    return write_seeds(folder, scores, DATA, **settings)
+
+
+def gate(folder: Path, corruption: str) -> dict[str, Any]:
+    (row,) = [row for row in gates(load_runs([folder])) if row["corruption"] == corruption]
+    return row
 
 
 def patch_gate(folder: Path) -> dict[str, Any]:
-    (row,) = [row for row in gates(load_runs([folder])) if row["corruption"] == "patch"]
-    return row
+    return gate(folder, "patch")
 
 
 def test_a_setting_discriminates_if_state_acro_and_the_best_method_hold(tmp_path):
@@ -44,6 +49,42 @@ def test_a_setting_discriminates_if_state_acro_and_the_best_method_hold(tmp_path
 def test_the_best_method_is_one_whose_seeds_tell_how_sure_it_is(tmp_path):
     row = patch_gate(grid(tmp_path, GOOD | {("mik", "patch"): (99,)}))
     assert (row["verdict"], row["above_random"]) == ("discriminates", pytest.approx(520 - 120))
+
+
+def test_references_are_methods_as_they_are_and_not_their_variants(tmp_path):
+    grid(tmp_path, GOOD | {("state", "patch"): ()})
+    grid(tmp_path, {("state", "patch"): (75, 77)}, pose_noise=34)
+    row = patch_gate(grid(tmp_path, {("random", "patch"): (49,)}, history="gru"))
+    assert row["verdict"] == "not known to discriminate: state was not measured"
+    assert (row["above_random"], row["error"]) == (pytest.approx(520 - 120), pytest.approx((800 / 2 + 800 / 2) ** 0.5))
+
+
+def test_a_single_seed_of_a_reference_counts_where_there_are_no_more(tmp_path):
+    lone = GOOD | {("acro", "none"): (60,)}
+    assert patch_gate(grid(tmp_path / "lone", lone))["acro_share"] == pytest.approx(600 / DATA)
+    grid(tmp_path / "lucky", GOOD | {("acro", "none"): (55, 56)})
+    row = patch_gate(grid(tmp_path / "lucky", {("acro", "none"): (99,)}, steps=60))
+    assert row["acro_share"] == pytest.approx(555 / DATA)
+
+
+def test_the_state_counts_once_a_seed_and_that_of_the_setting_first(tmp_path):
+    grid(tmp_path, GOOD | {("state", "none"): (9, 11, 40)})
+    assert gate(tmp_path, "none")["state_share"] == pytest.approx(200 / DATA)
+    assert patch_gate(tmp_path)["state_share"] == pytest.approx((750 + 770 + 400) / 3 / DATA)
+
+
+def test_a_reference_is_held_against_its_own_data(tmp_path):
+    grid(tmp_path, GOOD | {("state", "patch"): ()})
+    row = patch_gate(write_seeds(tmp_path, {("state", "patch"): (75, 77)}, 400.0))
+    assert (row["state_share"], row["acro_share"]) == (pytest.approx(760 / 400), pytest.approx(610 / DATA))
+    assert row["data_return"] == pytest.approx((DATA + 400) / 2)
+
+
+@pytest.mark.parametrize(("data", "words"), [(None, "not known"), (-1000.0, "not above 0"), (0.0, "not above 0")])
+def test_data_of_whose_return_there_are_no_shares_are_said(tmp_path, data, words):
+    row = patch_gate(write_seeds(tmp_path, GOOD, data))
+    assert (row["data_return"], row["state_share"], row["acro_share"]) == (data, None, None)
+    assert row["verdict"] == f"not known to discriminate: the data's return is {words}"
 
 
 @pytest.mark.parametrize(
@@ -72,10 +113,34 @@ def test_a_missed_gate_is_named_and_what_was_not_measured_too(tmp_path, changes,
 def test_methods_of_a_setting_that_does_not_discriminate_are_listed_by_name(tmp_path):
     runs = grid(tmp_path / "runs", GOOD | {("state", "patch"): (9, 9)})
     report = write_report([runs], tmp_path / "out")
-    assert ("walker_walk", "expert", "patch") in unranked(report.gates)
+    assert ("walker_walk", "expert", "patch", "td3_bc") in unranked(report.gates)
     names = [row["method"] for row in report.summary if row["corruption"] == "patch"]
     assert names == ["acro", "mik+a", "random", "state", "supervised+a"]
     text = report.page.read_text()
     assert text.index("does not discriminate: state returns") < text.index("Final scores")
     ranked = write_report([grid(tmp_path / "good", GOOD)], tmp_path / "other")
     assert next(row["method"] for row in ranked.summary if row["corruption"] == "patch") == "mik+a"
+
+
+def test_a_gate_that_one_algorithm_misses_says_nothing_of_another(tmp_path, capsys):
+    grid(tmp_path / "runs", GOOD)
+    grid(tmp_path / "runs", GOOD | {("acro", "none"): (9, 9)}, algorithm="iql")
+    report = write_report([tmp_path / "runs"], tmp_path / "out")
+    assert {place[3] for place in unranked(report.gates)} == {"iql"}
+    verdicts = {
+        algorithm: {row["verdict"] for row in report.claims if row["algorithm"] == algorithm}
+        for algorithm in ("iql", "td3_bc")
+    }
+    assert verdicts == {"iql": {"not judged: the setting does not discriminate", ""}, "td3_bc": {"holds", ""}}
+    assert next(row["method"] for row in report.summary if row["corruption"] == "patch") == "mik+a", "one can rank"
+    print_summary(report)
+    for shown in (report.page.read_text().replace("</td><td>", ": "), " ".join(capsys.readouterr().out.split())):
+        assert "walker_walk expert, patch, iql: does not discriminate: acro under none" in shown
+        assert "walker_walk expert, patch: discriminates" in shown
+
+
+def test_methods_are_listed_by_name_where_every_algorithm_misses_a_gate(tmp_path):
+    for algorithm in ("td3_bc", "iql"):
+        grid(tmp_path / "runs", GOOD | {("acro", "none"): (9, 9)}, algorithm=algorithm)
+    summary = write_report([tmp_path / "runs"], tmp_path / "out").summary
+    assert [row["method"] for row in summary if row["corruption"] == "patch"][:3] == ["acro", "acro", "mik+a"]

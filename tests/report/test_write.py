@@ -104,6 +104,20 @@ def test_what_was_trained_clean_counts_as_both(tmp_path):
     assert (row["return"], row["clean_return"]) == ("300.0", "300.0")
 
 
+def test_returns_are_those_of_the_episodes_whatever_divides_the_tasks_scores(tmp_path):
+    for seed, score in enumerate((30.0, 50.0)):
+        run = write_run(tmp_path / f"runs/{seed}", "acro", seed, {5: [9.0], 10: [score, 90.0]})
+        rows = read_episodes(run / "episodes.csv")
+        (run / "episodes.csv").unlink()
+        append_episodes(run / "episodes.csv", [row | {"return": row["score"]} for row in rows])
+    write_report([tmp_path / "runs"], tmp_path / "out")
+    returns = {}
+    for name in ("runs", "representations", "control"):
+        with (tmp_path / "out" / f"{name}.csv").open() as file:
+            returns[name] = [row["return"] for row in csv.DictReader(file)]
+    assert returns == {"runs": ["70.0", "60.0"], "representations": ["65.0"], "control": ["65.0"]}
+
+
 def test_returns_are_drawn_against_probes(tmp_path):
     for seed, method in enumerate(("acro", "mik", "random")):
         run = write_run(tmp_path / f"runs/{method}", method, seed, {10: [10.0 * (seed + 1)]})

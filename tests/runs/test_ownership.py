@@ -12,7 +12,7 @@ import pytest
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs import ownership
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.ownership import in_use, owned
 
 HOLDER = """
 import socket, sys, time
@@ -63,6 +63,18 @@ def test_an_owner_on_another_machine_lives_while_its_heart_beats(tmp_path, monke
     end(holder)
     with owned(tmp_path / "run") as owner:
         owner.check()
+
+
+def test_a_note_without_a_sign_of_life_holds_nothing(tmp_path):
+    """As after a power cut: the number of the process that died is another's by now."""
+    holder = hold(tmp_path)
+    assert in_use(tmp_path)
+    note = (tmp_path / ".owner.json").read_text()
+    end(holder)
+    assert not in_use(tmp_path)
+    (tmp_path / ".owner.json").write_text(json.dumps(json.loads(note) | {"pid": os.getpid()}))
+    os.utime(tmp_path / ".lock", (0, 0))
+    assert not in_use(tmp_path)
 
 
 def test_two_owners_in_one_process_are_two(tmp_path):

@@ -1,9 +1,10 @@
 """What is started when, what is tried again, and that nothing is done twice."""
 
+import shutil
+
 import pytest
 
-from tests.helpers_sweeps import Scripted, job
-from vd4rl_pomdp.runs.files import write_json
+from tests.helpers_sweeps import Scripted, finish, job
 from vd4rl_pomdp.sweeps import driver
 from vd4rl_pomdp.sweeps.driver import Driver, Retry, given_up
 from vd4rl_pomdp.sweeps.folder import SweepFolder
@@ -90,8 +91,7 @@ def test_a_job_that_another_driver_finished_meanwhile_is_left_alone(jobs, tmp_pa
     executor = Scripted(jobs)
     worker = Driver(jobs, executor, SweepFolder(tmp_path))
     for other in jobs[:2]:
-        other.folder.mkdir(parents=True)
-        write_json(other.folder / "timing.json", {})
+        finish(other.folder)
     assert worker.run()
     assert sorted(names(executor)) == ["b", "c"]
 
@@ -109,6 +109,30 @@ def test_a_job_that_another_process_is_at_is_waited_for(jobs, tmp_path, monkeypa
     assert finished
     assert names(executor).count("a") == 1
     assert asked.count("a") == 5
+
+
+def test_a_run_of_another_recipe_that_came_into_a_jobs_folder_does_not_finish_it(jobs, tmp_path):
+    finish(jobs[0].folder, seed=1)
+    _, executor = carry_out(jobs, tmp_path)
+    assert names(executor)[0] == "set"
+
+
+def test_what_was_done_once_and_is_gone_is_done_again(jobs, tmp_path):
+    carry_out(jobs, tmp_path)
+    shutil.rmtree(tmp_path / "a")
+    finished, executor = carry_out(jobs, tmp_path)
+    assert finished
+    assert names(executor) == ["a"]
+
+
+def test_a_job_that_ends_well_and_leaves_nothing_has_failed(jobs, tmp_path):
+    executor = Scripted(jobs)
+    executor.folders["c"] = tmp_path / "elsewhere"
+    assert not Driver(jobs, executor, SweepFolder(tmp_path)).run()
+    assert names(executor).count("c") == 2
+    row = SweepFolder(tmp_path).attempts()["c"][-1]
+    assert row["cause"] == "failed"
+    assert "holds nothing finished" in row["line"]
 
 
 def test_an_interruption_stops_the_jobs_and_is_told(jobs, tmp_path, monkeypatch):

@@ -101,6 +101,10 @@ def test_only_keeps_cells_by_value(file):
         ("pretrain = 3", "pretrain is no table"),
         ("seed = 0", "a block needs sections of"),
         ("[pretrain]\n[navigation_train]", "a block needs sections of"),
+        ("[collect]\n[finetune]", "finetune needs pretrain"),
+        ('[collect]\n[pretrain]\ndata = "mine"', "pretrain.data: a sweep names its folders itself"),
+        ('[collect]\nout = "mine"', "collect.out: a sweep names its folders itself"),
+        ("[collect]\n[pretrain]\nseed = 3", "pretrain.seed: a cell's trainings share one seed"),
         ("[pretrain]\nmethod = []", r"pretrain\.method is \[\]"),
         ("[pretrain]\nmethod = [[1]]", r"pretrain\.method is \[\[1\]\]"),
         ("block = 3", "its blocks are no list of tables"),
@@ -177,6 +181,15 @@ def test_every_shipped_cell_is_one_that_its_stages_take(name, testing):
     if testing:
         assert len(cells) <= 33
         assert {cell.value("preset") for cell in cells} == {"smoke"}
+
+
+@pytest.mark.parametrize(
+    "section", ['[collect]\nquality = "expert"\ntask = "nope"', '[navigation_collect]\nmaze = "nope"']
+)
+def test_a_set_that_cannot_be_collected_is_refused_before_anything_is_run(file, section):
+    (cell,) = load_grid(file(section)).cells()
+    with pytest.raises(UserError, match="'nope'"):
+        check_cell(cell)
 
 
 def test_the_papers_grids_are_its_figures_over_twelve_methods():

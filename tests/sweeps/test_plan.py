@@ -101,6 +101,28 @@ def test_a_name_that_another_run_has_is_left_to_it(copy):
     assert left(plan(copy)) == []
 
 
+def test_runs_on_every_further_content_of_a_set_have_folders_of_their_own(copy):
+    folders = set()
+    for length in (31, 32, 33):
+        shutil.rmtree(copy / "data" / "walker_walk")
+        write_fake_set(copy / "data" / "walker_walk" / "expert", [20, 25, length])
+        job = next(job for job in plan(copy) if not job.done)
+        assert job.folder not in folders
+        assert not job.begun
+        main(list(job.words))
+        folders.add(job.folder)
+        assert job.name not in left(plan(copy)), "it is found again"
+
+
+def test_a_policy_whose_encoder_saw_another_set_is_not_a_grids(copy):
+    folder = copy / "walker_walk" / "expert" / "patch" / "acro" / "seed0"
+    shutil.rmtree(folder / "pretrain")
+    card = folder / "finetune-td3_bc" / "encoder" / "config.json"
+    told = read_json(card)
+    write_json(card, told | {"pretrain": told["pretrain"] | {"data": "another"}})
+    assert [name.split("/")[-1].split("~")[0] for name in left(plan(copy))] == ["pretrain", "finetune-td3_bc"]
+
+
 def test_an_encoder_is_trained_once_for_all_its_policies(copy):
     names = left(plan(copy, ["finetune.algorithm=td3_bc,bc,iql"]))
     assert not any("pretrain" in name for name in names)

@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from tests.helpers_sweeps import job
+from tests.helpers_sweeps import finish, job
 from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.sweeps import status as status_module
 from vd4rl_pomdp.sweeps.estimate import Estimates
@@ -16,9 +16,7 @@ from vd4rl_pomdp.sweeps.status import lines, status
 @pytest.fixture
 def jobs(tmp_path, monkeypatch):
     monkeypatch.setattr(status_module, "in_use", lambda folder: folder.name == "running")
-    write_json_in = tmp_path / "done"
-    write_json_in.mkdir()
-    write_json(write_json_in / "timing.json", {"seconds": 5.0})
+    finish(tmp_path / "done")
     return [job(tmp_path, name) for name in ("done", "running", "waiting", "broken", "nan")]
 
 

@@ -97,7 +97,7 @@ def collect(config: CollectConfig, length: int | None = None) -> list[Path]:
         config: what to collect.
         length: most decisions of an episode; everything but tests keeps the task's.
     """
-    _check(config)
+    check_config(config)
     refuse_inside(config.out)
     plan = list(_plan(config))
     shards = [
@@ -125,8 +125,8 @@ def collection(config: CollectConfig) -> dict[str, Any]:
     return settings
 
 
-def _check(config: CollectConfig) -> None:
-    """Refuse settings that make no set."""
+def check_config(config: CollectConfig) -> None:
+    """Raise UserError for settings that make no set."""
     task = TASKS.named(config.task)
     refuse_outside(config, episodes=(1, MOST_EPISODES), episodes_per_shard=1, seed=(0, MAX_SEED), workers=0)
     refuse_outside(config, action_noise=(0, MAX_NOISE), frame_size=FRAME_SIZES)

@@ -26,7 +26,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from urllib3.exceptions import NewConnectionError
 
 from vd4rl_pomdp import __version__
-from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.errors import UserError, disk_error, disk_errors
 from vd4rl_pomdp.runs.files import replacing_file, sha256
 from vd4rl_pomdp.runs.outputs import refuse_kept
 from vd4rl_pomdp.runs.ownership import owned
@@ -99,23 +99,38 @@ def download(
     refuse_kept(destination)
     wanted = [file for file in manifest() if file.path.split("/")[2:4] == [task, quality]]
     if lacking := [file for file in wanted if not _is_complete(file, file.target(destination), verify)]:
-        with _owning(lacking[0].target(destination).parent), _progress_bar() as bar:
+        with _owning(_part(lacking[-1].target(destination))), _progress_bar() as bar:
             total = bar.add_task(f"{task} {quality}", total=sum(file.size for file in lacking))
             for file in lacking:
                 _provide(file, destination, endpoint.rstrip("/"), verify, bar)
+                _part(file.target(destination)).unlink(missing_ok=True)
                 bar.advance(total, file.size)
     return [file.target(destination) for file in wanted]
 
 
+def _part(target: Path) -> Path:
+    """Where a file grows; while it is there, nothing opens the set."""
+    return target.with_name(f"{target.name}.part")
+
+
 @contextmanager
-def _owning(folder: Path) -> Iterator[None]:
-    """Own a set's folder; what was made for that goes again if nothing has come into it."""
+def _owning(last: Path) -> Iterator[None]:
+    """Own a set's folder; what was made for that goes again if nothing has come into it.
+
+    Args:
+        last: part of the file that comes last: from the first on it says that the set is not whole.
+    """
+    folder = last.parent
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
         with owned(folder):
+            with disk_errors(last):
+                last.touch()
             yield
     finally:
         with suppress(OSError):
+            if not _size(last) and [file for file in folder.iterdir() if not file.name.startswith(".")] == [last]:
+                last.unlink()
             for place in made:
                 place.rmdir()
 
@@ -174,7 +189,7 @@ def _link(source: Path, target: Path) -> None:
 
 
 def _fetch(file: RemoteFile, target: Path, url: str, bar: Progress) -> None:
-    part = target.with_name(f"{target.name}.part")
+    part = _part(target)
     row = bar.add_task(file.path.split("/")[-1], total=file.size)
     start = furthest = _size(part)
     failures, problem = 0, ""

@@ -54,9 +54,7 @@ def shard_paths(folder: Path) -> list[Path]:
         return [folder]
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; collect a set there or download one with `vd4rl-pomdp data`")
-    partial = next(folder.glob("[!.]*.part"), None)
-    if partial:
-        raise UserError(f"{partial}: the set's download is not finished; start the same `data download` command again")
+    refuse_partial(folder)
     if (folder / PLAN).exists() and not (folder / RECORD).exists():
         raise UserError(f"{folder}: the set's collection is not finished; start the command that collects it again")
     shards = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
@@ -65,6 +63,12 @@ def shard_paths(folder: Path) -> list[Path]:
         hint = f"name a folder of shards such as {inner}" if inner else "collect or download a set there"
         raise UserError(f"{folder}: holds no .hdf5 shards; {hint}")
     return sorted(shards, key=_shard_order)
+
+
+def refuse_partial(folder: Path) -> None:
+    """Raise UserError if a set's download began in a folder and did not end."""
+    if partial := next(folder.glob("[!.]*.part"), None):
+        raise UserError(f"{partial}: the set's download is not finished; start the same `data download` command again")
 
 
 def shard_number(path: Path) -> tuple[str, int | None]:

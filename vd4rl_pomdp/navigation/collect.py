@@ -46,7 +46,7 @@ class _Job:
 
 def collect(config: MazeCollectConfig) -> list[Path]:
     """Collect the set, or what is missing of it; returns its shards."""
-    _check(config)
+    check_config(config)
     refuse_inside(config.out)
     shards = [
         Shard(path, [_job(config, i) for i in trajectories], _attributes(config))
@@ -70,7 +70,8 @@ def drive(maze: str, rows: int, action_repeat: int = 5, seed: int = 0) -> Column
     return _roll_out(_Job(maze, 0, seed, rows, action_repeat))
 
 
-def _check(config: MazeCollectConfig) -> None:
+def check_config(config: MazeCollectConfig) -> None:
+    """Raise UserError for settings that make no set."""
     check_maze(config.maze)
     refuse_outside(
         config, trajectories=(1, MOST_EPISODES), trajectory_rows=2, action_repeat=(1, MOST_STEPS),

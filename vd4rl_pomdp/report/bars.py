@@ -68,7 +68,7 @@ def _plot(
             if (row["env"], row["dataset"]) == place:
                 _lines(panel, row)
     for panel in axes if "" in titles else axes[::columns]:
-        panel.set_ylabel("score (return / 10)", fontsize=8)
+        panel.set_ylabel("score", fontsize=8)
     rows = [_row(row) for row in summary] + [
         {"kind": "seed", **{k: row[k] for k in _KEYS}, "method": label(row), "seed": row["seed"], "score": row["score"]}
         for row in runs
@@ -99,7 +99,8 @@ def _bars(axes: Axes, summary: list[Row], runs: list[Row], looks: dict[str, int]
     _crosses(axes, summary, runs, places)
     axes.set_xticks(range(len(looks)), [plain(name, _NAME_WIDTH) for name in looks], rotation=90, fontsize=7)
     axes.set_xlim(-0.6, len(looks) - 0.4)
-    axes.set_ylim(bottom=0)
+    if axes.dataLim.y0 >= 0:
+        axes.set_ylim(bottom=0)
     axes.grid(axis="x", visible=False)
 
 
@@ -134,7 +135,7 @@ def _crosses(axes: Axes, summary: list[Row], runs: list[Row], places: dict[str, 
     for row in summary:
         if row["absent"]:
             drawn = [row["high"], row["best_score"], *seeds.get(label(row), [])]
-            top = max((value for value in drawn if value is not None), default=0.0)
+            top = max([0.0, *(value for value in drawn if value is not None)])
             axes.annotate(f"×{row['absent']}", (places[label(row)], top), (0, 4), **crossed)
 
 

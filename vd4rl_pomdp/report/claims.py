@@ -10,11 +10,18 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable
 from typing import NamedTuple
 
-from vd4rl_pomdp.report.gaps import STATE
-from vd4rl_pomdp.report.gates import FAILED, SETTING, STANDARD_ERRORS, best_of, difference, returns_of
+from vd4rl_pomdp.report.gates import (
+    FAILED,
+    SETTING,
+    STANDARD_ERRORS,
+    as_it_is,
+    best_of,
+    difference,
+    returns_of,
+    seen_under,
+)
 from vd4rl_pomdp.report.load import LoadedRun
 from vd4rl_pomdp.report.tables import END_TO_END, REFERENCES, grouped, label
-from vd4rl_pomdp.report.variants import PLAIN
 from vd4rl_pomdp.runs.files import Row
 
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "not told apart", "too few seeds"
@@ -116,16 +123,10 @@ def _at(run: LoadedRun, *place: str) -> bool:
 
 def _runs_of(side: Contender, other: Contender, corruption: str, runs: Iterable[LoadedRun]) -> list[LoadedRun]:
     """Seeds of one side: of the variant that has two of them, and returns most."""
-    wanted = "none" if side.clean else corruption
-    seen = [run for run in runs if run.labels["corruption"] == wanted or run.labels["method"] == STATE]
-    if not side.method:
-        return best_of((run for run in seen if run.labels["method"] not in (other.method, *REFERENCES)), seeds=2)
-    return best_of((run for run in seen if run.labels["method"] == side.method and _plain(run, side.history)), seeds=2)
-
-
-def _plain(run: LoadedRun, history: str) -> bool:
-    wanted = PLAIN | {"history": history}
-    return all(run.settings.get(name, value) == value for name, value in wanted.items())
+    seen = seen_under("none" if side.clean else corruption, runs)
+    if side.method:
+        return as_it_is(side.method, seen, side.history)
+    return best_of(run for run in seen if run.labels["method"] not in (other.method, *REFERENCES))
 
 
 def _name(runs: list[LoadedRun]) -> str:
@@ -135,7 +136,7 @@ def _name(runs: list[LoadedRun]) -> str:
 def _verdict(row: Row, unranked: Collection[tuple[str, ...]]) -> str:
     if row["kind"] == "distance":
         return ""
-    if tuple(row[name] for name in SETTING[:3]) in unranked:
+    if tuple(row[name] for name in SETTING) in unranked:
         return f"not judged: the setting {FAILED}"
     if row["error"] is None:
         return FEW

@@ -19,7 +19,7 @@ from vd4rl_pomdp.report.layout import Line, ShownTable, interval, latex, with_in
 from vd4rl_pomdp.report.load import LoadedRun, load_runs
 from vd4rl_pomdp.report.measures import machine
 from vd4rl_pomdp.report.present import by_setting
-from vd4rl_pomdp.report.tables import evaluations, final_scores, grouped, label
+from vd4rl_pomdp.report.tables import SCORE, evaluations, final_scores, grouped, label
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.runs.files import Row, write_bytes, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
@@ -194,7 +194,8 @@ def write_comparison(comparison: SideBySide, out: Path) -> Path:
         out.mkdir(parents=True, exist_ok=True)
     shown = tables(comparison)
     write_csv(out / f"{FILE}.csv", list(comparison.rows[0]), comparison.rows)
-    note = "Score = return / 10, mean over seeds; 95% percentile bootstrap intervals."
+    note = f"{SCORE}. Mean over seeds, 95% percentile bootstrap intervals."
     write_bytes(out / f"{FILE}.tex", latex(shown, note).encode(errors="backslashreplace"))
-    write_text(out / "index.html", render("compare.html", sides=comparison.sides, tables=shown, file=FILE))
+    page = render("compare.html", score=SCORE, sides=comparison.sides, tables=shown, file=FILE)
+    write_text(out / "index.html", page)
     return out / "index.html"

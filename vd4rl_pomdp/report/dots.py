@@ -6,7 +6,7 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
-from vd4rl_pomdp.report.figures import COLOURS, Plot, file_name, panels, seeds_note, style
+from vd4rl_pomdp.report.figures import COLOURS, Plot, file_name, panels, seeds_note, span, style
 from vd4rl_pomdp.report.measures import COSTS, PROBES
 from vd4rl_pomdp.report.tables import by_label, grouped, label
 from vd4rl_pomdp.runs.files import Row
@@ -58,8 +58,8 @@ def _dots(axes: Axes, rows: list[Row], probe: str, looks: dict[str, int], raster
         axes.scatter(errors, returns, 26, ec="white", lw=0.5, zorder=-1 if rasterized else 3, **look)
     axes.set_rasterization_zorder(0)
     for set_limits, name in ((axes.set_xlim, probe), (axes.set_ylim, "return")):
-        highest = max((row[name] for row in known), default=0) or 1
-        set_limits(-0.04 * highest, 1.06 * highest)
+        low, high = span(row[name] for row in known)
+        set_limits(low - 0.04 * (high - low), low + 1.06 * (high - low))
     axes.set_xlabel("error, %", fontsize=8)
     axes.set_ylabel("return", fontsize=8)
 

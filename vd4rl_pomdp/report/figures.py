@@ -154,6 +154,13 @@ def seeds_note(rows: Sequence[Row], name: str = "seeds", noun: str = "seed") -> 
     return f"{text}{few}."
 
 
+def span(values: Iterable[float]) -> tuple[float, float]:
+    """Lowest and highest of some values and zero; 0 and 1 where all are zero."""
+    known = [0.0, *values]
+    low, high = min(known), max(known)
+    return (low, high) if high > low else (0.0, 1.0)
+
+
 def file_name(*words: str) -> str:
     """A name for files that says what is in them, whatever a corruption is called, and differs where the words do."""
     return "_".join(map(_plain_word, filter(None, words)))

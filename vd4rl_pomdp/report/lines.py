@@ -7,8 +7,10 @@ from collections.abc import Sequence
 import numpy as np
 from matplotlib.axes import Axes
 
-from vd4rl_pomdp.report.figures import Plot, file_name, panels, remark, room_for, seeds_note, style
+from vd4rl_pomdp.report.figures import Plot, file_name, panels, remark, room_for, seeds_note, span, style
+from vd4rl_pomdp.report.gaps import CONDITION
 from vd4rl_pomdp.report.load import LoadedRun
+from vd4rl_pomdp.report.overall import THRESHOLDS
 from vd4rl_pomdp.report.tables import by_label, grouped, label
 from vd4rl_pomdp.runs.files import Row
 
@@ -62,7 +64,8 @@ def _curves(axes: Axes, rows: list[Row], looks: dict[str, int]) -> None:
         low, high = ([row[end] for row in mine] for end in ("low", "high"))
         axes.fill_between(steps, low, high, color=look["color"], alpha=0.08, lw=0)
     axes.set_xlim(left=0)
-    axes.set_ylim(0, 1.05 * max(row["high"] for row in rows) or 1)
+    lowest, highest = span(row[end] for row in rows for end in ("low", "high"))
+    axes.set_ylim(1.05 * lowest, 1.05 * highest)
     axes.set_xlabel("gradient updates", fontsize=8)
     axes.set_ylabel("score", fontsize=8)
 
@@ -84,7 +87,7 @@ def profile_plots(profiles: list[Row], aggregate: list[Row], looks: dict[str, in
         for (name,), mine in grouped(rows, ("method",)):
             _profile(panel, mine, looks[name])
         remark(panel, note)
-        panel.set(xlim=(0, 100), ylim=(0, 1.02))
+        panel.set(xlim=(rows[0]["threshold"], rows[-1]["threshold"]), ylim=(0, 1.02))
         panel.set_xlabel("score", fontsize=8)
         panel.set_ylabel("share of runs above it", fontsize=8)
     caption = (
@@ -92,9 +95,8 @@ def profile_plots(profiles: list[Row], aggregate: list[Row], looks: dict[str, in
         f"pointwise 95% bands. {seeds_note(aggregate)}"
     )
     words = "; ".join(
-        f"{row['corruption']}: {row['method']} {row['share']:.2f} above 50"
-        for row in profiles
-        if row["threshold"] == 50
+        f"{row['corruption']}: {row['method']} {row['share']:.2f} above {row['threshold']:g}"
+        for row in profiles[THRESHOLDS // 2 :: THRESHOLDS]
     )
     return [Plot("profiles", caption, words, figure, profiles)]
 
@@ -117,22 +119,21 @@ def _profile(axes: Axes, rows: list[Row], number: int) -> None:
 
 
 def loss_rows(runs: list[LoadedRun]) -> list[Row]:
-    """Mean action loss over the pretraining runs of every condition, at most _POINTS steps of each."""
-    told = [
-        run.labels | {"variant": run.variant, "step": step, "loss": loss}
-        for run in runs
-        for step, loss in _thinned(run.result.losses)
-    ]
-    names = ("task", "quality", "corruption", "algorithm", "method", "variant", "step")
+    """Mean action loss over the finished pretraining runs of every condition, at most _POINTS of the steps of all."""
+    told = [run.labels | {"variant": run.variant, "losses": dict(run.result.losses)} for run in runs if run.finished]
     return [
-        dict(zip(names, group, strict=True))
-        | {"action_loss": float(np.mean([row["loss"] for row in members])), "seeds": len(members)}
-        for group, members in grouped(told, names)
+        dict(zip(CONDITION, group, strict=True))
+        | {"step": step, "action_loss": float(np.mean([row["losses"][step] for row in members]))}
+        | {"seeds": len(members)}
+        for group, members in grouped(told, CONDITION)
+        for step in _thinned(sorted(set.intersection(*(set(row["losses"]) for row in members))))
     ]
 
 
-def _thinned(losses: list[tuple[int, float]]) -> list[tuple[int, float]]:
-    return losses[:: -(-len(losses) // _POINTS)] if losses else []
+def _thinned(steps: list[int]) -> list[int]:
+    """At most _POINTS of some steps, the first and the last among them."""
+    places = np.linspace(0, len(steps) - 1, min(len(steps), _POINTS)).round().astype(int)
+    return [steps[place] for place in places]
 
 
 def loss_plots(losses: list[Row], looks: dict[str, int]) -> list[Plot]:
@@ -153,7 +154,8 @@ def loss_plots(losses: list[Row], looks: dict[str, int]) -> list[Plot]:
             for name, mine in by_label(rows)
         )
         caption = (
-            f"Action loss of pretraining under {corruption or 'any corruption'}, mean over seeds. {seeds_note(members)}"
+            f"Action loss of pretraining under {corruption or 'any corruption'}, mean over finished runs. "
+            f"{seeds_note(members)}"
         )
         plots.append(Plot(file_name("losses", corruption), caption, words, figure, members))
     return plots

@@ -8,10 +8,10 @@ import numpy as np
 
 from vd4rl_pomdp.reference import summarise
 from vd4rl_pomdp.report.gaps import CONDITION, in_words
+from vd4rl_pomdp.report.gates import returns_of
 from vd4rl_pomdp.report.load import IDENTITY, LoadedRun
 from vd4rl_pomdp.report.tables import by_label, grouped, table_order
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.tasks import SCORE_DIVISOR
 
 PROBES = ("probe_pose", "probe_velocity")
 COSTS = ("pretrain_seconds", "finetune_seconds")
@@ -48,7 +48,7 @@ def _run(run: LoadedRun, curve: list[Row]) -> Row:
     """Values of _RUN of one run."""
     last, best = max(curve, key=lambda row: row["step"]), max(curve, key=lambda row: row["score"])
     found = run.labels | run.representation | {"id": run.result.id, "variant": run.variant, "state": run.progress}
-    found |= {"score": last["score"], "return": last["score"] * SCORE_DIVISOR}
+    found |= {"score": last["score"], "return": float(returns_of([run])[0])}
     found |= {"best_score": best["score"], "best_step": best["step"], "finetune_seconds": run.seconds}
     found |= {"git_commit": run.record.get("git_commit", ""), "machine": machine(run)}
     return {name: found[name] for name in _RUN}

@@ -7,13 +7,14 @@ from itertools import combinations
 import numpy as np
 
 from vd4rl_pomdp.report import stats
+from vd4rl_pomdp.report.figures import span
 from vd4rl_pomdp.report.gaps import CONDITION
 from vd4rl_pomdp.report.tables import final_scores, grouped, label, table_order
 from vd4rl_pomdp.runs.files import Row
 
 SERIES = ("corruption", "algorithm", "method", "variant")
-THRESHOLDS = np.linspace(0, 100, 101)
-"""Scores at which a performance profile is computed."""
+THRESHOLDS = 101
+"""Number of scores at which a performance profile is computed."""
 MANY = 2_000
 """Bootstrap samples of each of the many intervals of a profile or a matrix."""
 AGGREGATES = ("iqm", "median", "mean", "optimality_gap")
@@ -98,17 +99,24 @@ def _turned(row: Row) -> Row:
 def profiles(rows: list[Row]) -> list[Row]:
     """Share of runs (all tasks and seeds of a method) whose final score is above each threshold, with 95% bands."""
     table = []
+    thresholds = _thresholds([score for _, members in grouped(rows, CONDITION) for score in final_scores(members)])
     for (corruption, *_), members in grouped(rows, SERIES):
         strata = _strata(members)
-        share = stats.performance_profile(np.concatenate(strata), THRESHOLDS)
-        band = stats.profile_band(strata, THRESHOLDS, np.random.default_rng(0), MANY)
+        share = stats.performance_profile(np.concatenate(strata), thresholds)
+        band = stats.profile_band(strata, thresholds, np.random.default_rng(0), MANY)
         names = {"corruption": corruption, "method": label(members[0]), "runs": sum(map(len, strata))}
         low, high = (part.tolist() for part in band) if band else ([None] * len(share),) * 2
         table += [
             names | {"threshold": float(t), "share": float(v), "low": a, "high": b}
-            for t, v, a, b in zip(THRESHOLDS, share, low, high, strict=True)
+            for t, v, a, b in zip(thresholds, share, low, high, strict=True)
         ]
     return table
+
+
+def _thresholds(scores: list[float]) -> np.ndarray:
+    """From 0, or the lowest score below it, to 100, or to 0 where no score is above it."""
+    low, high = span(scores)
+    return np.linspace(low, 100 if high > 0 else 0, THRESHOLDS)
 
 
 def _strata(rows: list[Row]) -> stats.Strata:

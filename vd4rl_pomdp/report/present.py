@@ -10,7 +10,7 @@ from vd4rl_pomdp.report.claims import tally
 from vd4rl_pomdp.report.figures import seeds_note
 from vd4rl_pomdp.report.gaps import MISSING
 from vd4rl_pomdp.report.layout import Line, ShownTable, interval, number, with_interval
-from vd4rl_pomdp.report.tables import grouped, label, setting
+from vd4rl_pomdp.report.tables import grouped, label, setting, with_algorithm
 from vd4rl_pomdp.runs.files import Row
 
 WIDEST = 6
@@ -24,7 +24,7 @@ def gates(rows: list[Row]) -> list[ShownTable]:
     for row in rows:
         shares = (number(row[name], 2) for name in ("state_share", "acro_share"))
         above = _with_error(row["above_random"], row["error"])
-        lines.append(Line((setting(row), row["verdict"], number(row["data_return"], 0), *shares, above)))
+        lines.append(Line((with_algorithm(row), row["verdict"], number(row["data_return"], 0), *shares, above)))
     return [ShownTable("", columns, lines, words=2)]
 
 

@@ -17,6 +17,8 @@ END_TO_END = ("bc", "drq_bc")
 """References that bring their own algorithm."""
 SETTING = ("task", "quality", "corruption")
 """What methods are compared in."""
+SCORE = "Score = return / 10 or the task's own divisor"
+"""What tables and pages say of their scores."""
 _MEASURED = (
     *("step", "score", "low", "high", "seeds", "episodes", "few_seeds"),
     *("best_step", "best_score", "best_low", "best_high"),
@@ -25,13 +27,22 @@ _MEASURED = (
 
 def label(row: Row) -> str:
     """A method's name in tables and figures, with the algorithm where it is not TD3+BC, and its variant."""
-    own = row["algorithm"] == "td3_bc" or row["method"] in END_TO_END
-    return ", ".join(filter(None, (row["method"], "" if own else row["algorithm"], row["variant"])))
+    algorithm = "" if row["method"] in END_TO_END else _algorithm(row)
+    return ", ".join(filter(None, (row["method"], algorithm, row["variant"])))
 
 
 def setting(row: Row) -> str:
     """Task, quality and corruption in words."""
     return f"{row['task']} {row['quality']}, {row['corruption']}"
+
+
+def with_algorithm(row: Row) -> str:
+    """A setting in words, with the algorithm where it is not TD3+BC."""
+    return ", ".join(filter(None, (setting(row), _algorithm(row))))
+
+
+def _algorithm(row: Row) -> str:
+    return "" if row["algorithm"] == "td3_bc" else row["algorithm"]
 
 
 def evaluations(runs: Iterable[LoadedRun]) -> list[Row]:

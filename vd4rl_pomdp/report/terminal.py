@@ -10,7 +10,7 @@ from vd4rl_pomdp.report.claims import tally
 from vd4rl_pomdp.report.gaps import MISSING
 from vd4rl_pomdp.report.layout import interval, number
 from vd4rl_pomdp.report.present import by_setting
-from vd4rl_pomdp.report.tables import grouped, label, setting
+from vd4rl_pomdp.report.tables import SCORE, grouped, label, with_algorithm
 from vd4rl_pomdp.report.write import Report
 from vd4rl_pomdp.runs.files import Row
 
@@ -19,11 +19,11 @@ def print_summary(report: Report, console: Console | None = None) -> None:
     """The verdicts of the gates and claims, then the tables of final scores, one a setting."""
     console = console or Console()
     for row in report.gates:
-        console.print(f"{setting(row)}: {row['verdict']}", markup=False, highlight=False)
+        console.print(f"{with_algorithm(row)}: {row['verdict']}", markup=False, highlight=False)
     for (claim,), members in grouped(report.claims, ("claim",)):
         if told := tally(members):
             console.print(f"{claim}: {told}", markup=False, highlight=False)
-    console.print("score = return / 10, mean over seeds [95% interval]", markup=False, highlight=False)
+    console.print(f"{SCORE}; mean over seeds [95% interval]", markup=False, highlight=False)
     for place, members in by_setting(report.summary):
         console.print(_table(place, members))
 

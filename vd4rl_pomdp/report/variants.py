@@ -49,6 +49,12 @@ def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Setting
     return words | _data(record.get("inputs", {}).get("data"), card.get("data"))
 
 
+def is_plain(settings: Settings, history: str = "method") -> bool:
+    """Whether settings add nothing to a method but a history; what is not recorded adds nothing."""
+    wanted = PLAIN | {"history": history}
+    return all(settings.get(name, PLAIN[name]) == value for name, value in wanted.items())
+
+
 def _data(own: str | None, before: str | None) -> Settings:
     """Short fingerprints of the sets behind a run, as far as they are recorded."""
     shown = {"data": own, "pretraining data": "the same" if own and before == own else before}

@@ -83,7 +83,7 @@ def _tables(runs: list[LoadedRun]) -> dict[str, list[Row]]:
     gated = gates(runs)
     of_runs = measures.run_table(runs, evaluated, gaps)
     return {
-        _MARK: tables.summary(final, gaps, unranked(gated)),
+        _MARK: tables.summary(final, gaps, unranked(gated, tables.SETTING)),
         "gates": gated,
         "claims": judge_claims(runs, unranked(gated)),
         "curves": tables.curves(evaluated),
@@ -157,6 +157,7 @@ def _render(
     wanted = {(row["task"], row["quality"]) for row in made[_MARK]}
     films, left_out = shown_films(runs)
     values: dict[str, Any] = {
+        "score": tables.SCORE,
         "finished": sum(run.finished for run in runs),
         "unfinished": unfinished(runs),
         "gaps": len(made["missing"]),
@@ -175,7 +176,7 @@ def _render(
 
 
 _NOTES = {
-    "summary": "Score = return / 10, mean over seeds, 95% percentile bootstrap intervals.",
+    "summary": f"{tables.SCORE}. Mean over seeds, 95% percentile bootstrap intervals.",
     "aggregate": "Over all tasks and seeds, 95% stratified bootstrap intervals.",
     "improvement": "Probability that a run of the row's method ends above one of the column's.",
 }

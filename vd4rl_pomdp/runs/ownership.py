@@ -77,12 +77,11 @@ def owned(folder: Path) -> Iterator[Owner]:
 
 
 def in_use(folder: Path) -> bool:
-    """Whether a process seems to own a folder: one that lives on this machine, or gave a sign of life of late."""
-    note = _read_note(folder)
-    if note.get("host") == socket.gethostname():
-        return _runs_here(note)
-    beat = _heartbeat(folder)
-    return beat is not None and time.time_ns() - beat < LEASE_S * 1e9
+    """Whether a process seems to own a folder: it gave a sign of life of late, and is not known to be gone."""
+    note, beat = _read_note(folder), _heartbeat(folder)
+    if beat is None or time.time_ns() - beat > LEASE_S * 1e9:
+        return False
+    return note.get("host") != socket.gethostname() or _runs_here(note)
 
 
 def _acquire(lease: SoftFileLease, folder: Path) -> None:

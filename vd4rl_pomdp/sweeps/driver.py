@@ -44,7 +44,6 @@ RETRIES = {
     FAILED: Retry(1),
     UserError.cause: Retry(0),
     DIVERGED: Retry(0),
-    DONE: Retry(0),
 }
 """By cause. Out of memory is tried again with twice the slots; where a job has them all already, it is not."""
 
@@ -52,11 +51,13 @@ RETRIES = {
 def given_up(rows: list[Row], largest: int = 1) -> str:
     """Why a job is not tried again, judging by its attempts since it was last taken up; empty if it is.
 
+    What was done once, and is there no more, is done again.
+
     Args:
         rows: its attempts, oldest first.
         largest: the most slots it could have.
     """
-    if not rows:
+    if not rows or rows[-1]["cause"] == DONE:
         return ""
     last = rows[-1]
     alike = 0
@@ -147,8 +148,12 @@ class Driver:
     def _end(self, ended: Ended) -> None:
         began, slots = self._running.pop(ended.name)
         seconds = time.monotonic() - began
+        job = self._jobs[ended.name]
+        finished = job.finished
+        if ended.cause == DONE and not finished:
+            ended = Ended(job.name, FAILED, f"{job.folder}: holds nothing finished, though the command ended well")
         self._note(ended, seconds, slots)
-        if self._jobs[ended.name].finished:
+        if finished:
             del self._left[ended.name]
         else:
             self._not_before[ended.name] = time.monotonic() + RETRIES[ended.cause].wait_s

@@ -35,6 +35,11 @@ class FoundRun:
         return recipe(self.record, self.card if self.record["stage"] == "finetune" else {})
 
     @property
+    def on_one_set(self) -> bool:
+        """Whether its encoder, if it was given one, was pretrained on its own data, as a grid's are."""
+        return self.card.get("data") in (None, self.record.get("inputs", {}).get("data"))
+
+    @property
     def settings(self) -> dict[str, Any]:
         """Its settings and its encoder's, without the seed: what its cost depends on, beside the machine."""
         return self.card.get("settings", {}) | settings_of(self.record["config"])
@@ -52,7 +57,7 @@ class FoundRuns:
 
     def of(self, name: str, data: DataSet) -> FoundRun | None:
         """The run of a recipe on a set, a finished one if there is one."""
-        fitting = [run for run in self._by_recipe.get(name, ()) if data.made(run.record)]
+        fitting = [run for run in self._by_recipe.get(name, ()) if run.on_one_set and data.made(run.record)]
         return max(fitting, key=lambda run: run.seconds is not None, default=None)
 
     def alike(self, name: str, data: DataSet) -> bool:
@@ -76,10 +81,15 @@ def runs_below(out: Path) -> Iterator[FoundRun]:
     for path in sorted(out.rglob("config.json")):
         record = read_json(path)
         if "stage" in record and isinstance(record.get("config"), dict) and "seed" in record["config"]:
-            timing, encoder = path.with_name("timing.json"), path.parent / "encoder" / CONFIG
-            seconds = read_json(timing).get("seconds") if timing.exists() else None
-            card = read_json(encoder).get("pretrain") if encoder.exists() else None
-            yield FoundRun(path.parent, record, _whole(card), seconds)
+            yield run_at(path.parent)
+
+
+def run_at(folder: Path) -> FoundRun:
+    """The run of a folder that holds one; UserError for a damaged record."""
+    timing, encoder = folder / "timing.json", folder / "encoder" / CONFIG
+    seconds = read_json(timing).get("seconds") if timing.exists() else None
+    card = read_json(encoder).get("pretrain") if encoder.exists() else None
+    return FoundRun(folder, read_json(folder / "config.json"), _whole(card), seconds)
 
 
 def _whole(card: Any) -> Row:

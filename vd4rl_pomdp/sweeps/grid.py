@@ -12,6 +12,7 @@ from vd4rl_pomdp.errors import UserError
 PIXELS = ("collect", "pretrain", "finetune")
 MAZES = ("navigation_collect", "navigation_train")
 SECTIONS = (*PIXELS, *MAZES)
+TRAININGS = ("pretrain", "finetune", "navigation_train")
 SHARED = ("seed", "preset")
 """Settings outside the sections."""
 Values = dict[str, Any]

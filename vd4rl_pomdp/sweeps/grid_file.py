@@ -42,6 +42,7 @@ from vd4rl_pomdp.sweeps.grid import (
     PIXELS,
     SECTIONS,
     SHARED,
+    TRAININGS,
     Grid,
     Sections,
     Values,
@@ -53,6 +54,8 @@ from vd4rl_pomdp.sweeps.grid import (
 
 GRIDS = Path(__file__).parents[1] / "experiments" / "grids"
 """The grids that ship with the package."""
+_FOLDERS = {"out", "data", "encoder"}
+"""Settings of the stages that a sweep sets."""
 
 
 def names() -> list[str]:
@@ -175,11 +178,19 @@ def _check_block(block: Sections) -> None:
     chain = [name for name in SECTIONS if name in block]
     if not chain or (set(chain) & set(PIXELS) and set(chain) & set(MAZES)):
         raise UserError(f"a block needs sections of {', '.join(PIXELS)}, or of {', '.join(MAZES)}")
+    if "finetune" in chain and "pretrain" not in chain:
+        raise UserError("a block with finetune needs pretrain, whose encoder it takes")
     for section, settings in block.items():
         _check_settings(section, settings)
 
 
 def _check_settings(section: str, settings: Values, axes: bool = True) -> None:
+    if folders := _FOLDERS.intersection(settings):
+        raise UserError(
+            f"{section}.{min(folders)}: a sweep names its folders itself: leave it out, and give --out, --data"
+        )
+    if section in TRAININGS and "seed" in settings:
+        raise UserError(f"{section}.seed: a cell's trainings share one seed: write it outside the sections")
     for name, value in settings.items():
         values = value if isinstance(value, list) and axes else [value]
         kinds = int if name == "seed" else str | int | float

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -12,7 +13,7 @@ from vd4rl_pomdp.data.format import PLAN, RECORD
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.settings import settings_of
-from vd4rl_pomdp.sweeps.found import FoundRuns
+from vd4rl_pomdp.sweeps.found import FoundRuns, run_at
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.naming import run_folder
 from vd4rl_pomdp.sweeps.sets import DataSet, set_of
@@ -39,12 +40,15 @@ class Job:
     """Whether it was finished when the plan was made."""
     settings: tuple[tuple[str, str], ...] = ()
     """Settings that its cost depends on."""
+    recipe: str = ""
+    """What a training computes; empty for a set."""
 
     @property
     def finished(self) -> bool:
-        """Whether there is nothing left to do now."""
-        mark = "timing.json" if self.section in STAGES else RECORD
-        return self.done or (self.folder / mark).is_file()
+        """Whether there is nothing left to do now; a run of another recipe that came into the folder does not count."""
+        if self.done or self.section not in STAGES:
+            return self.done or (self.folder / RECORD).is_file()
+        return (self.folder / "timing.json").is_file() and run_at(self.folder).recipe == self.recipe
 
     @property
     def begun(self) -> bool:
@@ -126,14 +130,14 @@ class JobPlanner:
         words = (*COMMANDS[section], *words_of(told(cell, section) | places | {"out": folder}))
         done = any(found is not None and found.seconds is not None for found in (run, kept))
         needs = tuple(job.name for job in before)
-        self._jobs[key] = Job(name, section, folder, words, needs, done, cost_of(values))
+        self._jobs[key] = Job(name, section, folder, words, needs, done, cost_of(values), recipe)
         return self._jobs[key]
 
     def _free(self, name: str, recipe: str) -> str:
         """A name that no other run has, be it in the plan or from an earlier sweep."""
-        if name in self._taken or self._out / name in self._here:
-            return f"{name}~{recipe[:6]}"
-        return name
+        own = f"{name}~{recipe[:6]}"  # further runs of one recipe are on sets of other content
+        names = chain([name, own], (f"{own}.{number}" for number in count(2)))
+        return next(name for name in names if name not in self._taken and self._out / name not in self._here)
 
 
 def cost_of(values: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:

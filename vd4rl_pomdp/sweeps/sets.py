@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.data.format import PLAN, RECORD, SUFFIXES
+from vd4rl_pomdp.data.format import PLAN, RECORD, SUFFIXES, refuse_partial
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.data.store import open_store
 from vd4rl_pomdp.errors import UserError
@@ -53,7 +53,8 @@ class DataSet:
         return open_store(self.folder).fingerprint
 
     def check(self) -> None:
-        """Raise UserError if its folder holds a set that was collected otherwise."""
+        """Raise UserError if its folder holds a set that was collected otherwise, or not downloaded to its end."""
+        refuse_partial(self.folder)
         stored = read_json(self.folder / PLAN) if (self.folder / PLAN).exists() else self.wanted
         if others := differing(stored, self.wanted):
             has, asked = (f"{others[0]} {values.get(others[0])}" for values in (stored, self.wanted))
@@ -81,7 +82,7 @@ def set_of(cell: GridCell, root: Path) -> DataSet:
     name = place + extras(cell, section)
     folder = root / name
     inner = folder / _DOWNLOADED
-    return DataSet(name, inner if _has_shards(inner) else folder, section, wanted)
+    return DataSet(name, inner if inner.is_dir() else folder, section, wanted)
 
 
 def _has_shards(folder: Path) -> bool:

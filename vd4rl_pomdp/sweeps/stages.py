@@ -79,9 +79,11 @@ def _parsed(section: str, words: tuple[str, ...]) -> Any:
 
 
 def _collect(words: list[str], program: str) -> Any:
-    from vd4rl_pomdp.data.collect import CollectConfig
+    from vd4rl_pomdp.data.collect import CollectConfig, check_config
 
-    return parse(CollectConfig, words, program)
+    config = parse(CollectConfig, words, program)
+    check_config(config)
+    return config
 
 
 def _pretrain(words: list[str], program: str) -> Any:
@@ -100,9 +102,12 @@ def _finetune(words: list[str], program: str) -> Any:
 
 
 def _navigation_collect(words: list[str], program: str) -> Any:
+    from vd4rl_pomdp.navigation.collect import check_config
     from vd4rl_pomdp.navigation.config import PRESETS, MazeCollectConfig
 
-    return with_presets(MazeCollectConfig, PRESETS, words, program)
+    config = with_presets(MazeCollectConfig, PRESETS, words, program)
+    check_config(config)
+    return config
 
 
 def _navigation_train(words: list[str], program: str) -> Any:

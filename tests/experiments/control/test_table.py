@@ -50,11 +50,10 @@ def test_what_the_seeds_do_not_tell_is_said():
     [
         [rows("none", 110.0, 90.0), rows("mik", 100.0, 180.0)],
         [rows("none", 110.0, 90.0), rows("mik", 300.0, 300.0), rows("random", 280.0, 310.0)],
-        [rows("none", 110.0), rows("mik", 600.0)],
         [rows("random", 310.0, 300.0), rows("mik", 200.0, 201.0)],
         [rows("none", 110.0, 90.0), rows("mik", 600.0, 600.0), rows("none", 100.0, 200.0, share=0.0)],
     ],
-    ids=["noise", "no better than an untrained memory", "one seed", "the floor is best", "nobody walks"],
+    ids=["noise", "no better than an untrained memory", "the floor is best", "nobody walks"],
 )
 def test_a_setting_that_misses_a_gate_is_not_ranked(groups):
     lines = told(*groups)
@@ -79,6 +78,19 @@ def test_a_ceiling_that_was_not_measured_is_said():
     lines = told(rows("none", 110.0, 90.0), rows("mik", 300.0, 310.0))
     assert "gate, nothing hidden and no memory: -, not measured" in lines
     assert lines[-1] == "memory pays: mik minus none is +205 ± 15 (n = 2)"
+
+
+def test_a_single_seed_measures_no_gate():
+    lines = told(rows("none", 110.0), rows("mik", 600.0))
+    assert "gate, mik minus none: +490 (n = 1), one seed has no standard error, not measured" in lines
+    assert lines[-1] == "the seeds do not tell whether memory pays: mik minus none is +490 (n = 1)"
+
+
+def test_the_best_method_is_one_of_two_seeds_where_there_are_any():
+    lines = told(rows("none", 110.0, 90.0), rows("mik", 260.0, 270.0), rows("ah", 500.0))
+    assert "gate, mik minus none: +165 ± 15 (n = 2), at least 2 standard errors, reached" in lines
+    lines = told(rows("none", 310.0, 290.0), rows("mik", 500.0))
+    assert "gate, mik minus none: +190 (n = 1), one seed has no standard error, not measured" in lines
 
 
 def test_a_run_is_told_on_one_line():

@@ -128,13 +128,18 @@ def _gates(rows: list[Row], every: list[Row]) -> Iterator[tuple[str, bool | None
     share = float(np.mean(ceiling)) / float(rows[0]["data_return"]) if ceiling else math.nan
     told = f"{share:.2f} of the data's return (n = {len(ceiling)}), at least {STATE_SHARE}" if ceiling else "-"
     yield "nothing hidden and no memory", share >= STATE_SHARE if ceiling else None, told
-    best, floor = _by_return(rows)[0], _floor(rows)
-    if floor is not None and best != floor:
-        found = difference(rows, best, floor)
-        told = f"{found}, at least {STANDARD_ERRORS:g} standard errors" if found else "-"
-        yield f"{best} minus {floor}", None if found is None else found.tells and found.mean > 0, told
-    elif floor is not None and len(_by_return(rows)) > 1:
-        yield f"the best minus {floor}", False, f"{floor} returns most"
+    floor = _floor(rows)
+    others = [name for name in _by_return(rows) if name != floor]
+    if floor is not None and others:
+        best = next((name for name in others if len(_returns(rows, name)) > 1), others[0])
+        yield f"{best} minus {floor}", *_above_floor(difference(rows, best, floor))
+
+
+def _above_floor(found: SeedDifference | None) -> tuple[bool | None, str]:
+    """Whether the best method is above the floor (None: the seeds that both have are too few), and by how much."""
+    if found is None or found.n == 1:
+        return None, f"{found}, one seed has no standard error" if found else "-"
+    return found.tells and found.mean > 0, f"{found}, at least {STANDARD_ERRORS:g} standard errors"
 
 
 def _floor(rows: list[Row]) -> str | None:
