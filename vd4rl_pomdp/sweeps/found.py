@@ -81,15 +81,19 @@ def runs_below(out: Path) -> Iterator[FoundRun]:
     for path in sorted(out.rglob("config.json")):
         record = read_json(path)
         if "stage" in record and isinstance(record.get("config"), dict) and "seed" in record["config"]:
-            yield run_at(path.parent)
+            yield _found(path.parent, record)
 
 
 def run_at(folder: Path) -> FoundRun:
     """The run of a folder that holds one; UserError for a damaged record."""
+    return _found(folder, read_json(folder / "config.json"))
+
+
+def _found(folder: Path, record: Row) -> FoundRun:
     timing, encoder = folder / "timing.json", folder / "encoder" / CONFIG
     seconds = read_json(timing).get("seconds") if timing.exists() else None
     card = read_json(encoder).get("pretrain") if encoder.exists() else None
-    return FoundRun(folder, read_json(folder / "config.json"), _whole(card), seconds)
+    return FoundRun(folder, record, _whole(card), seconds)
 
 
 def _whole(card: Any) -> Row:
