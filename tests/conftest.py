@@ -4,9 +4,13 @@ JAX compiles without most optimisations: the tests compile much and run little o
 the tests were started in the background of a shell, which lets its jobs ignore it. Submitit is loaded first:
 it sets up logging, which closes the stream of absl's handler unless that is stderr. Within a test that captures stderr
 itself it is not, but pytest's own, and every later test would fail.
+
+Where a process crashed is told at the end: what it writes at that moment is lost among the dots.
 """
 
+import faulthandler
 import os
+import shutil
 import signal
 from contextlib import suppress
 from pathlib import Path
@@ -22,6 +26,23 @@ with suppress(ImportError):
 os.environ.setdefault("JAX_DISABLE_MOST_OPTIMIZATIONS", "true")
 torch.set_num_threads(1)
 signal.signal(signal.SIGINT, signal.default_int_handler)
+
+CRASHES = Path(__file__).parents[1] / ".pytest_cache" / "crashes"
+"""A file for each process of the tests, empty unless it crashed."""
+
+
+def pytest_sessionstart(session):
+    if not hasattr(session.config, "workerinput"):
+        shutil.rmtree(CRASHES, ignore_errors=True)
+        CRASHES.mkdir(parents=True)
+    faulthandler.enable((CRASHES / str(os.getpid())).open("w"))
+
+
+def pytest_terminal_summary(terminalreporter):
+    for crash in CRASHES.iterdir():
+        if text := crash.read_text():
+            terminalreporter.section(f"process {crash.name} crashed")
+            terminalreporter.write(text)
 
 
 @pytest.fixture

@@ -55,6 +55,29 @@ def test_pictures_of_every_layout_become_frames(pixels, shape):
         assert (row.frame == t).all()
 
 
+def test_another_environment_in_the_process_changes_no_picture():
+    """Gymnasium draws into whatever context is current, if the environment has one viewer."""
+
+    def three_frames(between=lambda: None):
+        env = make_env(GymnasiumTask("HalfCheetah-v5"))
+        env.reset(1)
+        frames = []
+        for _ in range(3):
+            between()
+            frames.append(env.step(np.ones(6, np.float32)).frame)
+        return np.stack(frames)
+
+    others = []
+
+    def draw_a_walker():
+        others.append(make_env(TASKS["walker_walk"]))
+        others[-1].reset(1)
+
+    alone = three_frames()
+    assert (alone[0] != alone[-1]).any()
+    np.testing.assert_array_equal(three_frames(draw_a_walker), alone)
+
+
 def test_an_action_is_repeated_and_its_rewards_summed():
     _, rows = play(GymnasiumTask(Counter, action_repeat=3), 2)
     assert [row.reward for row in rows] == [0, 1 + 2 + 3, 4 + 5 + 6]

@@ -1,3 +1,5 @@
+import contextlib
+import gc
 import subprocess
 import sys
 
@@ -6,6 +8,7 @@ import pytest
 
 from vd4rl_pomdp.envs import rendering
 from vd4rl_pomdp.envs.make import make_env
+from vd4rl_pomdp.envs.maze import MazeEnv
 from vd4rl_pomdp.envs.rendering import suite
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import TASKS
@@ -62,3 +65,64 @@ def test_a_picture_stays_what_it_was_when_the_next_one_is_drawn():
     np.testing.assert_array_equal(first, kept)
     assert (later[-1] != first).any()
     assert first.flags.c_contiguous
+
+
+def three_frames(env, between=lambda: None):
+    env.reset(1)
+    frames = []
+    for _ in range(3):
+        between()
+        frames.append(env.step(np.ones(env.action_dim, np.float32)).frame)
+    return np.stack(frames)
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_another_renderer_in_the_process_changes_no_picture(closed):
+    """mujoco's own, whose context dm_control does not know of: it drew nothing and read the picture before."""
+    mazes = []
+
+    def draw_a_maze():
+        mazes.append(MazeEnv("three_curtains", render="exact"))
+        mazes[-1].reset(seed=0)
+        if closed:
+            mazes[-1].close()
+
+    alone = three_frames(make_env(TASKS["walker_walk"]))
+    np.testing.assert_array_equal(three_frames(make_env(TASKS["walker_walk"]), draw_a_maze), alone)
+
+
+def draw_walker():
+    env = make_env(TASKS["walker_walk"])
+    return three_frames(env), type(env.physics.contexts.gl)
+
+
+def draw_maze():
+    env = MazeEnv("three_curtains", render="exact")
+    env.reset(seed=0)
+    return np.stack([env.step(np.ones(2, np.float32))[0] for _ in range(3)]), rendering.mujoco.GLContext
+
+
+@pytest.mark.parametrize("draw", [draw_walker, draw_maze])
+def test_an_environment_that_is_freed_while_another_draws_changes_no_picture(draw, monkeypatch):
+    """The garbage collector at its worst moment: a context has been made current, and nothing drawn yet."""
+    alone, context = draw()
+    make_current = context.make_current
+    garbage = [make_env(TASKS["cheetah_run"])]
+    garbage[0].reset(1)
+
+    def then_collect(self):
+        made = make_current(self)
+        return within(made) if isinstance(made, contextlib.AbstractContextManager) else collect()
+
+    @contextlib.contextmanager
+    def within(made):
+        with made as thread:
+            collect()
+            yield thread
+
+    def collect():
+        if gc.isenabled():
+            garbage.clear()
+
+    monkeypatch.setattr(context, "make_current", then_collect)
+    np.testing.assert_array_equal(draw()[0], alone)

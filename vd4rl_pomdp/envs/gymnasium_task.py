@@ -8,7 +8,7 @@ import gymnasium
 import numpy as np
 from PIL import Image
 
-from vd4rl_pomdp.envs import opengl  # noqa: F401
+from vd4rl_pomdp.envs.opengl import undisturbed
 from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_SIZE, GymnasiumTask, Layout
@@ -91,7 +91,7 @@ class GymnasiumEnv(PixelEnv):
 
     def _picture(self) -> np.ndarray:
         """The present picture as (H, W, 3) uint8: a grey one has three equal channels."""
-        shown: Any = self.env.render() if self._renders else self._observation
+        shown = self._rendered() if self._renders else self._observation
         picture = shown if isinstance(shown, np.ndarray) else np.zeros(0)
         if picture.ndim == 3 and picture.shape[0] in (1, 3) and picture.shape[-1] not in (1, 3):
             picture = picture.transpose(1, 2, 0)
@@ -104,3 +104,11 @@ class GymnasiumEnv(PixelEnv):
                 "expected uint8 pictures (H, W, 3): choose pixels='render' or 'observation' as fits, or wrap it"
             )
         return np.repeat(picture, 3, axis=2) if picture.shape[-1] == 1 else picture
+
+    def _rendered(self) -> Any:
+        """What `render()` gives, drawn into the environment's own OpenGL context where it is one of MuJoCo's."""
+        viewer = getattr(getattr(self.env.unwrapped, "mujoco_renderer", None), "viewer", None)
+        with undisturbed():
+            if viewer is not None:  # it exists from the first picture on
+                viewer.make_context_current()
+            return self.env.render()

@@ -18,6 +18,7 @@ import weakref
 import numpy as np
 
 from vd4rl_pomdp.envs.maze_sky import BINS, panorama, sky_texture
+from vd4rl_pomdp.envs.opengl import undisturbed
 from vd4rl_pomdp.envs.rendering import Render, gl_error, mujoco, refuse_after_fork
 from vd4rl_pomdp.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, PICTURE_SIZE, MazeSpec, Style
 
@@ -40,7 +41,8 @@ class ExactRenderer:
         model.vis.quality.offsamples = 0
         model.vis.global_.offwidth = model.vis.global_.offheight = PICTURE_SIZE * fine
         try:
-            self._renderer = mujoco.Renderer(model, PICTURE_SIZE * fine, PICTURE_SIZE * fine)
+            with undisturbed():
+                self._renderer = mujoco.Renderer(model, PICTURE_SIZE * fine, PICTURE_SIZE * fine)
         except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
             raise gl_error(error) from error
         _keep_display()
@@ -49,16 +51,21 @@ class ExactRenderer:
     def __call__(self, data: mujoco.MjData) -> np.ndarray:
         """Picture of a state that `mj_forward` has seen."""
         self._renderer.update_scene(data, camera="view")
-        return average(self._renderer.render(), self._fine)
+        return average(self._rendered(), self._fine)
 
     def fine_picture(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
         """Colours (H, H, 3) uint8 and depths (H, H) float32 before averaging, H = 100 * fine."""
         self._renderer.update_scene(data, camera="view")
-        colors = self._renderer.render().copy()
+        colors = self._rendered().copy()
         self._renderer.enable_depth_rendering()
-        depths = self._renderer.render().copy()
+        depths = self._rendered().copy()
         self._renderer.disable_depth_rendering()
         return colors, depths
+
+    def _rendered(self) -> np.ndarray:
+        """The renderer's buffer."""
+        with undisturbed():
+            return self._renderer.render()
 
     def close(self) -> None:
         """Free the GL context."""

@@ -17,7 +17,7 @@ from typing import Any, get_args
 
 import numpy as np
 
-from vd4rl_pomdp.envs import opengl  # noqa: F401
+from vd4rl_pomdp.envs.opengl import undisturbed
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_SIZE
@@ -117,12 +117,20 @@ class FrameCamera:
         """The present state: (3, size, size) uint8."""
         refuse_after_fork()
         try:
-            if self._camera is None:
-                self._camera = Camera(self._physics, self._size, self._size, self._number)
-            image = self._camera.render()
+            with undisturbed():
+                image = self._drawn()
         except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
             raise gl_error(error) from error
         return np.array(image.transpose(2, 0, 1), order="C")  # a copy: the camera draws into one buffer
+
+    def _drawn(self) -> np.ndarray:
+        """The camera's buffer, (size, size, 3) uint8."""
+        if self._camera is None:
+            self._camera = Camera(self._physics, self._size, self._size, self._number)
+        context = self._physics.contexts.gl
+        with context.make_current() as thread:  # dm_control skips this where no other context of its own was current,
+            thread.call(context._platform_make_current)  # but mujoco's and Gymnasium's renderers have others
+        return self._camera.render()
 
 
 @cache
