@@ -30,6 +30,7 @@ class Config:
     data: Path = Path("data")
     seed: int = 0
     workers: int = 1
+    log_every: int = 50
 
 
 INPUTS = {"data": "abc"}
@@ -52,7 +53,7 @@ def test_only_the_same_run_goes_on_wherever_its_data_lies(tmp_path):
     with begin(tmp_path) as run:
         run.finish()
     before = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
-    with begin(tmp_path, data=Path("moved"), workers=7) as again:
+    with begin(tmp_path, data=Path("moved"), workers=7, log_every=9) as again:
         assert again.finished
     with pytest.raises(UserError, match=r"another config \(seed\)"):
         begin(tmp_path, seed=1)

@@ -1,5 +1,7 @@
 """Plans and attempts on the disk."""
 
+from pathlib import Path
+
 import pytest
 
 from tests.helpers_sweeps import job
@@ -44,7 +46,42 @@ def test_a_damaged_plan_is_named(tmp_path):
         folder.jobs()
 
 
-@pytest.mark.parametrize("text", ["{}", "[3]", '[{"name": "a"}]'])
+def paths(job):
+    return job.folder.resolve()
+
+
+def test_a_plan_is_read_from_elsewhere_and_carried_out_where_it_was_made(tmp_path, monkeypatch):
+    """Its commands name folders as seen from there: elsewhere they would make other ones."""
+    (tmp_path / "made").mkdir()
+    monkeypatch.chdir(tmp_path / "made")
+    out, data = Path("runs"), Path("../sets/walker")
+    jobs = [Job("data/walker", "collect", data, ()), job(out, "mik", "data/walker")]
+    SweepFolder(out).keep_plan("one", jobs)
+    SweepFolder(out).refuse_elsewhere()
+    monkeypatch.chdir(tmp_path)
+    seen = SweepFolder(Path("made/runs"))
+    assert [paths(job) for job in seen.jobs()] == [tmp_path / "sets" / "walker", tmp_path / "made" / "runs" / "mik"]
+    with pytest.raises(UserError, match=r"^made/runs: was planned in /.*/made as runs: `sweep retry` it there, or"):
+        seen.refuse_elsewhere()
+
+
+def test_a_sweep_that_was_moved_is_judged_by_its_own_folders(tmp_path):
+    out, data = tmp_path / "runs", tmp_path / "sets"
+    SweepFolder(out).keep_plan("one", [Job("data/x", "collect", data, ()), job(out, "a")])
+    out.rename(tmp_path / "moved")
+    moved = SweepFolder(tmp_path / "moved")
+    assert [job.folder for job in moved.jobs()] == [data, tmp_path / "moved" / "a"]
+    with pytest.raises(UserError, match=r"was planned in .*plan it anew by `sweep run GRID --out .*moved`"):
+        moved.refuse_elsewhere()
+
+
+def test_absolute_folders_are_the_same_from_everywhere(tmp_path, monkeypatch):
+    SweepFolder(tmp_path).keep_plan("one", [job(tmp_path, "a")])
+    monkeypatch.chdir("/")
+    SweepFolder(tmp_path).refuse_elsewhere()
+
+
+@pytest.mark.parametrize("text", ["{}", "[3]", '[{"name": "a"}]', '{"from": "/", "out": "runs", "jobs": []}'])
 def test_a_plan_of_something_else_is_named(tmp_path, text):
     folder = SweepFolder(tmp_path)
     folder.keep_plan("one", [])

@@ -46,7 +46,7 @@ def swept(tmp_path_factory):
         write_fake_set(out / "data" / "walker_walk" / "expert", [20, 25, 30])
         (out / "grid.toml").write_text(GRID)
         for job in plan(out):
-            if not job.done:
+            if not job.finished:
                 main(list(job.words))
     return out
 
@@ -64,7 +64,7 @@ def plan(out: Path, changes=(), kept=None, data=None):
 
 
 def left(jobs):
-    return [job.name for job in jobs if not job.done]
+    return [job.name for job in jobs if not job.finished]
 
 
 def test_what_was_run_is_finished_whatever_its_parts(swept):
@@ -106,7 +106,7 @@ def test_runs_on_every_further_content_of_a_set_have_folders_of_their_own(copy):
     for length in (31, 32, 33):
         shutil.rmtree(copy / "data" / "walker_walk")
         write_fake_set(copy / "data" / "walker_walk" / "expert", [20, 25, length])
-        job = next(job for job in plan(copy) if not job.done)
+        job = next(job for job in plan(copy) if not job.finished)
         assert job.folder not in folders
         assert not job.begun
         main(list(job.words))
@@ -144,8 +144,14 @@ def test_a_run_goes_on_in_its_own_folder(copy):
     folder = copy / "walker_walk" / "expert" / "patch" / "acro" / "seed0" / "finetune-td3_bc"
     (folder / "timing.json").unlink()
     folder = folder.rename(copy / "moved")
-    (job,) = (job for job in plan(copy) if not job.done)
+    (job,) = (job for job in plan(copy) if not job.finished)
     assert (job.name, job.folder, job.begun) == ("moved", folder, True)
+
+
+def test_what_is_removed_after_the_plan_was_made_is_to_be_done_again(copy):
+    jobs = plan(copy)
+    shutil.rmtree(jobs[-1].folder)
+    assert left(jobs) == [jobs[-1].name]
 
 
 def test_rows_that_were_kept_are_finished_runs(copy, tmp_path):
@@ -177,7 +183,7 @@ def test_an_encoder_whose_row_was_kept_is_made_again_for_a_new_policy(copy, tmp_
     shutil.copy(copy / "grid.toml", new)
     assert left(plan(new, kept=kept)) == []
     jobs = plan(new, ["finetune.updates=7"], kept=kept)
-    assert {job.section for job in jobs if not job.done} == {"pretrain", "finetune"}
+    assert {job.section for job in jobs if not job.finished} == {"pretrain", "finetune"}
     assert len(left(jobs)) == 9
 
 

@@ -100,17 +100,16 @@ def _print_plan(jobs: list[Job], past: list[Any]) -> None:
     from vd4rl_pomdp.sweeps.work import told_seconds
 
     estimates, users = Estimates(past, jobs), Counter(name for job in jobs for name in job.needs)
-    known, unknown = 0.0, 0
+    known, unknown, left = 0.0, 0, 0
     for job in jobs:
-        seconds = estimates.seconds(job)
-        state = "done" if job.done else "goes on" if job.begun else "new"
-        took = "" if job.done or seconds is None else f", about {told_seconds(seconds)}"
+        seconds, done = estimates.seconds(job), job.finished
+        state = "done" if done else "goes on" if job.begun else "new"
+        took = "" if done or seconds is None else f", about {told_seconds(seconds)}"
         shared = f", for {users[job.name]} jobs" if users[job.name] > 1 else ""
         print(f"# {job.name}: {state}{shared}{took}")
-        if not job.done:
+        if not done:
             print(f"{PROGRAM} {shlex.join(job.words)}")
-            known, unknown = known + (seconds or 0.0), unknown + (seconds is None)
-    left = sum(not job.done for job in jobs)
+            known, unknown, left = known + (seconds or 0.0), unknown + (seconds is None), left + 1
     told = f"{told_seconds(known)} of work by past runs" + f", {unknown} jobs of unknown length" * (unknown > 0)
     print(f"# {len(jobs)} jobs, {len(jobs) - left} done, {left} to do: {told}")
 
@@ -179,6 +178,7 @@ def _retry(words: Arguments, program: str) -> None:
 
     command = parse_stage(RetryCommand, words, program)
     folder = SweepFolder(command.out)
+    folder.refuse_elsewhere()
     jobs = folder.jobs()
     for name in _status(folder, jobs).failures:
         folder.forget(name)

@@ -8,10 +8,23 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import Any
 
-RUNTIME_FIELDS = frozenset({"out", "device", "workers", "wandb", "tensorboard", "data", "encoder", "eval_clean"})
+RUNTIME_FIELDS = frozenset(
+    {
+        "out",
+        "device",
+        "workers",
+        "wandb",
+        "tensorboard",
+        "data",
+        "encoder",
+        "eval_clean",
+        "log_every",
+        "checkpoint_every",
+    }
+)
 """Config fields that do not change a result, so that a run may go on with other values; data and encoder may be moved,
 and are compared by content; `eval_clean` adds rows that change no other."""
-NO_SETTINGS = RUNTIME_FIELDS | {"seed", "log_every", "checkpoint_every"}
+NO_SETTINGS = RUNTIME_FIELDS | {"seed"}
 """Config fields in which the seeds of one experiment may differ."""
 
 

@@ -1,6 +1,7 @@
 """What a sweep keeps beside its runs: its plans, one row for every attempt at a job, and what the jobs printed.
 
-    OUT/sweep/plans/GRID.json    the jobs of a grid: name, stage, folder, command, needs
+    OUT/sweep/plans/GRID.json    from (the working directory), out, and the jobs of a grid: name, stage, folder,
+                                 command, needs
     OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, step, slots, host
     OUT/sweep/logs/JOB.log
     OUT/sweep/slurm/             what the Slurm executor keeps
@@ -14,7 +15,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Iterable
-from dataclasses import asdict
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -43,15 +44,28 @@ class SweepFolder:
         """Write the jobs of a grid, in place of what was written of it before; other drivers may do so at once."""
         with disk_errors(self.path):
             (self.path / "plans").mkdir(parents=True, exist_ok=True)
-        write_json(self.path / "plans" / f"{grid}.json", [jsonable(asdict(job)) for job in jobs], shared=True)
+        plan = {"from": str(Path.cwd()), "out": str(self.out), "jobs": [jsonable(asdict(job)) for job in jobs]}
+        write_json(self.path / "plans" / f"{grid}.json", plan, shared=True)
 
     def jobs(self) -> list[Job]:
-        """The jobs of all plans; UserError if there is none."""
-        plans = sorted((self.path / "plans").glob("*.json"))
-        if not plans:
-            raise UserError(f"{self.out}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one")
-        jobs = [job for path in plans for job in _read_plan(path)]
+        """The jobs of all plans, their folders as seen from here; UserError if there is none."""
+        jobs = [replace(job, folder=plan.place(job.folder, self.out)) for plan in self._plans() for job in plan.jobs]
         return list({job.name: job for job in jobs}.values())
+
+    def refuse_elsewhere(self) -> None:
+        """Raise UserError if the commands of a plan name other folders here than where it was made."""
+        for plan in self._plans():
+            if plan.out_there.resolve() != self.out.resolve() or not (plan.absolute or plan.made_in == Path.cwd()):
+                raise UserError(
+                    f"{self.out}: was planned in {plan.made_in} as {plan.out}: `sweep retry` it there, or plan it "
+                    f"anew by `sweep run GRID --out {self.out}`"
+                )
+
+    def _plans(self) -> list[_Plan]:
+        paths = sorted((self.path / "plans").glob("*.json"))
+        if not paths:
+            raise UserError(f"{self.out}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one")
+        return [_read_plan(path) for path in paths]
 
     def work(self, job: Job, slots: int) -> Work:
         """A job as an executor takes it."""
@@ -98,12 +112,36 @@ def _row(line: str) -> Row:
     return row if isinstance(row, dict) and {"job", "cause"} <= row.keys() else {}
 
 
-def _read_plan(path: Path) -> list[Job]:
+@dataclass(frozen=True)
+class _Plan:
+    """A plan that was kept, with paths as they were told."""
+
+    made_in: Path
+    """The working directory, which relative paths begin at."""
+    out: Path
+    jobs: list[Job]
+
+    @property
+    def out_there(self) -> Path:
+        """The sweep's folder when the plan was made."""
+        return self.made_in / self.out
+
+    @property
+    def absolute(self) -> bool:
+        """Whether its commands mean the same from every working directory."""
+        return self.out.is_absolute() and all(job.folder.is_absolute() for job in self.jobs)
+
+    def place(self, folder: Path, out: Path) -> Path:
+        """Where a job's folder is if the sweep's is now `out`."""
+        return out / folder.relative_to(self.out) if folder.is_relative_to(self.out) else self.made_in / folder
+
+
+def _read_plan(path: Path) -> _Plan:
     try:
         told = parse_json(read_bytes(path).decode())
-        if not isinstance(told, list) or not told:
-            raise TypeError("it lists no jobs")
-        return [_job(one) for one in told]
+        if not isinstance(told, dict) or not told["jobs"]:
+            raise TypeError("it does not tell its jobs and where they were planned")
+        return _Plan(Path(told["from"]), Path(told["out"]), [_job(one) for one in told["jobs"]])
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path}: is damaged ({error}); remove it and start `sweep run` again") from error
 

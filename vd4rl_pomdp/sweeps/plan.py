@@ -37,7 +37,7 @@ class Job:
     needs: tuple[str, ...] = ()
     """Names of the jobs that come before it."""
     done: bool = False
-    """Whether it was finished when the plan was made."""
+    """Whether nothing is to do, although its folder does not tell: a kept row, or a set that was not collected here."""
     settings: tuple[tuple[str, str], ...] = ()
     """Settings that its cost depends on."""
     recipe: str = ""
@@ -107,7 +107,7 @@ class JobPlanner:
     def _collection(self, cell: GridCell, data: DataSet) -> Job:
         words = (*COMMANDS[data.section], *words_of(told(cell, data.section)), "--out", str(data.folder))
         job = Job(
-            f"{DATA}/{data.name}", data.section, data.folder, words, done=data.there, settings=cost_of(data.wanted)
+            f"{DATA}/{data.name}", data.section, data.folder, words, done=data.foreign, settings=cost_of(data.wanted)
         )
         return self._jobs.setdefault((data.section, "", data.name), job)
 
@@ -128,7 +128,7 @@ class JobPlanner:
         folder = self._out / name
         places = {"data": data.folder} | ({"encoder": before[-1].folder / "encoder"} if section == "finetune" else {})
         words = (*COMMANDS[section], *words_of(told(cell, section) | places | {"out": folder}))
-        done = any(found is not None and found.seconds is not None for found in (run, kept))
+        done = kept is not None and kept.seconds is not None
         needs = tuple(job.name for job in before)
         self._jobs[key] = Job(name, section, folder, words, needs, done, cost_of(values), recipe)
         return self._jobs[key]
@@ -148,8 +148,9 @@ def cost_of(values: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
 def _needed(jobs: list[Job]) -> list[Job]:
     """The finished jobs, and those that are the last of a cell or that an unfinished one needs."""
     inner = {name for job in jobs for name in job.needs}
+    finished = {job.name for job in jobs if job.finished}
     wanted: set[str] = set()
     for job in reversed(jobs):
-        if not job.done and (job.name not in inner or job.name in wanted):
+        if job.name not in finished and (job.name not in inner or job.name in wanted):
             wanted |= {job.name, *job.needs}
-    return [job for job in jobs if job.done or job.name in wanted]
+    return [job for job in jobs if job.name in finished | wanted]
