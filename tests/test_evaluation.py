@@ -23,6 +23,7 @@ from vd4rl_pomdp.nn import Encoder, EncoderConfig, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.policies.actor import ASSETS, load_actor
 from vd4rl_pomdp.runs.episodes import begin_episodes, read_episodes
+from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.tasks import TASKS
 from vd4rl_pomdp.types import StepType, Windows
 
@@ -171,6 +172,18 @@ def test_a_run_is_evaluated_as_it_was_trained_and_under_none_or_as_one_says(worl
     main(["evaluate", str(run), "--episodes", "1", "--workers", "1", "--corruption", "none", "--json"])
     (only,) = json.loads(capsys.readouterr().out)["under"].items()
     assert (only[0], only[1]["episodes"]) == ("none", written[1:])
+
+
+def test_another_corruption_is_played_with_the_runs_own_options(world, encoder, data, tmp_path, monkeypatch):
+    """Its patches were played at 16 pixels, whatever the run's size."""
+    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2)).path
+    card = read_json(run / "encoder" / "config.json")
+    card["pretrain"]["corruption"] |= {"patch_size": 40, "corruption_mode": "emission"}
+    write_json(run / "encoder" / "config.json", card)
+    jobs = []
+    monkeypatch.setattr(evaluation, "evaluate", lambda given, workers: jobs.extend(given) or [])
+    evaluate_run(run, "patch", 1, 1)
+    assert [job.corruption for job in jobs] == [CorruptionConfig.of("patch", "emission", patch_size=40)]
 
 
 def test_an_evaluation_names_its_step_and_touches_no_other_file(world, encoder, data, tmp_path):

@@ -241,8 +241,8 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
 
     Args:
         run: its folder.
-        corruption: name of the corruption to evaluate under (default fields); None for the run's own, and for none
-            at all, too.
+        corruption: name of the corruption to evaluate under, with the run's own options where it reads them; None for
+            the run's own, and for none at all, too.
         episodes: how many.
         workers: processes, 0 for every core.
 
@@ -265,7 +265,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     task = TASKS.named(card.task)
     chosen = own_and_none(CorruptionConfig.fill(card.corruption))
     if corruption is not None:
-        chosen = [CorruptionConfig.of(corruption)]
+        chosen = [CorruptionConfig.fill(card.corruption | {"corruption": corruption})]
     for one in chosen:
         one.check()
     actor = Reference.read(run).actor_file

@@ -63,7 +63,7 @@ class Style:
     heading_damping: float = 2.48
     """Leaves 0.403 of the turning rate after each simulator step: 0.27 radians for 5 steps and an action of 1."""
     push: float | None = 0.1
-    """First person: change of velocity for an action of 1, once a decision; None: 10 units/s^2 while it lasts."""
+    """First person: change of velocity for an action of 1, once a decision; None: what 10 units/s^2 come to in it."""
     limited_every_step: bool = False
     """Velocities are limited to 5 before every simulator step, as PointMaze does, or once a decision."""
     goal_radius: float = 0.1

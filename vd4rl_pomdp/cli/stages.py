@@ -35,7 +35,8 @@ class EvaluateCommand:
     run: tyro.conf.Positional[Path]
     """A fine-tuning run's folder."""
     corruption: str | None = None
-    """Corruption at evaluation; default: the one it was trained under, and then none, which takes as long again."""
+    """Corruption at evaluation, with the run's own options (a patch's size) where it reads them; default: the one that
+    it was trained under, and then none, which takes as long again."""
     episodes: int = 10
     """Episodes under each corruption."""
     parts: int = 1

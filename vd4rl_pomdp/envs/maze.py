@@ -16,7 +16,8 @@ from vd4rl_pomdp.mazes import PICTURE_SIZE, get_maze
 ACTION_REPEAT = 5
 """Simulator steps of 0.01 s for one action."""
 ACCELERATION = 10.0
-"""first_person without a `push`: units/s^2 along the heading for an action of 1 (from the top it is 23.9)."""
+"""first_person without a `push`: units/s^2 along the heading for an action of 1 (from the top it is 23.9);
+what they come to in a decision is added at its beginning."""
 FASTEST = 5.0
 """Velocities are limited to this on each axis, as in PointMaze."""
 CELL_OFFSET = np.array([0.2, -0.2])
