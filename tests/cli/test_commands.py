@@ -58,6 +58,7 @@ SWEEP = ["sweep", "run", "quick", "--out", "y", "--dry-run"]
         (["pretrain", "--data=", "--out", "y"], "--data= names nothing"),
         (["pretrain", "--data", "x", "--out", os.fsdecode(b"\xff")], "'\\udcff' is not UTF-8"),
         (["evaluate", ""], "the first word names nothing"),
+        (["report"], "no runs are named: name at least one"),
         (["sweep", "run", "huge", "--out", "x"], "unknown grid 'huge': choose one of control,"),
         (["sweep", "run", "nowhere.toml", "--out", "x"], "nowhere.toml: cannot be used (no such file or directory)"),
         (["sweep", "run", "quick"], "Missing from vd4rl-pomdp sweep run: --out"),

@@ -91,6 +91,19 @@ def test_an_encoder_folder_gives_back_the_same_encoder(tmp_path):
     assert not any(p.requires_grad for p in loaded.parameters())
 
 
+def test_a_runs_folder_in_place_of_its_encoders_is_told_of_the_encoder(tmp_path):
+    save_encoder(tmp_path / "encoder", Encoder(EncoderConfig(action_dim=6)), CARD)
+    (tmp_path / "config.json").write_text("{}")
+    with pytest.raises(UserError, match=r"not an encoder folder \(config.json: no 'encoder'\); name /.*/encoder$"):
+        load_encoder(tmp_path)
+
+
+def test_an_encoder_of_a_corruption_whose_file_was_not_run_says_so(tmp_path):
+    save_encoder(tmp_path, Encoder(EncoderConfig(action_dim=6)), replace(CARD, corruption={"corruption": "fog"}))
+    with pytest.raises(UserError, match=r"unknown corruption 'fog'.*; run the file that adds what it names, or"):
+        load_encoder(tmp_path)
+
+
 def test_bad_encoder_folders_are_refused_in_one_line(tmp_path):
     with pytest.raises(UserError, match="not an encoder folder"):
         load_encoder(tmp_path)

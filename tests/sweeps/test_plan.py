@@ -229,8 +229,8 @@ def collected(**settings):
     ("stored", "asked", "message"),
     [
         ({"episodes": 3}, "collect.episodes=200", "a set of episodes 3, the grid says episodes 200; choose another"),
-        ({}, "collect.frame_size=48", "a set of frame_size None, the grid says frame_size 48"),
-        ({"frame_size": 48}, "collect.seed=0", "a set of frame_size 48, the grid says frame_size None"),
+        ({}, "collect.frame_size=48", "a set of the default frame_size, the grid says frame_size 48"),
+        ({"frame_size": 48}, "collect.seed=0", "a set of frame_size 48, the grid says the default frame_size"),
     ],
 )
 def test_a_set_that_was_collected_otherwise_is_refused(copy, stored, asked, message):

@@ -6,7 +6,7 @@ import contextlib
 import io
 import json
 import re
-from dataclasses import fields, replace
+from dataclasses import MISSING, fields, replace
 from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
@@ -43,6 +43,8 @@ def _refuse_empty(config: Any, words: Arguments) -> None:
     """Refuse a flag that names nothing: an empty list, or an empty word where the default is none."""
     for field in fields(config):
         if getattr(config, field.name) == [] and (field.default_factory is not list or flag_of(field.name) in words):
+            if field.default_factory is MISSING:  # a positional one
+                raise UserError(f"no {field.name} are named: name at least one")
             raise UserError(f"{flag_of(field.name)} names nothing: give at least one or leave it out")
     free = {flag_of(field.name) for field in fields(config) if field.default == ""}
     for flag, word in pairwise(["", *words]):

@@ -265,3 +265,7 @@ def _check_column(path: Path, key: str, value: np.ndarray, count: int) -> None:
     bad = np.flatnonzero(~(np.abs(value.reshape(count, -1)) <= _LARGEST).all(1))
     if len(bad):
         raise UserError(f"{path}: {key!r} is not finite as float32 in row {bad[0]} ({len(bad)} such rows); {_REPAIR}")
+    if key == "discount" and (outside := np.flatnonzero((value < 0) | (value > 1))).size:
+        raise UserError(
+            f"{path}: 'discount' is {value[outside[0]]:g} in row {outside[0]}, not within 0 and 1; {_REPAIR}"
+        )

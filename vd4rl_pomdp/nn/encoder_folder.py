@@ -128,7 +128,10 @@ def load_encoder(
         encoder = Encoder(encoder_config)
         _check_corruption(card)
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
-        raise UserError(f"{folder}/config.json: names no encoder ({_first_line(error)}); pretrain it again") from error
+        raise UserError(
+            f"{folder}/config.json: names no encoder ({_first_line(error)}); run the file that adds what it "
+            "names, or pretrain it again"
+        ) from error
     try:
         encoder.load_state_dict(read_tensors(folder / WEIGHTS))
     except (FileNotFoundError, SafetensorError, RuntimeError) as error:
@@ -162,6 +165,7 @@ def read_record(folder: Path) -> EncoderRecord:
     except UserError:
         raise
     except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError) as error:
-        raise UserError(
-            f"{folder}: not an encoder folder (config.json: {error}); `vd4rl-pomdp pretrain` writes one as RUN/encoder"
-        ) from error
+        inner = folder / "encoder"
+        hint = f"name {inner}" if (inner / CONFIG).is_file() else "`vd4rl-pomdp pretrain` writes one as RUN/encoder"
+        reason = f"no {error}" if isinstance(error, KeyError) else error
+        raise UserError(f"{folder}: not an encoder folder (config.json: {reason}); {hint}") from error

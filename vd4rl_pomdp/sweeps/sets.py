@@ -57,7 +57,7 @@ class DataSet:
         refuse_partial(self.folder)
         stored = read_json(self.folder / PLAN) if (self.folder / PLAN).exists() else self.wanted
         if others := differing(stored, self.wanted):
-            has, asked = (f"{others[0]} {values.get(others[0])}" for values in (stored, self.wanted))
+            has, asked = (_told(others[0], values.get(others[0])) for values in (stored, self.wanted))
             raise UserError(f"{self.folder}: holds a set of {has}, the grid says {asked}; choose another --data")
 
     def made(self, record: Mapping[str, Any]) -> bool:
@@ -83,6 +83,10 @@ def set_of(cell: GridCell, root: Path) -> DataSet:
     folder = root / name
     inner = folder / _DOWNLOADED
     return DataSet(name, inner if inner.is_dir() else folder, section, wanted)
+
+
+def _told(name: str, value: Any) -> str:
+    return f"the default {name}" if value is None else f"{name} {value}"
 
 
 def _has_shards(folder: Path) -> bool:
