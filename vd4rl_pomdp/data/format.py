@@ -182,6 +182,7 @@ def read_rows(path: Path) -> dict[str, np.ndarray]:
         count = len(file[FRAMES_KEY])
     for key, value in rows.items():
         _check_column(path, key, value, count)
+    _check_discounts(path, rows["discount"], rows["step_type"])
     dtypes = {"action": "float32", "step_type": "uint8"}
     return {key: value.astype(dtypes.get(key, "float64"), copy=False) for key, value in rows.items()}
 
@@ -265,7 +266,11 @@ def _check_column(path: Path, key: str, value: np.ndarray, count: int) -> None:
     bad = np.flatnonzero(~(np.abs(value.reshape(count, -1)) <= _LARGEST).all(1))
     if len(bad):
         raise UserError(f"{path}: {key!r} is not finite as float32 in row {bad[0]} ({len(bad)} such rows); {_REPAIR}")
-    if key == "discount" and (outside := np.flatnonzero((value < 0) | (value > 1))).size:
-        raise UserError(
-            f"{path}: 'discount' is {value[outside[0]]:g} in row {outside[0]}, not within 0 and 1; {_REPAIR}"
-        )
+
+
+def _check_discounts(path: Path, discount: np.ndarray, step_type: np.ndarray) -> None:
+    """Refuse what discounts nothing; an episode's first row, which no step led to, may store anything."""
+    outside = np.flatnonzero(((discount < 0) | (discount > 1)) & (step_type != StepType.FIRST))
+    if len(outside):
+        row = outside[0]
+        raise UserError(f"{path}: 'discount' is {discount[row]:g} in row {row}, not within 0 and 1; {_REPAIR}")
