@@ -22,7 +22,7 @@ if __name__ == "__main__":
 
 
 def tell_and_sleep(job: int) -> None:
-    print(os.getpid(), flush=True)
+    os.write(1, f"{os.getpid()}\n".encode())  # at once: `print` may write the line's end apart, and there are two
     time.sleep(60)
 
 
