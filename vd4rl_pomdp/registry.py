@@ -11,6 +11,8 @@ from typing import Any, Generic, TypeVar
 from vd4rl_pomdp.errors import UserError
 
 Part = TypeVar("Part")
+BY_CALL = "registered by a call"
+"""Origin of the parts that a process has added itself."""
 REGISTRIES: dict[str, Registry[Any]] = {}
 """Every registry by its kind, in the order in which they were made."""
 
@@ -40,7 +42,12 @@ class Registry(Mapping[str, Part], Generic[Part]):
 
     def register(self, name: str, part: Part) -> None:
         """Add a part of one's own; a name that is taken, or a part of another kind, raises UserError."""
-        self._add(name, part, "registered by a call")
+        self._add(name, part, BY_CALL)
+
+    @property
+    def has_added(self) -> bool:
+        """Whether this process has added a part by a call."""
+        return BY_CALL in self._origins.values()
 
     def registered(self) -> dict[str, Part]:
         """The parts that are known without loading what installed packages offer: for code that runs at import."""

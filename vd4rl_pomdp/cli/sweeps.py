@@ -12,10 +12,11 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from vd4rl_pomdp.cli.dispatch import PROGRAM, Arguments, Command
+from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, show
 from vd4rl_pomdp.options import NO_OPTIONS, Options, StageConfig
 from vd4rl_pomdp.sweeps.executors import executor_kind
+from vd4rl_pomdp.sweeps.own_file import program_here, refuse_unknown_to_jobs, refuse_within_a_job
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.sweeps.folder import SweepFolder
@@ -83,6 +84,7 @@ def _run(words: Arguments, program: str) -> None:
     here, kept = FoundRuns(runs_below(command.out)), FoundRuns(runs_kept(command.done))
     planner = JobPlanner(command.out, command.data, kept, here)
     jobs = planner.plan(cells)
+    refuse_unknown_to_jobs(jobs)
     for name, number in planner.of_other_content.items():
         line = f"{number} kept runs are of a set collected alike, but with other content (from another machine?)"
         print(f"warning: {name}: {line}: they do not count", file=sys.stderr)
@@ -108,7 +110,7 @@ def _print_plan(jobs: list[Job], past: list[Any]) -> None:
         shared = f", for {users[job.name]} jobs" if users[job.name] > 1 else ""
         print(f"# {job.name}: {state}{shared}{took}")
         if not done:
-            print(f"{PROGRAM} {shlex.join(job.words)}")
+            print(f"{program_here()} {shlex.join(job.words)}")
             known, unknown, left = known + (seconds or 0.0), unknown + (seconds is None), left + 1
     told = f"{told_seconds(known)} of work by past runs" + f", {unknown} jobs of unknown length" * (unknown > 0)
     print(f"# {len(jobs)} jobs, {len(jobs) - left} done, {left} to do: {told}")
@@ -123,13 +125,14 @@ def carry_out(jobs: list[Job], folder: SweepFolder, kind: str, options: Options)
     """Run jobs to their end on an executor of a kind; SystemExit 1 if some are not finished."""
     from vd4rl_pomdp.sweeps.driver import Driver
 
+    refuse_within_a_job()
     executor = executor_kind(kind).build(options, folder.of_executor(kind))
     if not Driver(jobs, executor, folder).run():
         failures = _status(folder, jobs).failures
         for name, row in failures.items():
             print(f"{row['cause']}: {name}: {row['line']}", file=sys.stderr)
         left = f"{sum(not job.finished for job in jobs)} of {len(jobs)} jobs are not finished"
-        print(f"{left}, {len(failures)} failed; `{PROGRAM} sweep retry {folder.out}` takes those up again")
+        print(f"{left}, {len(failures)} failed; `{program_here()} sweep retry {folder.out}` takes those up again")
         sys.exit(1)
 
 

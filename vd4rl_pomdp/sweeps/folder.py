@@ -22,6 +22,7 @@ from typing import Any
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.runs.files import Row, jsonable, write_json
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
+from vd4rl_pomdp.sweeps.own_file import own_file
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.work import Work
 
@@ -70,7 +71,7 @@ class SweepFolder:
     def work(self, job: Job, slots: int) -> Work:
         """A job as an executor takes it."""
         log = self.path / "logs" / f"{job.name}.log"
-        return Work(job.name, job.words, log, slots)
+        return Work(job.name, job.words, log, slots, own_file())
 
     def of_executor(self, name: str) -> Path:
         """Folder of what an executor keeps."""

@@ -8,7 +8,7 @@ import signal
 import subprocess
 import sys
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Protocol
 
@@ -42,6 +42,8 @@ class Work:
     """What the command prints goes to this file's end."""
     slots: int = 1
     """Share of the executor's places that it takes."""
+    own_file: dict[str, str] = field(default_factory=dict)
+    """Where the parts of one's own come from that its process imports, as `sweeps.own_file` has it."""
 
 
 @dataclass(frozen=True)
@@ -86,11 +88,11 @@ def start_process(work: Work, environment: Mapping[str, str], cores: Sequence[in
         environment: what is added to this process's environment.
         cores: those that it may use; none: all.
     """
-    told = json.dumps({"words": work.words, "cores": list(cores), "parent": os.getpid()})
+    told = {"words": work.words, "own_file": work.own_file, "cores": list(cores), "parent": os.getpid()}
     work.log.parent.mkdir(parents=True, exist_ok=True)
     with work.log.open("ab") as log:
         return subprocess.Popen(
-            [sys.executable, "-m", "vd4rl_pomdp.sweeps.worker", told],
+            [sys.executable, "-m", "vd4rl_pomdp.sweeps.worker", json.dumps(told)],
             env=os.environ | dict(environment),
             stdin=subprocess.DEVNULL,
             stdout=log,

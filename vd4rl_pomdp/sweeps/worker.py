@@ -30,7 +30,9 @@ def main() -> None:
     words = told["words"]
     sys.argv = ["vd4rl-pomdp", *words]  # what a run records as its command
     from vd4rl_pomdp.cli.ends import run_to_end
+    from vd4rl_pomdp.sweeps.own_file import load
 
+    load(told["own_file"])
     end = run_to_end(words, signal.SIG_IGN)
     with contextlib.suppress(OSError):  # a full disk
         print(end.line or end.cause, file=sys.stderr, flush=True)

@@ -1,0 +1,69 @@
+"""Parts of one's own in a sweep: processes of its jobs import the file that it was started from, as `multiprocessing`
+has its processes do: everything but what stands below `if __name__ == "__main__":`.
+"""
+
+from __future__ import annotations
+
+import multiprocessing.spawn
+import shlex
+import sys
+from collections.abc import Iterable
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.registry import BY_CALL, REGISTRIES, origins
+
+if TYPE_CHECKING:
+    from vd4rl_pomdp.sweeps.plan import Job
+
+OwnFile = dict[str, str]
+"""A main module by `multiprocessing`'s name for how it is found: a path, or a module's name; empty for none."""
+_PROGRAM = "vd4rl-pomdp"
+_PATH, _NAME = "init_main_from_path", "init_main_from_name"
+_WORKER = "vd4rl_pomdp.sweeps.worker"
+
+
+def own_file() -> OwnFile:
+    """What this process was started from, if it has added parts and is not the program itself."""
+    if not any(registry.has_added for registry in REGISTRIES.values()):
+        return {}
+    told = multiprocessing.spawn.get_preparation_data("")
+    found = {how: told[how] for how in (_PATH, _NAME) if told.get(how)}
+    return {} if Path(found.get(_PATH, "")).stem == _PROGRAM else found
+
+
+def load(file: OwnFile) -> None:
+    """Import a file so that it is this process's main module, and that of the processes it starts in turn."""
+    if _PATH in file:
+        sys.path.insert(0, str(Path(file[_PATH]).parent))
+    multiprocessing.spawn.prepare(dict(file))
+    if file:
+        sys.argv[0] = str(sys.modules["__main__"].__file__)
+
+
+def program_here() -> str:
+    """What one types in place of `vd4rl-pomdp` to have the parts that this process has."""
+    file = own_file()
+    if _NAME in file:
+        return f"python -m {file[_NAME]}"
+    return f"python {shlex.quote(sys.argv[0])}" if file else _PROGRAM
+
+
+def refuse_unknown_to_jobs(jobs: Iterable[Job]) -> None:
+    """Raise UserError if a job names a part that its process could not know."""
+    if own_file():
+        return
+    for job in jobs:
+        for part, origin in origins(dict(job.settings)).items():
+            if origin == BY_CALL:
+                raise UserError(
+                    f"{part}: was registered in this process alone, and jobs have processes of their own: register it "
+                    "in a file that ends in `main()`, and start the sweep by `python FILE sweep run`"
+                )
+
+
+def refuse_within_a_job() -> None:
+    """Raise UserError where the file starts the sweep anew when a job imports it."""
+    if getattr(sys.modules["__main__"].__spec__, "name", "") == _WORKER:
+        raise UserError('a job cannot start a sweep: put the call that did below `if __name__ == "__main__":`')
