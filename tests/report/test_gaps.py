@@ -18,14 +18,12 @@ def test_an_ablation_is_missing_elsewhere_but_a_budget_for_every_task_is_not(tmp
         run = write_run(runs / f"patch{size}", "random", 0, {10: [1.0]})
         describe(run, {"patch_size": size}, data=f"f{size}")
     names = ("quality", "corruption", "method", "variant")
+    variants = [("mik+a", "max_k 1"), ("mik+a", "max_k 15"), ("acro", "steps 20"), ("acro", "steps 60")]
     assert {tuple(row[name] for name in names) for row in find_gaps(load_runs([runs]))} == {
-        ("medium", "patch", "mik+a", "max_k 1"),
-        ("medium", "patch", "random", "patch_size 16"),
-        ("medium", "patch", "random", "patch_size 48"),
-        ("expert", "none", "mik+a", "max_k 1"),
-        ("expert", "none", "mik+a", "max_k 15"),
-        ("expert", "none", "acro", "steps 20"),
-        ("expert", "none", "acro", "steps 60"),
+        ("medium", "patch, patch_size 16", "mik+a", "max_k 1"),
+        ("medium", "patch, patch_size 16", "random", ""),
+        *(("expert", "patch, patch_size 48", *variant) for variant in variants),
+        *(("expert", "none", *variant) for variant in variants),
     }
 
 

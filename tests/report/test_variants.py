@@ -4,6 +4,9 @@ import pytest
 
 from tests.helpers_report import describe, pooled, write_run
 from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.report.claims import judge_claims
+from vd4rl_pomdp.report.load import load_runs
+from vd4rl_pomdp.runs.files import read_json, write_json
 
 
 def test_runs_pool_whatever_their_seed_folder_device_and_logging(tmp_path):
@@ -17,7 +20,6 @@ def test_runs_pool_whatever_their_seed_folder_device_and_logging(tmp_path):
 @pytest.mark.parametrize(
     ("one", "other", "names"),
     [
-        ({"card": {"patch_size": 16}}, {"card": {"patch_size": 48}}, ["acro, patch_size 16", "acro, patch_size 48"]),
         ({"card": {"steps": 20}}, {"card": {"steps": 60}}, ["acro, steps 20", "acro, steps 60"]),
         ({"card": {}, "updates": 5}, {"card": {}, "updates": 9}, ["acro, updates 5", "acro, updates 9"]),
         (
@@ -52,7 +54,6 @@ def test_runs_pool_whatever_their_seed_folder_device_and_logging(tmp_path):
         ),
     ],
     ids=[
-        "patch",
         "steps",
         "updates",
         "same name",
@@ -73,6 +74,47 @@ def test_runs_that_differ_are_rows_of_their_own(tmp_path, one, other, names):
             describe(write_run(tmp_path / f"runs/{folder}{seed}", "acro", seed, {10: [1.0]}), **settings)
     write_run(tmp_path / "runs/random", "random", 0, {10: [1.0]})
     assert pooled(tmp_path / "runs") == dict.fromkeys(names, 2) | {"random": 1}
+
+
+def settings_of(runs):
+    """By method, the corruptions that a report tells apart."""
+    found = {}
+    for run in load_runs([runs]):
+        found.setdefault(run.labels["method"], set()).add(run.labels["corruption"])
+    return found
+
+
+def test_a_corruption_of_other_options_is_another_setting_whatever_the_method(tmp_path):
+    runs = tmp_path / "runs"
+    for method, size in (("acro", 16), ("mik+a", 48), ("mik", 48)):
+        for seed in (0, 1):
+            run = write_run(runs / f"{method}{seed}", method, seed, {10: [1.0 + seed + size]})
+            describe(run, {"patch_size": size}, data="f00")
+    write_run(runs / "early", "random", 0, {10: [1.0]})
+    few, many = "patch, patch_size 16", "patch, patch_size 48"
+    assert settings_of(runs) == {"acro": {few}, "mik+a": {many}, "mik": {many}, "random": {"patch"}}
+    claims = judge_claims(load_runs([runs]))
+    assert {(row["corruption"], row["left"], row["right"]) for row in claims} == {(many, "mik+a", "mik")}
+    page = write_report([runs], tmp_path / "report")[0].read_text()
+    assert f"walker_walk expert, {few}" in page
+
+
+def test_options_are_a_corruptions_whether_or_not_its_file_was_run(tmp_path):
+    runs = tmp_path / "runs"
+    for height in (8, 24):
+        run = describe(write_run(runs / f"acro{height}", "acro", 0, {10: [1.0]}), {"bar_height": height})
+        card = read_json(run / "encoder" / "config.json")
+        card["pretrain"]["corruption"] = {"corruption": "patch", "bar_height": height}
+        write_json(run / "encoder" / "config.json", card)
+    assert settings_of(runs) == {"acro": {"patch, bar_height 8", "patch, bar_height 24"}}
+
+
+def test_where_nothing_is_hidden_no_option_counts(tmp_path):
+    runs = tmp_path / "runs"
+    for size in (16, 48):
+        run = write_run(runs / f"acro{size}", "acro", size, {10: [1.0]}, labels={"corruption": "none"})
+        describe(run, {"patch_size": size})
+    assert settings_of(runs) == {"acro": {"none"}}
 
 
 def by_set(tmp_path, budgets):

@@ -57,18 +57,12 @@ def _state(run: LoadedRun | None) -> str:
 
 
 def _expected(by_method: dict[tuple[str, str], list[LoadedRun]], setting: Setting) -> Iterator[tuple[str, str, str]]:
-    """Algorithm, method and variant of every run that is expected in a setting.
-
-    Variants by fields of a corruption are expected in all settings with that corruption, variants by data only where
-    they are found.
-    """
+    """Algorithm, method and variant of every run that is expected in a setting; those by data where they are found."""
     for (algorithm, method), mine in by_method.items():
         for shared in _shared(mine, setting):
-            alike = [run for run in mine if run.parts[0] == shared and run.labels["corruption"] == setting[2]]
-            for fields in {run.parts[1]: None for run in alike} or [""]:
-                here = [run for run in alike if run.parts[1] == fields and _setting(run) == setting]
-                for data in {run.parts[2]: None for run in here} or [""]:
-                    yield algorithm, method, ", ".join(filter(None, (shared, fields, data)))
+            here = [run for run in mine if run.parts[0] == shared and _setting(run) == setting]
+            for data in {run.parts[1]: None for run in here} or [""]:
+                yield algorithm, method, ", ".join(filter(None, (shared, data)))
 
 
 def _shared(mine: list[LoadedRun], setting: Setting) -> Iterable[str]:

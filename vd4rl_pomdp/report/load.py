@@ -2,22 +2,24 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 from zipfile import BadZipFile
 
 import numpy as np
 
+from vd4rl_pomdp.corruptions import corruption_settings
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.reference import FILE as REFERENCE
 from vd4rl_pomdp.reference import Reference
-from vd4rl_pomdp.report.variants import Parts, Settings, differences, of_sets, read_settings
+from vd4rl_pomdp.report.variants import DATA, Parts, Settings, differences, of_sets, read_settings
 from vd4rl_pomdp.results import Result, find_results
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.reading import regular
 
+Member = TypeVar("Member")
 LABELS = ("task", "quality", "corruption", "algorithm", "method", "seed")
 """Columns that a run's files name it by."""
 IDENTITY = ("task", "quality", "corruption", "algorithm", "method", "variant", "seed")
@@ -33,7 +35,8 @@ class LoadedRun:
     result: Result
     """Its files."""
     labels: dict[str, Any]
-    """Values of LABELS; the task is empty until the run has opened its data."""
+    """Values of LABELS; the task is empty until the run has opened its data. The corruption is followed by its options
+    where other runs have others of the same name, "patch, patch_size 48": what they hide is another setting."""
     settings: Settings
     """All settings in which runs of its method may differ, in words."""
     rows: list[Row]
@@ -46,7 +49,7 @@ class LoadedRun:
     """Measures of its encoder: action_loss, probe_pose, probe_velocity, pretrain_seconds."""
     reference: Reference
     """What its policy is held against."""
-    parts: Parts = ("", "", "")
+    parts: Parts = ("", "")
     """Its settings that differ from those of other runs of its method, by the runs it is compared with."""
 
     @property
@@ -119,23 +122,56 @@ def load_runs(paths: list[Path], but: Path | None = None) -> list[LoadedRun]:
     Raises:
         UserError: there is no run, two have the same identity, or a file of one is damaged.
     """
-    runs = [_load(result) for result in find_results(paths, but)]
+    loaded = [_load(result) for result in find_results(paths, but)]
+    told = zip(loaded, _corruptions(loaded), strict=True)
+    runs = [replace(run, labels=run.labels | {"corruption": words}) for run, words in told]
     named = [replace(run, parts=parts) for run, parts in zip(runs, compare(runs), strict=True)]
     _refuse_twins(named)
     return named
 
 
+def _corruptions(runs: list[LoadedRun]) -> list[str]:
+    """What hides pixels from each run, in words; an option that early runs do not record is not told apart."""
+    unknown = dict.fromkeys(sorted(_of_corruptions(runs)), "")
+    settings = [{name: own.get(name, value) for name, value in unknown.items()} for own in _settings(runs)]
+    words = _differences(runs, settings, lambda run: run.labels["corruption"])
+    names = [str(run.labels["corruption"]) for run in runs]
+    return [
+        name if name == "none" else ", ".join(filter(None, (name, told)))
+        for name, told in zip(names, words, strict=True)
+    ]
+
+
 def compare(runs: list[LoadedRun], brief: bool = True) -> list[Parts]:
     """The settings in which each run differs from others of its stage, method and algorithm."""
-    parts: dict[str, Parts] = {}
+    hiding, settings = _of_corruptions(runs), _settings(runs)
+    methods = [_without(own, {*hiding, *DATA}) for own in settings]
+    data = [{name: own[name] for name in DATA if name in own} for own in settings]
+    of_methods = _differences(runs, methods, _method, brief)
+    of_data = _differences(runs, data, lambda run: (*_method(run), _set(run), run.labels["corruption"]))
+    return list(zip(of_methods, of_data, strict=True))
+
+
+def _differences(
+    runs: list[LoadedRun], settings: list[Settings], alike: Callable[[LoadedRun], Any], brief: bool = True
+) -> list[str]:
+    """What differs of some settings among the runs that are alike, run by run."""
+    words = [""] * len(runs)
+    for members in _groups(range(len(runs)), lambda number: alike(runs[number])):
+        for number, told in zip(members, differences([settings[i] for i in members], brief), strict=True):
+            words[number] = told
+    return words
+
+
+def _settings(runs: list[LoadedRun]) -> list[Settings]:
+    """The runs' settings, without what goes by the set."""
     own = own_to_sets(runs)
-    for members in _groups(runs, lambda run: (run.stage, run.labels["method"], run.labels["algorithm"])):
-        corruption = [str(run.labels["corruption"]) for run in members]
-        setting = [tuple(run.labels[name] for name in ("task", "quality", "corruption")) for run in members]
-        rest = [_without(run.settings, own[_kind(run)][_set(run)]) for run in members]
-        words = differences(rest, corruption, setting, brief)
-        parts |= dict(zip((run.result.id for run in members), words, strict=True))
-    return [parts[run.result.id] for run in runs]
+    return [_without(run.settings, own[_kind(run)][_set(run)]) for run in runs]
+
+
+def _of_corruptions(runs: Iterable[LoadedRun]) -> set[str]:
+    """Settings that are corruptions' options: those of the parts that are here, and what encoders say of theirs."""
+    return corruption_settings().union(*(run.result.encoder.get("corruption", {}) for run in runs))
 
 
 def own_to_sets(runs: list[LoadedRun]) -> dict[tuple[str, str], dict[str, Settings]]:
@@ -154,14 +190,18 @@ def _kind(run: LoadedRun) -> tuple[str, str]:
     return run.stage, str(run.labels["algorithm"])
 
 
-def _without(settings: Settings, names: Settings) -> Settings:
+def _method(run: LoadedRun) -> tuple[str, str, str]:
+    return *_kind(run), str(run.labels["method"])
+
+
+def _without(settings: Settings, names: Collection[str]) -> Settings:
     return {name: value for name, value in settings.items() if name not in names}
 
 
-def _groups(runs: Iterable[LoadedRun], key: Callable[[LoadedRun], Any]) -> list[list[LoadedRun]]:
-    groups: dict[Any, list[LoadedRun]] = {}
-    for run in runs:
-        groups.setdefault(key(run), []).append(run)
+def _groups(members: Iterable[Member], key: Callable[[Member], Any]) -> list[list[Member]]:
+    groups: dict[Any, list[Member]] = {}
+    for member in members:
+        groups.setdefault(key(member), []).append(member)
     return list(groups.values())
 
 

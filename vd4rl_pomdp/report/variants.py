@@ -6,23 +6,23 @@ run has its own config, its encoder's, and the data of both.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import Any
 
-from vd4rl_pomdp.corruptions import corruption_settings
 from vd4rl_pomdp.runs.settings import settings_of
 
 Settings = dict[str, str]
 """Values as words, by the name that is shown beside them."""
-Parts = tuple[str, str, str]
-"""What differs among all runs of a method, among those of one corruption, and among those of one setting."""
+Parts = tuple[str, str]
+"""What differs among all runs of a method, and of the data among those of one setting."""
 
 UNKNOWN = "pretraining"
 """Key in the settings of a run whose encoder does not say how it was pretrained."""
 _NOT_RECORDED = "not recorded"
 _UNSET = "unset"
 _PRESETS = ("preset", "pretraining preset")
-_DATA = ("data", "pretraining data")
+DATA = ("data", "pretraining data")
+"""Names of the sets' fingerprints."""
 PLAIN = {
     **{"history": "method", "random_histories": "0", "history_window": "0", "readout": "state"},
     **{"pose_noise": "0", "velocity_noise": "0"},
@@ -81,7 +81,7 @@ def of_sets(settings: Sequence[Settings], sets: Sequence[str]) -> dict[str, Sett
     """
     found: dict[str, dict[str, set[str]]] = {}
     for one, place in zip(settings, sets, strict=True):
-        for name in one.keys() - {UNKNOWN, *_DATA}:
+        for name in one.keys() - {UNKNOWN, *DATA}:
             found.setdefault(name, {}).setdefault(place, set()).add(one[name])
     own = {
         name: {place: min(values) for place, values in by_set.items()}
@@ -93,41 +93,14 @@ def of_sets(settings: Sequence[Settings], sets: Sequence[str]) -> dict[str, Sett
     }
 
 
-def differences(
-    settings: list[Settings], corruption: list[str], setting: list[tuple], brief: bool = True
-) -> list[Parts]:
-    """Words for what differs among runs of one method, run by run.
+def differences(settings: list[Settings], brief: bool = True) -> list[str]:
+    """What differs among some settings: "max_k 1, steps 20"; nothing for a value that adds nothing.
 
     Args:
-        settings: of the runs, without those that go by the set.
-        corruption: the name of each run's corruption: other fields of it are told apart within one name.
-        setting: task, quality and corruption of each run: data are told apart within one setting.
+        settings: those that count, without what goes by the set.
         brief: whether a preset is named in place of the settings that it decides.
     """
-    of_corruption = corruption_settings()
-    columns = (
-        _by_scope(
-            settings, [None] * len(settings), lambda name: name not in of_corruption and name not in _DATA, brief
-        ),
-        _by_scope(settings, corruption, of_corruption.__contains__, brief),
-        _by_scope(settings, setting, _DATA.__contains__, brief),
-    )
-    return list(zip(*columns, strict=True))
-
-
-def _by_scope(settings: list[Settings], scope: Sequence[Any], wanted: Callable[[str], bool], brief: bool) -> list[str]:
-    """What differs of the wanted settings among runs of one scope, run by run."""
-    words = [""] * len(settings)
-    for key in dict.fromkeys(scope):
-        members = [number for number, other in enumerate(scope) if other == key]
-        for number, text in zip(members, _name([settings[i] for i in members], wanted, brief), strict=True):
-            words[number] = text
-    return words
-
-
-def _name(settings: list[Settings], wanted: Callable[[str], bool], brief: bool) -> list[str]:
-    """What differs among some settings: "max_k 1, steps 20"; nothing for a value that adds nothing."""
-    known = filter(wanted, dict.fromkeys(name for one in settings for name in one))
+    known = dict.fromkeys(name for one in settings for name in one)
     names = [name for name in known if _differs(settings, name)]
     # An option of a chosen part is not there without the part: naming the part says it all.
     everywhere = [name for name in names if all(_value(one, name) != _UNSET for one in settings)]
@@ -145,7 +118,7 @@ def _value(settings: Settings, name: str) -> str:
     """A value in words; none where an encoder does not say how it was pretrained."""
     if name in settings:
         return settings[name]
-    if name in _DATA:
+    if name in DATA:
         return _NOT_RECORDED
     return "" if UNKNOWN in settings or name == UNKNOWN else _UNSET
 
