@@ -22,7 +22,11 @@ from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, epis
 from vd4rl_pomdp.runs.files import Row, replacing_file
 from vd4rl_pomdp.runs.loop import Loop
 from vd4rl_pomdp.runs.metrics import EVALUATION
+from vd4rl_pomdp.runs.run import remedy
 from vd4rl_pomdp.tasks import TASKS
+
+POLICY = ("policy/config.json", "policy/model.safetensors")
+"""A policy's files, below the folder of its run."""
 
 
 @dataclass(frozen=True)
@@ -48,16 +52,24 @@ class Evaluations:
                 f"{self._rows}: lacks the evaluation at update {missing[0]}; restore it or start another run"
             )
 
+    def require_all(self) -> None:
+        """Raise UserError unless a finished run has the rows of its evaluations, the last one's played as trained."""
+        self.require(self.config.updates)
+        own = self.card.corruption["corruption"]
+        last = [row for row in read_episodes(self._rows) if row["step"] == self.config.updates]
+        if sum(row["evaluated_under"] == own for row in last) < self.config.eval_episodes:
+            raise UserError(f"{self._rows}: lacks rows of the last evaluation; {remedy(self.run)}")
+
     def drop_after(self, step: int) -> None:
         """Forget the rows of evaluations after a step."""
         drop_episodes_after(self._rows, step)
 
     def carry_out(self, step: int, algorithm: Algorithm | EndToEnd, loop: Loop) -> None:
-        """Evaluate the policy of a step, unless that is done, and log the scores.
+        """Evaluate the policy of a step, unless that is done and the policy there, and log the scores.
 
         Its checkpoint is kept: while it plays, a signal need not wait.
         """
-        if not self._at(step):
+        if not self._at(step) or not all((self.run / name).exists() for name in POLICY):
             with interrupt.at_once():
                 self.drop_after(step - 1)
                 self._play(step, algorithm)

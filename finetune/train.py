@@ -12,7 +12,7 @@ import torch
 from finetune.algorithms import ALGORITHMS, Algorithm
 from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd
-from finetune.evaluations import Evaluations, labels
+from finetune.evaluations import POLICY, Evaluations, labels
 from finetune.features import STAGE, ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories, HistoryOptions
 from finetune.path import DataPath
@@ -24,7 +24,7 @@ from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import refuse_number, refuse_outside
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import (
-    CONFIG,
+    FILES_OF_RUN,
     EncoderCard,
     copy_encoder,
     encoder_hash,
@@ -43,6 +43,9 @@ from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.tasks import TASKS
+
+RESULTS = (*POLICY, *FILES_OF_RUN)
+"""What a finished run holds, beside the rows of its evaluations."""
 
 
 def finetune(config: FinetuneConfig) -> RunFolder:
@@ -69,8 +72,10 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     check_n_step(config, dataset)
     card = replace(card, quality=dataset.quality or card.quality)  # the policy's set names its rows
     inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
-    run = RunFolder(config.out, STAGE, config, inputs)
-    if not run.finished:
+    run = RunFolder(config.out, STAGE, config, inputs, RESULTS)
+    if run.finished:
+        Evaluations(run.path, config, card, Reference()).require_all()
+    else:
         require_room(config, dataset, encoder, device, FeatureFile(run.path, inputs).exists)
     with run:
         if not run.finished:
@@ -193,7 +198,7 @@ class FinetuneTrainer:
 def _keep_encoder(config: FinetuneConfig, run: Path) -> None:
     """Copy the encoder into the run, so that the run can be evaluated wherever it is moved; its timing, too."""
     source = config.encoder
-    if (run / "encoder" / CONFIG).exists():
+    if all((run / name).exists() for name in FILES_OF_RUN):
         return
     timing = source.parent / "timing.json"
     if timing.exists():

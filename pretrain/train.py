@@ -14,7 +14,7 @@ from vd4rl_pomdp.corruptions import check_corruption_fits
 from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError, refuse_outside
-from vd4rl_pomdp.nn.encoder_folder import EncoderCard, save_encoder
+from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, EncoderCard, save_encoder
 from vd4rl_pomdp.objective import Objective
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.device import autocast, pick_device
@@ -52,7 +52,8 @@ def _pretrain(config: PretrainConfig) -> RunFolder:
     device = pick_device(config.device)
     if method.trained:
         require_batch(objective, device, config)
-    with RunFolder(config.out, STAGE, replace(config, task=task), {"data": dataset.fingerprint}) as run:
+    inputs = {"data": dataset.fingerprint}
+    with RunFolder(config.out, STAGE, replace(config, task=task), inputs, FILES_OF_RUN) as run:
         if not run.finished:
             trainer = PretrainTrainer(objective.to(device), dataset.to(device), config)
             trainer.run(run, config.steps if method.trained else 0)

@@ -25,6 +25,7 @@ from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.reference import Reference, action_error
 from vd4rl_pomdp.runs.episodes import LABELS, read_episodes
 from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.run import remedy
 from vd4rl_pomdp.runs.workers import run_jobs
 from vd4rl_pomdp.tasks import FRAME_SIZE, MOST_EPISODES, TASKS, Task
 
@@ -260,7 +261,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     labels = read_json(run / "labels.json")
     missing = [name for name in LABELS if not isinstance(labels.get(name), str | int)]
     if missing:
-        raise UserError(f"{run / 'labels.json'}: has no {missing[0]!r}; the command that made the run writes it anew")
+        raise UserError(f"{run / 'labels.json'}: has no {missing[0]!r}; {remedy(run)}")
     card = load_encoder(run / "encoder")[1]
     task = TASKS.named(card.task)
     chosen = own_and_none(CorruptionConfig.fill(card.corruption))

@@ -15,7 +15,7 @@ from pretrain.navigation.trainer import STAGE, NavigationTrainer, make_objective
 from pretrain.train import DECIDE_MEMORY, require_batch
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.navigation.methods import UNTRAINED
-from vd4rl_pomdp.nn.encoder_folder import EncoderCard, save_encoder
+from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, EncoderCard, save_encoder
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import jsonable, write_json
@@ -24,6 +24,9 @@ from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.seeding import seed_networks
+
+RESULTS = ("results.json", "trajectory.csv", *FILES_OF_RUN)
+"""What a finished run holds."""
 
 
 def train(config: NavigationConfig) -> RunFolder:
@@ -40,7 +43,7 @@ def _train(config: NavigationConfig) -> RunFolder:
     objective = make_objective(data, config)
     device = pick_device(config.device)
     require_batch(objective, device, config)
-    with RunFolder(config.out, STAGE, config, data.inputs) as run:
+    with RunFolder(config.out, STAGE, config, data.inputs, RESULTS) as run:
         if not run.finished:
             trainer = NavigationTrainer(objective.to(device), data.on(device), config)
             trainer.run(run, 0 if config.method == UNTRAINED else config.steps)

@@ -4,12 +4,14 @@ import csv
 import json
 import os
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from finetune.features import FrozenEncoder
+from finetune.train import RESULTS
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
@@ -212,6 +214,39 @@ def test_a_cut_run_whose_evaluations_are_gone_does_not_go_on(encoder, data, tmp_
         run_finetune(config)
     (config.out / "episodes.csv").write_text("".join(rows))
     assert run_finetune(config).finished
+
+
+@pytest.fixture
+def finished(encoder, data, tmp_path):
+    """A finished run that was evaluated twice, and its config."""
+    config = smoke_finetune(
+        encoder, data, tmp_path / "finished", eval_every=10, updates=20, batch_size=4, eval_length=2
+    )
+    return run_finetune(config).path, config
+
+
+@pytest.mark.parametrize("name", [*RESULTS, "episodes.csv"])
+def test_a_finished_run_that_lost_a_result_says_so_and_writes_it_anew(finished, tmp_path, name):
+    run = shutil.copytree(finished[0], tmp_path / "run")
+    config = replace(finished[1], out=run)
+    if name == "episodes.csv":
+        rows = (run / name).read_text().splitlines(keepends=True)
+        (run / name).write_text("".join(rows[:2]))  # of the first evaluation
+    else:
+        (run / name).unlink()
+    before = contents(run)
+    with pytest.raises(UserError, match=r"or remove .*timing\.json and start the run's command again"):
+        run_finetune(config)
+    assert contents(run) == before
+    (run / "timing.json").unlink()
+    assert contents(run_finetune(config).path) == contents(finished[0])
+
+
+def test_a_finished_run_without_its_earlier_evaluations_cannot_get_them_back(finished, tmp_path):
+    run = shutil.copytree(finished[0], tmp_path / "run")
+    (run / "episodes.csv").unlink()
+    with pytest.raises(UserError, match=r"episodes\.csv: lacks the evaluation at update 10; restore it"):
+        run_finetune(replace(finished[1], out=run))
 
 
 def test_a_run_that_an_earlier_version_began_goes_on_and_is_evaluated_clean_at_the_end(

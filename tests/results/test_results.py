@@ -69,6 +69,18 @@ def test_runs_are_there_once_and_stay_as_they_are(tmp_path, capsys):
     assert (tmp_path / "copy" / "runs.jsonl").read_bytes() == (tmp_path / "out" / "runs.jsonl").read_bytes()
 
 
+def test_a_run_that_lost_its_last_evaluation_is_not_told_of_by_the_one_before(tmp_path):
+    run = whole_run(tmp_path / "run")
+    write_json(run / "timing.json", {"seconds": 1.0, "updates": 10})
+    record = read_json(run / "config.json")
+    write_json(run / "config.json", record | {"config": record["config"] | {"eval_episodes": 1}})
+    assert read_run(run).finished
+    rows = (run / "episodes.csv").read_text().splitlines(keepends=True)
+    (run / "episodes.csv").write_text("".join(rows[:-1]))
+    with pytest.raises(UserError, match=r"has 0 of 1 episodes of the last evaluation; put it back, or remove"):
+        read_run(run)
+
+
 def test_a_diverged_run_is_a_result(tmp_path):
     run = whole_run(tmp_path / "runs/0")
     (run / "timing.json").unlink()

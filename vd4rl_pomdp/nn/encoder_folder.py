@@ -26,6 +26,8 @@ from vd4rl_pomdp.runs.provenance import git_commit
 from vd4rl_pomdp.runs.reading import build, parse_json, read_bytes, read_tensors
 
 WEIGHTS, CONFIG = "model.safetensors", "config.json"
+FILES_OF_RUN = (f"encoder/{CONFIG}", f"encoder/{WEIGHTS}")
+"""An encoder's files, below the folder of the run that made it."""
 
 
 def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard, frames: int | None = None) -> None:

@@ -24,6 +24,7 @@ from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_csv
 from vd4rl_pomdp.runs.identity import identity
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
+from vd4rl_pomdp.runs.run import remedy
 from vd4rl_pomdp.runs.settings import settings_of
 
 RUNS, EPISODES = "runs.jsonl", "episodes.csv"
@@ -112,8 +113,18 @@ def read_run(folder: Path) -> Result:
         losses = [(int(row["step"]), row["action_loss"]) for row in metrics if "action_loss" in row]
         run = Result("", folder, files, step, losses if files[RECORD]["stage"] == "pretrain" else [], rows, True)
         _check(run)
+        _check_last_evaluation(run)
         files["labels"] = files.get("labels", {}) | _labels(run)
         return replace(run, id=_id(run))
+
+
+def _check_last_evaluation(run: Result) -> None:
+    """Raise UserError if a finished fine-tuning's folder lacks episodes of its last evaluation."""
+    last, episodes = run.files.get("timing", {}).get("updates"), run.record["config"].get("eval_episodes")
+    found = [row for row in run.rows if row["step"] == last and row["evaluated_under"] == row["corruption"]]
+    if last is not None and episodes is not None and len(found) < episodes:
+        what = f"{len(found)} of {episodes} episodes of the last evaluation"
+        raise UserError(f"{run.path / EPISODES}: has {what}; {remedy(run.path)}")
 
 
 def _labels(run: Result) -> dict[str, Any]:
@@ -123,7 +134,7 @@ def _labels(run: Result) -> dict[str, Any]:
         missing = [name for name in LABELS if name not in known]
         if missing:
             place = run.path / FILES["labels"]
-            raise UserError(f"{place}: has no {missing[0]!r}; start the same command again, which writes it anew")
+            raise UserError(f"{place}: has no {missing[0]!r}; {remedy(run.path)}")
         return {name: known[name] for name in LABELS}
     told = {"method": run.path.name, "task": run.encoder.get("task"), "quality": run.encoder.get("quality")}
     told |= run.record["config"]

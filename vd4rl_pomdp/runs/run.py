@@ -7,7 +7,7 @@ interrupted or not. One process owns the folder at a time.
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
 from types import TracebackType
@@ -27,6 +27,14 @@ from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS
 DIVERGED = "diverged.json"
 
 
+def remedy(folder: Path) -> str:
+    """What to do about a result of a finished run that is lost or damaged."""
+    return (
+        f"put it back, or remove {folder / 'timing.json'} and start the run's command again: it goes on from the last "
+        "checkpoint and writes it anew"
+    )
+
+
 def collection_of(data: Path) -> dict[str, Any]:
     """How a set was collected, which says more than its fingerprint where it is not at hand; empty for foreign sets."""
     return read_json(data / PLAN) if (data / PLAN).exists() else {}
@@ -35,7 +43,9 @@ def collection_of(data: Path) -> dict[str, Any]:
 class RunFolder:
     """A run's files; `with` begins the run or goes on with it, owns its folder meanwhile, and answers signals."""
 
-    def __init__(self, path: Path, stage: str, config: Any, inputs: dict[str, str]) -> None:
+    def __init__(
+        self, path: Path, stage: str, config: Any, inputs: dict[str, str], results: Sequence[str] = ()
+    ) -> None:
         """Nothing is written yet.
 
         Args:
@@ -43,9 +53,11 @@ class RunFolder:
             stage: the stage's name.
             config: the stage's settings, a dataclass.
             inputs: hashes of what the run reads, by name: the data's fingerprint, the encoder's hash.
+            results: files that a finished run holds.
 
         Raises:
-            UserError: the folder holds something else, or a run with other settings, inputs or of another format.
+            UserError: the folder holds something else, a run with other settings, inputs or of another format, or one
+                that was finished and has lost a result.
         """
         self.path = path
         self.config: dict[str, Any] = jsonable(flat(config))
@@ -55,6 +67,7 @@ class RunFolder:
         self._started, self._before = time.monotonic(), 0.0
         self._stack = ExitStack()
         self._owner: Owner | None = None
+        self._results = results
         self._check()
 
     def _check(self) -> None:
@@ -77,6 +90,9 @@ class RunFolder:
             what = ", ".join(differing) or f"stage {stored['stage']}"
             raise UserError(f"{self.path}: holds a run with another config ({what}); choose another --out or remove it")
         self._check_inputs(inputs)
+        lost = next((name for name in self._results if self.finished and not (self.path / name).exists()), None)
+        if lost:
+            raise UserError(f"{self.path / lost}: is gone; {remedy(self.path)}")
 
     def _check_inputs(self, old: dict[str, str]) -> None:
         """Raise UserError if data or encoder are others than those the run began with."""
