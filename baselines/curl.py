@@ -29,7 +29,7 @@ from torch import Tensor, nn
 
 from vd4rl_pomdp.augmentation import random_shift
 from vd4rl_pomdp.nn.action_target import ActionTarget
-from vd4rl_pomdp.nn.contrastive import info_nce
+from vd4rl_pomdp.nn.contrastive import info_nce, share_found
 from vd4rl_pomdp.nn.draws import Draws
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.heads import move_target
@@ -61,8 +61,7 @@ class CURL(Objective):
         group = torch.arange(batch, device=query.device)[:, None].expand(-1, rows)[real]
         scores = query[real] @ self.bilinear @ positive[real].T
         loss = info_nce(scores, group)
-        right = (scores.argmax(1) == torch.arange(len(scores), device=scores.device)).float().mean()
-        return loss, {"loss": loss.detach(), "accuracy": right}
+        return loss, {"loss": loss.detach(), "accuracy": share_found(scores, group)}
 
     def after_step(self) -> None:
         """Move the momentum encoder."""

@@ -133,6 +133,9 @@ class PretrainTrainer:
 def check_config(config: PretrainConfig) -> None:
     """Refuse settings that cannot work, before anything is read or written."""
     config.check()
+    least = METHODS.named(config.method).least_batch
+    if config.batch_size < least:
+        raise UserError(f"--batch-size is {config.batch_size}; {config.method} tells windows apart: give it {least}")
     check_pictures(config, FRAME_SIZES[1])
 
 

@@ -44,6 +44,8 @@ class Method:
     """Whether it is given the simulator state in place of pixels."""
     regresses_state: bool = False
     """Whether its loss, and nothing else of it, is told the simulator states: its windows are `StateWindows`."""
+    least_batch: int = 1
+    """Windows that a batch holds at least: 2 where a loss tells those of one window from those of another."""
     options: type[Options] = Options
     """Class of its options."""
     summary: str = ""
@@ -96,9 +98,12 @@ _OWN = {
     "one_step_inverse": Method(
         OneStepInverse, options=ActionOptions, summary="inverse model on the observations t and t+1"
     ),
-    "curl": Method(CURL, shift="own", summary="contrastive: two augmentations of one observation find each other"),
+    "curl": Method(
+        CURL, shift="own", least_batch=2, summary="contrastive: two augmentations of one observation find each other"
+    ),
     "driml": Method(
         DRIML,
+        least_batch=2,
         shift="observation",
         options=DRIMLOptions,
         summary="contrastive: (s_t, a_t) finds s_{t+k}, globally and by place",

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from baselines import CURL, DRIML, HOMER, DRIMLOptions, HOMEROptions
-from vd4rl_pomdp.nn.contrastive import info_nce
+from vd4rl_pomdp.nn.contrastive import info_nce, share_found
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.types import Windows
@@ -104,6 +104,12 @@ def test_info_nce_of_independent_views_is_log_n_and_of_equal_views_far_less():
         last[name] = sum(losses[-50:]) / 50
     assert last["independent"] == pytest.approx(math.log(n), abs=0.03)
     assert last["equal"] < 0.3 * math.log(n)
+
+
+def test_an_anchor_is_found_if_its_own_candidate_is_above_all_negatives():
+    scores = torch.tensor([[1.0, 2.0, 0.0], [0.0, 1.0, 0.0], [2.0, 0.0, 1.0]])
+    assert share_found(scores).item() == pytest.approx(1 / 3)
+    assert share_found(scores, torch.tensor([0, 0, 1])).item() == pytest.approx(2 / 3), "row 1 is no negative of row 0"
 
 
 def test_candidates_of_the_anchors_own_group_are_no_negatives():

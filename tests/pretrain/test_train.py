@@ -55,6 +55,13 @@ def test_another_config_in_the_same_folder_is_refused_and_nothing_is_lost(data, 
     assert contents(tmp_path / "run") == before
 
 
+@pytest.mark.parametrize("method", ["curl", "driml"])
+def test_a_loss_that_tells_windows_apart_wants_two_of_them(data, tmp_path, method):
+    with pytest.raises(UserError, match=f"--batch-size is 1; {method} tells windows apart: give it 2"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "out", method=method, batch_size=1))
+    assert not (tmp_path / "out").exists()
+
+
 def test_user_slips_are_one_line(data, tmp_path):
     with pytest.raises(UserError, match=r"unknown method 'mikado'.*mik\+a"):
         run_pretrain(smoke_pretrain(data, tmp_path / "a", method="mikado"))
