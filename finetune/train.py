@@ -127,8 +127,10 @@ def _cached(features: torch.Tensor, dataset: Dataset, number: int) -> torch.Tens
 
 
 def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
-    """Write how well the first view tells the simulator state, where the set stores it."""
-    if dataset.physics is None or dataset.task is None or (run.path / "probe.json").exists():
+    """Write how well the first view tells the simulator state, if the set stores it and has an episode to hold out."""
+    if dataset.physics is None or dataset.task is None or dataset.num_episodes < 2:
+        return
+    if (run.path / "probe.json").exists():
         return
     arrays = features[0, : dataset.num_rows].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
     errors = probe_state(*arrays, layout_of(TASKS.named(dataset.task)))

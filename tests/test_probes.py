@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 
 from vd4rl_pomdp.envs.rendering import suite
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.probes import probe_error, probe_state
 from vd4rl_pomdp.tasks import TASKS
 
@@ -52,3 +53,8 @@ def test_knowing_nothing_scores_the_mean_deviation_over_the_standard_deviation()
         (RNG.choice([-3.0, 5.0], 20_000), 100.0),
     ):
         assert probe_error(nothing, targets[:, None], episode) == pytest.approx(score, abs=2)
+
+
+def test_one_episode_alone_has_none_to_be_tested_on():
+    with pytest.raises(UserError, match="one alone is too few"):
+        probe_error(RNG.normal(size=(20, 3)), RNG.normal(size=(20, 2)), np.zeros(20, int))

@@ -6,6 +6,7 @@ import numpy as np
 from sklearn.linear_model import Ridge
 from sklearn.preprocessing import StandardScaler
 
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import Layout
 
 HELD_OUT = 5
@@ -22,8 +23,13 @@ def probe_error(features: np.ndarray, targets: np.ndarray, episode: np.ndarray) 
     Args:
         features: (N, D) representations.
         targets: (N, P) state variables; constant ones are left out (all constant: the error is 0).
-        episode: (N,) episode of every row. Every fifth episode is held out, the others are fitted.
+        episode: (N,) episode of every row, two at least. Every fifth episode is held out, the others are fitted.
+
+    Raises:
+        UserError: one episode alone.
     """
+    if episode.max() == 0:
+        raise UserError("a probe fits some episodes and is tested on others: one alone is too few")
     held_out = episode % HELD_OUT == HELD_OUT - 1 if episode.max() >= HELD_OUT - 1 else episode == episode.max()
     scale = StandardScaler().fit(targets[~held_out])
     varying = scale.var_ > 1e-10

@@ -91,6 +91,13 @@ def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_th
         run_pretrain(smoke_pretrain(data, tmp_path / "gru", method="drq_bc", history="gru"))
 
 
+def test_a_set_of_one_episode_is_learned_from_without_a_probe(encoder, tmp_path):
+    one = write_fake_set(tmp_path / "one" / "walker_walk" / "expert", [20], physics_dim=18)
+    run = run_finetune(smoke_finetune(encoder, one, tmp_path / "out", updates=2, batch_size=4, eval_length=2))
+    assert run.finished
+    assert not (run.path / "probe.json").exists()
+
+
 def test_user_slips_are_one_line(data, encoder, tmp_path):
     with pytest.raises(UserError, match="unknown algorithm"):
         run_finetune(smoke_finetune(encoder, data, tmp_path / "c", algorithm="ppo"))
