@@ -106,7 +106,6 @@ class Evaluations:
             EpisodeJob(
                 encoder=self.run / "encoder",
                 policy=self.run / "policy",
-                version=step,
                 task=task,
                 corruption=corruption,
                 episode=episode,

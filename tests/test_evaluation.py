@@ -83,7 +83,7 @@ def agent(tmp_path) -> tuple[Encoder, Policy]:
 
 def play(folder: Path, *episodes: int, actor: Path | None = None) -> list[evaluation.Episode]:
     job = EpisodeJob(
-        folder / "encoder", folder / "policy", 0, TASKS["walker_walk"], CorruptionConfig.of("patch"), 0, film=False
+        folder / "encoder", folder / "policy", TASKS["walker_walk"], CorruptionConfig.of("patch"), 0, film=False
     )
     return evaluate([replace(job, episode=episode, actor=actor) for episode in episodes], workers=1)
 
@@ -105,6 +105,17 @@ def test_actions_are_the_policys_on_what_was_seen_and_done_in_the_episode(world,
         with torch.no_grad():
             torch.testing.assert_close(policy(encoder.encode(window)), action, atol=1e-5, rtol=1e-4)
     assert np.abs(np.diff(world[0].done, axis=1)).max() > 1e-3, "the policy reads something"
+
+
+def test_a_policy_that_was_written_anew_is_the_one_that_plays(world, agent, tmp_path):
+    play(tmp_path, 0)
+    torch.manual_seed(1)
+    Policy(8, 6, 8).save(tmp_path / "policy")
+    play(tmp_path, 0)
+    assert not np.allclose(world[0].done[0], world[0].done[1])
+    (tmp_path / "policy" / "config.json").unlink()
+    with pytest.raises(UserError, match=r"policy.config\.json: cannot be read as JSON"):
+        play(tmp_path, 0)
 
 
 def test_an_episode_does_not_depend_on_those_before_it(world, agent, tmp_path, monkeypatch):

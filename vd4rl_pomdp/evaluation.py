@@ -18,7 +18,7 @@ from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.encoder_folder import load_encoder
+from vd4rl_pomdp.nn.encoder_folder import encoder_hash, load_encoder
 from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.nn.policy import Policy, load_policy
 from vd4rl_pomdp.policies.actor import Actor, read_actor
@@ -77,8 +77,6 @@ class EpisodeJob:
 
     encoder: Path
     policy: Path
-    version: int
-    """Changes when the policy folder was written anew."""
     task: Task
     """Itself and not its name: a task of one's own need not be registered where the job is done."""
     corruption: CorruptionConfig
@@ -147,19 +145,28 @@ def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[s
 
 
 _AGENTS: dict[tuple, Agent] = {}
+"""The agent of the last episode, by what its folders hold."""
 _ENVIRONMENTS: dict[tuple, CorruptedEnv] = {}
 
 
 def _run_episode(job: EpisodeJob) -> Episode:
-    key = (job.encoder, job.policy, job.version)
-    if key not in _AGENTS:
-        _AGENTS.clear()
-        _AGENTS[key] = Agent(load_encoder(job.encoder)[0], load_policy(job.policy))
-    agent = _AGENTS[key]
+    agent = _agent(job)
     place = (job.task, job.corruption, job.render, job.length, agent.picture_size, _draws(agent, job))
     if place not in _ENVIRONMENTS:
         _ENVIRONMENTS[place] = CorruptedEnv(*place)
     return _play(agent, _ENVIRONMENTS[place], job)
+
+
+def _agent(job: EpisodeJob) -> Agent:
+    """The one of a job; kept as long as its folders hold the same."""
+    try:
+        key = encoder_hash(job.encoder), encoder_hash(job.policy)  # whose files have the same names
+    except FileNotFoundError:
+        key = ("", "")  # loading says what is missing
+    if key not in _AGENTS:
+        _AGENTS.clear()
+        _AGENTS[key] = Agent(load_encoder(job.encoder)[0], load_policy(job.policy))
+    return _AGENTS[key]
 
 
 def _draws(agent: Agent, job: EpisodeJob) -> Drawn:
@@ -271,7 +278,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
         one.check()
     actor = Reference.read(run).actor_file
     jobs = [
-        EpisodeJob(run / "encoder", run / "policy", 0, task, one, episode, film=False, actor=actor)
+        EpisodeJob(run / "encoder", run / "policy", task, one, episode, film=False, actor=actor)
         for one in chosen
         for episode in range(episodes)
     ]

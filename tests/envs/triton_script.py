@@ -43,7 +43,7 @@ def stages() -> None:
     shape = {"eval_episodes": 2, "eval_length": 4, "workers": 1}
     finetune(FinetuneConfig.of("smoke", encoder=encoder, data=data, out=Path("finetune"), **shape))
     job = EpisodeJob(
-        encoder, Path("finetune/policy"), 0, TASKS["walker_walk"], CorruptionConfig(), 0, film=False, length=4
+        encoder, Path("finetune/policy"), TASKS["walker_walk"], CorruptionConfig(), 0, film=False, length=4
     )
     assert len(evaluate([job], workers=1)[0].rewards) == 4
 

@@ -136,7 +136,7 @@ def test_evaluation_repeats_whatever_the_number_of_workers(noisy, with_states, t
 
     def totals(encoder: Path, workers: int) -> list[float]:
         places = encoder, tmp_path / "policy"
-        jobs = [EpisodeJob(*places, 0, WALKER, corruption, e, film=False, length=6) for e in (0, 1)]
+        jobs = [EpisodeJob(*places, WALKER, corruption, e, film=False, length=6) for e in (0, 1)]
         return [episode.total for episode in evaluate(jobs, workers)]
 
     alone = totals(noisy, 1)
