@@ -154,6 +154,54 @@ def test_runs_are_added_to_an_earlier_report_and_none_is_lost(runs, tmp_path):
     assert [run.trajectory is None for run in loaded(out)].count(True) == 1, "the report alone keeps trajectories"
 
 
+def tell_set(run: Path, rows: int, **changed) -> None:
+    """Let a run say that its set has trajectories of so many rows, and other facts."""
+    record, results = (json.loads((run / name).read_text()) for name in ("config.json", "results.json"))
+    record["collection"] = {"maze": results["maze"], "trajectories": 300, "trajectory_rows": rows, "seed": 0} | changed
+    (run / "config.json").write_text(json.dumps(record))
+    (run / "results.json").write_text(json.dumps(results | {"set": f"set of {rows} rows"}))
+
+
+def test_samples_and_commands_are_those_of_the_runs_own_sets(tmp_path):
+    tell_set(write_run(tmp_path / "runs", Condition("compass_first_person", "mik+a"), 0, 1.0), 1000, seed=5)
+    tell_set(write_run(tmp_path / "runs", Condition("no_curtain", "mik+a"), 0, 1.0), 500)
+    untold = write_run(tmp_path / "runs", Condition("one_curtain", "mik+a"), 0, 1.0)
+    record = json.loads((untold / "config.json").read_text())
+    (untold / "config.json").write_text(json.dumps(record | {"collection": {}}))
+    page = write_report([tmp_path / "runs"], tmp_path / "out").read_text()
+    assert "on 150,000 or 300,000 samples" in page
+    collect = "vd4rl-pomdp navigation collect --preset cpu --maze"
+    assert f"{collect} compass_first_person --trajectories 300 --seed 5 --out data/compass_first_person\n" in page
+    assert f"{collect} no_curtain --trajectories 300 --trajectory-rows 500 --out data/no_curtain\n" in page
+    assert f"{collect} one_curtain" not in page
+
+
+def test_what_was_not_trained_alike_is_said(tmp_path):
+    alike = [write_run(tmp_path / "runs", Condition("no_curtain", method), 0, 1.0) for method in ("mik+a", "fj", "ah")]
+    longer = write_run(tmp_path / "runs", Condition("no_curtain", "no_history"), 0, 1.0)
+    write_run(tmp_path / "runs", Condition("no_curtain", "mik+a", self_prediction=True), 0, 1.0)
+    untrained = write_run(tmp_path / "runs", Condition("no_curtain", "random"), 0, 1.0)
+    (untrained / "timing.json").write_text(json.dumps({"steps": 0, "seconds": 1.0}))
+    write_report([tmp_path / "runs"], tmp_path / "out")
+    assert "Not alike" not in (tmp_path / "out" / "README.md").read_text(), "self-prediction and no training are told"
+    (longer / "timing.json").write_text(json.dumps({"steps": 9000, "seconds": 300.0}))
+    for run in (*alike, untrained):
+        tell_set(run, 1000)
+    page = write_report([tmp_path / "runs"], tmp_path / "out").read_text()
+    assert "Not alike in `no_curtain`: steps is 2500, but 9000 in `no_history-K15`." in page
+    assert "set is set of 1, but f00 in `mik+a-K15-sp`, `no_history-K15`." in page
+
+
+def test_every_condition_is_in_a_table_and_untrained_ones_alone_make_a_page(tmp_path):
+    write_run(tmp_path / "runs", Condition("no_curtain", "random"), 0, 41.5)
+    page = write_report([tmp_path / "runs"], tmp_path / "out").read_text()
+    assert "Budget: 2,500 gradient steps" in page
+    assert "no other table" not in page
+    write_run(tmp_path / "runs", Condition("no_curtain", "acro", 8), 0, 37.5)
+    page = write_report([tmp_path / "runs"], tmp_path / "out").read_text()
+    assert "| acro-K8 | **37.5** n=1 |" in page.partition("## State estimation errors of what no other table has")[2]
+
+
 def test_damaged_reports_and_runs_are_named(runs, tmp_path):
     whole = tmp_path / "whole"
     write_report([runs], whole)

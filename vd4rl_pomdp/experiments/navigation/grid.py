@@ -24,10 +24,15 @@ class Condition:
     @property
     def name(self) -> str:
         """Folder of the condition's runs."""
+        return f"{self.maze}/{self.short}"
+
+    @property
+    def short(self) -> str:
+        """Its name without the maze."""
         parts = [self.method, f"K{self.max_k}"]
-        for flag, short in (("self_prediction", "sp"), ("exogenous", "exo"), ("literal_future", "literal")):
-            parts += [short] if getattr(self, flag) else []
-        return f"{self.maze}/{'-'.join(parts)}"
+        for flag, word in (("self_prediction", "sp"), ("exogenous", "exo"), ("literal_future", "literal")):
+            parts += [word] if getattr(self, flag) else []
+        return "-".join(parts)
 
 
 def paper_rows() -> list[dict[str, str]]:

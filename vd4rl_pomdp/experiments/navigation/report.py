@@ -87,6 +87,7 @@ def _page(runs: list[NavigationRun], unfinished: list[Result], tables: list[Tabl
     lines += [
         f"Runs: {len(runs)}. Preset: {code(preset)}. Seeds: {', '.join(map(str, seeds))}. {_budget(runs)}",
         "",
+        *_unlike(runs),
         *_variants(runs),
         *(f"Unfinished, in no table: {code(str(result.path))} {progress(result)}.  " for result in unfinished),
         *([""] if unfinished else []),
@@ -132,16 +133,52 @@ def _variants(runs: list[NavigationRun]) -> list[str]:
 
 def _budget(runs: list[NavigationRun]) -> str:
     """What the runs cost, and where."""
-    trained = [run for run in runs if run.condition.method != UNTRAINED]
+    trained = [run for run in runs if run.condition.method != UNTRAINED] or runs
     steps = " or ".join(f"{count:,}" for count in sorted({int(run.facts["steps"]) for run in trained}))
     minutes = [float(run.facts["seconds"]) / 60 for run in trained]
     machines = markdown("; ".join(sorted({run.facts["gpu"] or f"{run.facts['processor']}, no GPU" for run in runs})))
-    data = PRESETS[runs[0].preset]
+    samples = " or ".join(f"{count:,}" for count in sorted({_samples(run) for run in runs} - {0})) or "unknown"
     return (
-        f"Budget: {steps} gradient steps on {data.trajectories * data.trajectory_rows:,} samples, "
+        f"Budget: {steps} gradient steps on {samples} samples, "
         f"{min(minutes, default=0):.0f} to {max(minutes, default=0):.0f} minutes a run ({machines}). "
         "The paper's: 200,000 steps on 500,000 samples."
     )
+
+
+def _samples(run: NavigationRun) -> int:
+    """Rows of its set; 0 if nothing tells how that was made."""
+    made = run.collection
+    return made["trajectories"] * made["trajectory_rows"] if made else 0
+
+
+def _unlike(runs: list[NavigationRun]) -> list[str]:
+    """What runs on one maze differ in beside what tells them apart: a sentence a setting."""
+    lines = []
+    for maze, members in _by_maze(runs).items():
+        for name in dict.fromkeys(name for run in members for name in run.settings):
+            where: dict[str, dict[str, None]] = {}
+            for run in members:
+                if not _is_without(run, name):
+                    value = run.settings.get(name, "the preset's")
+                    where.setdefault(value[:8] if name == "set" else value, {})[code(run.condition.short)] = None
+            if len(where) > 1:
+                usual = max(where, key=lambda value: len(where[value]))
+                others = "; ".join(f"{value} in {', '.join(who)}" for value, who in where.items() if value != usual)
+                lines.append(f"Not alike in {code(maze)}: {name} is {usual}, but {others}.  ")
+    return [*lines, ""] if lines else []
+
+
+def _is_without(run: NavigationRun, setting: str) -> bool:
+    """Whether a run does not do what a setting is about."""
+    if setting == "steps":
+        return run.condition.method == UNTRAINED
+    return not getattr(run.condition, setting, True)
+
+
+def _by_maze(runs: list[NavigationRun]) -> dict[str, list[NavigationRun]]:
+    return {
+        maze: [run for run in runs if run.condition.maze == maze] for maze in {r.condition.maze: None for r in runs}
+    }
 
 
 def _commands(runs: list[NavigationRun]) -> list[str]:
@@ -152,13 +189,19 @@ def _commands(runs: list[NavigationRun]) -> list[str]:
         "Each line computes one run; `navigation collect` makes its data. Seconds are wall-clock.",
         "`vd4rl-pomdp sweep run navigation --out runs/navigation --dry-run` prints those of every cell.",
     ]
-    commands = []
-    for maze in dict.fromkeys(run.condition.maze for run in runs):
-        data = {
-            flags_of(run.facts["command"]).get("data", f"data/{maze}") for run in runs if run.condition.maze == maze
-        }
-        collect = f"vd4rl-pomdp navigation collect --preset {runs[0].preset} --maze {maze} --out"
-        commands += [f"{collect} {shlex.quote(folder)}" for folder in sorted(data)]
+    commands = [line for members in _by_maze(runs).values() for line in sorted(set(map(_collect, members))) if line]
     for run in runs:
         commands.append(f"{run.facts['command']}  # {float(run.facts['seconds']):.0f} s")
     return [*lines, "", *code_block(commands, "bash")]
+
+
+def _collect(run: NavigationRun) -> str:
+    """The command that makes its set, with what differs from the preset; "" if nothing tells how that was made."""
+    maze, made, usual = run.condition.maze, run.collection, PRESETS[run.preset]
+    if not made:
+        return ""
+    words = ["vd4rl-pomdp", "navigation", "collect", "--preset", run.preset, "--maze", maze]
+    for name, value in made.items():
+        if name != "maze" and value != getattr(usual, name):
+            words += [f"--{name.replace('_', '-')}", str(value)]
+    return shlex.join([*words, "--out", flags_of(run.facts["command"]).get("data", f"data/{maze}")])

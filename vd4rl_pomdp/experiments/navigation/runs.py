@@ -16,6 +16,7 @@ import numpy as np
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.grid import Condition
+from vd4rl_pomdp.navigation.config import PRESETS
 from vd4rl_pomdp.navigation.measures import Measure, measure_of, measure_rows
 from vd4rl_pomdp.results import Result, find_results, refuse_loss, write_results
 from vd4rl_pomdp.runs.files import write_csv
@@ -61,6 +62,12 @@ class NavigationRun:
         return facts | settings_of(
             {k: v for k, v in flags_of(self.facts["command"]).items() if k not in named | {*facts}}
         )
+
+    @property
+    def collection(self) -> dict[str, Any]:
+        """How its set was made; early runs, which do not tell, took their preset's; {} if the set does not tell."""
+        usual = {name: getattr(PRESETS[self.preset], name) for name in ("trajectories", "trajectory_rows")}
+        return self.result.record.get("collection", usual)
 
     @property
     def file_name(self) -> str:

@@ -1,9 +1,9 @@
-"""The tables of the navigation report: the paper's, each number beside its own where units agree, and three more."""
+"""The tables of the navigation report: the paper's, each number beside its own where units agree, and four more."""
 
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import groupby
 from pathlib import Path
 from typing import Any
@@ -40,6 +40,7 @@ _TITLES = {
     "references": "References: untrained, trained on the true states, and MIK+A whose future holds a_{t+k-1}",
     "hidden": "Errors on steps that a curtain hides, K = 15",
     "by_k": "Action losses (nats x 100) by k, K = 15",
+    "others": "State estimation errors of what no other table has",
 }
 _PAPER_TABLES = tuple(_TITLES)[:7]
 _MAIN_TEXT = ("no_curtain", "three_curtains")
@@ -97,7 +98,7 @@ class Table:
 
 
 def make_tables(runs: list[NavigationRun]) -> list[Table]:
-    """The paper's six tables (position and velocity are one of them), then three of our own."""
+    """The paper's six tables (position and velocity are one of them), then four of our own."""
     tables = []
     for name in _PAPER_TABLES:
         for protocol, (split, probe) in (_LOSS_PROTOCOLS if name == "action_loss" else PROTOCOLS).items():
@@ -105,7 +106,8 @@ def make_tables(runs: list[NavigationRun]) -> list[Table]:
                 tables.append(_paper_table(name, protocol, split, probe, raw, runs))
     for make in (_references_table, _hidden_table):
         tables += [make(raw, runs) for raw in (False, True)]
-    return [*tables, _by_k_table(runs)]
+    others = _others(runs)
+    return [*tables, _by_k_table(runs), *(_others_table(others, raw, runs) for raw in (False, True) if others)]
 
 
 def _mazes(runs: list[NavigationRun], raw: bool = False) -> tuple[str, ...]:
@@ -159,6 +161,20 @@ def _hidden_table(raw: bool, runs: list[NavigationRun]) -> Table:
             measure = _refitted(component, raw, rows="hidden")
             rows.append((f"{method}, {component}", [_entry(Condition(maze, method), measure, runs) for maze in mazes]))
     return Table("hidden", _in_units(_REFITTED, raw), mazes, rows)
+
+
+def _others(runs: list[NavigationRun]) -> list[Condition]:
+    """Conditions, without their mazes, that neither the paper nor the references have."""
+    told = [condition_of(line, "") for line in paper_rows()]
+    told += [*(Condition("", method) for method in REFERENCES), Condition("", "mik+a", 1, literal_future=True)]
+    return [found for found in dict.fromkeys(replace(run.condition, maze="") for run in runs) if found not in told]
+
+
+def _others_table(others: list[Condition], raw: bool, runs: list[NavigationRun]) -> Table:
+    """State errors of conditions that no other table has."""
+    mazes, measure = _mazes(runs, raw), _refitted("state", raw)
+    rows = [(one.short, [_entry(replace(one, maze=maze), measure, runs) for maze in mazes]) for one in others]
+    return Table("others", _in_units(_REFITTED, raw), mazes, rows)
 
 
 def _refitted(component: str, raw: bool, rows: str = "all") -> Measure:
