@@ -65,14 +65,17 @@ class Evaluations:
         drop_episodes_after(self._rows, step)
 
     def carry_out(self, step: int, algorithm: Algorithm | EndToEnd, loop: Loop) -> None:
-        """Evaluate the policy of a step, unless that is done and the policy there, and log the scores.
+        """Keep the policy of a step, evaluate it, unless that is done, and log the scores.
 
         Its checkpoint is kept: while it plays, a signal need not wait.
+
+        Raises:
+            FloatingPointError: a weight is not finite.
         """
-        if not self._at(step) or not all((self.run / name).exists() for name in POLICY):
-            with interrupt.at_once():
-                self.drop_after(step - 1)
-                self._play(step, algorithm)
+        with interrupt.at_once():
+            self._keep(step, algorithm)
+            if not self._at(step):
+                self._play(step, loop)
         row = scores_by_corruption(self._at(step))
         loop.log_evaluation(row)
         loop.show(score=row[f"{EVALUATION}score/{self._under(step)[0].corruption}"])
@@ -88,12 +91,20 @@ class Evaluations:
         clean = self.config.eval_clean and step == self.config.updates
         return own_and_none(own) if clean else [own]
 
-    def _play(self, step: int, algorithm: Algorithm | EndToEnd) -> None:
-        """Keep a film of the first episode, then append the rows of all."""
+    def _keep(self, step: int, algorithm: Algorithm | EndToEnd) -> None:
+        """Write the policy, with the encoder if that was trained along."""
+        for part in [algorithm.policy] + ([algorithm.encoder] if isinstance(algorithm, EndToEnd) else []):
+            if not all(weights.isfinite().all() for weights in part.parameters()):
+                raise FloatingPointError(f"{self.run}: the policy's weights are not finite after update {step}")
         algorithm.policy.save(self.run / "policy")
         if isinstance(algorithm, EndToEnd):
             save_encoder(self.run / "encoder", algorithm.encoder, self.card)
+
+    def _play(self, step: int, loop: Loop) -> None:
+        """Keep a film of the first episode, then append the rows of all."""
+        self.drop_after(step - 1)
         episodes = evaluate(self._jobs(step), self.config.workers)
+        loop.require_owner()  # whoever took the run over meanwhile has rows of its own
         rows = episode_rows(episodes, labels(self.config, self.card) | {"step": step})
         if episodes[0].film is not None:
             with replacing_file(self.run / "film.npz") as fresh, fresh.open("wb") as file:

@@ -29,7 +29,7 @@ class HistoryOptions(Options):
     readout: Readout = "state"
     """What the policy is given: state (s_t), frame (e(o_t) alone) or frame+state (both)."""
     history_window: int = 0
-    """Rows that a state is computed from, in training and in evaluation; 0: as the encoder was pretrained."""
+    """Rows that a state is computed from, in training and in evaluation; 0: as the encoder's own config has it."""
     random_histories: float = 0.0
     """Share of the transitions whose history begins at a random row, and not with the episode."""
     shortest_history: int = 2

@@ -15,7 +15,7 @@ from vd4rl_pomdp.policies.actor import Actor
 from vd4rl_pomdp.tasks import TASKS, DMCTask
 
 EPISODES = 20
-"""Episodes that the error is measured on, evenly spaced in the set."""
+"""Episodes that the error is measured on, evenly spaced among those of a set that hold a decision."""
 
 
 class DataPath:
@@ -33,8 +33,10 @@ class DataPath:
 
     def action_error(self, policy: Policy) -> float:
         """Mean, over all decisions, of the mean squared difference from the actor's mean action."""
-        last = self._dataset.num_episodes - 1
-        numbers = np.unique(np.linspace(0, last, min(last + 1, EPISODES)).astype(int))
+        rows = (self._dataset.episode_end - self._dataset.episode_start).cpu().numpy()
+        deciding = np.flatnonzero(rows > 1)
+        last = len(deciding) - 1
+        numbers = deciding[np.unique(np.linspace(0, last, min(last + 1, EPISODES)).astype(int))]
         return float(np.concatenate([self._errors(policy, int(number)) for number in numbers]).mean())
 
     @torch.no_grad()

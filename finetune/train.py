@@ -42,7 +42,7 @@ from vd4rl_pomdp.runs.memory import telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.tasks import TASKS
+from vd4rl_pomdp.tasks import TASKS, UNKNOWN_QUALITY
 
 RESULTS = (*POLICY, *FILES_OF_RUN)
 """What a finished run holds, beside the rows of its evaluations."""
@@ -70,7 +70,8 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     if encoder.reads_state:
         dataset.require_states()
     check_n_step(config, dataset)
-    card = replace(card, quality=dataset.quality or card.quality)  # the policy's set names its rows
+    untold = card.quality if card.data == dataset.fingerprint else UNKNOWN_QUALITY
+    card = replace(card, quality=dataset.quality or untold)  # the policy's set names its rows
     inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
     run = RunFolder(config.out, STAGE, config, inputs, RESULTS)
     if run.finished:
@@ -131,6 +132,7 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     if dataset.physics is None or dataset.task is None or dataset.num_episodes < 2:
         return
     if (run.path / "probe.json").exists():
+        tell_probe(run.path / "encoder", read_json(run.path / "probe.json"))
         return
     arrays = features[0, : dataset.num_rows].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
     errors = probe_state(*arrays, layout_of(TASKS.named(dataset.task)))

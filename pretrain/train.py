@@ -26,7 +26,7 @@ from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.tasks import FRAME_SIZES, FRAME_STACK, TASKS
+from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_SIZES, FRAME_STACK, TASKS, UNKNOWN_QUALITY
 from vd4rl_pomdp.types import StateWindows, Windows
 
 STAGE = "pretrain"
@@ -111,7 +111,7 @@ class PretrainTrainer:
     def _labels(self, run: RunFolder) -> dict[str, str]:
         """What names the run where it is tracked."""
         told = {name: run.config[name] for name in ("method", "task", "corruption")}
-        return told | {"quality": self.dataset.quality or "unknown"}
+        return told | {"quality": self.dataset.quality or UNKNOWN_QUALITY}
 
     def state(self) -> dict[str, Any]:
         """Everything needed to go on to the bit."""
@@ -142,7 +142,8 @@ def check_config(config: PretrainConfig) -> None:
 def check_pictures(config: PretrainConfig, size: int) -> None:
     """Refuse a shift or a corruption that does not fit frames of size x size pixels."""
     refuse_outside(config, shift=(0, size - 1))
-    check_corruption_fits(config.corruption, size)
+    films = METHODS.named(config.method).reads_state  # pictures are for its film alone, of the benchmark's size
+    check_corruption_fits(config.corruption, min(size, FRAME_SIZE) if films else size)
 
 
 def require_batch(objective: Objective, device: torch.device, config: Any) -> None:
@@ -196,7 +197,7 @@ def _card(config: PretrainConfig, task: str, dataset: Dataset, run: RunFolder) -
     return EncoderCard(
         method=config.method,
         task=task,
-        quality=dataset.quality or "unknown",
+        quality=dataset.quality or UNKNOWN_QUALITY,
         corruption=flat(config.corruption),
         seed=config.seed,
         steps=config.steps,

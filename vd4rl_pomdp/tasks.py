@@ -34,6 +34,8 @@ NOISY_QUALITIES: tuple[NoisyQuality, ...] = get_args(NoisyQuality)
 """This package's own: where actions are not decided by the state, an inverse model can tell them from what they did."""
 SET_QUALITIES = (*QUALITIES, *NOISY_QUALITIES)
 """All that `data collect` makes."""
+UNKNOWN_QUALITY = "unknown"
+"""What stands for a quality that neither a set's files nor its folders tell."""
 
 
 @dataclass(frozen=True)

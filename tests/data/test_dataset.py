@@ -266,3 +266,13 @@ def test_every_trap_of_the_published_files_at_once(tmp_path):
     starts = [(e, t) for e, t in expected if t + 1 < lengths[e]]
     batch = dataset.transitions(range(dataset.num_transitions))
     np.testing.assert_array_equal(batch.action, np.stack([fake_action(e, t, 21) for e, t in starts]))
+
+
+def test_a_link_tells_a_set_as_the_folder_that_it_names_would(tmp_path):
+    held = write_fake_set(tmp_path / "held" / "medium", physics_dim=18)
+    (tmp_path / "walker_walk").mkdir()
+    (tmp_path / "walker_walk" / "expert").symlink_to(held)
+    linked = open_dataset(tmp_path / "walker_walk" / "expert", tmp_path / "cache")
+    assert (linked.task, linked.quality) == ("walker_walk", "expert")
+    with pytest.raises(UserError, match=r"medium: has physics but names no task; put it in a folder called"):
+        open_dataset(held, tmp_path / "cache").require_states()

@@ -51,6 +51,17 @@ def test_the_path_error_is_to_the_actors_mean_action_at_the_same_row(walked):
     assert path.action_error(lambda z: z.roll(1, 0)) > 0.01, "the rows differ"
 
 
+def test_an_episode_of_one_row_decides_nothing(walked, monkeypatch):
+    folder, states, actor = walked
+    dataset = open_dataset(folder)
+    ends = torch.tensor([ROWS, ROWS + 1, 2 * ROWS])
+    monkeypatch.setattr(dataset, "episode_start", torch.tensor([0, ROWS, ROWS + 1]))
+    monkeypatch.setattr(dataset, "episode_end", ends)
+    shown = torch.from_numpy(np.stack([actor.act(state) for state in states]))
+    path = DataPath(dataset, actor, lambda number: shown[dataset.episode_start[number] : ends[number]])
+    assert path.action_error(lambda z: z + 0.1) == pytest.approx(0.01, rel=1e-4)
+
+
 @pytest.mark.parametrize("views", [1, 0])
 def test_a_run_keeps_its_path_error_and_compares_closed_loop_actions(walked, encoder, tmp_path, views):
     folder, _, actor = walked

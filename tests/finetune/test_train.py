@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from finetune import evaluations, train
 from finetune.features import FrozenEncoder
 from finetune.train import RESULTS
 from finetune.train import finetune as run_finetune
@@ -18,7 +19,7 @@ from tests.helpers_data import write_fake_set
 from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import InUseError, UserError
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.runs import memory
 from vd4rl_pomdp.runs.metrics import read_metrics
@@ -135,6 +136,42 @@ def test_rows_are_named_after_the_set_that_the_policy_learned_from(encoder, data
     assert {row["quality"] for row in csv.DictReader((run.path / "episodes.csv").open())} == {"medium"}
 
 
+@pytest.mark.parametrize(("lengths", "quality"), [([20, 25], "unknown"), ([20, 25, 30], "expert")])
+def test_rows_on_a_set_of_unknown_quality_have_the_encoders_only_if_it_is_the_same_set(
+    encoder, data, tmp_path, lengths, quality
+):
+    other = write_fake_set(tmp_path / "walker_walk" / "mine", lengths)
+    run = run_finetune(smoke_finetune(encoder, other, tmp_path / "out", updates=2, batch_size=4, eval_length=2))
+    assert json.loads((run.path / "labels.json").read_text())["quality"] == quality
+
+
+def test_a_policy_that_diverges_before_an_evaluation_is_marked_and_not_kept(encoder, data, tmp_path):
+    config = smoke_finetune(
+        encoder, data, tmp_path / "out", updates=20, eval_every=10, log_every=20, batch_size=4, learning_rate=1e9
+    )
+    with pytest.raises(FloatingPointError, match="the policy's weights are not finite after update 10"):
+        run_finetune(config)
+    assert json.loads((config.out / "diverged.json").read_text())["step"] == 10
+    assert not (config.out / "policy").exists()
+
+
+@pytest.mark.parametrize("during", ["the last evaluation", "the end"])
+def test_a_run_that_was_taken_over_is_left_alone(encoder, data, tmp_path, monkeypatch, during):
+    config = smoke_finetune(encoder, data, tmp_path / "out", updates=2, batch_size=4, eval_length=2)
+    module, name = (evaluations, "evaluate") if during == "the last evaluation" else (train, "render_info")
+    done = getattr(module, name)
+
+    def taken_over(*arguments):
+        (config.out / ".owner.json").write_text(json.dumps({"host": "elsewhere", "pid": 1}))
+        return done(*arguments)
+
+    monkeypatch.setattr(module, name, taken_over)
+    with pytest.raises(InUseError, match="was taken over by"):
+        run_finetune(config)
+    assert not (config.out / "timing.json").exists()
+    assert (config.out / "episodes.csv").exists() == (during == "the end")
+
+
 def test_a_checkpoint_of_another_config_is_one_line(encoder, data, tmp_path):
     changes = {"updates": 2, "batch_size": 4, "eval_length": 2}
     narrow, wide = (
@@ -217,17 +254,18 @@ def test_a_cut_run_whose_evaluations_are_gone_does_not_go_on(encoder, data, tmp_
             run_finetune(config)
     rows = (config.out / "episodes.csv").read_text().splitlines(keepends=True)
     (config.out / "episodes.csv").write_text(rows[0] + rows[2])
-    with pytest.raises(UserError, match=r"episodes\.csv: lacks the evaluation at update 10"):
+    with pytest.raises(UserError, match=r"episodes\.csv: lacks the evaluation at update 10.*another run$"):
         run_finetune(config)
     (config.out / "episodes.csv").write_text("".join(rows))
     assert run_finetune(config).finished
 
 
-@pytest.fixture
-def finished(encoder, data, tmp_path):
-    """A finished run that was evaluated twice, and its config."""
+@pytest.fixture(params=["mik+a", "bc"])
+def finished(with_states, tmp_path, request):
+    """A finished run that was evaluated twice, and its config: of a frozen encoder, and of one trained along."""
+    made = run_pretrain(smoke_pretrain(with_states, tmp_path / "made", method=request.param)).path / "encoder"
     config = smoke_finetune(
-        encoder, data, tmp_path / "finished", eval_every=10, updates=20, batch_size=4, eval_length=2
+        made, with_states, tmp_path / "finished", eval_every=10, updates=20, batch_size=4, eval_length=2
     )
     return run_finetune(config).path, config
 

@@ -5,8 +5,8 @@ import pytest
 import torch
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.nn import Encoder, EncoderCard, EncoderConfig, load_encoder, save_encoder
-from vd4rl_pomdp.nn.sequence import run_gru_backward
+from vd4rl_pomdp.nn import Encoder, EncoderCard, EncoderConfig, load_encoder, save_encoder, sequence
+from vd4rl_pomdp.nn.sequence import run_gru_backward, run_gru_over_next
 from vd4rl_pomdp.types import Windows
 
 CARD = EncoderCard("mik+a", "walker_walk", "expert", {"corruption": "none"}, 0, 10, "smoke")
@@ -143,3 +143,12 @@ def test_an_encoder_card_of_nonsense_is_one_line(tmp_path, part, field, value):
     (tmp_path / "config.json").write_bytes(b"\x80\x04")
     with pytest.raises(UserError, match="not an encoder folder"):
         load_encoder(tmp_path)
+
+
+def test_a_span_beyond_the_window_costs_no_more_than_the_window(monkeypatch):
+    gru, x, length = torch.nn.GRU(3, 4, batch_first=True), torch.rand(2, 7, 3), torch.tensor([7, 5])
+    whole = run_gru_over_next(gru, x, length, 7)
+    read, run = [], sequence.run_gru
+    monkeypatch.setattr(sequence, "run_gru", lambda gru, x: (read.append(x.shape[1]), run(gru, x))[1])
+    assert torch.equal(run_gru_over_next(gru, x, length, 10**9), whole)
+    assert read == [7]

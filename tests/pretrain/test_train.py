@@ -5,6 +5,7 @@ import json
 import pytest
 
 from pretrain.objectives import METHODS
+from pretrain.train import check_config
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_pretrain
@@ -99,3 +100,14 @@ def test_what_does_not_fit_leaves_no_run_behind(data, tmp_path, change, message)
     with pytest.raises(UserError, match=message):
         run_pretrain(smoke_pretrain(data, tmp_path / "out", **change))
     assert not (tmp_path / "out").exists()
+
+
+def test_a_patch_that_the_film_of_a_state_cannot_hold_is_refused_first(tmp_path):
+    def check(**changes):
+        check_config(smoke_pretrain(tmp_path, tmp_path / "out", corruption="patch", **changes))
+
+    check(method="mik+a", patch_size=85)  # frames may be larger
+    with pytest.raises(UserError, match=r"patch size 85 exceeds the image \(84x84\)"):
+        check(method="state", patch_size=85)
+    with pytest.raises(UserError, match="--patch-count is 1001; it must be at least 1 and at most 1000"):
+        check(patch_count=1001)

@@ -59,7 +59,7 @@ class Patch(Options):
     """Whether the frames of a stack share their patches."""
 
     summary: ClassVar[str] = "squares of every frame, at uniformly random places, take one value"
-    limits: ClassVar[Limits] = {"patch_size": 1, "patch_count": 1, "patch_fill": (0, 255)}
+    limits: ClassVar[Limits] = {"patch_size": 1, "patch_count": (1, 1000), "patch_fill": (0, 255)}
 
     def __call__(self, frames: Tensor, key: Tensor, number: Tensor) -> None:
         """See `Stage`."""

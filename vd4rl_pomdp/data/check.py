@@ -71,8 +71,8 @@ def _why_not_replayed(dataset: Dataset, is_maze: bool) -> str:
         return "impossible: the set stores no simulator states"
     if is_maze:
         return ""
-    if dataset.task is None:
-        raise UserError(f"{dataset.path}: has physics but names no task; put it in a folder called like its task")
+    dataset.require_states()
+    assert dataset.task is not None
     task = TASKS.named(dataset.task)
     if not isinstance(task, DMCTask):
         return f"impossible: {dataset.task} is no task of dm_control"

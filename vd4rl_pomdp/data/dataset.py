@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -112,8 +113,10 @@ class Dataset:
         return self.action.shape[1]
 
     def require_states(self) -> None:
-        """Raise UserError if the set stores no simulator states."""
-        if self.physics is None or self.task is None:
+        """Raise UserError if the set stores no simulator states, or nothing tells whose they are."""
+        if self.physics is not None and self.task is None:
+            raise UserError(f"{self.path}: has physics but names no task; put it in a folder called like its task")
+        if self.physics is None:
             raise UserError(
                 f"{self.path}: stores no simulator states; `data collect` makes sets of dm_control's tasks that do"
             )
@@ -331,5 +334,6 @@ def _name(path: Path, attributes: list[dict[str, Any]], attribute: str, choices:
     stored = {str(one[attribute]) for one in attributes if one.get(attribute)}
     if len(stored) > 1:
         raise UserError(f"{path}: its shards come from {' and '.join(sorted(stored))}; keep one set in a folder")
-    named = (part for part in reversed(path.resolve().parts) if part in choices)
+    folders = *path.resolve().parts, *Path(os.path.abspath(path)).parts  # a link's name comes before its target's
+    named = (part for part in reversed(folders) if part in choices)
     return stored.pop() if stored else next(named, None)

@@ -33,6 +33,7 @@ def run_gru_backward(gru: nn.GRU, x: Tensor, length: Tensor) -> Tensor:
 def run_gru_over_next(gru: nn.GRU, x: Tensor, length: Tensor, span: int) -> Tensor:
     """Like `run_gru_backward`, but row j has seen rows j..j+span-1 alone: each state is computed anew from zero."""
     batch, rows, width = x.shape
+    span = min(span, rows)
     j = torch.arange(rows, device=x.device)
     count = (length[:, None] - j).clamp(1, span)  # padding rows read themselves
     index = (j[:, None] + count[..., None] - 1 - torch.arange(span, device=x.device)).maximum(j[:, None])

@@ -156,6 +156,8 @@ def fitting(checkpoint: Checkpoint) -> Iterator[None]:
     """Turn the errors that a checkpoint of another run leads to within the block into one sentence."""
     try:
         yield
+    except UserError:
+        raise
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         raise UserError(
             f"{checkpoint.path}: this checkpoint does not fit the run ({_first_line(error)}); choose another --out, or "

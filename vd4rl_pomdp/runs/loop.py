@@ -59,6 +59,10 @@ class Loop:
         """Write what an evaluation after the step just done gave, by names that begin with `metrics.EVALUATION`."""
         self._log.write(self._learner.step, row)
 
+    def require_owner(self) -> None:
+        """Raise an error if another process has taken the run over."""
+        self._run.require_owner()
+
     def show(self, **numbers: float) -> None:
         """Show numbers in the progress line."""
         self._progress.advance(0, **numbers)

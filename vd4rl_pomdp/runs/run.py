@@ -149,9 +149,13 @@ class RunFolder:
 
     def save(self, step: int, state: State) -> None:
         """Keep the state after a step as the newest checkpoint."""
+        self.require_owner()
+        self._checkpoints.add(step, pack(state), self.seconds)
+
+    def require_owner(self) -> None:
+        """Raise an error if another process has taken the run over; see `Owner.check`."""
         assert self._owner is not None, "a run is written inside its `with` block"
         self._owner.check()
-        self._checkpoints.add(step, pack(state), self.seconds)
 
     def mark_diverged(self, step: int, message: str) -> None:
         """Say that a number was no longer finite after `step`; going on with the run takes the mark away."""
@@ -159,5 +163,6 @@ class RunFolder:
 
     def finish(self, **more: Any) -> None:
         """Mark the run as done, keeping its wall-clock seconds and the last checkpoint."""
+        self.require_owner()
         self._checkpoints.prune(1)
         write_json(self.path / "timing.json", {"seconds": round(self.seconds, 2)} | more)
