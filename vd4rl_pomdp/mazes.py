@@ -69,7 +69,7 @@ class Style:
     goal_radius: float = 0.1
     goal_travel: float = 0.1
     """A goal is reached within this distance by a mass that has moved less than this in the last decision."""
-    goal_decisions: int = 300
+    goal_decisions: int = 150
     """Decisions after which another goal is drawn anyway; 0 for never."""
     goal_margin: float = 0.1
     """Goals are uniform where the mass has this much room."""
@@ -84,7 +84,7 @@ class Style:
 
 SOURCE = Style()
 """From the top, as the paper's data was made."""
-_FIRST_PERSON = replace(SOURCE, goal_radius=0.5, goal_travel=np.inf, goal_decisions=150, goals_are_cells=False)
+_FIRST_PERSON = replace(SOURCE, goal_radius=0.5, goal_travel=np.inf, goals_are_cells=False)
 """In first person, likewise."""
 HARD = Style(
     walls=(0.0, 0.4),

@@ -5,7 +5,7 @@
 
 Each state is computed anew, from zero, over its own m+1 rows. A window's first row carries no earlier action. For
 k <= m the later window of FJ+A contains a_t: the paper's counterexample rests on that. For k > m both windows show what
-MIK+A sees at the gap k-m with a future of m rows.
+MIK+A sees at the gap k-m with a past and a future of m rows, but for a_{t+k}, which that future reads, too.
 
 Authors' code: not published.
 

@@ -263,16 +263,16 @@ def test_a_goal_is_not_reached_in_passing_where_the_planner_halts():
 
 
 def test_a_goal_that_is_not_reached_gives_way_after_its_time():
-    for maze, decisions in (("first_person", 150), ("no_curtain", 300), ("hard_no_curtain", None)):
+    for maze, decisions in (("first_person", 150), ("no_curtain", 150), ("hard_no_curtain", None)):
         env = MazeEnv(maze, pixels=False)
         env.reset(seed=1)
         env.set_state(np.array([-1.3, -1.3, *env.state[2:]]))
         env.goal = first = np.array([1.2, 0.8])
         kept = 0
-        while np.array_equal(env.goal, first) and kept < 301:
+        while np.array_equal(env.goal, first) and kept < 151:
             env.step(np.zeros(2))
             kept += 1
-        assert kept == (decisions or 301)
+        assert kept == (decisions or 151)
 
 
 def test_an_unknown_maze_is_named_with_the_choices():

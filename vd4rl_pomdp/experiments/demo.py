@@ -95,7 +95,7 @@ def conclusion(jobs: list[Job]) -> Iterator[str]:
     policies = [(dict(job.settings), job.folder) for job in jobs if job.section == "finetune"]
     corruption = policies[0][0]["corruption"]
     yield f"Under {corruption}: return (mean ± standard error over episodes), and what is not known of pose and"
-    yield "velocity (error of a linear probe in % of a standard deviation; 100 knows nothing):"
+    yield "velocity (error of a linear probe in % of a standard deviation; 60 to 80 knows nothing):"
     for settings, folder in policies:
         rows = read_episodes(folder / "episodes.csv")
         last = max(row["step"] for row in rows)

@@ -62,7 +62,8 @@ FACTS = (
         ("fj", "fj+a"),
         f"P(a_t | rows t-m..t and t+k-m..t+k) is {ON_STATES} for every k > m (section 3.1)",
         PAST_AT,
-        "k up to m, as printed. Beyond, FJ+A sees what MIK+A sees at the gap k-m with n = m: it is "
+        "k up to m, as printed. Beyond, FJ+A sees what MIK+A sees at the gap k-m with n = m actions, "
+        "as the paper counts them (here MIK+A reads a_{t+k}, too): it is "
         "P(a_t | s_t, s_{t+k-m}) where its later window tells its first state",
         (ladder, counterexample),
         contradictions.forward_jump,
