@@ -253,6 +253,20 @@ def test_seeds_of_other_settings_make_no_mean_and_other_logging_does(tmp_path):
         loaded(tmp_path / "runs")
 
 
+def test_settings_are_those_of_whole_configs_whatever_the_commands_named(tmp_path):
+    folders = [write_run(tmp_path / "runs", Condition("no_curtain", "ah"), seed, 9.0) for seed in (0, 1)]
+    for folder, rate, more in zip(folders, (2e-3, 5e-2), ("", " --learning-rate 0.002"), strict=True):
+        record = json.loads((folder / "config.json").read_text()) | {"format": 3}
+        record["command"] += more
+        record["config"]["learning_rate"] = rate
+        (folder / "config.json").write_text(json.dumps(record))
+    with pytest.raises(UserError, match=r"seeds 0 and 1 differ in their learning_rate \(0.002, 0.05\)"):
+        loaded(tmp_path / "runs")
+    record["config"]["learning_rate"] = 2e-3  # the default, which the command spells out
+    (folders[1] / "config.json").write_text(json.dumps(record))
+    assert len(loaded(tmp_path / "runs")) == 2
+
+
 @pytest.mark.parametrize("folder", ["navigation", "navigation/longer"])
 def test_the_committed_rows_make_a_report(folder):
     assert len(loaded(ROOT / "results" / folder)) >= 2

@@ -19,6 +19,7 @@ from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import verdict_lines
 from vd4rl_pomdp.experiments.navigation.runs import (
     NavigationRun,
+    comparable,
     find_navigation,
     flags_of,
     load_runs,
@@ -155,11 +156,12 @@ def _unlike(runs: list[NavigationRun]) -> list[str]:
     """What runs on one maze differ in beside what tells them apart: a sentence a setting."""
     lines = []
     for maze, members in _by_maze(runs).items():
-        for name in dict.fromkeys(name for run in members for name in run.settings):
+        settings = comparable(members)
+        for name in dict.fromkeys(name for one in settings for name in one):
             where: dict[str, dict[str, None]] = {}
-            for run in members:
-                if not _is_without(run, name):
-                    value = run.settings.get(name, "the preset's")
+            for run, one in zip(members, settings, strict=True):
+                if name in one and not _is_without(run, name):
+                    value = one[name]
                     where.setdefault(value[:8] if name == "set" else value, {})[code(run.condition.short)] = None
             if len(where) > 1:
                 usual = max(where, key=lambda value: len(where[value]))

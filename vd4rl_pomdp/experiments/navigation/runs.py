@@ -55,15 +55,6 @@ class NavigationRun:
         }
 
     @property
-    def settings(self) -> dict[str, str]:
-        """Steps, data, and the flags of its command that change results and are no part of its condition."""
-        facts = {name: self.facts[name] for name in ("steps", "set")}
-        named = {*_IDENTITY[1:3], "literal_future", "preset"}
-        return facts | settings_of(
-            {k: v for k, v in flags_of(self.facts["command"]).items() if k not in named | {*facts}}
-        )
-
-    @property
     def collection(self) -> dict[str, Any]:
         """How its set was made; early runs, which do not tell, took their preset's; {} if the set does not tell."""
         usual = {name: getattr(PRESETS[self.preset], name) for name in ("trajectories", "trajectory_rows")}
@@ -142,6 +133,23 @@ def load_runs(results: Sequence[Result]) -> list[NavigationRun]:
     return sorted(runs.values(), key=lambda run: tuple(run.identity.values()))
 
 
+def comparable(runs: Sequence[NavigationRun]) -> list[dict[str, str]]:
+    """Steps, data, and the settings that change results and are no part of a condition, run by run.
+
+    Those of their configs if all have whole ones. The flags of their commands else: early runs kept no more, and a
+    setting that none names is "the preset's".
+    """
+    whole = all("format" in run.result.record for run in runs)
+    told = [run.result.record["config"] if whole else flags_of(run.facts["command"]) for run in runs]
+    names = {} if whole else dict.fromkeys((name for one in told for name in one), "the preset's")
+    found = [{name: str(value) for name, value in settings_of(names | one).items()} for one in told]
+    told_apart = {"method", "max_k", "literal_future", "preset"}
+    facts = [{name: run.facts[name] for name in ("steps", "set")} for run in runs]
+    return [
+        {k: v for k, v in one.items() if k not in told_apart} | fact for one, fact in zip(found, facts, strict=True)
+    ]
+
+
 def is_missing(condition: Condition, runs: Iterable[NavigationRun]) -> bool:
     """Whether a condition has no run, although its maze has runs and the same condition has some in another maze."""
     conditions = {run.condition for run in runs}
@@ -162,9 +170,9 @@ def _refuse_mixtures(runs: Iterable[NavigationRun]) -> None:
     first: dict[Condition, NavigationRun] = {}
     for run in runs:
         other = first.setdefault(run.condition, run)
-        mine, others = run.settings, other.settings
+        others, mine = comparable([other, run])
         for name in dict.fromkeys((*others, *mine)):
-            values = [settings.get(name, "the preset's") for settings in (others, mine)]
+            values = [settings.get(name, "none") for settings in (others, mine)]
             if values[0] != values[1]:
                 raise UserError(
                     f"{run.condition.name}: seeds {other.seed} and {run.seed} differ in their {name} "
