@@ -338,6 +338,33 @@ def test_claims_are_judged_by_means_and_seed_by_seed(runs):
     assert (waiting.seeds, waiting.holds) == (0, False)
 
 
+def test_in_first_person_the_place_must_be_known_by_far_and_in_the_papers_order(tmp_path):
+    for method, level, sp in (
+        ("random", 40, 0),
+        ("mik+a", 21, 0),
+        ("mik+a", 14, 1),
+        ("no_history", 30, 0),
+        ("ah+a", 25, 0),
+    ):
+        write_run(tmp_path, Condition("compass_first_person", method, self_prediction=bool(sp)), 0, level)
+    found = loaded(tmp_path)
+    told = {
+        claim.text: judge(claim, found).holds for claim in claims("compass_first_person") if "state error" in claim.text
+    }
+    assert {text: holds for text, holds in told.items() if "K=1" not in text} == {
+        "state error of mik+a, of the untrained one's": False,
+        "state error of mik+a": False,
+        "no_history's state error, of that of mik+a": True,
+        "state error of mik+a with self-prediction, of the untrained one's": True,
+        "state error of mik+a with self-prediction": True,
+        "no_history's state error, of that of mik+a with self-prediction": True,
+        "ah+a's state error, of no_history's": False,
+    }
+    bound = next(claim for claim in claims("first_person") if claim.text == "state error of mik+a")
+    assert bound.raw() == bound, "15% is no number of raw units"
+    assert not any("self-prediction" in claim.text for claim in claims("no_curtain"))
+
+
 def test_the_page_says_which_statements_hold_and_what_the_paper_has(runs, tmp_path):
     page = write_report([runs], tmp_path / "out").read_text()
     rows = {line.split(" | ")[1]: line for line in page.splitlines() if line.startswith("| three_curtains | ")}

@@ -11,6 +11,7 @@ import numpy as np
 
 from vd4rl_pomdp.experiments.control.config import MEASURED, NO_MEMORY, SETTING, UNTRAINED
 from vd4rl_pomdp.report.gates import FAILED, STANDARD_ERRORS, STATE_SHARE
+from vd4rl_pomdp.report.load import PROBES
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs.files import Row
 
@@ -52,7 +53,7 @@ def line_of(row: Row) -> str:
             f"{name_of(row)}, seed {row['seed']}",
             f"returns {value['return']:.0f} ({low:.0f} to {high:.0f}) of the data's {data:.0f}",
             f"action error {value['error_on_data']:.3f} on the data, {value['error_in_loop']:.3f} in closed loop",
-            f"probes {value['probe_pose']:.1f}, {value['probe_velocity']:.1f}",
+            f"probes {', '.join(f'{value[name]:.1f}' for name in PROBES)}",
             f"{value['seconds']:.0f} s",
         ]
     )
@@ -116,7 +117,7 @@ def _method_row(rows: list[Row], method: str) -> tuple[str, ...]:
         return float(np.mean([float(row[name]) for row in mine]))
 
     errors = (f"{mean(name):.3f}" for name in ("error_on_data", "error_in_loop"))
-    probes = (f"{mean(name):.1f}" for name in ("probe_pose", "probe_velocity"))
+    probes = (f"{mean(name):.1f}" for name in PROBES)
     span, good = f"{low:.0f} to {high:.0f}", f"{100 * mean('good_share'):.0f}%"
     return (method, str(len(mine)), returns, span, good, *errors, *probes)
 

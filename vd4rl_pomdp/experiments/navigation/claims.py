@@ -15,6 +15,8 @@ from vd4rl_pomdp.navigation.methods import UNTRAINED, WITH_MEMORY
 RECURRENT = ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
 NEAR_ZERO = 5.0
 """Action loss (nats x 100) that counts as near zero; guessing among 20 codes is 300."""
+FEW = 15.0
+"""State error (% of a standard deviation) below which a first person is said to know where it is."""
 Test = Callable[[float, float], bool]
 
 
@@ -29,9 +31,10 @@ class Claim:
     right: tuple[Condition, Measure] | None = None
 
     def raw(self) -> Claim:
-        """The same statement about errors in the simulator's units."""
-        left, right = ((side[0], side[1].raw()) if side else None for side in (self.left, self.right))
-        assert left is not None
+        """The same statement about errors in the simulator's units; itself where it names a bound in its own."""
+        if self.right is None:
+            return self
+        left, right = ((condition, measure.raw()) for condition, measure in (self.left, self.right))
         return replace(self, left=left, right=right)
 
     def holds(self, left: float, right: float) -> bool:
@@ -92,6 +95,8 @@ def claims(maze: str) -> list[Claim]:
             Claim("mik's velocity error, of mik+a's", (Condition(maze, "mik"), velocity), ">=", 1.5, (best, velocity)),
             Claim("ah's state error, of mik+a's", (Condition(maze, "ah"), state), ">", 1, (best, state)),
         ]
+    if MAZES[maze].paper == "first_person":
+        found += _first_person(maze, state)
     untrained = Condition(maze, UNTRAINED), position
     for method in RECURRENT:
         found.append(
@@ -104,6 +109,42 @@ def claims(maze: str) -> list[Claim]:
             )
         )
     return found
+
+
+def _first_person(maze: str, state: Measure) -> list[Claim]:
+    """That the place is known where a picture does not tell it: by far, and in the paper's order."""
+    found = []
+    for ours, name in (
+        (Condition(maze, "mik+a"), "mik+a"),
+        (Condition(maze, "mik+a", self_prediction=True), "mik+a with self-prediction"),
+    ):
+        found += [
+            Claim(
+                f"state error of {name}, of the untrained one's",
+                (ours, state),
+                "<",
+                0.5,
+                (Condition(maze, UNTRAINED), state),
+            ),
+            Claim(f"state error of {name}", (ours, state), "<", FEW),
+            Claim(
+                f"no_history's state error, of that of {name}",
+                (Condition(maze, "no_history"), state),
+                ">",
+                1,
+                (ours, state),
+            ),
+        ]
+    return [
+        *found,
+        Claim(
+            "ah+a's state error, of no_history's",
+            (Condition(maze, "ah+a"), state),
+            ">",
+            1,
+            (Condition(maze, "no_history"), state),
+        ),
+    ]
 
 
 def judge(claim: Claim, runs: Sequence[NavigationRun]) -> Verdict:
