@@ -1,6 +1,7 @@
 """What is started when, what is tried again, and that nothing is done twice."""
 
 import shutil
+from dataclasses import replace
 
 import pytest
 
@@ -76,6 +77,28 @@ def test_out_of_memory_is_tried_with_twice_the_slots_while_half_as_many_run(jobs
 def test_without_more_slots_out_of_memory_is_final(jobs, tmp_path):
     _, executor = carry_out(jobs, tmp_path, {"a": ["out of memory"]}, slots=1)
     assert names(executor).count("a") == 1
+
+
+def test_out_of_memory_with_less_than_all_slots_is_not_final_whoever_looks(jobs, tmp_path):
+    carry_out(jobs, tmp_path, {"a": ["out of memory"] * 2}, slots=2)
+    once, twice = SweepFolder(tmp_path).attempts()["a"]
+    assert (given_up([once]), given_up([once, twice])) == ("", "out of memory")
+
+
+def test_out_of_memory_beside_others_is_tried_again_where_there_is_one_slot(jobs, tmp_path):
+    folder = SweepFolder(tmp_path)
+    folder.add({"job": "set", "cause": "out of memory", "step": None, "slots": 1, "largest": 2})
+    finished, executor = carry_out(jobs, tmp_path, slots=1)
+    assert finished
+    assert executor.started[0] == ("set", 1)
+
+
+def test_a_job_of_another_command_has_not_been_tried(jobs, tmp_path):
+    carry_out(jobs, tmp_path, {"a": ["refused"]})
+    corrected = [replace(one, words=("list", "--device", "cpu")) if one.name == "a" else one for one in jobs]
+    finished, executor = carry_out(corrected, tmp_path)
+    assert finished
+    assert names(executor) == ["a", "b"]
 
 
 def test_failures_stay_until_they_are_taken_up_again(jobs, tmp_path):

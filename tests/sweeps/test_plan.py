@@ -13,6 +13,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
 from vd4rl_pomdp.sweeps.estimate import Estimates
+from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.plan import JobPlanner
@@ -58,9 +59,9 @@ def copy(swept, tmp_path, monkeypatch):
     return tmp_path / "copy"
 
 
-def plan(out: Path, changes=(), kept=None, data=None):
+def plan(out: Path, changes=(), kept=None, data=None, others=()):
     cells = load_grid(str(out / "grid.toml"), changes).cells()
-    return JobPlanner(out, data, kept or FoundRuns([]), FoundRuns(runs_below(out))).plan(cells)
+    return JobPlanner(out, data, kept or FoundRuns([]), FoundRuns(runs_below(out)), others).plan(cells)
 
 
 def left(jobs):
@@ -99,6 +100,22 @@ def test_a_name_that_another_run_has_is_left_to_it(copy):
     assert len(names) == 5
     assert all("~" in name for name in names)
     assert left(plan(copy)) == []
+
+
+def test_a_name_that_another_grid_has_planned_is_left_to_it(tmp_path, capsys):
+    """Of neither grid anything has begun."""
+    folder = SweepFolder(tmp_path)
+    (tmp_path / "grid.toml").write_text(GRID)
+    first, second = plan(tmp_path, ["finetune.updates=30"]), ["--change", "finetune.updates=40", "--out", str(tmp_path)]
+    folder.keep_plan("first", first)
+    main(["sweep", "run", str(tmp_path / "grid.toml"), *second, "--dry-run"])
+    named = {line.split(":")[0][2:] for line in capsys.readouterr().out.splitlines() if line.startswith("# ")}
+    shared = {job.name for job in first if job.section != "finetune"}
+    assert shared <= named
+    assert sum("~" in name for name in named) == len(first) - len(shared)
+    assert {job.name for job in first} & named == shared
+    assert folder.jobs_of_others("first") == []
+    assert plan(tmp_path, ["finetune.updates=30"], others=first) == first, "a job of both is one"
 
 
 def test_runs_on_every_further_content_of_a_set_have_folders_of_their_own(copy):
@@ -203,6 +220,20 @@ def test_without_their_set_kept_rows_count_by_how_it_was_collected(copy, tmp_pat
     shutil.copy(copy / "grid.toml", new)
     assert left(plan(new, kept=kept)) == []
     assert len(left(plan(new, ["collect.episodes=100"], kept=kept))) == 10
+
+
+def test_a_kept_row_that_does_not_say_how_its_set_was_collected_has_it_from_one_on_the_same_content(copy, tmp_path):
+    tell_collection(copy)
+    early = next(copy.rglob("finetune-td3_bc/config.json"))
+    write_json(early, {name: value for name, value in read_json(early).items() if name != "collection"})
+    main(["results", "add", str(copy), "--out", str(tmp_path / "rows")])
+    kept, new = FoundRuns(runs_kept([tmp_path / "rows"])), tmp_path / "new"
+    new.mkdir()
+    shutil.copy(copy / "grid.toml", new)
+    assert left(plan(new, kept=kept)) == []
+    write_json(early, read_json(early) | {"inputs": {"data": "of no other row"}})
+    main(["results", "add", str(early.parent), "--out", str(tmp_path / "alone")])
+    assert [run.record["collection"] for run in runs_kept([tmp_path / "alone"])] == [None]
 
 
 @pytest.mark.parametrize(("lengths", "told"), [([20, 25, 31], True), ([20, 25, 30], False)])

@@ -49,6 +49,22 @@ def test_states_come_from_folders_owners_and_attempts(jobs):
     assert found.seconds_left is None
 
 
+@pytest.mark.parametrize(
+    ("slots", "state"),
+    [({"slots": 1, "largest": 2}, "waiting"), ({"slots": 2, "largest": 2}, "failed"), ({}, "failed")],
+)
+def test_out_of_memory_waits_as_long_as_there_are_more_slots(jobs, slots, state):
+    found = status(jobs, {"waiting": [row("out of memory") | slots]}, Estimates([]))
+    assert found.states["waiting"] == state
+    assert list(found.failures) == ["waiting"] * (state == "failed")
+
+
+def test_an_attempt_at_another_command_says_nothing_of_a_job(jobs):
+    rows = {"waiting": [row("refused") | {"words": ["other"]}], "broken": [row("refused") | {"words": ["list"]}]}
+    found = status(jobs, rows, Estimates([]))
+    assert (found.states["waiting"], list(found.failures)) == ("waiting", ["broken"])
+
+
 def test_the_text_names_failures_with_their_last_line(jobs):
     text = "\n".join(lines(status(jobs, attempts(), Estimates([]))))
     assert "5 jobs: 1 diverged, 1 done, 1 failed, 1 running, 1 waiting" in text

@@ -82,7 +82,8 @@ def _run(words: Arguments, program: str) -> None:
         refuse_no_folder(place)
     refuse_kept(command.out)
     here, kept = FoundRuns(runs_below(command.out)), FoundRuns(runs_kept(command.done))
-    planner = JobPlanner(command.out, command.data, kept, here)
+    folder = SweepFolder(command.out)
+    planner = JobPlanner(command.out, command.data, kept, here, folder.jobs_of_others(grid.name))
     jobs = planner.plan(cells)
     refuse_unknown_to_jobs(jobs)
     for name, number in planner.of_other_content.items():
@@ -91,7 +92,6 @@ def _run(words: Arguments, program: str) -> None:
     if command.dry_run:
         _print_plan(jobs, [*here.runs, *kept.runs])
         return
-    folder = SweepFolder(command.out)
     folder.keep_plan(grid.name, jobs)
     _carry_out(jobs, command, folder)
 

@@ -45,17 +45,19 @@ RETRIES = {
     UserError.cause: Retry(0),
     DIVERGED: Retry(0),
 }
-"""By cause. Out of memory is tried again with twice the slots; where a job has them all already, it is not."""
+"""By cause. Out of memory is tried again with twice the slots; where a job had them all already, it is not."""
 
 
-def given_up(rows: list[Row], largest: int = 1) -> str:
+def attempts_at(job: Job, attempts: dict[str, list[Row]]) -> list[Row]:
+    """A job's attempts, oldest first: those at the command that it has now, which a corrected grid changes."""
+    words = list(job.words)
+    return [row for row in attempts.get(job.name, []) if row.get("words", words) == words]
+
+
+def given_up(rows: list[Row]) -> str:
     """Why a job is not tried again, judging by its attempts since it was last taken up; empty if it is.
 
     What was done once, and is there no more, is done again.
-
-    Args:
-        rows: its attempts, oldest first.
-        largest: the most slots it could have.
     """
     if not rows or rows[-1]["cause"] == DONE:
         return ""
@@ -65,7 +67,7 @@ def given_up(rows: list[Row], largest: int = 1) -> str:
         if (row["cause"], row["step"]) != (last["cause"], last["step"]):
             break
         alike += 1
-    hopeless = last["cause"] == OutOfMemoryError.cause and last["slots"] >= largest
+    hopeless = last["cause"] == OutOfMemoryError.cause and last["slots"] >= last.get("largest", 1)
     return last["cause"] if hopeless or alike > RETRIES.get(last["cause"], Retry(0)).times else ""
 
 
@@ -76,10 +78,11 @@ class Driver:
         """See the module."""
         self._jobs = {job.name: job for job in jobs}
         self._executor, self._folder = executor, folder
-        self._rows = folder.attempts()
+        attempts = folder.attempts()
+        self._rows = {name: attempts_at(job, attempts) for name, job in self._jobs.items()}
         self._left = {job.name: job for job in self._jobs.values() if not job.finished}
-        self._running: dict[str, tuple[float, int]] = {}
-        """When each began, and its slots."""
+        self._running: dict[str, tuple[float, int, int]] = {}
+        """When each began, its slots, and the most it could have had."""
         self._not_before: dict[str, float] = {}
         self._lost: set[str] = set()
         """What is left and will stay so: jobs that were given up, and those that need them."""
@@ -109,7 +112,7 @@ class Driver:
 
     def _begin(self, job: Job) -> None:
         slots = self._slots(job)
-        self._running[job.name] = (time.monotonic(), slots)
+        self._running[job.name] = (time.monotonic(), slots, self._executor.largest)
         try:
             with disk_errors(job.folder):
                 self._executor.start(self._folder.work(job, slots))
@@ -132,13 +135,12 @@ class Driver:
     def _give_up(self) -> None:
         """Find out which jobs are lost."""
         for job in self._left.values():  # a job comes after those it needs
-            rows = self._rows.get(job.name, [])
-            if given_up(rows, self._executor.largest) or not self._lost.isdisjoint(job.needs):
+            if given_up(self._rows[job.name]) or not self._lost.isdisjoint(job.needs):
                 self._lost.add(job.name)
 
     def _slots(self, job: Job) -> int:
         """One, or twice as many as when the memory last did not suffice."""
-        short = [row["slots"] for row in self._rows.get(job.name, []) if row["cause"] == OutOfMemoryError.cause]
+        short = [row["slots"] for row in self._rows[job.name] if row["cause"] == OutOfMemoryError.cause]
         return min(2 * max(short), self._executor.largest) if short else 1
 
     def _collect(self) -> None:
@@ -146,13 +148,13 @@ class Driver:
             self._end(ended)
 
     def _end(self, ended: Ended) -> None:
-        began, slots = self._running.pop(ended.name)
+        began, slots, largest = self._running.pop(ended.name)
         seconds = time.monotonic() - began
         job = self._jobs[ended.name]
         finished = job.finished
         if ended.cause == DONE and not finished:
             ended = Ended(job.name, FAILED, f"{job.folder}: holds nothing finished, though the command ended well")
-        self._note(ended, seconds, slots)
+        self._note(ended, seconds, slots, largest)
         if finished:
             del self._left[ended.name]
         else:
@@ -160,12 +162,13 @@ class Driver:
             self._give_up()
         self._say(ended, seconds)
 
-    def _note(self, ended: Ended, seconds: float, slots: int) -> None:
+    def _note(self, ended: Ended, seconds: float, slots: int, largest: int) -> None:
         """Keep the row of an attempt, here and on the disk, unless that is full."""
         row: Row = {"job": ended.name, "cause": ended.cause, "line": ended.line}
-        row |= {"ended": round(time.time(), 1), "seconds": round(seconds, 1), "slots": slots}
-        row |= {"step": progress_of(self._jobs[ended.name]), "host": socket.gethostname()}
-        self._rows.setdefault(ended.name, []).append(row)
+        row |= {"ended": round(time.time(), 1), "seconds": round(seconds, 1), "slots": slots, "largest": largest}
+        job = self._jobs[ended.name]
+        row |= {"step": progress_of(job), "host": socket.gethostname(), "words": list(job.words)}
+        self._rows[ended.name].append(row)
         try:
             self._folder.add(row)
         except DiskFullError as error:

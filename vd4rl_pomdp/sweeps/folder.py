@@ -2,7 +2,8 @@
 
     OUT/sweep/plans/GRID.json    from (the working directory), out, and the jobs of a grid: name, stage, folder,
                                  command, needs
-    OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, step, slots, host
+    OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, step, slots, largest
+                                 (the most slots it could have had), host, words (of its command)
     OUT/sweep/logs/JOB.log
     OUT/sweep/slurm/             what the Slurm executor keeps
 
@@ -53,6 +54,10 @@ class SweepFolder:
         jobs = [replace(job, folder=plan.place(job.folder, self.out)) for plan in self._plans() for job in plan.jobs]
         return list({job.name: job for job in jobs}.values())
 
+    def jobs_of_others(self, grid: str) -> list[Job]:
+        """The jobs of all plans but that of a grid, as they were written."""
+        return [job for path in self._plan_files() if path.stem != grid for job in _read_plan(path).jobs]
+
     def refuse_elsewhere(self) -> None:
         """Raise UserError if the commands of a plan name other folders here than where it was made."""
         for plan in self._plans():
@@ -63,10 +68,12 @@ class SweepFolder:
                 )
 
     def _plans(self) -> list[_Plan]:
-        paths = sorted((self.path / "plans").glob("*.json"))
-        if not paths:
+        if not (paths := self._plan_files()):
             raise UserError(f"{self.out}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one")
         return [_read_plan(path) for path in paths]
+
+    def _plan_files(self) -> list[Path]:
+        return sorted((self.path / "plans").glob("*.json"))
 
     def work(self, job: Job, slots: int) -> Work:
         """A job as an executor takes it."""

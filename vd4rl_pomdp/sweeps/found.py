@@ -3,12 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.nn.encoder_folder import CONFIG
-from vd4rl_pomdp.results import read_results
+from vd4rl_pomdp.results import Result, read_results
 from vd4rl_pomdp.runs.files import Row, read_json
 from vd4rl_pomdp.runs.identity import recipe
 from vd4rl_pomdp.runs.settings import settings_of
@@ -35,9 +35,14 @@ class FoundRun:
         return recipe(self.record, self.card if self.record["stage"] == "finetune" else {})
 
     @property
+    def data(self) -> str:
+        """Fingerprint of its set, empty where it tells none."""
+        return self.record.get("inputs", {}).get("data", "")
+
+    @property
     def on_one_set(self) -> bool:
         """Whether its encoder, if it was given one, was pretrained on its own data, as a grid's are."""
-        return self.card.get("data") in (None, self.record.get("inputs", {}).get("data"))
+        return self.card.get("data") in (None, self.data)
 
     @property
     def settings(self) -> dict[str, Any]:
@@ -68,12 +73,22 @@ class FoundRuns:
         return folder in self._folders
 
 
-def runs_kept(folders: Iterable[Path]) -> Iterator[FoundRun]:
-    """Every run of some results folders; UserError for a folder that is none."""
-    for folder in folders:
-        for run in read_results(folder):
-            seconds = (run.files.get(name, {}).get("seconds") for name in ("timing", "pretrain_timing"))
-            yield FoundRun(run.path, run.record, _whole(run.card), *seconds)
+def runs_kept(folders: Iterable[Path]) -> list[FoundRun]:
+    """Every run of some results folders; UserError for a folder that is none.
+
+    Early ones do not record how their set was collected: as another run on the same content says.
+    """
+    runs = [_kept(run) for folder in folders for run in read_results(folder)]
+    told = {run.data: run.record["collection"] for run in runs if run.data and run.record.get("collection")}
+    return [
+        replace(run, record=run.record | {"collection": run.record.get("collection") or told.get(run.data)})
+        for run in runs
+    ]
+
+
+def _kept(run: Result) -> FoundRun:
+    seconds = (run.files.get(name, {}).get("seconds") for name in ("timing", "pretrain_timing"))
+    return FoundRun(run.path, run.record, _whole(run.card), *seconds)
 
 
 def runs_below(out: Path) -> Iterator[FoundRun]:

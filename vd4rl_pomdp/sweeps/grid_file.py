@@ -189,15 +189,22 @@ def _check_settings(section: str, settings: Values, axes: bool = True) -> None:
         raise UserError(
             f"{section}.{min(folders)}: a sweep names its folders itself: leave it out, and give --out, --data"
         )
+    if "help" in settings:  # a flag of every command
+        raise UserError(f"{section}.help: is no setting of a stage; leave it out")
     if section in TRAININGS and "seed" in settings:
         raise UserError(f"{section}.seed: a cell's trainings share one seed: write it outside the sections")
     for name, value in settings.items():
         values = value if isinstance(value, list) and axes else [value]
-        kinds = int if name == "seed" else str | int | float
-        if not values or not all(isinstance(one, kinds) for one in values):
+        if not values or not all(_is_value(name, one) for one in values):
             where = f"{section}.{name}".lstrip(".")
-            wanted = "a number" if kinds is int else "a number, a word, true or false"
+            wanted = "a number" if name == "seed" else "a number, a word, true or false"
             raise UserError(f"{where} is {value!r}: write {wanted}{', or a list of such' * axes}")
+
+
+def _is_value(name: str, told: Any) -> bool:
+    if name == "seed":
+        return isinstance(told, int) and not isinstance(told, bool)
+    return isinstance(told, str | int | float)
 
 
 def _values_of(block: Sections, name: str) -> list[Any]:

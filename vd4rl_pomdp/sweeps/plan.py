@@ -60,7 +60,9 @@ class Job:
 class JobPlanner:
     """Makes the jobs of a grid, looking at what is there."""
 
-    def __init__(self, out: Path, data: Path | None, kept: FoundRuns, here: FoundRuns) -> None:
+    def __init__(
+        self, out: Path, data: Path | None, kept: FoundRuns, here: FoundRuns, others: Iterable[Job] = ()
+    ) -> None:
         """Nothing is written.
 
         Args:
@@ -68,11 +70,13 @@ class JobPlanner:
             data: folder of the sets, `out`/data if None.
             kept: runs whose rows are kept, their folders being elsewhere.
             here: runs below `out`.
+            others: jobs of other grids in `out`, begun or not.
         """
         self._out, self._data, self._kept, self._here = out, data or out / DATA, kept, here
         self._jobs: dict[tuple[str, str, str], Job] = {}
         self._sets: dict[str, DataSet] = {}
         self._taken: set[str] = set()
+        self._of_others = {job.name: job.recipe for job in others}
         self.of_other_content: Counter[str] = Counter()
         """Kept runs that do not count, by set: theirs was collected alike, and its content is another."""
 
@@ -134,10 +138,13 @@ class JobPlanner:
         return self._jobs[key]
 
     def _free(self, name: str, recipe: str) -> str:
-        """A name that no other run has, be it in the plan or from an earlier sweep."""
+        """A name that no other run has, be it in the plan, in another grid's, or from an earlier sweep."""
         own = f"{name}~{recipe[:6]}"  # further runs of one recipe are on sets of other content
         names = chain([name, own], (f"{own}.{number}" for number in count(2)))
-        return next(name for name in names if name not in self._taken and self._out / name not in self._here)
+        return next(name for name in names if name not in self._taken and not self._of_another(name, recipe))
+
+    def _of_another(self, name: str, recipe: str) -> bool:
+        return self._out / name in self._here or self._of_others.get(name, recipe) != recipe
 
 
 def cost_of(values: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.ownership import in_use
-from vd4rl_pomdp.sweeps.driver import given_up
+from vd4rl_pomdp.sweeps.driver import attempts_at, given_up
 from vd4rl_pomdp.sweeps.estimate import Estimates
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.work import DIVERGED, DONE, told_seconds
@@ -52,9 +52,10 @@ def status(jobs: list[Job], attempts: dict[str, list[Row]], estimates: Estimates
     """
     states, failures = {}, {}
     for job in jobs:
-        states[job.name] = _state(job, attempts.get(job.name, []))
+        rows = attempts_at(job, attempts)
+        states[job.name] = _state(job, rows)
         if states[job.name] in (FAILED, DIVERGED):
-            failures[job.name] = attempts[job.name][-1]
+            failures[job.name] = rows[-1]
     left = [job for job in jobs if states[job.name] in (RUNNING, WAITING)]
     seconds = [estimates.seconds(job) for job in left]
     known = [value for value in seconds if value is not None]
