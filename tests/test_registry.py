@@ -60,6 +60,24 @@ def test_a_part_of_another_kind_is_refused(registry):
         registry.register("three", 3)
 
 
+def no_yours(name, part):
+    if part == "yours":
+        raise UserError("it is yours: choose mine")
+
+
+def test_a_part_that_cannot_work_is_refused_however_it_comes(registry, monkeypatch, capsys):
+    registry._refuse = no_yours
+    told = "frame encoder 'a': it is yours: choose mine"
+    with pytest.raises(UserError, match=told):
+        registry.register("a", "yours")
+    with pytest.raises(UserError, match=told):
+        Registry("frame encoder", {"b": "mine", "a": "yours"}, lambda part: True, "anything", no_yours)
+    monkeypatch.setattr("tests.test_registry.THEIRS", "yours")
+    offer(monkeypatch, a="tests.test_registry:THEIRS")
+    assert "a" not in registry
+    assert told in capsys.readouterr().err
+
+
 def test_an_entry_point_offers_a_part(registry, monkeypatch):
     offer(monkeypatch, theirs="tests.test_registry:THEIRS")
     assert registry.named("theirs") == "theirs"

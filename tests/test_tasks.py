@@ -124,6 +124,40 @@ def test_what_is_no_task_is_not_registered():
         TASKS.named("mine")
 
 
+@pytest.mark.parametrize("name", ["my/cartpole", "/cartpole", "cartpole/", "", ".", ".."])
+def test_a_task_whose_name_no_file_can_have_is_not_registered(name):
+    with TASKS.isolated(), pytest.raises(UserError, match=f"task '{name}': sets have files and folders of this name"):
+        TASKS.register(name, DMCTask("cartpole", "swingup"))
+
+
+class Unpaid(gymnasium.Env):
+    """Pays a number in its first step alone."""
+
+    def __init__(self, paid, render_mode=None):
+        self.paid, self.render_mode, self.steps = paid, render_mode, 0
+        self.observation_space = gymnasium.spaces.Box(0, 255, (1,))
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.zeros(1), 1.0 if self.steps == 1 else self.paid, False, False, {}
+
+    def render(self):
+        return np.zeros((84, 84), np.uint8)
+
+
+@pytest.mark.parametrize("paid", [np.nan, np.inf, -np.inf])
+def test_a_reward_that_is_no_number_is_refused_in_the_step_that_pays_it(paid):
+    env = make_env(GymnasiumTask(Unpaid, {"paid": paid}))
+    env.reset(0)
+    assert env.step(np.zeros(2, np.float32)).reward == 1
+    with pytest.raises(UserError, match=f"environment Unpaid pays {paid}, expected a number: mend its rewards"):
+        env.step(np.zeros(2, np.float32))
+
+
 def test_an_environment_that_does_not_exist_is_one_line():
     for environment, arguments, reason in (
         ("NoSuchThing-v0", {}, "NoSuchThing"),

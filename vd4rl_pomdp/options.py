@@ -6,8 +6,9 @@ nested in the stage's config; on the command line and in records all settings st
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, fields
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import MISSING, dataclass, fields
+from inspect import get_annotations
 from typing import Any, ClassVar, Self
 
 from vd4rl_pomdp.errors import UserError, flag_of, refuse_outside
@@ -40,16 +41,32 @@ NO_OPTIONS = Options()
 
 
 def flat(config: Any) -> dict[str, Any]:
-    """All settings of a config by name, its options' included."""
+    """All settings of a config by name, its options' included.
+
+    Raises:
+        UserError: two of them have one name, so that one flag would set both, and a record hold one of them.
+    """
     found: dict[str, Any] = {}
+    owners: dict[str, str] = {}
+    for owner, name, value in _settings(config):
+        if name in found:
+            raise UserError(
+                f"{owners[name]} and {owner} both have the setting {name!r}, and {flag_of(name)} cannot set two: "
+                "rename it in the part of your own"
+            )
+        found[name], owners[name] = value, owner
+    return found
+
+
+def _settings(config: Any) -> Iterator[tuple[str, str, Any]]:
+    """Class, name and value of every setting of a config, its options' included."""
     for field in fields(config):
         value = getattr(config, field.name)
         nested = options_in(value)
         if nested is None:
-            found[field.name] = value
+            yield type(config).__name__, field.name, value
         for options in nested or ():
-            found |= flat(options)
-    return found
+            yield from _settings(options)
 
 
 def options_in(value: Any) -> tuple[Options, ...] | None:
@@ -64,6 +81,51 @@ def check_options(config: Any) -> None:
     for field in fields(config):
         for options in options_in(getattr(config, field.name)) or ():
             options.check()
+
+
+def refuse_options(kind: Any, base: type[Options] = Options) -> None:
+    """Raise UserError for what cannot be the class of a part's options: flags or records would lose some of them.
+
+    Args:
+        kind: what a part names as this class.
+        base: a class that it is, or is derived from.
+    """
+    if not (isinstance(kind, type) and issubclass(kind, base)):
+        raise UserError(
+            f"its options are {kind!r}: name a class that is derived from {base.__module__}.{base.__name__}"
+        )
+    for fault in (*_undecorated(kind), *_unkept(kind), *_unlimited(kind)):
+        raise UserError(fault)
+    flat(kind.fill({}))
+
+
+def _undecorated(kind: type[Options]) -> Iterator[str]:
+    """Classes whose fields are no options, because nothing made them fields."""
+    for base in kind.__mro__:
+        own = [hint for hint in get_annotations(base).values() if "ClassVar" not in str(hint)]
+        if own and issubclass(base, Options) and "__dataclass_fields__" not in vars(base):
+            yield f"{base.__name__} has options, but is no dataclass: write @dataclass(frozen=True) above it"
+
+
+def _unkept(kind: type[Options]) -> Iterator[str]:
+    """Fields that cannot be options: by their names, or because no record gives back their values."""
+    for field in fields(kind):
+        where = f"the option {field.name!r} of {kind.__name__}"
+        if hasattr(Options, field.name):
+            yield f"{where} hides Options.{field.name}: rename it"
+        default = field.default if field.default_factory is MISSING else field.default_factory()
+        if not isinstance(default, bool | int | float | str | Options | None):
+            yield f"{where} needs a default that is a number, a word, a truth value or None: records keep nothing else"
+
+
+def _unlimited(kind: type[Options]) -> Iterator[str]:
+    """Names in `limits` that are not those of numbers."""
+    defaults = {field.name: field.default for field in fields(kind)}
+    for base in kind.__mro__:
+        for name in vars(base).get("limits", {}):
+            default = defaults.get(name, "")
+            if isinstance(default, bool) or not isinstance(default, int | float | None):
+                yield f"limits of {base.__name__} name {name!r}, which is no number among its options: mend the name"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -92,7 +154,7 @@ class StageConfig:
             settings: values by name, of the stage's own settings and of the chosen parts' options.
 
         Raises:
-            UserError: an unknown preset or part, or a setting that nothing reads.
+            UserError: an unknown preset or part, a setting that nothing reads, or one that two parts have.
         """
         values = cls.defaults(preset) | settings
         parts = cls.parts(values)

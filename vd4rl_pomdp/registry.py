@@ -20,7 +20,14 @@ REGISTRIES: dict[str, Registry[Any]] = {}
 class Registry(Mapping[str, Part], Generic[Part]):
     """All parts of one kind; reading it loads what installed packages offer, once."""
 
-    def __init__(self, kind: str, own: Mapping[str, Part], fits: Callable[[Any], bool], expected: str) -> None:
+    def __init__(
+        self,
+        kind: str,
+        own: Mapping[str, Part],
+        fits: Callable[[Any], bool],
+        expected: str,
+        refuse: Callable[[str, Any], None] = lambda name, part: None,
+    ) -> None:
         """See the class.
 
         Args:
@@ -29,6 +36,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
             own: the package's parts by name.
             fits: whether an object is a part of this kind.
             expected: what such an object is, for messages.
+            refuse: raises UserError, without naming the part, for a name or an object of this kind that cannot work.
         """
         self.kind, self.setting = kind, kind.replace(" ", "_")
         self.group = f"vd4rl_pomdp.{self.setting}s"
@@ -36,12 +44,14 @@ class Registry(Mapping[str, Part], Generic[Part]):
         """Offered parts that cannot be loaded, and why."""
         self._parts = dict(own)
         self._origins: dict[str, str] = {}
-        self._fits, self._expected = fits, expected
+        self._fits, self._expected, self._refuse = fits, expected, refuse
         self._loaded = False
+        for name, part in own.items():
+            self._refuse_faulty(name, part)
         REGISTRIES[self.setting] = self
 
     def register(self, name: str, part: Part) -> None:
-        """Add a part of one's own; a name that is taken, or a part of another kind, raises UserError."""
+        """Add a part of one's own; a name that is taken, or a part that cannot work, raises UserError."""
         self._add(name, part, BY_CALL)
 
     @property
@@ -99,7 +109,14 @@ class Registry(Mapping[str, Part], Generic[Part]):
             raise UserError(f"a {self.kind} called {name!r} exists already: choose another name")
         if not self._fits(part):
             raise UserError(f"{self.kind} {name!r} is a {type(part).__name__}, not {self._expected}")
+        self._refuse_faulty(name, part)
         self._parts[name], self._origins[name] = part, origin
+
+    def _refuse_faulty(self, name: str, part: Any) -> None:
+        try:
+            self._refuse(name, part)
+        except UserError as error:
+            raise UserError(f"{self.kind} {name!r}: {error}") from None
 
     def _load_offered(self) -> None:
         """Add what installed packages offer; what cannot be loaded is told of once, and left out."""

@@ -8,10 +8,12 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
 
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.registry import Registry
 
 FRAME_SIZE = 84
@@ -142,6 +144,12 @@ class GymnasiumTask(Task):
         return f"Gymnasium's {name}, {super().summary}"
 
 
+def _refuse_name(name: str, task: Task) -> None:
+    """Raise UserError for a name under which no file of a set could be written."""
+    if name in ("", "..") or Path(name).name != name:
+        raise UserError("sets have files and folders of this name, which it cannot be: choose one without '/'")
+
+
 TASKS: Registry[Task] = Registry(
     "task",
     {
@@ -153,6 +161,7 @@ TASKS: Registry[Task] = Registry(
     },
     lambda part: isinstance(part, DMCTask | GymnasiumTask),
     "a vd4rl_pomdp.tasks.DMCTask or GymnasiumTask",
+    _refuse_name,
 )
 """All tasks. Packages offer theirs in the group of entry points `vd4rl_pomdp.tasks`. The noise of the benchmark's is of
 0.2, 0.3, 0.4 and 0.5 the largest that leaves the expert more than half of its mean return."""

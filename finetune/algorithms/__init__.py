@@ -7,6 +7,7 @@ from finetune.algorithms.bc import BC
 from finetune.algorithms.drqv2_bc import DrQv2BC
 from finetune.algorithms.iql import IQL, IQLOptions
 from finetune.algorithms.td3_bc import TD3BC, TD3BCOptions
+from vd4rl_pomdp.options import refuse_options
 from vd4rl_pomdp.registry import Registry
 
 __all__ = [
@@ -27,5 +28,6 @@ ALGORITHMS: Registry[type[Algorithm]] = Registry(
     {"td3_bc": TD3BC, "drqv2_bc": DrQv2BC, "iql": IQL, "bc": BC},
     lambda part: isinstance(part, type) and issubclass(part, Algorithm),
     "a class of finetune.algorithms.Algorithm",
+    lambda name, part: refuse_options(part.options),
 )
 """All algorithms. Packages offer theirs in the group of entry points `vd4rl_pomdp.algorithms`; each names a class."""

@@ -15,7 +15,7 @@ from pretrain.objectives.untrained import StateOptions, Untrained
 from vd4rl_pomdp.augmentation import Sharing
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.objective import ActionOptions, InverseOptions, Objective
-from vd4rl_pomdp.options import Options
+from vd4rl_pomdp.options import Options, refuse_options
 from vd4rl_pomdp.registry import Registry
 
 
@@ -138,6 +138,10 @@ _OWN = {
     ),
 }
 METHODS: Registry[Method] = Registry(
-    "method", _OWN, lambda part: isinstance(part, Method), "a pretrain.objectives.Method"
+    "method",
+    _OWN,
+    lambda part: isinstance(part, Method),
+    "a pretrain.objectives.Method",
+    lambda name, part: refuse_options(part.options),
 )
 """All methods. Packages offer theirs in the group of entry points `vd4rl_pomdp.methods`; each names a `Method`."""

@@ -16,6 +16,7 @@ from vd4rl_pomdp.testing.frame_encoders import (
     a_seed_decides_everything,
     features_have_one_shape,
     gradients_reach_all_parameters,
+    make,
     pictures_are_not_mixed,
 )
 
@@ -88,7 +89,6 @@ class Centred(nn.Module):
 
 
 MUTANTS = [
-    (Flat, features_have_one_shape, r"its maps have the shape \(144,\)"),
     (Bounded, features_have_one_shape, "some are not finite"),
     (
         lambda: nn.BatchNorm2d(4),
@@ -128,3 +128,18 @@ def test_a_right_one_passes_at_any_size_and_what_cannot_be_is_refused(encoders):
         check_frame_encoder("mixer", size=84)
     with pytest.raises(UserError, match="unknown frame encoder 'vit'"):
         check_frame_encoder("vit")
+
+
+def test_a_module_that_makes_no_maps_is_refused_where_it_is_built(encoders):
+    encoders.register("mine", FrameEncoderPart(with_layer(Flat)))
+    told = (
+        r"frame encoder 'mine' makes \('N', 144\) of N pictures, not maps \(N, C', H', W'\): give its module's output"
+    )
+    for build in (check_frame_encoder, make):
+        with pytest.raises(UserError, match=told):
+            build("mine", size=SIZE)
+
+
+def test_the_name_of_what_reads_states_is_refused(encoders):
+    with pytest.raises(UserError, match="frame encoder 'state': encoders of simulator states have this name"):
+        encoders.register("state", FrameEncoderPart(convolution))

@@ -7,7 +7,7 @@ import torch
 
 from pretrain.objectives import METHODS, Method
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.objective import InverseOptions, Objective, StateInverse
+from vd4rl_pomdp.objective import InverseObjective, InverseOptions, Objective, StateInverse
 from vd4rl_pomdp.testing import check_method
 from vd4rl_pomdp.testing.contract import run_check
 from vd4rl_pomdp.testing.methods import (
@@ -164,6 +164,12 @@ class Broken(Mean):
         raise RuntimeError("a shape does not fit")
 
 
+class Silent(StateInverse):
+    """Forgets to declare what it sees, and is no class that can be made."""
+
+    visible = InverseObjective.visible
+
+
 MUTANTS = [
     (Vector, a_loss_is_a_finite_scalar, r"its shape is \(1,\)"),
     (Diverged, a_loss_is_a_finite_scalar, "it is inf"),
@@ -205,6 +211,16 @@ def test_a_method_that_keeps_all_promises_passes_and_unknown_ones_and_settings_a
         check_method("mine", max_k=2)
     with pytest.raises(UserError, match="unknown method 'yours'"):
         check_method("yours")
+
+
+@pytest.mark.parametrize(
+    ("build", "reason"),
+    [(Silent, "TypeError: .* abstract method '?visible"), (lambda *parts: parts[0], "makes a Encoder")],
+)
+def test_a_method_that_makes_no_objective_breaks_a_promise(methods, build, reason):
+    methods.register("mine", Method(build, options=InverseOptions))
+    with pytest.raises(AssertionError, match=f"method 'mine' breaks a promise(.|\n)*makes an objective(.|\n)*{reason}"):
+        check_method("mine")
 
 
 @pytest.mark.parametrize("word", [{"shift": "windows"}, {"history": "lstm"}])

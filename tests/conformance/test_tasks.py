@@ -76,7 +76,6 @@ def tasks():
 WALKER = TASKS["walker_walk"]
 MUTANTS = [
     (GymnasiumTask(Unseeded), episodes_repeat_from_their_seeds, "row 0 shows another picture or state"),
-    (GymnasiumTask(Infinite), rows_have_the_declared_widths, "a reward is inf"),
     (GymnasiumTask(Square, layout=Layout(3)), rows_have_the_declared_widths, "its layout says .* the environment has"),
     (replace(WALKER, layout=Layout(6, 23, 9, travel=(1,))), rows_have_the_declared_widths, "its layout says"),
     (GymnasiumTask(Failing), episodes_end_once, "RuntimeError: the motor is off"),
@@ -108,6 +107,13 @@ def test_what_the_harness_itself_could_break_is_caught(tasks, monkeypatch):
             episodes_end_once,
             "another discount than 1",
         ),
+        (
+            GymnasiumEnv,
+            "_apply",
+            lambda self, a: (np.inf, False, 1.0),
+            rows_have_the_declared_widths,
+            "a reward is inf",
+        ),
         (PixelEnv, "step", lambda self, a: replace(step(self, a), step_type=1), episodes_end_once, "decisions goes on"),
         (dmc, "replay_rewards", lambda n, p, a: np.zeros(len(a)), rewards_replay, "were paid"),
     ]
@@ -125,3 +131,6 @@ def test_right_ones_of_both_kinds_pass_and_unknown_names_are_refused(tasks):
     check_task("reacher")
     with pytest.raises(UserError, match="unknown task 'mine'"):
         check_task("mine")
+    tasks.register("infinite", GymnasiumTask(Infinite))
+    with pytest.raises(UserError, match="environment Infinite pays inf"):
+        check_task("infinite")

@@ -1,3 +1,5 @@
+import re
+
 import numpy as np
 import pytest
 import torch
@@ -8,9 +10,11 @@ from vd4rl_pomdp._shift import shift_by_index, shift_by_lines
 from vd4rl_pomdp.augmentation import random_shift
 from vd4rl_pomdp.corruptions import (
     CORRUPTIONS,
+    STAGES,
     BatchCorruption,
     CorruptionConfig,
     KeyStream,
+    Patch,
     derive_keys,
     draw_integers,
     make_corruption,
@@ -164,6 +168,22 @@ def test_shifting_some_of_the_images_by_lines_leaves_out_the_others():
     out = torch.empty_like(obs[some])
     shift_by_lines(obs, some, offset, out)
     assert torch.equal(out, shift_by_index(obs[some], offset))
+
+
+@pytest.mark.parametrize("name", ["patch+patch", "patch+patch+zero_frames", "zero_frames+zero_frames"])
+def test_a_stage_that_is_named_twice_is_refused(name):
+    twice = name.split("+")[0]
+    with pytest.raises(UserError, match=re.escape(f"corruption '{name}' names {twice} twice, and its options are one")):
+        CorruptionConfig.of(name)
+
+
+@pytest.mark.parametrize("name", ["none", "bars+wide", "patch+"])
+def test_a_stage_is_not_called_as_none_or_several_are(name):
+    with (
+        STAGES.isolated(),
+        pytest.raises(UserError, match=re.escape(f"corruption '{name}': 'none' and names with '+'")),
+    ):
+        STAGES.register(name, type("Bars", (Patch,), {}))
 
 
 @pytest.mark.parametrize("name", CORRUPTIONS)

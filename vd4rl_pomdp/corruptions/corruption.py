@@ -15,7 +15,7 @@ from torch import Tensor
 
 from vd4rl_pomdp.corruptions.keys import DRAWS, KeyStream, derive_keys, draw_integers, draw_numbered, hash_keys
 from vd4rl_pomdp.errors import UserError, flag_of
-from vd4rl_pomdp.options import Limits, Options, flat
+from vd4rl_pomdp.options import Limits, Options, flat, refuse_options
 from vd4rl_pomdp.registry import Registry
 from vd4rl_pomdp.seeding import stream_seed
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
@@ -99,11 +99,19 @@ def _is_stage(part: Any) -> bool:
     return isinstance(part, type) and issubclass(part, Options) and any("__call__" in vars(c) for c in part.__mro__)
 
 
+def _refuse_stage(name: str, kind: type[Options]) -> None:
+    """Raise UserError for a stage that no corruption's name could tell of, or whose options cannot work."""
+    if name == "none" or "+" in name:
+        raise UserError("'none' and names with '+' mean no stage, or several: choose another name")
+    refuse_options(kind)
+
+
 STAGES: Registry[type[Options]] = Registry(
     "corruption",
     {"patch": Patch, ZERO_FRAMES: ZeroFrames},
     _is_stage,
     "a class of vd4rl_pomdp.options.Options with the method of a Stage",
+    _refuse_stage,
 )
 """Every stage by name: a dataclass of its options that is a `Stage`. A corruption's name joins its stages with `+`, in
 the order in which they are applied. Packages offer theirs in the group of entry points `vd4rl_pomdp.corruptions`."""
@@ -112,8 +120,10 @@ CORRUPTIONS = ("none", "patch", "zero_frames", "patch+zero_frames")
 
 
 def _kinds(corruption: str) -> list[type[Options]]:
-    """Classes of a corruption's stages; an unknown name raises UserError."""
+    """Classes of a corruption's stages; an unknown or a repeated name raises UserError."""
     names = [] if corruption == "none" else corruption.split("+")
+    for name in (name for name in names if names.count(name) > 1):
+        raise UserError(f"corruption {corruption!r} names {name} twice, and its options are one set: name it once")
     if any(name not in STAGES and name not in STAGES.broken for name in names) or ZERO_FRAMES in names[:-1]:
         own = [name for name in STAGES if STAGES.origin(name)]
         raise UserError(f"unknown corruption {corruption!r}: choose one of {', '.join([*CORRUPTIONS, *own])}")
@@ -141,10 +151,11 @@ class CorruptionConfig(Options):
             options: values of the stages' options by name.
 
         Raises:
-            UserError: an unknown name, or an option that no stage reads.
+            UserError: an unknown or a repeated name, an option that no stage reads, or one that two of them have.
         """
         config = cls.fill({"corruption": corruption, "corruption_mode": corruption_mode} | options)
-        for name in (name for name in options if name not in flat(config)):
+        known = flat(config)
+        for name in (name for name in options if name not in known):
             raise UserError(f"{flag_of(name)} is not read by the corruption {corruption}: leave it out")
         return config
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import gymnasium
@@ -67,10 +68,15 @@ class GymnasiumEnv(PixelEnv):
         rescaled, total = self._rescaled(action), 0.0
         for _ in range(self.task.action_repeat):
             self._observation, reward, terminated, truncated, _ = self.env.step(rescaled)
-            total += float(reward)
+            total += self._finite(float(reward))
             if terminated or truncated:
                 return total, True, 0.0 if terminated else 1.0
         return total, False, 1.0
+
+    def _finite(self, reward: float) -> float:
+        if not math.isfinite(reward):
+            raise UserError(f"environment {self._name} pays {reward}, expected a number: mend its rewards, or wrap it")
+        return reward
 
     def _rescaled(self, action: np.ndarray) -> np.ndarray:
         """An (A,) action in [-1, 1] between the bounds of the environment's own, in its shape and dtype."""

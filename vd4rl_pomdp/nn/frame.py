@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from vd4rl_pomdp.corruptions.keys import draw_normals
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.options import Limits, Options
+from vd4rl_pomdp.options import Limits, Options, refuse_options
 from vd4rl_pomdp.registry import Registry
 
 
@@ -159,6 +159,17 @@ def _flat(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     return nn.Sequential()
 
 
+STATE = "state"
+"""Frame encoder of the `state` reference, which is no part: it reads no pixels."""
+
+
+def _refuse_part(name: str, part: FrameEncoderPart) -> None:
+    """Raise UserError for a frame encoder that could not be told from another, or whose options cannot work."""
+    if name == STATE:
+        raise UserError("encoders of simulator states have this name: choose another")
+    refuse_options(part.options, FrameOptions)
+
+
 FRAME_ENCODERS: Registry[FrameEncoderPart] = Registry(
     "frame encoder",
     {
@@ -172,6 +183,7 @@ FRAME_ENCODERS: Registry[FrameEncoderPart] = Registry(
     },
     lambda part: isinstance(part, FrameEncoderPart),
     "a vd4rl_pomdp.nn.frame.FrameEncoderPart",
+    _refuse_part,
 )
 """All frame encoders. Packages offer theirs in the group of entry points `vd4rl_pomdp.frame_encoders`."""
 
@@ -232,13 +244,13 @@ class StateFrame(nn.Module):
         return state[..., None, None]
 
 
-STATE = "state"
-"""Frame encoder of the `state` reference."""
-
-
 def make_frame_encoder(name: str, channels: int, size: int, options: FrameOptions) -> FrameEncoder:
-    """Build a frame encoder by name; an unknown name raises UserError listing the choices."""
+    """Build a frame encoder by name; an unknown name, or one whose module makes no maps, raises UserError."""
     maps = FRAME_ENCODERS.named(name).build(channels, size, options)
-    return FrameEncoder(maps, channels, size, options.feature_dim).to(
-        memory_format=torch.channels_last  # type: ignore[call-overload]
-    )
+    encoder = FrameEncoder(maps, channels, size, options.feature_dim)
+    if len(encoder.map_shape) != 3:
+        raise UserError(
+            f"frame encoder {name!r} makes {('N', *encoder.map_shape)} of N pictures, not maps (N, C', H', W'): "
+            "give its module's output height and width, 1 for none"
+        )
+    return encoder.to(memory_format=torch.channels_last)  # type: ignore[call-overload]

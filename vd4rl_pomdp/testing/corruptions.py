@@ -35,9 +35,12 @@ def check_corruption(name: str, **options: Any) -> None:
 
     Raises:
         AssertionError: a promise is broken; says which one, and by what.
-        UserError: there is no such stage or option.
+        UserError: there is no such stage or option, or a setting of the training has an option's name.
     """
+    from pretrain.config import PretrainConfig
+
     CorruptionConfig.of(name, **options)
+    PretrainConfig.of("smoke", corruption=name, **options)
     run_checks("corruption", CHECKS, name, **options)
 
 

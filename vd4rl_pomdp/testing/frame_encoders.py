@@ -11,7 +11,7 @@ from torch import Tensor
 
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import EncoderCard, load_encoder, save_encoder
-from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, FrameEncoder
+from vd4rl_pomdp.nn.frame import FrameEncoder
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
 
@@ -28,9 +28,12 @@ def check_frame_encoder(name: str, size: int = FRAME_SIZE, **options: Any) -> No
 
     Raises:
         AssertionError: a promise is broken; says which one, and by what.
-        UserError: there is no such frame encoder or option, or it cannot read pictures of that size.
+        UserError: there is no such frame encoder or option, it cannot read pictures of that size or makes no maps of
+            them, or a setting of the training has an option's name.
     """
-    FRAME_ENCODERS.check(name)
+    from pretrain.config import PretrainConfig
+
+    PretrainConfig.of("smoke", frame_encoder=name, **options)
     run_checks("frame encoder", CHECKS, name, size=size, **options)
 
 
@@ -55,7 +58,6 @@ def features_have_one_shape(name: str, **options: Any) -> None:
     encoder, size = make(name, **options), options["size"]
     frame, width, obs = encoder.frame, encoder.config.feature_dim, pictures(6, size)
     assert isinstance(frame, FrameEncoder)
-    claim(len(frame.map_shape) == 3, f"its maps have the shape {frame.map_shape}, not (channels, height, width)")
     with torch.no_grad():
         flat, windows, floats = frame(obs), frame(obs.view(2, 3, *obs.shape[1:])), frame(obs.float())
     for given, shape in ((flat, (6, width)), (windows, (2, 3, width)), (floats, (6, width))):

@@ -8,10 +8,11 @@ from typing import Any, cast
 
 import torch
 
+from vd4rl_pomdp.corruptions import CORRUPTIONS
 from vd4rl_pomdp.nn.action_target import ACTION_TARGETS
 from vd4rl_pomdp.objective import InverseObjective, Objective
 from vd4rl_pomdp.state_scale import StateScale
-from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
+from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_check, run_checks, shown
 from vd4rl_pomdp.types import StateWindows, Windows
 from vd4rl_pomdp.visibility import declared, dependence, response, wrong_pairs
 
@@ -32,24 +33,28 @@ def check_method(name: str, **settings: Any) -> None:
 
     Raises:
         AssertionError: a promise is broken; says which one, and by what.
-        UserError: there is no such method or setting.
+        UserError: there is no such method or setting, or something chosen beside it has a setting of the same name.
     """
-    run_checks("method", checks_of(name), name, **settings)
+    from pretrain.config import PretrainConfig
+
+    PretrainConfig.of("smoke", **({"method": name, "corruption": CORRUPTIONS[-1]} | settings))
+    run_check("method", an_objective_can_be_made, name, **settings)
+    run_checks("method", checks_of(name, **settings), name, **settings)
 
 
-def checks_of(name: str) -> tuple[Check, ...]:
+def checks_of(name: str, **settings: Any) -> tuple[Check, ...]:
     """The checks that a method has to pass: all encode, those that are trained have a loss, some predict actions."""
     from pretrain.objectives import METHODS
 
     trained = TRAINED if METHODS.named(name).trained else ()
-    return ENCODING + trained + (INVERSE if predicts_actions(name) else ())
+    return ENCODING + trained + (INVERSE if predicts_actions(name, **settings) else ())
 
 
-def predicts_actions(name: str) -> bool:
+def predicts_actions(name: str, **settings: Any) -> bool:
     """Whether a method is trained as an inverse model."""
     from pretrain.objectives import METHODS
 
-    return METHODS.named(name).trained and isinstance(build(name), InverseObjective)
+    return METHODS.named(name).trained and isinstance(build(name, **settings), InverseObjective)
 
 
 def build(name: str, **settings: Any) -> Objective:
@@ -99,6 +104,12 @@ def windows(name: str, lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0
         return plain
     g = torch.Generator().manual_seed(seed)
     return StateWindows(**plain, state=torch.randn(len(lengths), ROWS, STATE, generator=g))
+
+
+def an_objective_can_be_made(name: str, **settings: Any) -> None:
+    """Of an encoder, a target, options and a seed a method makes an objective, with all that its class asks for."""
+    made = build(name, **settings)
+    claim(isinstance(made, Objective), f"it makes a {type(made).__name__}")
 
 
 def streaming_equals_batch(name: str, **settings: Any) -> None:

@@ -26,7 +26,7 @@ def check_task(name: str) -> None:
 
     Raises:
         AssertionError: a promise is broken; says which one, and by what.
-        UserError: there is no such task, or its environment cannot be built.
+        UserError: there is no such task, or its environment cannot be built, shows no pictures or pays no numbers.
     """
     TASKS.check(name)
     run_checks("task", CHECKS, name)
