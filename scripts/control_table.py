@@ -11,8 +11,8 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from vd4rl_pomdp.report.gaps import CONDITION, condition_of
-from vd4rl_pomdp.report.load import load_runs
-from vd4rl_pomdp.report.measures import PROBES, control, representations, run_table
+from vd4rl_pomdp.report.load import PROBES, load_runs
+from vd4rl_pomdp.report.measures import control, representations, run_table
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.report.tables import evaluations, grouped, label
 

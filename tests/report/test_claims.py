@@ -10,6 +10,7 @@ from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.report.claims import CLAIMS, judge_claims, tally
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.terminal import print_summary
+from vd4rl_pomdp.runs.files import read_json, write_json
 
 DATA = 600.0
 GOOD = {
@@ -82,6 +83,49 @@ def test_claims_are_about_methods_as_they_are_and_not_about_their_variants(tmp_p
     assert "history gru" in rows[FIRST]["right"], "the best other one, whatever its variant"
 
 
+def test_runs_of_like_settings_are_compared_and_not_the_best_of_each_side(tmp_path):
+    write(tmp_path, GOOD)
+    rows = judged(write(tmp_path, {("mik+a", "patch"): (90, 92), ("driml", "patch"): (95, 97)}, steps=60))
+    assert (rows[ACTIONS]["left_return"], rows[ACTIONS]["right_return"]) == pytest.approx((520, 320))
+    assert (rows[FIRST]["left_return"], rows[FIRST]["right_return"]) == pytest.approx((910, 960))
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"steps": 60}, "steps"),
+        ({"steps": 60, "max_k": 1}, "steps, max_k"),
+        ({"steps": 60, "preset": "paper"}, "pretraining preset"),
+    ],
+)
+def test_where_no_runs_have_like_settings_nothing_is_judged_but_said(tmp_path, settings, words):
+    write(tmp_path, GOOD | {("mik+a", "patch"): (), ("mik+a", "none"): ()})
+    rows = judged(write(tmp_path, {("mik+a", "patch"): (90, 92)}, **settings))
+    for claim in (ACTIONS, FIRST, "what is left to a memory that was told the states"):
+        row = rows[claim]
+        assert (row["verdict"], row["difference"], row["error"]) == (f"not judged: other {words}", None, None)
+        assert 910 in (round(row["left_return"]), round(row["right_return"])), "both sides are shown"
+    assert rows[MEMORY]["verdict"] == "holds"
+    states = rows["what is left to the states themselves"]
+    assert (states["verdict"], states["difference"]) == ("", pytest.approx(760 - 910)), "states are not pretrained"
+
+
+def test_updates_of_fine_tuning_count_for_the_states_too(tmp_path):
+    write(tmp_path, GOOD)
+    for run in tmp_path.glob("mik+a-patch-*"):
+        describe(run, updates=500)
+    row = judged(tmp_path)["what is left to the states themselves"]
+    assert row["verdict"] == "not judged: other updates"
+
+
+def test_seeds_that_share_an_encoder_are_not_judged(tmp_path):
+    write(tmp_path, GOOD | {("driml", "patch"): (80, 82)})
+    for run in tmp_path.glob("driml-patch-*"):
+        card = read_json(run / "encoder" / "config.json")
+        write_json(run / "encoder" / "config.json", {"pretrain": card["pretrain"] | {"seed": 7}})
+    assert judged(tmp_path)[FIRST]["right"] == "mik"
+
+
 def test_a_setting_that_early_runs_do_not_record_is_the_methods_own(tmp_path):
     for seed in (0, 1):
         describe(write_run(tmp_path / f"acro{seed}", "acro", seed, {10: [20.0 + seed]}), seed=seed)
@@ -116,6 +160,6 @@ def test_the_page_and_the_terminal_tell_what_becomes_of_the_claims(tmp_path, cap
 
 
 def test_a_tally_counts_settings_by_verdict():
-    rows = [{"verdict": verdict} for verdict in ("holds", "too few seeds", "holds", "not told apart")]
+    rows = [{"kind": "above", "verdict": verdict} for verdict in ("holds", "too few seeds", "holds", "not told apart")]
     assert tally(rows) == "holds in 2 of 4 settings; too few seeds in 1; not told apart in 1"
-    assert tally([{"verdict": ""}]) == ""
+    assert tally([{"kind": "distance", "verdict": "not judged: other steps"}]) == ""

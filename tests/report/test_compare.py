@@ -53,7 +53,22 @@ def test_variants_are_compared_by_name_and_a_lone_one_with_the_other_sets(tmp_pa
     lone = compare_results(tmp_path / "a" / "15", tmp_path / "b" / "1").rows
     assert [(row["difference"], row["settings"]) for row in lone] == [(-13.0, "max_k 15 → 1")]
     some = compare_results(tmp_path / "a", tmp_path / "b" / "1").rows
-    assert [row["difference"] for row in some] == [None] * 3, "which of two it is compared with is not told"
+    assert {row["variant"]: row["difference"] for row in some} == {"max_k 1": 1.0, "max_k 15": None}
+    describe(write_run(tmp_path / "c", "mik+a", 0, {10: [9.0]}), {"max_k": 30})
+    other = compare_results(tmp_path / "a", tmp_path / "c").rows
+    assert [row["difference"] for row in other] == [None] * 3, "which of two it is compared with is not told"
+
+
+def test_equal_settings_are_compared_however_each_set_names_them(tmp_path):
+    for size in (16, 48):
+        for seed in (0, 1):
+            run = write_run(tmp_path / f"a/{size}/{seed}", "acro", seed, {10: [size + seed]})
+            describe(run, {"patch_size": size})
+    rows = compare_results(tmp_path / "a", tmp_path / "a" / "16").rows
+    found = {row["corruption"]: (row["difference"], row["seeds_a"], row["seeds_b"]) for row in rows}
+    assert found == {"patch, patch_size 16": (0.0, 2, 2), "patch, patch_size 48": (None, 2, 0)}
+    back = compare_results(tmp_path / "a" / "16", tmp_path / "a").rows
+    assert [row["difference"] for row in back if row["corruption"] == "patch"] == [0.0]
 
 
 def test_no_word_is_broken_at_eighty_columns(tmp_path):

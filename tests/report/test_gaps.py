@@ -3,6 +3,7 @@
 from tests.helpers_report import describe, write_run
 from vd4rl_pomdp.report.gaps import find_gaps
 from vd4rl_pomdp.report.load import load_runs
+from vd4rl_pomdp.runs.files import read_json, write_json
 
 
 def test_an_ablation_is_missing_elsewhere_but_a_budget_for_every_task_is_not(tmp_path):
@@ -40,3 +41,25 @@ def test_the_state_is_not_missing_where_other_pixels_of_the_same_set_are_hidden(
         ("medium", "none", "state"),
         ("medium", "patch", "state"),
     }
+
+
+def test_a_finished_seed_is_no_gap_whatever_else_was_begun(tmp_path):
+    runs = tmp_path / "runs"
+    describe(write_run(runs / "a", "acro", 0, {10: [1.0]}), {})
+    begun = describe(write_run(runs / "b", "acro", 0, {}), {})
+    (begun / "timing.json").unlink()
+    card = read_json(begun / "encoder" / "config.json")
+    write_json(begun / "encoder" / "config.json", {"pretrain": card["pretrain"] | {"frames": 7}})
+    loaded = load_runs([runs])
+    assert [run.finished for run in loaded] == [True, False]
+    assert find_gaps(loaded) == []
+
+
+def test_a_seed_on_the_encoder_of_its_own_is_no_gap_of_those_that_share_it(tmp_path):
+    runs = tmp_path / "runs"
+    for seed in (0, 1, 2):
+        run = describe(write_run(runs / str(seed), "acro", seed, {10: [1.0]}), {})
+        card = read_json(run / "encoder" / "config.json")
+        write_json(run / "encoder" / "config.json", {"pretrain": card["pretrain"] | {"seed": 0}})
+    gaps = [(row["variant"], row["seed"]) for row in find_gaps(load_runs([runs]))]
+    assert gaps == [("", 1), ("", 2)]

@@ -5,7 +5,7 @@ from typing import Any
 
 import pytest
 
-from tests.helpers_report import write_seeds
+from tests.helpers_report import describe, write_seeds
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.report.gates import gates, unranked
 from vd4rl_pomdp.report.load import load_runs
@@ -57,6 +57,20 @@ def test_references_are_methods_as_they_are_and_not_their_variants(tmp_path):
     row = patch_gate(grid(tmp_path, {("random", "patch"): (49,)}, history="gru"))
     assert row["verdict"] == "not known to discriminate: state was not measured"
     assert (row["above_random"], row["error"]) == (pytest.approx(520 - 120), pytest.approx((800 / 2 + 800 / 2) ** 0.5))
+
+
+def test_the_best_method_is_held_against_random_that_was_fine_tuned_alike(tmp_path):
+    grid(tmp_path, GOOD | {("random", "patch"): ()})
+    grid(tmp_path, {("random", "patch"): (10, 14)}, steps=0)
+    assert patch_gate(tmp_path)["verdict"] == "discriminates", "it is not pretrained"
+    for run in tmp_path.glob("random-*"):
+        describe(run, updates=500)
+    row = patch_gate(tmp_path)
+    assert row["verdict"] == "not known to discriminate: best and random have other updates"
+    assert (row["above_random"], row["error"]) == (None, None)
+    for run in tmp_path.glob("acro-patch-*"):
+        describe(run, updates=500)
+    assert patch_gate(tmp_path)["above_random"] == pytest.approx(210 - 120), "the best of those that are alike"
 
 
 def test_a_single_seed_of_a_reference_counts_where_there_are_no_more(tmp_path):

@@ -52,9 +52,9 @@ def test_every_figure_has_its_files_its_words_and_n(tmp_path, figure_files):
     assert sorted(row["score"] for row in rows if row["kind"] == "seed" and row["method"] == "acro") == [
         "20.0", "21.0", "22.0", "9.0",
     ]  # fmt: skip
-    (tmp_path / "out" / "figures" / "old.png").touch()
+    (tmp_path / "out" / "figures" / "scores_old.png").touch()
     write_report([runs], tmp_path / "out")
-    assert {path.name for path in (tmp_path / "out" / "figures").iterdir()} == found, "what is no figure of it goes"
+    assert {path.name for path in (tmp_path / "out" / "figures").iterdir()} == found, "an earlier one goes"
 
 
 def test_lines_of_many_methods_differ_in_more_than_colour():

@@ -149,3 +149,44 @@ def test_a_preset_stands_for_what_it_decides_and_the_page_says_all(tmp_path):
     assert set(pooled(tmp_path / "runs")) == labels
     page = write_report([tmp_path / "runs"], tmp_path / "out")[0].read_text()
     assert "<td>preset smoke, steps 5, pretraining preset smoke, max_k 3</td>" in page
+
+
+def on_encoder(folder, seed, encoder, quality="expert"):
+    """A run of acro whose encoder was pretrained with a seed of its own."""
+    run = write_run(folder / f"{quality}-{encoder}-{seed}", "acro", seed, {10: [1.0]}, labels={"quality": quality})
+    card = read_json(describe(run, {}) / "encoder" / "config.json")
+    write_json(run / "encoder" / "config.json", {"pretrain": card["pretrain"] | {"seed": encoder}})
+    return run
+
+
+def test_seeds_on_one_encoder_are_no_replicates_of_the_method(tmp_path):
+    for seed in (0, 1, 2):
+        on_encoder(tmp_path / "one", seed, encoder=0)
+        on_encoder(tmp_path / "own", seed, encoder=seed)
+        on_encoder(tmp_path / "others", 0, encoder=seed)
+    assert pooled(tmp_path / "own") == {"acro": 3}
+    assert pooled(tmp_path / "one") == {"acro": 1, "acro, pretraining seed 0": 2}
+    assert pooled(tmp_path / "others") == {"acro": 1, "acro, pretraining seed 1": 1, "acro, pretraining seed 2": 1}
+
+
+def test_what_seeds_share_is_told_whatever_other_runs_there_are(tmp_path):
+    for seed, quality in enumerate(("expert", "medium")):
+        for own in (2, 3):
+            on_encoder(tmp_path / "runs", own, encoder=seed, quality=quality)
+    assert pooled(tmp_path / "runs") == {"acro, pretraining seed 0": 2, "acro, pretraining seed 1": 2}
+    assert pooled(tmp_path / "runs" / "expert-0-2") == {"acro, pretraining seed 0": 1}
+
+
+def test_a_corruption_has_one_name_whatever_learns_under_it(tmp_path):
+    runs = tmp_path / "runs"
+    for algorithm, task, size in (
+        *(("td3_bc", "walker_walk", 16), ("td3_bc", "cheetah_run", 48)),
+        *(("bc", "walker_walk", 16), ("bc", "walker_walk", 48)),
+    ):
+        labels = {"algorithm": algorithm, "task": task}
+        describe(write_run(runs / f"{labels}{size}", "acro", 0, {10: [1.0]}, labels=labels), {"patch_size": size})
+    found = {(run.labels["algorithm"], run.labels["task"], run.labels["corruption"]) for run in load_runs([runs])}
+    assert found == {
+        *(("td3_bc", "walker_walk", "patch, patch_size 16"), ("td3_bc", "cheetah_run", "patch, patch_size 48")),
+        *(("bc", "walker_walk", "patch, patch_size 16"), ("bc", "walker_walk", "patch, patch_size 48")),
+    }

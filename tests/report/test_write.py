@@ -296,3 +296,20 @@ def test_a_machine_that_does_not_speak_utf8_ends_no_command(tmp_path):
     assert (done.returncode, b"\\u03bc" in done.stdout) == (0, True), done.stderr
     for name in ("index.html", "summary.csv", "episodes.csv"):
         assert "μ" in (tmp_path / "out" / name).read_text(encoding="utf-8")
+
+
+def test_a_report_removes_figures_of_an_earlier_one_and_nobody_elses(tmp_path):
+    out = tmp_path / "out"
+    for corruption in ("patch", "none"):
+        write_run(tmp_path / corruption, "acro", 0, {10: [1.0]}, labels={"corruption": corruption})
+    write_report([tmp_path / "patch", tmp_path / "none"], out)
+    assert (out / "figures" / "scores_none.csv").exists()
+    mine = [out / "figures" / name for name in ("mine.png", "my_scores.csv", "poster.pdf")]
+    for file in mine:
+        file.touch()
+    for name in ("runs.jsonl", "episodes.csv"):
+        (out / name).unlink()
+    write_report([tmp_path / "patch"], out)
+    assert not list((out / "figures").glob("scores_none.*"))
+    assert (out / "figures" / "scores_patch.csv").exists()
+    assert all(file.exists() for file in mine)

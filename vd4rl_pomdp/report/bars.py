@@ -95,8 +95,9 @@ def _bars(axes: Axes, summary: list[Row], runs: list[Row], looks: dict[str, int]
     places = {name: place for place, name in enumerate(looks)}
     scored = [row | {"place": places[label(row)]} for row in summary if row["score"] is not None]
     _draw(axes, scored, [looks[label(row)] for row in scored])
-    _dots(axes, runs, places, looks)
-    _crosses(axes, summary, runs, places)
+    seeds = dict(by_label(runs))
+    _dots(axes, seeds, places, looks)
+    _crosses(axes, summary, seeds, places)
     axes.set_xticks(range(len(looks)), [plain(name, _NAME_WIDTH) for name in looks], rotation=90, fontsize=7)
     axes.set_xlim(-0.6, len(looks) - 0.4)
     if axes.dataLim.y0 >= 0:
@@ -117,10 +118,10 @@ def _draw(axes: Axes, rows: list[Row], looks: list[int]) -> None:
     axes.scatter(places, [row["best_score"] for row in rows], 16, marker="D", fc="none", ec="black", lw=0.7, zorder=4)
 
 
-def _dots(axes: Axes, runs: list[Row], places: dict[str, int], looks: dict[str, int]) -> None:
+def _dots(axes: Axes, seeds: dict[str, list[Row]], places: dict[str, int], looks: dict[str, int]) -> None:
     """One dot a seed, side by side."""
     x, y, colours = [], [], []
-    for name, members in by_label(runs):
+    for name, members in seeds.items():
         spread = np.linspace(-0.25, 0.25, len(members)) if len(members) > 1 else np.zeros(1)
         x += (places[name] + spread).tolist()
         y += [row["score"] for row in sorted(members, key=lambda row: row["seed"])]
@@ -128,13 +129,13 @@ def _dots(axes: Axes, runs: list[Row], places: dict[str, int], looks: dict[str, 
     axes.scatter(x, y, 7, color=colours, ec="black", lw=0.4, zorder=4)
 
 
-def _crosses(axes: Axes, summary: list[Row], runs: list[Row], places: dict[str, int]) -> None:
+def _crosses(axes: Axes, summary: list[Row], seeds: dict[str, list[Row]], places: dict[str, int]) -> None:
     """How many seeds are missing, above all that is drawn of a method."""
-    seeds = {name: [row["score"] for row in members] for name, members in by_label(runs)}
     crossed: dict[str, Any] = {"ha": "center", "fontsize": 6.5, "weight": "bold", "textcoords": "offset points"}
     for row in summary:
         if row["absent"]:
-            drawn = [row["high"], row["best_score"], *seeds.get(label(row), [])]
+            dots = [seed["score"] for seed in seeds.get(label(row), [])]
+            drawn = [row["high"], row["best_score"], *dots]
             top = max([0.0, *(value for value in drawn if value is not None)])
             axes.annotate(f"×{row['absent']}", (places[label(row)], top), (0, 4), **crossed)
 

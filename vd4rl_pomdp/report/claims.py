@@ -2,7 +2,8 @@
 
 Its text and its two figures (Wu et al., arXiv 2404.14552, Section 4.2) say that baselines fail considerably under
 partial observability, that a history and then past actions improve on them, and that MIK+A is ahead in almost all
-tasks. Two distances stand beside that: to a memory that was told the states, and to the states themselves.
+tasks. Two distances stand beside that: to a memory that was told the states, and to the states themselves. Only runs of
+like settings are compared.
 """
 
 from __future__ import annotations
@@ -14,17 +15,20 @@ from vd4rl_pomdp.report.gates import (
     FAILED,
     SETTING,
     STANDARD_ERRORS,
+    Sides,
     as_it_is,
-    best_of,
     difference,
     returns_of,
     seen_under,
+    sides,
 )
 from vd4rl_pomdp.report.load import LoadedRun
 from vd4rl_pomdp.report.tables import END_TO_END, REFERENCES, grouped, label
 from vd4rl_pomdp.runs.files import Row
 
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "not told apart", "too few seeds"
+DISTANCE = "distance"
+"""The kind of what is no claim."""
 
 
 class Contender(NamedTuple):
@@ -67,10 +71,10 @@ CLAIMS = (
         "what is left to a memory that was told the states",
         Contender("supervised+a"),
         Contender("mik+a"),
-        kind="distance",
+        kind=DISTANCE,
     ),
     ReturnClaim(
-        "what is left to the states themselves", Contender("state", clean=True), Contender("mik+a"), kind="distance"
+        "what is left to the states themselves", Contender("state", clean=True), Contender("mik+a"), kind=DISTANCE
     ),
 )
 
@@ -78,7 +82,8 @@ CLAIMS = (
 def judge_claims(runs: list[LoadedRun], unranked: Collection[tuple[str, ...]] = ()) -> list[Row]:
     """One row for every claim and setting of which both sides have finished runs, with its `verdict`.
 
-    `difference` is the left side's mean return less the right one's, `error` its standard error over seeds.
+    `difference` is the left side's mean return less the right one's, `error` its standard error over seeds. Where no
+    runs of both sides have like settings, there are neither, and the verdict says what differs.
 
     Args:
         runs: of a report.
@@ -86,35 +91,35 @@ def judge_claims(runs: list[LoadedRun], unranked: Collection[tuple[str, ...]] = 
     """
     finished = [run for run in runs if run.rows and run.finished and run.labels["method"] not in END_TO_END]
     settings = sorted({tuple(str(run.labels[name]) for name in SETTING) for run in finished})
-    rows = (_row(claim, place, finished) for claim in CLAIMS for place in settings)
-    return [row | {"verdict": _verdict(row, unranked)} for row in rows if row is not None]
+    rows = (_row(claim, place, finished, unranked) for claim in CLAIMS for place in settings)
+    return [row for row in rows if row is not None]
 
 
 def tally(rows: list[Row]) -> str:
     """What becomes of a claim over its settings: "holds in 1 of 2 settings; too few seeds in 1"."""
-    if not rows[0]["verdict"]:
+    if rows[0]["kind"] == DISTANCE:
         return ""
     counts = {verdict: len(members) for (verdict,), members in grouped(rows, ("verdict",))}
     held = f"{HOLDS} in {counts.pop(HOLDS, 0)} of {len(rows)} setting{'s' * (len(rows) != 1)}"
     return "; ".join([held, *(f"{verdict} in {count}" for verdict, count in counts.items())])
 
 
-def _row(claim: ReturnClaim, place: tuple[str, ...], runs: list[LoadedRun]) -> Row | None:
+def _row(
+    claim: ReturnClaim, place: tuple[str, ...], runs: list[LoadedRun], unranked: Collection[tuple[str, ...]]
+) -> Row | None:
     task, quality, corruption, algorithm = place
     if claim.hidden == (corruption == "none"):
         return None
     alike = [run for run in runs if _at(run, task, quality, algorithm)]
-    left = _runs_of(claim.left, claim.right, corruption, alike)
-    right = _runs_of(claim.right, claim.left, corruption, alike)
-    if not left or not right:
+    compared = sides(
+        _runs_of(claim.left, claim.right, corruption, alike), _runs_of(claim.right, claim.left, corruption, alike)
+    )
+    if not compared.left:
         return None
-    above, error = difference(left, right)
-    named = {"claim": claim.text, "kind": claim.kind} | dict(zip(SETTING, place, strict=True))
-    return named | {
-        **{"left": _name(left), "left_return": float(returns_of(left).mean()), "left_seeds": len(left)},
-        **{"right": _name(right), "right_return": float(returns_of(right).mean()), "right_seeds": len(right)},
-        **{"difference": above, "error": error},
-    }
+    above, error = difference(compared)
+    row = {"claim": claim.text, "kind": claim.kind} | dict(zip(SETTING, place, strict=True))
+    row |= _side("left", compared.left) | _side("right", compared.right) | {"difference": above, "error": error}
+    return row | {"verdict": _verdict(row, compared, place in unranked)}
 
 
 def _at(run: LoadedRun, *place: str) -> bool:
@@ -122,21 +127,25 @@ def _at(run: LoadedRun, *place: str) -> bool:
 
 
 def _runs_of(side: Contender, other: Contender, corruption: str, runs: Iterable[LoadedRun]) -> list[LoadedRun]:
-    """Seeds of one side: of the variant that has two of them, and returns most."""
+    """Runs of one side: of a method as it is, or of all methods that may be the best."""
     seen = seen_under("none" if side.clean else corruption, runs)
     if side.method:
         return as_it_is(side.method, seen, side.history)
-    return best_of(run for run in seen if run.labels["method"] not in (other.method, *REFERENCES))
+    return [run for run in seen if run.labels["method"] not in (other.method, *REFERENCES)]
 
 
-def _name(runs: list[LoadedRun]) -> str:
-    return label(runs[0].labels | {"variant": runs[0].variant})
+def _side(name: str, runs: list[LoadedRun]) -> Row:
+    """Columns about one side."""
+    shown = label(runs[0].labels | {"variant": runs[0].variant})
+    return {name: shown, f"{name}_return": float(returns_of(runs).mean()), f"{name}_seeds": len(runs)}
 
 
-def _verdict(row: Row, unranked: Collection[tuple[str, ...]]) -> str:
-    if row["kind"] == "distance":
+def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
+    if compared.unlike:
+        return f"not judged: other {', '.join(compared.unlike)}"
+    if row["kind"] == DISTANCE:
         return ""
-    if tuple(row[name] for name in SETTING) in unranked:
+    if unranked:
         return f"not judged: the setting {FAILED}"
     if row["error"] is None:
         return FEW

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from rich.console import Console
@@ -16,7 +16,7 @@ from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.figures import seeds_note
 from vd4rl_pomdp.report.gaps import CONDITION
 from vd4rl_pomdp.report.layout import Line, ShownTable, interval, latex, with_interval
-from vd4rl_pomdp.report.load import LoadedRun, load_runs
+from vd4rl_pomdp.report.load import LABELS, LoadedRun, load_runs
 from vd4rl_pomdp.report.measures import machine
 from vd4rl_pomdp.report.present import by_setting
 from vd4rl_pomdp.report.tables import SCORE, evaluations, final_scores, grouped, label
@@ -27,6 +27,8 @@ from vd4rl_pomdp.text import write_text
 
 FILE = "comparison"
 """Its files' name, which tells a comparison's folder."""
+Conditions = dict[tuple, list[LoadedRun]]
+"""Finished runs by the values of CONDITION."""
 _KEY = CONDITION[:-1]
 """What two conditions share, however their variants are called."""
 _COLUMNS = ("method", "settings, A → B", "A", "B", "B – A", "95% interval", "seeds")
@@ -57,17 +59,18 @@ class SideBySide(NamedTuple):
 def compare_results(one: Path, other: Path) -> SideBySide:
     """Compare the final scores of all finished runs at or below two paths, run folders or results folders.
 
-    Conditions are those of a report of each set. A method that has a single variant in either set is compared whatever
-    its settings; a method with several is compared where both sets have a variant of the same name.
+    Conditions are those of a report of each set. Those of equal settings are compared, whatever a report of their own
+    set calls them; then those of the same name; then a method that has a single variant in either set, whatever its
+    settings.
 
     Raises:
         UserError: a path holds no evaluated run, or a file is damaged.
     """
     runs = [_loaded(path) for path in (one, other)]
-    first, second = (dict(_conditions(part)) for part in runs)
-    pairs: list[tuple[tuple | None, tuple | None]] = [(mine, _partner(mine, first, second)) for mine in first]
-    matched = {theirs for _, theirs in pairs}
-    pairs += [(None, theirs) for theirs in second if theirs not in matched]
+    first, second = map(_conditions, runs)
+    partners = _partners(first, second)
+    pairs: list[tuple[tuple | None, tuple | None]] = [(mine, partners.get(mine)) for mine in first]
+    pairs += [(None, theirs) for theirs in second if theirs not in partners.values()]
     rows = [_row(first.get(mine or ()), second.get(theirs or ()), mine or theirs or ()) for mine, theirs in pairs]
     sides = _side(one, runs[0]), _side(other, runs[1])
     return SideBySide(sides, sorted(rows, key=lambda row: [str(row[name]) for name in CONDITION]))
@@ -80,18 +83,34 @@ def _loaded(path: Path) -> list[LoadedRun]:
     return runs
 
 
-def _conditions(runs: list[LoadedRun]) -> Iterable[tuple[tuple, list[LoadedRun]]]:
-    """Finished runs by the values of CONDITION."""
+def _conditions(runs: list[LoadedRun]) -> Conditions:
     finished = [{**run.labels, "variant": run.variant, "run": run} for run in runs if run.rows and run.finished]
-    return ((key, [row["run"] for row in members]) for key, members in grouped(finished, CONDITION))
+    return {key: [row["run"] for row in members] for key, members in grouped(finished, CONDITION)}
 
 
-def _partner(mine: tuple, first: dict[tuple, Any], second: dict[tuple, Any]) -> tuple | None:
-    """The condition of the second set that one of the first is compared with."""
+def _partners(first: Conditions, second: Conditions) -> dict[tuple, tuple]:
+    """By condition of the first set, that of the second which it is compared with, if there is one."""
+    settings = {_what_was_done(runs): theirs for theirs, runs in second.items()}
+    equal = {mine: _what_was_done(runs) for mine, runs in first.items()}
+    found = {mine: settings[done] for mine, done in equal.items() if done in settings}
+    free = second.keys() - set(found.values())
+    named = {mine: _of_like_name(mine, first, second) for mine in first if mine not in found}
+    return found | {mine: theirs for mine, theirs in named.items() if theirs in free}
+
+
+def _of_like_name(mine: tuple, first: Conditions, second: Conditions) -> tuple | None:
+    """The condition of the second set that is called as one of the first; of a lone variant the other's; or nothing."""
     if mine in second:
         return mine
-    (alike, theirs) = ([key for key in part if key[: len(_KEY)] == mine[: len(_KEY)]] for part in (first, second))
+    alike, theirs = ([key for key in part if key[: len(_KEY)] == mine[: len(_KEY)]] for part in (first, second))
     return theirs[0] if len(alike) == len(theirs) == 1 else None
+
+
+def _what_was_done(runs: list[LoadedRun]) -> tuple:
+    """What a condition's runs computed on what, as their files have it: not by names that depend on other runs."""
+    labels = runs[0].result.labels
+    settings = {frozenset(run.settings.items()) for run in runs}
+    return *(labels[name] for name in LABELS if name != "seed"), frozenset(settings)
 
 
 def _row(one: list[LoadedRun] | None, other: list[LoadedRun] | None, key: tuple) -> Row:

@@ -7,7 +7,8 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from vd4rl_pomdp.report.figures import COLOURS, Plot, file_name, panels, seeds_note, span, style
-from vd4rl_pomdp.report.measures import COSTS, PROBES
+from vd4rl_pomdp.report.load import PROBES
+from vd4rl_pomdp.report.measures import COSTS
 from vd4rl_pomdp.report.tables import by_label, grouped, label
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.text import plain

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
-from vd4rl_pomdp.report.load import LoadedRun, compare, own_to_sets
+from vd4rl_pomdp.report.load import LoadedRun, compare
 from vd4rl_pomdp.report.measures import machine
 from vd4rl_pomdp.report.tables import label, setting
 from vd4rl_pomdp.runs.settings import settings_of
@@ -48,11 +48,11 @@ def differing(runs: list[LoadedRun]) -> list[tuple[str, str]]:
 
 def _own_to_sets(runs: list[LoadedRun]) -> dict[str, str]:
     """Settings that go by the set, in words."""
-    words: dict[str, list[str]] = {}
-    for (stage, _), by_set in own_to_sets(runs).items():
-        for place, settings in by_set.items() if stage == "finetune" else ():
-            words.setdefault(place, []).extend(f"{name} {value}" for name, value in settings.items())
-    return {place: ", ".join(dict.fromkeys(texts)) for place, texts in words.items() if texts}
+    words: dict[str, dict[str, None]] = {}
+    for run in runs:
+        told = (f"{name} {value}" for name, value in run.of_set.items() if run.stage == "finetune")
+        words.setdefault(run.set_name, {}).update(dict.fromkeys(told))
+    return {place: ", ".join(texts) for place, texts in words.items() if texts}
 
 
 def facts(runs: list[LoadedRun]) -> list[dict[str, str]]:

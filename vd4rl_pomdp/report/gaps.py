@@ -7,6 +7,7 @@ from itertools import groupby
 from typing import TypeVar
 
 from vd4rl_pomdp.report.load import LABELS, LoadedRun
+from vd4rl_pomdp.report.variants import ENCODER_SEED
 from vd4rl_pomdp.runs.files import Row
 
 Key = TypeVar("Key")
@@ -29,15 +30,24 @@ def find_gaps(runs: list[LoadedRun]) -> list[Row]:
     by_method = _groups(grid, _method)
     rows = []
     for setting, here in _groups(grid, _setting).items():
-        there = {(*_method(run), run.variant, run.labels["seed"]): run for run in here}
+        there = {(*_method(run), run.variant, run.labels["seed"]): run for run in sorted(here, key=_has_score)}
         seeds = sorted({run.labels["seed"] for run in here})
         for algorithm, method, variant in _expected(by_method, setting):
             condition = dict(zip(CONDITION, (*setting, algorithm, method, variant), strict=True))
             for seed in seeds:
                 run = there.get((algorithm, method, variant, seed))
-                if run is None or not (run.finished and run.rows):
+                if not _is_own(variant, seed) and (run is None or not _has_score(run)):
                     rows.append(condition | {"seed": seed, "state": _state(run)})
     return rows
+
+
+def _has_score(run: LoadedRun) -> bool:
+    return run.finished and bool(run.rows)
+
+
+def _is_own(variant: str, seed: int) -> bool:
+    """Whether a variant's encoder is that of a seed: with it the seed is one of the method, not of the variant."""
+    return f"{ENCODER_SEED} {seed}" in variant.split(", ")
 
 
 def _groups(runs: list[LoadedRun], key: Callable[[LoadedRun], Key]) -> dict[Key, list[LoadedRun]]:

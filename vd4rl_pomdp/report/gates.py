@@ -3,21 +3,23 @@
 The data must suffice for the algorithm where the state is known (`state`) and where nothing is hidden (`acro` under
 `none`), and under the corruption some method must be better than no training (`random`). Where one of these fails,
 differences between returns say more of the data and the algorithm than of the representations. The three are these
-methods as they are, none of their variants.
+methods as they are, without what variants add to them, and returns are compared between runs of like settings alone.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 
 from vd4rl_pomdp.report.gaps import STATE
-from vd4rl_pomdp.report.load import LoadedRun
+from vd4rl_pomdp.report.load import LoadedRun, of_corruptions
 from vd4rl_pomdp.report.tables import END_TO_END, REFERENCES, grouped
-from vd4rl_pomdp.report.variants import is_plain
+from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, is_plain, unlike
 from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.settings import settings_of
 
 STATE_SHARE, ACRO_SHARE = 0.9, 0.7
 """Least shares of the data's mean return, of `state` and of `acro` under `none`."""
@@ -25,14 +27,25 @@ STANDARD_ERRORS = 2.0
 """Least difference between the best method and `random`, in its standard errors over seeds."""
 PASSED, FAILED, UNKNOWN = "discriminates", "does not discriminate", "not known to discriminate"
 SETTING = ("task", "quality", "corruption", "algorithm")
+_NOT_PRETRAINED = ("random", STATE)
+"""Methods of which no setting of pretraining counts."""
+
+
+class Sides(NamedTuple):
+    """What is compared: seeds of two methods, each of one variant, or nothing where one has no run."""
+
+    left: list[LoadedRun]
+    right: list[LoadedRun]
+    unlike: list[str]
+    """Settings in which they differ; empty where the comparison is one of methods."""
 
 
 def gates(runs: list[LoadedRun]) -> list[Row]:
     """One row for every task, quality, corruption and algorithm with frozen encoders' finished runs, and its `verdict`.
 
     `data_return` is a mean over the sets behind its runs, `state_share` and `acro_share` are shares of the return of
-    their own, `above_random` is the best method's mean return less that of `random`, `error` its standard error over
-    seeds. What is not known is None.
+    their own, `above_random` is the best method's mean return less that of `random`, as `sides` finds them, `error` its
+    standard error over seeds. What is not known is None.
     """
     finished = [run for run in runs if run.rows and run.finished and run.labels["method"] not in END_TO_END]
     return [_gate(key, finished) for key in sorted({_key(run) for run in finished})]
@@ -52,9 +65,10 @@ def _gate(key: tuple[str, ...], runs: list[LoadedRun]) -> Row:
     task, quality, corruption, algorithm = key
     alike = [run for run in runs if _key(run)[:2] == (task, quality) and _key(run)[3] == algorithm]
     here, clean = (seen_under(under, alike) for under in (corruption, "none"))
-    state, acro = as_it_is("state", here), as_it_is("acro", clean)
-    learned = best_of(run for run in here if run.labels["method"] not in REFERENCES)
-    above, error = difference(learned, as_it_is("random", here))
+    state, acro = best_of(as_it_is("state", here)), best_of(as_it_is("acro", clean))
+    learned = [run for run in here if run.labels["method"] not in REFERENCES]
+    compared = sides(learned, as_it_is("random", here))
+    above, error = difference(compared)
     data = {value for run in here if (value := run.reference.data_return) is not None}
     row = dict(zip(SETTING, key, strict=True)) | {
         "data_return": float(np.mean(sorted(data))) if data else None,
@@ -63,7 +77,7 @@ def _gate(key: tuple[str, ...], runs: list[LoadedRun]) -> Row:
         "above_random": above,
         "error": error,
     }
-    return row | {"verdict": _verdict(row, state, acro)}
+    return row | {"verdict": _verdict(row, state, acro, compared.unlike)}
 
 
 def seen_under(corruption: str, runs: Iterable[LoadedRun]) -> list[LoadedRun]:
@@ -76,8 +90,8 @@ def seen_under(corruption: str, runs: Iterable[LoadedRun]) -> list[LoadedRun]:
 
 
 def as_it_is(method: str, runs: Iterable[LoadedRun], history: str = "method") -> list[LoadedRun]:
-    """The seeds of a method as it is: `best_of` its variants that add nothing to it but a history."""
-    return best_of(run for run in runs if run.labels["method"] == method and is_plain(run.settings, history))
+    """The runs of a method as it is: those that add nothing to it but a history."""
+    return [run for run in runs if run.labels["method"] == method and is_plain(run.settings, history)]
 
 
 def best_of(runs: Iterable[LoadedRun]) -> list[LoadedRun]:
@@ -85,11 +99,44 @@ def best_of(runs: Iterable[LoadedRun]) -> list[LoadedRun]:
 
     One with a single seed is taken only where none has more.
     """
+    return max(_variants(runs), key=_preference, default=[])
+
+
+def sides(left: Iterable[LoadedRun], right: Iterable[LoadedRun]) -> Sides:
+    """Of the pairs of a method and variant of each side the one to be compared.
+
+    First come pairs of like settings, then those with more than one seed on both sides, then those that return most.
+    """
+    others = _variants(right)
+    pairs = [Sides(one, other, _unlike(one[0], other[0])) for one in _variants(left) for other in others]
+    alike = [pair for pair in pairs if not pair.unlike]
+    return max(alike or pairs, key=lambda pair: _preference(pair.left, pair.right), default=Sides([], [], []))
+
+
+def _variants(runs: Iterable[LoadedRun]) -> list[list[LoadedRun]]:
+    """Seeds by method and variant; where they share an encoder, their spread is not that of a method."""
     groups: dict[tuple[str, str], list[LoadedRun]] = {}
     for run in runs:
-        groups.setdefault((str(run.labels["method"]), run.variant), []).append(run)
-    enough = [members for members in groups.values() if len(members) > 1]
-    return max(enough or groups.values(), key=lambda members: returns_of(members).mean(), default=[])
+        if ENCODER_SEED not in run.settings:
+            groups.setdefault((str(run.labels["method"]), run.variant), []).append(run)
+    return list(groups.values())
+
+
+def _preference(*compared: list[LoadedRun]) -> tuple[int, float]:
+    """How many have more than one seed, and the sum of their mean returns."""
+    return sum(len(seeds) > 1 for seeds in compared), sum(float(returns_of(seeds).mean()) for seeds in compared)
+
+
+def _unlike(one: LoadedRun, other: LoadedRun) -> list[str]:
+    """Settings that both have, but not alike, other than what a claim is about and what hides pixels.
+
+    Of a method that is not pretrained, only settings of fine-tuning count.
+    """
+    names = (one.settings.keys() & other.settings.keys()) - of_corruptions([one, other])
+    for run in (one, other):
+        if run.labels["method"] in _NOT_PRETRAINED:
+            names &= settings_of(run.record["config"]).keys() | {DATA[0]}
+    return unlike(one.settings, other.settings, names)
 
 
 def returns_of(runs: list[LoadedRun]) -> np.ndarray:
@@ -98,13 +145,15 @@ def returns_of(runs: list[LoadedRun]) -> np.ndarray:
     return np.array([np.mean([row["return"] for row in rows if row["step"] == final]) for rows, final in finals])
 
 
-def difference(runs: list[LoadedRun], others: list[LoadedRun]) -> tuple[float | None, float | None]:
-    """Mean return of some seeds less that of others, and its standard error over seeds.
+def difference(compared: Sides) -> tuple[float | None, float | None]:
+    """Mean return of the left side less that of the right one, and its standard error over seeds.
 
-    None where a side has no run; no error where one has a single seed.
+    None where a side has no run, or settings differ; no error where a side has a single seed.
     """
-    best, floor = returns_of(runs), returns_of(others)
-    above = float(best.mean() - floor.mean()) if len(best) and len(floor) else None
+    if not compared.left or compared.unlike:
+        return None, None
+    best, floor = returns_of(compared.left), returns_of(compared.right)
+    above = float(best.mean() - floor.mean())
     if min(len(best), len(floor)) < 2:
         return above, None
     return above, math.sqrt(best.var(ddof=1) / len(best) + floor.var(ddof=1) / len(floor))
@@ -117,7 +166,7 @@ def _share(runs: list[LoadedRun]) -> float | None:
     return float((returns_of(runs) / known).mean()) if runs and len(known) == len(runs) else None
 
 
-def _verdict(row: Row, state: list[LoadedRun], acro: list[LoadedRun]) -> str:
+def _verdict(row: Row, state: list[LoadedRun], acro: list[LoadedRun], differing: list[str]) -> str:
     """A word, and why."""
     missed, unknown = [], []
     for name, least, words, runs in (
@@ -128,7 +177,9 @@ def _verdict(row: Row, state: list[LoadedRun], acro: list[LoadedRun]) -> str:
             unknown.append(_no_share(words, runs))
         elif row[name] < least:
             missed.append(f"{words} returns {row[name]:.2f} of the data's return, less than {least}")
-    if row["error"] is None:
+    if differing:
+        unknown.append(f"best and random have other {', '.join(differing)}")
+    elif row["error"] is None:
         unknown.append("best and random need two seeds each")
     elif row["above_random"] <= STANDARD_ERRORS * row["error"]:
         missed.append(f"best minus random is {row['above_random']:.0f}, within {STANDARD_ERRORS:g} standard errors")

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Collection, Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, TypeVar
 from zipfile import BadZipFile
@@ -24,6 +24,8 @@ LABELS = ("task", "quality", "corruption", "algorithm", "method", "seed")
 """Columns that a run's files name it by."""
 IDENTITY = ("task", "quality", "corruption", "algorithm", "method", "variant", "seed")
 """Columns that tell a run's rows from all others of a report: LABELS, and its variant."""
+PROBES = ("probe_pose", "probe_velocity")
+"""Errors of linear probes of an encoder."""
 FILM = {"clean": 4, "corrupted": 4, "return": 1}
 """Arrays of a film and their axes."""
 
@@ -46,9 +48,11 @@ class LoadedRun:
     seconds: float | None
     """Wall-clock time; None while the run is unfinished."""
     representation: dict[str, float | None]
-    """Measures of its encoder: action_loss, probe_pose, probe_velocity, pretrain_seconds."""
+    """Measures of its encoder: action_loss, PROBES, pretrain_seconds."""
     reference: Reference
     """What its policy is held against."""
+    of_set: Settings = field(default_factory=dict)
+    """Its settings that go by the set, such as a budget; they make no variants."""
     parts: Parts = ("", "")
     """Its settings that differ from those of other runs of its method, by the runs it is compared with."""
 
@@ -66,6 +70,11 @@ class LoadedRun:
     def stage(self) -> str:
         """What it does: "pretrain" or "finetune"."""
         return self.result.record["stage"]
+
+    @property
+    def set_name(self) -> str:
+        """Task and quality."""
+        return f"{self.labels['task']} {self.labels['quality']}"
 
     @property
     def variant(self) -> str:
@@ -122,7 +131,8 @@ def load_runs(paths: list[Path], but: Path | None = None) -> list[LoadedRun]:
     Raises:
         UserError: there is no run, two have the same identity, or a file of one is damaged.
     """
-    loaded = [_load(result) for result in find_results(paths, but)]
+    read = [_load(result) for result in find_results(paths, but)]
+    loaded = [replace(run, of_set=own) for run, own in zip(read, _of_sets(read), strict=True)]
     told = zip(loaded, _corruptions(loaded), strict=True)
     runs = [replace(run, labels=run.labels | {"corruption": words}) for run, words in told]
     named = [replace(run, parts=parts) for run, parts in zip(runs, compare(runs), strict=True)]
@@ -132,7 +142,7 @@ def load_runs(paths: list[Path], but: Path | None = None) -> list[LoadedRun]:
 
 def _corruptions(runs: list[LoadedRun]) -> list[str]:
     """What hides pixels from each run, in words; an option that early runs do not record is not told apart."""
-    unknown = dict.fromkeys(sorted(_of_corruptions(runs)), "")
+    unknown = dict.fromkeys(sorted(of_corruptions(runs)), "")
     settings = [{name: own.get(name, value) for name, value in unknown.items()} for own in _settings(runs)]
     words = _differences(runs, settings, lambda run: run.labels["corruption"])
     names = [str(run.labels["corruption"]) for run in runs]
@@ -144,11 +154,11 @@ def _corruptions(runs: list[LoadedRun]) -> list[str]:
 
 def compare(runs: list[LoadedRun], brief: bool = True) -> list[Parts]:
     """The settings in which each run differs from others of its stage, method and algorithm."""
-    hiding, settings = _of_corruptions(runs), _settings(runs)
+    hiding, settings = of_corruptions(runs), _settings(runs)
     methods = [_without(own, {*hiding, *DATA}) for own in settings]
     data = [{name: own[name] for name in DATA if name in own} for own in settings]
     of_methods = _differences(runs, methods, _method, brief)
-    of_data = _differences(runs, data, lambda run: (*_method(run), _set(run), run.labels["corruption"]))
+    of_data = _differences(runs, data, lambda run: (*_method(run), run.set_name, run.labels["corruption"]))
     return list(zip(of_methods, of_data, strict=True))
 
 
@@ -165,25 +175,32 @@ def _differences(
 
 def _settings(runs: list[LoadedRun]) -> list[Settings]:
     """The runs' settings, without what goes by the set."""
-    own = own_to_sets(runs)
-    return [_without(run.settings, own[_kind(run)][_set(run)]) for run in runs]
+    return [_without(run.settings, run.of_set) for run in runs]
 
 
-def _of_corruptions(runs: Iterable[LoadedRun]) -> set[str]:
+def of_corruptions(runs: Iterable[LoadedRun]) -> set[str]:
     """Settings that are corruptions' options: those of the parts that are here, and what encoders say of theirs."""
     return corruption_settings().union(*(run.result.encoder.get("corruption", {}) for run in runs))
 
 
-def own_to_sets(runs: list[LoadedRun]) -> dict[tuple[str, str], dict[str, Settings]]:
-    """By stage and algorithm, and by set: settings that go by the set, such as a budget; they make no variants."""
-    return {
-        _kind(members[0]): of_sets([run.settings for run in members], list(map(_set, members)))
+def _of_sets(runs: list[LoadedRun]) -> list[Settings]:
+    """Each run's settings that go by its set.
+
+    A corruption's options do if they do in all runs, since it has one name whatever learns under it; other settings if
+    they do in all runs of one stage and algorithm.
+    """
+    hiding = of_corruptions(runs)
+    options = _by_set(runs, [_without(run.settings, run.settings.keys() - hiding) for run in runs])
+    others = {
+        _kind(members[0]): _by_set(members, [_without(run.settings, hiding) for run in members])
         for members in _groups(runs, _kind)
     }
+    found = (options[run.set_name] | others[_kind(run)][run.set_name] for run in runs)
+    return [dict(sorted(own.items())) for own in found]
 
 
-def _set(run: LoadedRun) -> str:
-    return f"{run.labels['task']} {run.labels['quality']}"
+def _by_set(runs: list[LoadedRun], settings: list[Settings]) -> dict[str, Settings]:
+    return of_sets(settings, [run.set_name for run in runs])
 
 
 def _kind(run: LoadedRun) -> tuple[str, str]:
@@ -235,8 +252,7 @@ def _representation(result: Result) -> dict[str, float | None]:
     probe, timing = (result.files.get(name, {}) for name in ("probe", "pretrain_timing"))
     return {
         "action_loss": _number(result.encoder.get("action_loss")),
-        "probe_pose": _number(probe.get("probe_pose")),
-        "probe_velocity": _number(probe.get("probe_velocity")),
+        **{name: _number(probe.get(name)) for name in PROBES},
         "pretrain_seconds": _number(timing.get("seconds")),
     }
 

@@ -9,11 +9,10 @@ import numpy as np
 from vd4rl_pomdp.reference import summarise
 from vd4rl_pomdp.report.gaps import CONDITION, in_words
 from vd4rl_pomdp.report.gates import returns_of
-from vd4rl_pomdp.report.load import IDENTITY, LoadedRun
+from vd4rl_pomdp.report.load import IDENTITY, PROBES, LoadedRun
 from vd4rl_pomdp.report.tables import by_label, grouped, table_order
 from vd4rl_pomdp.runs.files import Row
 
-PROBES = ("probe_pose", "probe_velocity")
 COSTS = ("pretrain_seconds", "finetune_seconds")
 _RUN = (
     *("id", *IDENTITY, "action_loss", *PROBES, "score", "return", "best_score", "best_step"),

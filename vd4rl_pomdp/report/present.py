@@ -10,6 +10,7 @@ from vd4rl_pomdp.report.claims import tally
 from vd4rl_pomdp.report.figures import seeds_note
 from vd4rl_pomdp.report.gaps import MISSING
 from vd4rl_pomdp.report.layout import Line, ShownTable, interval, number, with_interval
+from vd4rl_pomdp.report.load import PROBES
 from vd4rl_pomdp.report.tables import grouped, label, setting, with_algorithm
 from vd4rl_pomdp.runs.files import Row
 
@@ -128,7 +129,7 @@ def representations(rows: list[Row]) -> list[ShownTable]:
 def _measure_line(row: Row) -> Line:
     if not row["seeds"]:
         return Line((label(row),), row["missing"])
-    probes = (number(row[name]) for name in ("probe_pose", "probe_velocity"))
+    probes = (number(row[name]) for name in PROBES)
     return Line((label(row), number(row["action_loss"], 3), *probes, number(row["return"], 0), str(row["seeds"])))
 
 

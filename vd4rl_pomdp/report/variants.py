@@ -6,7 +6,7 @@ run has its own config, its encoder's, and the data of both.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from vd4rl_pomdp.runs.settings import settings_of
@@ -23,6 +23,8 @@ _UNSET = "unset"
 _PRESETS = ("preset", "pretraining preset")
 DATA = ("data", "pretraining data")
 """Names of the sets' fingerprints."""
+ENCODER_SEED = "pretraining seed"
+"""The seed of a run's encoder, where the run's own is another: its seeds share what they were pretrained with."""
 PLAIN = {
     **{"history": "method", "random_histories": "0", "history_window": "0", "readout": "state"},
     **{"pose_noise": "0", "velocity_noise": "0"},
@@ -46,6 +48,8 @@ def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Setting
     words = {name: _words(value) for name, value in found.items() if name not in _LABELS}
     if record["stage"] == "finetune" and not card.get("settings"):
         words[UNKNOWN] = _NOT_RECORDED
+    if card.get("seed", record["config"]["seed"]) != record["config"]["seed"]:
+        words[ENCODER_SEED] = str(card["seed"])
     return words | _data(record.get("inputs", {}).get("data"), card.get("data"))
 
 
@@ -53,6 +57,12 @@ def is_plain(settings: Settings, history: str = "method") -> bool:
     """Whether settings add nothing to a method but a history; what is not recorded adds nothing."""
     wanted = PLAIN | {"history": history}
     return all(settings.get(name, PLAIN[name]) == value for name, value in wanted.items())
+
+
+def unlike(one: Settings, other: Settings, names: Collection[str]) -> list[str]:
+    """Which of some settings differ, but for what a method is named by; a preset stands for the others."""
+    found = [name for name in one if name in names and name not in PLAIN and one[name] != other[name]]
+    return [name for name in found if name in _PRESETS] or found
 
 
 def _data(own: str | None, before: str | None) -> Settings:
@@ -73,7 +83,7 @@ def of_sets(settings: Sequence[Settings], sets: Sequence[str]) -> dict[str, Sett
     """Settings that go by the set, such as a budget: every run on a set has them so, and those on another otherwise.
 
     Args:
-        settings: of all runs of one stage and algorithm.
+        settings: of all runs that are looked at together.
         sets: task and quality of each run.
 
     Returns:
@@ -81,7 +91,7 @@ def of_sets(settings: Sequence[Settings], sets: Sequence[str]) -> dict[str, Sett
     """
     found: dict[str, dict[str, set[str]]] = {}
     for one, place in zip(settings, sets, strict=True):
-        for name in one.keys() - {UNKNOWN, *DATA}:
+        for name in one.keys() - {UNKNOWN, ENCODER_SEED, *DATA}:
             found.setdefault(name, {}).setdefault(place, set()).add(one[name])
     own = {
         name: {place: min(values) for place, values in by_set.items()}
@@ -96,12 +106,14 @@ def of_sets(settings: Sequence[Settings], sets: Sequence[str]) -> dict[str, Sett
 def differences(settings: list[Settings], brief: bool = True) -> list[str]:
     """What differs among some settings: "max_k 1, steps 20"; nothing for a value that adds nothing.
 
+    ENCODER_SEED is told even where it does not differ: no other name says that seeds share an encoder.
+
     Args:
         settings: those that count, without what goes by the set.
         brief: whether a preset is named in place of the settings that it decides.
     """
     known = dict.fromkeys(name for one in settings for name in one)
-    names = [name for name in known if _differs(settings, name)]
+    names = [name for name in known if name != ENCODER_SEED and _differs(settings, name)]
     # An option of a chosen part is not there without the part: naming the part says it all.
     everywhere = [name for name in names if all(_value(one, name) != _UNSET for one in settings)]
     names = [name for name in names if name in everywhere or not _decided(settings, name, everywhere)]
@@ -110,8 +122,12 @@ def differences(settings: list[Settings], brief: bool = True) -> list[str]:
         if preset in names and not _decided(settings, preset, deciding):
             deciding.append(preset)
     names = [name for name in names if name in deciding or not _decided(settings, name, deciding)]
-    values = ({name: _value(one, name) for name in names} for one in settings)
+    values = [{name: _value(one, name) for name in names} | _encoder_seed(one) for one in settings]
     return [", ".join(f"{k} {v}" for k, v in one.items() if v not in ("", PLAIN.get(k))) for one in values]
+
+
+def _encoder_seed(settings: Settings) -> Settings:
+    return {name: value for name, value in settings.items() if name == ENCODER_SEED}
 
 
 def _value(settings: Settings, name: str) -> str:

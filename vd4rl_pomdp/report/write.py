@@ -201,10 +201,12 @@ def _write_tables(out: Path, made: dict[str, list[Row]], shown: dict[str, list[S
 
 
 def _write_plots(folder: Path, plots: dict[str, list[Plot]]) -> None:
+    """Every figure; those that an earlier report had and this one has not are removed, by their sections' names."""
     made = [plot for group in plots.values() for plot in group]
     for plot in made:
         save_plot(folder, plot)
     names = {plot.name for plot in made}
     for path in folder.iterdir():
-        if path.suffix in (".csv", ".png", ".pdf") and path.stem not in names:
+        of_report = path.suffix in (".csv", ".png", ".pdf") and path.stem.partition("_")[0] in plots
+        if of_report and path.stem not in names:
             path.unlink()
