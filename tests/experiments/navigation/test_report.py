@@ -429,6 +429,17 @@ def test_the_bar_plot_has_the_papers_variants(runs, tmp_path, monkeypatch):
     assert paper < set(drawn)
 
 
+def test_the_bar_plot_has_the_mazes_with_numbers_in_its_units(runs, tmp_path, monkeypatch):
+    write_run(runs, Condition("hard_no_curtain", "mik+a"), 0, 5.0, raw=False)
+    drawn = set()
+    monkeypatch.setattr(figures, "_bar", lambda axes, place, condition, *rest: drawn.add(condition.maze))
+    figures.accuracy_bars(loaded(runs), STATE, tmp_path / "bars.png")
+    assert drawn == {"three_curtains", "hard_no_curtain"}
+    drawn.clear()
+    figures.accuracy_bars(loaded(runs), STATE.raw(), tmp_path / "bars.png")
+    assert drawn == {"three_curtains"}
+
+
 def test_which_way_round_a_relation_is():
     claim = next(c for c in claims("no_curtain") if c.text.startswith("no_history's velocity"))
     assert claim.holds(90.0, 30.0)

@@ -34,9 +34,10 @@ _NO_RUN: dict[str, Any] = {"color": "#999999", "linestyle": "", "marker": "x", "
 def accuracy_bars(runs: list[NavigationRun], measure: Measure, path: Path) -> None:
     """State prediction accuracy, 100 - error, of every objective and maze, as in the paper's bar plot.
 
-    The paper's marks stand beside raw units alone. What the paper or another maze has and a maze lacks is crossed.
+    A panel for each maze whose runs have the measure. The paper's marks stand beside raw units alone. What the paper or
+    another maze has and a maze lacks is crossed.
     """
-    mazes = [maze for maze in MAZES if any(run.condition.maze == maze for run in runs)]
+    mazes = [maze for maze in MAZES if any(run.condition.maze == maze and measure in run.values for run in runs)]
     columns = min(2, len(mazes))
     rows = -(-len(mazes) // columns)
     figure = Figure(figsize=(1 + 5.2 * columns, 0.8 + 2.9 * rows), layout="constrained")
