@@ -113,38 +113,16 @@ def claims(maze: str) -> list[Claim]:
 
 def _first_person(maze: str, state: Measure) -> list[Claim]:
     """That the place is known where a picture does not tell it: by far, and in the paper's order."""
+    untrained, no_history, recorder = ((Condition(maze, name), state) for name in (UNTRAINED, "no_history", "ah+a"))
     found = []
-    for ours, name in (
-        (Condition(maze, "mik+a"), "mik+a"),
-        (Condition(maze, "mik+a", self_prediction=True), "mik+a with self-prediction"),
-    ):
+    for told, name in ((False, "mik+a"), (True, "mik+a with self-prediction")):
+        ours = Condition(maze, "mik+a", self_prediction=told), state
         found += [
-            Claim(
-                f"state error of {name}, of the untrained one's",
-                (ours, state),
-                "<",
-                0.5,
-                (Condition(maze, UNTRAINED), state),
-            ),
-            Claim(f"state error of {name}", (ours, state), "<", FEW),
-            Claim(
-                f"no_history's state error, of that of {name}",
-                (Condition(maze, "no_history"), state),
-                ">",
-                1,
-                (ours, state),
-            ),
+            Claim(f"state error of {name}, of the untrained one's", ours, "<", 0.5, untrained),
+            Claim(f"state error of {name}", ours, "<", FEW),
+            Claim(f"no_history's state error, of that of {name}", no_history, ">", 1, ours),
         ]
-    return [
-        *found,
-        Claim(
-            "ah+a's state error, of no_history's",
-            (Condition(maze, "ah+a"), state),
-            ">",
-            1,
-            (Condition(maze, "no_history"), state),
-        ),
-    ]
+    return [*found, Claim("ah+a's state error, of no_history's", recorder, ">", 1, no_history)]
 
 
 def judge(claim: Claim, runs: Sequence[NavigationRun]) -> Verdict:
