@@ -16,7 +16,7 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp.data import Dataset
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, flag_of
 from vd4rl_pomdp.nn.encoder import Encoder, Readout
 from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.seeding import stream_generator
@@ -52,6 +52,10 @@ class HistoryOptions(Options):
                 f"--shortest-history is {self.shortest_history}, --longest-history {self.longest_history}: "
                 "choose a longest that is no shorter"
             )
+        if self.readout == "frame":
+            for name in ("history_window", "random_histories"):
+                if getattr(self, name):
+                    raise UserError(f"{flag_of(name)} is not read: --readout frame reads no history; leave it out")
 
     @property
     def encoder_changes(self) -> dict[str, Any]:

@@ -134,6 +134,9 @@ def test_a_slip_is_a_sentence_before_anything_is_played(changes, message, tmp_pa
 def test_runs_go_seed_by_seed_and_none_is_run_twice(tmp_path):
     windows = list(config(tmp_path, history_windows=[0, 4]).runs())
     assert [(run.method, run.history_window) for run in windows] == [("none", 0), ("mik+a", 0), ("mik+a", 4)]
+    several = {"methods": ["mik+a"], "readouts": ["state", "frame"], "random_histories": [0.0, 0.5]}
+    read = [(run.readout, run.random_histories) for run in config(tmp_path, **several).runs()]
+    assert read == [("state", 0.0), ("state", 0.5), ("frame", 0.0)], "the newest frame alone has no history"
     runs = list(config(tmp_path, seeds=[0, 1, 0], hidden_shares=[0.5, 0.0]).runs())
     assert [(run.hidden_share, run.seed, run.method) for run in runs] == [
         (share, seed, method) for share in (0.5, 0.0) for seed in (0, 1) for method in ("none", "mik+a")

@@ -17,8 +17,6 @@ from vd4rl_pomdp.tasks import MOST_EPISODES, TASKS
 
 NO_MEMORY, UNTRAINED = "none", "random"
 """What is seen of the states itself, and a GRU over it that is not trained: the floors."""
-NO_MEMORY_READ: tuple[Readout, float, int] = ("state", 0.0, 0)
-"""What is read of a memory where there is none."""
 _FEATURE_BYTES = 4 * 256 * 2
 """Of a row: 4 views of a GRU's 256 units in half precision."""
 _LIMITS: dict[str, tuple[float, float]] = {
@@ -83,13 +81,20 @@ class ControlConfig:
         for task, noise, share, seed in product(self.tasks, self.action_noises, self.hidden_shares, self.seeds):
             budget = (self.episodes, self._decisions(task), self.pretrain_steps, self.updates, self.eval_episodes)
             memories = product(self.methods, self.readouts, self.random_histories, self.history_windows)
-            for method, readout, share_begun, window in memories:
-                read = NO_MEMORY_READ if method == NO_MEMORY else (readout, share_begun, window)
+            for method, readout, begun, window in memories:
+                read = _read(method, readout, begun, window)
                 runs.append(ControlRun(task, noise, share, *budget, method, *read, seed))
         yield from dict.fromkeys(runs)
 
     def _decisions(self, task: str) -> int:
         return TASKS.named(task).decisions if self.decisions is None else self.decisions
+
+
+def _read(method: str, readout: Readout, random_histories: float, history_window: int) -> tuple[Readout, float, int]:
+    """What is read of a method's memory: nothing where there is none, no history of the newest frame alone."""
+    if method == NO_MEMORY:
+        return "state", 0.0, 0
+    return ("frame", 0.0, 0) if readout == "frame" else (readout, random_histories, history_window)
 
 
 @dataclass(frozen=True)
