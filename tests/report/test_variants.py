@@ -84,6 +84,14 @@ def settings_of(runs):
     return found
 
 
+def test_runs_of_two_formats_do_not_pool(tmp_path):
+    for seed in (0, 1):
+        run = describe(write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [1.0]}), {})
+        record = read_json(run / "config.json")
+        write_json(run / "config.json", record | {"format": 3 + seed})
+    assert pooled(tmp_path / "runs") == {"acro, format 3": 1, "acro, format 4": 1}
+
+
 def test_a_corruption_of_other_options_is_another_setting_whatever_the_method(tmp_path):
     runs = tmp_path / "runs"
     for method, size in (("acro", 16), ("mik+a", 48), ("mik", 48)):

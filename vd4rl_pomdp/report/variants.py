@@ -45,6 +45,7 @@ def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Setting
     before = dict(card.get("corruption", {})) | {name: card[name] for name in ("steps", "preset") if name in card}
     before |= card.get("settings") or {}
     found = own | {(f"pretraining {k}" if k in own else k): v for k, v in before.items()}
+    found |= {"format": record["format"]} if "format" in record else {}
     words = {name: _words(value) for name, value in found.items() if name not in _LABELS}
     if record["stage"] == "finetune" and not card.get("settings"):
         words[UNKNOWN] = _NOT_RECORDED
