@@ -52,6 +52,9 @@ class HistoryOptions(Options):
                 f"--shortest-history is {self.shortest_history}, --longest-history {self.longest_history}: "
                 "choose a longest that is no shorter"
             )
+        for name in ("shortest_history", "longest_history"):
+            if not self.random_histories and getattr(self, name) != getattr(HistoryOptions, name):
+                raise UserError(f"{flag_of(name)} is not read: --random-histories is 0; leave it out")
         if self.readout == "frame":
             for name in ("history_window", "random_histories"):
                 if getattr(self, name):

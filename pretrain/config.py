@@ -11,7 +11,7 @@ import tyro
 
 from pretrain.objectives import METHODS, Method
 from vd4rl_pomdp.corruptions import NO_CORRUPTION, CorruptionConfig
-from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
+from vd4rl_pomdp.errors import MAX_SEED, UserError, flag_of, refuse_outside
 from vd4rl_pomdp.nn.encoder import MAX_LAYERS
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS
 from vd4rl_pomdp.options import NO_OPTIONS, Limits, Options, StageConfig
@@ -135,8 +135,9 @@ class PretrainConfig(TrainingConfig):
         """Refuse settings that cannot work, before anything is read or written."""
         super().check()
         usual, method = self.defaults(self.preset), METHODS.named(self.method)
-        if method.reads_state and self.frame_encoder != usual["frame_encoder"]:
-            raise UserError(f"--frame-encoder is not read by the method {self.method}: leave it out")
+        for name in ("frame_encoder", "shift"):
+            if method.reads_state and getattr(self, name) != usual[name]:
+                raise UserError(f"{flag_of(name)} is not read by the method {self.method}: leave it out")
         if method.shift == "own" and self.shift != usual["shift"]:
             raise UserError(f"--shift is not read by the method {self.method}, which shifts by itself: leave it out")
 

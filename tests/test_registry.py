@@ -42,6 +42,13 @@ def test_what_a_block_registers_is_forgotten_after_it(registry):
     assert registry.origin("mine") == ""
 
 
+def test_what_packages_offer_outlives_a_block_that_met_it_first(registry, monkeypatch):
+    offer(monkeypatch, theirs="tests.test_registry:THEIRS")
+    with registry.isolated():
+        assert "theirs" in registry
+    assert "theirs" in registry
+
+
 def test_an_unknown_name_is_told_the_choices(registry):
     with pytest.raises(UserError, match="unknown frame encoder 'owl': choose one of own, own\\+a"):
         registry.named("owl")

@@ -70,6 +70,11 @@ def refuse_number(name: str, value: float, low: float, high: float = MOST) -> No
         raise UserError(f"{flag_of(name)} is {value}; it must be at least {low} and at most {high}")
 
 
+def first_line(error: BaseException) -> str:
+    """What an error says first; its kind if it says nothing."""
+    return next(iter(str(error).splitlines()), type(error).__name__)
+
+
 def flag_of(name: str) -> str:
     """The flag that sets a config's field."""
     return f"--{name.replace('_', '-')}"

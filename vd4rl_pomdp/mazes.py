@@ -129,6 +129,11 @@ class MazeSpec:
         return f"vd4rl_pomdp/Maze{self.name.title().replace('_', '')}-v0"
 
     @property
+    def driver(self) -> str:
+        """What drives in its data: ppo, or planner."""
+        return "ppo" if self.first_person else "planner"
+
+    @property
     def first_person(self) -> bool:
         """Whether it is seen through the mass's own eyes; a state then has a heading."""
         return self.paper == "first_person"

@@ -66,6 +66,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
     @contextmanager
     def isolated(self) -> Iterator[None]:
         """Within the block parts may be registered; after it they are forgotten, as tests want it."""
+        self._load_offered()
         parts, origins = dict(self._parts), dict(self._origins)
         try:
             yield

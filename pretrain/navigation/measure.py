@@ -102,13 +102,17 @@ def _losses(split: str, logs: dict[str, float]) -> dict[Measure, float]:
 
 
 def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]:
-    """Means of the logged intervals that end in the last `average_last` steps."""
-    last = [row for row in read_metrics(path) if row["step"] > config.steps - config.average_last]
-    values: dict[str, list[float]] = defaultdict(list)
-    for row in last:
-        for name, value in row.items():
-            values[name].append(value)
-    return {name: sum(numbers) / len(numbers) for name, numbers in values.items()}
+    """Means over the last `average_last` steps: of the rows that are logged in them, each as often as it has steps."""
+    before = max(0, config.steps - config.average_last)
+    sums: dict[str, float] = defaultdict(float)
+    counts: dict[str, float] = defaultdict(float)
+    for row in read_metrics(path):
+        if row["step"] > before:
+            for name, value in row.items():
+                sums[name] += value * (row["step"] - before)
+                counts[name] += row["step"] - before
+            before = row["step"]
+    return {name: total / counts[name] for name, total in sums.items()}
 
 
 def write_trajectory(path: Path, trainer: NavigationTrainer, probe: StateProbe) -> None:

@@ -59,7 +59,7 @@ def _conclude(run: RunFolder, trainer: NavigationTrainer) -> None:
     card = EncoderCard(
         method=config.method,
         task=data.maze.name,
-        quality="planner",
+        quality=data.maze.driver,
         corruption=flat(CorruptionConfig()),
         seed=config.seed,
         steps=trainer.step,

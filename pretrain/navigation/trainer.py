@@ -92,7 +92,7 @@ class NavigationTrainer:
                 logs, states = self.update()
                 loop.add(logs)
                 self.errors.add(*states, self.config.burn_in)
-                if loop.due(self.config.log_every):
+                if loop.due(self.config.log_every) or self.step == steps - self.config.average_last:
                     loop.log("loss", "state", **self.errors.both(self.data.states.std))
                     self.errors = ErrorSums()
                 loop.step_done(save=loop.due(self.config.checkpoint_every))

@@ -52,10 +52,14 @@ class Method:
     """One line that says what it is."""
 
     def __post_init__(self) -> None:
-        """Raise UserError for a word that this class does not know."""
+        """Raise UserError for a word that this class does not know, and for what cannot be together."""
         for name, words in (("history", ("none", "gru")), ("shift", (*get_args(Sharing), "own"))):
             if (value := getattr(self, name)) not in words:
                 raise UserError(f"a Method's {name} is {value!r}: choose one of {', '.join(words)}")
+        if self.end_to_end and self.history != "none":
+            raise UserError("a Method trained end to end has no memory: leave its history out")
+        if self.reads_state and self.trained:
+            raise UserError("a Method that reads states is not trained: say trained=False")
 
 
 _OWN = {

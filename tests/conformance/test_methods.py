@@ -223,6 +223,18 @@ def test_a_method_that_makes_no_objective_breaks_a_promise(methods, build, reaso
         check_method("mine")
 
 
+@pytest.mark.parametrize(
+    ("parts", "message"),
+    [
+        ({"trained": False, "end_to_end": "bc", "history": "gru"}, "trained end to end has no memory"),
+        ({"reads_state": True}, "that reads states is not trained"),
+    ],
+)
+def test_a_method_of_what_cannot_be_together_is_refused_where_it_is_made(parts, message):
+    with pytest.raises(UserError, match=f"a Method {message}"):
+        Method(Mean, **parts)
+
+
 @pytest.mark.parametrize("word", [{"shift": "windows"}, {"history": "lstm"}])
 def test_a_method_that_asks_for_what_there_is_not_is_refused_where_it_is_made(word):
     with pytest.raises(UserError, match=f"a Method's {next(iter(word))} is .*: choose one of .*"):

@@ -197,3 +197,12 @@ def test_noise_of_nonsense_in_an_encoder_folder_is_one_line(noisy, noise):
     (noisy / "config.json").write_text(json.dumps(config))
     with pytest.raises(UserError, match="names no encoder"):
         load_encoder(noisy)
+
+
+def test_a_part_that_fails_without_a_word_is_told_by_the_kind_of_its_error(noisy, monkeypatch):
+    def silent(config):
+        raise ValueError
+
+    monkeypatch.setattr("vd4rl_pomdp.nn.encoder_folder.Encoder", silent)
+    with pytest.raises(UserError, match=r"names no encoder \(ValueError\)"):
+        load_encoder(noisy)

@@ -40,9 +40,10 @@ def test_what_the_chosen_parts_do_not_read_is_refused(settings, reader):
         PretrainConfig.of("smoke", **settings).check()
 
 
-def test_the_states_frame_encoder_cannot_be_chosen():
-    with pytest.raises(UserError, match="--frame-encoder is not read by the method state"):
-        PretrainConfig.of("smoke", method="state", frame_encoder="drq").check()
+@pytest.mark.parametrize(("name", "value"), [("frame_encoder", "drq"), ("shift", 2)])
+def test_what_is_done_to_pictures_is_not_chosen_for_states(name, value):
+    with pytest.raises(UserError, match=f"--{name.replace('_', '-')} is not read by the method state"):
+        PretrainConfig.of("smoke", method="state", **{name: value}).check()
 
 
 def test_a_method_that_shifts_by_itself_is_told_no_shift():

@@ -11,7 +11,7 @@ import numpy as np
 from vd4rl_pomdp.data.dataset import Dataset, open_dataset
 from vd4rl_pomdp.data.format import read_attributes, read_dtypes, shard_paths
 from vd4rl_pomdp.data.store import verify_store
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, first_line
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.tasks import TASKS, DMCTask
 
@@ -99,7 +99,7 @@ def _replay_error(dataset: Dataset, replay: ReplayFn | None) -> float:
             except (RuntimeError, ValueError) as error:  # dm_control's, also where the simulation diverges
                 raise UserError(
                     f"{dataset.path}: the episode of row {start} cannot be replayed in {dataset.task} "
-                    f"({str(error).splitlines()[0]}); put the set in a folder called like its task, or collect it again"
+                    f"({first_line(error)}); put the set in a folder called like its task, or collect it again"
                 ) from error
             worst = max(worst, float(np.abs(replayed - reward[start + 1 : end]).max()))
     return worst

@@ -19,14 +19,14 @@ import numpy as np
 
 from vd4rl_pomdp.envs.opengl import undisturbed
 from vd4rl_pomdp.envs.pixels import Render
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, first_line
 from vd4rl_pomdp.tasks import FRAME_SIZE
 
 
 def gl_error(error: Exception) -> UserError:
     """A sentence for a machine on which no OpenGL context can be made."""
     return UserError(
-        f"cannot render with MUJOCO_GL={os.environ['MUJOCO_GL']} ({str(error).splitlines()[0]}): install Debian's "
+        f"cannot render with MUJOCO_GL={os.environ['MUJOCO_GL']} ({first_line(error)}): install Debian's "
         "libegl1, libgl1 and libgl1-mesa-dri for MUJOCO_GL=egl, or libosmesa6 for MUJOCO_GL=osmesa"
     )
 

@@ -152,11 +152,12 @@ def _environment(maze: str, action_repeat: int) -> MazeEnv:
 
 
 def _attributes(config: MazeCollectConfig) -> dict[str, Any]:
-    style = get_maze(config.maze).style
+    maze = get_maze(config.maze)
+    style = maze.style
     packages = ("mujoco", "gymnasium-robotics", "vd4rl-pomdp")
     return {
         "task": config.maze,
-        "policy": "ppo" if get_maze(config.maze).first_person else "planner",
+        "policy": maze.driver,
         "seed": config.seed,
         "action_repeat": config.action_repeat,
         "noise": style.noise,

@@ -16,7 +16,7 @@ from safetensors.torch import save
 
 from vd4rl_pomdp import __version__
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.errors import UserError, disk_errors, first_line
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.encoder_card import EncoderCard, EncoderOrigin, EncoderRecord
 from vd4rl_pomdp.nn.frame import STATE
@@ -131,13 +131,13 @@ def load_encoder(
         _check_corruption(card)
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise UserError(
-            f"{folder}/config.json: names no encoder ({_first_line(error)}); run the file that adds what it "
+            f"{folder}/config.json: names no encoder ({first_line(error)}); run the file that adds what it "
             "names, or pretrain it again"
         ) from error
     try:
         encoder.load_state_dict(read_tensors(folder / WEIGHTS))
     except (FileNotFoundError, SafetensorError, RuntimeError) as error:
-        reason = _first_line(error)
+        reason = first_line(error)
         raise UserError(f"{folder}/model.safetensors: cannot be read ({reason}); pretrain the encoder again") from error
     return encoder.eval().requires_grad_(False), card
 
@@ -149,10 +149,6 @@ def _check_corruption(card: EncoderCard) -> None:
     for stage in config.stages:
         build(type(stage), asdict(stage))
     config.check()
-
-
-def _first_line(error: Exception) -> str:
-    return str(error).splitlines()[0]
 
 
 def read_record(folder: Path) -> EncoderRecord:

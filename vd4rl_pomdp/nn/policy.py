@@ -9,7 +9,7 @@ from safetensors import SafetensorError
 from safetensors.torch import save
 from torch import Tensor, nn
 
-from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.errors import UserError, disk_errors, first_line
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp
 from vd4rl_pomdp.runs.files import read_json, write_bytes, write_json
 from vd4rl_pomdp.runs.reading import read_tensors
@@ -75,7 +75,7 @@ def load_policy(folder: Path) -> Policy:
         policy = Policy(**read_json(folder / "config.json"))
         policy.load_state_dict(read_tensors(folder / "model.safetensors"))
     except (FileNotFoundError, SafetensorError, RuntimeError, TypeError) as error:
-        reason = str(error).splitlines()[0]
+        reason = first_line(error)
         raise UserError(
             f"{folder}: not a policy folder ({reason}); `vd4rl-pomdp finetune` writes one as RUN/policy"
         ) from error

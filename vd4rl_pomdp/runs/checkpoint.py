@@ -24,7 +24,7 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.errors import UserError, disk_errors, first_line
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import synchronise
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
@@ -126,7 +126,7 @@ class Checkpoints:
         except (FileNotFoundError, KeyError, TypeError, ValueError) as error:
             if isinstance(error, UserError):
                 raise
-            raise _DamagedError(_first_line(error)) from error
+            raise _DamagedError(first_line(error)) from error
         if stored != FORMAT:
             raise UserError(
                 f"{path}: is a checkpoint of format {stored}, this version writes format {FORMAT} and cannot go on "
@@ -160,13 +160,9 @@ def fitting(checkpoint: Checkpoint) -> Iterator[None]:
         raise
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
         raise UserError(
-            f"{checkpoint.path}: this checkpoint does not fit the run ({_first_line(error)}); choose another --out, or "
+            f"{checkpoint.path}: this checkpoint does not fit the run ({first_line(error)}); choose another --out, or "
             f"remove {checkpoint.path.parent} to start the run again"
         ) from error
-
-
-def _first_line(error: Exception) -> str:
-    return next(iter(str(error).splitlines()), type(error).__name__)
 
 
 def _split(node: Any, path: str, tensors: dict[str, Tensor]) -> Any:

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import copy
 from collections.abc import Iterable
+from dataclasses import fields
 from typing import Any, cast
 
 import torch
 
 from vd4rl_pomdp.corruptions import CORRUPTIONS
-from vd4rl_pomdp.nn.action_target import ACTION_TARGETS
+from vd4rl_pomdp.nn.action_target import ACTION_TARGETS, CodeOptions, target_options
 from vd4rl_pomdp.objective import InverseObjective, Objective
 from vd4rl_pomdp.state_scale import StateScale
 from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_check, run_checks, shown
@@ -221,7 +222,10 @@ def padding_changes_no_loss(name: str, **settings: Any) -> None:
 def every_action_target_is_taken(name: str, **settings: Any) -> None:
     """A method that predicts actions has a finite loss with every action target."""
     for target in ACTION_TARGETS:
-        loss, _ = build(name, **(settings | {"action_target": target})).loss(batch(), 0.0)
+        read = {field.name for field in fields(target_options(target))}
+        unread = {field.name for field in fields(CodeOptions)} - read
+        told = {name: value for name, value in settings.items() if name not in unread}
+        loss, _ = build(name, **(told | {"action_target": target})).loss(batch(), 0.0)
         claim(torch.isfinite(loss), f"with {target} it is {loss.item()}")
 
 

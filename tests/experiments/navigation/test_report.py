@@ -507,3 +507,14 @@ def test_slips_are_one_line_and_exit_code_2(words, message, capsys, tmp_path, mo
 
 def test_runs_are_frozen_values():
     assert replace(Condition("no_curtain", "ah"), max_k=1).name == "no_curtain/ah-K1"
+
+
+def test_a_method_that_knows_no_k_is_one_of_k_1(tmp_path):
+    folder = write_run(tmp_path, Condition("no_curtain", "ah"), 0, 5.0)
+    record = json.loads((folder / "config.json").read_text())
+    del record["config"]["max_k"]
+    record["config"]["method"] = "one_step_inverse"
+    (folder / "config.json").write_text(json.dumps(record))
+    (run,) = load_runs(find_navigation([tmp_path]))
+    assert run.condition == Condition("no_curtain", "one_step_inverse", max_k=1)
+    assert "one_step_inverse" in write_report([tmp_path], tmp_path / "report").read_text()

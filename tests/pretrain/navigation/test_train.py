@@ -73,6 +73,16 @@ def test_the_run_measures_every_k_hidden_steps_and_both_splits(maze_set, tmp_pat
     assert found["state_error", "training", "online", "all", 0] == pytest.approx(expected)
 
 
+def test_averages_are_of_the_last_steps_however_often_metrics_are_logged(maze_set, tmp_path):
+    few = {"average_last": 5, "evaluation_windows": 2, "refit_windows": 2}
+    intervals = (1, 2, 3, 100)
+    for every in intervals:
+        train(smoke(maze_set, tmp_path / str(every), log_every=every, **few))
+    found = [results(tmp_path / str(every)) for every in intervals]
+    for measure in (("state_error", "training", "online", "all", 0), ("action_loss", "training", "", "all", 0)):
+        assert [one[measure] for one in found] == pytest.approx([found[0][measure]] * len(found))
+
+
 def test_an_interrupted_run_ends_like_an_uninterrupted_one(maze_set, tmp_path, monkeypatch):
     whole = train(smoke(maze_set, tmp_path / "whole"))
     update, calls = NavigationTrainer.update, []

@@ -211,9 +211,10 @@ def _run_of(result: Result) -> NavigationRun:
     config = record["config"]
     named = {
         "maze": results["maze"],
-        **{name: config[name] for name in ("method", "max_k")},
+        "method": config["method"],
         "exogenous": config["exogenous"] != "none",
-        "self_prediction": config.get("self_prediction", 0.0) > 0,  # these two are options of some methods alone
+        "max_k": config.get("max_k", 1),  # these three are options of some methods alone
+        "self_prediction": config.get("self_prediction", 0.0) > 0,
         "literal_future": config.get("literal_future", False),
     }
     condition = build(Condition, named)
