@@ -103,7 +103,7 @@ def _losses(split: str, logs: dict[str, float]) -> dict[Measure, float]:
 
 def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]:
     """Means over the last `average_last` steps: of the rows that are logged in them, each as often as it has steps."""
-    before = max(0, config.steps - config.average_last)
+    before: float = max(0, config.steps - config.average_last)
     sums: dict[str, float] = defaultdict(float)
     counts: dict[str, float] = defaultdict(float)
     for row in read_metrics(path):
