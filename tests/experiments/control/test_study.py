@@ -7,6 +7,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.control import study as module
 from vd4rl_pomdp.experiments.control.config import LABELS, ControlConfig, fitting_methods
 from vd4rl_pomdp.experiments.control.study import control_study
+from vd4rl_pomdp.runs.ownership import owned
 
 TINY = {"episodes": 2, "decisions": 32, "pretrain_steps": 2, "updates": 2, "eval_episodes": 2, "action_noises": [0.5]}
 
@@ -94,6 +95,31 @@ def test_a_run_whose_episodes_are_not_whole_counts_as_not_run(whole, tmp_path, m
         control_study(config(tmp_path, methods=["none", "random"]), lambda row: None)
     runs, episodes = tables(tmp_path)
     assert ([row["method"] for row in runs], [row["method"] for row in episodes]) == (["none"], ["none"] * 2)
+
+
+def test_rows_that_another_process_adds_before_this_one_owns_the_folder_stay(whole, tmp_path, monkeypatch):
+    def owned_late(out):
+        for name in ("runs.csv", "episodes.csv"):
+            (out / name).write_bytes((whole / name).read_bytes())
+        return owned(out)
+
+    monkeypatch.setattr(module, "owned", owned_late)
+    monkeypatch.delattr(module, "measured")
+    assert len(ran(config(tmp_path))) == 2
+    assert tables(tmp_path) == tables(whole)
+
+
+def test_a_study_whose_folder_was_taken_over_writes_no_more(tmp_path, monkeypatch):
+    real = module.measured
+
+    def taken_over(run):
+        (tmp_path / ".owner.json").write_text('{"host": "elsewhere", "pid": 1}')
+        return real(run)
+
+    monkeypatch.setattr(module, "measured", taken_over)
+    with pytest.raises(UserError, match="was taken over by process 1 on elsewhere"):
+        control_study(config(tmp_path), lambda row: None)
+    assert tables(tmp_path) == [[], []]
 
 
 def test_another_commands_folder_is_refused_and_stays_as_it_is(tmp_path):

@@ -10,7 +10,7 @@ from vd4rl_pomdp.experiments.control.config import LABELS, RUN_COLUMNS, WORDS, C
 from vd4rl_pomdp.experiments.control.measures import EPISODE_COLUMNS, measured
 from vd4rl_pomdp.runs.files import Row, read_csv, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.ownership import Owner, owned
 
 RUNS, EPISODES = "runs.csv", "episodes.csv"
 
@@ -26,21 +26,21 @@ def control_study(config: ControlConfig, on_run: Callable[[Row], None]) -> list[
         All rows of OUT/runs.csv, other studies' in the same folder included, by column as text.
 
     Raises:
-        UserError: bad settings, or a folder that holds something else or damaged files.
+        UserError: bad settings, or a folder that holds something else or damaged files, or is another process's.
     """
     config.check()
     refuse_foreign(config.out, "control study", RUNS)
-    runs, episodes = _read(config.out)
-    with owned(config.out):
-        _write(config.out, runs, episodes)
+    with owned(config.out) as owner:
+        runs, episodes = _read(config.out)
+        _write(owner, config.out, runs, episodes)
         for run in config.runs():
             row = next((row for row in runs if _labels(row) == tuple(run.labels.values())), None)
             if row is None:
                 row, played = measured(run)
                 runs, episodes = [*runs, row], [*episodes, *played]
-                _write(config.out, runs, episodes)
+                _write(owner, config.out, runs, episodes)
             on_run(row)
-    return _read(config.out)[0]
+        return _read(config.out)[0]
 
 
 def _read(out: Path) -> tuple[list[Row], list[Row]]:
@@ -52,8 +52,9 @@ def _read(out: Path) -> tuple[list[Row], list[Row]]:
     return whole, [row for row in episodes if _labels(row) in names]
 
 
-def _write(out: Path, runs: list[Row], episodes: list[Row]) -> None:
+def _write(owner: Owner, out: Path, runs: list[Row], episodes: list[Row]) -> None:
     """Episodes first: what has no row among the runs counts as not run."""
+    owner.check()
     write_csv(out / EPISODES, EPISODE_COLUMNS, episodes)
     write_csv(out / RUNS, RUN_COLUMNS, runs)
 
