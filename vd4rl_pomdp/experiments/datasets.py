@@ -21,6 +21,7 @@ from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.policies.actor import ships
 from vd4rl_pomdp.runs.files import Row, read_csv, read_json, write_csv, write_json
 from vd4rl_pomdp.runs.outputs import refuse_foreign
+from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 from vd4rl_pomdp.tasks import MOST_EPISODES, SET_QUALITIES, TASKS
 
@@ -48,36 +49,39 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
         Rows of the table, in the order of `tasks` and `SET_QUALITIES`.
 
     Raises:
-        UserError: an unknown task or quality, no episode to time, or a damaged file in the folder.
+        UserError: an unknown task or quality, no episode to time, or a folder with a damaged file or another owner.
     """
     _check(tasks, qualities, timed_episodes)
     refuse_number("workers", workers, 0)
     refuse_foreign(out, "table of sets", "returns.csv", "sets.csv")
-    out.mkdir(parents=True, exist_ok=True)
-    returns = read_csv(out / "returns.csv", RETURNS, _WORDS)
-    costs = read_csv(out / "costs.csv", COSTS, _WORDS)
-    actors = read_json(out / "actors.json") if (out / "actors.json").exists() else {}
-    for task, quality in product(tasks, qualities):
-        if not ships(task, quality):
-            continue
-        config = CollectConfig(task, quality, Path(), EPISODES, workers=workers)  # type: ignore[arg-type]
-        name, hashes = f"{task} {quality}", actor_hashes(config)
-        known = any((row["task"], row["quality"]) == (task, quality) for row in returns)
-        if actors.get(name) != hashes or not known:
-            played = enumerate(replay_returns(config))
-            returns = [row for row in returns if (row["task"], row["quality"]) != (task, quality)]
-            returns += [{"task": task, "quality": quality, "episode": i, "return": repr(v)} for i, v in played]
-            write_csv(out / "returns.csv", RETURNS, returns)
-            write_csv(out / "sets.csv", SETS, summarise(returns, costs))
-            actors[name] = hashes
-            write_json(out / "actors.json", actors)
-    for task in tasks:
-        if not any(row["task"] == task for row in costs):
-            costs.append(_cost(task, timed_episodes))
-            write_csv(out / "costs.csv", COSTS, costs)
-    table = summarise(returns, costs)
-    write_csv(out / "sets.csv", SETS, table)
-    write_json(out / "provenance.json", {"git_commit": git_commit(), "versions": versions(), "machine": machine()})
+    with owned(out) as owner:
+        returns = read_csv(out / "returns.csv", RETURNS, _WORDS)
+        costs = read_csv(out / "costs.csv", COSTS, _WORDS)
+        actors = read_json(out / "actors.json") if (out / "actors.json").exists() else {}
+        for task, quality in product(tasks, qualities):
+            if not ships(task, quality):
+                continue
+            config = CollectConfig(task, quality, Path(), EPISODES, workers=workers)  # type: ignore[arg-type]
+            name, hashes = f"{task} {quality}", actor_hashes(config)
+            known = any((row["task"], row["quality"]) == (task, quality) for row in returns)
+            if actors.get(name) != hashes or not known:
+                played = enumerate(replay_returns(config))
+                returns = [row for row in returns if (row["task"], row["quality"]) != (task, quality)]
+                returns += [{"task": task, "quality": quality, "episode": i, "return": repr(v)} for i, v in played]
+                actors[name] = hashes
+                owner.check()
+                write_csv(out / "returns.csv", RETURNS, returns)
+                write_csv(out / "sets.csv", SETS, summarise(returns, costs))
+                write_json(out / "actors.json", actors)
+        for task in tasks:
+            if not any(row["task"] == task for row in costs):
+                costs.append(_cost(task, timed_episodes))
+                owner.check()
+                write_csv(out / "costs.csv", COSTS, costs)
+        table = summarise(returns, costs)
+        owner.check()
+        write_csv(out / "sets.csv", SETS, table)
+        write_json(out / "provenance.json", {"git_commit": git_commit(), "versions": versions(), "machine": machine()})
     return table
 
 
