@@ -93,6 +93,17 @@ def test_a_run_goes_on_and_forgets_what_it_wrote_after_its_checkpoint(configure,
         train_policy(replace(config, n_step=3))
 
 
+def test_a_run_that_reached_its_return_stays_ended(configure, tmp_path, monkeypatch):
+    from vd4rl_pomdp.policies import learner
+    from vd4rl_pomdp.policies.train import decisions_made, train_policy
+
+    monkeypatch.setattr(learner, "RANDOM_DECISIONS", 1_000)  # no update is compiled
+    config = configure(tmp_path, decisions=160, stop_at=-1.0)
+    for _ in range(2):
+        train_policy(config)
+        assert decisions_made(tmp_path) == 40
+
+
 def test_a_new_run_starts_where_committed_networks_stood(configure, tmp_path):
     from vd4rl_pomdp.policies import learner
     from vd4rl_pomdp.policies.export import NETWORKS, export_run, read_curve, snapshot_path

@@ -75,7 +75,7 @@ def _learn(model: SAC, config: PolicyConfig, owner: Owner, on_progress: Callable
     _forget_newer(config.out, done)
     if done == 0 and config.start_from is not None:
         done = _start_from(model, config, config.start_from)
-    mean = -np.inf
+    mean = next((mean for _, mean in reversed(_curve(config.out))), -np.inf)
     while done < config.decisions and mean < config.stop_at:
         with interrupt.deferred():
             mean = _learn_and_evaluate(model, config, done)
@@ -178,8 +178,12 @@ def _start_from(model: SAC, config: PolicyConfig, start: Path) -> int:
 
 def _record(run: Path, actor: Actor, decisions: int, mean: float) -> None:
     actor.save(snapshot_path(run, decisions))
-    curve = read_curve(run) if (run / "curve.csv").exists() else []
-    _write_curve(run, [*curve, (decisions, mean)])
+    _write_curve(run, [*_curve(run), (decisions, mean)])
+
+
+def _curve(run: Path) -> list[tuple[int, float]]:
+    """What a run has of its curve; empty before the first evaluation."""
+    return read_curve(run) if (run / "curve.csv").exists() else []
 
 
 def _write_curve(run: Path, curve: list[tuple[int, float]]) -> None:
