@@ -150,6 +150,10 @@ def test_a_start_that_does_not_fit_is_one_sentence(configure, tmp_path):
     train_policy(configure(tmp_path / "old", decisions=20))
     with pytest.raises(UserError, match="networks of another shape"):
         train_policy(configure(tmp_path / "new", start_from=tmp_path / "old", hidden=8))
+    (tmp_path / "old" / "curve.csv").write_text("decisions,return_mean\n")
+    with pytest.raises(UserError, match=r"old: its curve\.csv holds no evaluation; --start-from takes a run that"):
+        train_policy(configure(tmp_path / "empty", start_from=tmp_path / "old"))
+    assert not (tmp_path / "empty").exists()
 
 
 def test_a_folder_with_something_else_is_refused_untouched(configure, tmp_path):

@@ -150,14 +150,15 @@ def _check_folder(config: PolicyConfig) -> None:
 
 
 def _check_start(config: PolicyConfig, start: Path) -> None:
-    """Raise UserError unless a folder holds a policy run of the task, with a curve that can be read."""
+    """Raise UserError unless a folder holds a policy run of the task, with an evaluation in its curve."""
     missing = [name for name in PROGRESS if not (start / name).exists()]
     if missing:
         raise UserError(f"{start}: has no {' and no '.join(missing)}; --start-from takes the folder of a policy run")
     task = read_json(start / "config.json").get("task")
     if task != config.task:
         raise UserError(f"{start}: is a run of {task}, not of {config.task}")
-    read_curve(start)
+    if not read_curve(start):
+        raise UserError(f"{start}: its curve.csv holds no evaluation; --start-from takes a run that got to its first")
 
 
 def _start_from(model: SAC, config: PolicyConfig, start: Path) -> int:
