@@ -2,6 +2,7 @@ import json
 import signal
 import sys
 from dataclasses import replace
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 
 import numpy as np
@@ -199,6 +200,24 @@ def test_a_damaged_run_is_one_sentence(configure, tmp_path, monkeypatch):
         with pytest.raises(UserError, match="cannot be read as JSON"):
             attempt()
     assert not (tmp_path / "again").exists()
+
+
+def test_an_export_needs_no_training_library_and_names_the_one_that_trained(configure, tmp_path, monkeypatch):
+    from vd4rl_pomdp.policies import export, learner
+    from vd4rl_pomdp.policies.train import train_policy
+
+    def installed(name):
+        if name in ("sbx-rl", "jax"):
+            raise PackageNotFoundError(name)
+        return version(name)
+
+    monkeypatch.setattr(learner, "RANDOM_DECISIONS", 1_000)  # no update is compiled
+    monkeypatch.setattr(learner, "version", lambda name: f"{name} of then")
+    train_policy(configure(tmp_path / "run", decisions=40))
+    monkeypatch.setattr(export, "version", installed)
+    files = export.export_run(tmp_path / "run", tmp_path / "out")
+    told = {"sbx-rl": "sbx-rl of then", "jax": "jax of then", "numpy": np.__version__}
+    assert read_actor(files["expert"]).card["versions"].items() >= told.items()
 
 
 def test_what_is_no_run_cannot_be_exported(tmp_path):

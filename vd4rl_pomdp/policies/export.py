@@ -135,7 +135,12 @@ def _publish(
     returns: list[float],
     curve: list[tuple[int, float]],
 ) -> Path:
-    """Write the actor with its card, and beside it the card with the learning curve."""
+    """Write the actor with its card, and beside it the card with the learning curve.
+
+    Versions of what trained it are those that its snapshot names; of what played the returns, those of this process.
+    """
+    actor = read_actor(snapshot_path(run, step))
+    here = {name: version(name) for name in ("dm-control", "mujoco", "numpy")}
     card = {
         "task": config["task"],
         "quality": quality,
@@ -146,9 +151,9 @@ def _publish(
         "returns": returns,
         "returns_seeds": [CARD_SEED, CARD_SEED + CARD_EPISODES - 1],
         "config": config,
-        "versions": {name: version(name) for name in ("sbx-rl", "jax", "dm-control", "mujoco", "numpy")},
+        "versions": actor.card.get("versions", {}) | here,
     }
-    Actor(read_actor(snapshot_path(run, step)).weights, card).save(path)
+    Actor(actor.weights, card).save(path)
     write_bytes(path.with_suffix(".json"), (json.dumps(card | {"learning_curve": curve}, indent=1) + "\n").encode())
     return path
 

@@ -7,6 +7,7 @@ the observation statistics alone, small enough for a repository, and is what ano
 from __future__ import annotations
 
 import json
+from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -87,6 +88,7 @@ def export_actor(model: SAC, config: PolicyConfig, decisions: int) -> Actor:
         weights["observation.mean"] = envs.obs_rms.mean
         weights["observation.std"] = np.sqrt(envs.obs_rms.var + envs.epsilon)
     card = {"task": config.task, "decisions": decisions, "algorithm": "SAC", "seed": config.seed}
+    card["versions"] = {name: version(name) for name in ("sbx-rl", "jax")}
     return Actor({name: np.asarray(value, np.float32) for name, value in weights.items()}, card)
 
 
