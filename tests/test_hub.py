@@ -79,6 +79,17 @@ def test_an_encoder_comes_back_as_it_was_with_its_name(hub, encoder, tmp_path):
     assert list(hub.large.values()) == [(encoder / "model.safetensors").read_bytes()]
 
 
+def test_a_pulled_encoders_card_names_the_licence_it_was_pushed_with_or_none(hub, encoder, tmp_path):
+    push(encoder, ENCODER, license="apache-2.0")
+    pull(ENCODER, tmp_path / "new")
+    assert huggingface_hub.ModelCard.load(tmp_path / "new" / "README.md").data.license == "apache-2.0"
+    listing = json.loads(hub.files(WHERE[ENCODER])[LISTING])
+    del listing["license"]  # as earlier versions wrote it
+    hub.repos[WHERE[ENCODER]].commit("main", hub.files(WHERE[ENCODER]) | {LISTING: json.dumps(listing).encode()})
+    pull(ENCODER, tmp_path / "earlier")
+    assert "licen" not in (tmp_path / "earlier" / "README.md").read_text()
+
+
 def test_a_set_comes_back_as_it_was(hub, data, tmp_path):
     push(data, SET)
     assert pull(SET, tmp_path / "new")
@@ -221,6 +232,7 @@ def test_a_repository_of_something_else_is_neither_written_nor_read(hub, encoder
         b'{"format": 2, "kind": "an encoder", "sha256": {"config.json": "", "model.safetensors": ""}}',
         b'{"format": 1, "kind": "a data set", "sha256": {}}',
         b'{"format": 1, "kind": "an encoder", "sha256": {"config.json": ""}}',
+        b'{"format": 1, "kind": "an encoder", "sha256": {"config.json": "", "model.safetensors": ""}, "license": 1}',
         b'{"format": 1, "kind": "an encoder", "sha256": {"config.json": 1, "model.safetensors": ""}}',
         b'{"format": 1, "kind": "an encoder", "sha256": {"config.json": "", "model.safetensors": "", "../x.md": ""}}',
     ],

@@ -1,8 +1,8 @@
 """Encoders and data sets on the Hugging Face Hub.
 
-A repository that `push` wrote holds a listing beside the files: their kind, and the SHA-256 of each, by which `pull`
-judges what it was sent. Encoders are model repositories, OWNER/NAME; data sets are datasets/OWNER/NAME, as in the Hub's
-own addresses. Endpoint and token are those of huggingface_hub: HF_ENDPOINT, HF_TOKEN, `hf auth login`.
+A repository that `push` wrote holds a listing beside the files: their kind, their licence, and the SHA-256 of each, by
+which `pull` judges what it was sent. Encoders are model repositories, OWNER/NAME; data sets are datasets/OWNER/NAME, as
+in the Hub's own addresses. Endpoint and token are those of huggingface_hub: HF_ENDPOINT, HF_TOKEN, `hf auth login`.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ def push(
         if revision != "main":
             api.create_branch(repository.name, branch=revision, repo_type=repository.type, exist_ok=True)
             held = _held(api, repository, hub_info(api, repository, revision))
-        listing = Listing.of(files, repository.kind)
+        listing = Listing.of(files, repository.kind, license)
         texts = {CARD: card.encode(), LISTING: json_text(asdict(listing)).encode()}
         adds = [CommitOperationAdd(file.name, file) for file in files]
         adds += [CommitOperationAdd(name, content) for name, content in texts.items()]

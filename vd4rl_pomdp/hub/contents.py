@@ -33,11 +33,13 @@ class Listing:
     kind: str
     sha256: dict[str, str]
     """Of each file by its name."""
+    license: str = ""
+    """That its owner gives it, as the Hub spells it; empty in a listing of an earlier version, which names none."""
 
     @classmethod
-    def of(cls, files: list[Path], kind: str) -> Listing:
-        """The listing of files of a folder."""
-        return cls(_FORMAT, kind, {file.name: sha256(file) for file in files})
+    def of(cls, files: list[Path], kind: str, license: str) -> Listing:
+        """The listing of files of a folder, under a licence."""
+        return cls(_FORMAT, kind, {file.name: sha256(file) for file in files}, license)
 
     @classmethod
     def read(cls, path: Path, repository: Repository) -> Listing:
@@ -123,4 +125,4 @@ def accept(content: Path, listing: Listing, repository: Repository) -> None:
             shutil.rmtree(path) if path.is_dir() else path.unlink()
     _check(content, listing.kind)
     if listing.kind == ENCODER:
-        write_bytes(content / CARD, model_card(read_record(content)).encode())
+        write_bytes(content / CARD, model_card(read_record(content), license=listing.license).encode())

@@ -21,7 +21,7 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
     Args:
         record: an encoder folder's config.json.
         repository: OWNER/NAME on the Hub from which the card's code loads it; empty: from the card's own folder.
-        license: the licence that its owner gives it, as the Hub spells it.
+        license: the licence that its owner gives it, as the Hub spells it; empty: the card names none.
     """
     card = record.pretrain
     return "\n".join(
@@ -35,7 +35,7 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
             "| | |",
             "|---|---|",
             *(f"| {name} | {value} |" for name, value in _facts(record)),
-            f"| licence | {code(license)} |",
+            *([f"| licence | {code(license)} |"] if license else []),
             "",
             "## Use it",
             "",
@@ -55,7 +55,8 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
 def _front_matter(tags: list[str], license: str) -> list[str]:
     """YAML, its texts as JSON has them, which is YAML, too."""
     told = [one_line(tag) for tag in dict.fromkeys(tags)]
-    values = {"license": license, "library_name": "vd4rl-pomdp", "pipeline_tag": TAGS[0], "tags": told}
+    values = {"license": license} if license else {}
+    values |= {"library_name": "vd4rl-pomdp", "pipeline_tag": TAGS[0], "tags": told}
     return ["---", *(f"{name}: {json.dumps(value)}" for name, value in values.items()), "---"]
 
 
