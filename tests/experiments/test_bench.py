@@ -1,6 +1,7 @@
 import pytest
+import torch
 
-from vd4rl_pomdp.experiments.bench import data, training
+from vd4rl_pomdp.experiments.bench import data, suite, training
 from vd4rl_pomdp.experiments.bench.suite import GOALS
 from vd4rl_pomdp.runs.files import flatten
 
@@ -14,6 +15,31 @@ def test_a_set_smaller_than_the_usual_one_can_be_measured(tmp_path, monkeypatch)
     assert opening["rows"] == dataset.num_rows == 8 * data.EPISODE_ROWS
     assert all(value > 0 for value in measured.values())
     assert {name for name in GOALS if name.split(".")[0] in sections} <= set(measured)
+
+
+def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
+    seen = {}
+
+    def section(name):
+        return lambda dataset, *_: seen.setdefault(name, {"device": dataset.t.device.type})
+
+    named = ("sampling", "pretraining", "finetuning", "methods")
+    for name in named:
+        monkeypatch.setattr(suite, name, section(name))
+    for name in ("memory", "collection", "maze_pictures", "maze_training"):
+        monkeypatch.setattr(suite, name, lambda *_: {})
+    monkeypatch.setattr(suite, "synthetic_set", lambda folder, episodes: data.synthetic_set(folder, 1))
+    monkeypatch.setattr(suite, "pick_device", lambda name: torch.device("meta"))
+    results = suite.bench()
+    assert [results[name]["device"] for name in named] == ["cpu", "meta", "meta", "meta"]
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+def test_a_set_on_a_gpu_can_be_measured(tmp_path, monkeypatch):
+    monkeypatch.setattr(training, "BATCH", 4)
+    dataset = data.synthetic_set(tmp_path, 8)[0].to("cuda")
+    assert training.pretraining(dataset, tmp_path, 1)["device"].startswith("cuda")
+    assert all(value > 0 for value in training.finetuning(dataset, 1).values())
 
 
 def test_what_a_maze_step_spends_beside_the_network_is_timed_itself(monkeypatch):

@@ -32,7 +32,7 @@ def make_trainer(dataset: Dataset, config: PretrainConfig) -> PretrainTrainer:
     from pretrain.build import build_objective, build_target
     from pretrain.train import PretrainTrainer
 
-    target = build_target(config, dataset.action[:2000].numpy())
+    target = build_target(config, dataset.action[:2000].cpu().numpy())
     objective = build_objective(config, dataset.action_dim, target)
     return PretrainTrainer(objective.to(dataset.t.device), dataset, config)
 

@@ -14,6 +14,7 @@ from vd4rl_pomdp.experiments.bench.data import sampling, synthetic_set
 from vd4rl_pomdp.experiments.bench.drawing import collection, maze_pictures
 from vd4rl_pomdp.experiments.bench.memory import memory
 from vd4rl_pomdp.experiments.bench.training import finetuning, maze_training, methods, pretraining
+from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import flatten
 from vd4rl_pomdp.runs.provenance import machine, versions
 
@@ -52,9 +53,9 @@ def bench(quick: bool = False) -> dict[str, Any]:
     repeats = 5 if quick else 15
     with tempfile.TemporaryDirectory() as folder:
         dataset, opening = synthetic_set(Path(folder), 20 if quick else 200)
-        results = {
-            "opening": opening,
-            "sampling": sampling(dataset, repeats),
+        results: dict[str, Any] = {"opening": opening, "sampling": sampling(dataset, repeats)}
+        dataset.to(pick_device("auto"))
+        results |= {
             "pretraining": pretraining(dataset, Path(folder), repeats),
             "finetuning": finetuning(dataset, repeats),
             "methods": methods(dataset, Path(folder), repeats),

@@ -1,4 +1,7 @@
-"""Updates of pretraining and fine-tuning: rates, overheads, and what caching features saves."""
+"""Updates of pretraining and fine-tuning: rates, overheads, and what caching features saves.
+
+A set is trained on where it is.
+"""
 
 from __future__ import annotations
 
@@ -25,8 +28,7 @@ def pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
     """Share of a step that the batch (sampling, corruption, shift) and the optimiser take, and bf16 against fp32."""
     from pretrain.config import PretrainConfig
 
-    device = pick_device("auto")
-    results: dict[str, Any] = {"device": str(device)}
+    results: dict[str, Any] = {"device": str(dataset.t.device)}
     steps: dict[str, float] = {}
     for precision in ("fp32", "bf16"):
         given = {"data": folder, "out": folder, "batch_size": 8, "precision": precision}
