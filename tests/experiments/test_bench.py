@@ -1,7 +1,9 @@
+import resource
+
 import pytest
 import torch
 
-from vd4rl_pomdp.experiments.bench import data, suite, training
+from vd4rl_pomdp.experiments.bench import data, memory, suite, training
 from vd4rl_pomdp.experiments.bench.suite import GOALS
 from vd4rl_pomdp.runs.files import flatten
 
@@ -40,6 +42,19 @@ def test_a_set_on_a_gpu_can_be_measured(tmp_path, monkeypatch):
     dataset = data.synthetic_set(tmp_path, 8)[0].to("cuda")
     assert training.pretraining(dataset, tmp_path, 1)["device"].startswith("cuda")
     assert all(value > 0 for value in training.finetuning(dataset, 1).values())
+
+
+def test_memory_is_told_where_linux_does_not_tell_it(tmp_path, monkeypatch):
+    kibibytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    monkeypatch.setattr(memory.sys, "platform", "linux")
+    peak, private = memory.resident(tmp_path / "none")
+    assert (peak // 1024, private) == (pytest.approx(kibibytes, rel=0.01), None)
+    monkeypatch.setattr(memory.sys, "platform", "darwin")
+    assert memory.resident(tmp_path / "none")[0] == pytest.approx(kibibytes, rel=0.01)
+    monkeypatch.setattr(memory, "run_jobs", lambda *_: [(300, None)])
+    assert memory.memory(tmp_path, 200) == {"frames_gib": 200 / 2**30, "peak_over_frames": 1.5}
+    (tmp_path / "status").write_text("Name:\ta:b\nVmHWM:\t  2048 kB\nRssAnon:\t  1024 kB\n")
+    assert memory.resident(tmp_path / "status") == (2 << 20, 1 << 20)
 
 
 def test_what_a_maze_step_spends_beside_the_network_is_timed_itself(monkeypatch):

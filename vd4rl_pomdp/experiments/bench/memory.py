@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import resource
+import sys
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -18,13 +20,13 @@ STEPS = 3
 
 
 def memory(folder: Path, frame_bytes: int) -> dict[str, float]:
-    """Peak memory of a process that trains on the set in `folder`, and what a second one adds: all but the frames."""
-    (peak, private) = next(iter(run_jobs(_train_a_little, [folder, folder], 2)))
-    return {
-        "frames_gib": frame_bytes / 2**30,
-        "peak_over_frames": peak / frame_bytes,
-        "second_process_over_frames": private / frame_bytes,
-    }
+    """Peak memory of a process that trains on the set in `folder`, and what a second one adds: all but the frames.
+
+    The latter is left out where the system does not tell it.
+    """
+    peak, private = next(iter(run_jobs(_train_a_little, [folder, folder], 2)))
+    ratios = {"frames_gib": frame_bytes / 2**30, "peak_over_frames": peak / frame_bytes}
+    return ratios if private is None else ratios | {"second_process_over_frames": private / frame_bytes}
 
 
 def make_trainer(dataset: Dataset, config: PretrainConfig) -> PretrainTrainer:
@@ -42,7 +44,7 @@ def touch(frames: torch.Tensor) -> None:
     frames.view(-1)[::4096].max()
 
 
-def _train_a_little(folder: Path) -> tuple[int, int]:
+def _train_a_little(folder: Path) -> tuple[int, int | None]:
     """Peak resident bytes of a process that reads the whole set and trains, and how many of them it does not share."""
     from pretrain.config import PretrainConfig
 
@@ -52,6 +54,18 @@ def _train_a_little(folder: Path) -> tuple[int, int]:
     for _ in range(STEPS):
         trainer.update()
     touch(dataset.frames)
-    fields = dict(line.split(":") for line in Path("/proc/self/status").read_text(encoding="utf-8").splitlines())
-    kibibytes = {name: int(fields[name].split()[0]) for name in ("VmHWM", "RssAnon")}
-    return kibibytes["VmHWM"] * 1024, kibibytes["RssAnon"] * 1024
+    return resident()
+
+
+def resident(status: Path = Path("/proc/self/status")) -> tuple[int, int | None]:
+    """Peak resident bytes of this process, and how many of those it has now it does not share.
+
+    `status` is where Linux tells them; elsewhere the peak is the system's own, and the other None. On Linux that peak
+    would be no less than that of the process that started this one.
+    """
+    if status.exists():
+        fields = dict(line.split(":", 1) for line in status.read_text(encoding="utf-8").splitlines())
+        peak, private = (int(fields[name].split()[0]) * 1024 for name in ("VmHWM", "RssAnon"))
+        return peak, private
+    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
+    return peak * (1 if sys.platform == "darwin" else 1024), None
