@@ -51,6 +51,15 @@ class WorkerDiedError(UserError):
     cause = "killed"
 
 
+class DivergedError(FloatingPointError):
+    """A number of training is no longer finite, in a command without --learning-rate and --precision."""
+
+    def __init__(self, message: str, remedy: str) -> None:
+        super().__init__(message)
+        self.remedy = remedy
+        """What its user can do, in words that end a sentence."""
+
+
 MAX_SEED = 2**31 - 1
 """Largest seed that every random generator in use takes."""
 MOST = 10**9

@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vd4rl_pomdp.cli.dispatch import run_stage
-from vd4rl_pomdp.errors import DIVERGED, DONE, INTERRUPTED, UserError, disk_error
+from vd4rl_pomdp.errors import DIVERGED, DONE, INTERRUPTED, DivergedError, UserError, disk_error
 from vd4rl_pomdp.runs import interrupt
 
 
@@ -36,7 +36,8 @@ def run_to_end(words: Sequence[str], second: signal.Handlers = signal.SIG_DFL) -
     except UserError as error:
         return End(2, error.cause, f"error: {' '.join(str(error).split())}")
     except FloatingPointError as error:
-        remedy = "lower --learning-rate or use --precision fp32"
+        usual = "lower --learning-rate or use --precision fp32"
+        remedy = error.remedy if isinstance(error, DivergedError) else usual
         return End(1, DIVERGED, f"error: training diverged, {error}; {remedy}")
     except KeyboardInterrupt as error:
         return End(130, INTERRUPTED, _ended("interrupted", str(error)))

@@ -3,10 +3,12 @@ from pathlib import Path
 
 import pytest
 
+from vd4rl_pomdp.cli.ends import run_to_end
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.control import study as module
 from vd4rl_pomdp.experiments.control.config import LABELS, ControlConfig, fitting_methods
 from vd4rl_pomdp.experiments.control.study import control_study
+from vd4rl_pomdp.experiments.control.training import _finite
 from vd4rl_pomdp.runs.ownership import owned
 
 TINY = {"episodes": 2, "decisions": 32, "pretrain_steps": 2, "updates": 2, "eval_episodes": 2, "action_noises": [0.5]}
@@ -120,6 +122,13 @@ def test_a_study_whose_folder_was_taken_over_writes_no_more(tmp_path, monkeypatc
     with pytest.raises(UserError, match="was taken over by process 1 on elsewhere"):
         control_study(config(tmp_path), lambda row: None)
     assert tables(tmp_path) == [[], []]
+
+
+def test_a_run_that_diverges_ends_the_study_with_what_its_user_can_do(tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "measured", lambda run: _finite(run, {"critic_loss": float("nan")}))
+    end = run_to_end(["control-study", "--out", str(tmp_path), "--methods", "none", "--seeds", "3"])
+    told = "training diverged, none on walker_walk, seed 3: critic_loss is nan; leave it out of --methods or --seeds"
+    assert (end.code, end.cause, end.line) == (1, "diverged", f"error: {told}")
 
 
 def test_another_commands_folder_is_refused_and_stays_as_it_is(tmp_path):

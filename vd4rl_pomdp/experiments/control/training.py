@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.errors import DivergedError
 from vd4rl_pomdp.experiments.control.config import NO_MEMORY, UNTRAINED, ControlRun
 from vd4rl_pomdp.experiments.control.data import HiddenView, PlayedSet
 from vd4rl_pomdp.nn.encoder import Encoder
@@ -95,8 +96,9 @@ def _encoded(encoder: Encoder, histories: Histories, number: int, view: HiddenVi
 
 
 def _finite(run: ControlRun, means: dict[str, float]) -> dict[str, float]:
-    """The means; one that is not finite raises FloatingPointError."""
+    """The means; one that is not finite raises DivergedError."""
     bad = [name for name, value in means.items() if not abs(value) < float("inf")]
     if bad:
-        raise FloatingPointError(f"{run.method} on {run.task}, seed {run.seed}: {bad[0]} is {means[bad[0]]}")
+        where = f"{run.method} on {run.task}, seed {run.seed}"
+        raise DivergedError(f"{where}: {bad[0]} is {means[bad[0]]}", "leave it out of --methods or --seeds")
     return means
