@@ -23,6 +23,14 @@ def test_a_plain_log_shows_numbers_speed_and_time_left_by_count_and_by_time(caps
     assert lines[-1].startswith("train: 200/1000 steps  loss 0.005  0.19 steps/s  ETA 1:")
 
 
+def test_more_steps_than_planned_leave_no_time(capsys):
+    clock = Clock()
+    with ProgressLine("PPO", 100, "decisions", clock=clock) as progress:
+        clock.now = 1.0
+        progress.advance(200)
+    assert capsys.readouterr().err == "PPO: 200/100 decisions  200 decisions/s  ETA 0:00:00\n"
+
+
 def test_a_fast_log_has_ten_lines_and_a_resumed_one_counts_its_own_speed(capsys):
     clock = Clock()
     with ProgressLine("train", 1000, "steps", start=500, clock=clock) as progress:

@@ -44,7 +44,7 @@ class FirstPersonConfig:
     maze: str = "first_person"
     """first_person, or hard_first_person."""
     decisions: int = 200_000
-    """Environment decisions in all."""
+    """Environment decisions, at the least: PPO makes whole rounds of 2,048."""
     action_repeat: int = 5
     """Simulator steps of 0.01 s for one action."""
     seed: int = 0
@@ -192,7 +192,7 @@ def _export(model: PPO, config: FirstPersonConfig) -> Actor:
     card = {
         "task": config.maze,
         "algorithm": "PPO",
-        "decisions": config.decisions,
+        "decisions": model.num_timesteps,
         "action_repeat": config.action_repeat,
         "seed": config.seed,
         "stable_baselines3": version("stable-baselines3"),

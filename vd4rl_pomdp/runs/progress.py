@@ -70,7 +70,7 @@ class ProgressLine:
         if now <= then or self._done <= start:
             return ""
         speed = (self._done - start) / (now - then)
-        left = timedelta(seconds=round((self._total - self._done) / speed))
+        left = timedelta(seconds=round(max(0, self._total - self._done) / speed))
         return f"{speed:.3g} {self._unit}/s  ETA {left}"
 
     def reach(self, done: int, **numbers: float) -> None:
