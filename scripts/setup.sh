@@ -1,11 +1,15 @@
 #!/usr/bin/env bash
 # Set up what `make demo` and `make test` need: a virtual environment with the package, and software rendering.
-# A second run finds its stamp and does nothing. PYTHON=python3.12 chooses the interpreter.
+# A second run finds its stamp and does nothing. PYTHON=python3.12 chooses the interpreter: an environment of another
+# version is made anew. Without it an environment keeps its own.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
-PYTHON="${PYTHON:-python3}"
 VENV=.venv
+if [ -z "${PYTHON:-}" ]; then
+    PYTHON=python3
+    [ ! -x "$VENV/bin/python" ] || PYTHON="$VENV/bin/python"
+fi
 STAMP="$VENV/.installed"
 export MUJOCO_GL="${MUJOCO_GL:-egl}"
 RENDER_PACKAGES=(libegl1 libgl1 libgl1-mesa-dri)
@@ -30,7 +34,9 @@ install_debian() {
     $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq "$@" >/dev/null
 }
 
-wanted="$(cat pyproject.toml constraints.txt scripts/setup.sh | sha256sum | cut -d' ' -f1) $PYTHON"
+version() { "$1" -V 2>/dev/null || true; }
+
+wanted="$(cat pyproject.toml constraints.txt scripts/setup.sh | sha256sum | cut -d' ' -f1) $(version "$PYTHON")"
 if [ -f "$STAMP" ] && [ "$(cat "$STAMP")" = "$wanted" ]; then
     exit 0
 fi
@@ -42,9 +48,9 @@ if ! "$PYTHON" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14
     say "setup: $PYTHON is $("$PYTHON" -V), one of 3.11 to 3.13 is needed; name it with PYTHON=python3.12"
     exit 2
 fi
-if [ ! -x "$VENV/bin/python" ]; then
+if [ "$(version "$VENV/bin/python")" != "$(version "$PYTHON")" ]; then
     "$PYTHON" -c 'import ensurepip, venv' 2>/dev/null || install_debian python3-venv
-    "$PYTHON" -m venv "$VENV"
+    "$PYTHON" -m venv --clear "$VENV"
 fi
 say "setup: installing Python packages (a few minutes the first time)"
 pip_install() { "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt "$@"; }

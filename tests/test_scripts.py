@@ -1,5 +1,8 @@
 import csv
 import importlib
+import os
+import shutil
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -99,6 +102,28 @@ def test_the_measurement_is_refused_in_a_line(tmp_path, monkeypatch, settings, m
     script = importlib.import_module("noisy_states")
     with pytest.raises(UserError, match=message):
         script.main(script.Config(**settings, out=tmp_path / "table.csv"))
+
+
+def test_another_python_makes_the_environment_anew(tmp_path):
+    """With interpreters that only say their version, note what they make, and agree to all else."""
+    (tmp_path / "scripts").mkdir()
+    shutil.copy(SCRIPTS / "setup.sh", tmp_path / "scripts")
+    for name in ("pyproject.toml", "constraints.txt"):
+        (tmp_path / name).touch()
+    for number in (11, 12):
+        python = tmp_path / f"python3.{number}"
+        make = f"mkdir -p .venv/bin; cp {python} .venv/bin/python; echo {number} >>{tmp_path}/made"
+        python.write_text(f'#!/bin/sh\ncase "$*" in -V) echo Python 3.{number}.0;; "-m venv"*) {make};; esac\n')
+        python.chmod(0o755)
+
+    def made_after(**chosen):
+        environment = {name: value for name, value in os.environ.items() if name != "PYTHON"}
+        subprocess.run(["bash", "scripts/setup.sh"], cwd=tmp_path, env=environment | chosen, check=True)
+        return (tmp_path / "made").read_text().split()
+
+    one, other = ({"PYTHON": str(tmp_path / f"python3.{number}")} for number in (11, 12))
+    assert made_after(**one) == made_after(**one) == ["11"]
+    assert made_after(**other) == made_after() == ["11", "12"]
 
 
 def test_the_control_studys_page_shows_the_table_of_its_rows(monkeypatch):
