@@ -55,7 +55,7 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
 def _front_matter(tags: list[str], license: str) -> list[str]:
     """YAML, its texts as JSON has them, which is YAML, too."""
     told = [one_line(tag) for tag in dict.fromkeys(tags)]
-    values = {"license": license} if license else {}
+    values: dict[str, str | list[str]] = {"license": license} if license else {}
     values |= {"library_name": "vd4rl-pomdp", "pipeline_tag": TAGS[0], "tags": told}
     return ["---", *(f"{name}: {json.dumps(value)}" for name, value in values.items()), "---"]
 
