@@ -17,6 +17,7 @@ from vd4rl_pomdp.testing.tasks import (
     episodes_end_once,
     episodes_repeat_from_their_seeds,
     frames_have_the_size_asked_for,
+    frames_stay_as_they_were,
     rewards_replay,
     rows_have_the_declared_widths,
 )
@@ -97,9 +98,16 @@ def test_what_the_harness_itself_could_break_is_caught(tasks, monkeypatch):
 
     tasks.register("mine", GymnasiumTask(Square))
     step, time_step, frame = PixelEnv.step, GymnasiumEnv._time_step, GymnasiumEnv._frame
+    buffer = np.zeros((3, 84, 84), np.uint8)
+
+    def drawn_into_one_buffer(self, size):
+        buffer[:] = frame(self, size)
+        return buffer
+
     broken = [
         (GymnasiumEnv, "_rescaled", lambda self, a: a * 5, actions_fill_their_bounds, "becomes .* the bounds are"),
         (GymnasiumEnv, "_frame", lambda self, s: frame(self, s + 1), frames_have_the_size_asked_for, "of size 84 is"),
+        (GymnasiumEnv, "_frame", drawn_into_one_buffer, frames_stay_as_they_were, "row 0 changes in later rows"),
         (
             GymnasiumEnv,
             "_time_step",

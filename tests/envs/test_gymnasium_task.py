@@ -55,6 +55,23 @@ def test_pictures_of_every_layout_become_frames(pixels, shape):
         assert (row.frame == t).all()
 
 
+class OneBuffer(Counter):
+    """Draws every picture into the same memory."""
+
+    def picture(self):
+        self.buffer = getattr(self, "buffer", np.empty(self.shape, np.uint8))
+        self.buffer[:] = self.steps
+        return self.buffer
+
+
+@pytest.mark.parametrize("shape", [(3, 16, 16), (16, 16, 3), (16, 16)])
+def test_a_row_keeps_its_frame_where_an_environment_draws_into_one_buffer(shape):
+    _, rows = play(GymnasiumTask(OneBuffer, {"shape": shape}, pixels="observation"), 2, size=16)
+    for t, row in enumerate(rows):
+        assert (row.frame == t).all()
+        assert row.frame.flags.c_contiguous
+
+
 def test_another_environment_in_the_process_changes_no_picture():
     """Gymnasium draws into whatever context is current, if the environment has one viewer."""
 

@@ -93,7 +93,7 @@ class GymnasiumEnv(PixelEnv):
         picture = self._picture()
         if picture.shape[:2] != (size, size):
             picture = np.asarray(Image.fromarray(picture).resize((size, size), Image.Resampling.BOX))
-        return np.ascontiguousarray(picture.transpose(2, 0, 1))
+        return np.array(picture.transpose(2, 0, 1), order="C")  # a copy: the environment may draw into its buffer again
 
     def _picture(self) -> np.ndarray:
         """The present picture as (H, W, 3) uint8: a grey one has three equal channels."""

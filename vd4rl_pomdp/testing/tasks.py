@@ -73,6 +73,16 @@ def frames_have_the_size_asked_for(name: str) -> None:
             claim(found == ((3, size, size), np.uint8), f"a frame of size {size} is {found[0]} {found[1]}")
 
 
+def frames_stay_as_they_were(name: str) -> None:
+    """A row keeps its frame while the environment goes on."""
+    env = make(name, SIZES[0])
+    first = env.reset(3).frame
+    assert first is not None
+    before = first.copy()
+    play(env, 4)
+    claim(np.array_equal(first, before), "the frame of row 0 changes in later rows: give each row a copy of its own")
+
+
 def rows_have_the_declared_widths(name: str) -> None:
     """Rows hold states of the task's layout, which is that of its environment, and finite rewards, 0 in the first."""
     from vd4rl_pomdp.envs.make import layout_of
@@ -152,6 +162,7 @@ def rewards_replay(name: str) -> None:
 CHECKS: tuple[Check, ...] = (
     episodes_repeat_from_their_seeds,
     frames_have_the_size_asked_for,
+    frames_stay_as_they_were,
     rows_have_the_declared_widths,
     episodes_end_once,
     actions_fill_their_bounds,
