@@ -28,7 +28,7 @@ def alter(path, key, change):
 @pytest.mark.parametrize(
     ("names", "expected"),
     [
-        (["10_mixed", "9_mixed", "1_mixed", "0_mixed"], ["0_mixed", "1_mixed", "9_mixed", "10_mixed"]),
+        ([f"{number}_mixed" for number in reversed(range(11))], [f"{number}_mixed" for number in range(11)]),
         (
             ["0_walker_walk_expert", "0_walker_walk_medium", "1_walker_walk_expert", "1_walker_walk_medium"],
             ["0_walker_walk_expert", "1_walker_walk_expert", "0_walker_walk_medium", "1_walker_walk_medium"],
@@ -40,6 +40,21 @@ def test_shards_are_ordered_by_name_then_by_number(tmp_path, names, expected):
     for name in names:
         (tmp_path / f"{name}.hdf5").touch()
     assert [p.stem for p in shard_paths(tmp_path)] == expected
+
+
+@pytest.mark.parametrize(
+    ("names", "message"),
+    [
+        (["0_a", "1_a", "3_a"], "has the shard 3_a, but none called 2_a"),
+        (["0_a", "1_a", "1_b", "2_b"], "has the shard 2_b, but none called 0_b"),
+        (["0", "2"], "has the shard 2, but none called 1"),
+    ],
+)
+def test_a_number_that_is_left_out_is_told(tmp_path, names, message):
+    for name in names:
+        (tmp_path / f"{name}.hdf5").touch()
+    with pytest.raises(UserError, match=f"{message}; download or collect it again, or number"):
+        shard_paths(tmp_path)
 
 
 def test_only_visible_shards_are_listed(tmp_path):

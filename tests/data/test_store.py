@@ -16,6 +16,7 @@ from vd4rl_pomdp.data import store as store_module
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.data.store import PlayedStore, default_cache, open_store, verify_store
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs.files import write_json
 
 fork = multiprocessing.get_context("fork")
 
@@ -226,37 +227,58 @@ def test_rows_that_belong_to_no_episode_are_named(tmp_path, cache):
     set_step_type(folder / "1_fake.hdf5", 2, 1)  # row 8, the third episode's first
     with pytest.raises(UserError, match=r"1_fake\.hdf5: row 2 follows an episode's last row without beginning"):
         open_store(folder, cache)
-    (folder / "0_fake.hdf5").unlink()
-    with pytest.raises(UserError, match=r"1_fake\.hdf5: row 0 has step_type 1, but the first row .*missing"):
+    (folder / "1_fake.hdf5").replace(folder / "0_fake.hdf5")
+    with pytest.raises(UserError, match=r"0_fake\.hdf5: row 0 has step_type 1, but the first row .*missing"):
         open_store(folder, cache)
     assert not cache.exists() or visible(cache) == []
 
 
-def test_a_shard_missing_in_the_middle_is_found(tmp_path, cache):
-    folder = write_fake_set(tmp_path / "set", (9, 9), cuts=(3, 6, 9, 12))
-    (folder / "1_fake.hdf5").unlink()
-    with pytest.raises(UserError, match=r"2_fake\.hdf5: row 0 continues an episode, but not that of 0_fake\.hdf5"):
+def test_a_shard_missing_inside_an_episode_is_found(tmp_path, cache):
+    folder = write_fake_set(tmp_path / "set", (9,), cuts=(3, 6), names=["0_a.hdf5", "1_a.hdf5", "0_b.hdf5"])
+    (folder / "1_a.hdf5").unlink()
+    with pytest.raises(UserError, match=r"0_b\.hdf5: row 0 continues an episode, but not that of 0_a\.hdf5"):
         open_store(folder, cache)
 
 
-def test_a_subset_of_whole_episodes_may_be_used(tmp_path, cache):
+@pytest.mark.parametrize("lacking", [0, 2])
+def test_a_shard_of_whole_episodes_that_is_missing_is_found_by_its_number(tmp_path, cache, lacking):
+    folder = write_fake_set(tmp_path / "set", (3, 3, 3, 3), cuts=(3, 6, 9))
+    (folder / f"{lacking}_fake.hdf5").unlink()
+    with pytest.raises(UserError, match=f"set: has the shard 3_fake, but none called {lacking}_fake; download or"):
+        open_store(folder, cache)
+
+
+def test_the_first_shards_of_a_set_may_be_used_and_any_single_one(tmp_path, cache):
     folder = write_fake_set(tmp_path / "set", (3, 3, 3), cuts=(3, 6))
-    (folder / "1_fake.hdf5").unlink()
-    frames = open_store(folder, cache).frames()
-    assert frame_identity(frames)[:, 0].tolist() == [[0, 0], [0, 1], [0, 2], [2, 0], [2, 1], [2, 2]]
+    (folder / "2_fake.hdf5").unlink()
+    for path, episodes in ((folder, (0, 1)), (folder / "1_fake.hdf5", (1,))):
+        rows = frame_identity(open_store(path, cache).frames())[:, 0].tolist()
+        assert rows == [[episode, t] for episode in episodes for t in range(3)]
+
+
+@pytest.mark.parametrize("unit", ["episodes", "trajectories"])
+def test_a_collected_set_that_lacks_episodes_is_refused(tmp_path, cache, unit):
+    folder = write_fake_set(tmp_path / "set", (3, 3, 3), cuts=(3, 6))
+    write_json(folder / "collection.json", {unit: 3})
+    write_json(folder / "provenance.json", {})
+    assert open_store(folder, cache).meta["rows"] == 9
+    (folder / "2_fake.hdf5").unlink()
+    with pytest.raises(UserError, match=r"set: holds 2 episodes, its collection\.json says 3: is a shard missing"):
+        open_store(folder, cache)
+    assert open_store(folder / "1_fake.hdf5", cache).meta["rows"] == 3, "one shard is no set"
 
 
 @pytest.mark.parametrize(
     ("second", "message"),
     [
-        ({"action_dim": 5, "physics_dim": 3}, r"1_b\.hdf5: 'action' has 5 dimensions, in 0_a\.hdf5 6"),
-        ({"physics_dim": 4}, r"1_b\.hdf5: 'physics' has 4 dimensions, in 0_a\.hdf5 3"),
-        ({}, r"0_a\.hdf5: has 'physics', 1_b\.hdf5 has not"),
+        ({"action_dim": 5, "physics_dim": 3}, r"0_b\.hdf5: 'action' has 5 dimensions, in 0_a\.hdf5 6"),
+        ({"physics_dim": 4}, r"0_b\.hdf5: 'physics' has 4 dimensions, in 0_a\.hdf5 3"),
+        ({}, r"0_a\.hdf5: has 'physics', 0_b\.hdf5 has not"),
     ],
 )
 def test_shards_of_different_sets_are_refused(tmp_path, cache, second, message):
     write_fake_set(tmp_path / "set", (4,), physics_dim=3, names=["0_a.hdf5"])
-    write_fake_set(tmp_path / "set", (4,), names=["1_b.hdf5"], **second)
+    write_fake_set(tmp_path / "set", (4,), names=["0_b.hdf5"], **second)
     with pytest.raises(UserError, match=message):
         open_store(tmp_path / "set", cache)
 

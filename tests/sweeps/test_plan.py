@@ -272,9 +272,9 @@ def test_a_set_that_was_collected_otherwise_is_refused(copy, stored, asked, mess
 
 @pytest.mark.parametrize("size", [48, 84])
 def test_a_set_that_was_collected_so_is_taken(copy, size):
-    write_json(copy / "data" / "walker_walk" / "expert" / "collection.json", collected(frame_size=size))
+    write_json(copy / "data" / "walker_walk" / "expert" / "collection.json", collected(frame_size=size, episodes=3))
     (copy / "data" / "walker_walk" / "expert" / "provenance.json").write_text("{}")
-    assert left(plan(copy, [f"collect.frame_size={size}"])) == []
+    assert left(plan(copy, [f"collect.frame_size={size}", "collect.episodes=3"])) == []
 
 
 def test_one_folder_is_not_asked_for_two_sets(copy):

@@ -61,7 +61,7 @@ def write_card(path: Path) -> Path:
     shards = shard_paths(path)
     check_frames(shards)
     parts = [read_rows(shard) for shard in shards]
-    rows = join_shards(shards, parts)
+    rows = join_shards(path, shards, parts)
     attributes = [read_attributes(shard) for shard in shards]
     names = identity(path, attributes)
     starts = np.flatnonzero(rows["step_type"] == StepType.FIRST)

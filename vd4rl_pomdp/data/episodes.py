@@ -7,22 +7,30 @@ from pathlib import Path
 
 import numpy as np
 
-from vd4rl_pomdp.data.format import shard_number
+from vd4rl_pomdp.data.format import PLAN, shard_number
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.types import StepType
 
 
-def join_shards(shards: Sequence[Path], parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
-    """Concatenate the rows of all shards (as `read_rows` gives them) into those of the set.
+def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Concatenate the rows of all shards into those of the set.
+
+    Args:
+        path: the set, or a single shard.
+        shards: its files, as `shard_paths` gives them.
+        parts: their rows, as `read_rows` gives them.
 
     Raises:
-        UserError: the shards differ in width or keys, or an episode's beginning is missing.
+        UserError: the shards differ in width or keys, an episode's beginning is missing, or a collected set has not
+            as many episodes as its collection.json says.
     """
     for shard, part in zip(shards, parts, strict=True):
         _agree(shards[0], parts[0], shard, part)
     starts = np.cumsum([0, *(len(part["reward"]) for part in parts)])
     rows = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     _check_order(shards, starts, rows["step_type"])
+    _check_count(path, int((rows["step_type"] == StepType.FIRST).sum()))
     return rows
 
 
@@ -35,6 +43,17 @@ def _agree(first: Path, expected: Mapping[str, np.ndarray], shard: Path, part: M
         if value.shape[1:] != expected[key].shape[1:]:
             widths = f"{value.shape[1]} dimensions, in {first.name} {expected[key].shape[1]}"
             raise UserError(f"{shard}: {key!r} has {widths}; keep one set in a folder")
+
+
+def _check_count(path: Path, episodes: int) -> None:
+    """Refuse a collected set that lacks episodes; a set of other makers says nothing of their number."""
+    plan = read_json(path / PLAN) if (path / PLAN).is_file() else {}
+    planned = plan.get("episodes", plan.get("trajectories", episodes))  # as its command calls them
+    if episodes != planned:
+        raise UserError(
+            f"{path}: holds {episodes} episodes, its {PLAN} says {planned}: is a shard missing or of another set? "
+            "collect or download it again"
+        )
 
 
 def _check_order(shards: Sequence[Path], starts: np.ndarray, step_type: np.ndarray) -> None:

@@ -13,8 +13,10 @@ from __future__ import annotations
 import io
 import json
 import re
+from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from itertools import count
 from pathlib import Path
 from typing import Any
 
@@ -48,7 +50,8 @@ def shard_paths(folder: Path) -> list[Path]:
     `9_mixed`, and the two halves of a medium_expert folder are not interleaved. Hidden files are no shards.
 
     Raises:
-        UserError: there is no such folder, no shard in it, or a download or collection of it was cut.
+        UserError: there is no such folder, no shard in it, a number is left out among shards whose names agree
+            otherwise, or a download or collection of it was cut.
     """
     if folder.is_file():
         return [folder]
@@ -62,7 +65,23 @@ def shard_paths(folder: Path) -> list[Path]:
         inner = next((p.parent for suffix in SUFFIXES for p in sorted(folder.rglob(f"[!.]*{suffix}"))), None)
         hint = f"name a folder of shards such as {inner}" if inner else "collect or download a set there"
         raise UserError(f"{folder}: holds no .hdf5 shards; {hint}")
+    _refuse_gaps(folder, shards)
     return sorted(shards, key=_shard_order)
+
+
+def _refuse_gaps(folder: Path, shards: Sequence[Path]) -> None:
+    """Raise UserError unless the numbers of shards whose names agree otherwise are 0, 1, 2, ..."""
+    numbers: dict[str, set[int]] = defaultdict(set)
+    for rest, number in map(shard_number, shards):
+        if number is not None:
+            numbers[rest].add(number)
+    for rest, found in numbers.items():
+        lacking = next(number for number in count() if number not in found)
+        if lacking < max(found):
+            raise UserError(
+                f"{folder}: has the shard {max(found)}{rest}, but none called {lacking}{rest}; {_REPAIR}, or number "
+                "the shards of a set of your own 0, 1, 2, ..."
+            )
 
 
 def refuse_partial(folder: Path) -> None:

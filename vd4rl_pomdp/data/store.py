@@ -136,7 +136,7 @@ def open_store(path: Path, cache: Path | None = None) -> Store:
     meta = _read_meta(folder)
     if meta is None:
         with _locked(folder):
-            meta = _read_meta(folder) or _decode(shards, folder)
+            meta = _read_meta(folder) or _decode(path, shards, folder)
     return Store(folder, meta)
 
 
@@ -177,10 +177,10 @@ def _locked(folder: Path) -> Iterator[None]:
         yield
 
 
-def _decode(shards: Sequence[Path], folder: Path) -> dict[str, Any]:
+def _decode(path: Path, shards: Sequence[Path], folder: Path) -> dict[str, Any]:
     """Decode into a hidden folder and rename it; what a killed process left there is removed first."""
     frame_size = read_frame_size(shards)
-    rows = join_shards(shards, [read_rows(shard) for shard in shards])
+    rows = join_shards(path, shards, [read_rows(shard) for shard in shards])
     scratch = folder.with_name(f".{folder.name}.tmp")
     shutil.rmtree(scratch, ignore_errors=True)
     try:

@@ -97,7 +97,7 @@ def _check(folder: Path, kind: str) -> None:
     else:
         shards = shard_paths(folder)
         check_frames(shards)
-        join_shards(shards, [read_rows(shard) for shard in shards])
+        join_shards(folder, shards, [read_rows(shard) for shard in shards])
 
 
 def _is_name_of_set(name: str) -> bool:
