@@ -96,7 +96,7 @@ class Evaluations:
         for part in [algorithm.policy] + ([algorithm.encoder] if isinstance(algorithm, EndToEnd) else []):
             if not all(weights.isfinite().all() for weights in part.parameters()):
                 raise FloatingPointError(f"{self.run}: the policy's weights are not finite after update {step}")
-        algorithm.policy.save(self.run / "policy")
+        algorithm.policy.save(self.run / "policy", step)
         if isinstance(algorithm, EndToEnd):
             save_encoder(self.run / "encoder", algorithm.encoder, self.card)
 

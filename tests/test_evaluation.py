@@ -20,7 +20,7 @@ from vd4rl_pomdp.envs.pixels import TimeStep
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import EVALUATION_SEED, Episode, EpisodeJob, by_part, episode_rows, evaluate, evaluate_run
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, save_encoder
-from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
 from vd4rl_pomdp.policies.actor import ASSETS, load_actor
 from vd4rl_pomdp.runs.episodes import begin_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
@@ -215,3 +215,30 @@ def test_an_evaluation_names_its_step_and_touches_no_other_file(world, encoder, 
     with pytest.raises(UserError, match="has no column 'method'"):
         begin_episodes(thesis)
     assert thesis.read_text() == "a,b\n1,2\n"
+
+
+def test_an_evaluation_is_of_the_step_of_the_policy_and_not_of_the_newest_row(world, encoder, data, tmp_path):
+    """A run that was cut in its evaluation has a policy and no row of it yet."""
+    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2)).path
+    assert policy_step(run / "policy") == 2
+    policy = load_policy(run / "policy")
+    policy.save(run / "policy", step=7)
+    assert [row["step"] for row in evaluate_run(run, None, 1, 1).rows] == [7, 7]
+    policy.save(run / "policy")  # as earlier versions did
+    assert [row["step"] for row in evaluate_run(run, None, 1, 1).rows] == [2, 2]
+
+
+@pytest.mark.parametrize("part", ["policy", "encoder"])
+def test_a_policy_that_changes_while_it_plays_is_told(world, encoder, data, tmp_path, monkeypatch, part):
+    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2)).path
+    play_all = evaluation.evaluate
+
+    def train_on(jobs, workers):
+        episodes = play_all(jobs, workers)
+        card = read_json(run / part / "config.json")
+        write_json(run / part / "config.json", card | {"later": 1})
+        return episodes
+
+    monkeypatch.setattr(evaluation, "evaluate", train_on)
+    with pytest.raises(UserError, match="run: wrote another policy while this one played; evaluate it"):
+        evaluate_run(run, None, 1, 1)

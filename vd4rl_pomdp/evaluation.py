@@ -20,7 +20,7 @@ from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import encoder_hash, load_encoder
 from vd4rl_pomdp.nn.frame import StateFrame
-from vd4rl_pomdp.nn.policy import Policy, load_policy
+from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
 from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.reference import Reference, action_error
 from vd4rl_pomdp.runs.episodes import LABELS, read_episodes
@@ -159,14 +159,19 @@ def _run_episode(job: EpisodeJob) -> Episode:
 
 def _agent(job: EpisodeJob) -> Agent:
     """The one of a job; kept as long as its folders hold the same."""
-    try:
-        key = encoder_hash(job.encoder), encoder_hash(job.policy)  # whose files have the same names
-    except FileNotFoundError:
-        key = ("", "")  # loading says what is missing
+    key = _content(job.encoder, job.policy)
     if key not in _AGENTS:
         _AGENTS.clear()
         _AGENTS[key] = Agent(load_encoder(job.encoder)[0], load_policy(job.policy))
     return _AGENTS[key]
+
+
+def _content(encoder: Path, policy: Path) -> tuple[str, str]:
+    """Names of what the folders of an agent hold."""
+    try:
+        return encoder_hash(encoder), encoder_hash(policy)  # whose files have the same names
+    except FileNotFoundError:
+        return "", ""  # loading says what is missing
 
 
 def _draws(agent: Agent, job: EpisodeJob) -> Drawn:
@@ -239,7 +244,7 @@ class EvaluatedRun:
     """A policy played again."""
 
     rows: list[dict[str, Any]]
-    """Of `episodes.csv`; `corruption` is that of training, `step` that of the run's newest policy."""
+    """Of `episodes.csv`; `corruption` is that of training, `step` that of the policy that played."""
     episodes: list[Episode]
     """Their episodes, in the same order."""
 
@@ -258,7 +263,8 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
         `episodes` of them under each corruption.
 
     Raises:
-        UserError: an unknown corruption, no episode, or a folder without an evaluated run.
+        UserError: an unknown corruption, no episode, a folder without an evaluated run, or one whose policy changes
+            while it plays.
     """
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
@@ -277,13 +283,19 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     for one in chosen:
         one.check()
     actor = Reference.read(run).actor_file
+    encoder, policy = run / "encoder", run / "policy"
     jobs = [
-        EpisodeJob(run / "encoder", run / "policy", task, one, episode, film=False, actor=actor)
+        EpisodeJob(encoder, policy, task, one, episode, film=False, actor=actor)
         for one in chosen
         for episode in range(episodes)
     ]
-    step = max(row["step"] for row in evaluated)
+    content = _content(encoder, policy)
+    step = policy_step(policy)
+    if step is None:  # of an earlier version
+        step = max(row["step"] for row in evaluated)
     played = evaluate(jobs, workers)
+    if _content(encoder, policy) != content:
+        raise UserError(f"{run}: wrote another policy while this one played; evaluate it when it is done")
     return EvaluatedRun(episode_rows(played, labels | {"step": step}), played)
 
 

@@ -5,14 +5,18 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError
+from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
 
 from vd4rl_pomdp.errors import UserError, disk_errors, first_line
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp
 from vd4rl_pomdp.runs.files import read_json, write_bytes, write_json
-from vd4rl_pomdp.runs.reading import read_tensors
+from vd4rl_pomdp.runs.reading import read_tensors, regular
+
+_WEIGHTS = "model.safetensors"
+_STEP = "step"
+"""Metadata of the weights' file."""
 
 
 class Standardise(nn.Module):
@@ -61,11 +65,12 @@ class Policy(nn.Module):
         """Mean action for representations that are already standardised."""
         return torch.tanh(self.net(z))
 
-    def save(self, folder: Path) -> None:
-        """Write the policy folder."""
+    def save(self, folder: Path, step: int | None = None) -> None:
+        """Write the policy folder; with the weights goes the training step that they are of, if it is told."""
         with disk_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
-        write_bytes(folder / "model.safetensors", save({k: v.contiguous().cpu() for k, v in self.state_dict().items()}))
+        weights = {k: v.contiguous().cpu() for k, v in self.state_dict().items()}
+        write_bytes(folder / _WEIGHTS, save(weights, None if step is None else {_STEP: str(step)}))
         write_json(folder / "config.json", self.shape)
 
 
@@ -73,10 +78,22 @@ def load_policy(folder: Path) -> Policy:
     """Read a policy folder; raises UserError if it is missing or damaged."""
     try:
         policy = Policy(**read_json(folder / "config.json"))
-        policy.load_state_dict(read_tensors(folder / "model.safetensors"))
+        policy.load_state_dict(read_tensors(folder / _WEIGHTS))
     except (FileNotFoundError, SafetensorError, RuntimeError, TypeError) as error:
-        reason = first_line(error)
-        raise UserError(
-            f"{folder}: not a policy folder ({reason}); `vd4rl-pomdp finetune` writes one as RUN/policy"
-        ) from error
+        raise _no_policy(folder, error) from error
     return policy.eval().requires_grad_(False)
+
+
+def policy_step(folder: Path) -> int | None:
+    """The training step of a policy folder's weights, None if they do not tell it; UserError as `load_policy`."""
+    try:
+        with safe_open(regular(folder / _WEIGHTS), "pt") as file:
+            told = (file.metadata() or {}).get(_STEP)
+        return None if told is None else int(told)
+    except (OSError, SafetensorError, ValueError) as error:
+        raise _no_policy(folder, error) from error
+
+
+def _no_policy(folder: Path, error: Exception) -> UserError:
+    reason = first_line(error)
+    return UserError(f"{folder}: not a policy folder ({reason}); `vd4rl-pomdp finetune` writes one as RUN/policy")
