@@ -55,7 +55,8 @@ class FinetuneConfig(StageConfig):
     eval_clean: bool = True
     """Play the last evaluation under no corruption, too, which takes as long again; it changes nothing else."""
     eval_length: int = 500
-    """Most decisions in an evaluation episode, which never has more than the task's; fewer only for trials."""
+    """Most decisions in an evaluation episode, which never has more than the task's; fewer only for trials. The default
+    is all of them, of a task that has more, too."""
     workers: int = 0
     """Processes that evaluate; 0 uses every core."""
     device: str = "auto"

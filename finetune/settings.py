@@ -16,18 +16,23 @@ from vd4rl_pomdp.options import NO_OPTIONS, flat
 from vd4rl_pomdp.runs.memory import require_disk, require_memory
 
 
-def as_trained(config: FinetuneConfig, method: str, algorithm: str, remembers: bool) -> FinetuneConfig:
+def as_trained(config: FinetuneConfig, method: str, algorithm: str, remembers: bool, decisions: int) -> FinetuneConfig:
     """The settings as an encoder's policy is trained with them: what it cannot read is no part of them.
+
+    An evaluation of the default length is one of whole episodes, however long they are.
 
     Args:
         config: the settings that were told.
         method: the encoder's.
         algorithm: the algorithm that the method brings along, if it has no frozen stage; else empty.
         remembers: whether the encoder has a memory.
+        decisions: of an episode of the task.
 
     Raises:
         UserError: a setting that was not the default is not read.
     """
+    if config.eval_length == FinetuneConfig.eval_length:
+        config = replace(config, eval_length=max(config.eval_length, decisions))
     if algorithm:
         config = _end_to_end(config, algorithm)
     return config if remembers and not algorithm else _without_memory(config, method)

@@ -62,9 +62,9 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     dataset.require_transitions()
     encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frame_size)
     refuse_outside(config, shift=(0, dataset.frame_size - 1))
-    longest = max(TASKS.named(card.task).decisions, FinetuneConfig.eval_length)
-    refuse_number("eval_length", config.eval_length, 1, longest)
-    config = as_trained(config, card.method, card.end_to_end, encoder.gru is not None)
+    decisions = TASKS.named(card.task).decisions
+    refuse_number("eval_length", config.eval_length, 1, max(decisions, FinetuneConfig.eval_length))
+    config = as_trained(config, card.method, card.end_to_end, encoder.gru is not None, decisions)
     if isinstance(config.memory, HistoryOptions):
         encoder.config = replace(encoder.config, **config.memory.encoder_changes)
     if encoder.reads_state:

@@ -52,7 +52,7 @@ READERS: list[tuple[str, list[str], list[str]]] = [
         [
             f"{RUN}/{name}"
             for name in (
-                *("labels.json", "episodes.csv", "encoder/config.json", "encoder/model.safetensors"),
+                *("config.json", "labels.json", "episodes.csv", "encoder/config.json", "encoder/model.safetensors"),
                 *("policy/config.json", "policy/model.safetensors", "reference.json"),
             )
         ],
@@ -120,6 +120,10 @@ FINE: dict[str, str] = {
         for kind in ("missing", "a dangling link")
     },
     "report | runs-cut/finetuning/labels.json | *": "a run that has rows is named by them",
+    **{
+        f"evaluate | {RUN}/config.json | {kind}": "without it whole episodes are played"
+        for kind in ("missing", "a dangling link")
+    },
     "report | */timing.json | missing": "a run that is not finished has none",
     "report | */timing.json | a dangling link": "a run that is not finished has none",
     "report | */probe.json | missing": "a set without states gives none",

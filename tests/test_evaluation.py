@@ -242,3 +242,15 @@ def test_a_policy_that_changes_while_it_plays_is_told(world, encoder, data, tmp_
     monkeypatch.setattr(evaluation, "evaluate", train_on)
     with pytest.raises(UserError, match="run: wrote another policy while this one played; evaluate it"):
         evaluate_run(run, None, 1, 1)
+
+
+@pytest.mark.parametrize(("record", "length"), [({"config": {"eval_length": 2}}, 2), ({}, 500), (None, 500)])
+def test_a_run_is_evaluated_again_over_its_own_length(world, encoder, data, tmp_path, monkeypatch, record, length):
+    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=3)).path
+    (run / "config.json").unlink()
+    if record is not None:
+        write_json(run / "config.json", record)
+    jobs = []
+    monkeypatch.setattr(evaluation, "evaluate", lambda given, workers: jobs.extend(given) or [])
+    evaluate_run(run, "patch", 1, 1)
+    assert [job.length for job in jobs] == [length]

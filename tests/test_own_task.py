@@ -177,6 +177,26 @@ def test_an_evaluation_is_never_longer_than_the_task(tasks, tmp_path):
         run_finetune(replace(config, out=tmp_path / "other", eval_length=501))
 
 
+@pytest.mark.parametrize(("told", "length"), [(500, 510), (499, 499)])
+def test_an_evaluation_is_of_whole_episodes_of_a_task_that_is_longer_than_the_benchmarks(
+    tasks, tmp_path, monkeypatch, told, length
+):
+    """499 is what one says, 500 the default."""
+    tasks.register("long", replace(tasks["centre"], arguments={"speed": 0.0}, decisions=510))
+    data = tmp_path / "long"
+    collect(CollectConfig("long", "random", data, episodes=2, workers=1, frame_size=50), 60)
+    encoder = run_pretrain(pretrain.config.PretrainConfig.of("smoke", data=data, out=tmp_path / "pretrain")).path
+    config = finetune.config.FinetuneConfig.of(
+        "smoke", encoder=encoder / "encoder", data=data, workers=1, updates=2, eval_every=2, out=tmp_path / "run"
+    )
+    config = replace(config, eval_length=told, eval_clean=False)
+    run = run_finetune(config)
+    assert run_finetune(config).finished, "the same command finds it"
+    assert {row["length"] for row in read_episodes(run.path / "episodes.csv")} == {length}
+    assert json.loads((run.path / "config.json").read_text())["config"]["eval_length"] == length
+    assert {row["length"] for row in evaluate_run(run.path, None, 1, 1).rows} == {length}
+
+
 def test_a_score_is_divided_by_the_tasks_own_number(tasks):
     tasks.register("games", replace(tasks["centre"], score_divisor=4.0))
     (row,) = episode_rows([Episode("none", 0, [2.0], None)], {"task": "games"})

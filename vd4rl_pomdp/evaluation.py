@@ -260,7 +260,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
         workers: processes, 0 for every core.
 
     Returns:
-        `episodes` of them under each corruption.
+        `episodes` of them under each corruption, as long as those of the run's own evaluations.
 
     Raises:
         UserError: an unknown corruption, no episode, a folder without an evaluated run, or one whose policy changes
@@ -283,9 +283,9 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     for one in chosen:
         one.check()
     actor = Reference.read(run).actor_file
-    encoder, policy = run / "encoder", run / "policy"
+    encoder, policy, length = run / "encoder", run / "policy", _length(run, task)
     jobs = [
-        EpisodeJob(encoder, policy, task, one, episode, film=False, actor=actor)
+        EpisodeJob(encoder, policy, task, one, episode, film=False, length=length, actor=actor)
         for one in chosen
         for episode in range(episodes)
     ]
@@ -297,6 +297,14 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     if _content(encoder, policy) != content:
         raise UserError(f"{run}: wrote another policy while this one played; evaluate it when it is done")
     return EvaluatedRun(episode_rows(played, labels | {"step": step}), played)
+
+
+def _length(run: Path, task: Task) -> int:
+    """Most decisions in an episode of a run's evaluations; the task's where the run does not tell."""
+    file = run / "config.json"
+    config = read_json(file).get("config") if file.exists() else None
+    told = config.get("eval_length") if isinstance(config, dict) else None
+    return min(told, task.decisions) if isinstance(told, int) else task.decisions
 
 
 def own_and_none(corruption: CorruptionConfig) -> list[CorruptionConfig]:

@@ -166,7 +166,7 @@ def test_cloning_reads_no_option_of_the_critic(name):
     config = FinetuneConfig.of("smoke", algorithm="drqv2_bc", **given)
     for refused in (
         lambda: FinetuneConfig.of("smoke", algorithm="bc", **given),
-        lambda: as_trained(config, "bc", "bc", False),
+        lambda: as_trained(config, "bc", "bc", False, 500),
     ):
         with pytest.raises(UserError, match=f"--{name.replace('_', '-')} is not read by the algorithm bc"):
             refused()
@@ -188,4 +188,4 @@ def test_an_algorithm_reads_its_own_options_only(algorithm, reads):
 
 def test_an_encoder_that_is_trained_has_no_views():
     with pytest.raises(UserError, match="--views is not read by the algorithm drqv2_bc"):
-        as_trained(FinetuneConfig.of("smoke", views=3), "drq_bc", "drqv2_bc", False)
+        as_trained(FinetuneConfig.of("smoke", views=3), "drq_bc", "drqv2_bc", False, 500)

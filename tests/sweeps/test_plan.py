@@ -1,6 +1,7 @@
 """Jobs and what is finished: by what runs computed, on which data, wherever they lie."""
 
 import shutil
+from dataclasses import replace
 from pathlib import Path
 
 import pytest
@@ -18,6 +19,7 @@ from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.plan import JobPlanner
 from vd4rl_pomdp.sweeps.stages import recorded
+from vd4rl_pomdp.tasks import TASKS
 
 ROOT = Path(__file__).parents[2]
 GRID = """
@@ -277,6 +279,16 @@ def test_a_set_that_was_collected_so_is_taken(copy, size):
     assert left(plan(copy, [f"collect.frame_size={size}", "collect.episodes=3"])) == []
 
 
+def test_a_longer_task_is_evaluated_over_all_of_it(tmp_path):
+    (tmp_path / "grid.toml").write_text(GRID.replace("walker_walk", "long"))
+    with TASKS.isolated():
+        TASKS.register("long", replace(TASKS["walker_walk"], decisions=700))
+        cell = load_grid(str(tmp_path / "grid.toml"), []).cells()[0]
+        assert recorded(cell, "finetune")["eval_length"] == 5, "as the preset says"
+        usual = load_grid(str(tmp_path / "grid.toml"), ["finetune.eval_length=500"]).cells()[0]
+        assert recorded(usual, "finetune")["eval_length"] == 700
+
+
 def test_one_folder_is_not_asked_for_two_sets(copy):
     with (copy / "grid.toml").open("a") as file:
         file.write('[[where]]\nonly = ["method=acro"]\ncollect = { episodes = 3 }\n')
@@ -292,8 +304,9 @@ def test_a_downloaded_set_is_found_below_its_size(copy, tmp_path):
     assert jobs[0].folder == copy / "data" / "walker_walk" / "expert" / "84px"
 
 
-def test_a_grid_without_a_set_is_refused(tmp_path):
-    (tmp_path / "grid.toml").write_text("[pretrain]\nmethod = 'acro'")
+@pytest.mark.parametrize("more", ["", "\n[finetune]\nalpha = 2.0"])
+def test_a_grid_without_a_set_is_refused(tmp_path, more):
+    (tmp_path / "grid.toml").write_text("[pretrain]\nmethod = 'acro'" + more)
     with pytest.raises(UserError, match="trains on no set: add a section collect"):
         plan(tmp_path)
 

@@ -18,6 +18,7 @@ from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.identity import recipe
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.sweeps.grid import GridCell, Values
+from vd4rl_pomdp.tasks import TASKS
 
 _NOWHERE = "-"
 """Stands for a path while settings are parsed."""
@@ -163,4 +164,6 @@ def _finetuning(cell: GridCell) -> Any:
     before = config_of(cell, "pretrain")
     method = METHODS.named(before.method)
     remembers = memory_of(before.method, method, before.history) == "gru"
-    return as_trained(config_of(cell, "finetune"), before.method, method.end_to_end, remembers)
+    task = TASKS.get(cell.value("task"))  # none in a cell that will be refused, for it has no set
+    decisions = task.decisions if task else 0
+    return as_trained(config_of(cell, "finetune"), before.method, method.end_to_end, remembers, decisions)
