@@ -13,7 +13,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from vd4rl_pomdp.data.dataset import identity
-from vd4rl_pomdp.data.episodes import join_shards
+from vd4rl_pomdp.data.episodes import episode_returns, join_shards
 from vd4rl_pomdp.data.format import RECORD, check_frames, read_attributes, read_rows, read_some_frames, shard_paths
 from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.errors import UserError, disk_error
@@ -29,7 +29,7 @@ HOW = {
     "random": "Uniformly random actions.",
     "medium": "The medium actor's sampled actions; the one that ships has about half of the expert's return.",
     "expert": "The expert actor's sampled actions; the one that ships is the best snapshot of its training run.",
-    "medium_expert": "The first half of the episodes by the medium actor, the second half by the expert actor.",
+    "medium_expert": "The first half of the episodes by the expert actor, the second half by the medium actor.",
     "medium_replay": (
         "Not a replay buffer itself, but regenerated from actors saved along the training run up to its medium level: "
         "each episode is played anew, with the run's exploration noise, by the actor saved nearest to the moment of "
@@ -38,7 +38,7 @@ HOW = {
     "medium_noisy": "The medium actor's sampled actions, with Gaussian noise added. Not one of V-D4RL's sets.",
     "expert_noisy": "The expert actor's sampled actions, with Gaussian noise added. Not one of V-D4RL's sets.",
     "medium_expert_noisy": (
-        "The first half of the episodes by the medium actor, the second half by the expert actor, with Gaussian noise "
+        "The first half of the episodes by the expert actor, the second half by the medium actor, with Gaussian noise "
         "added to their sampled actions. Not one of V-D4RL's sets."
     ),
 }
@@ -65,7 +65,7 @@ def write_card(path: Path) -> Path:
     attributes = [read_attributes(shard) for shard in shards]
     names = identity(path, attributes)
     starts = np.flatnonzero(rows["step_type"] == StepType.FIRST)
-    returns = np.add.reduceat(rows["reward"], starts)
+    returns = episode_returns(rows["reward"], starts)
     lengths = np.diff([*starts, len(rows["reward"])])
     published = _published(*names)
     film = _film(shards, [len(part["reward"]) for part in parts], starts, lengths, returns)
@@ -104,14 +104,14 @@ def _picture(
 ) -> bytes:
     figure = Figure(figsize=(8.4, 4.0), layout="constrained", dpi=110)
     above, below = figure.subplots(2, 1, height_ratios=(2.4, 1))
-    top = max(returns.max(), published or 0.0)
-    counts, edges, _ = above.hist(returns, bins=np.linspace(0, max(top, 1.0) * 1.02, 41), color="#56b4e9")
+    low, top = min(returns.min(), 0.0), max(returns.max(), published or 0.0, 1.0)
+    counts, edges, _ = above.hist(returns, bins=np.linspace(low, top * 1.02, 41), color="#56b4e9")
     above.axvline(returns.mean(), ymax=LINES, color="#0072b2", label=f"mean of this set, {returns.mean():.1f}")
     if published is not None:
         label = f"published: plain BC on V-D4RL's set of this name, {published:.0f}"
         above.axvline(published, ymax=LINES, color="#d55e00", ls="--", label=label)
     above.set(xlabel="episode return", ylabel="episodes", title=plain(_title(names)))
-    above.set(xlim=(0, edges[-1]), ylim=(0, counts.max() / LINES))
+    above.set(xlim=(edges[0], edges[-1]), ylim=(0, counts.max() / LINES))
     above.yaxis.get_major_locator().set_params(integer=True)
     above.spines[["top", "right"]].set_visible(False)
     above.legend(frameon=False, fontsize=8, ncols=2, loc="upper center")

@@ -13,6 +13,7 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp.buffers import FrameBuffers
+from vd4rl_pomdp.data.episodes import episode_returns
 from vd4rl_pomdp.data.store import Store, open_store
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError
@@ -78,8 +79,7 @@ class Dataset:
         """(N,) int64: episode of every row."""
         self.t = torch.arange(len(step_type)) - self.episode_start[self.episode]
         """(N,) int64: row within its episode."""
-        reward[starts] = 0.0
-        self.returns = torch.from_numpy(np.add.reduceat(reward, starts))
+        self.returns = torch.from_numpy(episode_returns(reward, starts))
         """(E,) float64: undiscounted return of every episode."""
 
     @property

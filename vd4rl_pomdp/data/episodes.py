@@ -34,6 +34,21 @@ def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str,
     return rows
 
 
+def episode_returns(reward: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Undiscounted returns of all episodes.
+
+    Args:
+        reward: (N,) float64 of all rows; that of an episode's first row, which no action led to, does not count.
+        starts: (E,) int64, first row of every episode.
+
+    Returns:
+        (E,) float64.
+    """
+    paid = reward.copy()
+    paid[starts] = 0.0
+    return np.add.reduceat(paid, starts)
+
+
 def _agree(first: Path, expected: Mapping[str, np.ndarray], shard: Path, part: Mapping[str, np.ndarray]) -> None:
     if expected.keys() != part.keys():
         key = min(expected.keys() ^ part.keys())
