@@ -130,6 +130,35 @@ def test_a_task_whose_name_no_file_can_have_is_not_registered(name):
         TASKS.register(name, DMCTask("cartpole", "swingup"))
 
 
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"decisions": 0}, "task 'mine': its decisions is 0: it must be at least 1"),
+        ({"action_repeat": 0}, "task 'mine': its action_repeat is 0: it must be at least 1"),
+        ({"score_divisor": 0.0}, "task 'mine': its score_divisor is 0.0: it must be a positive number"),
+        ({"score_divisor": -10.0}, "its score_divisor is -10.0: it must be a positive number"),
+        ({"score_divisor": np.nan}, "its score_divisor is nan: it must be a positive number"),
+    ],
+)
+def test_numbers_that_make_no_task_are_not_registered(numbers, message):
+    for task in (DMCTask("cartpole", "swingup", **numbers), GymnasiumTask("CartPole-v1", **numbers)):
+        with TASKS.isolated(), pytest.raises(UserError, match=message):
+            TASKS.register("mine", task)
+
+
+@pytest.mark.parametrize("camera", [-1, 9])
+def test_a_camera_that_a_model_has_not_is_one_line(camera):
+    message = f"dm_control's walker walk has no camera {camera}: register the task with one of 0 to 1"
+    for layout in (None, TASKS["walker_walk"].layout):
+        with pytest.raises(UserError, match=message):
+            make_env(DMCTask("walker", "walk", camera, layout=layout))
+
+
+def test_a_length_that_is_refused_is_the_tasks_own_where_none_is_told():
+    with pytest.raises(UserError, match="an episode of 0 decisions is too short"):
+        make_env(DMCTask("walker", "walk", decisions=0))
+
+
 class Unpaid(gymnasium.Env):
     """Pays a number in its first step alone."""
 

@@ -6,6 +6,7 @@ its parameters included, is fixed where it is registered: no flag changes it.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -144,10 +145,15 @@ class GymnasiumTask(Task):
         return f"Gymnasium's {name}, {super().summary}"
 
 
-def _refuse_name(name: str, task: Task) -> None:
-    """Raise UserError for a name under which no file of a set could be written."""
+def _refuse(name: str, task: Task) -> None:
+    """Raise UserError for a name under which no file of a set could be written, and for numbers that make no task."""
     if name in ("", "..") or Path(name).name != name:
         raise UserError("sets have files and folders of this name, which it cannot be: choose one without '/'")
+    for what in ("decisions", "action_repeat"):
+        if (number := getattr(task, what)) < 1:
+            raise UserError(f"its {what} is {number}: it must be at least 1")
+    if not 0 < task.score_divisor < math.inf:
+        raise UserError(f"its score_divisor is {task.score_divisor}: it must be a positive number")
 
 
 TASKS: Registry[Task] = Registry(
@@ -161,7 +167,7 @@ TASKS: Registry[Task] = Registry(
     },
     lambda part: isinstance(part, DMCTask | GymnasiumTask),
     "a vd4rl_pomdp.tasks.DMCTask or GymnasiumTask",
-    _refuse_name,
+    _refuse,
 )
 """All tasks. Packages offer theirs in the group of entry points `vd4rl_pomdp.tasks`. The noise of the benchmark's is of
 0.2, 0.3, 0.4 and 0.5 the largest that leaves the expert more than half of its mean return."""

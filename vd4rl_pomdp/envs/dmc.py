@@ -24,10 +24,19 @@ class DMCEnv(PixelEnv):
         self._random = np.random.RandomState(0)
         self.simulator = _load(task, self._random)
         """The dm_control environment."""
+        self._check_camera(task)
         self._layout = task.layout or self._found_layout(task.camera)
         if size is not None:
             rendering.prepare(self.physics, render, size)
             self._frame_camera = rendering.FrameCamera(self.physics, size, task.camera)
+
+    def _check_camera(self, task: DMCTask) -> None:
+        cameras = self.physics.model.ncam
+        if not 0 <= task.camera < cameras:
+            raise UserError(
+                f"dm_control's {task.domain} {task.task} has no camera {task.camera}: register the task with one of 0 "
+                f"to {cameras - 1}"
+            )
 
     @property
     def physics(self) -> Any:

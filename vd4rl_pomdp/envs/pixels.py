@@ -59,7 +59,7 @@ class PixelEnv(ABC):
         """Whether the next time steps have a frame; it can be turned off and on where there is a size."""
         self._length = task.decisions if length is None else length
         if self._length < 1:
-            raise UserError(f"an episode of {length} decisions is too short; it needs at least 1")
+            raise UserError(f"an episode of {self._length} decisions is too short; it needs at least 1")
         self._decisions = 0
 
     @property
