@@ -138,6 +138,22 @@ def test_a_partial_file_of_an_earlier_run_is_continued(mirror, tmp_path):
     assert (tmp_path / path).read_bytes() == CONTENT["0_a_expert.hdf5"]
 
 
+def test_a_part_that_was_left_beside_a_file_blocks_no_set(mirror, tmp_path):
+    shards = fetch(mirror, tmp_path)
+    for content in (CONTENT["0_a_expert.hdf5"], b"?" * len(CONTENT["0_a_expert.hdf5"])):  # whole, and another's
+        shards[0].write_bytes(content)
+        (tmp_path / f"{EXPERT}/0_a_expert.hdf5.part").write_bytes(b"")
+        assert fetch(mirror, tmp_path) == shards == shard_paths(tmp_path / EXPERT)
+        assert shards[0].read_bytes() == CONTENT["0_a_expert.hdf5"]
+
+
+def test_a_damaged_file_of_another_set_is_not_linked(mirror, tmp_path):
+    damaged = fetch(mirror, tmp_path)[0]
+    damaged.write_bytes(b"?" * damaged.stat().st_size)
+    shards = fetch(mirror, tmp_path, "medium_expert")
+    assert {shard.name: shard.read_bytes() for shard in shards} == CONTENT
+
+
 def test_a_server_without_ranges_starts_over(mirror, tmp_path):
     path = f"{EXPERT}/0_a_expert.hdf5"
     mirror.ranges, mirror.cuts[path] = False, 2

@@ -79,7 +79,7 @@ def download(
         quality: one of `tasks.QUALITIES`.
         destination: folder that holds all downloaded sets; a file that another set in it has is linked, not fetched.
         endpoint: address of the mirror, up to and without `/datasets`; None: `default_endpoint`.
-        verify: also compute the SHA-256 of files that are there; otherwise their size is enough.
+        verify: also compute the SHA-256 of files that are at their places; otherwise their size is enough there.
 
     Returns:
         The set's shards, all of them verified.
@@ -98,11 +98,11 @@ def download(
         raise UserError(f"endpoint {endpoint!r} is no address; it starts with https:// or http://")
     refuse_kept(destination)
     wanted = [file for file in manifest() if file.path.split("/")[2:4] == [task, quality]]
-    if lacking := [file for file in wanted if not _is_complete(file, file.target(destination), verify)]:
+    if lacking := [file for file in wanted if not _is_settled(file, file.target(destination), verify)]:
         with _owning(_part(lacking[-1].target(destination))), _progress_bar() as bar:
             total = bar.add_task(f"{task} {quality}", total=sum(file.size for file in lacking))
             for file in lacking:
-                _provide(file, destination, endpoint.rstrip("/"), verify, bar)
+                _provide(file, destination, endpoint.rstrip("/"), bar)
                 _part(file.target(destination)).unlink(missing_ok=True)
                 bar.advance(total, file.size)
     return [file.target(destination) for file in wanted]
@@ -141,14 +141,14 @@ def _progress_bar() -> Progress:
     return Progress(*columns, TimeRemainingColumn(), console=console, disable=not console.is_terminal)
 
 
-def _provide(file: RemoteFile, destination: Path, endpoint: str, verify: bool, bar: Progress) -> None:
-    """Make sure that one file is at its place: it is there, an equal one is linked, or it is fetched."""
+def _provide(file: RemoteFile, destination: Path, endpoint: str, bar: Progress) -> None:
+    """Make sure that one file is at its place: it is there, an equal one is linked, or it is fetched; verified."""
     target = file.target(destination)
-    if _is_complete(file, target, verify):
+    if _is_complete(file, target, verify=True):
         return
     try:
         twins = (other.target(destination) for other in manifest() if other.sha256 == file.sha256)
-        twin = next((path for path in twins if path != target and _is_complete(file, path, verify)), None)
+        twin = next((path for path in twins if path != target and _is_complete(file, path, verify=True)), None)
         if twin:
             _link(twin, target)
         else:
@@ -165,6 +165,11 @@ def _headers(url: str) -> dict[str, str]:
     """What huggingface_hub tells of itself, and its user's token if that is meant for an address."""
     token = None if url.startswith(f"{default_endpoint().rstrip('/')}/") else False
     return build_hf_headers(token=token, library_name="vd4rl-pomdp", library_version=__version__)
+
+
+def _is_settled(file: RemoteFile, path: Path, verify: bool) -> bool:
+    """Whether nothing is left to do for a file: it is at its place, and no part of it lies beside it."""
+    return not _part(path).exists() and _is_complete(file, path, verify)
 
 
 def _is_complete(file: RemoteFile, path: Path, verify: bool) -> bool:
