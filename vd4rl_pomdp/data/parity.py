@@ -51,9 +51,12 @@ def render_info(task: str = CANARY) -> dict[str, Any]:
 
 
 def compare(rendered: np.ndarray, reference: np.ndarray) -> dict[str, Any]:
-    """Mean absolute difference, share of pixels off by more than 8 of 255, and whether they count as equal."""
-    difference = np.abs(rendered.astype(np.int16) - reference)
-    mean = float(difference.mean())
+    """Mean absolute difference, share of pixels off by more than 8 of 255, and whether they count as equal.
+
+    Pixels are uint8, or floating point: a median may lie between two.
+    """
+    difference = np.abs(rendered.astype(np.float32) - reference)
+    mean = float(difference.mean(dtype=np.float64))
     return {
         "mean_difference": round(mean, 4),
         "share_off_by_8": round(float((difference > _OFF_BY).mean()), 5),
