@@ -202,6 +202,16 @@ def test_a_key_that_is_no_array_is_named(shard):
         read_shard(shard)
 
 
+@pytest.mark.parametrize("key", ["observation", "reward", "physics"])
+def test_a_null_dataset_is_no_array(shard, key):
+    with h5py.File(shard, "a") as file:
+        file.pop(key, None)
+        file.create_dataset(key, data=h5py.Empty("f8"))
+    for read in (read_shard, read_dtypes):
+        with pytest.raises(UserError, match=f"has no '{key}'"):
+            read(shard)
+
+
 def outside(file: h5py.File, folder: Path, kind: str, value: np.ndarray) -> None:
     """Keep a key's values in another file."""
     with h5py.File(folder / "other.h5", "w") as other:

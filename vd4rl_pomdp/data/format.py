@@ -258,9 +258,14 @@ def _check_keys(path: Path, file: h5py.File) -> None:
     elsewhere = [key for key in wanted if _is_elsewhere(file, key)]
     if elsewhere:
         raise UserError(f"{path}: {elsewhere[0]!r} lies in another file, which is not followed; {_REPAIR}")
-    missing = [key for key in wanted if not isinstance(file.get(key), h5py.Dataset)]
+    missing = [key for key in wanted if not _holds_array(file.get(key))]
     if missing:
         raise UserError(f"{path}: has no {missing[0]!r}, so it is no V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
+
+
+def _holds_array(stored: Any) -> bool:
+    """Whether this is a dataset with a shape; HDF5's null datasets have none."""
+    return isinstance(stored, h5py.Dataset) and stored.shape is not None
 
 
 def _is_elsewhere(file: h5py.File, key: str) -> bool:
