@@ -74,7 +74,7 @@ class Transitions(Batch):
     """n-step transitions (o_t, a_t, r, d, o_{t+n}); nothing crosses an episode's end."""
 
     obs: Tensor
-    """(B, C, 84, 84) uint8: frames t-2..t, oldest first, the first frame repeated at an episode's start."""
+    """(B, C, H, W) uint8: frames t-2..t, oldest first, the first frame repeated at an episode's start."""
     action: Tensor
     """(B, A) float32: a_t."""
     reward: Tensor
@@ -82,7 +82,7 @@ class Transitions(Batch):
     discount: Tensor
     """(B,) float32: product of the stored discounts, times gamma for every step after the first."""
     next_obs: Tensor
-    """(B, C, 84, 84) uint8: the stack at t+n, or at the episode's last row if that comes first."""
+    """(B, C, H, W) uint8: the stack at t+n, or at the episode's last row if that comes first."""
     key: Tensor
     """(B,) int64: `row_key` of row t, which keys `emission` corruptions."""
     next_key: Tensor

@@ -1,4 +1,4 @@
-"""The four mazes as Gymnasium environments: pixels in, accelerations out, goals that move when they are reached."""
+"""The mazes as Gymnasium environments: pixels in, accelerations out, goals that move when they are reached."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The four mazes' simulator: gymnasium-robotics' PointMaze U maze with curtains, or with a heading and eyes.
+"""The mazes' simulator: gymnasium-robotics' PointMaze U maze with curtains, or with a heading and eyes.
 
 Curtains are drawn and never collide; goals are never drawn.
 """
