@@ -121,8 +121,8 @@ FINE: dict[str, str] = {
     },
     "report | runs-cut/finetuning/labels.json | *": "a run that has rows is named by them",
     **{
-        f"evaluate | {RUN}/config.json | {kind}": "without it whole episodes are played"
-        for kind in ("missing", "a dangling link")
+        f"evaluate | {RUN}/config.json | {kind}": "where it tells no length, whole episodes are played"
+        for kind in ("missing", "a dangling link", "no key")
     },
     "report | */timing.json | missing": "a run that is not finished has none",
     "report | */timing.json | a dangling link": "a run that is not finished has none",
