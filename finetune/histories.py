@@ -52,13 +52,18 @@ class HistoryOptions(Options):
                 f"--shortest-history is {self.shortest_history}, --longest-history {self.longest_history}: "
                 "choose a longest that is no shorter"
             )
-        for name in ("shortest_history", "longest_history"):
-            if not self.random_histories and getattr(self, name) != getattr(HistoryOptions, name):
-                raise UserError(f"{flag_of(name)} is not read: --random-histories is 0; leave it out")
+        for name, reason in self._unread().items():
+            if getattr(self, name) != getattr(HistoryOptions, name):
+                raise UserError(f"{flag_of(name)} is not read: {reason}; leave it out")
+
+    def _unread(self) -> dict[str, str]:
+        """Options that have no effect beside the others, and why."""
+        unread: dict[str, str] = {}
+        if not self.random_histories:
+            unread |= dict.fromkeys(("shortest_history", "longest_history"), "--random-histories is 0")
         if self.readout == "frame":
-            for name in ("history_window", "random_histories"):
-                if getattr(self, name):
-                    raise UserError(f"{flag_of(name)} is not read: --readout frame reads no history; leave it out")
+            unread |= dict.fromkeys(("history_window", "random_histories"), "--readout frame reads no history")
+        return unread
 
     @property
     def encoder_changes(self) -> dict[str, Any]:

@@ -135,8 +135,8 @@ class PretrainConfig(TrainingConfig):
         """Refuse settings that cannot work, before anything is read or written."""
         super().check()
         usual, method = self.defaults(self.preset), METHODS.named(self.method)
-        for name in ("frame_encoder", "shift"):
-            if method.reads_state and getattr(self, name) != usual[name]:
+        for name in ("frame_encoder", "shift") if method.reads_state else ():
+            if getattr(self, name) != usual[name]:
                 raise UserError(f"{flag_of(name)} is not read by the method {self.method}: leave it out")
         if method.shift == "own" and self.shift != usual["shift"]:
             raise UserError(f"--shift is not read by the method {self.method}, which shifts by itself: leave it out")

@@ -1,10 +1,10 @@
 import subprocess
-import sys
 from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
 
+from tests.helpers_wheel import build_wheel
 from vd4rl_pomdp.runs import provenance
 from vd4rl_pomdp.runs.provenance import COMMIT_FILE, checkout_commit, command, recorded_commit
 
@@ -60,9 +60,7 @@ def test_a_wheel_carries_the_commit_it_was_built_from(checkout):
     )
     git(checkout, "add", "-A")
     git(checkout, "commit", "-qm", "second")
-    build = "from setuptools import build_meta; print(build_meta.build_wheel('.'))"
-    built = subprocess.run([sys.executable, "-c", build], cwd=checkout, capture_output=True, text=True, check=True)
-    with ZipFile(checkout / built.stdout.splitlines()[-1]) as wheel:
+    with ZipFile(build_wheel(checkout)) as wheel:
         assert wheel.read(COMMIT_FILE).decode().strip() == git(checkout, "rev-parse", "HEAD")
 
 
