@@ -91,9 +91,9 @@ def stop():
 def test_the_demo_ends_with_the_last_evaluation_what_is_known_and_how_sure_it_is(tmp_path):
     jobs = demo_jobs(tmp_path)
     write_returns(jobs)
-    head, _, *lines, caveat, _ = conclusion(jobs)
+    head, _, _, *lines, caveat, _ = conclusion(jobs)
     assert LABELS["corruption"] in head
-    assert [" ".join(line.split()) for line in lines] == [f"{method} 120 ± 20 (n = 2) 39, 54" for method in METHODS]
+    assert [" ".join(line.split()) for line in lines] == [f"{method} 39, 54 120 ± 20 (n = 2)" for method in METHODS]
     assert "One seed each" in caveat
 
 

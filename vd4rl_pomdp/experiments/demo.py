@@ -94,17 +94,18 @@ def conclusion(jobs: list[Job]) -> Iterator[str]:
     """What the demo's methods know and return, and how sure it is: lines of text."""
     policies = [(dict(job.settings), job.folder) for job in jobs if job.section == "finetune"]
     corruption = policies[0][0]["corruption"]
-    yield f"Under {corruption}: return (mean ± standard error over episodes), and what is not known of pose and"
-    yield "velocity (error of a linear probe in % of a standard deviation; 60 to 80 knows nothing):"
+    yield f"Under {corruption}, what is not known of pose and velocity (error of a"
+    yield "linear probe in % of a standard deviation; 60 to 80 knows nothing), and the"
+    yield "return (mean ± standard error over episodes):"
     for settings, folder in policies:
         rows = read_episodes(folder / "episodes.csv")
         last = max(row["step"] for row in rows)
         returns = [row["return"] for row in rows if row["step"] == last]
-        told = f"{mean_and_error(returns)} (n = {len(returns)})"
         probe = read_json(folder / "probe.json")
-        yield f"  {settings['method']:<8}{told:<20}{', '.join(f'{probe[name]:.0f}' for name in PROBES)}"
-    yield "One seed each: with another, returns may end elsewhere, what is known hardly does."
-    yield "What three seeds say of 100 episodes is in results/control."
+        known = ", ".join(f"{probe[name]:.0f}" for name in PROBES)
+        yield f"  {settings['method']:<8}{known:<10}{mean_and_error(returns)} (n = {len(returns)})"
+    yield "One seed each: with another, what is known hardly changes, and returns may end"
+    yield "elsewhere. What three seeds say of 100 episodes is in results/control."
 
 
 def show_navigation(jobs: list[Job], film: Path) -> Iterator[str]:
@@ -112,7 +113,7 @@ def show_navigation(jobs: list[Job], film: Path) -> Iterator[str]:
     runs = load_runs(find_navigation([job.folder for job in jobs if job.section == "navigation_train"]))
     trajectories = {run.condition.method: run.trajectory for run in runs if run.trajectory is not None}
     write_film(trajectories, get_maze(runs[0].condition.maze), film)
-    yield "Error of the position while a curtain hides the mass, in % of a standard deviation (held out, one seed):"
+    yield "Held-out position error behind curtains, % of a standard deviation (one seed):"
     for run in runs:
         error = run.values.get(refitted_error("position", rows="hidden"))
         yield f"  {run.condition.method:<12}{'no hidden step' if error is None else f'{error:.0f}'}"
