@@ -90,9 +90,9 @@ def _close(renderer: weakref.ref[mujoco.Renderer]) -> None:
 
 
 def average(fine: np.ndarray, by: int) -> np.ndarray:
-    """(H, W, 3) uint8 -> (3, H / by, W / by) uint8, rounded area averages."""
-    height, width = fine.shape[0] // by, fine.shape[1] // by
-    sums = fine.reshape(height, by, width, by, 3).sum((1, 3), dtype=np.uint32)
+    """(H, W, 3) uint8 -> (3, H / by, W / by) uint8, rounded area averages, by at most 16."""
+    rows = np.stack([fine[i::by] for i in range(by)]).sum(0, dtype=np.uint16)
+    sums = np.stack([rows[:, i::by] for i in range(by)]).sum(0, dtype=np.uint16)
     return np.ascontiguousarray(((sums + by * by // 2) // (by * by)).astype(np.uint8).transpose(2, 0, 1))
 
 
