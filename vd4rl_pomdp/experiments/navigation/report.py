@@ -136,12 +136,13 @@ def _budget(runs: list[NavigationRun]) -> str:
     """What the runs cost, and where."""
     trained = [run for run in runs if run.condition.method != UNTRAINED] or runs
     steps = " or ".join(f"{count:,}" for count in sorted({int(run.facts["steps"]) for run in trained}))
-    minutes = [float(run.facts["seconds"]) / 60 for run in trained]
+    minutes = sorted(round(float(run.facts["seconds"]) / 60) for run in trained)
+    took = " to ".join(dict.fromkeys(map(str, (minutes[0], minutes[-1]))))
     machines = markdown("; ".join(sorted({run.facts["gpu"] or f"{run.facts['processor']}, no GPU" for run in runs})))
     samples = " or ".join(f"{count:,}" for count in sorted({_samples(run) for run in runs} - {0})) or "unknown"
     return (
         f"Budget: {steps} gradient steps on {samples} samples, "
-        f"{min(minutes, default=0):.0f} to {max(minutes, default=0):.0f} minutes a run ({machines}). "
+        f"{took} minutes a run ({machines}). "
         "The paper's: 200,000 steps on 500,000 samples."
     )
 
