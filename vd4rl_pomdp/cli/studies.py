@@ -5,13 +5,17 @@ from __future__ import annotations
 import json
 import sys
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
+from typing import TYPE_CHECKING
 
 import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse, show
+
+if TYPE_CHECKING:
+    from vd4rl_pomdp.report.load import Choice
 
 
 @dataclass(frozen=True)
@@ -22,6 +26,12 @@ class ReportCommand:
     """Run folders, results folders, or folders that contain some; what `theory --out` wrote adds its section."""
     out: Path = Path("report")
     """Folder of the report."""
+    grid: str = ""
+    """Report the cells of this grid alone: one that ships (`vd4rl-pomdp sweep list`), or a TOML or Python file."""
+    only: list[str] = field(default_factory=list)
+    """Of the grid, cells with these values alone: method=mik+a,acro seed=0."""
+    change: list[str] = field(default_factory=list)
+    """Settings that the grid was carried out with in place of its own: preset=cpu finetune.updates=20000."""
 
 
 @dataclass(frozen=True)
@@ -53,9 +63,23 @@ def _report(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.report import print_summary, write_report
 
     command = parse(ReportCommand, words, program)
-    report = write_report(command.runs, command.out)
+    report = write_report(command.runs, command.out, _choice(command))
     print_summary(report)
     print(f"report: {report.page}")
+
+
+def _choice(command: ReportCommand) -> Choice:
+    """Which of the runs that it finds a report is about."""
+    from vd4rl_pomdp.errors import UserError
+    from vd4rl_pomdp.sweeps.grid import narrow
+    from vd4rl_pomdp.sweeps.grid_file import load_grid
+    from vd4rl_pomdp.sweeps.members import GridMembers
+
+    if command.grid:
+        return GridMembers(command.grid, narrow(load_grid(command.grid, command.change).cells(), command.only)).among
+    if command.only or command.change:
+        raise UserError("--only and --change are about a grid's cells: name it with --grid")
+    return list
 
 
 @dataclass(frozen=True)

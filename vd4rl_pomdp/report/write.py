@@ -21,7 +21,7 @@ from vd4rl_pomdp.report.films import shown_films
 from vd4rl_pomdp.report.gaps import find_gaps
 from vd4rl_pomdp.report.gates import gates, unranked
 from vd4rl_pomdp.report.layout import ShownTable, latex
-from vd4rl_pomdp.report.load import LoadedRun, load_runs
+from vd4rl_pomdp.report.load import Choice, LoadedRun, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.report.theory import load_section
@@ -47,8 +47,8 @@ class Report(NamedTuple):
     """Table of the paper's claims and what becomes of them."""
 
 
-def write_report(paths: list[Path], out: Path) -> Report:
-    """Write the report of all runs at or below `paths` into `out`.
+def write_report(paths: list[Path], out: Path, choose: Choice = list) -> Report:
+    """Write the report of the runs at or below `paths` that `choose` takes, all of them by default, into `out`.
 
     The folder is a results folder, too, so that the report can be made again from it alone. A study that
     `vd4rl-pomdp theory` wrote at or below `paths` becomes a section of the page.
@@ -58,7 +58,7 @@ def write_report(paths: list[Path], out: Path) -> Report:
             report, or it tells of finished runs that are not reported.
     """
     refuse_foreign(out, "report", f"{_MARK}.csv", RUNS)
-    runs = load_runs(paths, out)
+    runs = load_runs(paths, out, choose)
     refuse_loss([run.result for run in runs], out)
     if not any(run.rows for run in runs):
         raise UserError(f"{paths[0]}: holds no evaluated run yet; `vd4rl-pomdp finetune` evaluates")

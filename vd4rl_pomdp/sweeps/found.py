@@ -74,11 +74,16 @@ class FoundRuns:
 
 
 def runs_kept(folders: Iterable[Path]) -> list[FoundRun]:
-    """Every run of some results folders; UserError for a folder that is none.
+    """Every run of some results folders; UserError for a folder that is none."""
+    return found_in([run for folder in folders for run in read_results(folder)])
+
+
+def found_in(results: Iterable[Result]) -> list[FoundRun]:
+    """Some runs, in their order.
 
     Early ones do not record how their set was collected: as another run on the same content says.
     """
-    runs = [_kept(run) for folder in folders for run in read_results(folder)]
+    runs = [_kept(run) for run in results]
     told = {run.data: run.record["collection"] for run in runs if run.data and run.record.get("collection")}
     return [
         replace(run, record=run.record | {"collection": run.record.get("collection") or told.get(run.data)})

@@ -1,0 +1,113 @@
+"""Which runs are a grid's: by what they computed and on which sets, whoever made them."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.helpers_report import grid_run
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.data.collect import CollectConfig, collection
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.results import read_results, write_results
+from vd4rl_pomdp.runs import FORMAT
+from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.sweeps.grid_file import load_grid
+from vd4rl_pomdp.sweeps.members import GridMembers
+from vd4rl_pomdp.sweeps.stages import collection_of, recorded
+
+RESULTS = Path(__file__).parents[2] / "results"
+GRID = """
+seed = [0, 1]
+preset = "smoke"
+[collect]
+task = "walker_walk"
+quality = "expert"
+episodes = 3
+[pretrain]
+method = ["mik+a", "acro"]
+corruption = "patch"
+[finetune]
+eval_episodes = 1
+"""
+
+
+@pytest.fixture
+def grid(tmp_path):
+    (tmp_path / "grid.toml").write_text(GRID)
+    return tmp_path / "grid.toml"
+
+
+@pytest.fixture
+def runs(grid):
+    """Fine-tunings as the grid's cells make them, on a set that was collected."""
+    made = []
+    for cell in load_grid(str(grid)).cells():
+        labels = {name: cell.value(name) for name in ("method", "task", "quality", "corruption", "seed")}
+        run = grid_run(grid.parent, labels | {"algorithm": "td3_bc"}, 1, 1, np.random.default_rng(0))
+        before = recorded(cell, "pretrain")
+        card = {"settings": settings_of(before), "seed": cell.seed, "data": "here"}
+        record = run.record | {"format": FORMAT, "config": recorded(cell, "finetune")}
+        record |= {"inputs": {"data": "here"}, "collection": collection_of(cell)}
+        made.append(replace(run, id=f"{labels}", files=run.files | {"config": record, "encoder": {"pretrain": card}}))
+    return made
+
+
+def members(grid, runs, *changes):
+    return GridMembers("grid", load_grid(str(grid), changes).cells()).among(runs)
+
+
+def changed(run, **record):
+    return replace(run, files=run.files | {"config": run.record | record})
+
+
+def test_runs_of_the_cells_settings_are_the_grids(grid, runs):
+    assert members(grid, runs) == runs
+    assert members(grid, runs, "seed=1", "pretrain.method=acro") == [runs[3]]
+    with pytest.raises(UserError, match=r"^none of 4 runs is one of the 4 cells of grid that are asked for"):
+        members(grid, runs, "pretrain.corruption=none")
+
+
+def test_the_set_is_told_by_how_it_was_collected(grid, runs):
+    other = collection(CollectConfig(task="walker_walk", quality="expert", episodes=4, out=Path()))
+    elsewhere = {"inputs": {"data": "elsewhere"}}
+    twin = replace(runs[2], files=runs[2].files | {"encoder": {"pretrain": runs[2].card | {"data": "elsewhere"}}})
+    own = [runs[0], changed(twin, **elsewhere)]
+    assert members(grid, [*own, changed(runs[1], collection=other), changed(runs[3], **elsewhere)]) == own, (
+        "of other content, but collected alike; collected otherwise; an encoder of another set"
+    )
+
+
+def test_a_set_that_nobody_collected_is_told_by_its_name(grid, runs):
+    downloaded = [changed(run, collection={}) for run in runs]
+    assert members(grid, downloaded) == downloaded
+    with pytest.raises(UserError, match="none of 4 runs"):
+        members(grid, downloaded, "collect.quality=medium")
+
+
+def test_the_offline_figures_page_counts_its_cells():
+    cells = load_grid("offline").cells()
+    own, control = read_results(RESULTS / "offline"), read_results(RESULTS / "control")
+    found = GridMembers("offline", cells).among([*own, *control])
+    assert found[: len(own)] == own
+    assert {run.record["config"]["update_precision"] for run in found} == {"bf16"}
+    assert {run.encoder["settings"]["history"] for run in found if run.encoder} == {"method"}
+    told = f"has {len(cells)} cells, of which {len(found)} are measured"
+    assert told in (RESULTS / "offline" / "README.md").read_text()
+
+
+def test_a_report_is_about_the_cells_that_are_asked_for(grid, runs, tmp_path, capsys):
+    write_results(tmp_path / "rows", runs)
+    words = ["report", str(tmp_path / "rows"), "--out", str(tmp_path / "report")]
+    main([*words, "--grid", str(grid), "--only", "method=acro"])
+    assert [run.labels["method"] for run in read_results(tmp_path / "report")] == ["acro", "acro"]
+    capsys.readouterr()
+    for flags, told in (
+        (["--only", "method=acro"], "--only and --change are about a grid's cells: name it with --grid"),
+        (["--grid", "navigation"], "navigation: its cells are mazes; `vd4rl-pomdp navigation report` reports them"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            main([*words, *flags])
+        assert end.value.code == 2
+        assert told in capsys.readouterr().err

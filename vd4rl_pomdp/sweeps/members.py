@@ -1,0 +1,56 @@
+"""Which runs are a grid's own, wherever and by whatever command they were made."""
+
+from __future__ import annotations
+
+from collections import defaultdict
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.results import Result
+from vd4rl_pomdp.sweeps.found import FoundRun, found_in
+from vd4rl_pomdp.sweeps.grid import GridCell
+from vd4rl_pomdp.sweeps.sets import DataSet, set_of
+from vd4rl_pomdp.sweeps.stages import check_cell, recipe_of
+
+_NOWHERE = Path()
+"""Sets are told by how they were collected, not by where they lie."""
+
+
+class GridMembers:
+    """The pretrainings and fine-tunings that a grid's cells ask for."""
+
+    def __init__(self, name: str, cells: Iterable[GridCell]) -> None:
+        """Learn what the cells compute.
+
+        Args:
+            name: of the grid, for messages.
+            cells: those that count.
+
+        Raises:
+            UserError: a stage would refuse a cell's settings, or a cell trains in a maze.
+        """
+        cells = list(cells)
+        self._asked = f"one of the {len(cells)} cells of {name} that are asked for"
+        self._sets: dict[str, list[DataSet]] = defaultdict(list)
+        for cell in cells:
+            check_cell(cell)
+            if "navigation_train" in cell.chain:
+                raise UserError(f"{name}: its cells are mazes; `vd4rl-pomdp navigation report` reports them")
+            for section in cell.chain[1:]:
+                self._sets[recipe_of(cell, section)].append(set_of(cell, _NOWHERE))
+
+    def among(self, results: Sequence[Result]) -> list[Result]:
+        """Those of some runs that are the grid's, in their order; UserError if none is."""
+        found = [run for run, seen in zip(results, found_in(results), strict=True) if self._has(run, seen)]
+        if not found:
+            raise UserError(f"none of {len(results)} runs is {self._asked}; `sweep run --dry-run` lists the cells")
+        return found
+
+    def _has(self, run: Result, seen: FoundRun) -> bool:
+        """Whether some cell asks for it; one on a set that nobody collected is told by task and quality."""
+        sets = self._sets.get(seen.recipe, ())
+        if seen.record.get("collection"):
+            return seen.on_one_set and any(data.alike(seen.record) for data in sets)
+        labels = {name: run.labels[name] for name in ("task", "quality")}
+        return seen.on_one_set and any(labels.items() <= data.wanted.items() for data in sets)
