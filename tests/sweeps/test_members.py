@@ -1,5 +1,6 @@
 """Which runs are a grid's: by what they computed and on which sets, whoever made them."""
 
+import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -95,6 +96,20 @@ def test_the_offline_figures_page_counts_its_cells():
     assert {run.encoder["settings"]["history"] for run in found if run.encoder} == {"method"}
     told = f"has {len(cells)} cells, of which {len(found)} are measured"
     assert told in (RESULTS / "offline" / "README.md").read_text()
+
+
+def test_only_what_the_grid_asks_for_is_missed(grid, runs, tmp_path):
+    write_results(
+        tmp_path / "rows", [run for run in runs if (run.labels["method"], run.labels["seed"]) != ("mik+a", 1)]
+    )
+    words = ["report", str(tmp_path / "rows"), "--out", str(tmp_path / "report"), "--grid", str(grid)]
+    main(words)
+    (row,) = csv.DictReader((tmp_path / "report" / "missing.csv").open())
+    assert (row["method"], row["seed"], row["state"]) == ("mik+a", "1", "missing")
+    one_seed = '[[block]]\npretrain = { method = "acro" }\n[[block]]\nseed = 0\npretrain = { method = "mik+a" }\n'
+    grid.write_text(GRID + one_seed)
+    main(words)
+    assert not (tmp_path / "report" / "missing.csv").exists()
 
 
 def test_a_report_is_about_the_cells_that_are_asked_for(grid, runs, tmp_path, capsys):

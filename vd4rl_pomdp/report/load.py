@@ -20,8 +20,6 @@ from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.reading import regular
 
 Member = TypeVar("Member")
-Choice = Callable[[list[Result]], list[Result]]
-"""Takes some of the runs that were found; `list` takes all."""
 LABELS = ("task", "quality", "corruption", "algorithm", "method", "seed")
 """Columns that a run's files name it by."""
 IDENTITY = ("task", "quality", "corruption", "algorithm", "method", "variant", "seed")
@@ -30,6 +28,19 @@ PROBES = ("probe_pose", "probe_velocity")
 """Errors of linear probes of an encoder."""
 FILM = {"clean": 4, "corrupted": 4, "return": 1}
 """Arrays of a film and their axes."""
+
+
+@dataclass(frozen=True)
+class Choice:
+    """What a report is about; everything, unless it is told."""
+
+    among: Callable[[list[Result]], list[Result]] = list
+    """Takes some of the runs that were found."""
+    asks: Callable[[Row], bool] = lambda row: True
+    """Whether a run that is not there, told by LABELS, is missed."""
+
+
+ALL = Choice()
 
 
 @dataclass(frozen=True)
@@ -127,13 +138,13 @@ class LoadedRun:
             raise UserError(f"{path}: cannot be read ({error}); remove it, and the report goes without") from error
 
 
-def load_runs(paths: list[Path], but: Path | None = None, choose: Choice = list) -> list[LoadedRun]:
+def load_runs(paths: list[Path], but: Path | None = None, choice: Choice = ALL) -> list[LoadedRun]:
     """The chosen runs at or below the paths, of run folders and results folders; `but` as in `find_results`.
 
     Raises:
         UserError: there is no run, two have the same identity, or a file of one is damaged.
     """
-    read = [_load(result) for result in choose(find_results(paths, but))]
+    read = [_load(result) for result in choice.among(find_results(paths, but))]
     loaded = [replace(run, of_set=own) for run, own in zip(read, _of_sets(read), strict=True)]
     told = zip(loaded, _corruptions(loaded), strict=True)
     runs = [replace(run, labels=run.labels | {"corruption": words}) for run, words in told]

@@ -21,7 +21,7 @@ from vd4rl_pomdp.report.films import shown_films
 from vd4rl_pomdp.report.gaps import find_gaps
 from vd4rl_pomdp.report.gates import gates, unranked
 from vd4rl_pomdp.report.layout import ShownTable, latex
-from vd4rl_pomdp.report.load import Choice, LoadedRun, load_runs
+from vd4rl_pomdp.report.load import ALL, Choice, LoadedRun, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.report.theory import load_section
@@ -47,8 +47,8 @@ class Report(NamedTuple):
     """Table of the paper's claims and what becomes of them."""
 
 
-def write_report(paths: list[Path], out: Path, choose: Choice = list) -> Report:
-    """Write the report of the runs at or below `paths` that `choose` takes, all of them by default, into `out`.
+def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
+    """Write the report of the runs at or below `paths` that `choice` is about, all of them by default, into `out`.
 
     The folder is a results folder, too, so that the report can be made again from it alone. A study that
     `vd4rl-pomdp theory` wrote at or below `paths` becomes a section of the page.
@@ -58,11 +58,11 @@ def write_report(paths: list[Path], out: Path, choose: Choice = list) -> Report:
             report, or it tells of finished runs that are not reported.
     """
     refuse_foreign(out, "report", f"{_MARK}.csv", RUNS)
-    runs = load_runs(paths, out, choose)
+    runs = load_runs(paths, out, choice)
     refuse_loss([run.result for run in runs], out)
     if not any(run.rows for run in runs):
         raise UserError(f"{paths[0]}: holds no evaluated run yet; `vd4rl-pomdp finetune` evaluates")
-    made = _tables(runs)
+    made = _tables(runs, choice)
     shown = _shown(made)
     plots = _plots(runs, made)
     page = _render(runs, made, shown, plots, load_section(paths))
@@ -75,11 +75,11 @@ def write_report(paths: list[Path], out: Path, choose: Choice = list) -> Report:
     return Report(out / "index.html", made[_MARK], made["gates"], made["claims"])
 
 
-def _tables(runs: list[LoadedRun]) -> dict[str, list[Row]]:
+def _tables(runs: list[LoadedRun], choice: Choice) -> dict[str, list[Row]]:
     """All tables of a report as its CSV files hold them, by name."""
     evaluated = tables.evaluations(runs)
     final = tables.evaluations(run for run in runs if run.finished)
-    gaps = find_gaps(runs)
+    gaps = [row for row in find_gaps(runs) if choice.asks(row)]
     gated = gates(runs)
     of_runs = measures.run_table(runs, evaluated, gaps)
     return {

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.results import Result
+from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.sweeps.found import FoundRun, found_in
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.sets import DataSet, set_of
-from vd4rl_pomdp.sweeps.stages import check_cell, recipe_of
+from vd4rl_pomdp.sweeps.stages import check_cell, recipe_of, recorded
 
 _NOWHERE = Path()
 """Sets are told by how they were collected, not by where they lie."""
@@ -33,12 +35,15 @@ class GridMembers:
         cells = list(cells)
         self._asked = f"one of the {len(cells)} cells of {name} that are asked for"
         self._sets: dict[str, list[DataSet]] = defaultdict(list)
+        self._policies: set[tuple[Any, ...]] = set()
         for cell in cells:
             check_cell(cell)
             if "navigation_train" in cell.chain:
                 raise UserError(f"{name}: its cells are mazes; `vd4rl-pomdp navigation report` reports them")
             for section in cell.chain[1:]:
                 self._sets[recipe_of(cell, section)].append(set_of(cell, _NOWHERE))
+            if "finetune" in cell.chain:
+                self._policies.add(_policy(cell))
 
     def among(self, results: Sequence[Result]) -> list[Result]:
         """Those of some runs that are the grid's, in their order; UserError if none is."""
@@ -47,6 +52,11 @@ class GridMembers:
             raise UserError(f"none of {len(results)} runs is {self._asked}; `sweep run --dry-run` lists the cells")
         return found
 
+    def asks(self, row: Row) -> bool:
+        """Whether a cell asks for a policy of these labels (`report.load.LABELS`), whatever its variant."""
+        corruption = row["corruption"].partition(",")[0]  # without what tells its options apart
+        return (row["task"], row["quality"], corruption, row["algorithm"], row["method"], row["seed"]) in self._policies
+
     def _has(self, run: Result, seen: FoundRun) -> bool:
         """Whether some cell asks for it; one on a set that nobody collected is told by task and quality."""
         sets = self._sets.get(seen.recipe, ())
@@ -54,3 +64,10 @@ class GridMembers:
             return seen.on_one_set and any(data.alike(seen.record) for data in sets)
         labels = {name: run.labels[name] for name in ("task", "quality")}
         return seen.on_one_set and any(labels.items() <= data.wanted.items() for data in sets)
+
+
+def _policy(cell: GridCell) -> tuple[Any, ...]:
+    """Labels of the policy that a cell trains."""
+    wanted, before = set_of(cell, _NOWHERE).wanted, recorded(cell, "pretrain")
+    algorithm = recorded(cell, "finetune")["algorithm"]
+    return (wanted["task"], wanted["quality"], before["corruption"], algorithm, before["method"], cell.seed)
