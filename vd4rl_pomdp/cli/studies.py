@@ -71,18 +71,17 @@ def _report(words: Arguments, program: str) -> None:
 def _choice(command: ReportCommand) -> Choice:
     """What a report is about."""
     from vd4rl_pomdp.errors import UserError
-    from vd4rl_pomdp.report.load import ALL, Choice
+    from vd4rl_pomdp.report.load import ALL
+
+    if not command.grid:
+        if command.only or command.change:
+            raise UserError("--only and --change are about a grid's cells: name it with --grid")
+        return ALL
     from vd4rl_pomdp.sweeps.grid import narrow
     from vd4rl_pomdp.sweeps.grid_file import load_grid
     from vd4rl_pomdp.sweeps.members import GridMembers
 
-    if command.grid:
-        cells = narrow(load_grid(command.grid, command.change).cells(), command.only)
-        members = GridMembers(command.grid, cells)
-        return Choice(members.among, members.asks)
-    if command.only or command.change:
-        raise UserError("--only and --change are about a grid's cells: name it with --grid")
-    return ALL
+    return GridMembers(command.grid, narrow(load_grid(command.grid, command.change).cells(), command.only))
 
 
 @dataclass(frozen=True)

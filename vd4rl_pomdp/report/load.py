@@ -30,14 +30,16 @@ FILM = {"clean": 4, "corrupted": 4, "return": 1}
 """Arrays of a film and their axes."""
 
 
-@dataclass(frozen=True)
 class Choice:
-    """What a report is about; everything, unless it is told."""
+    """What a report is about: everything, unless a subclass says otherwise."""
 
-    among: Callable[[list[Result]], list[Result]] = list
-    """Takes some of the runs that were found."""
-    asks: Callable[[Row], bool] = lambda row: True
-    """Whether a run that is not there, told by LABELS, is missed."""
+    def among(self, results: list[Result]) -> list[Result]:
+        """The chosen ones of the runs that were found, in their order."""
+        return results
+
+    def asks(self, row: Row) -> bool:
+        """Whether a run that is not there, told by LABELS, is missed."""
+        return True
 
 
 ALL = Choice()

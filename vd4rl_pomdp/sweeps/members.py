@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 from collections import defaultdict
-from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.report.load import Choice
 from vd4rl_pomdp.results import Result
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.sweeps.found import FoundRun, found_in
@@ -19,10 +19,10 @@ _NOWHERE = Path()
 """Sets are told by how they were collected, not by where they lie."""
 
 
-class GridMembers:
+class GridMembers(Choice):
     """The pretrainings and fine-tunings that a grid's cells ask for."""
 
-    def __init__(self, name: str, cells: Iterable[GridCell]) -> None:
+    def __init__(self, name: str, cells: list[GridCell]) -> None:
         """Learn what the cells compute.
 
         Args:
@@ -32,7 +32,6 @@ class GridMembers:
         Raises:
             UserError: a stage would refuse a cell's settings, or a cell trains in a maze.
         """
-        cells = list(cells)
         self._asked = f"one of the {len(cells)} cells of {name} that are asked for"
         self._sets: dict[str, list[DataSet]] = defaultdict(list)
         self._policies: set[tuple[Any, ...]] = set()
@@ -40,12 +39,13 @@ class GridMembers:
             check_cell(cell)
             if "navigation_train" in cell.chain:
                 raise UserError(f"{name}: its cells are mazes; `vd4rl-pomdp navigation report` reports them")
+            data = set_of(cell, _NOWHERE)
             for section in cell.chain[1:]:
-                self._sets[recipe_of(cell, section)].append(set_of(cell, _NOWHERE))
+                self._sets[recipe_of(cell, section)].append(data)
             if "finetune" in cell.chain:
-                self._policies.add(_policy(cell))
+                self._policies.add(_policy(cell, data))
 
-    def among(self, results: Sequence[Result]) -> list[Result]:
+    def among(self, results: list[Result]) -> list[Result]:
         """Those of some runs that are the grid's, in their order; UserError if none is."""
         found = [run for run, seen in zip(results, found_in(results), strict=True) if self._has(run, seen)]
         if not found:
@@ -66,8 +66,7 @@ class GridMembers:
         return seen.on_one_set and any(labels.items() <= data.wanted.items() for data in sets)
 
 
-def _policy(cell: GridCell) -> tuple[Any, ...]:
-    """Labels of the policy that a cell trains."""
-    wanted, before = set_of(cell, _NOWHERE).wanted, recorded(cell, "pretrain")
-    algorithm = recorded(cell, "finetune")["algorithm"]
-    return (wanted["task"], wanted["quality"], before["corruption"], algorithm, before["method"], cell.seed)
+def _policy(cell: GridCell, data: DataSet) -> tuple[Any, ...]:
+    """Labels of the policy that a cell trains on its set."""
+    before, algorithm = recorded(cell, "pretrain"), recorded(cell, "finetune")["algorithm"]
+    return (data.wanted["task"], data.wanted["quality"], before["corruption"], algorithm, before["method"], cell.seed)
