@@ -25,4 +25,4 @@ types: setup ## Type checks
 	@$(BIN)/mypy
 
 unit: setup ## Tests, on two processes
-	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2
+	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal
