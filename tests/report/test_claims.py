@@ -60,6 +60,10 @@ def test_every_claim_is_a_difference_of_means_with_its_error(tmp_path):
         ({("mik", "patch"): (60,)}, MEMORY, "too few seeds"),
         ({("driml", "patch"): (80, 82)}, FIRST, "does not hold"),
         ({("random", "patch"): (80, 82)}, FIRST, "holds"),
+        ({("driml", "patch"): (56,)}, FIRST, "too few seeds"),
+        ({("driml", "patch"): (20,)}, FIRST, "holds"),
+        ({("driml", "patch"): (80, 82), ("fj+a", "patch"): (90,)}, FIRST, "does not hold"),
+        ({("driml", "patch"): (50, 58), ("fj+a", "patch"): (40, 42)}, FIRST, "not told apart"),
         ({("mik+a", "none"): (50, 52)}, CLEAN, "does not hold"),
         ({("mik+a", "none"): (50, 70)}, CLEAN, "holds"),
         ({("acro", "none"): (60,)}, CLEAN, "too few seeds"),
@@ -151,10 +155,10 @@ def test_the_page_and_the_terminal_tell_what_becomes_of_the_claims(tmp_path, cap
     assert "<h2>Claims</h2>" in page
     assert "mik+a: 520 (n = 2)" in page
     assert (tmp_path / "out" / "claims.csv").exists()
-    assert r"310 $\pm$ 22" in (tmp_path / "out" / "claims.tex").read_text(), "acro is the best with two seeds"
+    assert r"400 $\pm$ 14" in (tmp_path / "out" / "claims.tex").read_text()
     print_summary(report)
     shown = " ".join(capsys.readouterr().out.split())
-    assert f"{FIRST}: holds in 1 of 1 setting" in shown
+    assert f"{FIRST}: holds in 0 of 1 setting; too few seeds in 1" in shown, "mik returns more, with one seed"
     assert f"{ACTIONS}: holds in 0 of 1 setting; too few seeds in 1" in shown
     assert "told the states" not in shown
 

@@ -19,6 +19,7 @@ from vd4rl_pomdp.report.gates import (
     as_it_is,
     difference,
     returns_of,
+    seeds_by_variant,
     seen_under,
     sides,
 )
@@ -35,7 +36,7 @@ class Contender(NamedTuple):
     """Runs that a claim is about."""
 
     method: str = ""
-    """A method; empty for the best of those that the other side does not name."""
+    """A method; empty for every one that the other side does not name."""
     history: str = "method"
     """Its `--history`."""
     clean: bool = False
@@ -111,9 +112,9 @@ def _row(
     if claim.hidden == (corruption == "none"):
         return None
     alike = [run for run in runs if _at(run, task, quality, algorithm)]
-    compared = sides(
-        _runs_of(claim.left, claim.right, corruption, alike), _runs_of(claim.right, claim.left, corruption, alike)
-    )
+    left = _runs_of(claim.left, claim.right, corruption, alike)
+    right = _runs_of(claim.right, claim.left, corruption, alike)
+    compared = sides(left, right) if claim.right.method else _decisive(left, right)
     if not compared.left:
         return None
     above, error = difference(compared)
@@ -122,12 +123,28 @@ def _row(
     return row | {"verdict": _verdict(row, compared, place in unranked)}
 
 
+def _decisive(left: list[LoadedRun], others: list[LoadedRun]) -> Sides:
+    """The comparison that decides a claim about every other method.
+
+    It is the one that refutes the claim with most, or else that with the method and variant that returns most, however
+    few its seeds: one that may be the best is not passed over for another that has more of them.
+    """
+    pairs = [pair for seeds in seeds_by_variant(others) if (pair := sides(left, seeds)).left]
+    alike = [pair for pair in pairs if not pair.unlike]
+    refuted = [pair for pair in alike if _is_below(*difference(pair))]
+    return max(refuted or alike or pairs, key=lambda pair: returns_of(pair.right).mean(), default=Sides([], [], []))
+
+
+def _is_below(above: float | None, error: float | None) -> bool:
+    return above is not None and error is not None and above < -STANDARD_ERRORS * error
+
+
 def _at(run: LoadedRun, *place: str) -> bool:
     return tuple(run.labels[name] for name in ("task", "quality", "algorithm")) == place
 
 
 def _runs_of(side: Contender, other: Contender, corruption: str, runs: Iterable[LoadedRun]) -> list[LoadedRun]:
-    """Runs of one side: of a method as it is, or of all methods that may be the best."""
+    """Runs of one side: of a method as it is, or of all other methods."""
     seen = seen_under("none" if side.clean else corruption, runs)
     if side.method:
         return as_it_is(side.method, seen, side.history)
@@ -149,7 +166,7 @@ def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
         return f"not judged: the setting {FAILED}"
     if row["error"] is None:
         return FEW
-    margin = STANDARD_ERRORS * row["error"]
-    if row["difference"] < -margin:
+    if _is_below(row["difference"], row["error"]):
         return FAILS
-    return HOLDS if row["kind"] == "not below" or row["difference"] > margin else OPEN
+    told = row["difference"] > STANDARD_ERRORS * row["error"]
+    return HOLDS if row["kind"] == "not below" or told else OPEN

@@ -99,7 +99,7 @@ def best_of(runs: Iterable[LoadedRun]) -> list[LoadedRun]:
 
     One with a single seed is taken only where none has more.
     """
-    return max(_variants(runs), key=_preference, default=[])
+    return max(seeds_by_variant(runs), key=_preference, default=[])
 
 
 def sides(left: Iterable[LoadedRun], right: Iterable[LoadedRun]) -> Sides:
@@ -107,13 +107,13 @@ def sides(left: Iterable[LoadedRun], right: Iterable[LoadedRun]) -> Sides:
 
     First come pairs of like settings, then those with more than one seed on both sides, then those that return most.
     """
-    others = _variants(right)
-    pairs = [Sides(one, other, _unlike(one[0], other[0])) for one in _variants(left) for other in others]
+    others = seeds_by_variant(right)
+    pairs = [Sides(one, other, _unlike(one[0], other[0])) for one in seeds_by_variant(left) for other in others]
     alike = [pair for pair in pairs if not pair.unlike]
     return max(alike or pairs, key=lambda pair: _preference(pair.left, pair.right), default=Sides([], [], []))
 
 
-def _variants(runs: Iterable[LoadedRun]) -> list[list[LoadedRun]]:
+def seeds_by_variant(runs: Iterable[LoadedRun]) -> list[list[LoadedRun]]:
     """Seeds by method and variant; where they share an encoder, their spread is not that of a method."""
     groups: dict[tuple[str, str], list[LoadedRun]] = {}
     for run in runs:
