@@ -42,7 +42,8 @@ def test_a_setting_discriminates_if_state_acro_and_the_best_method_hold(tmp_path
     assert row["data_return"] == DATA
     assert row["state_share"] == pytest.approx(760 / DATA)
     assert row["acro_share"] == pytest.approx(610 / DATA)
-    assert row["above_random"] == pytest.approx(520 - 120), "the best that learned, not the ceiling"
+    assert row["best_share"] == pytest.approx(520 / DATA), "the best that learned, not the ceiling"
+    assert row["above_random"] == pytest.approx(520 - 120)
     assert row["error"] == pytest.approx((800 / 2 + 800 / 2) ** 0.5)
 
 
@@ -97,7 +98,12 @@ def test_a_reference_is_held_against_its_own_data(tmp_path):
 @pytest.mark.parametrize(("data", "words"), [(None, "not known"), (-1000.0, "not above 0"), (0.0, "not above 0")])
 def test_data_of_whose_return_there_are_no_shares_are_said(tmp_path, data, words):
     row = patch_gate(write_seeds(tmp_path, GOOD, data))
-    assert (row["data_return"], row["state_share"], row["acro_share"]) == (data, None, None)
+    assert [row[name] for name in ("data_return", "state_share", "acro_share", "best_share")] == [
+        data,
+        None,
+        None,
+        None,
+    ]
     assert row["verdict"] == f"not known to discriminate: the data's return is {words}"
 
 

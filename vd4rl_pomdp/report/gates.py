@@ -43,9 +43,9 @@ class Sides(NamedTuple):
 def gates(runs: list[LoadedRun]) -> list[Row]:
     """One row for every task, quality, corruption and algorithm with frozen encoders' finished runs, and its `verdict`.
 
-    `data_return` is a mean over the sets behind its runs, `state_share` and `acro_share` are shares of the return of
-    their own, `above_random` is the best method's mean return less that of `random`, as `sides` finds them, `error` its
-    standard error over seeds. What is not known is None.
+    `data_return` is a mean over the sets behind its runs; `state_share`, `acro_share` and `best_share`, the best
+    method's, are shares of the return of their own. `above_random` is the best method's mean return less that of
+    `random`, as `sides` finds them, `error` its standard error over seeds. What is not known is None.
     """
     finished = [run for run in runs if run.rows and run.finished and run.labels["method"] not in END_TO_END]
     return [_gate(key, finished) for key in sorted({_key(run) for run in finished})]
@@ -74,6 +74,7 @@ def _gate(key: tuple[str, ...], runs: list[LoadedRun]) -> Row:
         "data_return": float(np.mean(sorted(data))) if data else None,
         "state_share": _share(state),
         "acro_share": _share(acro),
+        "best_share": _share(compared.left),
         "above_random": above,
         "error": error,
     }

@@ -20,10 +20,10 @@ WIDEST = 6
 
 def gates(rows: list[Row]) -> list[ShownTable]:
     """What has to hold before methods are ranked."""
-    columns = ("setting", "verdict", "data's return", "state", "acro, none", "best – random")
+    columns = ("setting", "verdict", "data's return", "state", "acro, none", "best", "best – random")
     lines = []
     for row in rows:
-        shares = (number(row[name], 2) for name in ("state_share", "acro_share"))
+        shares = (number(row[name], 2) for name in ("state_share", "acro_share", "best_share"))
         above = _with_error(row["above_random"], row["error"])
         lines.append(Line((with_algorithm(row), row["verdict"], number(row["data_return"], 0), *shares, above)))
     return [ShownTable("", columns, lines, words=2)]
