@@ -11,6 +11,7 @@ from collections.abc import Iterator
 from pathlib import Path
 
 from vd4rl_pomdp.report.gaps import CONDITION, condition_of
+from vd4rl_pomdp.report.layout import number
 from vd4rl_pomdp.report.load import PROBES, load_runs
 from vd4rl_pomdp.report.measures import control, representations, run_table
 from vd4rl_pomdp.report.stats import mean_and_error
@@ -31,9 +32,9 @@ def table_lines(folder: Path) -> Iterator[str]:
     for policy in control(runs):
         key = condition_of(policy)
         returns = [row["return"] for row in sorted(seeds[key], key=lambda row: row["seed"])]
-        clean = "–" if policy["clean_return"] is None else f"{policy['clean_return']:.0f}"
-        errors = f"{policy['path_error']:.3f}, {policy['action_error']:.3f}"
-        probes = ", ".join(f"{encoders[key][name]:.1f}" for name in PROBES)
+        clean = number(policy["clean_return"], 0)
+        errors = f"{number(policy['path_error'], 3)}, {number(policy['action_error'], 3)}"
+        probes = ", ".join(number(encoders[key][name], 1) for name in PROBES)
         place = f"{policy['task']} {policy['quality']} | {policy['corruption']} | {label(policy)}"
         yield f"| {place} | {len(returns)} | {_told(returns)} | {clean} | {errors} | {probes} |"
 

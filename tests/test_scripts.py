@@ -133,3 +133,10 @@ def test_the_control_studys_page_shows_the_table_of_its_rows(monkeypatch):
     assert len(lines) > 30
     page = (script.RESULTS / "README.md").read_text()
     assert "\n\n" + "\n".join(lines) + "\n\n" in page, "run `python scripts/control_table.py`, and put it on the page"
+
+
+def test_a_set_of_several_actors_has_no_action_errors(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    script = importlib.import_module("control_table")
+    lines = script.table_lines(script.RESULTS.parent / "offline")
+    assert {line.split(" | ")[6] for line in lines if "medium_expert |" in line} == {"–, –"}
