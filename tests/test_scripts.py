@@ -135,6 +135,30 @@ def test_the_control_studys_page_shows_the_table_of_its_rows(monkeypatch):
     assert "\n\n" + "\n".join(lines) + "\n\n" in page, "run `python scripts/control_table.py`, and put it on the page"
 
 
+def test_pages_show_the_tables_of_the_papers_mazes_as_their_rows_make_them(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    script = importlib.import_module("navigation_table")
+    runs = script.main_runs()
+    readme, docs = ((SCRIPTS.parent / page).read_text() for page in ("README.md", "docs/navigation.md"))
+    tables = [(readme, script.state_lines(runs, (15, 1))), (docs, script.state_lines(runs, (1,)))]
+    tables += [(docs, script.maze_lines(runs, maze)) for maze in script.MAZES]
+    for page, lines in tables:
+        assert "\n\n" + "\n".join(lines) + "\n\n" in page, (
+            "run `python scripts/navigation_table.py`; put it on the page"
+        )
+
+
+def test_pages_show_the_returns_that_their_rows_hold(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    script = importlib.import_module("offline_table")
+    runs = script.main_runs()
+    readme, offline = ((SCRIPTS.parent / page).read_text() for page in ("README.md", "results/offline/README.md"))
+    tables = [(readme, script.readme_lines(runs)), *((offline, lines) for lines in script.page_tables(runs))]
+    assert len(tables) > 4
+    for page, lines in tables:
+        assert "\n\n" + "\n".join(lines) + "\n\n" in page, "run `python scripts/offline_table.py`; put it on the page"
+
+
 def test_a_set_of_several_actors_has_no_action_errors(monkeypatch):
     monkeypatch.syspath_prepend(SCRIPTS)
     script = importlib.import_module("control_table")

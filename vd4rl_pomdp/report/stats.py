@@ -167,7 +167,7 @@ def _ends(values: np.ndarray) -> Interval:
     return float(low), float(high)
 
 
-def mean_and_error(values: Sequence[float]) -> str:
-    """Whole numbers in words: the mean and its standard error, or the mean alone of a single value."""
-    error = f" ± {np.std(values, ddof=1) / math.sqrt(len(values)):.0f}" if len(values) > 1 else ""
-    return f"{np.mean(values):.0f}{error}"
+def mean_and_error(values: Sequence[float], digits: int = 0) -> str:
+    """In words: the mean and its standard error, or the mean alone of a single value."""
+    error = f" ± {np.std(values, ddof=1) / math.sqrt(len(values)):.{digits}f}" if len(values) > 1 else ""
+    return f"{np.mean(values):.{digits}f}{error}"

@@ -1,0 +1,125 @@
+"""The tables of returns in README.md and results/offline/README.md, made from rows of results/control and offline.
+
+    python scripts/offline_table.py
+
+A test holds the pages against them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import numpy as np
+
+from vd4rl_pomdp.report.gates import returns_of
+from vd4rl_pomdp.report.layout import number
+from vd4rl_pomdp.report.load import PROBES, LoadedRun, load_runs
+from vd4rl_pomdp.report.stats import mean_and_error
+from vd4rl_pomdp.sweeps.grid_file import load_grid
+from vd4rl_pomdp.sweeps.members import GridMembers
+
+RESULTS = Path(__file__).parents[1] / "results"
+GRIDS = ("offline", "control")
+HIDDEN, CLEAN = "patch+zero_frames", "none"
+SETS = {
+    ("walker_walk", "expert_noisy"): "walker_walk, noisy expert",
+    ("walker_walk", "expert"): "walker_walk, expert",
+    ("walker_walk", "medium_expert"): "walker_walk, medium_expert",
+    ("cheetah_run", "medium_noisy"): "cheetah_run, noisy medium",
+    ("cheetah_run", "expert_noisy"): "cheetah_run, noisy expert",
+    ("cheetah_run", "expert"): "cheetah_run, expert",
+    ("cheetah_run", "medium_expert"): "cheetah_run, medium_expert",
+}
+"""What the README calls a set."""
+CONTROL_ONLY = ("cheetah_run", "medium_noisy")
+"""The set that results/offline does not tell of."""
+COLUMNS = (
+    *((name, HIDDEN) for name in ("random", "acro", "ah+a", "mik", "mik+a", "supervised+a")),
+    *((name, CLEAN) for name in ("acro", "mik+a")),
+)
+"""What the README tells of a set: methods, and what was hidden from them."""
+
+
+def main_runs() -> list[LoadedRun]:
+    """Finished TD3+BC of the two grids, without variants."""
+    cells = [cell for name in GRIDS for cell in load_grid(name).cells()]
+    found = load_runs([RESULTS / name for name in GRIDS], choice=GridMembers(" and ".join(GRIDS), cells))
+    return [run for run in found if run.rows and run.finished and not run.variant]
+
+
+def readme_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """Returns of the main methods, a row for every set."""
+    yield (
+        "| set (data's return) | `random` | `acro` | `ah+a` | `mik` | `mik+a` | told the states |"
+        " nothing hidden: `acro` | `mik+a` |"
+    )
+    yield "|---|" + "---:|" * len(COLUMNS)
+    for place, words in SETS.items():
+        here = [run for run in runs if _place(run) == place]
+        if here:
+            cells = [_with_seeds(_of(here, method, corruption)) for method, corruption in COLUMNS]
+            yield f"| {words} ({here[0].reference.data_return:.0f}) | {' | '.join(cells)} |"
+
+
+def page_tables(runs: Sequence[LoadedRun]) -> Iterator[list[str]]:
+    """Tables of results/offline/README.md, one a set."""
+    for place in SETS:
+        if place != CONTROL_ONLY and any(_place(run) == place and run.labels["corruption"] == HIDDEN for run in runs):
+            yield list(set_lines(runs, *place))
+
+
+def set_lines(runs: Sequence[LoadedRun], task: str, quality: str) -> Iterator[str]:
+    """All methods on one set, those that return most first."""
+    yield (
+        "| method | seeds | return (seeds) | episodes | nothing hidden |"
+        " action error: data, loop | probe: pose, velocity |"
+    )
+    yield "|---|---:|---:|---:|---:|---:|---:|"
+    here = [run for run in runs if _place(run) == (task, quality)]
+    methods = {run.labels["method"]: _of(here, run.labels["method"], HIDDEN) for run in here}
+    shown = [(method, mine) for method, mine in methods.items() if mine]
+    for method, mine in sorted(shown, key=lambda one: -returns_of(one[1]).mean()):
+        returns = [f"{value:.0f}" for value in returns_of(mine)]
+        each = f" ({', '.join(returns)})" if len(returns) > 1 else ""
+        last = [row for run in mine for row in run.rows if row["step"] == run.rows[-1]["step"]]
+        episodes = [row["return"] for row in last]
+        loop = _mean([row["action_error"] for row in last], 3)
+        data = _mean([run.reference.path_error for run in mine], 3)
+        probes = ", ".join(_mean([run.representation[name] for run in mine], 1) for name in PROBES)
+        yield (
+            f"| `{method}` | {len(mine)} | {_told(mine)}{each} | {min(episodes):.0f} to {max(episodes):.0f} |"
+            f" {_with_seeds(_of(here, method, CLEAN))} | {data}, {loop} | {probes} |"
+        )
+
+
+def _place(run: LoadedRun) -> tuple[str, str]:
+    return run.labels["task"], run.labels["quality"]
+
+
+def _of(runs: Sequence[LoadedRun], method: str, corruption: str) -> list[LoadedRun]:
+    """Runs of a method under a corruption, by seed."""
+    mine = [run for run in runs if (run.labels["method"], run.labels["corruption"]) == (method, corruption)]
+    return sorted(mine, key=lambda run: run.labels["seed"])
+
+
+def _told(runs: list[LoadedRun]) -> str:
+    """Mean return and its standard error over seeds; a dash if there is none."""
+    return mean_and_error(returns_of(runs).tolist()) if runs else "–"
+
+
+def _with_seeds(runs: list[LoadedRun]) -> str:
+    """The same, and how many they are where they are not three."""
+    return _told(runs) + (f" (n = {len(runs)})" if len(runs) in (1, 2) else "")
+
+
+def _mean(values: Sequence[float | None], digits: int) -> str:
+    """Mean of what is known."""
+    known = [value for value in values if value is not None]
+    return number(float(np.mean(known)) if known else None, digits)
+
+
+if __name__ == "__main__":
+    found = main_runs()
+    for lines in (readme_lines(found), *page_tables(found)):
+        print("\n".join(lines), end="\n\n")
