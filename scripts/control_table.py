@@ -7,7 +7,7 @@ A test holds the page against it.
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 from vd4rl_pomdp.report.gaps import CONDITION, condition_of
@@ -36,10 +36,10 @@ def table_lines(folder: Path) -> Iterator[str]:
         errors = f"{number(policy['path_error'], 3)}, {number(policy['action_error'], 3)}"
         probes = ", ".join(number(encoders[key][name], 1) for name in PROBES)
         place = f"{policy['task']} {policy['quality']} | {policy['corruption']} | {label(policy)}"
-        yield f"| {place} | {len(returns)} | {_told(returns)} | {clean} | {errors} | {probes} |"
+        yield f"| {place} | {len(returns)} | {with_seeds(returns)} | {clean} | {errors} | {probes} |"
 
 
-def _told(returns: list[float]) -> str:
+def with_seeds(returns: Sequence[float]) -> str:
     """Mean and error over seeds, and each of them where there are several."""
     each = f" ({', '.join(f'{value:.0f}' for value in returns)})" if len(returns) > 1 else ""
     return mean_and_error(returns) + each

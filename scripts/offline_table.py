@@ -10,11 +10,12 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-import numpy as np
+from control_table import with_seeds
 
 from vd4rl_pomdp.report.gates import returns_of
 from vd4rl_pomdp.report.layout import number
 from vd4rl_pomdp.report.load import PROBES, LoadedRun, load_runs
+from vd4rl_pomdp.report.measures import known_mean
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
@@ -58,7 +59,7 @@ def readme_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
     for place, words in SETS.items():
         here = [run for run in runs if _place(run) == place]
         if here:
-            cells = [_with_seeds(_of(here, method, corruption)) for method, corruption in COLUMNS]
+            cells = [_told(_of(here, method, corruption)) for method, corruption in COLUMNS]
             yield f"| {words} ({here[0].reference.data_return:.0f}) | {' | '.join(cells)} |"
 
 
@@ -80,16 +81,15 @@ def set_lines(runs: Sequence[LoadedRun], task: str, quality: str) -> Iterator[st
     methods = {run.labels["method"]: _of(here, run.labels["method"], HIDDEN) for run in here}
     shown = [(method, mine) for method, mine in methods.items() if mine]
     for method, mine in sorted(shown, key=lambda one: -returns_of(one[1]).mean()):
-        returns = [f"{value:.0f}" for value in returns_of(mine)]
-        each = f" ({', '.join(returns)})" if len(returns) > 1 else ""
         last = [row for run in mine for row in run.rows if row["step"] == run.rows[-1]["step"]]
         episodes = [row["return"] for row in last]
-        loop = _mean([row["action_error"] for row in last], 3)
-        data = _mean([run.reference.path_error for run in mine], 3)
-        probes = ", ".join(_mean([run.representation[name] for run in mine], 1) for name in PROBES)
+        spread = f"{min(episodes):.0f} to {max(episodes):.0f}"
+        loop = number(known_mean(row["action_error"] for row in last), 3)
+        data = number(known_mean(run.reference.path_error for run in mine), 3)
+        probes = ", ".join(number(known_mean(run.representation[name] for run in mine), 1) for name in PROBES)
         yield (
-            f"| `{method}` | {len(mine)} | {_told(mine)}{each} | {min(episodes):.0f} to {max(episodes):.0f} |"
-            f" {_with_seeds(_of(here, method, CLEAN))} | {data}, {loop} | {probes} |"
+            f"| `{method}` | {len(mine)} | {with_seeds(returns_of(mine).tolist())} | {spread} |"
+            f" {_told(_of(here, method, CLEAN))} | {data}, {loop} | {probes} |"
         )
 
 
@@ -104,19 +104,10 @@ def _of(runs: Sequence[LoadedRun], method: str, corruption: str) -> list[LoadedR
 
 
 def _told(runs: list[LoadedRun]) -> str:
-    """Mean return and its standard error over seeds; a dash if there is none."""
-    return mean_and_error(returns_of(runs).tolist()) if runs else "–"
-
-
-def _with_seeds(runs: list[LoadedRun]) -> str:
-    """The same, and how many they are where they are not three."""
-    return _told(runs) + (f" (n = {len(runs)})" if len(runs) in (1, 2) else "")
-
-
-def _mean(values: Sequence[float | None], digits: int) -> str:
-    """Mean of what is known."""
-    known = [value for value in values if value is not None]
-    return number(float(np.mean(known)) if known else None, digits)
+    """Mean return and its standard error over seeds, and how many if fewer than three; a dash if there is none."""
+    if not runs:
+        return number(None)
+    return mean_and_error(returns_of(runs).tolist()) + (f" (n = {len(runs)})" if len(runs) < 3 else "")
 
 
 if __name__ == "__main__":

@@ -66,7 +66,7 @@ def representations(table: list[Row]) -> list[Row]:
     found = []
     for group, members in grouped(table, CONDITION):
         finished = [row for row in members if row["score"] is not None]
-        means = {name: _known_mean(row[name] for row in finished) for name in _MEANS}
+        means = {name: known_mean(row[name] for row in finished) for name in _MEANS}
         states = in_words([row for row in members if row["score"] is None])
         found.append(dict(zip(CONDITION, group, strict=True)) | means | {"seeds": len(finished), "missing": states})
     return sorted(found, key=table_order)
@@ -80,7 +80,7 @@ def costs(table: list[Row]) -> list[Row]:
         row: Row = {"method": name, "runs": len(members)}
         for cost in COSTS:
             known = [member[cost] for member in members if member[cost] is not None]
-            row |= {cost: _known_mean(known), f"{cost}_min": min(known, default=None)}
+            row |= {cost: known_mean(known), f"{cost}_min": min(known, default=None)}
             row[f"{cost}_max"] = max(known, default=None)
         found.append(row | {"machines": "; ".join(sorted({member["machine"] for member in members} - {""}))})
     return found
@@ -96,7 +96,7 @@ def control(runs: list[LoadedRun]) -> list[Row]:
     measured = [run.labels | {"variant": run.variant} | _control(run) for run in finished]
     table = [
         dict(zip(CONDITION, group, strict=True))
-        | {name: _known_mean(row[name] for row in members) for name in _CONTROL}
+        | {name: known_mean(row[name] for row in members) for name in _CONTROL}
         | {"seeds": len(members)}
         for group, members in grouped(measured, CONDITION)
     ]
@@ -114,6 +114,7 @@ def _control(run: LoadedRun) -> Row:
     return found
 
 
-def _known_mean(values: Iterable[float | None]) -> float | None:
+def known_mean(values: Iterable[float | None]) -> float | None:
+    """Mean of the values that are known; None if none is."""
     known = [value for value in values if value is not None]
     return float(np.mean(known)) if known else None

@@ -43,7 +43,8 @@ _TITLES = {
     "others": "State estimation errors of what no other table has",
 }
 _PAPER_TABLES = tuple(_TITLES)[:7]
-_MAIN_TEXT = ("no_curtain", "three_curtains")
+MAIN_TEXT = ("no_curtain", "three_curtains")
+"""Mazes of the tables in the paper's main text."""
 
 
 @dataclass(frozen=True)
@@ -122,7 +123,7 @@ def _in_units(protocol: str, raw: bool) -> str:
 
 
 def _paper_table(name: str, protocol: str, split: str, probe: str, raw: bool, runs: list[NavigationRun]) -> Table:
-    mazes = tuple(maze for maze in _mazes(runs, raw) if name != "exogenous_main" or MAZES[maze].paper in _MAIN_TEXT)
+    mazes = tuple(maze for maze in _mazes(runs, raw) if name != "exogenous_main" or MAZES[maze].paper in MAIN_TEXT)
     rows = []
     for line in paper_rows():
         if line["table"] != name.removesuffix("_main"):
@@ -132,7 +133,7 @@ def _paper_table(name: str, protocol: str, split: str, probe: str, raw: bool, ru
         options = "".join(f", {o}" for o in ("self-prediction",) if line["self_prediction"] == "Y")
         label = f"{line['objective']}, K={line['k_max']}{options}"
         shown = measure.raw() if raw else measure
-        rows.append((label, [_entry(condition_of(line, maze), shown, runs) for maze in mazes]))
+        rows.append((label, [entry_of(condition_of(line, maze), shown, runs) for maze in mazes]))
     return Table(name, protocol if name == "action_loss" else _in_units(protocol, raw), mazes, rows)
 
 
@@ -143,11 +144,13 @@ def _references_table(raw: bool, runs: list[NavigationRun]) -> Table:
     for method in REFERENCES:
         for component in ("state", "position", "velocity"):
             measure = _refitted(component, raw)
-            rows.append((f"{method}, {component}", [_entry(Condition(maze, method), measure, runs) for maze in mazes]))
+            rows.append(
+                (f"{method}, {component}", [entry_of(Condition(maze, method), measure, runs) for maze in mazes])
+            )
     literal = [Condition(maze, "mik+a", 1, literal_future=True) for maze in mazes]
     for name, measure in {"state error": _refitted("state", raw), "action loss": held_out_loss()}.items():
         rows.append(
-            (f"MIK+A, literal future, K=1, {name}", [_entry(condition, measure, runs) for condition in literal])
+            (f"MIK+A, literal future, K=1, {name}", [entry_of(condition, measure, runs) for condition in literal])
         )
     return Table("references", _in_units(_REFITTED, raw), mazes, rows)
 
@@ -159,7 +162,9 @@ def _hidden_table(raw: bool, runs: list[NavigationRun]) -> Table:
     for method in METHOD_NAMES:
         for component in ("position", "velocity"):
             measure = _refitted(component, raw, rows="hidden")
-            rows.append((f"{method}, {component}", [_entry(Condition(maze, method), measure, runs) for maze in mazes]))
+            rows.append(
+                (f"{method}, {component}", [entry_of(Condition(maze, method), measure, runs) for maze in mazes])
+            )
     return Table("hidden", _in_units(_REFITTED, raw), mazes, rows)
 
 
@@ -173,7 +178,7 @@ def _others(runs: list[NavigationRun]) -> list[Condition]:
 def _others_table(others: list[Condition], raw: bool, runs: list[NavigationRun]) -> Table:
     """State errors of conditions that no other table has."""
     mazes, measure = _mazes(runs, raw), _refitted("state", raw)
-    rows = [(one.short, [_entry(replace(one, maze=maze), measure, runs) for maze in mazes]) for one in others]
+    rows = [(one.short, [entry_of(replace(one, maze=maze), measure, runs) for maze in mazes]) for one in others]
     return Table("others", _in_units(_REFITTED, raw), mazes, rows)
 
 
@@ -187,12 +192,13 @@ def _by_k_table(runs: list[NavigationRun]) -> Table:
     mazes, rows = _mazes(runs), []
     for method in OBJECTIVES:
         for k in (1, 5, 15):
-            entries = [_entry(Condition(maze, method), held_out_loss(k), runs) for maze in mazes]
+            entries = [entry_of(Condition(maze, method), held_out_loss(k), runs) for maze in mazes]
             rows.append((f"{method}, k={k}", entries))
     return Table("by_k", "held-out trajectories", mazes, rows)
 
 
-def _entry(condition: Condition, measure: Measure, runs: list[NavigationRun]) -> Entry:
+def entry_of(condition: Condition, measure: Measure, runs: list[NavigationRun]) -> Entry:
+    """One measure of a condition, as some runs have it."""
     numbers = [run.values[measure] for run in runs if run.condition == condition and measure in run.values]
     seeds = {run.seed for run in runs if run.condition.maze == condition.maze}
     return Entry(condition, measure, np.array(numbers), len(seeds), is_missing(condition, runs))
