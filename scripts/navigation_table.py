@@ -1,4 +1,4 @@
-"""The tables of README.md and docs/navigation.md about the paper's own mazes, made from the rows of results/navigation.
+"""The tables of README.md and docs/navigation.md about the paper's own mazes, made from rows of results/navigation.
 
     python scripts/navigation_table.py
 
@@ -32,11 +32,17 @@ REFERENCES = {
     "supervised_picture": "told the states: one picture",
 }
 """Methods that no objective trains, as the pages call them."""
+COMPASS = "compass_first_person"
 
 
 def main_runs() -> list[NavigationRun]:
     """The runs of results/navigation, without those of folders within it."""
     return load_runs(read_results(RESULTS))
+
+
+def first_person_runs() -> list[NavigationRun]:
+    """The runs of the grid `first_person`."""
+    return load_runs(read_results(RESULTS / "first_person"))
 
 
 def maze_lines(runs: list[NavigationRun], maze: str) -> Iterator[str]:
@@ -63,6 +69,25 @@ def state_lines(runs: list[NavigationRun], ks: Sequence[int]) -> Iterator[str]:
             yield f"| {maze.replace('_', ' ')}, K = {k} | {seeds} | {' | '.join(map(_cell, entries))} |"
 
 
+def first_person_lines(runs: list[NavigationRun]) -> Iterator[str]:
+    """Errors under the compass of all that was trained there, those with the smallest state errors first."""
+    yield "| | seeds | state | position, velocity | probe beside the model: position, velocity |"
+    yield "|---|---:|---:|---:|---:|"
+    objectives = {
+        f"`{name}`{words}": Condition(COMPASS, name, self_prediction=bool(words))
+        for name in OBJECTIVES
+        for words in ("", " with self-prediction")
+    }
+    told = objectives | {words: Condition(COMPASS, name) for name, words in REFERENCES.items()}
+    measures = [refitted_error(component) for component in ("state", "position", "velocity")]
+    measures += [one._replace(probe="online") for one in measures[1:]]
+    rows = {name: [entry_of(condition, one, runs) for one in measures] for name, condition in told.items()}
+    trained = [name for name, (state, *_) in rows.items() if len(state.numbers)]
+    for name in sorted(trained, key=lambda one: rows[one][0].numbers.mean()):
+        state, *others = map(_cell, rows[name])
+        yield f"| {name} | {len(rows[name][0].numbers)} | {state} | {', '.join(others[:2])} | {', '.join(others[2:])} |"
+
+
 def _line(name: str, entries: list[Entry]) -> str:
     *raw, position, velocity = map(_cell, entries)
     return f"| {name} | {len(entries[-1].numbers)} | {' | '.join(raw)} | {position}, {velocity} |"
@@ -81,5 +106,6 @@ if __name__ == "__main__":
         state_lines(found, (15, 1)),
         *(maze_lines(found, maze) for maze in MAIN_TEXT),
         state_lines(found, (1,)),
+        first_person_lines(first_person_runs()),
     ):
         print("\n".join(lines), end="\n\n")

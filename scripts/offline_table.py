@@ -81,7 +81,7 @@ def set_lines(runs: Sequence[LoadedRun], task: str, quality: str) -> Iterator[st
     methods = {run.labels["method"]: _of(here, run.labels["method"], HIDDEN) for run in here}
     shown = [(method, mine) for method, mine in methods.items() if mine]
     for method, mine in sorted(shown, key=lambda one: -returns_of(one[1]).mean()):
-        last = [row for run in mine for row in run.rows if row["step"] == run.rows[-1]["step"]]
+        last = [row for run in mine for row in run.last]
         episodes = [row["return"] for row in last]
         spread = f"{min(episodes):.0f} to {max(episodes):.0f}"
         loop = number(known_mean(row["action_error"] for row in last), 3)

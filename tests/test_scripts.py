@@ -142,6 +142,7 @@ def test_pages_show_the_tables_of_the_papers_mazes_as_their_rows_make_them(monke
     readme, docs = ((SCRIPTS.parent / page).read_text() for page in ("README.md", "docs/navigation.md"))
     tables = [(readme, script.state_lines(runs, (15, 1))), (docs, script.state_lines(runs, (1,)))]
     tables += [(docs, script.maze_lines(runs, maze)) for maze in script.MAIN_TEXT]
+    tables += [(docs, script.first_person_lines(script.first_person_runs()))]
     for page, lines in tables:
         assert "\n\n" + "\n".join(lines) + "\n\n" in page, (
             "run `python scripts/navigation_table.py`; put it on the page"

@@ -142,8 +142,7 @@ def _unlike(one: LoadedRun, other: LoadedRun) -> list[str]:
 
 def returns_of(runs: list[LoadedRun]) -> np.ndarray:
     """Mean return of each run's last evaluation, (n,)."""
-    finals = [(run.rows, max(row["step"] for row in run.rows)) for run in runs]
-    return np.array([np.mean([row["return"] for row in rows if row["step"] == final]) for rows, final in finals])
+    return np.array([np.mean([row["return"] for row in run.last]) for run in runs])
 
 
 def difference(compared: Sides) -> tuple[float | None, float | None]:

@@ -103,9 +103,18 @@ class LoadedRun:
         return tuple(str(labels[name]) for name in IDENTITY)
 
     @property
-    def clean(self) -> list[Row]:
-        """Evaluation rows under no corruption, whatever it was trained under."""
-        return [row for row in (*self.rows, *self.others) if row["evaluated_under"] == "none"]
+    def last(self) -> list[Row]:
+        """Rows of its last evaluation, under the corruption of training."""
+        return self._at_end(self.rows)
+
+    @property
+    def last_clean(self) -> list[Row]:
+        """Rows of its last evaluation under no corruption, whatever it was trained under; empty if there was none."""
+        return [row for row in self._at_end([*self.rows, *self.others]) if row["evaluated_under"] == "none"]
+
+    def _at_end(self, rows: list[Row]) -> list[Row]:
+        end = max((row["step"] for row in self.rows), default=None)
+        return [row for row in rows if row["step"] == end]
 
     @property
     def finished(self) -> bool:

@@ -106,10 +106,8 @@ def control(runs: list[LoadedRun]) -> list[Row]:
 def _control(run: LoadedRun) -> Row:
     """Values of _CONTROL of one run."""
     found: Row = {"data_return": run.reference.data_return, "path_error": run.reference.path_error}
-    final = max(row["step"] for row in run.rows)
-    for prefix, rows in (("", run.rows), ("clean_", run.clean)):
-        last = [row for row in rows if row["step"] == final]
-        summed = summarise(last, run.reference) if last else {}
+    for prefix, rows in (("", run.last), ("clean_", run.last_clean)):
+        summed = summarise(rows, run.reference) if rows else {}
         found |= {prefix + name: summed.get(key) for name, key in _EVALUATED.items()}
     return found
 
