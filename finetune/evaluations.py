@@ -73,7 +73,7 @@ class Evaluations:
             FloatingPointError: a weight is not finite.
         """
         with interrupt.at_once():
-            self._keep(step, algorithm)
+            self._keep(step, algorithm, loop)
             if not self._at(step):
                 self._play(step, loop)
         row = scores_by_corruption(self._at(step))
@@ -91,11 +91,10 @@ class Evaluations:
         clean = self.config.eval_clean and step == self.config.updates
         return own_and_none(own) if clean else [own]
 
-    def _keep(self, step: int, algorithm: Algorithm | EndToEnd) -> None:
+    def _keep(self, step: int, algorithm: Algorithm | EndToEnd, loop: Loop) -> None:
         """Write the policy, with the encoder if that was trained along."""
         for part in [algorithm.policy] + ([algorithm.encoder] if isinstance(algorithm, EndToEnd) else []):
-            if not all(weights.isfinite().all() for weights in part.parameters()):
-                raise FloatingPointError(f"{self.run}: the policy's weights are not finite after update {step}")
+            loop.require_finite(part)
         algorithm.policy.save(self.run / "policy", step)
         if isinstance(algorithm, EndToEnd):
             save_encoder(self.run / "encoder", algorithm.encoder, self.card)

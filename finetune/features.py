@@ -132,12 +132,17 @@ class FeatureFile:
             return self._inputs | {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
 
 
+def feature_type(encoder: Encoder) -> type[np.floating]:
+    """What features are kept as: half precision, but for states, which may hardly differ and are then scaled up."""
+    return np.float32 if encoder.reads_state else np.float16
+
+
 def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: FeatureFile) -> Tensor:
     """Encode the whole set under `views` draws, or read what was encoded before.
 
     Returns:
-        (views, features, D) float16 on the data set's device, numbered as `Histories` says; `kept` keeps them for the
-        run's resumption.
+        (views, features, D) on the data set's device, float16 of an encoder's and float32 of simulator states, numbered
+        as `Histories` says; `kept` keeps them for the run's resumption.
     """
     features = kept.read()
     if features is None:
@@ -149,7 +154,7 @@ def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: 
 @torch.no_grad()
 def _encode_all(frozen: FrozenEncoder, histories: Histories, views: int) -> np.ndarray:
     episodes = frozen.dataset.num_episodes
-    out = np.empty((views, histories.features, frozen.encoder.dim), np.float16)
+    out = np.empty((views, histories.features, frozen.encoder.dim), feature_type(frozen.encoder))
     with ProgressLine("encode", views * episodes, "episodes") as progress:
         for number in range(views):
             view, random = frozen.view(number), histories.of_view(number)

@@ -19,7 +19,7 @@ EPISODES = 20
 
 
 class DataPath:
-    """A set's own episodes, as a policy was shown them in training, and its actor's mean actions there."""
+    """A set's own episodes, as a policy sees them from their first rows on, and its actor's mean actions there."""
 
     def __init__(self, dataset: Dataset, actor: Actor, encode: Callable[[int], Tensor]) -> None:
         """Nothing is computed yet.

@@ -4,10 +4,12 @@ from __future__ import annotations
 
 from dataclasses import replace
 
+import numpy as np
 import torch
 
 from finetune.algorithms import ReturnOptions
 from finetune.config import FinetuneConfig
+from finetune.features import feature_type
 from finetune.histories import Histories
 from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.errors import UserError, flag_of, refuse_number
@@ -64,7 +66,7 @@ def require_room(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, dev
     Features that are `kept` on the disk already take no more of it.
     """
     histories = Histories(dataset, config.memory, 1, config.seed)
-    features = config.views * histories.features * encoder.dim * 2
+    features = config.views * histories.features * encoder.dim * np.dtype(feature_type(encoder)).itemsize
     require_memory(features, device, config, "views")
     if not kept:
         require_disk(features, config.out, config, "views")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -46,6 +47,8 @@ from vd4rl_pomdp.tasks import TASKS, UNKNOWN_QUALITY
 
 RESULTS = (*POLICY, *FILES_OF_RUN)
 """What a finished run holds, beside the rows of its evaluations."""
+STANDARDISED_BY = 1024
+"""Least transitions whose representations give their means and deviations, where none are kept (`--views 0`)."""
 
 
 def finetune(config: FinetuneConfig) -> RunFolder:
@@ -110,7 +113,8 @@ def _trainer(
         sampler = FeatureSampler(histories, features, config.batch_size, returns.n_step, returns.gamma, generator)
     else:
         sampler = ExactSampler(frozen, config.memory, config.batch_size, returns.n_step, returns.gamma, generator)
-        policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(4)]))
+        batches = math.ceil(STANDARDISED_BY / config.batch_size)
+        policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(batches)]))
     noise = stream_generator(config.seed, STAGE, "noise")
     algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
     algorithm.precision = config.update_precision

@@ -107,6 +107,7 @@ class PretrainTrainer:
                 if loop.due(self.config.log_every):
                     loop.log("loss")
                 loop.step_done(save=loop.due(self.config.checkpoint_every))
+            loop.require_finite(self.objective)
 
     def _labels(self, run: RunFolder) -> dict[str, str]:
         """What names the run where it is tracked."""

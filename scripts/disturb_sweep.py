@@ -92,10 +92,16 @@ class Sweep:
         except OSError:
             return []
 
+    def require_driver(self) -> None:
+        """Raise RuntimeError if the driver has ended: nothing is left to disturb."""
+        if self.driver.poll() is not None:
+            raise RuntimeError(f"the driver ended with {self.driver.returncode} before it was disturbed")
+
 
 def kill_a_job(sweep: Sweep, draw: random.Random) -> str:
     """End a random job at once."""
     while not (jobs := sweep.jobs):
+        sweep.require_driver()
         time.sleep(0.05)
     os.kill(draw.choice(jobs), signal.SIGKILL)
     return "a job killed"
@@ -120,6 +126,7 @@ def truncate_a_checkpoint(sweep: Sweep, draw: random.Random) -> str:
                 if not (run / "timing.json").exists() and path.exists():
                     os.truncate(path, path.stat().st_size // 2)
                     return f"the checkpoint of step {step} truncated"
+        sweep.require_driver()
         time.sleep(0.02)
 
 

@@ -48,7 +48,7 @@ def encode(trainer: NavigationTrainer, number: Tensor, length: int | None = None
     """Frozen states (B, T, D) float32 of windows, and their rows (B, T)."""
     window = trainer.data.windows(number, length)
     with autocast(trainer.device, trainer.config.precision):
-        return trainer.objective.encoder.encode(window).float(), trainer.data.states.rows(window)
+        return trainer.objective.encoder.encode(window).float(), trainer.data.dataset.rows(window.key)
 
 
 def refitted_errors(trainer: NavigationTrainer) -> tuple[StateProbe, dict[str, dict[str, float]]]:

@@ -17,7 +17,6 @@ from vd4rl_pomdp.navigation.measures import RAW_PREFIX
 from vd4rl_pomdp.nn.heads import mlp
 from vd4rl_pomdp.nn.policy import Standardise
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.types import Windows, unpack_row_key
 
 STATE_DIM = 4
 COMPONENTS = {"state": slice(0, 4), "position": slice(0, 2), "velocity": slice(2, 4)}
@@ -36,8 +35,6 @@ class TrueStates:
     mean: Tensor
     std: Tensor
     """(4,) float32, of the training rows."""
-    episode_start: Tensor
-    """(E,) int64."""
 
     @classmethod
     def of(cls, dataset: Dataset, maze: MazeSpec, training_rows: int) -> TrueStates:
@@ -46,12 +43,7 @@ class TrueStates:
         raw = torch.from_numpy(dataset.physics[:, maze.position + maze.velocity])
         std, mean = torch.std_mean(raw[:training_rows], dim=0)
         hidden = torch.from_numpy(maze.hidden(dataset.physics))
-        return cls(((raw - mean) / std).float(), hidden, mean.float(), std.float(), dataset.episode_start)
-
-    def rows(self, window: Windows) -> Tensor:
-        """(B, T) int64 rows of a batch's windows."""
-        episode, t = unpack_row_key(window.key)
-        return self.episode_start[episode] + t
+        return cls(((raw - mean) / std).float(), hidden, mean.float(), std.float())
 
     def to(self, device: torch.device) -> TrueStates:
         """Copy on a device."""

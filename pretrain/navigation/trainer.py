@@ -74,7 +74,7 @@ class NavigationTrainer:
     def losses(self, window: Windows) -> tuple[Tensor, dict[str, Tensor], tuple[Tensor, Tensor, Tensor]]:
         """Objective's and probe's loss of one batch, whose frames are encoded once."""
         past, future = self.objective.representations(window)
-        rows = self.data.states.rows(window)
+        rows = self.data.dataset.rows(window.key)
         supervised = self.config.method in SUPERVISED
         estimate, truth = self.probe(past, frozen=not supervised), self.data.states.values[rows]
         error = (estimate.float() - truth).square().mean()
@@ -96,6 +96,7 @@ class NavigationTrainer:
                     loop.log("loss", "state", **self.errors.both(self.data.states.std))
                     self.errors = ErrorSums()
                 loop.step_done(save=loop.due(self.config.checkpoint_every))
+            loop.require_finite(self.objective)
 
     def state(self) -> dict[str, Any]:
         """Everything needed to go on to the bit, also between two rows of metrics."""

@@ -56,6 +56,13 @@ def test_the_largest_replay_error_counts(folder, tmp_path):
     assert check_dataset(folder, tmp_path / "cache", true_replay)["replay_max_error"] == pytest.approx(0.25)
 
 
+def test_a_replay_that_gives_no_number_is_not_exact(folder, tmp_path):
+    def broken(task, physics, action):
+        return true_replay(task, physics, action) * np.nan
+
+    assert np.isnan(check_dataset(folder, tmp_path / "cache", broken)["replay_max_error"])
+
+
 def test_without_physics_nothing_is_replayed(tmp_path):
     report = check_dataset(write_fake_set(tmp_path / "set", (4,)), tmp_path / "cache", replay=None)
     assert report["replay_max_error"] is None

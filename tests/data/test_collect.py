@@ -126,6 +126,11 @@ def test_an_interrupted_collection_ends_in_the_same_files(whole, tmp_path, monke
     assert provenance["frames"] == json.loads((whole / "provenance.json").read_text())["frames"]
     assert provenance["seconds"] >= 1000.0
     assert not (out / ".parts.json").exists()
+    (out / "1_walker_walk_random.hdf5").unlink()
+    collect(config(out), LENGTH)
+    again = json.loads((out / "provenance.json").read_text())
+    assert again["frames"] == provenance["frames"]
+    assert again["seconds"] >= 1000.0, "a shard that was lost is collected again, and the others still count"
 
 
 def test_an_interrupt_before_the_config_was_written_does_not_block_the_folder(whole, tmp_path):

@@ -80,7 +80,7 @@ def test_stored_discounts_are_multiplied_and_may_be_zero(tmp_path):
     np.testing.assert_allclose(dataset.transitions(range(4)).discount, [0.5, 0.25, 1.0, 0.0])
     batch = dataset.transitions(range(4), n_step=2, gamma=0.1)
     np.testing.assert_allclose(batch.discount, [0.0125, 0.025, 0.0, 0.0])
-    np.testing.assert_allclose(batch.reward, [0.0001, 0.0012, 0.0023, 0.003], rtol=1e-5)
+    np.testing.assert_allclose(batch.reward, [0.00005, 0.00105, 0.0023, 0.003], rtol=1e-5)
 
 
 def test_nothing_is_paid_for_an_episodes_first_row_whatever_it_stores(tmp_path):

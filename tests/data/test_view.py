@@ -105,3 +105,10 @@ def test_row_keys_unpack_and_padding_is_not_real(dataset):
     assert [x.tolist() for x in unpack_row_key(row_key(episode, t))] == [episode.tolist(), t.tolist()]
     window = dataset.windows([0, 1], 4).replace(length=torch.tensor([4, 2]))
     assert window.real.tolist() == [[True] * 4, [True, True, False, False]]
+
+
+@pytest.mark.parametrize("shift", [0, 4])
+def test_a_batch_may_be_empty(dataset, shift):
+    view = View(dataset, CorruptionConfig.of("patch+zero_frames"), shift)
+    assert view.transitions([]).obs.shape == (0, 9, 84, 84)
+    assert view.windows([], 3).obs.shape == (0, 3, 9, 84, 84)

@@ -7,10 +7,11 @@ import numpy as np
 import pytest
 import torch
 
-from finetune.features import ExactSampler, FrozenEncoder
+from finetune.features import ExactSampler, FeatureFile, FrozenEncoder, encode_views
+from finetune.histories import Histories
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
-from tests.helpers_stages import contents, smoke_pretrain
+from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp import evaluation
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.corruptions.keys import draw_normals
@@ -206,3 +207,12 @@ def test_a_part_that_fails_without_a_word_is_told_by_the_kind_of_its_error(noisy
     monkeypatch.setattr("vd4rl_pomdp.nn.encoder_folder.Encoder", silent)
     with pytest.raises(UserError, match=r"names no encoder \(ValueError\)"):
         load_encoder(noisy)
+
+
+def test_states_are_kept_in_full_precision(with_states, tmp_path):
+    """A coordinate that never changes is scaled up: rounded to half precision, it would be another in evaluation."""
+    encoder, dataset = pretrained(with_states, tmp_path / "exact"), open_dataset(with_states)
+    dataset.physics[:, 3] = 1.3
+    seen, config = frozen(encoder, dataset), smoke_finetune(encoder, with_states, tmp_path / "out")
+    features = encode_views(seen, Histories(dataset, config.memory, 1, 0), 1, FeatureFile(tmp_path, {}))
+    assert torch.equal(features[0], dataset.states())

@@ -149,7 +149,7 @@ def test_a_policy_that_diverges_before_an_evaluation_is_marked_and_not_kept(enco
     config = smoke_finetune(
         encoder, data, tmp_path / "out", updates=20, eval_every=10, log_every=20, batch_size=4, learning_rate=1e9
     )
-    with pytest.raises(FloatingPointError, match="the policy's weights are not finite after update 10"):
+    with pytest.raises(FloatingPointError, match="weights are not finite after step 10"):
         run_finetune(config)
     assert json.loads((config.out / "diverged.json").read_text())["step"] == 10
     assert not (config.out / "policy").exists()

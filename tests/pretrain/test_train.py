@@ -1,8 +1,10 @@
 """Pretraining: cut anywhere and started again, it ends in the files of an uninterrupted run."""
 
 import json
+import math
 
 import pytest
+import torch
 
 from pretrain.objectives import METHODS
 from pretrain.train import check_config
@@ -111,3 +113,19 @@ def test_a_patch_that_the_film_of_a_state_cannot_hold_is_refused_first(tmp_path)
         check(method="state", patch_size=85)
     with pytest.raises(UserError, match="--patch-count is 1001; it must be at least 1 and at most 1000"):
         check(patch_count=1001)
+
+
+def test_an_encoder_that_its_last_step_ruins_is_marked_and_not_kept(data, tmp_path, monkeypatch):
+    config = smoke_pretrain(data, tmp_path / "out", steps=2)
+
+    def ruin(objective):
+        ruin.steps += 1
+        if ruin.steps == config.steps:
+            torch.nn.init.constant_(next(objective.parameters()), math.inf)
+
+    ruin.steps = 0
+    monkeypatch.setattr("vd4rl_pomdp.objective.Objective.after_step", ruin)
+    with pytest.raises(FloatingPointError, match="out: weights are not finite after step 2"):
+        run_pretrain(config)
+    assert json.loads((config.out / "diverged.json").read_text())["step"] == 2
+    assert not (config.out / "encoder").exists()

@@ -49,7 +49,7 @@ def test_every_claim_is_a_difference_of_means_with_its_error(tmp_path):
     }
     assert rows[ACTIONS]["difference"] == pytest.approx(200)
     assert rows[ACTIONS]["error"] == pytest.approx((800 / 2 + 200 / 2) ** 0.5)
-    assert [row["verdict"] for row in rows.values()] == ["holds"] * 5 + ["", ""]
+    assert [row["verdict"] for row in rows.values()] == ["holds"] * 4 + ["not refuted", "", ""]
 
 
 @pytest.mark.parametrize(
@@ -65,7 +65,8 @@ def test_every_claim_is_a_difference_of_means_with_its_error(tmp_path):
         ({("driml", "patch"): (80, 82), ("fj+a", "patch"): (90,)}, FIRST, "does not hold"),
         ({("driml", "patch"): (50, 58), ("fj+a", "patch"): (40, 42)}, FIRST, "not told apart"),
         ({("mik+a", "none"): (50, 52)}, CLEAN, "does not hold"),
-        ({("mik+a", "none"): (50, 70)}, CLEAN, "holds"),
+        ({("mik+a", "none"): (50, 70)}, CLEAN, "not refuted"),
+        ({("mik+a", "none"): (80, 82)}, CLEAN, "holds"),
         ({("acro", "none"): (60,)}, CLEAN, "too few seeds"),
     ],
 )

@@ -14,7 +14,8 @@ from tests.helpers_report import describe, grid, pretraining, write_run
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.reference import Reference
-from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.report import write, write_report
+from vd4rl_pomdp.results import add_results
 from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import write_json
 
@@ -222,7 +223,7 @@ def test_a_report_of_unfinished_runs_alone_says_so(tmp_path):
     assert "0 finished runs, 1 unfinished" in page.read_text()
 
 
-def test_a_report_writes_over_nothing_but_an_earlier_report(tmp_path, capsys):
+def test_a_report_writes_over_nothing_but_an_earlier_report(tmp_path, capsys, monkeypatch):
     for seed in (0, 1):
         write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [25.0]})
     write_run(tmp_path / "runs/random", "random", 0, {10: [1.0]})
@@ -239,6 +240,16 @@ def test_a_report_writes_over_nothing_but_an_earlier_report(tmp_path, capsys):
     first = {p.name for p in (tmp_path / "out").iterdir()}
     with pytest.raises(UserError, match="the results of 2 runs that would be lost"):
         write_report([tmp_path / "runs" / "0"], tmp_path / "out")
+    draw, late = write._plots, write_run(tmp_path / "late", "acro", 7, {10: [25.0]})
+
+    def add_meanwhile(*told):
+        add_results([late], tmp_path / "out")
+        return draw(*told)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(write, "_plots", add_meanwhile)
+        with pytest.raises(UserError, match="the results of 1 runs that would be lost"):
+            write_report([tmp_path / "out"], tmp_path / "out")
     for name in ("runs.jsonl", "episodes.csv"):
         (tmp_path / "out" / name).unlink()
     write_report([tmp_path / "runs" / "0"], tmp_path / "out")

@@ -82,3 +82,14 @@ def test_a_damaged_table_of_episodes_is_named_and_kept(tmp_path, cell):
         with pytest.raises(UserError, match=r"episodes\.csv: (a row is not whole|the score of seed 1)"):
             read()
     assert path.read_bytes() == before
+
+
+def test_a_row_that_a_full_disk_cut_is_not_read_and_nothing_is_glued_to_it(tmp_path):
+    path = tmp_path / "episodes.csv"
+    path.write_text(EARLIER)
+    row = read_episodes(path)[0]
+    path.write_text(EARLIER[:-2])
+    for use in (read_episodes, lambda path: append_episodes(path, [row])):
+        with pytest.raises(UserError, match=r"a row is not whole \(the last line has no end\); remove it"):
+            use(path)
+    assert path.read_text() == EARLIER[:-2]

@@ -1,7 +1,9 @@
+import os
+
 import pytest
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.runs.files import read_csv, write_csv
+from vd4rl_pomdp.runs.files import appending, read_csv, write_csv
 
 COLUMNS = ("name", "value")
 
@@ -26,3 +28,11 @@ def test_another_table_or_a_damaged_one_is_a_sentence(text, message, tmp_path):
     (tmp_path / "table.csv").write_text(text)
     with pytest.raises(UserError, match=message):
         read_csv(tmp_path / "table.csv", COLUMNS, ("name",))
+
+
+def test_appended_lines_are_on_the_disk_when_the_block_ends(tmp_path, monkeypatch):
+    path, synchronised = tmp_path / "rows", []
+    monkeypatch.setattr("os.fsync", lambda handle: synchronised.append((os.fstat(handle).st_ino, path.read_text())))
+    with appending(path) as file:
+        file.write("one\n")
+    assert synchronised == [(path.stat().st_ino, "one\n")]

@@ -1,13 +1,15 @@
 """Plans and attempts on the disk."""
 
+import os
 from pathlib import Path
 
 import pytest
 
 from tests.helpers_sweeps import job
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.errors import DiskFullError, UserError
 from vd4rl_pomdp.runs import files
-from vd4rl_pomdp.sweeps.folder import SweepFolder
+from vd4rl_pomdp.sweeps.folder import SweepFolder, plan_name
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.work import CAUSES, DONE, FAILED, Work, code_of, ended, told_seconds
 
@@ -105,3 +107,32 @@ def test_other_codes_are_kills_and_defects(tmp_path, code, cause):
 @pytest.mark.parametrize(("seconds", "text"), [(42, "42 s"), (99.6, "100 s"), (600, "10 min"), (12240, "3.4 h")])
 def test_times_are_told_as_one_reads_them(seconds, text):
     assert told_seconds(seconds) == text
+
+
+def test_the_row_after_one_that_a_full_disk_cut_is_whole(tmp_path, monkeypatch):
+    folder, write = SweepFolder(tmp_path), os.write
+    folder.add({"job": "a", "cause": FAILED})
+    with monkeypatch.context() as patch:
+        patch.setattr(os, "write", lambda handle, line: write(handle, line[:9]))
+        with pytest.raises(DiskFullError):
+            folder.add({"job": "a", "cause": FAILED})
+    folder.forget("a")
+    folder.add({"job": "b", "cause": DONE})
+    assert folder.attempts() == {"b": [{"job": "b", "cause": DONE}]}
+
+
+def test_a_part_of_a_grid_has_a_plan_of_its_own(tmp_path, monkeypatch):
+    """So that two machines may share a grid by `--only`, and each sees what all of them do."""
+    (tmp_path / "grid.toml").write_text(
+        'preset = "smoke"\nseed = [0, 1]\n[collect]\ntask = "walker_walk"\nquality = "expert"\n'
+        '[pretrain]\nmethod = "acro"\n'
+    )
+    monkeypatch.setattr("vd4rl_pomdp.cli.sweeps._carry_out", lambda *told: None)
+    run = ["sweep", "run", str(tmp_path / "grid.toml"), "--out", str(tmp_path / "out")]
+    for only in ("seed=0", "seed=1", "seed=1"):
+        main([*run, "--only", only])
+    names = {job.name for job in SweepFolder(tmp_path / "out").jobs()}
+    assert {name.split("/")[-1 if name.startswith("data/") else -2] for name in names} == {"expert", "seed0", "seed1"}
+    assert len(list((tmp_path / "out" / "sweep" / "plans").iterdir())) == 2
+    assert plan_name("grid", []) == "grid"
+    assert plan_name("grid", ["b=1", "a=0"]) == plan_name("grid", ["a=0", "b=1"]) != plan_name("grid", ["a=0"])

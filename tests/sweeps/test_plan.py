@@ -206,6 +206,32 @@ def test_an_encoder_whose_row_was_kept_is_made_again_for_a_new_policy(copy, tmp_
     assert len(left(jobs)) == 9
 
 
+@pytest.mark.parametrize("turned", [False, True])
+def test_an_encoder_that_is_asked_for_and_needed_is_made_whatever_the_order_of_blocks(copy, tmp_path, turned):
+    blocks = ["[[block]]\n", "[[block]]\nfinetune = { updates = 7 }\n"]
+    head = GRID.partition("[finetune]")[0] + 'method = "acro"\n'
+    (copy / "grid.toml").write_text(head + "".join(blocks[::-1] if turned else blocks))
+    new = tmp_path / "new"
+    shutil.copytree(copy / "data", new / "data")
+    shutil.copy(copy / "grid.toml", new)
+
+    def stages(kept):
+        found = plan(new, kept=FoundRuns(runs_kept([kept])) if kept else None)
+        return {job.section for job in found if not job.finished}
+
+    pretrained = [
+        path.parent for path in copy.rglob("pretrain/config.json") if read_json(path)["config"]["method"] == "acro"
+    ]
+    main(["results", "add", *map(str, pretrained), "--out", str(tmp_path / "encoders")])
+    assert stages(None) == stages(tmp_path / "encoders") == {"pretrain", "finetune"}, "a row is no encoder"
+    (job,) = (job for job in plan(copy) if job.section == "finetune")
+    main(list(job.words))
+    main(["results", "add", str(job.folder), "--out", str(tmp_path / "policies")])
+    assert stages(tmp_path / "policies") == {"pretrain"}, "it was asked for"
+    main(["results", "add", *map(str, pretrained), "--out", str(tmp_path / "policies")])
+    assert stages(tmp_path / "policies") == set()
+
+
 def tell_collection(folder: Path) -> None:
     """Write into every run how its set was collected."""
     for config in folder.rglob("config.json"):

@@ -49,6 +49,17 @@ def test_states_come_from_folders_owners_and_attempts(jobs):
     assert found.seconds_left is None
 
 
+def test_what_needs_a_failed_job_is_blocked_and_is_no_time_left(jobs, tmp_path):
+    after = [job(tmp_path, "policy", "broken"), job(tmp_path, "table", "policy"), job(tmp_path, "other", "waiting")]
+    found = status([*jobs, *after], attempts(), Estimates([]))
+    assert [found.states[name] for name in ("policy", "table", "other")] == ["blocked", "blocked", "waiting"]
+    assert set(found.failures) == {"broken", "nan"}
+    finish(tmp_path / "waiting")
+    finish(tmp_path / "running")
+    finish(tmp_path / "other")
+    assert status([*jobs, *after], attempts(), Estimates([])).seconds_left == 0.0
+
+
 @pytest.mark.parametrize(
     ("slots", "state"),
     [({"slots": 1, "largest": 2}, "waiting"), ({"slots": 2, "largest": 2}, "failed"), ({}, "failed")],

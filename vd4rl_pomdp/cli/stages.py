@@ -58,10 +58,10 @@ def _evaluate(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.runs.outputs import refuse_inside
 
     command = parse(EvaluateCommand, words, program)
+    refuse_number("parts", command.parts, 1)
     if command.out is not None:
         refuse_inside(command.out)
         begin_episodes(command.out)  # before any episode is played
-    refuse_number("parts", command.parts, 1)
     played = evaluate_run(command.run, command.corruption, command.episodes, command.workers)
     rows = played.rows
     if command.out is not None:

@@ -69,7 +69,7 @@ class RunCommand(_ExecutorConfig):
 def _run(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.errors import refuse_no_folder
     from vd4rl_pomdp.runs.outputs import refuse_kept
-    from vd4rl_pomdp.sweeps.folder import SweepFolder
+    from vd4rl_pomdp.sweeps.folder import SweepFolder, plan_name
     from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
     from vd4rl_pomdp.sweeps.grid import narrow
     from vd4rl_pomdp.sweeps.grid_file import load_grid
@@ -83,7 +83,8 @@ def _run(words: Arguments, program: str) -> None:
     refuse_kept(command.out)
     here, kept = FoundRuns(runs_below(command.out)), FoundRuns(runs_kept(command.done))
     folder = SweepFolder(command.out)
-    planner = JobPlanner(command.out, command.data, kept, here, folder.jobs_of_others(grid.name))
+    plan = plan_name(grid.name, [*command.only, *command.change, *["testing"] * command.testing])
+    planner = JobPlanner(command.out, command.data, kept, here, folder.jobs_of_others(plan))
     jobs = planner.plan(cells)
     refuse_unknown_to_jobs(jobs)
     for name, number in planner.of_other_content.items():
@@ -92,7 +93,7 @@ def _run(words: Arguments, program: str) -> None:
     if command.dry_run:
         _print_plan(jobs, [*here.runs, *kept.runs])
         return
-    folder.keep_plan(grid.name, jobs)
+    folder.keep_plan(plan, jobs)
     _carry_out(jobs, command, folder)
 
 

@@ -101,8 +101,8 @@ def _replay_error(dataset: Dataset, replay: ReplayFn | None) -> float:
                     f"{dataset.path}: the episode of row {start} cannot be replayed in {dataset.task} "
                     f"({first_line(error)}); put the set in a folder called like its task, or collect it again"
                 ) from error
-            worst = max(worst, float(np.abs(replayed - reward[start + 1 : end]).max()))
-    return worst
+            worst = np.maximum(worst, np.abs(replayed - reward[start + 1 : end]).max())  # passes NaN on
+    return float(worst)
 
 
 def _maze_error(dataset: Dataset, attributes: dict[str, Any]) -> float:
@@ -115,8 +115,8 @@ def _maze_error(dataset: Dataset, attributes: dict[str, Any]) -> float:
         replayed = replay_states(
             attributes["task"], states[start], action[start + 1 : end], attributes["action_repeat"]
         )
-        worst = max(worst, float(np.abs(replayed - states[start + 1 : end]).max(initial=0.0)))
-    return worst
+        worst = np.maximum(worst, np.abs(replayed - states[start + 1 : end]).max(initial=0.0))  # passes NaN on
+    return float(worst)
 
 
 def _dtypes(shards: list[Path]) -> dict[str, list[str]]:

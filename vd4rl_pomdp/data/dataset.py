@@ -202,9 +202,10 @@ class Dataset:
             observations: what makes observations of (B,) rows, in place of `stacks`.
 
         Returns:
-            `Transitions`. With m = min(n_step, steps left), `reward` is the sum of gamma^i r_{t+i} for i < m and
-            `discount` the product of the m stored discounts times gamma^(m-1). The learner multiplies its own gamma
-            once more (acme's convention), also where m is cut short, so that for n_step = 1 both are as stored.
+            `Transitions`. With m = min(n_step, steps left) and d_i the product of the first i stored discounts,
+            `reward` is the sum of gamma^i d_i r_{t+i} for i < m, and `discount` is gamma^(m-1) d_m. The learner
+            multiplies its own gamma once more (acme's convention), also where m is cut short: for n_step = 1 both are
+            as stored.
 
         Raises:
             IndexError: an index is out of range.
@@ -232,9 +233,10 @@ class Dataset:
         step = torch.arange(n_step, device=rows.device)
         inside = rows[:, None] + step < last[:, None]
         paid = torch.minimum(rows[:, None] + step + 1, last[:, None])
-        reward = (self.reward[paid] * gamma**step * inside).sum(1)
-        product = torch.where(inside, self.discount[paid], 1.0).prod(1)
-        return reward, product * gamma ** (inside.sum(1) - 1).clamp(min=0), torch.minimum(rows + n_step, last)
+        discount = torch.where(inside, self.discount[paid], 1.0).cumprod(1)
+        before = torch.cat([torch.ones_like(discount[:, :1]), discount[:, :-1]], 1)
+        reward = (self.reward[paid] * before * gamma**step * inside).sum(1)
+        return reward, discount[:, -1] * gamma ** (inside.sum(1) - 1).clamp(min=0), torch.minimum(rows + n_step, last)
 
     def num_windows(self, length: int) -> int:
         """Number of windows of `length` consecutive rows of one episode; raises UserError as `windows` does."""

@@ -89,7 +89,9 @@ class _Record:
 
     def __init__(self, out: Path) -> None:
         self._path, self._parts_path = out / RECORD, out / ".parts.json"
-        self._parts: dict[str, list[float]] = read_json(self._parts_path) if self._parts_path.exists() else {}
+        self._told = read_json(self._path).get("parts", {}) if self._path.exists() else {}
+        added = read_json(self._parts_path) if self._parts_path.exists() else {}
+        self._parts: dict[str, list[float]] = self._told | added
 
     def note(self, shard: Path, seconds: float, frames: int) -> None:
         """Remember a shard's part, just before it is written, until the set is whole."""
@@ -98,12 +100,13 @@ class _Record:
 
     def write(self, workers: int, task: str) -> None:
         """Write the set's record, unless it has one and nothing was added."""
-        if not self._parts and self._path.exists():
+        if self._path.exists() and self._parts == self._told:
             return
         from vd4rl_pomdp.data.parity import render_info
 
         seconds, frames = (sum(part[i] for part in self._parts.values()) for i in (0, 1))
-        facts = {"seconds": round(seconds, 1), "frames": int(frames), "workers": count_workers(workers)}
+        facts: dict[str, Any] = {"seconds": round(seconds, 1), "frames": int(frames)}
+        facts |= {"workers": count_workers(workers), "parts": self._parts}
         origin = {"command": command(), "git_commit": git_commit(), "versions": versions()}
         write_json(self._path, facts | origin | {"render": render_info(task)})
         self._parts_path.unlink(missing_ok=True)

@@ -90,11 +90,11 @@ class View:
         kept = corruption.kept(keys, stack)
         chosen = self.dataset.stack_rows(rows, stack).view(-1, stack).gather(1, kept)
         images = _shift.BUFFERS.take((chosen.numel() + 1, *frames.shape[1:]))
-        offset = _shift.draw_offset(shift_key, self._pad).repeat_interleave(chosen.numel() // len(shift_key), 0)
+        offset = _shift.draw_offset(shift_key, self._pad).repeat_interleave(chosen.numel() // max(1, len(shift_key)), 0)
         _shift.shift_by_lines(frames, chosen.flatten(), offset, images[:-1])
         corruption.change_(images[:-1].view(*chosen.shape, *images.shape[1:]), keys, kept)
         obs = images[:-1] if kept.shape[1] == stack else _spread(images, kept, stack)
-        return obs.view(*rows.shape, -1, *images.shape[2:])
+        return obs.view(*rows.shape, stack * images.shape[1], *images.shape[2:])
 
 
 def _spread(images: Tensor, kept: Tensor, stack: int) -> Tensor:

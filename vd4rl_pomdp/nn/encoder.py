@@ -52,7 +52,7 @@ class StreamState(NamedTuple):
     """What an encoder remembers between rows."""
 
     hidden: Tensor
-    """(layers, B, H); empty for memoryless encoders and under a history window."""
+    """(layers, B, H); empty for memoryless encoders, and not read under a history window."""
     rows: Tensor
     """(B, L', F + A): the GRU's last inputs under a history window, else empty."""
 

@@ -28,6 +28,8 @@ from vd4rl_pomdp.report.tables import END_TO_END, REFERENCES, grouped, label
 from vd4rl_pomdp.runs.files import Row
 
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "not told apart", "too few seeds"
+NOT_REFUTED = "not refuted"
+"""What becomes of a claim that one side is not below the other, where the two are not told apart."""
 DISTANCE = "distance"
 """The kind of what is no claim."""
 
@@ -52,7 +54,7 @@ class ReturnClaim(NamedTuple):
     hidden: bool = True
     """Whether it is about settings that hide something, or about those that hide nothing."""
     kind: str = "above"
-    """above; not below, which the left side's missing advantage does not refute; distance, which is no claim."""
+    """above; not below, which is refuted where the left side is below; distance, which is no claim."""
 
 
 CLAIMS = (
@@ -168,5 +170,6 @@ def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
         return FEW
     if _is_below(row["difference"], row["error"]):
         return FAILS
-    told = row["difference"] > STANDARD_ERRORS * row["error"]
-    return HOLDS if row["kind"] == "not below" or told else OPEN
+    if row["difference"] > STANDARD_ERRORS * row["error"]:
+        return HOLDS
+    return NOT_REFUTED if row["kind"] == "not below" else OPEN

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import chain
 from math import cos, hypot, pi, sin
 from pathlib import Path
 from typing import Any
@@ -37,7 +36,7 @@ def write_theory(study: Study, out: Path) -> Path:
 
 def load_section(paths: list[Path]) -> str | None:
     """The section about the study that `write_theory` left at or below some paths, if there is one."""
-    files = sorted(set(chain.from_iterable(path.rglob(FILE) for path in paths)))
+    files = sorted({file.resolve(): file for path in paths for file in path.rglob(FILE)}.values())
     if len(files) > 1:
         raise UserError(f"{files[0]} and {files[1]}: two studies of the theory; report one of them")
     for file in files:

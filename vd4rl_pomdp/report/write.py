@@ -28,6 +28,7 @@ from vd4rl_pomdp.report.theory import load_section
 from vd4rl_pomdp.results import RUNS, refuse_loss, write_results
 from vd4rl_pomdp.runs.files import Row, write_bytes, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
+from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.text import write_text
 
 _MARK = "summary"
@@ -59,19 +60,22 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
     """
     refuse_foreign(out, "report", f"{_MARK}.csv", RUNS)
     runs = load_runs(paths, out, choice)
-    refuse_loss([run.result for run in runs], out)
+    results = [run.result for run in runs]
+    refuse_loss(results, out)
     if not any(run.rows for run in runs):
         raise UserError(f"{paths[0]}: holds no evaluated run yet; `vd4rl-pomdp finetune` evaluates")
     made = _tables(runs, choice)
     shown = _shown(made)
     plots = _plots(runs, made)
     page = _render(runs, made, shown, plots, load_section(paths))
-    with disk_errors(out):
-        (out / FIGURES).mkdir(parents=True, exist_ok=True)
-    _write_tables(out, made, shown)
-    _write_plots(out / FIGURES, plots)
-    write_results(out, [run.result for run in runs])
-    write_text(out / "index.html", page)
+    with owned(out):
+        refuse_loss(results, out)  # of runs that were added while this was drawn
+        with disk_errors(out):
+            (out / FIGURES).mkdir(exist_ok=True)
+        _write_tables(out, made, shown)
+        _write_plots(out / FIGURES, plots)
+        write_results(out, results)
+        write_text(out / "index.html", page)
     return Report(out / "index.html", made[_MARK], made["gates"], made["claims"])
 
 

@@ -69,8 +69,11 @@ def read_episodes(path: Path) -> list[dict[str, Any]]:
     """
     if not regular(path).is_file() or path.stat().st_size == 0:
         return []
-    with _whole(path), path.open(newline="", encoding="utf-8") as file:
-        return _parse(path, file)
+    with _whole(path):
+        text = path.read_bytes().decode()
+        if not text.endswith("\n"):
+            raise ValueError("the last line has no end")
+        return _parse(path, io.StringIO(text, newline=""))
 
 
 def check_episodes(path: Path) -> None:

@@ -128,9 +128,15 @@ def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
 
 @contextmanager
 def appending(path: Path) -> Iterator[Any]:
-    """A text file to append lines to; raises UserError if the system refuses."""
+    """A text file to append lines to, which are on the disk when the block ends: a checkpoint may tell of them.
+
+    Raises:
+        UserError: the system refuses.
+    """
     with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
         yield file
+        file.flush()
+        os.fsync(file.fileno())
 
 
 def synchronise(path: Path) -> None:

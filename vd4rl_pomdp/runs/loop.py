@@ -6,7 +6,7 @@ from collections.abc import Iterator, Mapping
 from contextlib import closing, contextmanager
 from typing import Any, Protocol
 
-from torch import Tensor
+from torch import Tensor, nn
 
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.checkpoint import State
@@ -58,6 +58,11 @@ class Loop:
     def log_evaluation(self, row: dict[str, float]) -> None:
         """Write what an evaluation after the step just done gave, by names that begin with `metrics.EVALUATION`."""
         self._log.write(self._learner.step, row)
+
+    def require_finite(self, module: nn.Module) -> None:
+        """Raise FloatingPointError if a weight is not finite: what the last step did stands in no row of metrics."""
+        if not all(weights.isfinite().all() for weights in module.parameters()):
+            raise FloatingPointError(f"{self._run.path}: weights are not finite after step {self._learner.step}")
 
     def require_owner(self) -> None:
         """Raise an error if another process has taken the run over."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import socket
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from vd4rl_pomdp.errors import DiskFullError, InUseError, OutOfMemoryError, UserError, disk_errors
@@ -71,6 +71,15 @@ def given_up(rows: list[Row]) -> str:
     return last["cause"] if hopeless or alike > RETRIES.get(last["cause"], Retry(0)).times else ""
 
 
+def lost_among(jobs: Iterable[Job], rows: Mapping[str, list[Row]]) -> set[str]:
+    """Of unfinished jobs, each after those it needs, the names of those given up, and of those that need such a one."""
+    lost: set[str] = set()
+    for job in jobs:
+        if given_up(rows[job.name]) or not lost.isdisjoint(job.needs):
+            lost.add(job.name)
+    return lost
+
+
 class Driver:
     """One process's part in a sweep."""
 
@@ -84,9 +93,8 @@ class Driver:
         self._running: dict[str, tuple[float, int, int]] = {}
         """When each began, its slots, and the most it could have had."""
         self._not_before: dict[str, float] = {}
-        self._lost: set[str] = set()
-        """What is left and will stay so: jobs that were given up, and those that need them."""
-        self._give_up()
+        self._lost = lost_among(self._left.values(), self._rows)
+        """What is left and will stay so."""
 
     def run(self) -> bool:
         """Work until nothing is left that can be done; whether all is finished."""
@@ -132,12 +140,6 @@ class Driver:
             self._not_before[job.name] = time.monotonic() + RETRIES[InUseError.cause].wait_s
         return busy
 
-    def _give_up(self) -> None:
-        """Find out which jobs are lost."""
-        for job in self._left.values():  # a job comes after those it needs
-            if given_up(self._rows[job.name]) or not self._lost.isdisjoint(job.needs):
-                self._lost.add(job.name)
-
     def _slots(self, job: Job) -> int:
         """One, or twice as many as when the memory last did not suffice."""
         short = [row["slots"] for row in self._rows[job.name] if row["cause"] == OutOfMemoryError.cause]
@@ -159,7 +161,7 @@ class Driver:
             del self._left[ended.name]
         else:
             self._not_before[ended.name] = time.monotonic() + RETRIES[ended.cause].wait_s
-            self._give_up()
+            self._lost = lost_among(self._left.values(), self._rows)
         self._say(ended, seconds)
 
     def _note(self, ended: Ended, seconds: float, slots: int, largest: int) -> None:

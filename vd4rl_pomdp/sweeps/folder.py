@@ -1,7 +1,7 @@
 """What a sweep keeps beside its runs: its plans, one row for every attempt at a job, and what the jobs printed.
 
     OUT/sweep/plans/GRID.json    from (the working directory), out, and the jobs of a grid: name, stage, folder,
-                                 command, needs
+                                 command, needs; GRID~*.json those of a part of it, or of it with other settings
     OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, step, slots, largest
                                  (the most slots it could have had), host, words (of its command)
     OUT/sweep/logs/JOB.log
@@ -13,6 +13,8 @@ own folder says it.
 
 from __future__ import annotations
 
+import errno
+import hashlib
 import json
 import os
 from collections.abc import Iterable
@@ -32,6 +34,12 @@ RETRIED = "retried"
 """Cause of a row that says: forget this job's failures."""
 
 
+def plan_name(grid: str, words: Iterable[str]) -> str:
+    """What the plan of a grid is called, given the words that narrow or change it: each such command has its own."""
+    told = sorted(words)
+    return f"{grid}~{hashlib.blake2b(json.dumps(told).encode(), digest_size=4).hexdigest()}" if told else grid
+
+
 class SweepFolder:
     """The files of a sweep below its folder."""
 
@@ -42,21 +50,21 @@ class SweepFolder:
         """Where they lie."""
         self._attempts = self.path / "attempts.jsonl"
 
-    def keep_plan(self, grid: str, jobs: Iterable[Job]) -> None:
-        """Write the jobs of a grid, in place of what was written of it before; other drivers may do so at once."""
+    def keep_plan(self, name: str, jobs: Iterable[Job]) -> None:
+        """Write the jobs of a plan, in place of what was written of it before; other drivers may do so at once."""
         with disk_errors(self.path):
             (self.path / "plans").mkdir(parents=True, exist_ok=True)
         plan = {"from": str(Path.cwd()), "out": str(self.out), "jobs": [jsonable(asdict(job)) for job in jobs]}
-        write_json(self.path / "plans" / f"{grid}.json", plan, shared=True)
+        write_json(self.path / "plans" / f"{name}.json", plan, shared=True)
 
     def jobs(self) -> list[Job]:
         """The jobs of all plans, their folders as seen from here; UserError if there is none."""
         jobs = [replace(job, folder=plan.place(job.folder, self.out)) for plan in self._plans() for job in plan.jobs]
         return list({job.name: job for job in jobs}.values())
 
-    def jobs_of_others(self, grid: str) -> list[Job]:
-        """The jobs of all plans but that of a grid, as they were written."""
-        return [job for path in self._plan_files() if path.stem != grid for job in _read_plan(path).jobs]
+    def jobs_of_others(self, name: str) -> list[Job]:
+        """The jobs of all plans but one, as they were written."""
+        return [job for path in self._plan_files() if path.stem != name for job in _read_plan(path).jobs]
 
     def refuse_elsewhere(self) -> None:
         """Raise UserError if the commands of a plan name other folders here than where it was made."""
@@ -86,12 +94,16 @@ class SweepFolder:
 
     def add(self, row: Row) -> None:
         """Append the row of an attempt."""
-        line = json.dumps(row) + "\n"
+        line = (json.dumps(row) + "\n").encode()
         with disk_errors(self._attempts):
             self.path.mkdir(parents=True, exist_ok=True)
-            handle = os.open(self._attempts, os.O_WRONLY | os.O_APPEND | os.O_CREAT, 0o666)
+            handle = os.open(self._attempts, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
             try:
-                os.write(handle, line.encode())
+                end = os.lseek(handle, 0, os.SEEK_END)
+                if end and os.pread(handle, 1, end - 1) != b"\n":  # a full disk cut the row before
+                    line = b"\n" + line
+                if os.write(handle, line) < len(line):
+                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             finally:
                 os.close(handle)
 

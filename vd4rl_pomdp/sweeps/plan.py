@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from itertools import chain, count
 from pathlib import Path
 from typing import Any
@@ -76,6 +76,8 @@ class JobPlanner:
         self._jobs: dict[tuple[str, str, str], Job] = {}
         self._sets: dict[str, DataSet] = {}
         self._taken: set[str] = set()
+        self._asked: set[str] = set()
+        """Names of the jobs that are the last of a cell."""
         self._of_others = {job.name: job.recipe for job in others}
         self.of_other_content: Counter[str] = Counter()
         """Kept runs that do not count, by set: theirs was collected alike, and its content is another."""
@@ -89,7 +91,7 @@ class JobPlanner:
         for cell in cells:
             check_cell(cell)
             self._add(cell)
-        return _needed(list(self._jobs.values()))
+        return self._needed()
 
     def _add(self, cell: GridCell) -> None:
         data = self._set(cell)
@@ -98,6 +100,7 @@ class JobPlanner:
         for section in cell.chain[1:]:
             values |= recorded(cell, section)
             before.append(self._training(cell, section, data, values, before))
+        self._ask(before[-1], data)
 
     def _set(self, cell: GridCell) -> DataSet:
         found = set_of(cell, self._data)
@@ -120,10 +123,7 @@ class JobPlanner:
         key = (section, recipe, data.name)
         if key in self._jobs:
             return self._jobs[key]
-        run, last = self._here.of(recipe, data), section == cell.chain[-1]
-        kept = self._kept.of(recipe, data) if last else None  # a kept row is no encoder to train on
-        if last and kept is None and self._kept.alike(recipe, data):
-            self.of_other_content[data.name] += 1
+        run = self._here.of(recipe, data)
         if run is not None:
             name = run.folder.relative_to(self._out).as_posix()
         else:
@@ -132,10 +132,34 @@ class JobPlanner:
         folder = self._out / name
         places = {"data": data.folder} | ({"encoder": before[-1].folder / "encoder"} if section == "finetune" else {})
         words = (*COMMANDS[section], *words_of(told(cell, section) | places | {"out": folder}))
-        done = kept is not None and kept.seconds is not None
         needs = tuple(job.name for job in before)
-        self._jobs[key] = Job(name, section, folder, words, needs, done, cost_of(values), recipe)
+        self._jobs[key] = Job(name, section, folder, words, needs, settings=cost_of(values), recipe=recipe)
         return self._jobs[key]
+
+    def _ask(self, job: Job, data: DataSet) -> None:
+        """Want a job for itself, not for those that need it; a kept row is as good."""
+        if job.name in self._asked:
+            return
+        self._asked.add(job.name)
+        kept = self._kept.of(job.recipe, data)
+        if kept is None and self._kept.alike(job.recipe, data):
+            self.of_other_content[data.name] += 1
+        if kept is not None and kept.seconds is not None:
+            self._jobs[job.section, job.recipe, data.name] = replace(job, done=True)
+
+    def _needed(self) -> list[Job]:
+        """The finished jobs, those that were asked for, and those that an unfinished one needs."""
+        found: list[Job] = []
+        needed: set[str] = set()
+        for job in reversed(self._jobs.values()):
+            if job.name in needed and job.section in STAGES:
+                job = replace(job, done=False)  # a kept row is no encoder to train on
+            if not job.finished:
+                if job.name not in needed | self._asked:
+                    continue
+                needed |= set(job.needs)
+            found.append(job)
+        return found[::-1]
 
     def _free(self, name: str, recipe: str) -> str:
         """A name that no other run has, be it in the plan, in another grid's, or from an earlier sweep."""
@@ -150,14 +174,3 @@ class JobPlanner:
 def cost_of(values: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
     """Settings that a job's cost depends on, in order, their values as words."""
     return tuple(sorted((name, str(value)) for name, value in settings_of(values).items()))
-
-
-def _needed(jobs: list[Job]) -> list[Job]:
-    """The finished jobs, and those that are the last of a cell or that an unfinished one needs."""
-    inner = {name for job in jobs for name in job.needs}
-    finished = {job.name for job in jobs if job.finished}
-    wanted: set[str] = set()
-    for job in reversed(jobs):
-        if job.name not in finished and (job.name not in inner or job.name in wanted):
-            wanted |= {job.name, *job.needs}
-    return [job for job in jobs if job.name in finished | wanted]

@@ -8,12 +8,12 @@ from dataclasses import dataclass
 
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.ownership import in_use
-from vd4rl_pomdp.sweeps.driver import attempts_at, given_up
+from vd4rl_pomdp.sweeps.driver import attempts_at, given_up, lost_among
 from vd4rl_pomdp.sweeps.estimate import Estimates
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.work import DIVERGED, DONE, told_seconds
 
-RUNNING, WAITING, FAILED = "running", "waiting", "failed"
+RUNNING, WAITING, BLOCKED, FAILED = "running", "waiting", "blocked", "failed"
 RATE_S = 3600.0
 """A rate is that of the jobs that ended within so many seconds."""
 
@@ -23,7 +23,7 @@ class Status:
     """What `sweep status` shows."""
 
     states: dict[str, str]
-    """done, running, waiting, failed or diverged, by job."""
+    """done, running, waiting, blocked (by a failure before it), failed or diverged, by job."""
     per_hour: float
     """Jobs that ended in the last hour, or since the sweep began if that is less, as a rate."""
     seconds_left: float | None
@@ -50,12 +50,11 @@ def status(jobs: list[Job], attempts: dict[str, list[Row]], estimates: Estimates
         attempts: rows of their attempts by name.
         estimates: what jobs take.
     """
-    states, failures = {}, {}
-    for job in jobs:
-        rows = attempts_at(job, attempts)
-        states[job.name] = _state(job, rows)
-        if states[job.name] in (FAILED, DIVERGED):
-            failures[job.name] = rows[-1]
+    rows = {job.name: attempts_at(job, attempts) for job in jobs}
+    states = {job.name: _state(job, rows[job.name]) for job in jobs}
+    lost = lost_among((job for job in jobs if states[job.name] != DONE), rows)
+    states |= {name: BLOCKED for name in lost if states[name] == WAITING}
+    failures = {name: rows[name][-1] for name, state in states.items() if state in (FAILED, DIVERGED)}
     left = [job for job in jobs if states[job.name] in (RUNNING, WAITING)]
     seconds = [estimates.seconds(job) for job in left]
     known = [value for value in seconds if value is not None]

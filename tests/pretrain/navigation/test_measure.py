@@ -22,7 +22,7 @@ def trainer(maze_set: Path, tmp_path_factory, monkeypatch) -> NavigationTrainer:
 
 def shift_states(trainer: NavigationTrainer, held_out: bool) -> None:
     """Move the true states of the training or of the held-out rows."""
-    split = int(trainer.data.states.episode_start[trainer.data.first_held_out])
+    split = int(trainer.data.dataset.episode_start[trainer.data.first_held_out])
     trainer.data.states.values[slice(split, None) if held_out else slice(split)] += 3
 
 

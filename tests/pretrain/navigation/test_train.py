@@ -167,7 +167,7 @@ def test_windows_carry_the_states_of_their_rows(maze_set, tmp_path):
     trainer = trainer_of(smoke(maze_set, tmp_path / "run"))
     states, data = trainer.data.states, trainer.data
     window = data.windows(torch.tensor([0, 30, 130]))
-    raw = states.values[states.rows(window)] * states.std + states.mean
+    raw = states.values[data.dataset.rows(window.key)] * states.std + states.mean
     for b, key in enumerate(window.key[:, 0].tolist()):
         start = int(data.dataset.episode_start[key >> 20]) + (key & (1 << 20) - 1)
         np.testing.assert_allclose(raw[b], data.dataset.physics[start : start + 16], atol=1e-4)

@@ -1,5 +1,6 @@
 """What a task of a Slurm array does, without Slurm: a process that is given jobs as files, and signals."""
 
+import errno
 import os
 import signal
 import subprocess
@@ -8,7 +9,6 @@ import sys
 import pytest
 
 from tests.sweeps.executors.waiting import begun, until, waiting_job, work_of
-from vd4rl_pomdp.errors import DiskFullError
 from vd4rl_pomdp.sweeps.executors.allocation import Allocation
 from vd4rl_pomdp.sweeps.executors.handover import Handover
 from vd4rl_pomdp.sweeps.work import DONE, INTERRUPTED, KILLED, Ended, Work
@@ -113,7 +113,7 @@ def test_on_a_full_disk_an_end_is_told_later_and_once(tmp_path, monkeypatch):
     handed, task, executor = Handover(tmp_path), Allocation(tmp_path, 0, 4), FakeExecutor(DONE)
     attempt = handed.add(0, Work("job", ("list",), tmp_path / "log"))
     with monkeypatch.context() as patch:
-        patch.setattr(Handover, "end", lambda *told: (_ for _ in ()).throw(DiskFullError("full")))
+        patch.setattr(os, "mkdir", lambda *told, **more: (_ for _ in ()).throw(OSError(errno.ENOSPC, "full")))
         task._begin(executor, handed.left(0))
         task._tell(executor, handed)
     task._begin(executor, handed.left(0))

@@ -88,7 +88,7 @@ def test_a_cluster_without_room_for_a_job_is_refused(options):
 
 def test_without_ray_one_is_told_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
-    with pytest.raises(UserError, match=r"needs Ray: pip install 'vd4rl-pomdp\[ray\]'"):
+    with pytest.raises(UserError, match=r"needs Ray: pip install '\.\[ray\]' in a clone"):
         RayExecutor(RayOptions())
 
 

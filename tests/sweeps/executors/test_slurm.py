@@ -111,7 +111,7 @@ def test_what_is_stopped_ends_in_peace_and_what_is_cancelled_was_killed(out):
     run(executor, 0)
     executor.stop()
     assert queue() == []
-    assert {ended.name: ended.cause for ended in run(executor, 2)} == {"running": INTERRUPTED, "waiting": KILLED}
+    assert {ended.name: ended.cause for ended in run(executor, 2)} == {"running": INTERRUPTED, "waiting": INTERRUPTED}
     assert not begun(waiting)
 
 

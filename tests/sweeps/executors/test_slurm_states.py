@@ -135,6 +135,35 @@ def test_a_new_driver_takes_over_what_is_in_the_queue_but_no_other_command_of_th
     assert len(third._tasks[0].array.left(0)) == 2, "a task that is there is used"
 
 
+def test_what_was_stopped_while_it_waited_was_not_killed(fake, tmp_path, monkeypatch):
+    def cancel(jobs, *options):
+        if "--state=PENDING" in options:
+            fake.put("CANCELLED")
+
+    monkeypatch.setattr(module, "cancel", cancel)
+    made = executor(tmp_path)
+    made.start(work(tmp_path, "job"))
+    made.ended()
+    made.stop()
+    assert [ended.cause for ended in made.ended()] == [INTERRUPTED]
+
+
+def test_a_queue_that_does_not_answer_while_all_is_stopped_ends_no_patience(fake, tmp_path, monkeypatch):
+    told, answers = [], [None, None, None, "RUNNING", None, "COMPLETED"]
+
+    def read_queue():
+        answer = answers.pop(0) if answers else "COMPLETED"
+        return None if answer is None else {key: TaskState(answer, "7_0", "") for key in fake.queue}
+
+    made = executor(tmp_path)
+    made.start(work(tmp_path, "job"))
+    made.ended()
+    monkeypatch.setattr(module, "read_queue", read_queue)
+    monkeypatch.setattr(module, "cancel", lambda jobs, *options: told.append((jobs, *options)))
+    made.stop()
+    assert told == [(["7_0"], "--state=PENDING"), (["7_0"], "--signal=TERM"), ([],)]
+
+
 def test_what_a_task_may_wait_for_in_vain_is_told_once(fake, tmp_path, capsys):
     made = executor(tmp_path)
     made.start(work(tmp_path, "job"))
@@ -164,8 +193,8 @@ def test_options_become_what_submitit_takes():
 @pytest.mark.parametrize(
     ("executor", "missing", "told"),
     [
-        ("slurm", "submitit", "needs submitit: pip install 'vd4rl-pomdp[slurm]'"),
-        ("ray", "ray", "needs Ray: pip install 'vd4rl-pomdp[ray]'"),
+        ("slurm", "submitit", "needs submitit: pip install '.[slurm]' in a clone of vd4rl-pomdp"),
+        ("ray", "ray", "needs Ray: pip install '.[ray]' in a clone of vd4rl-pomdp"),
     ],
 )
 def test_a_missing_extra_is_one_line(tmp_path, monkeypatch, capsys, executor, missing, told):

@@ -33,6 +33,7 @@ from vd4rl_pomdp.navigation.measures import refitted_error
 from vd4rl_pomdp.navigation.methods import UNTRAINED
 from vd4rl_pomdp.results import RUNS, Result
 from vd4rl_pomdp.runs.outputs import refuse_foreign
+from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.text import code, code_block, markdown, write_text
 
 Samples = Callable[[], Mapping[str, np.ndarray]]
@@ -50,6 +51,11 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
     refuse_foreign(out, "navigation report", RUNS)
     found = find_navigation(sources, out)
     runs, unfinished = load_runs(found), [result for result in found if not result.finished]
+    with owned(out):
+        return _write(runs, unfinished, out, samples)
+
+
+def _write(runs: list[NavigationRun], unfinished: list[Result], out: Path, samples: Samples | None) -> Path:
     save_runs(runs, out)
     (out / "figures").mkdir(exist_ok=True)
     pictures = _draw(runs, out / "figures")
@@ -189,12 +195,14 @@ def _commands(runs: list[NavigationRun]) -> list[str]:
     lines = [
         "## Commands",
         "",
-        "Each line computes one run; `navigation collect` makes its data. Seconds are wall-clock.",
-        "`vd4rl-pomdp sweep run navigation --out runs/navigation --dry-run` prints those of every cell.",
+        "Each line computes one run, and says on which maze and in how many seconds (wall-clock); `navigation collect`",
+        "makes its data. Folders are as they were told: sets of two mazes may have lain under one name, on different",
+        "machines. The grids `navigation` (the paper's own mazes) and `first_person` print the lines of all cells:",
+        "`vd4rl-pomdp sweep run GRID --out runs --dry-run`.",
     ]
     commands = [line for members in _by_maze(runs).values() for line in sorted(set(map(_collect, members))) if line]
     for run in runs:
-        commands.append(f"{run.facts['command']}  # {float(run.facts['seconds']):.0f} s")
+        commands.append(f"{run.facts['command']}  # {run.condition.maze}, {float(run.facts['seconds']):.0f} s")
     return [*lines, "", *code_block(commands, "bash")]
 
 

@@ -45,9 +45,11 @@ class Handover:
         }
 
     def end(self, attempt: str, ended: Ended) -> None:
-        """Tell how an attempt ended."""
-        (self.folder / "ended").mkdir(exist_ok=True)
-        write_json(self.folder / "ended" / f"{attempt}.json", asdict(ended))
+        """Tell how an attempt ended; raises DiskFullError if it could not be written."""
+        path = self.folder / "ended" / f"{attempt}.json"
+        with disk_errors(path):
+            path.parent.mkdir(exist_ok=True)
+        write_json(path, asdict(ended))
 
     def ended(self) -> set[str]:
         """Attempts that have ended."""

@@ -175,7 +175,7 @@ def _connected(address: str) -> Any:
     try:
         import ray
     except ImportError as error:
-        raise UserError("--executor ray needs Ray: pip install 'vd4rl-pomdp[ray]'") from error
+        raise UserError("--executor ray needs Ray: pip install '.[ray]' in a clone of vd4rl-pomdp") from error
     try:
         with _own_signals():
             ray.init(address, log_to_driver=False, logging_level=logging.WARNING, ignore_reinit_error=True)

@@ -98,11 +98,12 @@ class _Task:
                 del self.mine[name]
                 yield self.array.end_of(attempt)
 
-    def untold(self, state: TaskState) -> list[Ended]:
-        """How its jobs ended when it has ended itself."""
+    def untold(self, state: TaskState, stopped: bool) -> list[Ended]:
+        """How its jobs ended when it has ended itself; what this driver has `stopped` was not killed."""
         line = last_line(self.array.folder / f"{state.job}_0_log.out") if state.name == "FAILED" else ""
         line = line or f"Slurm says {state.name} of task {state.job}"
-        return [Ended(name, OVER[state.name], line) for name in self.mine]
+        cause = INTERRUPTED if stopped and OVER[state.name] == KILLED else OVER[state.name]
+        return [Ended(name, cause, line) for name in self.mine]
 
 
 class SlurmExecutor:
@@ -127,6 +128,9 @@ class SlurmExecutor:
         """Tasks of the array that is not submitted yet."""
         self._accepted = False
         """Whether Slurm has taken an array of these options."""
+        self._queue: Queue = {}
+        """What Slurm told last."""
+        self._stopped = False
         self._warned: list[str] = []
         self._next_files = self._next_queue = self._next_submission = 0.0
 
@@ -160,13 +164,20 @@ class SlurmExecutor:
             self._submit()
         queue = None
         if now >= self._next_queue:
-            self._next_queue, queue = now + QUEUE_S, read_queue()
+            self._next_queue, queue = now + QUEUE_S, self._ask()
             self._warn(queue or {})
         if queue is None and now < self._next_files:
             return []
         self._next_files = now + FILES_S
         found = [ended for task in self._tasks for ended in task.told()]  # after the queue: none is overlooked
         return found if queue is None else found + self._gone(queue)
+
+    def _ask(self) -> Queue | None:
+        """The queue; None if Slurm does not answer, and what it told last stays."""
+        queue = read_queue()
+        if queue is not None:
+            self._queue = queue
+        return queue
 
     def _warn(self, queue: Queue) -> None:
         """Say, once each, what tasks wait for that may never come."""
@@ -179,7 +190,7 @@ class SlurmExecutor:
         """Jobs in tasks that have ended without telling of them."""
         over = [task for task in self._tasks if queue.get(task.key, _UNKNOWN).name in OVER]
         self._tasks = [task for task in self._tasks if task not in over]
-        return [ended for task in over for ended in task.untold(queue.get(task.key, _UNKNOWN))]
+        return [ended for task in over for ended in task.untold(queue.get(task.key, _UNKNOWN), self._stopped)]
 
     def _submit(self) -> None:
         """Submit what was gathered; where Slurm took such an array before, a failure is waited out."""
@@ -197,7 +208,7 @@ class SlurmExecutor:
 
     def stop(self) -> None:
         """Take what waits out of the queue, ask every job to end where nothing is lost, and wait for it."""
-        self._fresh = []
+        self._fresh, self._stopped = [], True
         cancel(self._live(), "--state=PENDING")
         cancel(self._live(), "--signal=TERM")
         until = time.monotonic() + PATIENCE_S + QUEUE_S
@@ -207,9 +218,9 @@ class SlurmExecutor:
         self._next_queue = 0.0
 
     def _live(self) -> list[str]:
-        """Slurm's numbers of this sweep's tasks that have not ended."""
-        queue = read_queue() or {}
-        states = [queue.get(task.key, _UNKNOWN) for task in self._tasks]
+        """Slurm's numbers of this sweep's tasks that have not ended, as far as it has told."""
+        self._ask()
+        states = [self._queue.get(task.key, _UNKNOWN) for task in self._tasks]
         return [state.job for state in states if state.name not in OVER]
 
 

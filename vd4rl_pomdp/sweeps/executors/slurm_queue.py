@@ -74,7 +74,7 @@ def require_slurm() -> None:
     try:
         import submitit  # noqa: F401
     except ImportError as error:
-        raise UserError("--executor slurm needs submitit: pip install 'vd4rl-pomdp[slurm]'") from error
+        raise UserError("--executor slurm needs submitit: pip install '.[slurm]' in a clone of vd4rl-pomdp") from error
     for name in ("sbatch", "squeue", "scancel", "srun"):
         if shutil.which(name) is None:
             raise UserError(f"--executor slurm finds no {name} here: start the sweep where Slurm's commands are")
