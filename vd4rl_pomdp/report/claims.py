@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 from vd4rl_pomdp.report.gates import (
     FAILED,
-    SETTING,
+    GATED,
     STANDARD_ERRORS,
     Sides,
     as_it_is,
@@ -93,7 +93,7 @@ def judge_claims(runs: list[LoadedRun], unranked: Collection[tuple[str, ...]] = 
         unranked: settings that do not discriminate: there nothing is judged.
     """
     finished = [run for run in runs if run.rows and run.finished and run.labels["method"] not in END_TO_END]
-    settings = sorted({tuple(str(run.labels[name]) for name in SETTING) for run in finished})
+    settings = sorted({tuple(str(run.labels[name]) for name in GATED) for run in finished})
     rows = (_row(claim, place, finished, unranked) for claim in CLAIMS for place in settings)
     return [row for row in rows if row is not None]
 
@@ -120,7 +120,7 @@ def _row(
     if not compared.left:
         return None
     above, error = difference(compared)
-    row = {"claim": claim.text, "kind": claim.kind} | dict(zip(SETTING, place, strict=True))
+    row = {"claim": claim.text, "kind": claim.kind} | dict(zip(GATED, place, strict=True))
     row |= _side("left", compared.left) | _side("right", compared.right) | {"difference": above, "error": error}
     return row | {"verdict": _verdict(row, compared, place in unranked)}
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from typing import Any
 
+from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import LoadedRun, compare
 from vd4rl_pomdp.report.measures import machine
 from vd4rl_pomdp.report.tables import label, setting
@@ -57,10 +58,7 @@ def _own_to_sets(runs: list[LoadedRun]) -> dict[str, str]:
 
 def facts(runs: list[LoadedRun]) -> list[dict[str, str]]:
     """One entry for all seeds of a condition: what they share, and what they were computed with."""
-    groups: dict[str, list[LoadedRun]] = {}
-    for run in runs:
-        groups.setdefault(title(run), []).append(run)
-    return [_facts(name, members) for name, members in groups.items()]
+    return [_facts(name, members) for name, members in groups(runs, title).items()]
 
 
 def _facts(name: str, runs: list[LoadedRun]) -> dict[str, str]:

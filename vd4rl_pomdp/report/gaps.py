@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from itertools import groupby
-from typing import TypeVar
 
+from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import LABELS, LoadedRun
 from vd4rl_pomdp.report.variants import ENCODER_SEED
 from vd4rl_pomdp.runs.files import Row
 
-Key = TypeVar("Key")
 Setting = tuple[str, str, str]
 """Task, quality and corruption: what methods are compared in."""
 MISSING = "missing"
@@ -27,9 +26,9 @@ def find_gaps(runs: list[LoadedRun]) -> list[Row]:
     run has in that setting.
     """
     grid = [run for run in runs if run.stage == "finetune" and run.labels["task"]]
-    by_method = _groups(grid, _method)
+    by_method = groups(grid, _method)
     rows = []
-    for setting, here in _groups(grid, _setting).items():
+    for setting, here in groups(grid, _setting).items():
         there = {(*_method(run), run.variant, run.labels["seed"]): run for run in sorted(here, key=_has_score)}
         seeds = sorted({run.labels["seed"] for run in here})
         for algorithm, method, variant in _expected(by_method, setting):
@@ -48,13 +47,6 @@ def _has_score(run: LoadedRun) -> bool:
 def _is_own(variant: str, seed: int) -> bool:
     """Whether a variant's encoder is that of a seed: with it the seed is one of the method, not of the variant."""
     return f"{ENCODER_SEED} {seed}" in variant.split(", ")
-
-
-def _groups(runs: list[LoadedRun], key: Callable[[LoadedRun], Key]) -> dict[Key, list[LoadedRun]]:
-    groups: dict[Key, list[LoadedRun]] = {}
-    for run in runs:
-        groups.setdefault(key(run), []).append(run)
-    return groups
 
 
 def _setting(run: LoadedRun) -> Setting:

@@ -15,6 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vd4rl_pomdp.report.gaps import STATE
+from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import LoadedRun, of_corruptions
 from vd4rl_pomdp.report.tables import END_TO_END, REFERENCES, grouped
 from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, is_plain, unlike
@@ -26,7 +27,7 @@ STATE_SHARE, ACRO_SHARE = 0.9, 0.7
 STANDARD_ERRORS = 2.0
 """Least difference between the best method and `random`, in its standard errors over seeds."""
 PASSED, FAILED, UNKNOWN = "discriminates", "does not discriminate", "not known to discriminate"
-SETTING = ("task", "quality", "corruption", "algorithm")
+GATED = ("task", "quality", "corruption", "algorithm")
 _NOT_PRETRAINED = ("random", STATE)
 """Methods of which no setting of pretraining counts."""
 
@@ -51,14 +52,14 @@ def gates(runs: list[LoadedRun]) -> list[Row]:
     return [_gate(key, finished) for key in sorted({_key(run) for run in finished})]
 
 
-def unranked(table: list[Row], names: Sequence[str] = SETTING) -> set[tuple[str, ...]]:
+def unranked(table: list[Row], names: Sequence[str] = GATED) -> set[tuple[str, ...]]:
     """The settings that do not discriminate: values of some columns, where all rows that have them miss a gate."""
     places = grouped(table, names)
     return {place for place, rows in places if all(row["verdict"].startswith(FAILED) for row in rows)}
 
 
 def _key(run: LoadedRun) -> tuple[str, ...]:
-    return tuple(str(run.labels[name]) for name in SETTING)
+    return tuple(str(run.labels[name]) for name in GATED)
 
 
 def _gate(key: tuple[str, ...], runs: list[LoadedRun]) -> Row:
@@ -70,7 +71,7 @@ def _gate(key: tuple[str, ...], runs: list[LoadedRun]) -> Row:
     compared = sides(learned, as_it_is("random", here))
     above, error = difference(compared)
     data = {value for run in here if (value := run.reference.data_return) is not None}
-    row = dict(zip(SETTING, key, strict=True)) | {
+    row = dict(zip(GATED, key, strict=True)) | {
         "data_return": float(np.mean(sorted(data))) if data else None,
         "state_share": _share(state),
         "acro_share": _share(acro),
@@ -116,11 +117,8 @@ def sides(left: Iterable[LoadedRun], right: Iterable[LoadedRun]) -> Sides:
 
 def seeds_by_variant(runs: Iterable[LoadedRun]) -> list[list[LoadedRun]]:
     """Seeds by method and variant; where they share an encoder, their spread is not that of a method."""
-    groups: dict[tuple[str, str], list[LoadedRun]] = {}
-    for run in runs:
-        if ENCODER_SEED not in run.settings:
-            groups.setdefault((str(run.labels["method"]), run.variant), []).append(run)
-    return list(groups.values())
+    own = (run for run in runs if ENCODER_SEED not in run.settings)
+    return list(groups(own, lambda run: (run.labels["method"], run.variant)).values())
 
 
 def _preference(*compared: list[LoadedRun]) -> tuple[int, float]:

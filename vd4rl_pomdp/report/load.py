@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Iterable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 from zipfile import BadZipFile
 
 import numpy as np
@@ -14,12 +14,12 @@ from vd4rl_pomdp.corruptions import corruption_settings
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.reference import FILE as REFERENCE
 from vd4rl_pomdp.reference import Reference
+from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.variants import DATA, Parts, Settings, differences, of_sets, read_settings
 from vd4rl_pomdp.results import Result, find_results
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.reading import regular
 
-Member = TypeVar("Member")
 LABELS = ("task", "quality", "corruption", "algorithm", "method", "seed")
 """Columns that a run's files name it by."""
 IDENTITY = ("task", "quality", "corruption", "algorithm", "method", "variant", "seed")
@@ -191,7 +191,7 @@ def _differences(
 ) -> list[str]:
     """What differs of some settings among the runs that are alike, run by run."""
     words = [""] * len(runs)
-    for members in _groups(range(len(runs)), lambda number: alike(runs[number])):
+    for members in groups(range(len(runs)), lambda number: alike(runs[number])).values():
         for number, told in zip(members, differences([settings[i] for i in members], brief), strict=True):
             words[number] = told
     return words
@@ -217,7 +217,7 @@ def _of_sets(runs: list[LoadedRun]) -> list[Settings]:
     options = _by_set(runs, [_without(run.settings, run.settings.keys() - hiding) for run in runs])
     others = {
         _kind(members[0]): _by_set(members, [_without(run.settings, hiding) for run in members])
-        for members in _groups(runs, _kind)
+        for members in groups(runs, _kind).values()
     }
     found = (options[run.set_name] | others[_kind(run)][run.set_name] for run in runs)
     return [dict(sorted(own.items())) for own in found]
@@ -237,13 +237,6 @@ def _method(run: LoadedRun) -> tuple[str, str, str]:
 
 def _without(settings: Settings, names: Collection[str]) -> Settings:
     return {name: value for name, value in settings.items() if name not in names}
-
-
-def _groups(members: Iterable[Member], key: Callable[[Member], Any]) -> list[list[Member]]:
-    groups: dict[Any, list[Member]] = {}
-    for member in members:
-        groups.setdefault(key(member), []).append(member)
-    return list(groups.values())
 
 
 def _load(result: Result) -> LoadedRun:

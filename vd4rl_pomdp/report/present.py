@@ -9,6 +9,7 @@ from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.claims import tally
 from vd4rl_pomdp.report.figures import seeds_note
 from vd4rl_pomdp.report.gaps import MISSING
+from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.layout import Line, ShownTable, interval, number, with_interval
 from vd4rl_pomdp.report.load import PROBES
 from vd4rl_pomdp.report.tables import grouped, label, setting, with_algorithm
@@ -175,7 +176,4 @@ def _counted(title: str, columns: tuple[str, ...], line: Callable[[Row], Line], 
 
 def by_setting(rows: list[Row]) -> list[tuple[str, list[Row]]]:
     """Rows by task, quality and corruption, in words."""
-    groups: dict[str, list[Row]] = {}
-    for row in rows:
-        groups.setdefault(setting(row), []).append(row)
-    return list(groups.items())
+    return list(groups(rows, setting).items())

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable
+from collections.abc import Collection, Iterable, Sequence
 
 import numpy as np
 
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import CONDITION, condition_of, in_words
+from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import LoadedRun
 from vd4rl_pomdp.runs.files import Row
 
@@ -68,9 +69,7 @@ def summary(rows: list[Row], gaps: list[Row], unranked: Collection[tuple[str, ..
         gaps: of `find_gaps`.
         unranked: settings whose methods are not ranked.
     """
-    absent: dict[tuple[str, ...], list[Row]] = {}
-    for gap in gaps:
-        absent.setdefault(condition_of(gap), []).append(gap)
+    absent = groups(gaps, condition_of)
     table = []
     for group, members in grouped(rows, CONDITION):
         condition = dict(zip(CONDITION, group, strict=True))
@@ -139,20 +138,14 @@ def _summary_order(row: Row, unranked: Collection[tuple[str, ...]]) -> tuple:
     return *place, reference, 0.0 if tuple(place) in unranked else score, label(row)
 
 
-def grouped(rows: Iterable[Row], names: Iterable[str]) -> list[tuple[tuple, list[Row]]]:
+def grouped(rows: Iterable[Row], names: Sequence[str]) -> list[tuple[tuple, list[Row]]]:
     """Rows by their values in some columns, in the order in which these first come."""
-    groups: dict[tuple, list[Row]] = {}
-    for row in rows:
-        groups.setdefault(tuple(row[name] for name in names), []).append(row)
-    return list(groups.items())
+    return list(groups(rows, lambda row: tuple(row[name] for name in names)).items())
 
 
 def by_label(rows: Iterable[Row]) -> list[tuple[str, list[Row]]]:
     """Rows by their method's name in tables and figures, likewise."""
-    groups: dict[str, list[Row]] = {}
-    for row in rows:
-        groups.setdefault(label(row), []).append(row)
-    return list(groups.items())
+    return list(groups(rows, label).items())
 
 
 def _by_step(rows: list[Row]) -> dict[int, list[Row]]:
