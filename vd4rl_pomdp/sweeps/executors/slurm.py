@@ -162,35 +162,39 @@ class SlurmExecutor:
         now = time.monotonic()
         if self._fresh and now >= self._next_submission:
             self._submit()
-        queue = None
+        answered = False
         if now >= self._next_queue:
-            self._next_queue, queue = now + QUEUE_S, self._ask()
-            self._warn(queue or {})
-        if queue is None and now < self._next_files:
+            self._next_queue, answered = now + QUEUE_S, self._ask()
+            self._warn()
+        if not answered and now < self._next_files:
             return []
         self._next_files = now + FILES_S
         found = [ended for task in self._tasks for ended in task.told()]  # after the queue: none is overlooked
-        return found if queue is None else found + self._gone(queue)
+        return found + self._gone() if answered else found
 
-    def _ask(self) -> Queue | None:
-        """The queue; None if Slurm does not answer, and what it told last stays."""
+    def _ask(self) -> bool:
+        """Read the queue; whether Slurm answers, and if it does not, what it told last stays."""
         queue = read_queue()
         if queue is not None:
             self._queue = queue
-        return queue
+        return queue is not None
 
-    def _warn(self, queue: Queue) -> None:
+    def _state(self, task: _Task) -> TaskState:
+        """What Slurm told last of a task."""
+        return self._queue.get(task.key, _UNKNOWN)
+
+    def _warn(self) -> None:
         """Say, once each, what tasks wait for that may never come."""
-        for state in (queue.get(task.key, _UNKNOWN) for task in self._tasks):
+        for state in map(self._state, self._tasks):
             if state.name == "PENDING" and state.reason not in (*_USUAL, *self._warned):
                 self._warned.append(state.reason)
                 print(f"warning: Slurm keeps task {state.job} waiting: {state.reason}", file=sys.stderr)
 
-    def _gone(self, queue: Queue) -> list[Ended]:
+    def _gone(self) -> list[Ended]:
         """Jobs in tasks that have ended without telling of them."""
-        over = [task for task in self._tasks if queue.get(task.key, _UNKNOWN).name in OVER]
+        over = [task for task in self._tasks if self._state(task).name in OVER]
         self._tasks = [task for task in self._tasks if task not in over]
-        return [ended for task in over for ended in task.untold(queue.get(task.key, _UNKNOWN), self._stopped)]
+        return [ended for task in over for ended in task.untold(self._state(task), self._stopped)]
 
     def _submit(self) -> None:
         """Submit what was gathered; where Slurm took such an array before, a failure is waited out."""
@@ -220,8 +224,7 @@ class SlurmExecutor:
     def _live(self) -> list[str]:
         """Slurm's numbers of this sweep's tasks that have not ended, as far as it has told."""
         self._ask()
-        states = [self._queue.get(task.key, _UNKNOWN) for task in self._tasks]
-        return [state.job for state in states if state.name not in OVER]
+        return [state.job for state in map(self._state, self._tasks) if state.name not in OVER]
 
 
 def _known(folder: Path, places: int) -> list[_Task]:
