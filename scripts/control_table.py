@@ -1,9 +1,4 @@
-"""The table of results/control/README.md, made from its rows.
-
-    python scripts/control_table.py
-
-A test holds the page against it.
-"""
+"""The table of results/control/README.md, made from its rows."""
 
 from __future__ import annotations
 
@@ -43,7 +38,3 @@ def with_seeds(returns: Sequence[float]) -> str:
     """Mean and error over seeds, and each of them where there are several."""
     each = f" ({', '.join(f'{value:.0f}' for value in returns)})" if len(returns) > 1 else ""
     return mean_and_error(returns) + each
-
-
-if __name__ == "__main__":
-    print("\n".join(table_lines(RESULTS)))

@@ -1,9 +1,4 @@
-"""The tables of README.md and docs/navigation.md about the paper's own mazes, made from rows of results/navigation.
-
-    python scripts/navigation_table.py
-
-A test holds the pages against them.
-"""
+"""The tables of README.md and docs/navigation.md about the paper's own mazes, made from rows of results/navigation."""
 
 from __future__ import annotations
 
@@ -12,7 +7,8 @@ from pathlib import Path
 
 from vd4rl_pomdp.experiments.navigation.grid import Condition
 from vd4rl_pomdp.experiments.navigation.runs import NavigationRun, load_runs
-from vd4rl_pomdp.experiments.navigation.tables import MAIN_TEXT, Entry, entry_of
+from vd4rl_pomdp.experiments.navigation.tables import Entry, entry_of
+from vd4rl_pomdp.mazes import PAPER_MAZES
 from vd4rl_pomdp.navigation.measures import online_error, refitted_error
 from vd4rl_pomdp.navigation.methods import METHOD_NAMES, OBJECTIVES, UNTRAINED
 from vd4rl_pomdp.report.layout import number
@@ -45,6 +41,15 @@ def first_person_runs() -> list[NavigationRun]:
     return load_runs(read_results(RESULTS / "first_person"))
 
 
+def measured(runs: list[NavigationRun]) -> list[str]:
+    """The paper's own mazes in which every objective was trained at K = 15."""
+    return [
+        maze
+        for maze in PAPER_MAZES
+        if all(len(entry_of(Condition(maze, name), MEASURES[0], runs).numbers) for name in OBJECTIVES)
+    ]
+
+
 def maze_lines(runs: list[NavigationRun], maze: str) -> Iterator[str]:
     """All methods at K = 15 in one maze, those with the smallest state errors first, then the references."""
     yield "| | seeds | state | position | velocity | position, velocity in % |"
@@ -62,7 +67,7 @@ def state_lines(runs: list[NavigationRun], ks: Sequence[int]) -> Iterator[str]:
     yield "| | seeds | " + " | ".join(f"`{name}`" for name in methods) + " |"
     yield "|---|---:|" + "---:|" * len(methods)
     for k in ks:
-        for maze in MAIN_TEXT:
+        for maze in measured(runs):
             entries = [entry_of(Condition(maze, name, k), MEASURES[0], runs) for name in methods]
             counts = {len(entry.numbers) for entry in entries} - {0}
             seeds = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
@@ -98,14 +103,3 @@ def _cell(entry: Entry) -> str:
     if not len(entry.numbers):
         return number(None)
     return mean_and_error(entry.numbers.tolist(), 1) + ("" if entry.paper is None else f" ({entry.paper:.1f})")
-
-
-if __name__ == "__main__":
-    found = main_runs()
-    for lines in (
-        state_lines(found, (15, 1)),
-        *(maze_lines(found, maze) for maze in MAIN_TEXT),
-        state_lines(found, (1,)),
-        first_person_lines(first_person_runs()),
-    ):
-        print("\n".join(lines), end="\n\n")

@@ -1,9 +1,4 @@
-"""The tables of returns in README.md and results/offline/README.md, made from rows of results/control and offline.
-
-    python scripts/offline_table.py
-
-A test holds the pages against them.
-"""
+"""The tables of returns in README.md and results/offline/README.md, made from rows of results/control and offline."""
 
 from __future__ import annotations
 
@@ -63,11 +58,11 @@ def readme_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
             yield f"| {words} ({here[0].reference.data_return:.0f}) | {' | '.join(cells)} |"
 
 
-def page_tables(runs: Sequence[LoadedRun]) -> Iterator[list[str]]:
-    """Tables of results/offline/README.md, one a set."""
+def page_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str]]:
+    """Sets of which results/offline/README.md has a table."""
     for place in SETS:
         if place != CONTROL_ONLY and any(_place(run) == place and run.labels["corruption"] == HIDDEN for run in runs):
-            yield list(set_lines(runs, *place))
+            yield place
 
 
 def set_lines(runs: Sequence[LoadedRun], task: str, quality: str) -> Iterator[str]:
@@ -108,9 +103,3 @@ def _told(runs: list[LoadedRun]) -> str:
     if not runs:
         return number(None)
     return mean_and_error(returns_of(runs).tolist()) + (f" (n = {len(runs)})" if len(runs) < 3 else "")
-
-
-if __name__ == "__main__":
-    found = main_runs()
-    for lines in (readme_lines(found), *page_tables(found)):
-        print("\n".join(lines), end="\n\n")

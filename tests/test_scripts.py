@@ -126,38 +126,24 @@ def test_another_python_makes_the_environment_anew(tmp_path):
     assert made_after(**other) == made_after() == ["11", "12"]
 
 
-def test_the_control_studys_page_shows_the_table_of_its_rows(monkeypatch):
+def test_pages_show_the_tables_that_their_rows_make(monkeypatch):
     monkeypatch.syspath_prepend(SCRIPTS)
-    script = importlib.import_module("control_table")
-    lines = list(script.table_lines(script.RESULTS))
-    assert len(lines) > 30
-    page = (script.RESULTS / "README.md").read_text()
-    assert "\n\n" + "\n".join(lines) + "\n\n" in page, "run `python scripts/control_table.py`, and put it on the page"
+    script = importlib.import_module("page_tables")
+    pages = {page: {name: list(lines) for name, lines in tables.items()} for page, tables in script.pages().items()}
+    assert all(tables and all(len(lines) > 3 for lines in tables.values()) for tables in pages.values())
+    for page, tables in pages.items():
+        text = (SCRIPTS.parent / page).read_text()
+        assert script.with_tables(text, tables, page) == text, f"{page}: run `python scripts/page_tables.py`"
 
 
-def test_pages_show_the_tables_of_the_papers_mazes_as_their_rows_make_them(monkeypatch):
+def test_a_table_takes_the_place_of_the_one_under_its_mark(monkeypatch):
     monkeypatch.syspath_prepend(SCRIPTS)
-    script = importlib.import_module("navigation_table")
-    runs = script.main_runs()
-    readme, docs = ((SCRIPTS.parent / page).read_text() for page in ("README.md", "docs/navigation.md"))
-    tables = [(readme, script.state_lines(runs, (15, 1))), (docs, script.state_lines(runs, (1,)))]
-    tables += [(docs, script.maze_lines(runs, maze)) for maze in script.MAIN_TEXT]
-    tables += [(docs, script.first_person_lines(script.first_person_runs()))]
-    for page, lines in tables:
-        assert "\n\n" + "\n".join(lines) + "\n\n" in page, (
-            "run `python scripts/navigation_table.py`; put it on the page"
-        )
-
-
-def test_pages_show_the_returns_that_their_rows_hold(monkeypatch):
-    monkeypatch.syspath_prepend(SCRIPTS)
-    script = importlib.import_module("offline_table")
-    runs = script.main_runs()
-    readme, offline = ((SCRIPTS.parent / page).read_text() for page in ("README.md", "results/offline/README.md"))
-    tables = [(readme, script.readme_lines(runs)), *((offline, lines) for lines in script.page_tables(runs))]
-    assert len(tables) > 4
-    for page, lines in tables:
-        assert "\n\n" + "\n".join(lines) + "\n\n" in page, "run `python scripts/offline_table.py`; put it on the page"
+    script = importlib.import_module("page_tables")
+    page = "a\n\n<!-- table: one -->\n| old |\n| older |\n\n| not it |\n<!-- table: other -->\nend"
+    written = script.with_tables(page, {"other": ["| 2 |"], "one": ["| 1 |"]}, "page.md")
+    assert written == "a\n\n<!-- table: one -->\n| 1 |\n\n| not it |\n<!-- table: other -->\n| 2 |\nend"
+    with pytest.raises(UserError, match=r"^page.md: one line `<!-- table: new -->` is wanted, .* belongs; 0 found$"):
+        script.with_tables(page, {"new": ["| 3 |"]}, "page.md")
 
 
 def test_a_set_of_several_actors_has_no_action_errors(monkeypatch):
