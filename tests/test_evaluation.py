@@ -2,6 +2,7 @@
 
 import json
 from dataclasses import replace
+from functools import cache
 from pathlib import Path
 
 import numpy as np
@@ -63,8 +64,7 @@ class ScriptedEnv:
 def world(monkeypatch) -> list[ScriptedEnv]:
     """Takes the place of the environments; holds those that were made."""
     made: list[ScriptedEnv] = []
-    monkeypatch.setattr(evaluation, "CorruptedEnv", lambda *a: (made.append(ScriptedEnv()), made[-1])[1])
-    monkeypatch.setattr(evaluation, "_ENVIRONMENTS", {})
+    monkeypatch.setattr(evaluation, "_environment", cache(lambda *a: (made.append(ScriptedEnv()), made[-1])[1]))
     monkeypatch.setattr(evaluation, "_AGENTS", {})
     return made
 
@@ -118,9 +118,9 @@ def test_a_policy_that_was_written_anew_is_the_one_that_plays(world, agent, tmp_
         play(tmp_path, 0)
 
 
-def test_an_episode_does_not_depend_on_those_before_it(world, agent, tmp_path, monkeypatch):
+def test_an_episode_does_not_depend_on_those_before_it(world, agent, tmp_path):
     play(tmp_path, 0, 1)
-    monkeypatch.setattr(evaluation, "_ENVIRONMENTS", {})
+    evaluation._environment.cache_clear()
     play(tmp_path, 1)
     np.testing.assert_array_equal(world[0].done[1], world[1].done[0])
 

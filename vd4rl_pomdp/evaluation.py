@@ -146,15 +146,18 @@ def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[s
 
 _AGENTS: dict[tuple, Agent] = {}
 """The agent of the last episode, by what its folders hold."""
-_ENVIRONMENTS: dict[tuple, CorruptedEnv] = {}
 
 
 def _run_episode(job: EpisodeJob) -> Episode:
     agent = _agent(job)
     place = (job.task, job.corruption, job.render, job.length, agent.picture_size, _draws(agent, job))
-    if place not in _ENVIRONMENTS:
-        _ENVIRONMENTS[place] = CorruptedEnv(*place)
-    return _play(agent, _ENVIRONMENTS[place], job)
+    return _play(agent, _environment(*place), job)
+
+
+@cache
+def _environment(*place: Any) -> CorruptedEnv:
+    """The process's environment for these arguments: one GL context serves all its episodes."""
+    return CorruptedEnv(*place)
 
 
 def _agent(job: EpisodeJob) -> Agent:

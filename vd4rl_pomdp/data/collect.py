@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
+from functools import cache
 from pathlib import Path
 from typing import Any, Literal
 
@@ -261,16 +262,12 @@ def _roll_out(job: _Job) -> Columns:
     }
 
 
-_ENVIRONMENTS: dict[tuple, Any] = {}
-
-
+@cache
 def _environment(*arguments: Any) -> Any:
     """The process's environment for these arguments: one GL context serves all its episodes."""
     from vd4rl_pomdp.envs.make import make_env
 
-    if arguments not in _ENVIRONMENTS:
-        _ENVIRONMENTS[arguments] = make_env(*arguments)
-    return _ENVIRONMENTS[arguments]
+    return make_env(*arguments)
 
 
 def _attributes(config: CollectConfig, path: Path, collector: Collector) -> dict[str, Any]:

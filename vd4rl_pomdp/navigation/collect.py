@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -139,16 +140,12 @@ def _controller(env: MazeEnv, rng: np.random.Generator) -> Callable[[np.ndarray,
     return (WaypointPlanner(env, rng) if env.maze_spec.style.goals_are_cells else Planner(env)).act
 
 
-_ENVIRONMENTS: dict[tuple[str, int], MazeEnv] = {}
-
-
+@cache
 def _environment(maze: str, action_repeat: int) -> MazeEnv:
     """The process's environment for these arguments: one GL context serves all its trajectories."""
     from vd4rl_pomdp.envs.maze import MazeEnv
 
-    if (maze, action_repeat) not in _ENVIRONMENTS:
-        _ENVIRONMENTS[maze, action_repeat] = MazeEnv(maze, action_repeat)
-    return _ENVIRONMENTS[maze, action_repeat]
+    return MazeEnv(maze, action_repeat)
 
 
 def _attributes(config: MazeCollectConfig) -> dict[str, Any]:

@@ -60,10 +60,6 @@ class Executor(Protocol):
     """Where jobs run. Run folders and logs lie on a disk that driver and jobs share."""
 
     @property
-    def slots(self) -> int:
-        """Jobs at a time."""
-
-    @property
     def largest(self) -> int:
         """The most slots that share a memory, so that one job may take them all."""
 
