@@ -139,10 +139,16 @@ class GymnasiumTask(Task):
     """Steps for which an action is applied, and their rewards summed; an episode that ends ends it, too."""
 
     @property
+    def name(self) -> str:
+        """The environment's: its id, or that of what makes it."""
+        if isinstance(self.environment, str):
+            return self.environment
+        return getattr(self.environment, "__name__", repr(self.environment))
+
+    @property
     def summary(self) -> str:
         """One line that says what it is."""
-        name = self.environment if isinstance(self.environment, str) else self.environment.__name__
-        return f"Gymnasium's {name}, {super().summary}"
+        return f"Gymnasium's {self.name}, {super().summary}"
 
 
 def _refuse(name: str, task: Task) -> None:

@@ -32,6 +32,8 @@ class StepType(IntEnum):
 
 _T_BITS = 20
 """Bits of a row's place within its episode."""
+MOST_ROWS = 1 << _T_BITS
+"""Of an episode: the keys of more would be another's."""
 
 
 def row_key(episode: Tensor, t: Tensor) -> Tensor:

@@ -69,7 +69,7 @@ class ReferenceOptions(Options):
     """Options of the references, which train no inverse model."""
 
     max_k: int = 15
-    """The K of the objectives that it is compared with: it changes nothing but the cell of a table."""
+    """The K of the objectives that it is compared with: its cell of a table, and one of the initial draws."""
 
     limits: ClassVar[Limits] = {"max_k": 1}
 

@@ -1,3 +1,5 @@
+from functools import partial
+
 import gymnasium
 import numpy as np
 import pytest
@@ -137,6 +139,12 @@ def test_an_environment_is_made_by_its_id_with_its_arguments():
         assert (rows[4].last, rows[4].discount) == (True, 1.0), "its own limit of time truncates"
     finally:
         gymnasium.registry.pop("vd4rl_pomdp_test/Counter-v0")
+
+
+def test_an_environment_of_bound_arguments_is_one_too():
+    task = GymnasiumTask(partial(Counter, end=9))
+    assert "Counter" in task.summary
+    play(task, 2)
 
 
 @pytest.mark.parametrize(

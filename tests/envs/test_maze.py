@@ -291,3 +291,12 @@ for name in ("WalkerWalk", "MazeThreeCurtains", "CheetahRun"):
 """
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
     assert "Traceback" not in done.stderr, done.stderr
+
+
+@pytest.mark.parametrize(
+    ("arguments", "message"),
+    [({"render": "Exact"}, "unknown rendering 'Exact'"), ({"action_repeat": 0}, "--action-repeat is 0")],
+)
+def test_an_environment_that_cannot_be_is_refused(arguments, message):
+    with pytest.raises(UserError, match=message):
+        MazeEnv("no_curtain", **arguments)

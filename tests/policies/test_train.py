@@ -136,6 +136,29 @@ def test_a_new_run_starts_where_committed_networks_stood(configure, tmp_path):
         np.testing.assert_allclose(taken.weights["mean.weight"], original.weights["mean.weight"], atol=1e-3)
 
 
+@pytest.mark.parametrize(
+    ("more", "line"),
+    [
+        ({"temperature": 0.0}, "--temperature is 0"),
+        ({"eval_episodes": 10_001}, "--eval-episodes is 10001; .* most 10000"),
+    ],
+)
+def test_settings_that_would_stop_a_run_on_its_way_are_refused(configure, tmp_path, more, line):
+    from vd4rl_pomdp.policies.train import train_policy
+
+    with pytest.raises(UserError, match=line):
+        train_policy(configure(tmp_path / "new", **more))
+    assert not (tmp_path / "new").exists()
+
+
+def test_a_run_that_goes_on_takes_no_episode_of_an_evaluation():
+    from vd4rl_pomdp.policies.learner import _seed_from
+
+    seeds = [_seed_from(0, decisions) for decisions in range(5_000, 300_001, 5_000)]
+    assert len(set(seeds)) == len(seeds)
+    assert min(seeds) > 100_000
+
+
 def leaves_of(tree):
     import jax
 
@@ -151,6 +174,13 @@ def test_a_start_that_does_not_fit_is_one_sentence(configure, tmp_path):
     train_policy(configure(tmp_path / "old", decisions=20))
     with pytest.raises(UserError, match="networks of another shape"):
         train_policy(configure(tmp_path / "new", start_from=tmp_path / "old", hidden=8))
+    for more, line in (
+        ({"decisions": 40}, "old: has made 20 decisions, and --refill adds 20: nothing is left of --decisions 40"),
+        ({"stop_at": 0.0}, "old: returns .* already; give a --stop-at above it"),
+        ({"refill": 0}, "--refill 0 leaves no decision for --critic-warmup to learn from; give it 0, too"),
+    ):
+        with pytest.raises(UserError, match=line):
+            train_policy(configure(tmp_path / "empty", start_from=tmp_path / "old", **more))
     (tmp_path / "old" / "curve.csv").write_text("decisions,return_mean\n")
     with pytest.raises(UserError, match=r"old: its curve\.csv holds no evaluation; --start-from takes a run that"):
         train_policy(configure(tmp_path / "empty", start_from=tmp_path / "old"))

@@ -48,3 +48,12 @@ def test_the_content_of_both_sets_counts_for_the_identity_alone():
     names = {identity(RECORD, CARD), identity(own, CARD), identity(RECORD, before), identity(own, before)}
     assert len(names) == 4
     assert recipe(own, before) == recipe(RECORD, CARD)
+
+
+def test_images_of_a_folder_are_told_by_their_content_and_made_ones_by_their_name():
+    def named(exogenous, content):
+        record = _changed(RECORD, "config", "exogenous", exogenous)
+        return identity(_changed(record, "inputs", "exogenous", content), {})
+
+    assert named("cifar", "f1") == named("cifar", "f1") != named("cifar", "f2")
+    assert named("textures", "textures") == identity(_changed(RECORD, "config", "exogenous", "textures"), {})

@@ -64,6 +64,14 @@ def test_the_environment_passes_gymnasiums_checker():
         check_env(env.unwrapped)
 
 
+def test_an_action_of_the_world_is_no_place_of_one():
+    env = make()
+    env.reset(seed=0)
+    for wrong in (-1, 2):
+        with pytest.raises(UserError, match=rf"^action {wrong}: give the place of one in \[-1, 1\], 0 to 1$"):
+            env.step(wrong)
+
+
 def test_the_environment_walks_as_the_world_does():
     env, world = make(max_episode_steps=9), counterexample()
     rng = np.random.default_rng(0)

@@ -40,7 +40,10 @@ class FiniteEnv(gymnasium.Env[np.ndarray, np.int64]):
         return self._show()
 
     def step(self, action: np.int64) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """Apply one action and let the exogenous part run."""
+        """Apply one action and let the exogenous part run; raises UserError for a place that holds none."""
+        if not self.action_space.contains(action):
+            last = len(self.world.actions) - 1
+            raise UserError(f"action {action}: give the place of one in {list(self.world.actions)}, 0 to {last}")
         state, noise = self._pair
         after = self.world.step[state, self.world.actions[int(action)]]
         self._pair = after, self._draw(self.world.drift[noise])

@@ -23,7 +23,7 @@ class GymnasiumEnv(PixelEnv):
 
     def __init__(self, task: GymnasiumTask, size: int | None = FRAME_SIZE, length: int | None = None) -> None:
         super().__init__(task, size, length)
-        self._name = task.environment if isinstance(task.environment, str) else task.environment.__name__
+        self._name = task.name
         self._renders = task.pixels == "render"
         self.env = self._make(task)
         """The Gymnasium environment."""

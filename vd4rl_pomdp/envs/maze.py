@@ -10,8 +10,9 @@ import numpy as np
 from vd4rl_pomdp.envs import Info
 from vd4rl_pomdp.envs.maze_model import COLLISION_RADIUS, HEADING, TIMESTEP, build_simulator
 from vd4rl_pomdp.envs.maze_renderers import ExactRenderer, MazeRenderer, make_renderer
-from vd4rl_pomdp.envs.rendering import Render, mujoco
-from vd4rl_pomdp.mazes import PICTURE_SIZE, get_maze
+from vd4rl_pomdp.envs.rendering import Render, check_render, mujoco
+from vd4rl_pomdp.errors import refuse_number
+from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, get_maze
 
 ACTION_REPEAT = 5
 """Simulator steps of 0.01 s for one action."""
@@ -44,6 +45,8 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         pixels: bool = True,
         render_mode: str | None = None,
     ) -> None:
+        check_render(render)
+        refuse_number("action_repeat", action_repeat, 1, MOST_STEPS)
         self.maze_spec = get_maze(maze)
         self._repeat = action_repeat
         self._point, self.maze = build_simulator(self.maze_spec)

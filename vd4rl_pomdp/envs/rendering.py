@@ -69,13 +69,18 @@ def check_mujoco(version: str = mujoco.__version__) -> None:
         )
 
 
+def check_render(render: str) -> None:
+    """Raise UserError for a word that names no rendering."""
+    if render not in get_args(Render):
+        raise UserError(f"unknown rendering {render!r}: choose one of {', '.join(get_args(Render))}")
+
+
 def prepare(physics: Any, render: Render, size: int) -> None:
     """Restore the old sky, set the shadow map's size, and that of the buffer to what `size` x `size` pictures need.
 
     Must be called before the first render of `physics`. The buffer, 640x480 by default, is cleared for every picture.
     """
-    if render not in get_args(Render):
-        raise UserError(f"unknown rendering {render!r}: choose one of {', '.join(get_args(Render))}")
+    check_render(render)
     model = physics.model
     sky = _sky()
     number = next(i for i in range(model.ntex) if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX)

@@ -26,7 +26,7 @@ from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.provenance import versions
 from vd4rl_pomdp.seeding import episode_seed
 from vd4rl_pomdp.tasks import MOST_EPISODES
-from vd4rl_pomdp.types import StepType
+from vd4rl_pomdp.types import MOST_ROWS, StepType
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.envs.maze import MazeEnv
@@ -75,7 +75,7 @@ def check_config(config: MazeCollectConfig) -> None:
     """Raise UserError for settings that make no set."""
     check_maze(config.maze)
     refuse_outside(
-        config, trajectories=(1, MOST_EPISODES), trajectory_rows=2, action_repeat=(1, MOST_STEPS),
+        config, trajectories=(1, MOST_EPISODES), trajectory_rows=(2, MOST_ROWS), action_repeat=(1, MOST_STEPS),
         seed=(0, MAX_SEED), trajectories_per_shard=1, workers=0,
     )  # fmt: skip
     rows = config.trajectory_rows * min(config.trajectories, config.trajectories_per_shard)

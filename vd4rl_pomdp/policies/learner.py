@@ -23,6 +23,7 @@ from vd4rl_pomdp.policies.state_env import StateEnv
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, fitting
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.reading import read_bytes
+from vd4rl_pomdp.seeding import stream_seed
 from vd4rl_pomdp.tasks import Task
 
 if TYPE_CHECKING:
@@ -183,7 +184,7 @@ def _restore(model: SAC, files: dict[str, bytes]) -> None:
     import jax
 
     counters, stored, replay = json.loads(files[_COUNTERS]), load(files[_MODEL]), load(files[_REPLAY])
-    model.set_random_seed(model.seed + counters["decisions"])  # other episodes than the run began with
+    model.set_random_seed(_seed_from(model.seed or 0, counters["decisions"]))
     policy = model.policy
     leaves, structure = _flatten(_states(model))
     restored = [np.asarray(stored[f"{i:04d}"], dtype=np.asarray(leaf).dtype) for i, leaf in enumerate(leaves)]
@@ -192,6 +193,11 @@ def _restore(model: SAC, files: dict[str, bytes]) -> None:
     _set_statistics(model, stored)
     _restore_replay(model.replay_buffer, replay, counters["position"])
     model.num_timesteps, model._n_updates = counters["decisions"], counters["updates"]
+
+
+def _seed_from(seed: int, decisions: int) -> int:
+    """Of a run that goes on: other episodes than it began with, and than those that evaluate. Gymnasium adds to it."""
+    return stream_seed(seed, "policy", "resumed", decisions) % 2**31
 
 
 def _restore_replay(buffer: Any, replay: dict[str, np.ndarray], position: int) -> None:

@@ -38,7 +38,7 @@ from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_cs
 from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import Owner, owned
-from vd4rl_pomdp.tasks import MOST_EPISODES, TASKS
+from vd4rl_pomdp.tasks import TASKS
 
 if TYPE_CHECKING:
     from sbx import SAC
@@ -114,9 +114,11 @@ def _check(config: PolicyConfig) -> None:
     refuse_outside(
         config, seed=(0, MAX_SEED), decisions=1, learning_rate=0, hidden=1, n_step=(1, task.decisions),
         envs=(1, MOST_ENVS), updates_per_decision=0, batch_size=1, temperature=0, temperature_rate=0,
-        target_entropy=(-MOST, MOST), replay_size=1, eval_every=1, eval_episodes=(1, MOST_EPISODES),
+        target_entropy=(-MOST, MOST), replay_size=1, eval_every=1, eval_episodes=(1, CARD_SEED),
         stop_at=(-MOST, MOST), refill=0, critic_warmup=0,
     )  # fmt: skip
+    if config.temperature == 0:
+        raise UserError("--temperature is 0; it must be above: it is where a learnt one starts")
     # of float32 numbers, as the weights are
     require_memory(8 * state_dim * config.replay_size, CPU, config, "replay_size")
     require_memory(4 * (15 * config.hidden**2 + config.batch_size * config.hidden), CPU, config, "hidden", "batch_size")
@@ -157,8 +159,18 @@ def _check_start(config: PolicyConfig, start: Path) -> None:
     task = read_json(start / "config.json").get("task")
     if task != config.task:
         raise UserError(f"{start}: is a run of {task}, not of {config.task}")
-    if not read_curve(start):
+    if not (curve := read_curve(start)):
         raise UserError(f"{start}: its curve.csv holds no evaluation; --start-from takes a run that got to its first")
+    done, mean = curve[-1]
+    if done + config.refill >= config.decisions:
+        raise UserError(
+            f"{start}: has made {done} decisions, and --refill adds {config.refill}: nothing is left of --decisions "
+            f"{config.decisions}; give more"
+        )
+    if mean >= config.stop_at:
+        raise UserError(f"{start}: returns {mean:g} already; give a --stop-at above it")
+    if config.refill == 0 and config.critic_warmup > 0:
+        raise UserError("--refill 0 leaves no decision for --critic-warmup to learn from; give it 0, too")
 
 
 def _start_from(model: SAC, config: PolicyConfig, start: Path) -> int:

@@ -20,7 +20,11 @@ def identity(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:
         record: its config.json.
         card: what the encoder it started from says of its pretraining; empty for a pretraining run.
     """
-    return _hash([recipe(record, card), record.get("inputs", {}).get("data"), card.get("data")])
+    inputs = record.get("inputs", {})
+    named = record["config"].get("exogenous")
+    images = inputs.get("exogenous", named)  # the content of a folder; the name again of those that are made
+    own = [] if images == named else [images]
+    return _hash([recipe(record, card), inputs.get("data"), card.get("data"), *own])
 
 
 def recipe(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:

@@ -15,7 +15,7 @@ from vd4rl_pomdp.experiments.navigation import figures
 from vd4rl_pomdp.experiments.navigation.claims import claims, judge, paper_number, verdict_lines
 from vd4rl_pomdp.experiments.navigation.grid import Condition, condition_of, paper_rows
 from vd4rl_pomdp.experiments.navigation.report import write_report
-from vd4rl_pomdp.experiments.navigation.runs import NavigationRun, find_navigation, load_runs
+from vd4rl_pomdp.experiments.navigation.runs import NavigationRun, find_navigation, load_runs, read_trajectory
 from vd4rl_pomdp.mazes import FREE_CELLS, MAZES
 from vd4rl_pomdp.navigation.measures import RAW_PREFIX, Measure, refitted_error
 from vd4rl_pomdp.navigation.methods import OBJECTIVES
@@ -219,6 +219,59 @@ def test_damaged_reports_and_runs_are_named(runs, tmp_path):
         loaded(runs)
     with pytest.raises(UserError, match="name at least one run folder"):
         loaded()
+
+
+@pytest.mark.parametrize(
+    ("file", "before", "after", "said"),
+    [
+        (
+            "results.json",
+            '"maze": "three_curtains"',
+            '"maze": "compass"',
+            r"its results are damaged \(its maze is 'compass'",
+        ),
+        ("config.json", '"preset": "cpu"', '"preset": "fast"', r"its results are damaged \(its preset is 'fast'"),
+    ],
+)
+def test_a_run_of_something_unknown_is_named_before_anything_is_written(runs, tmp_path, file, before, after, said):
+    damaged = runs / "three_curtains" / "mik-K15" / "seed0" / file
+    text = damaged.read_text()
+    assert before in text
+    damaged.write_text(text.replace(before, after))
+    with pytest.raises(UserError, match=said):
+        write_report([runs], tmp_path / "out")
+
+
+def test_a_trajectory_without_estimates_is_named(runs):
+    path = runs / "three_curtains" / "mik-K15" / "seed0" / "trajectory.csv"
+    path.write_text(path.read_text().replace("estimated_y", "estimated"))
+    with pytest.raises(UserError, match=r"trajectory.csv: is no trajectory of a run \(it has no estimated_y\)"):
+        read_trajectory(path)
+
+
+def test_a_run_that_measured_nothing_is_named(runs, tmp_path):
+    path = runs / "three_curtains" / "mik-K15" / "seed0" / "results.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"rows": []}))
+    with pytest.raises(UserError, match=r"its results are damaged \(it has measured nothing\)"):
+        loaded(runs)
+
+
+def test_exogenous_images_are_told_by_their_content(tmp_path):
+    condition = Condition("no_curtain", "ah", exogenous=True)
+    folders = [write_run(tmp_path / "runs", condition, seed, 9.0) for seed in (0, 1)]
+    whole = [json.loads((folder / "config.json").read_text()) for folder in folders]
+
+    def say(*images: tuple[str, str]) -> None:
+        for folder, record, (path, content) in zip(folders, whole, images, strict=True):
+            told = {"config": record["config"] | {"exogenous": path}, "format": 3}
+            told |= {"inputs": record["inputs"] | {"exogenous": content}}
+            (folder / "config.json").write_text(json.dumps(record | told))
+
+    say(("/a/cifar", "f1"), ("/b/cifar", "f1"))
+    assert len(loaded(tmp_path / "runs")) == 2
+    say(("cifar", "f1"), ("cifar", "f2"))
+    with pytest.raises(UserError, match=r"seeds 0 and 1 differ in their exogenous \(f1, f2\)"):
+        loaded(tmp_path / "runs")
 
 
 def test_seeds_of_another_budget_or_set_make_no_mean(tmp_path):

@@ -16,6 +16,7 @@ import numpy as np
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.grid import Condition
+from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.navigation.config import PRESETS
 from vd4rl_pomdp.navigation.measures import Measure, measure_of, measure_rows
 from vd4rl_pomdp.results import Result, find_results, refuse_loss, write_results
@@ -28,6 +29,8 @@ ROWS, TRAJECTORIES = "rows.csv", "trajectories"
 _IDENTITY = ("maze", "method", "max_k", "self_prediction", "exogenous", "literal_future", "preset", "seed")
 _MEASURED = (*Measure._fields, "value")
 _FILES = ("results", "timing", "machine")
+_DRAWN = ("x", "y", "estimated_x", "estimated_y")
+"""Columns of a trajectory that figures and films draw."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +73,10 @@ def read_trajectory(path: Path) -> dict[str, np.ndarray]:
     """Columns of a run's trajectory.csv by name, each (T,) float64; raises UserError for a file that is none."""
     try:
         rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"), newline="")))
-        return {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+        table = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
+        if missing := [name for name in _DRAWN if name not in table]:
+            raise ValueError(f"it has no {', '.join(missing)}")
+        return table
     except (OSError, IndexError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path}: is no trajectory of a run ({error}); train the run again") from error
 
@@ -137,17 +143,22 @@ def comparable(runs: Sequence[NavigationRun]) -> list[dict[str, str]]:
     """Steps, data, and the settings that change results and are no part of a condition, run by run.
 
     Those of their configs if all have whole ones. The flags of their commands else: early runs kept no more, and a
-    setting that none names is "the preset's".
+    setting that none names is "the preset's". Exogenous images are told by their content, where it is known.
     """
     whole = all("format" in run.result.record for run in runs)
     told = [run.result.record["config"] if whole else flags_of(run.facts["command"]) for run in runs]
     names = {} if whole else dict.fromkeys((name for one in told for name in one), "the preset's")
     found = [{name: str(value) for name, value in settings_of(names | one).items()} for one in told]
     told_apart = {"method", "max_k", "literal_future", "preset"}
-    facts = [{name: run.facts[name] for name in ("steps", "set")} for run in runs]
+    facts = [{name: run.facts[name] for name in ("steps", "set")} | _images(run) for run in runs]
     return [
         {k: v for k, v in one.items() if k not in told_apart} | fact for one, fact in zip(found, facts, strict=True)
     ]
+
+
+def _images(run: NavigationRun) -> dict[str, str]:
+    inputs = run.result.record.get("inputs", {})
+    return {"exogenous": inputs["exogenous"]} if "exogenous" in inputs else {}
 
 
 def is_missing(condition: Condition, runs: Iterable[NavigationRun]) -> bool:
@@ -217,9 +228,12 @@ def _run_of(result: Result) -> NavigationRun:
         "self_prediction": config.get("self_prediction", 0.0) > 0,
         "literal_future": config.get("literal_future", False),
     }
+    for name, value, known in (("maze", results["maze"], MAZES), ("preset", config["preset"], PRESETS)):
+        if value not in known:
+            raise ValueError(f"its {name} is {value!r}")
+    if not results["rows"]:
+        raise ValueError("it has measured nothing")
     condition = build(Condition, named)
-    if not isinstance(config["preset"], str):
-        raise TypeError(f"its preset is {config['preset']!r}")
     if not all(isinstance(timing[name], int | float) for name in ("steps", "seconds")):
         raise TypeError("timing.json holds no numbers")
     facts: dict[str, Any] = {
