@@ -70,8 +70,9 @@ def state_lines(runs: list[NavigationRun], ks: Sequence[int]) -> Iterator[str]:
         for maze in measured(runs):
             entries = [entry_of(Condition(maze, name, k), MEASURES[0], runs) for name in methods]
             counts = {len(entry.numbers) for entry in entries} - {0}
-            seeds = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
-            yield f"| {maze.replace('_', ' ')}, K = {k} | {seeds} | {' | '.join(map(_cell, entries))} |"
+            if counts:
+                seeds = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
+                yield f"| {maze.replace('_', ' ')}, K = {k} | {seeds} | {' | '.join(map(_cell, entries))} |"
 
 
 def first_person_lines(runs: list[NavigationRun]) -> Iterator[str]:
