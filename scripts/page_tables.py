@@ -8,13 +8,14 @@ pages against what this writes.
 
 from __future__ import annotations
 
-import sys
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import control_table
 import navigation_table
 import offline_table
+from script import run_script
 
 from vd4rl_pomdp.errors import UserError
 
@@ -23,6 +24,11 @@ MARK = "<!-- table: {} -->"
 """The line above a table."""
 Tables = dict[str, Iterable[str]]
 """Lines of tables, by their names."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Write the tables that are made from committed rows into their pages; there is nothing to choose."""
 
 
 def pages() -> dict[str, Tables]:
@@ -65,13 +71,14 @@ def with_tables(text: str, tables: Tables, page: str) -> str:
     return "\n".join(lines)
 
 
-if __name__ == "__main__":
-    try:
-        written = {
-            page: with_tables((ROOT / page).read_text(encoding="utf-8"), tables, page)
-            for page, tables in pages().items()
-        }
-    except UserError as error:
-        sys.exit(f"error: {error}")
+def main(config: Config) -> None:
+    """Write all pages, or none if a mark is missing."""
+    written = {
+        page: with_tables((ROOT / page).read_text(encoding="utf-8"), tables, page) for page, tables in pages().items()
+    }
     for page, text in written.items():
         (ROOT / page).write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    run_script(main, Config)
