@@ -64,6 +64,8 @@ MAX_SEED = 2**31 - 1
 """Largest seed that every random generator in use takes."""
 MOST = 10**9
 """Largest number that any flag takes, unless it says otherwise."""
+MOST_ROWS = 2**20
+"""Most rows of an episode: the keys of more would be another's."""
 
 
 def refuse_outside(config: Any, **ranges: float | tuple[float, float]) -> None:

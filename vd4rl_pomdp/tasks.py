@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import MOST, MOST_ROWS, UserError
 from vd4rl_pomdp.registry import Registry
 
 FRAME_SIZE = 84
@@ -155,9 +155,9 @@ def _refuse(name: str, task: Task) -> None:
     """Raise UserError for a name under which no file of a set could be written, and for numbers that make no task."""
     if name in ("", "..") or Path(name).name != name:
         raise UserError("sets have files and folders of this name, which it cannot be: choose one without '/'")
-    for what in ("decisions", "action_repeat"):
-        if (number := getattr(task, what)) < 1:
-            raise UserError(f"its {what} is {number}: it must be at least 1")
+    for what, most in (("decisions", MOST_ROWS - 1), ("action_repeat", MOST)):
+        if not 1 <= (number := getattr(task, what)) <= most:
+            raise UserError(f"its {what} is {number}: it must be at least 1 and at most {most}")
     if not 0 < task.score_divisor < math.inf:
         raise UserError(f"its score_divisor is {task.score_divisor}: it must be a positive number")
 

@@ -21,6 +21,8 @@ from typing import Any, Self
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.errors import MOST_ROWS
+
 
 class StepType(IntEnum):
     """dm_env's step types, as stored in V-D4RL's `step_type`."""
@@ -30,10 +32,8 @@ class StepType(IntEnum):
     LAST = 2
 
 
-_T_BITS = 20
+_T_BITS = (MOST_ROWS - 1).bit_length()
 """Bits of a row's place within its episode."""
-MOST_ROWS = 1 << _T_BITS
-"""Of an episode: the keys of more would be another's."""
 
 
 def row_key(episode: Tensor, t: Tensor) -> Tensor:

@@ -76,6 +76,11 @@ SWEEP = ["sweep", "run", "quick", "--out", "y", "--dry-run"]
         ),
         ([*SWEEP, "--change", "pretrain.method=drq_bc", "finetune.views=2"], "--views is not read by"),
         ([*SWEEP, "--only", "method=curl"], "the grid has mik+a, acro, random; write name=value,value"),
+        (
+            [*SWEEP, "--only", "method=acro", "--only", "seed=0"],
+            "--only is given twice: name all its values behind one",
+        ),
+        ([*SWEEP, "--change=seed=1", "--dry-run", "--change=preset=cpu"], "--change is given twice"),
         ([*SWEEP, "--executor", "cloud"], "unknown executor 'cloud': choose one of local"),
         (["sweep", "status", "file"], "file: holds no sweep; `vd4rl-pomdp sweep run GRID --out file` makes one"),
         (["sweep", "retry", "x"], "x: holds no sweep"),
@@ -101,6 +106,13 @@ def test_a_slip_is_one_line_and_exit_code_2(words, message, capsys, tmp_path, mo
     assert error.startswith("error: ")
     assert message in error
     assert [p.name for p in tmp_path.iterdir()] == ["file"], "nothing may be left behind"
+
+
+def test_a_tilde_behind_an_equals_sign_is_the_users_folder(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("HOME", str(tmp_path))
+    with pytest.raises(SystemExit):
+        main(["pretrain", "--out=~/run", "--data=~/set"])
+    assert f"error: {tmp_path}/set: no such folder" in capsys.readouterr().err
 
 
 @pytest.mark.parametrize("package", ["vd4rl_pomdp", "vd4rl_pomdp.cli"])

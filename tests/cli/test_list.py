@@ -48,6 +48,14 @@ def test_it_takes_no_words(words, capsys):
     assert len(capsys.readouterr().err.splitlines()) == 1
 
 
+def test_a_part_that_says_nothing_of_itself_does_not_speak_for_its_base_class():
+    class Told:
+        """Something else."""
+
+    assert summary_of(Told) == "Something else"
+    assert summary_of(type("Silent", (Told,), {})) == ""
+
+
 def test_a_summary_is_the_first_line_of_a_docstring_where_there_is_none():
     assert (
         summary_of(summary_of)

@@ -162,6 +162,22 @@ def test_what_can_be_no_task_is_one_line(arguments, message):
     assert "\n" not in str(caught.value)
 
 
+@pytest.mark.parametrize("place", ["reset", "step", "render"])
+def test_what_an_environment_misses_later_is_one_line_too(place):
+    class Needy(Counter):
+        pass
+
+    def refuse(self, *arguments, **options):
+        raise gymnasium.error.DependencyNotInstalled("pygame is not installed,\nrun `pip install pygame`")
+
+    setattr(Needy, place, refuse)
+    with pytest.raises(
+        UserError, match=r"Needy cannot .* \(pygame is not installed, run `pip .* install what"
+    ) as caught:
+        play(GymnasiumTask(Needy), 1)
+    assert "\n" not in str(caught.value)
+
+
 def test_the_corrupted_environment_tells_who_ended_an_episode():
     with TASKS.isolated():
         TASKS.register("ending", GymnasiumTask(Counter, {"end": 2}))

@@ -45,6 +45,15 @@ def test_streaming_and_batch_encodings_agree(history: str, use_actions: bool, sp
             torch.testing.assert_close(z, whole[:, t], atol=1e-5, rtol=1e-4)
 
 
+def test_observations_of_another_shape_are_refused():
+    encoder, other = make("gru", True), window()
+    for obs in (other.obs[..., :64, :64], other.obs[:, :, :3]):
+        with pytest.raises(UserError, match=r"reads observations of shape \(9, 84, 84\), and these are of \("):
+            encoder.encode(other.replace(obs=obs))
+        with pytest.raises(UserError, match="pretrain an encoder on these"):
+            encoder.step(obs[:, 0], other.prev_action[:, 0], encoder.initial_state(len(obs)))
+
+
 @pytest.mark.parametrize("span", [0, 3])
 def test_a_readout_is_the_frame_the_state_or_both_in_streams_and_batches(span: int):
     batch, read = window(), {}

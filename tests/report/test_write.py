@@ -19,6 +19,8 @@ from vd4rl_pomdp.results import add_results
 from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import write_json
 
+ROOT = Path(__file__).parents[2]
+
 
 def test_a_report_counts_seeds_not_episodes(tmp_path):
     for seed, scores in enumerate([[10.0, 30.0], [40.0, 40.0]]):
@@ -37,6 +39,14 @@ def test_a_report_counts_seeds_not_episodes(tmp_path):
     assert "data:image/webp;base64" in text
     assert "30.0" in text
     assert not re.search(r'(src|href)="?(https?:)?//', text), "the page must not need a network"
+
+
+def test_the_report_of_mazes_is_named_where_there_are_only_mazes(tmp_path):
+    with pytest.raises(
+        UserError, match=r"holds no evaluated run yet; `vd4rl-pomdp navigation report` reports its mazes"
+    ):
+        write_report([ROOT / "results" / "navigation"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
 
 
 def test_references_with_their_own_algorithm_stand_in_the_same_table(tmp_path):

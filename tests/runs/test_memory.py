@@ -62,6 +62,7 @@ def test_more_than_the_machine_or_the_disk_has_is_refused(tmp_path):
     require_disk(1, tmp_path / "not" / "there", Settings(), "window")
     with pytest.raises(UserError, match=r"--window 4 takes .* GB on the disk of .*: lower it or free"):
         require_disk(1e18, tmp_path / "not" / "there", Settings(), "window")
+    require_disk(1e18, Path("/proc/not/there"), Settings(), "window")  # no disk: making the folder says what is wrong
 
 
 def test_a_limit_of_the_control_group_counts(tmp_path, monkeypatch):

@@ -94,6 +94,11 @@ def test_only_keeps_cells_by_value(file):
     assert [(cell.value("task"), cell.seed) for cell in kept] == [("walker_walk", 1)] * 2
 
 
+def test_blanks_around_conditions_and_changes_mean_nothing(file):
+    cells = load_grid(file(TOML), ["seed = 3, 4", "pretrain.method = mik"]).cells()
+    assert {(cell.seed, cell.value("method")) for cell in narrow(cells, ["seed = 4, 3"])} == {(3, "mik"), (4, "mik")}
+
+
 @pytest.mark.parametrize(
     ("text", "message"),
     [

@@ -15,7 +15,7 @@ import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments
 from vd4rl_pomdp.errors import UserError, flag_of
-from vd4rl_pomdp.options import StageConfig, option_names
+from vd4rl_pomdp.options import StageConfig, flat, option_names
 from vd4rl_pomdp.runs.files import flatten
 
 _LONGEST_LIST = 6
@@ -30,13 +30,27 @@ def parse(config: Any, words: Arguments, program: str, default: Any = None) -> A
     shown = io.StringIO()
     try:
         with contextlib.redirect_stderr(shown):
-            parsed = tyro.cli(config, args=words, prog=program, description=config.__doc__, config=_FLAT, **options)
+            parsed = tyro.cli(
+                config,
+                args=[_at_home(word) for word in words],
+                prog=program,
+                description=config.__doc__,
+                config=_FLAT,
+                **options,
+            )
     except SystemExit as end:
         if end.code in (0, None):
             raise
         raise UserError(_one_line(shown.getvalue(), program)) from None
     _refuse_empty(parsed, words)
+    _refuse_twice(parsed, words)
     return parsed
+
+
+def _at_home(word: str) -> str:
+    """A word with the user's folder in place of `~` in `--out=~/runs`, which shells leave as it is."""
+    flag, _, value = word.partition("=")
+    return f"{flag}={Path(value).expanduser()}" if flag.startswith("--") and value.startswith("~") else word
 
 
 def _refuse_empty(config: Any, words: Arguments) -> None:
@@ -50,6 +64,14 @@ def _refuse_empty(config: Any, words: Arguments) -> None:
     for flag, word in pairwise(["", *words]):
         if (word == "" and flag not in free) or (word.startswith("--") and word[-1] == "=" and word[:-1] not in free):
             raise UserError(f"{word or flag or 'the first word'} names nothing: give a value or leave it out")
+
+
+def _refuse_twice(config: Any, words: Arguments) -> None:
+    """Refuse a second flag of a list: of the two the last would count, and what the first names be lost unnoticed."""
+    given = [word.partition("=")[0].replace("_", "-") for word in words]
+    for flag in (flag_of(name) for name, value in flat(config).items() if isinstance(value, list)):
+        if given.count(flag) > 1:
+            raise UserError(f"{flag} is given twice: name all its values behind one {flag}")
 
 
 def _one_line(box: str, program: str) -> str:

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import inspect
 from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any
@@ -41,8 +40,8 @@ def _lines(registry: Registry[Any]) -> Iterator[str]:
 
 def summary_of(part: Any) -> str:
     """What a part says of itself in a line: its `summary`, or the first line of its docstring."""
-    text = getattr(part, "summary", "") or inspect.getdoc(getattr(part, "build", part)) or ""
-    return text.partition("\n")[0].removesuffix(".")
+    text = getattr(part, "summary", "") or getattr(part, "build", part).__doc__ or ""  # its own, no base class's
+    return text.strip().partition("\n")[0].removesuffix(".")
 
 
 LIST = Command("methods, corruptions, algorithms, frame encoders and tasks, one line each", _list)

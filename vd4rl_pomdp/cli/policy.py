@@ -18,7 +18,7 @@ def _train(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.runs.progress import ProgressLine
 
     if not any(word.split("=")[0] in ("--task", "--help", "-h") for word in words):
-        raise UserError(f"--task is missing: choose one of {', '.join(recipes())}")
+        raise UserError("--task is missing: name one of dm_control's tasks; `vd4rl-pomdp list` shows all")
     config = with_presets(PolicyConfig, recipes(), words, program, flag="--task")
     done = decisions_made(config.out)
     with ProgressLine(f"train {config.task}", config.decisions, "decisions", done) as progress:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import gymnasium
@@ -16,6 +18,8 @@ from vd4rl_pomdp.tasks import FRAME_SIZE, GymnasiumTask, Layout
 from vd4rl_pomdp.types import StepType
 
 NOTHING = np.zeros(0)
+_REFUSALS = (gymnasium.error.Error, ImportError)
+"""What an environment raises that cannot do what it is asked, for lack of a package or otherwise."""
 
 
 class GymnasiumEnv(PixelEnv):
@@ -42,15 +46,21 @@ class GymnasiumEnv(PixelEnv):
 
     def _make(self, task: GymnasiumTask) -> gymnasium.Env:
         arguments = dict(task.arguments) | ({"render_mode": "rgb_array"} if self._renders else {})
-        try:
+        with self._telling("cannot be made", (*_REFUSALS, TypeError)):
             if isinstance(task.environment, str):
                 return gymnasium.make(task.environment, disable_env_checker=True, **arguments)
             return task.environment(**arguments)
-        except (gymnasium.error.Error, ImportError, TypeError) as error:
+
+    @contextmanager
+    def _telling(self, what: str, refusals: tuple[type[Exception], ...] = _REFUSALS) -> Iterator[None]:
+        """Turn what an environment itself refuses, such as a package that it misses, into a UserError."""
+        try:
+            yield
+        except refusals as error:
             reason = " ".join(str(error).split())
             raise UserError(
-                f"environment {self._name} cannot be made ({reason}): mend the task's registration, or install what "
-                "the environment needs"
+                f"environment {self._name} {what} ({reason}): mend the task's registration, or install what the "
+                "environment needs"
             ) from error
 
     def _bounded_box(self, space: gymnasium.Space) -> gymnasium.spaces.Box:
@@ -62,12 +72,14 @@ class GymnasiumEnv(PixelEnv):
         )
 
     def _begin(self, seed: int) -> None:
-        self._observation, _ = self.env.reset(seed=seed)
+        with self._telling("cannot be reset"):
+            self._observation, _ = self.env.reset(seed=seed)
 
     def _apply(self, action: np.ndarray) -> tuple[float, bool, float]:
         rescaled, total = self._rescaled(action), 0.0
         for _ in range(self.task.action_repeat):
-            self._observation, reward, terminated, truncated, _ = self.env.step(rescaled)
+            with self._telling("cannot make a step"):
+                self._observation, reward, terminated, truncated, _ = self.env.step(rescaled)
             total += self._finite(float(reward))
             if terminated or truncated:
                 return total, True, 0.0 if terminated else 1.0
@@ -114,7 +126,7 @@ class GymnasiumEnv(PixelEnv):
     def _rendered(self) -> Any:
         """What `render()` gives, drawn into the environment's own OpenGL context where it is one of MuJoCo's."""
         viewer = getattr(getattr(self.env.unwrapped, "mujoco_renderer", None), "viewer", None)
-        with undisturbed():
+        with undisturbed(), self._telling("cannot draw its picture"):
             if viewer is not None:  # it exists from the first picture on
                 viewer.make_context_current()
             return self.env.render()

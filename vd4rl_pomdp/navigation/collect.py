@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
-from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
+from vd4rl_pomdp.errors import MAX_SEED, MOST_ROWS, refuse_outside
 from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, Style, check_maze, get_maze
 from vd4rl_pomdp.navigation.config import MazeCollectConfig
 from vd4rl_pomdp.runs.files import jsonable
@@ -26,7 +26,7 @@ from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.provenance import versions
 from vd4rl_pomdp.seeding import episode_seed
 from vd4rl_pomdp.tasks import MOST_EPISODES
-from vd4rl_pomdp.types import MOST_ROWS, StepType
+from vd4rl_pomdp.types import StepType
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.envs.maze import MazeEnv

@@ -102,7 +102,8 @@ class Encoder(nn.Module):
         return self.config.frame_encoder == STATE
 
     def encode(self, window: Windows) -> Tensor:
-        """Representations of every row: (B, T, C, 84, 84) uint8 -> (B, T, dim)."""
+        """Representations of every row: (B, T, C, H, W) uint8 -> (B, T, dim); raises UserError for other pictures."""
+        self._refuse_other(window.obs)
         return self.from_features(self.frame(window.obs), window.prev_action)
 
     def from_features(self, features: Tensor, prev_action: Tensor) -> Tensor:
@@ -124,13 +125,17 @@ class Encoder(nn.Module):
         """Advance by one row.
 
         Args:
-            obs: (B, C, 84, 84) uint8.
+            obs: (B, C, H, W) uint8.
             prev_action: (B, A) float32, zeros at an episode's first row.
             state: from `initial_state` or the previous call.
 
         Returns:
             (B, dim) representation, and the state for the next row.
+
+        Raises:
+            UserError: pictures of another shape than it was built for.
         """
+        self._refuse_other(obs)
         features = self.frame(obs)
         if not self.remembers:
             return features, state
@@ -143,6 +148,15 @@ class Encoder(nn.Module):
         rows = torch.cat([state.rows, row], dim=1)[:, -span:]
         newest = run_gru(self.gru, self._forget_first_action(rows))[0][:, -1]
         return self._read(features, newest), state._replace(rows=rows)
+
+    def _refuse_other(self, obs: Tensor) -> None:
+        """Raise UserError for observations (..., C, H, W) of another shape than this encoder's."""
+        own = (self.config.channels, self.config.size, self.config.size)
+        if not self.reads_state and obs.shape[-3:] != own:
+            raise UserError(
+                f"this encoder reads observations of shape {own}, and these are of {tuple(obs.shape[-3:])}: use frames "
+                "of its size and stack, or pretrain an encoder on these"
+            )
 
     def _read(self, features: Tensor, states: Tensor) -> Tensor:
         """The representation, given e(o_t) (..., F) and s_t (..., H)."""

@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from vd4rl_pomdp.tasks import TASKS, DMCTask
+from vd4rl_pomdp.tasks import TASKS
 
 
 @dataclass(frozen=True)
@@ -93,6 +93,5 @@ gradients. Where a run has levelled off, another from it (--start-from) with oth
 
 
 def recipes() -> dict[str, PolicyConfig]:
-    """Defaults of every task of dm_control, those that were added included."""
-    tasks = [name for name, task in TASKS.items() if isinstance(task, DMCTask)]
-    return {name: RECIPES.get(name, replace(_GENERAL, task=name)) for name in tasks}
+    """Defaults of every task, those that were added included."""
+    return {name: RECIPES.get(name, replace(_GENERAL, task=name)) for name in TASKS}

@@ -63,7 +63,9 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
     results = [run.result for run in runs]
     refuse_loss(results, out)
     if not any(run.rows for run in runs):
-        raise UserError(f"{paths[0]}: holds no evaluated run yet; `vd4rl-pomdp finetune` evaluates")
+        mazes = all(result.record["stage"] == "navigation" for result in results)
+        told = "`vd4rl-pomdp navigation report` reports its mazes" if mazes else "`vd4rl-pomdp finetune` evaluates"
+        raise UserError(f"{paths[0]}: holds no evaluated run yet; {told}")
     made = _tables(runs, choice)
     shown = _shown(made)
     plots = _plots(runs, made)

@@ -45,11 +45,11 @@ def require_memory(needed: float, device: torch.device, config: Any, *names: str
 def require_disk(needed: float, path: Path, config: Any, *names: str) -> None:
     """Raise UserError, naming the flags that decide, if `needed` bytes exceed what is free where `path` will be."""
     place = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
-    free = shutil.disk_usage(place).free
-    if needed > free:
+    disk = shutil.disk_usage(place)
+    if needed > disk.free and disk.total:  # a file system without room, such as /proc, says itself what may not be
         raise DiskFullError(
-            f"{_named(config, names)} takes {needed / 1e9:,.1f} GB on the disk of {path}, and {free / 1e9:,.1f} GB are "
-            f"free: {_remedy(names)} or free some space"
+            f"{_named(config, names)} takes {needed / 1e9:,.1f} GB on the disk of {path}, and {disk.free / 1e9:,.1f} "
+            f"GB are free: {_remedy(names)} or free some space"
         )
 
 

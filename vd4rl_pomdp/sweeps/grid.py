@@ -129,10 +129,10 @@ def narrow(cells: list[GridCell], only: Sequence[str]) -> list[GridCell]:
 
 def condition(text: str) -> tuple[str, list[str]]:
     """Name and values of a condition: "method=mik+a,acro"."""
-    name, equals, values = text.partition("=")
+    name, equals, values = (part.strip() for part in text.partition("="))
     if not equals or not name:
         raise UserError(f"{text!r} is no condition: write name=value,value, such as method=mik+a,acro")
-    return name, values.split(",")
+    return name, [value.strip() for value in values.split(",")]
 
 
 def check_values(text: str, wanted: list[str], found: list[str]) -> None:

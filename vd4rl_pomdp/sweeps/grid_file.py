@@ -156,13 +156,13 @@ def _sections(table: Any) -> Sections:
 
 def _change(text: str) -> Sections:
     """A change as the command line tells it: "section.name=value", or "name=value" for one of SHARED."""
-    where, equals, value = text.partition("=")
+    where, equals, value = (part.strip() for part in text.partition("="))
     section, _, name = where.rpartition(".")
     if not equals or not name:
         raise UserError(f"{text!r} is no change: write section.name=value, such as pretrain.steps=100 or seed=0,1")
     if (section and section not in SECTIONS) or (not section and name not in SHARED):
         raise UserError(f"{where!r} is no setting of a grid: write one of {', '.join(SHARED)}, or SECTION.NAME")
-    values = [_value(part) for part in value.split(",")]
+    values = [_value(part.strip()) for part in value.split(",")]
     return {section: {name: values if len(values) > 1 else values[0]}}
 
 
