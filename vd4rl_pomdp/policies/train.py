@@ -38,7 +38,7 @@ from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_cs
 from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import Owner, owned
-from vd4rl_pomdp.tasks import TASKS, DMCTask
+from vd4rl_pomdp.tasks import TASKS
 
 if TYPE_CHECKING:
     from sbx import SAC
@@ -61,8 +61,6 @@ def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None]
         UserError: an unknown task or one without states, settings out of range, or a folder of another run.
     """
     task = TASKS.named(config.task)
-    if not isinstance(task, DMCTask):
-        raise UserError(f"task {config.task} has no simulator states, which actors read: choose one of dm_control's")
     refuse_inside(config.out)
     _check(config)
     with owned(config.out) as owner:
