@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import os
 import re
+import shutil
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -97,6 +98,18 @@ def test_a_set_comes_back_as_it_was(hub, data, tmp_path):
     pushed = hub.files(WHERE[SET])
     assert set(pushed) == {*content(data), "README.md", LISTING, ".gitattributes"}
     assert len(hub.large) == len(list(data.glob("*.hdf5"))) + 1
+
+
+def test_shards_of_capital_suffixes_are_sent_and_counted(hub, data, tmp_path):
+    mine = shutil.copytree(data, tmp_path / "mine")
+    last = max(mine.glob("*.hdf5"))
+    last.rename(last.with_suffix(".HDF5"))
+    push(mine, SET)
+    assert pull(SET, tmp_path / "new")
+    assert content(tmp_path / "new") == content(mine)
+    (tmp_path / "new" / "9_more.H5").write_bytes(b"mine")
+    with pytest.raises(UserError, match="is not empty and holds something else"):
+        pull(SET, tmp_path / "new")
 
 
 def test_cards_on_the_hub_say_how_to_load_what_they_describe(hub, encoder, data, monkeypatch, capsys):

@@ -80,7 +80,8 @@ class Transitions(Batch):
     action: Tensor
     """(B, A) float32: a_t."""
     reward: Tensor
-    """(B,) float32: sum of gamma^i r_{t+i} over the steps up to t+n or the episode's end."""
+    """(B,) float32: sum of gamma^i d_i r_{t+i} over the steps up to t+n or the episode's end, with d_i the product of
+    the stored discounts before."""
     discount: Tensor
     """(B,) float32: product of the stored discounts, times gamma for every step after the first."""
     next_obs: Tensor

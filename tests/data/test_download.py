@@ -191,6 +191,7 @@ def test_a_set_has_one_owner_while_it_is_downloaded(mirror, tmp_path, monkeypatc
     def meanwhile(*arguments):
         with pytest.raises(UserError, match=rf"84px: is in use by process {os.getpid()} on"):
             fetch(mirror, tmp_path)
+        assert "1_a_expert.hdf5.part" in names(tmp_path / EXPERT), "it still says that the set is not whole"
         refused.append(1)
         return receive(*arguments)
 

@@ -57,6 +57,14 @@ def test_a_number_that_is_left_out_is_told(tmp_path, names, message):
         shard_paths(tmp_path)
 
 
+@pytest.mark.parametrize("names", [("0_a.hdf5", "0_a.h5"), ("0_a.hdf5", "00_a.hdf5"), ("a.HDF5", "a.hdf5")])
+def test_a_shard_that_is_there_twice_is_told(tmp_path, names):
+    for name in names:
+        (tmp_path / name).touch()
+    with pytest.raises(UserError, match=r"has both .* and .*, which are one shard; remove one"):
+        shard_paths(tmp_path)
+
+
 def test_only_visible_shards_are_listed(tmp_path):
     for name in (".0_a.hdf5.tmp", ".0_b.hdf5", "0_a.txt", "0_a.hdf5", "collection.json", "provenance.json"):
         (tmp_path / name).touch()

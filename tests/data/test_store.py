@@ -266,6 +266,10 @@ def test_a_collected_set_that_lacks_episodes_is_refused(tmp_path, cache, unit):
     with pytest.raises(UserError, match=r"set: holds 2 episodes, its collection\.json says 3: is a shard missing"):
         open_store(folder, cache)
     assert open_store(folder / "1_fake.hdf5", cache).meta["rows"] == 3, "one shard is no set"
+    assert open_store(folder / "0_fake.hdf5", cache).meta["rows"] == 3
+    (folder / "1_fake.hdf5").unlink()
+    with pytest.raises(UserError, match="holds 1 episodes"):
+        open_store(folder, cache)
 
 
 @pytest.mark.parametrize(

@@ -1,5 +1,6 @@
 """Damaged runs are named, and nothing is written."""
 
+import numpy as np
 import pytest
 
 from tests.helpers_report import describe, write_run
@@ -32,9 +33,13 @@ def test_cut_rows_and_films_are_named(tmp_path):
     with pytest.raises(UserError, match=r"episodes\.csv: a row is not whole"):
         write_report([tmp_path / "a"], tmp_path / "out")
     rows.write_text(whole)
-    (tmp_path / "a" / "film.npz").write_bytes(b"cut")
-    with pytest.raises(UserError, match=r"film\.npz: cannot be read"):
-        write_report([tmp_path / "a"], tmp_path / "out")
+    film = tmp_path / "a" / "film.npz"
+    np.savez_compressed(film, clean=np.arange(999))
+    packed = film.read_bytes()
+    for damaged in (b"cut", packed[:100] + b"\xff" * 99 + packed[199:]):
+        film.write_bytes(damaged)
+        with pytest.raises(UserError, match=r"film\.npz: cannot be read"):
+            write_report([tmp_path / "a"], tmp_path / "out")
 
 
 @pytest.mark.parametrize("value", ["nan", "inf", "-inf"])

@@ -90,6 +90,71 @@ def test_a_diverged_run_is_a_result(tmp_path):
     assert (found.finished, found.settled, found.diverged["step"]) == (False, True, 7)
 
 
+def test_a_run_that_finished_after_all_takes_the_place_of_the_one_that_diverged(tmp_path):
+    run = whole_run(tmp_path / "runs/0", score=1.5)
+    (run / "timing.json").rename(tmp_path / "timing.json")
+    write_json(run / "diverged.json", {"step": 7, "message": "critic_loss is nan"})
+    for out in ("out", "report"):
+        add_results([run], tmp_path / out)
+    diverged = shutil.copytree(run, tmp_path / "diverged")
+    (run / "diverged.json").unlink()
+    shutil.rmtree(run)
+    whole_run(run)
+    for paths in ([run, tmp_path / "out"], [tmp_path / "out", run]):
+        assert [found.finished for found in find_results(paths)] == [True]
+    write_report([run], tmp_path / "report")
+    assert add_results([run], tmp_path / "out") == (1, 0, 0, 0)
+    for out in ("out", "report"):
+        assert [(found.finished, found.rows[-1]["score"]) for found in read_results(tmp_path / out)] == [(True, 2.0)]
+    assert add_results([diverged], tmp_path / "out") == (0, 0, 1, 0), "and never the other way round"
+
+
+def test_a_report_replaces_no_rows_of_a_settled_run(tmp_path):
+    add_results([whole_run(tmp_path / "runs/0")], tmp_path / "kept")
+    before = (tmp_path / "kept" / "episodes.csv").read_bytes()
+    with pytest.raises(UserError, match=r"kept: holds other rows of 1 runs \(such as \w+\), which would be lost"):
+        write_report([whole_run(tmp_path / "again/0", score=3.0)], tmp_path / "kept")
+    assert (tmp_path / "kept" / "episodes.csv").read_bytes() == before
+    write_report([tmp_path / "runs"], tmp_path / "kept")
+
+
+def test_columns_of_ones_own_are_no_part_of_a_result(tmp_path):
+    run = whole_run(tmp_path / "runs/0")
+    add_results([run], tmp_path / "out")
+    for folder_of_rows in (run, tmp_path / "out"):
+        lines = (folder_of_rows / "episodes.csv").read_text().splitlines()
+        (folder_of_rows / "episodes.csv").write_text("\n".join(f"{line},note" for line in lines) + "\n")
+    assert add_results([run], tmp_path / "out") == (0, 1, 0, 0)
+    write_report([tmp_path / "runs"], tmp_path / "report")
+
+
+def test_a_row_that_was_cut_with_its_run_is_left_out(tmp_path):
+    run = whole_run(tmp_path / "runs/0")
+    whole_run(tmp_path / "runs/1", seed=1)
+    (run / "timing.json").unlink()
+    (run / "episodes.csv").write_text((run / "episodes.csv").read_text()[:-20])
+    assert [row["step"] for row in read_run(run).rows] == [5]
+    assert "unfinished" in write_report([tmp_path / "runs"], tmp_path / "report").page.read_text()
+
+
+def test_results_can_be_read_while_others_are_added(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    add_results([whole_run(tmp_path / "runs/0")], out)
+    later, read = whole_run(tmp_path / "runs/1", seed=1), folder.read_episodes
+
+    def meanwhile(path):
+        rows = read(path)
+        with monkeypatch.context() as patch:
+            patch.setattr(folder, "read_episodes", read)
+            add_results([later], out)
+        return rows
+
+    with monkeypatch.context() as patch:
+        patch.setattr(folder, "read_episodes", meanwhile)
+        assert len(read_results(out)) == 1
+    assert len(read_results(out)) == 2
+
+
 def test_a_writing_that_is_killed_midway_leaves_what_was_there(tmp_path, monkeypatch):
     add_results([whole_run(tmp_path / "runs/0")], tmp_path / "out")
     before = [content(run) for run in read_results(tmp_path / "out")]

@@ -37,9 +37,12 @@ def test_columns_of_ones_own_stay_in_a_table_that_is_appended_to(tmp_path):
     row = {name: value for name, value in read_episodes(path)[0].items() if name != "variant"}
     append_episodes(path, [row])
     assert read_episodes(path) == [row | {"variant": "max_k 1"}, row | {"variant": ""}]
+    append_episodes(path, [row | {"step": 7}])
+    drop_episodes_after(path, 6)
+    assert read_episodes(path) == [row | {"variant": "max_k 1"}, row | {"variant": ""}]
 
 
-@pytest.mark.parametrize("end", ["", ",", ",patch", ",patch,nan", ",patch,0.1.2", ",,0.1"])
+@pytest.mark.parametrize("end", ["", ",", ",patch", ",patch,nan", ",patch,0.1.2", ",,0.1", ",patch,0.1,more"])
 def test_a_row_whose_end_is_missing_or_wrong_is_not_read(tmp_path, end):
     path = tmp_path / "episodes.csv"
     lines = EARLIER.splitlines()

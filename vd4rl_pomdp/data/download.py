@@ -123,16 +123,25 @@ def _owning(last: Path) -> Iterator[None]:
     folder = last.parent
     made = [place for place in (folder, *folder.parents) if not place.exists()]
     try:
-        with owned(folder):
-            with disk_errors(last):
-                last.touch()
+        with owned(folder), _marking(last):
             yield
     finally:
         with suppress(OSError):
-            if not _size(last) and [file for file in folder.iterdir() if not file.name.startswith(".")] == [last]:
-                last.unlink()
             for place in made:
                 place.rmdir()
+
+
+@contextmanager
+def _marking(last: Path) -> Iterator[None]:
+    """Keep the part that says so while a set is not whole; it goes again if nothing but it has come."""
+    try:
+        with disk_errors(last):
+            last.touch()
+        yield
+    finally:
+        with suppress(OSError):
+            if not _size(last) and [f for f in last.parent.iterdir() if not f.name.startswith(".")] == [last]:
+                last.unlink()
 
 
 def _progress_bar() -> Progress:

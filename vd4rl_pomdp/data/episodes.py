@@ -30,7 +30,7 @@ def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str,
     starts = np.cumsum([0, *(len(part["reward"]) for part in parts)])
     rows = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     _check_order(shards, starts, rows["step_type"])
-    _check_count(path, int((rows["step_type"] == StepType.FIRST).sum()))
+    check_count(path, int((rows["step_type"] == StepType.FIRST).sum()))
     return rows
 
 
@@ -60,7 +60,7 @@ def _agree(first: Path, expected: Mapping[str, np.ndarray], shard: Path, part: M
             raise UserError(f"{shard}: {key!r} has {widths}; keep one set in a folder")
 
 
-def _check_count(path: Path, episodes: int) -> None:
+def check_count(path: Path, episodes: int) -> None:
     """Refuse a collected set that lacks episodes; a set of other makers says nothing of their number."""
     plan = read_json(path / PLAN) if (path / PLAN).is_file() else {}
     planned = plan.get("episodes", plan.get("trajectories", episodes))  # as its command calls them

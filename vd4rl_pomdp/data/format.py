@@ -43,6 +43,11 @@ _LARGEST = np.finfo(np.float32).max
 _REPAIR = "download or collect it again"
 
 
+def is_shard_name(name: str) -> bool:
+    """Whether a file of this name is a shard: hidden ones are none."""
+    return not name.startswith(".") and name.lower().endswith(SUFFIXES)
+
+
 def shard_paths(folder: Path) -> list[Path]:
     """Shards of a set in the order of their rows; `folder` may also name a single shard.
 
@@ -50,8 +55,8 @@ def shard_paths(folder: Path) -> list[Path]:
     `9_mixed`, and the two halves of a medium_expert folder are not interleaved. Hidden files are no shards.
 
     Raises:
-        UserError: there is no such folder, no shard in it, a number is left out among shards whose names agree
-            otherwise, or a download or collection of it was cut.
+        UserError: there is no such folder, no shard in it, a number is left out or there twice among shards whose
+            names agree otherwise, or a download or collection of it was cut.
     """
     if folder.is_file():
         return [folder]
@@ -60,11 +65,12 @@ def shard_paths(folder: Path) -> list[Path]:
     refuse_partial(folder)
     if (folder / PLAN).exists() and not (folder / RECORD).exists():
         raise UserError(f"{folder}: the set's collection is not finished; start the command that collects it again")
-    shards = [p for p in folder.iterdir() if p.suffix.lower() in SUFFIXES and not p.name.startswith(".")]
+    shards = [path for path in folder.iterdir() if is_shard_name(path.name)]
     if not shards:
-        inner = next((p.parent for suffix in SUFFIXES for p in sorted(folder.rglob(f"[!.]*{suffix}"))), None)
+        inner = next((path.parent for path in sorted(folder.rglob("*")) if is_shard_name(path.name)), None)
         hint = f"name a folder of shards such as {inner}" if inner else "collect or download a set there"
         raise UserError(f"{folder}: holds no .hdf5 shards; {hint}")
+    _refuse_twins(folder, shards)
     _refuse_gaps(folder, shards)
     return sorted(shards, key=_shard_order)
 
@@ -82,6 +88,14 @@ def _refuse_gaps(folder: Path, shards: Sequence[Path]) -> None:
                 f"{folder}: has the shard {max(found)}{rest}, but none called {lacking}{rest}; {_REPAIR}, or number "
                 "the shards of a set of your own 0, 1, 2, ..."
             )
+
+
+def _refuse_twins(folder: Path, shards: Sequence[Path]) -> None:
+    """Raise UserError if two shards, such as 0_x.h5 and 0_x.hdf5, have one name and number: rows would count twice."""
+    found: dict[tuple[str, int | None], Path] = {}
+    for shard in sorted(shards):
+        if (twin := found.setdefault(shard_number(shard), shard)) is not shard:
+            raise UserError(f"{folder}: has both {twin.name} and {shard.name}, which are one shard; remove one")
 
 
 def refuse_partial(folder: Path) -> None:

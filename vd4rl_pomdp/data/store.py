@@ -25,11 +25,12 @@ from typing import Any, Literal
 
 import numpy as np
 
-from vd4rl_pomdp.data.episodes import join_shards
+from vd4rl_pomdp.data.episodes import check_count, join_shards
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows, shard_paths
 from vd4rl_pomdp.errors import DiskFullError, UserError, disk_error
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
+from vd4rl_pomdp.types import StepType
 
 _VERSION = 2
 _FRAMES = "frames.u8"
@@ -137,7 +138,9 @@ def open_store(path: Path, cache: Path | None = None) -> Store:
     if meta is None:
         with _locked(folder):
             meta = _read_meta(folder) or _decode(path, shards, folder)
-    return Store(folder, meta)
+    store = Store(folder, meta)
+    check_count(path, int((store.array("step_type") == StepType.FIRST).sum()))  # its shards may have been another's
+    return store
 
 
 def verify_store(store: Store) -> None:

@@ -8,7 +8,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from vd4rl_pomdp.data.episodes import join_shards
-from vd4rl_pomdp.data.format import SUFFIXES, check_frames, read_rows, shard_paths
+from vd4rl_pomdp.data.format import check_frames, is_shard_name, read_rows, shard_paths
 from vd4rl_pomdp.data.hub_card import set_card
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.hub.repository import ENCODER, SET, Repository
@@ -22,7 +22,7 @@ LISTING = "vd4rl_pomdp.json"
 """Name of the listing beside the files."""
 _FORMAT = 1
 _ENCODER_FILES = {CONFIG, WEIGHTS}
-_SET_SUFFIXES = (*SUFFIXES, ".json", ".md", ".png")
+_SET_SUFFIXES = (".json", ".md", ".png")
 
 
 @dataclass(frozen=True)
@@ -61,7 +61,7 @@ class Listing:
         if self.kind == ENCODER:
             fits = names == _ENCODER_FILES
         else:
-            fits = all(map(_is_name_of_set, names)) and any(name.endswith(SUFFIXES) for name in names)
+            fits = all(map(_is_name_of_set, names)) and any(map(is_shard_name, names))
         told = all(isinstance(digest, str) for digest in self.sha256.values())
         if (self.format, self.kind) != (_FORMAT, repository.kind) or not (fits and told):
             raise ValueError(json.dumps(asdict(self)))
@@ -86,7 +86,7 @@ def checked(folder: Path, repository: Repository, license: str) -> tuple[list[Pa
 def _kind(folder: Path) -> str | None:
     """What a folder holds; files that are called shards make a set, so that it is told what is wrong with them."""
     kind = kept_in(folder)
-    named = kind is None and folder.is_dir() and any(path.suffix in SUFFIXES for path in folder.iterdir())
+    named = kind is None and folder.is_dir() and any(is_shard_name(path.name) for path in folder.iterdir())
     return SET if named else kind
 
 
@@ -102,12 +102,13 @@ def _check(folder: Path, kind: str) -> None:
 
 def _is_name_of_set(name: str) -> bool:
     """Whether a set may have a file of a name: no folder's, no hidden one, no README of another maker."""
-    return Path(name).name == name and not name.startswith(".") and name.endswith(_SET_SUFFIXES) and name != CARD
+    told = name.endswith(_SET_SUFFIXES) and not name.startswith(".") and name != CARD
+    return Path(name).name == name and (is_shard_name(name) or told)
 
 
 def is_there(folder: Path, listing: Listing) -> bool:
     """Whether a folder holds what a listing lists, and no shard that would make it another set."""
-    shards = {path.name for suffix in SUFFIXES for path in folder.glob(f"*{suffix}")}
+    shards = {path.name for path in folder.glob("*") if is_shard_name(path.name)}
     return shards <= listing.sha256.keys() and all(
         (folder / n).is_file() and sha256(folder / n) == digest for n, digest in listing.sha256.items()
     )

@@ -38,7 +38,7 @@ def bar_plots(
         summary: scores of every condition.
         runs: table of runs, whose final scores are the dots.
         looks: numbers of all methods of the report in `style`.
-        published: scores by `env` and `dataset` that were reached on the very sets of a panel; drawn where the
+        published: scores by `env` and `dataset` that were reached on V-D4RL's own sets; drawn where the
             corruption is none.
     """
     plots = []
@@ -149,7 +149,9 @@ def _lines(axes: Axes, row: dict[str, str]) -> None:
 
 
 def _published_note(published: list[dict[str, str]]) -> str:
-    return " Lines: V-D4RL's published scores, on the same sets, with nothing hidden." if published else ""
+    return (
+        " Lines: V-D4RL's published scores, on its own sets of these names, with nothing hidden." if published else ""
+    )
 
 
 def _words(row: Row) -> str:

@@ -19,7 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.runs.episodes import COLUMNS, LABELS, read_episodes
+from vd4rl_pomdp.runs.episodes import COLUMNS, LABELS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_csv
 from vd4rl_pomdp.runs.identity import identity
 from vd4rl_pomdp.runs.metrics import read_metrics
@@ -107,7 +107,7 @@ def read_run(folder: Path) -> Result:
     files = {name: read_json(folder / place) for name, place in FILES.items() if (folder / place).exists()}
     if ENCODER in files and not isinstance(files[ENCODER].get("pretrain"), dict):
         raise UserError(f"{folder / FILES[ENCODER]}: does not say how the encoder was pretrained; pretrain it again")
-    metrics, rows = read_metrics(folder / "metrics.jsonl"), read_episodes(folder / EPISODES)
+    metrics, rows = read_metrics(folder / "metrics.jsonl"), _folder_rows(folder / EPISODES, "timing" in files)
     step = max((int(row["step"]) for row in (*metrics, *rows)), default=0)
     with _whole(folder):
         losses = [(int(row["step"]), row["action_loss"]) for row in metrics if "action_loss" in row]
@@ -116,6 +116,12 @@ def read_run(folder: Path) -> Result:
         _check_last_evaluation(run)
         files["labels"] = files.get("labels", {}) | _labels(run)
         return replace(run, id=_id(run))
+
+
+def _folder_rows(path: Path, finished: bool) -> list[Row]:
+    """A run folder's rows; what cut a run that is not finished may have cut its last row, which is left out."""
+    rows = read_episodes(path) if finished else episodes_until(path, sys.maxsize)
+    return [{name: row[name] for name in COLUMNS} for row in rows]
 
 
 def _check_last_evaluation(run: Result) -> None:
@@ -143,12 +149,16 @@ def _labels(run: Result) -> dict[str, Any]:
 
 def read_results(folder: Path) -> list[Result]:
     """All runs of a results folder; raises UserError if it is none, or damaged."""
-    by_run: dict[str, list[Row]] = {}
+    path, by_run = folder / RUNS, dict[str, list[Row]]()
+    lines = _lines(path)  # before the rows, which are written first: one that is written meanwhile lacks none
     for row in read_episodes(folder / EPISODES):
         if "id" not in row:
             raise UserError(f"{folder / EPISODES}: has no column 'id'; it was not written beside {RUNS}")
-        by_run.setdefault(row.pop("id"), []).append(row | {name: _shared(row[name]) for name in LABELS})
-    return _read_runs(folder, by_run)
+        by_run.setdefault(row["id"], []).append({name: _shared(row[name]) for name in COLUMNS})
+    runs = [_parse(path, number, line, by_run) for number, line in enumerate(lines, 1)]
+    if len({run.id for run in runs}) != len(runs):
+        raise UserError(f"{path}: names a run twice; remove one of the two lines")
+    return runs
 
 
 def _shared(value: Any) -> Any:
@@ -156,14 +166,9 @@ def _shared(value: Any) -> Any:
     return sys.intern(value) if isinstance(value, str) else value
 
 
-def settled_ids(folder: Path) -> set[str]:
-    """Ids of the runs of a results folder that have finished or diverged; empty if there is none yet."""
-    return {run.id for run in _read_runs(folder, None) if run.settled} if (folder / RUNS).exists() else set()
-
-
-def _read_runs(folder: Path, rows: dict[str, list[Row]] | None) -> list[Result]:
-    """All runs of a results folder with their rows, by run; without any, if there is None."""
-    path = folder / RUNS
+def _lines(path: Path) -> list[str]:
+    """The lines of a runs.jsonl."""
+    folder = path.parent
     try:
         lines = read_bytes(path).decode().splitlines()
     except FileNotFoundError as error:
@@ -172,10 +177,7 @@ def _read_runs(folder: Path, rows: dict[str, list[Row]] | None) -> list[Result]:
         raise UserError(f"{path}: is no UTF-8 ({error}); take another copy") from error
     if not lines:
         raise UserError(f"{path}: is empty; take another copy, or remove it")
-    runs = [_parse(path, number, line, rows) for number, line in enumerate(lines, 1)]
-    if len({run.id for run in runs}) != len(runs):
-        raise UserError(f"{path}: names a run twice; remove one of the two lines")
-    return runs
+    return lines
 
 
 def write_results(out: Path, runs: Iterable[Result]) -> None:
@@ -195,7 +197,7 @@ def _object(run: Result) -> dict[str, Any]:
     return told | ({"losses": run.losses} if run.losses else {})
 
 
-def _parse(path: Path, number: int, line: str, rows: dict[str, list[Row]] | None) -> Result:
+def _parse(path: Path, number: int, line: str, rows: dict[str, list[Row]]) -> Result:
     with _whole(f"{path}: line {number}"):
         told = parse_json(line)
         files = {name: told[name] for name in FILES if name in told}
@@ -206,10 +208,8 @@ def _parse(path: Path, number: int, line: str, rows: dict[str, list[Row]] | None
         return run
 
 
-def _rows(path: Path, run: str, rows: dict[str, list[Row]] | None, count: int) -> list[Row]:
+def _rows(path: Path, run: str, rows: dict[str, list[Row]], count: int) -> list[Row]:
     """The rows that a run had when its line was written: a cut writing may have added later ones."""
-    if rows is None:
-        return []
     mine = rows.get(run, [])
     if len(mine) < count:
         raise UserError(f"{path.parent / EPISODES}: has {len(mine)} of {count} rows of run {run}; take another copy")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.results.folder import RUNS, Result, read_results, read_run, settled_ids, write_results
+from vd4rl_pomdp.results.folder import RUNS, Result, read_results, read_run, write_results
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.ownership import owned
@@ -58,10 +58,10 @@ def _outermost(path: Path) -> Iterator[Path]:
 
 
 def _better(one: Result, other: Result) -> Result:
-    """Of two tales of one run the one that is settled, then that of its folder, then the one that is further."""
-    if one.settled and other.settled and one.measured != other.measured:
+    """Of two tales of one run the one that finished, else diverged; then that of its folder, then the one ahead."""
+    if one.finished == other.finished and one.settled and other.settled and one.measured != other.measured:
         raise UserError(f"{other.path} and {one.path}: two runs of one method, setting and seed; name one of them")
-    return max(one, other, key=lambda run: (run.settled, run.folder, len(run.measured), run.step))
+    return max(one, other, key=lambda run: (run.finished, run.settled, run.folder, len(run.measured), run.step))
 
 
 class Added(NamedTuple):
@@ -91,7 +91,8 @@ class Added(NamedTuple):
 def add_results(paths: Sequence[Path], out: Path) -> Added:
     """Append the runs at or below some paths to a results folder, each once; no row that is there changes.
 
-    An unfinished run of the folder, such as a report of that time keeps, gives way to the same run when it is settled.
+    An unfinished run of the folder, such as a report of that time keeps, gives way to the same run when it is settled,
+    and one that diverged to the same run when it has finished after all.
 
     Raises:
         UserError: as `find_results`, or `out` holds something else, is damaged or is in use.
@@ -101,7 +102,7 @@ def add_results(paths: Sequence[Path], out: Path) -> Added:
     with owned(out):
         there = {run.id: run for run in (read_results(out) if (out / RUNS).exists() else [])}
         settled = [run for run in found if run.settled]
-        fresh = {run.id: run for run in settled if run.id not in there or not there[run.id].settled}
+        fresh = {run.id: run for run in settled if run.id not in there or _ends_better(run, there[run.id])}
         if fresh:
             write_results(out, (there | fresh).values())
     again = [run for run in settled if run.id not in fresh]
@@ -109,11 +110,27 @@ def add_results(paths: Sequence[Path], out: Path) -> Added:
     return Added(len(fresh), known, len(again) - known, len(found) - len(settled))
 
 
+def _ends_better(one: Result, other: Result) -> bool:
+    """Whether a settled run says more of the same run than another tale: that did not end, or diverged."""
+    return not other.settled or (one.finished and not other.finished)
+
+
 def refuse_loss(runs: Sequence[Result], out: Path) -> None:
-    """Raise UserError if writing runs as the results folder `out` would lose settled ones that it tells of."""
-    lost = settled_ids(out) - {run.id for run in runs if run.settled}
-    if lost:
+    """Raise UserError if writing runs as the results folder `out` would lose settled ones, or rows, that it holds."""
+    there = [run for run in (read_results(out) if (out / RUNS).exists() else []) if run.settled]
+    written = {run.id: run for run in runs if run.settled}
+    if lost := [run for run in there if run.id not in written]:
         raise UserError(
             f"{out}: holds the results of {len(lost)} runs that would be lost; name the folder among those to report, "
             "remove it, or choose another --out"
         )
+    if changed := [run for run in there if not _agree(run, written[run.id])]:
+        raise UserError(
+            f"{out}: holds other rows of {len(changed)} runs (such as {changed[0].id}), which would be lost; choose "
+            "another --out"
+        )
+
+
+def _agree(kept: Result, written: Result) -> bool:
+    """Whether nothing of a settled run is lost where the same run is written in its place."""
+    return kept.measured == written.measured or _ends_better(written, kept)

@@ -76,11 +76,6 @@ def read_episodes(path: Path) -> list[dict[str, Any]]:
         return _parse(path, io.StringIO(text, newline=""))
 
 
-def check_episodes(path: Path) -> None:
-    """Raise UserError unless `read_episodes` can read a file."""
-    read_episodes(path)
-
-
 @contextmanager
 def _whole(path: Path) -> Iterator[None]:
     """Whatever a damaged table leads to becomes a sentence."""
@@ -104,6 +99,8 @@ def _parse(path: Path, lines: Iterable[str]) -> list[dict[str, Any]]:
 
 def _added(row: dict[str, str]) -> dict[str, Any]:
     """The columns that files of earlier versions lack, parsed."""
+    if None in row:
+        raise ValueError("it has more cells than there are columns")
     under, text = row.get("evaluated_under", row["corruption"]), row.get("action_error", "")
     if not under or text is None:
         raise ValueError("its end is missing")
@@ -129,7 +126,7 @@ def drop_episodes_after(path: Path, step: int) -> None:
     if not path.exists():
         return
     if kept := episodes_until(path, step):
-        write_csv(path, COLUMNS, kept)
+        write_csv(path, tuple(dict.fromkeys((*COLUMNS, *kept[0]))), kept)  # columns of one's own stay
     else:
         path.unlink()
 

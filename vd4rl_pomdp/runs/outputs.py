@@ -11,7 +11,7 @@ from pathlib import Path
 
 import h5py
 
-from vd4rl_pomdp.data.format import FRAMES_KEY, PLAN, SUFFIXES
+from vd4rl_pomdp.data.format import FRAMES_KEY, PLAN, is_shard_name
 from vd4rl_pomdp.errors import UserError
 
 _ROWS = {FRAMES_KEY, "action", "reward", "step_type"}
@@ -69,7 +69,7 @@ def _is_run(config: Path) -> bool:
 def _is_set(folder: Path) -> bool:
     if (folder / PLAN).is_file():
         return True
-    shards = (folder / name for name in _names(folder) if name.lower().endswith(SUFFIXES))
+    shards = (folder / name for name in _names(folder) if is_shard_name(name))
     return any(path.is_file() and _is_shard(path) for path in shards)
 
 

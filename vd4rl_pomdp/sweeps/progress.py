@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vd4rl_pomdp.data.format import SUFFIXES
+from vd4rl_pomdp.data.format import is_shard_name
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.stages import STAGES
@@ -14,4 +14,4 @@ def progress_of(job: Job) -> int:
         return max(Checkpoints(job.folder).steps(), default=0)
     if not job.folder.is_dir():
         return 0
-    return sum(path.suffix.lower() in SUFFIXES for path in job.folder.iterdir())
+    return sum(is_shard_name(path.name) for path in job.folder.iterdir())

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.data.format import PLAN, RECORD, SUFFIXES, refuse_partial
+from vd4rl_pomdp.data.format import PLAN, RECORD, is_shard_name, refuse_partial
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.data.store import open_store
 from vd4rl_pomdp.errors import UserError
@@ -90,4 +90,4 @@ def _told(name: str, value: Any) -> str:
 
 
 def _has_shards(folder: Path) -> bool:
-    return folder.is_dir() and any(path.suffix.lower() in SUFFIXES for path in folder.iterdir())
+    return folder.is_dir() and any(is_shard_name(path.name) for path in folder.iterdir())
