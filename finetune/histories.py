@@ -61,6 +61,8 @@ class HistoryOptions(Options):
         unread: dict[str, str] = {}
         if not self.random_histories:
             unread |= dict.fromkeys(("shortest_history", "longest_history"), "--random-histories is 0")
+        elif 0 < self.history_window <= self.shortest_history:
+            unread["random_histories"] = "--history-window is no longer than --shortest-history"
         if self.readout == "frame":
             unread |= dict.fromkeys(("history_window", "random_histories"), "--readout frame reads no history")
         return unread

@@ -41,6 +41,10 @@ def as_trained(config: FinetuneConfig, method: str, algorithm: str, remembers: b
 
 
 def _end_to_end(config: FinetuneConfig, algorithm: str) -> FinetuneConfig:
+    if config.algorithm not in (FinetuneConfig.algorithm, algorithm):
+        raise UserError(
+            f"--algorithm {config.algorithm} is not read: the encoder is trained by {algorithm}; leave it out"
+        )
     if config.views != config.usual()["views"]:
         raise UserError(f"--views is not read by the algorithm {algorithm}, which trains the encoder: leave it out")
     return config.altered(algorithm=algorithm, views=0)

@@ -30,7 +30,7 @@ from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_SIZES, FRAME_STACK, TASKS, UNKNO
 from vd4rl_pomdp.types import StateWindows, Windows
 
 STAGE = "pretrain"
-DECIDE_MEMORY = ("batch_size", "window", "feature_dim", "hidden_dim", "head_dim", "codes")
+DECIDE_MEMORY = ("batch_size", "window", "feature_dim", "hidden_dim", "head_dim", "codes", "homer_codes")
 """Settings that the memory of a training hangs on."""
 
 

@@ -4,7 +4,7 @@ import sys
 
 import pytest
 
-from vd4rl_pomdp.cli import COMMANDS, main
+from vd4rl_pomdp.cli import COMMANDS, ends, main
 from vd4rl_pomdp.cli.parsing import show
 
 NAMES = [
@@ -113,6 +113,19 @@ def test_a_tilde_behind_an_equals_sign_is_the_users_folder(tmp_path, monkeypatch
     with pytest.raises(SystemExit):
         main(["pretrain", "--out=~/run", "--data=~/set"])
     assert f"error: {tmp_path}/set: no such folder" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("stage", "flag"), [("pretrain", "--precision"), ("finetune", "--update-precision")])
+def test_a_training_that_diverged_names_its_own_flag(stage, flag, monkeypatch):
+    def diverge(words):
+        raise FloatingPointError("critic_loss is nan")
+
+    monkeypatch.setattr(ends, "run_stage", diverge)
+    end = ends.run_to_end([stage, "--out", "x"])
+    assert (end.code, end.line) == (
+        1,
+        f"error: training diverged, critic_loss is nan; lower --learning-rate or use {flag} fp32",
+    )
 
 
 @pytest.mark.parametrize("package", ["vd4rl_pomdp", "vd4rl_pomdp.cli"])

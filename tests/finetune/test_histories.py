@@ -118,6 +118,10 @@ def test_an_encoder_without_a_memory_refuses_the_options_of_one(data, tmp_path):
         ({"shortest_history": 5, "longest_history": 4}, "--shortest-history is 5, --longest-history 4: choose"),
         ({"shortest_history": 4}, "--shortest-history is not read: --random-histories is 0; leave it out"),
         ({"longest_history": 20}, "--longest-history is not read: --random-histories is 0; leave it out"),
+        (
+            {"history_window": 4, "random_histories": 0.5, "shortest_history": 4, "longest_history": 9},
+            "--random-histories is not read: --history-window is no longer than --shortest-history",
+        ),
         ({"history_window": -1}, "--history-window is -1; it must be at least 0"),
         ({"readout": "frame", "history_window": 4}, "--history-window is not read: --readout frame reads no history"),
         ({"readout": "frame", "random_histories": 0.5}, "--random-histories is not read: --readout frame reads no h"),

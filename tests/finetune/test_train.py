@@ -71,7 +71,11 @@ def test_references_resume_to_the_bit(with_states, tmp_path, monkeypatch, method
     trained = (whole / "encoder" / "model.safetensors").read_bytes()
     assert (trained != (made / "model.safetensors").read_bytes()) == (method != "state")
     rows = list(csv.DictReader((whole / "episodes.csv").open()))
-    assert {row["algorithm"] for row in rows} == {{"bc": "bc", "drq_bc": "drqv2_bc", "state": "td3_bc"}[method]}
+    own = {"bc": "bc", "drq_bc": "drqv2_bc", "state": "td3_bc"}[method]
+    assert {row["algorithm"] for row in rows} == {own}
+    if method != "state":
+        with pytest.raises(UserError, match=f"--algorithm iql is not read: the encoder is trained by {own}; leave"):
+            run_finetune(smoke_finetune(made, with_states, tmp_path / "other", algorithm="iql"))
 
 
 def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_them(with_states, data, tmp_path):

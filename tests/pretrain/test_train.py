@@ -115,6 +115,11 @@ def test_a_patch_that_the_film_of_a_state_cannot_hold_is_refused_first(tmp_path)
         check(patch_count=1001)
 
 
+def test_weights_that_no_memory_holds_are_told_as_such(data, tmp_path):
+    with pytest.raises(UserError, match=r"out of memory with .*--feature-dim 1000000000"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "out", feature_dim=10**9))
+
+
 def test_an_encoder_that_its_last_step_ruins_is_marked_and_not_kept(data, tmp_path, monkeypatch):
     config = smoke_pretrain(data, tmp_path / "out", steps=2)
 

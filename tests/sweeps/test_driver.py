@@ -110,6 +110,20 @@ def test_failures_stay_until_they_are_taken_up_again(jobs, tmp_path):
     assert names(executor) == ["a", "b"]
 
 
+def test_a_job_that_was_given_up_here_and_finished_elsewhere_is_finished(jobs, tmp_path, monkeypatch):
+    executor = Scripted(jobs, {"c": ["diverged"]})
+    worker, collect = Driver(jobs, executor, SweepFolder(tmp_path)), Driver._collect
+
+    def meanwhile(own):
+        collect(own)
+        if "c" in own._lost:
+            finish(jobs[3].folder)
+
+    monkeypatch.setattr(Driver, "_collect", meanwhile)
+    assert worker.run()
+    assert names(executor).count("c") == 1
+
+
 def test_a_job_that_another_driver_finished_meanwhile_is_left_alone(jobs, tmp_path):
     executor = Scripted(jobs)
     worker = Driver(jobs, executor, SweepFolder(tmp_path))

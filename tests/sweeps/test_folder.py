@@ -1,6 +1,7 @@
 """Plans and attempts on the disk."""
 
 import os
+import shutil
 from pathlib import Path
 
 import pytest
@@ -134,5 +135,9 @@ def test_a_part_of_a_grid_has_a_plan_of_its_own(tmp_path, monkeypatch):
     names = {job.name for job in SweepFolder(tmp_path / "out").jobs()}
     assert {name.split("/")[-1 if name.startswith("data/") else -2] for name in names} == {"expert", "seed0", "seed1"}
     assert len(list((tmp_path / "out" / "sweep" / "plans").iterdir())) == 2
+    (tmp_path / "other").mkdir()
+    shutil.copy(tmp_path / "grid.toml", tmp_path / "other")
+    main(["sweep", "run", str(tmp_path / "other" / "grid.toml"), "--out", str(tmp_path / "out"), "--only", "seed=0"])
+    assert len(list((tmp_path / "out" / "sweep" / "plans").iterdir())) == 3, "another file is another grid"
     assert plan_name("grid", []) == "grid"
     assert plan_name("grid", ["b=1", "a=0"]) == plan_name("grid", ["a=0", "b=1"]) != plan_name("grid", ["a=0"])

@@ -126,7 +126,36 @@ def test_what_is_no_grid_is_refused(file, text, message):
         load_grid(file(text)).cells()
 
 
-@pytest.mark.parametrize("text", ["x = 3", "GRID = 3", "import nothing_at_all", "raise SystemError('no')"])
+def test_a_name_of_two_sections_is_told_by_its_section(file):
+    rates = "learning_rate = 0.001\n[finetune]\nlearning_rate = [0.001, 0.01]"
+    path = file(f"[collect]\n[pretrain]\n{rates}\n[[where]]\nonly = ['finetune.learning_rate=0.01']\npreset = 'cpu'")
+    cells = load_grid(path).cells()
+    for rate, preset in (("0.001", None), ("0.01", "cpu")):
+        (kept,) = narrow(cells, [f"finetune.learning_rate={rate}"])
+        assert (kept.value("finetune.learning_rate"), kept.value("preset")) == (float(rate), preset)
+    with pytest.raises(UserError, match=r"'learning_rate' means pretrain\.learning_rate and finetune\.learning_rate"):
+        narrow(cells, ["learning_rate=0.001"])
+    with pytest.raises(UserError, match="sets nothing of that name"):
+        narrow(cells, ["collect.learning_rate=0.001"])
+
+
+def test_what_changes_no_result_is_no_axis(file):
+    assert len(load_grid(file("[collect]\n[pretrain]\nlog_every = 10")).cells()) == 1
+    with pytest.raises(UserError, match=r"pretrain\.log_every: changes no result"):
+        load_grid(file("[collect]\n[pretrain]\nlog_every = [10, 20]"))
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "raise SystemExit(3)",
+        "GRID = {'collect': {}, 'pretrain': {3: 4}}",
+        "x = 3",
+        "GRID = 3",
+        "import nothing_at_all",
+        "raise SystemError('no')",
+    ],
+)
 def test_a_python_file_that_defines_none_is_refused(file, text):
     with pytest.raises(UserError, match=r"mine\.py"):
         load_grid(file(text, "mine.py"))

@@ -143,7 +143,7 @@ def test_a_policy_whose_encoder_saw_another_set_is_not_a_grids(copy):
 
 
 def test_an_encoder_is_trained_once_for_all_its_policies(copy):
-    names = left(plan(copy, ["finetune.algorithm=td3_bc,bc,iql"]))
+    names = left(plan(copy, ["pretrain.method=mik+a,acro", "finetune.algorithm=td3_bc,bc,iql"]))
     assert not any("pretrain" in name for name in names)
 
 
@@ -303,6 +303,11 @@ def test_a_set_that_was_collected_so_is_taken(copy, size):
     write_json(copy / "data" / "walker_walk" / "expert" / "collection.json", collected(frame_size=size, episodes=3))
     (copy / "data" / "walker_walk" / "expert" / "provenance.json").write_text("{}")
     assert left(plan(copy, [f"collect.frame_size={size}", "collect.episodes=3"])) == []
+
+
+def test_a_set_of_ones_own_has_frames_of_the_size_that_is_asked_for(copy):
+    with pytest.raises(UserError, match=r"expert: holds frames of 84x84 pixels, the grid says 48; choose another"):
+        plan(copy, ["collect.frame_size=48"])
 
 
 def test_a_longer_task_is_evaluated_over_all_of_it(tmp_path):

@@ -36,7 +36,8 @@ def run_to_end(words: Sequence[str], second: signal.Handlers = signal.SIG_DFL) -
     except UserError as error:
         return End(2, error.cause, f"error: {' '.join(str(error).split())}")
     except FloatingPointError as error:
-        usual = "lower --learning-rate or use --precision fp32"
+        precision = "--update-precision" if words[:1] == ["finetune"] else "--precision"
+        usual = f"lower --learning-rate or use {precision} fp32"
         remedy = error.remedy if isinstance(error, DivergedError) else usual
         return End(1, DIVERGED, f"error: training diverged, {error}; {remedy}")
     except KeyboardInterrupt as error:

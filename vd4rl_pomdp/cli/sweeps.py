@@ -72,7 +72,7 @@ def _run(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.sweeps.folder import SweepFolder, plan_name
     from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
     from vd4rl_pomdp.sweeps.grid import narrow
-    from vd4rl_pomdp.sweeps.grid_file import load_grid
+    from vd4rl_pomdp.sweeps.grid_file import load_grid, names
     from vd4rl_pomdp.sweeps.plan import JobPlanner
 
     command = parse_stage(RunCommand, words, program)
@@ -83,7 +83,8 @@ def _run(words: Arguments, program: str) -> None:
     refuse_kept(command.out)
     here, kept = FoundRuns(runs_below(command.out)), FoundRuns(runs_kept(command.done))
     folder = SweepFolder(command.out)
-    plan = plan_name(grid.name, [*command.only, *command.change, *["testing"] * command.testing])
+    own = [str(Path(command.grid).resolve())] * (command.grid not in names())  # another file is another grid
+    plan = plan_name(grid.name, [*own, *command.only, *command.change, *["testing"] * command.testing])
     planner = JobPlanner(command.out, command.data, kept, here, folder.jobs_of_others(plan))
     jobs = planner.plan(cells)
     refuse_unknown_to_jobs(jobs)

@@ -14,6 +14,7 @@ from torch import Tensor, nn
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, STATE, FrameEncoder, StateFrame, make_frame_encoder
 from vd4rl_pomdp.nn.sequence import run_gru
+from vd4rl_pomdp.runs.memory import ran_out
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.types import Windows
 
@@ -63,6 +64,8 @@ def _frame_encoder(config: EncoderConfig) -> FrameEncoder:
     try:
         return make_frame_encoder(config.frame_encoder, config.channels, config.size, options)
     except RuntimeError as error:  # a convolution's, whose input is smaller than its kernel
+        if ran_out(error):
+            raise
         raise UserError(
             f"frame encoder {config.frame_encoder!r} cannot read pictures of {config.size}x{config.size} pixels: "
             "choose another --frame-encoder, or a set of larger frames"

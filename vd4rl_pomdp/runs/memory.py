@@ -59,12 +59,13 @@ def telling_memory(config: Any, *names: str) -> Iterator[None]:
     try:
         yield
     except (MemoryError, RuntimeError) as error:
-        if not _ran_out(error):
+        if not ran_out(error):
             raise
         raise OutOfMemoryError(f"out of memory with {_named(config, names)}: {_remedy(names)}") from error
 
 
-def _ran_out(error: Exception) -> bool:
+def ran_out(error: Exception) -> bool:
+    """Whether an error says that memory did not suffice."""
     own = isinstance(error, MemoryError | torch.OutOfMemoryError)
     return own or any(part in str(error) for part in _OUT)
 

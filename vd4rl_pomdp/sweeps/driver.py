@@ -108,7 +108,7 @@ class Driver:
             self._executor.stop()
             self._collect()
             raise
-        return not self._left
+        return all(job.finished for job in self._left.values())  # others may have finished what was given up here
 
     def _start(self) -> None:
         """Start every job that can be."""

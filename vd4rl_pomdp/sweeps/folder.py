@@ -1,7 +1,8 @@
 """What a sweep keeps beside its runs: its plans, one row for every attempt at a job, and what the jobs printed.
 
     OUT/sweep/plans/GRID.json    from (the working directory), out, and the jobs of a grid: name, stage, folder,
-                                 command, needs; GRID~*.json those of a part of it, or of it with other settings
+                                 command, needs; GRID~*.json those of a grid of one's own, of a part of one, or of one
+                                 with other settings
     OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, step, slots, largest
                                  (the most slots it could have had), host, words (of its command)
     OUT/sweep/logs/JOB.log
@@ -35,7 +36,7 @@ RETRIED = "retried"
 
 
 def plan_name(grid: str, words: Iterable[str]) -> str:
-    """What the plan of a grid is called, given the words that narrow or change it: each such command has its own."""
+    """What a grid's plan is called, given its file and what narrows or changes it: each such command has its own."""
     told = sorted(words)
     return f"{grid}~{hashlib.blake2b(json.dumps(told).encode(), digest_size=4).hexdigest()}" if told else grid
 

@@ -41,9 +41,23 @@ class GridCell:
         return self.shared.get("seed", 0)
 
     def value(self, name: str) -> Any:
-        """What it sets a setting to, in whichever section; None if it does not."""
-        found = (values[name] for values in (self.shared, *self.sections.values()) if name in values)
-        return next(found, None)
+        """What it sets `section.name` to, or `name` in whichever section; None if it does not.
+
+        Raises:
+            UserError: sections set that name to different values.
+        """
+        return value_of({"": self.shared} | self.sections, name)
+
+
+def value_of(sections: Sections, name: str) -> Any:
+    """What some sections, of which "" are the settings outside of all, set a name to; as `GridCell.value`."""
+    section, _, own = name.rpartition(".")
+    if section or name in sections.get("", {}):
+        return sections.get(section, {}).get(own)
+    found = {f"{section}.{name}": values[name] for section, values in sections.items() if name in values}
+    if any(value != next(iter(found.values())) for value in found.values()):
+        raise UserError(f"{name!r} means {' and '.join(found)} here, which differ: write one of these")
+    return next(iter(found.values()), None)
 
 
 @dataclass(frozen=True)

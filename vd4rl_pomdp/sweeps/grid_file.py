@@ -36,7 +36,9 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.runs.interrupt import Terminated
 from vd4rl_pomdp.runs.reading import read_bytes, regular
+from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS
 from vd4rl_pomdp.sweeps.grid import (
     MAZES,
     PIXELS,
@@ -50,6 +52,7 @@ from vd4rl_pomdp.sweeps.grid import (
     check_values,
     condition,
     merge,
+    value_of,
 )
 
 GRIDS = Path(__file__).parents[1] / "experiments" / "grids"
@@ -89,11 +92,11 @@ def _read(path: Path, name: str) -> Values:
         if path.suffix == ".toml":
             return tomllib.loads(read_bytes(path).decode())
         told = runpy.run_path(str(regular(path))).get("GRID")
-    except UserError:
+    except (UserError, Terminated):
         raise
     except OSError as error:
         raise disk_error(path, error) from error
-    except Exception as error:
+    except (Exception, SystemExit) as error:
         raise UserError(f"{path}: is no grid ({type(error).__name__}: {error}); mend it") from error
     if not isinstance(told, dict):
         raise UserError(f"{path}: defines no dict called GRID; see the grids that ship for its form")
@@ -194,6 +197,10 @@ def _check_settings(section: str, settings: Values, axes: bool = True) -> None:
     if section in TRAININGS and "seed" in settings:
         raise UserError(f"{section}.seed: a cell's trainings share one seed: write it outside the sections")
     for name, value in settings.items():
+        if not isinstance(name, str):
+            raise UserError(f"{section}: {name!r} is the name of no setting")
+        if isinstance(value, list) and axes and name in RUNTIME_FIELDS:
+            raise UserError(f"{section}.{name}: changes no result, so that cells of several would be one run; tell one")
         values = value if isinstance(value, list) and axes else [value]
         if not values or not all(_is_value(name, one) for one in values):
             where = f"{section}.{name}".lstrip(".")
@@ -208,5 +215,5 @@ def _is_value(name: str, told: Any) -> bool:
 
 
 def _values_of(block: Sections, name: str) -> list[Any]:
-    found = next((settings[name] for settings in block.values() if name in settings), None)
+    found = value_of(block, name)
     return found if isinstance(found, list) else [found]

@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.data.format import PLAN, RECORD, is_shard_name, refuse_partial
+from vd4rl_pomdp.data.format import PLAN, RECORD, is_shard_name, read_frame_size, refuse_partial, shard_paths
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.data.store import open_store
 from vd4rl_pomdp.errors import UserError
@@ -16,6 +16,7 @@ from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.naming import extras
 from vd4rl_pomdp.sweeps.stages import collection_of
+from vd4rl_pomdp.tasks import FRAME_SIZE
 
 _DOWNLOADED = "84px"
 """Folder in which a downloaded set has its shards."""
@@ -55,10 +56,20 @@ class DataSet:
     def check(self) -> None:
         """Raise UserError if its folder holds a set that was collected otherwise, or not downloaded to its end."""
         refuse_partial(self.folder)
+        if self.foreign:
+            self._check_frames()
         stored = read_json(self.folder / PLAN) if (self.folder / PLAN).exists() else self.wanted
         if others := differing(stored, self.wanted):
             has, asked = (_told(others[0], values.get(others[0])) for values in (stored, self.wanted))
             raise UserError(f"{self.folder}: holds a set of {has}, the grid says {asked}; choose another --data")
+
+    def _check_frames(self) -> None:
+        """Raise UserError if a set that nothing here collected has frames of another size: its files tell no more."""
+        asked = self.wanted.get("frame_size") or FRAME_SIZE
+        if self.section == "collect" and (size := read_frame_size(shard_paths(self.folder))) != asked:
+            raise UserError(
+                f"{self.folder}: holds frames of {size}x{size} pixels, the grid says {asked}; choose another --data"
+            )
 
     def made(self, record: Mapping[str, Any]) -> bool:
         """Whether a run, as its config.json tells it, was trained on this set."""

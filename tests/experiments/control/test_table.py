@@ -39,6 +39,12 @@ def test_methods_are_ranked_and_answers_given_where_all_gates_are_reached():
     assert not any("does not discriminate" in line for line in lines)
 
 
+def test_a_policy_that_reads_no_memory_answers_nothing_about_it():
+    frame = ("frame", 0.0, 0)
+    lines = told(rows("none", 110.0, 90.0), rows("mik", 260.0, 270.0), rows("mik", 80.0, 70.0, read=frame), CEILING)
+    assert [line for line in lines if "memory pays" in line] == ["memory pays: mik minus none is +165 ± 15 (n = 2)"]
+
+
 def test_what_the_seeds_do_not_tell_is_said():
     lines = told(rows("none", 10.0, 9.0), rows("mik", 260.0, 270.0), rows("mik+a", 480.0, 200.0), rows("ah", 8.0, 7.0))
     assert "the seeds do not tell whether past actions pay: mik+a minus mik is +75 ± 145 (n = 2)" in lines

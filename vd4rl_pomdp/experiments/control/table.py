@@ -149,7 +149,8 @@ def _floor(rows: list[Row]) -> str | None:
 
 def _answers(rows: list[Row]) -> Iterator[str]:
     """One sentence for every pair of methods that differ in memory alone, or in past actions alone."""
-    methods = {name_of(row): row["method"] for row in rows if row["method"] not in (NO_MEMORY, UNTRAINED)}
+    remembering = (row for row in rows if row["method"] not in (NO_MEMORY, UNTRAINED) and row["readout"] != "frame")
+    methods = {name_of(row): row["method"] for row in remembering}
     pairs = [("memory", name, NO_MEMORY) for name, method in methods.items() if not method.endswith("+a")]
     pairs += [
         ("past actions", name, name.replace("+a", "", 1)) for name, method in methods.items() if method.endswith("+a")
