@@ -6,6 +6,7 @@ import pytest
 
 from vd4rl_pomdp.cli import COMMANDS, ends, main
 from vd4rl_pomdp.cli.parsing import show
+from vd4rl_pomdp.runs.interrupt import Terminated
 
 NAMES = [
     [name, *([inner] if inner else [])]
@@ -113,6 +114,15 @@ def test_a_tilde_behind_an_equals_sign_is_the_users_folder(tmp_path, monkeypatch
     with pytest.raises(SystemExit):
         main(["pretrain", "--out=~/run", "--data=~/set"])
     assert f"error: {tmp_path}/set: no such folder" in capsys.readouterr().err
+
+
+def test_a_signal_while_words_are_read_is_no_slip(monkeypatch):
+    def end(*words, **options):
+        raise Terminated
+
+    monkeypatch.setattr("tyro.cli", end)
+    ended = ends.run_to_end(["data", "check", "x"])
+    assert (ended.code, ended.line) == (143, "terminated: the same command does what is left")
 
 
 @pytest.mark.parametrize(("stage", "flag"), [("pretrain", "--precision"), ("finetune", "--update-precision")])

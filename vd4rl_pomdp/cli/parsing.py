@@ -17,6 +17,7 @@ from vd4rl_pomdp.cli.dispatch import Arguments
 from vd4rl_pomdp.errors import UserError, flag_of
 from vd4rl_pomdp.options import StageConfig, flat, option_names
 from vd4rl_pomdp.runs.files import flatten
+from vd4rl_pomdp.runs.interrupt import Terminated
 
 _LONGEST_LIST = 6
 _FLAT = (tyro.conf.OmitArgPrefixes,)
@@ -39,7 +40,7 @@ def parse(config: Any, words: Arguments, program: str, default: Any = None) -> A
                 **options,
             )
     except SystemExit as end:
-        if end.code in (0, None):
+        if end.code in (0, None) or isinstance(end, Terminated):
             raise
         raise UserError(_one_line(shown.getvalue(), program)) from None
     _refuse_empty(parsed, words)
