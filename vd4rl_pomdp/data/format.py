@@ -67,8 +67,8 @@ def shard_paths(folder: Path) -> list[Path]:
         raise UserError(f"{folder}: the set's collection is not finished; start the command that collects it again")
     shards = [path for path in folder.iterdir() if is_shard_name(path.name)]
     if not shards:
-        inner = next((path.parent for path in sorted(folder.rglob("*")) if is_shard_name(path.name)), None)
-        hint = f"name a folder of shards such as {inner}" if inner else "collect or download a set there"
+        first = min((path for path in folder.rglob("*") if is_shard_name(path.name)), default=None)
+        hint = f"name a folder of shards such as {first.parent}" if first else "collect or download a set there"
         raise UserError(f"{folder}: holds no .hdf5 shards; {hint}")
     _refuse_twins(folder, shards)
     _refuse_gaps(folder, shards)

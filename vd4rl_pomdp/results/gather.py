@@ -59,9 +59,14 @@ def _outermost(path: Path) -> Iterator[Path]:
 
 def _better(one: Result, other: Result) -> Result:
     """Of two tales of one run the one that finished, else diverged; then that of its folder, then the one ahead."""
-    if one.finished == other.finished and one.settled and other.settled and one.measured != other.measured:
+    if one.settled and _ending(one) == _ending(other) and one.measured != other.measured:
         raise UserError(f"{other.path} and {one.path}: two runs of one method, setting and seed; name one of them")
-    return max(one, other, key=lambda run: (run.finished, run.settled, run.folder, len(run.measured), run.step))
+    return max(one, other, key=lambda run: (_ending(run), run.folder, len(run.measured), run.step))
+
+
+def _ending(run: Result) -> int:
+    """How much is told of a run's end: 0 that it has none yet, 1 that it diverged, 2 that it finished."""
+    return run.settled + run.finished
 
 
 class Added(NamedTuple):
@@ -100,9 +105,9 @@ def add_results(paths: Sequence[Path], out: Path) -> Added:
     refuse_foreign(out, "results", RUNS, "README.md")  # whose page may be there before the first run
     found = find_results(paths, out)
     with owned(out):
-        there = {run.id: run for run in (read_results(out) if (out / RUNS).exists() else [])}
+        there = {run.id: run for run in _kept(out)}
         settled = [run for run in found if run.settled]
-        fresh = {run.id: run for run in settled if run.id not in there or _ends_better(run, there[run.id])}
+        fresh = {run.id: run for run in settled if run.id not in there or _ending(run) > _ending(there[run.id])}
         if fresh:
             write_results(out, (there | fresh).values())
     again = [run for run in settled if run.id not in fresh]
@@ -110,14 +115,14 @@ def add_results(paths: Sequence[Path], out: Path) -> Added:
     return Added(len(fresh), known, len(again) - known, len(found) - len(settled))
 
 
-def _ends_better(one: Result, other: Result) -> bool:
-    """Whether a settled run says more of the same run than another tale: that did not end, or diverged."""
-    return not other.settled or (one.finished and not other.finished)
+def _kept(out: Path) -> list[Result]:
+    """The runs of a results folder, none before the first."""
+    return read_results(out) if (out / RUNS).exists() else []
 
 
 def refuse_loss(runs: Sequence[Result], out: Path) -> None:
     """Raise UserError if writing runs as the results folder `out` would lose settled ones, or rows, that it holds."""
-    there = [run for run in (read_results(out) if (out / RUNS).exists() else []) if run.settled]
+    there = [run for run in _kept(out) if run.settled]
     written = {run.id: run for run in runs if run.settled}
     if lost := [run for run in there if run.id not in written]:
         raise UserError(
@@ -133,4 +138,4 @@ def refuse_loss(runs: Sequence[Result], out: Path) -> None:
 
 def _agree(kept: Result, written: Result) -> bool:
     """Whether nothing of a settled run is lost where the same run is written in its place."""
-    return kept.measured == written.measured or _ends_better(written, kept)
+    return kept.measured == written.measured or _ending(written) > _ending(kept)
