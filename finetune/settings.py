@@ -58,9 +58,8 @@ def _without_memory(config: FinetuneConfig, method: str) -> FinetuneConfig:
     return replace(config, memory=NO_OPTIONS)
 
 
-def check_n_step(config: FinetuneConfig, dataset: Dataset) -> None:
-    """Raise UserError for returns over more steps than an episode has."""
-    longest = int((dataset.episode_end - dataset.episode_start).max()) - 1
+def check_n_step(config: FinetuneConfig, longest: int) -> None:
+    """Raise UserError for returns over more steps than the `longest` episode has."""
     refuse_number("n_step", returns_of(config).n_step, 1, max(longest, ReturnOptions.n_step))
 
 

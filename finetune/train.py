@@ -72,7 +72,7 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
         encoder.config = replace(encoder.config, **config.memory.encoder_changes)
     if encoder.reads_state:
         dataset.require_states()
-    check_n_step(config, dataset)
+    check_n_step(config, int((dataset.episode_end - dataset.episode_start).max()) - 1)
     untold = card.quality if card.data == dataset.fingerprint else UNKNOWN_QUALITY
     card = replace(card, quality=dataset.quality or untold)  # the policy's set names its rows
     inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}

@@ -9,8 +9,9 @@ from typing import Any, ClassVar, Literal
 from pretrain.config import MemoryOptions, TrainingConfig, frame_options
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.errors import UserError, flag_of, refuse_outside
-from vd4rl_pomdp.navigation.methods import REFERENCES
+from vd4rl_pomdp.navigation.methods import METHOD_NAMES, REFERENCES
 from vd4rl_pomdp.navigation.observations import SHAPES, Picture
+from vd4rl_pomdp.objective import ActionOptions
 from vd4rl_pomdp.options import NO_OPTIONS, Limits, Options, flat
 
 _PAPER: dict[str, Any] = {
@@ -143,6 +144,9 @@ class NavigationConfig(TrainingConfig):
         refuse_outside(
             self, steps=1, burn_in=0, average_last=1, evaluation_windows=1, refit_windows=1, refit_steps=1, warm_up=0
         )
+        trained = self.trained()
+        if not isinstance(trained.options, ActionOptions):
+            raise UserError(f"{trained.method} predicts no actions: choose one of {', '.join(METHOD_NAMES)}")
         if self.picture not in SHAPES:
             raise UserError(f"unknown picture {self.picture!r}: choose one of {', '.join(SHAPES)}")
         if self.burn_in >= self.window:

@@ -12,8 +12,7 @@ from pretrain.build import build_objective, build_target
 from pretrain.navigation.config import NavigationConfig
 from pretrain.navigation.data import MazeData
 from pretrain.navigation.probe import ErrorSums, StateProbe
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.navigation.methods import METHOD_NAMES, SUPERVISED
+from vd4rl_pomdp.navigation.methods import SUPERVISED
 from vd4rl_pomdp.navigation.observations import SHAPES
 from vd4rl_pomdp.objective import InverseObjective
 from vd4rl_pomdp.runs.device import autocast
@@ -31,8 +30,6 @@ def make_objective(data: MazeData, config: NavigationConfig) -> InverseObjective
     """The objective of a config on a maze's data, on the CPU."""
     trained = config.trained()
     target = build_target(trained, data.training_actions.numpy())
-    if target is None:
-        raise UserError(f"{trained.method} predicts no actions: choose one of {', '.join(METHOD_NAMES)}")
     objective = build_objective(trained, data.training_actions.shape[1], target, observation=SHAPES[config.picture])
     assert isinstance(objective, InverseObjective)
     return objective

@@ -8,7 +8,7 @@ import pytest
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.experiments.navigation.grid import condition_of, paper_rows
 from vd4rl_pomdp.mazes import PAPER_MAZES
-from vd4rl_pomdp.sweeps.grid import narrow
+from vd4rl_pomdp.sweeps.grid import GridCell, narrow
 from vd4rl_pomdp.sweeps.grid_file import load_grid, names
 from vd4rl_pomdp.sweeps.stages import check_cell
 
@@ -228,6 +228,40 @@ def test_a_set_that_cannot_be_collected_is_refused_before_anything_is_run(file, 
     (cell,) = load_grid(file(section)).cells()
     with pytest.raises(UserError, match="'nope'"):
         check_cell(cell)
+
+
+CELL = {
+    "collect": {"task": "walker_walk", "quality": "expert", "frame_size": 48},
+    "pretrain": {"frame_encoder": "nature", "steps": 10},
+    "finetune": {},
+}
+MAZE_CELL = {
+    "navigation_collect": {"maze": "no_curtain", "trajectories": 2, "trajectory_rows": 64},
+    "navigation_train": {},
+}
+
+
+@pytest.mark.parametrize(
+    ("cell", "section", "changes", "message"),
+    [
+        (CELL, "pretrain", {"shift": 48}, "--shift is 48; it must be at least 0 and at most 47"),
+        (CELL, "pretrain", {"corruption": "patch", "patch_size": 49}, r"patch size 49 exceeds the image \(48x48\)"),
+        (CELL, "pretrain", {"window": 502}, "--window 502 is longer than an episode of the set, of 501 rows"),
+        (CELL, "pretrain", {"frame_encoder": "mixer"}, "48 is no multiple"),
+        (CELL, "finetune", {"shift": 48}, "--shift is 48; it must be at least 0 and at most 47"),
+        (CELL, "finetune", {"n_step": 501}, "--n-step is 501; it must be at least 1 and at most 500"),
+        (CELL, "collect", {"frame_size": 16}, "'nature' cannot read pictures of 16x16 pixels"),
+        (MAZE_CELL, "navigation_train", {"method": "curl"}, "curl predicts no actions"),
+        (MAZE_CELL, "navigation_train", {"window": 65}, "--window 65 is longer than an episode of the set, of 64 rows"),
+        (MAZE_CELL, "navigation_collect", {"trajectories": 1}, "--trajectories is 1: a single trajectory leaves none"),
+    ],
+)
+def test_a_training_that_cannot_read_the_set_of_its_cell_is_refused_before_the_set_is_collected(
+    cell, section, changes, message
+):
+    check_cell(GridCell({}, cell, {}))
+    with pytest.raises(UserError, match=message):
+        check_cell(GridCell({}, cell | {section: cell[section] | changes}, {}))
 
 
 def test_the_papers_grids_are_its_figures_over_twelve_methods():

@@ -38,9 +38,14 @@ def open_maze_set(path: Path, cache: Path | None = None) -> tuple[Dataset, MazeS
             f"{path}: holds no true states ('physics'), which the probe needs; collect a set with "
             "`vd4rl-pomdp navigation collect`"
         )
-    if dataset.num_episodes < 2:
-        raise UserError(f"{path}: holds a single trajectory, so none can be held out; collect more --trajectories")
+    check_trajectories(dataset.num_episodes, str(path))
     return dataset, MAZES[names.pop()]
+
+
+def check_trajectories(number: int, where: str) -> None:
+    """Raise UserError for a set of so few trajectories that none can be held out."""
+    if number < 2:
+        raise UserError(f"{where}: a single trajectory leaves none to be held out; collect more --trajectories")
 
 
 def to_grey50(pictures: Tensor) -> Tensor:

@@ -58,7 +58,8 @@ class StreamState(NamedTuple):
     """(B, L', F + A): the GRU's last inputs under a history window, else empty."""
 
 
-def _frame_encoder(config: EncoderConfig) -> FrameEncoder:
+def build_frame_encoder(config: EncoderConfig) -> FrameEncoder:
+    """The frame encoder of a config; raises UserError if it cannot read pictures of that size."""
     told = {"feature_dim": config.feature_dim} | config.frame_options
     options = FRAME_ENCODERS.named(config.frame_encoder).options.fill(told)
     try:
@@ -82,7 +83,7 @@ class Encoder(nn.Module):
             config = self.config = replace(config, feature_dim=config.channels)
             self.frame: FrameEncoder | StateFrame = StateFrame(config.channels, **config.frame_options)
         else:
-            self.frame = _frame_encoder(config)
+            self.frame = build_frame_encoder(config)
         inputs = config.feature_dim + (config.action_dim if config.use_actions else 0)
         self.gru = (
             nn.GRU(inputs, config.hidden_dim, config.gru_layers, batch_first=True) if config.history == "gru" else None

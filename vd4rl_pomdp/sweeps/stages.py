@@ -17,6 +17,7 @@ from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.identity import recipe
 from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.sweeps.fits import check_fit
 from vd4rl_pomdp.sweeps.grid import GridCell, Values
 from vd4rl_pomdp.tasks import TASKS
 
@@ -57,9 +58,8 @@ def words_of(settings: Values) -> list[str]:
 
 
 def check_cell(cell: GridCell) -> None:
-    """Raise UserError for settings that a stage would refuse."""
-    for section in cell.chain:
-        config_of(cell, section)
+    """Raise UserError for settings that a stage would refuse, by themselves or on the set that the cell collects."""
+    check_fit({section: config_of(cell, section) for section in cell.chain})
     if "finetune" in cell.chain:
         _finetuning(cell)
 

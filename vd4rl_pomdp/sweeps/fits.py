@@ -1,0 +1,73 @@
+"""Whether the trainings of a cell fit the set that it collects, which can be known before there is one.
+
+A stage refuses the same once it has read its set; a sweep would have collected it, and trained on it, in vain.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, replace
+from functools import cache
+from typing import Any
+
+from vd4rl_pomdp.errors import UserError, refuse_outside
+from vd4rl_pomdp.nn.encoder import EncoderConfig, build_frame_encoder
+from vd4rl_pomdp.tasks import FRAME_STACK, TASKS
+
+
+def check_fit(configs: Mapping[str, Any]) -> None:
+    """Raise UserError for frames or episodes that a training of a cell cannot read.
+
+    Args:
+        configs: the settings of the cell's stages, by section.
+    """
+    configs = {section: replace(config, seed=0) for section, config in configs.items()}  # seeds do not matter here
+    if (maze_set := configs.get("navigation_collect")) and (training := configs.get("navigation_train")):
+        _check_maze(training, maze_set)
+    if data_set := configs.get("collect"):
+        size, rows = data_set.frame_size, TASKS.named(data_set.task).decisions + 1
+        if before := configs.get("pretrain"):
+            _check_pretraining(before, size, rows)
+        if after := configs.get("finetune"):
+            _check_finetuning(after, size, rows)
+
+
+@cache
+def _check_maze(training: Any, maze_set: Any) -> None:
+    from vd4rl_pomdp.navigation.observations import SHAPES, check_trajectories
+
+    check_trajectories(maze_set.trajectories, "--trajectories is 1")
+    _check_window(training.window, maze_set.trajectory_rows)
+    _check_frames(training, *SHAPES[training.picture])
+
+
+@cache
+def _check_pretraining(config: Any, size: int, rows: int) -> None:
+    from pretrain.objectives import METHODS
+    from pretrain.train import check_pictures
+
+    check_pictures(config, size)
+    _check_window(config.window, rows)
+    if not METHODS.named(config.method).reads_state:
+        _check_frames(config, 3 * FRAME_STACK, size)
+
+
+@cache
+def _check_finetuning(config: Any, size: int, rows: int) -> None:
+    from finetune.settings import check_n_step
+
+    refuse_outside(config, shift=(0, size - 1))
+    check_n_step(config, rows - 1)
+
+
+def _check_window(window: int, rows: int) -> None:
+    if window > rows:
+        raise UserError(f"--window {window} is longer than an episode of the set, of {rows} rows: choose a shorter one")
+
+
+def _check_frames(config: Any, channels: int, size: int) -> None:
+    """Build the frame encoder, to see that it can be; its width plays no part."""
+    told = {name: value for name, value in asdict(config.frame).items() if name != "feature_dim"}
+    build_frame_encoder(
+        EncoderConfig(0, config.frame_encoder, feature_dim=1, channels=channels, size=size, frame_options=told)
+    )
