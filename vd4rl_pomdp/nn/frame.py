@@ -87,7 +87,7 @@ def _drq(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
 
 
 def _nature(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
-    """Three strided convolutions (Mnih et al. 2015): a fraction of DrQ's cost."""
+    """Three convolutions, two of them strided (Mnih et al. 2015): a fraction of DrQ's cost."""
     return nn.Sequential(
         nn.Conv2d(channels, 32, 8, stride=4),
         nn.ReLU(),
@@ -174,7 +174,7 @@ FRAME_ENCODERS: Registry[FrameEncoderPart] = Registry(
     "frame encoder",
     {
         "drq": FrameEncoderPart(_drq, summary="four 3x3 convolutions of 32 channels, as in DrQ and V-D4RL"),
-        "nature": FrameEncoderPart(_nature, summary="three strided convolutions, at a fraction of drq's cost"),
+        "nature": FrameEncoderPart(_nature, summary="three convolutions of 32 and 64 channels, at a fraction of drq's cost"),
         "small": FrameEncoderPart(
             _small, summary="three strided convolutions of few channels, for grey 50x50 pictures"
         ),
