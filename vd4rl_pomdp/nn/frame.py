@@ -174,7 +174,9 @@ FRAME_ENCODERS: Registry[FrameEncoderPart] = Registry(
     "frame encoder",
     {
         "drq": FrameEncoderPart(_drq, summary="four 3x3 convolutions of 32 channels, as in DrQ and V-D4RL"),
-        "nature": FrameEncoderPart(_nature, summary="three convolutions of 32 and 64 channels, at a fraction of drq's cost"),
+        "nature": FrameEncoderPart(
+            _nature, summary="three convolutions of 32 and 64 channels, at a fraction of drq's cost"
+        ),
         "small": FrameEncoderPart(
             _small, summary="three strided convolutions of few channels, for grey 50x50 pictures"
         ),
