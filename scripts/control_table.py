@@ -10,7 +10,7 @@ from vd4rl_pomdp.report.layout import number
 from vd4rl_pomdp.report.load import PROBES, load_runs
 from vd4rl_pomdp.report.measures import control, representations, run_table
 from vd4rl_pomdp.report.stats import mean_and_error
-from vd4rl_pomdp.report.tables import evaluations, grouped, label
+from vd4rl_pomdp.report.tables import TOLD_STATES, evaluations, grouped, label
 
 RESULTS = Path(__file__).parents[1] / "results" / "control"
 HEAD = """\
@@ -29,9 +29,14 @@ def table_lines(folder: Path) -> Iterator[str]:
         returns = [row["return"] for row in sorted(seeds[key], key=lambda row: row["seed"])]
         clean = number(policy["clean_return"], 0)
         errors = f"{number(policy['path_error'], 3)}, {number(policy['action_error'], 3)}"
-        probes = ", ".join(number(encoders[key][name], 1) for name in PROBES)
+        probes = probes_of(policy["method"], [encoders[key][name] for name in PROBES])
         place = f"{policy['task']} {policy['quality']} | {policy['corruption']} | {label(policy)}"
         yield f"| {place} | {len(returns)} | {with_seeds(returns)} | {clean} | {errors} | {probes} |"
+
+
+def probes_of(method: str, errors: Sequence[float | None]) -> str:
+    """Errors of the probes, marked where the encoder was trained on the states of held-out episodes, too."""
+    return ", ".join(number(error, 1) for error in errors) + ("†" if method in TOLD_STATES else "")
 
 
 def with_seeds(returns: Sequence[float]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from control_table import with_seeds
+from control_table import probes_of, with_seeds
 
 from vd4rl_pomdp.report.gates import returns_of
 from vd4rl_pomdp.report.layout import number
@@ -81,7 +81,7 @@ def set_lines(runs: Sequence[LoadedRun], task: str, quality: str) -> Iterator[st
         spread = f"{min(episodes):.0f} to {max(episodes):.0f}"
         loop = number(known_mean(row["action_error"] for row in last), 3)
         data = number(known_mean(run.reference.path_error for run in mine), 3)
-        probes = ", ".join(number(known_mean(run.representation[name] for run in mine), 1) for name in PROBES)
+        probes = probes_of(method, [known_mean(run.representation[name] for run in mine) for name in PROBES])
         yield (
             f"| `{method}` | {len(mine)} | {with_seeds(returns_of(mine).tolist())} | {spread} |"
             f" {_told(_of(here, method, CLEAN))} | {data}, {loop} | {probes} |"

@@ -157,7 +157,7 @@ class InverseObjective(Objective):
         sums = losses.new_zeros(2, self.options.largest_gap + 1)
         sums.index_add_(1, pairs[:, 1], torch.stack([losses.sum(0), real.sum(0)]))
         means = sums[0] / sums[1].clamp(min=1)
-        return {f"loss_k{k:02d}": means[k] for k in range(1, int(pairs[:, 1].max()) + 1)}
+        return {f"loss_k{k:02d}": means[k] for k in pairs[:, 1].unique().tolist()}
 
     def _self_prediction(self, past: Tensor, pairs: Tensor, real: Tensor) -> Tensor:
         assert self.predictor is not None

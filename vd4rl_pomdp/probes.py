@@ -1,4 +1,7 @@
-"""What a frozen representation says of the simulator state: a linear probe on held-out episodes."""
+"""What a frozen representation says of the simulator state: a linear probe on held-out episodes.
+
+Held out from the probe, not from pretraining: an encoder that was trained on the states themselves knew these, too.
+"""
 
 from __future__ import annotations
 

@@ -119,6 +119,8 @@ class NoisyAlgorithm(Algorithm):
     """What the noise is drawn from."""
     updates: int = 0
     """Updates that were made."""
+    planned: int
+    """Updates that there will be."""
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on."""

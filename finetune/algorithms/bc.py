@@ -3,7 +3,8 @@
     min  (a~ - a)^2,   a~ = pi(z) + clipped noise of a scheduled std
 
 The reference that uses no reward. The noise is that of `drqv2_bc`: noisy actions are cut off at -1 and 1, and the
-gradient passes there as if they were not, so that a policy near a bound is pulled inwards while the noise is large.
+gradient passes there as if they were not, so that a policy near a bound is pushed outwards while the noise is large: it
+is the mean of the actions cut off that comes to be the data's.
 
 Authors' code: github.com/conglu1997/v-d4rl (drqbc/bcagent.py).
 
@@ -36,12 +37,12 @@ class BC(NoisyAlgorithm):
     def __init__(
         self, policy: Policy, options: Options, learning_rate: float, updates: int, generator: torch.Generator
     ) -> None:
-        self.policy, self.generator = policy, generator
+        self.policy, self.planned, self.generator = policy, updates, generator
         self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=learning_rate, fused=True)
 
     def losses(self, batch: FeatureBatch) -> Iterator[Loss]:
         """See the module."""
-        chosen = with_noise(self.policy(batch.z), noise_at(self.updates), self.generator)
+        chosen = with_noise(self.policy(batch.z), noise_at(self.updates, self.planned), self.generator)
         loss = F.mse_loss(chosen, batch.action)
         yield Loss(loss, self.optimiser, {"bc_loss": loss.detach()})
         self.updates += 1

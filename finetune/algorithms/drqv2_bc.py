@@ -8,7 +8,7 @@ Noisy actions are cut off at -1 and 1, and the gradient passes there as if they 
 Authors' code: github.com/conglu1997/v-d4rl (drqbc).
 
 Differences to TD3+BC here: no target actor, an actor step with every critic step, noise that decays linearly from 1.0
-to 0.1 over 250k updates and is on the cloned action, too, tau 0.01.
+to 0.1 over 250k updates, or half of a shorter training, and is on the cloned action, too, tau 0.01.
 
 Differences to the authors' loop:
 - Representations are standardised and go straight into the networks. The authors' actor and critic each begin with a
@@ -37,7 +37,7 @@ class DrQv2BC(TD3BC):
         return self._policy_action(next_z)
 
     def _policy_action(self, z: Tensor) -> Tensor:
-        return with_noise(self.policy.from_standardised(z), noise_at(self.updates), self.generator)
+        return with_noise(self.policy.from_standardised(z), noise_at(self.updates, self.planned), self.generator)
 
     def _policy_value(self, z: Tensor, action: Tensor) -> Tensor:
         return torch.minimum(*self.critic(z, action))

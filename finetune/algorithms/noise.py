@@ -11,14 +11,20 @@ from torch import Tensor
 NOISE_CLIP = 0.3
 """Largest noise on a dimension of an action."""
 NOISE_START, NOISE_END, NOISE_UPDATES = 1.0, 0.1, 250_000
-"""Standard deviation at the first update, from the last of these updates on, and how many these are."""
+"""Standard deviation at the first update, from the last of these updates on, and how many these are at most."""
 MARGIN = 1e-6
 """How far from -1 and 1 a noisy action stays."""
 
 
-def noise_at(update: int) -> float:
-    """Standard deviation of the noise after so many updates: it falls linearly, then stays."""
-    done = min(1.0, update / NOISE_UPDATES)
+def noise_at(update: int, planned: int) -> float:
+    """Standard deviation of the noise after so many updates: it falls linearly, then stays.
+
+    Args:
+        update: updates that were made.
+        planned: all that there will be; it falls over half of them where that is sooner than in V-D4RL, which makes
+            550,000: noise that has not fallen when training ends pushes the policy's actions outwards.
+    """
+    done = min(1.0, update / min(NOISE_UPDATES, planned / 2))
     return NOISE_START + done * (NOISE_END - NOISE_START)
 
 

@@ -50,7 +50,7 @@ class TD3BC(NoisyAlgorithm):
     def __init__(
         self, policy: Policy, options: TD3BCOptions, learning_rate: float, updates: int, generator: torch.Generator
     ) -> None:
-        self.policy, self.settings, self.generator = policy, options, generator
+        self.policy, self.settings, self.planned, self.generator = policy, options, updates, generator
         shape = policy.shape
         device = policy.standardise.mean.device
         self.critic = TwinCritic(shape["dim"], shape["action_dim"], shape["hidden"]).to(device)

@@ -30,9 +30,9 @@ class Method:
     history: str = "none"
     """Memory of its encoder, gru or none; --history gru gives one to those that have none."""
     use_actions: bool = False
-    """Whether the GRU reads past actions."""
+    """Whether the GRU reads past actions; without a memory of its own, under --history gru alone."""
     past: int | None = None
-    """Rows before t that a state is computed from unless the user chooses m; None: all."""
+    """Rows before t that a GRU's state is computed from unless the user chooses m; None: all."""
     shift: Sharing | Literal["own"] = "window"
     """What shares one random shift: the observations of a window, or the frames of one observation, where what a window
     shares would give the answer away; own: the objective shifts by itself, and what it is given is not shifted."""

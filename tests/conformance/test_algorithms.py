@@ -1,5 +1,6 @@
 """Every algorithm of the registry keeps the contract of algorithms, and what breaks it is caught."""
 
+import numpy as np
 import pytest
 import torch
 
@@ -114,6 +115,13 @@ class Forgetful(TD3BC):
         super().load_state_dict(state | {"updates": 0})
 
 
+class Unkept(BC):
+    """Its state holds a number that is not Python's, such as a best loss so far."""
+
+    def state_dict(self):
+        return super().state_dict() | {"best": np.float32(0.5)}
+
+
 class Drawing(BC):
     def losses(self, batch):
         return super().losses(batch.replace(z=batch.z + torch.randn(batch.z.shape)))
@@ -144,6 +152,7 @@ MUTANTS = [
     (Jumping, targets_creep_and_nothing_else_moves_by_itself, "did not move by tau"),
     (Still, targets_creep_and_nothing_else_moves_by_itself, "of the targets target_critic, target_policy moved none"),
     (Forgetful, an_algorithm_that_goes_on_elsewhere_takes_the_same_steps, "update 3 logs"),
+    (Unkept, an_algorithm_that_goes_on_elsewhere_takes_the_same_steps, "cannot keep best, which is a float32"),
     (Drawing, updates_draw_from_the_generator_alone, "after other seeds of torch, update 0 logs"),
     (Unbounded, actions_lie_within_their_bounds, "one has the size"),
     (Writing, a_batch_is_left_as_it_was, "it changed reward"),

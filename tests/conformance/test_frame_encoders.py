@@ -130,6 +130,43 @@ def test_a_right_one_passes_at_any_size_and_what_cannot_be_is_refused(encoders):
         check_frame_encoder("vit")
 
 
+class Twice(nn.Module):
+    """A convolution that is used twice, under two names."""
+
+    def __init__(self):
+        super().__init__()
+        self.first = self.second = nn.Conv2d(4, 4, 1)
+
+    def forward(self, x):
+        return self.second(self.first(x))
+
+
+class OverFrames(nn.Module):
+    """A convolution over places and frames."""
+
+    def __init__(self):
+        super().__init__()
+        self.convolution = nn.Conv3d(1, 2, (2, 1, 1))
+
+    def forward(self, x):
+        return self.convolution(x[:, None]).flatten(1, 2)
+
+
+@pytest.mark.parametrize("layer", [Twice, OverFrames])
+def test_shared_weights_and_convolutions_of_other_dimensions_are_kept(encoders, layer):
+    encoders.register("mine", FrameEncoderPart(with_layer(layer)))
+    check_frame_encoder("mine", size=SIZE)
+
+
+def test_a_fault_in_a_part_is_not_told_as_pictures_of_a_wrong_size(encoders):
+    encoders.register("mine", FrameEncoderPart(with_layer(lambda: nn.Conv2d(5, 4, 1))))
+    with pytest.raises(RuntimeError, match="to have 5 channels, but got 4"):
+        make("mine", size=SIZE)
+    encoders.register("large", FrameEncoderPart(with_layer(lambda: nn.MaxPool2d(7))))
+    with pytest.raises(UserError, match="'large' cannot read pictures of 20x20 pixels"):
+        make("large", size=SIZE)
+
+
 def test_a_module_that_makes_no_maps_is_refused_where_it_is_built(encoders):
     encoders.register("mine", FrameEncoderPart(with_layer(Flat)))
     told = (

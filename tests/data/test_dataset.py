@@ -6,7 +6,7 @@ import torch
 from tests.helpers_data import fake_action, fake_reward, fake_rows, frame_identity, write_fake_set
 from vd4rl_pomdp.data import TransitionSampler, View, WindowSampler, open_dataset
 from vd4rl_pomdp.data.format import shard_paths, write_shard
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import OutOfMemoryError, UserError
 from vd4rl_pomdp.types import row_key
 
 LENGTHS = (5, 3, 260)
@@ -35,6 +35,15 @@ def test_counts_and_names(dataset):
     assert list(zip(dataset.episode.tolist(), dataset.t.tolist(), strict=True)) == ROWS
     expected = [sum(fake_reward(e, t) for t in range(length - 1)) for e, length in enumerate(LENGTHS)]
     np.testing.assert_allclose(dataset.returns, expected, rtol=1e-12)
+
+
+def test_frames_that_fit_into_no_memory_are_told_as_the_sets_not_as_a_batchs(dataset, monkeypatch):
+    def full(self, device):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+    monkeypatch.setattr(torch.Tensor, "to", full)
+    with pytest.raises(OutOfMemoryError, match=r"84px: 0.0 GB of frames exceed the free memory of cuda: choose"):
+        dataset.to("cuda")
 
 
 def test_row_tensors_have_the_documented_types(dataset):

@@ -1,5 +1,6 @@
 """Updates are what the papers' formulas say, on networks small enough to write the formulas out."""
 
+import sys
 from dataclasses import replace
 
 import numpy as np
@@ -120,8 +121,22 @@ def test_actor_and_targets_move_at_every_so_many_updates_and_targets_slowly(kind
 
 
 def test_drqv2s_noise_decays_linearly_and_then_stays():
-    found = [noise.noise_at(updates) for updates in (0, 125_000, 250_000, 10**6)]
+    found = [noise.noise_at(updates, 10**6) for updates in (0, 125_000, 250_000, 10**6)]
     assert found == pytest.approx([1.0, 0.55, 0.1, 0.1])
+
+
+@pytest.mark.parametrize("kind", [BC, DrQv2BC])
+def test_noise_has_fallen_by_the_middle_of_a_training_shorter_than_v_d4rls(monkeypatch, kind):
+    """Else a clone near a bound is pushed to it: what the data's mean action is held against has the noise cut off."""
+    stds = []
+    module = sys.modules[kind.__module__]
+    monkeypatch.setattr(module, "noise_at", lambda *told: stds.append(noise.noise_at(*told)) or stds[-1])
+    algorithm = make(kind)  # of 40 updates
+    for number in range(40):
+        algorithm.update(batch(number))
+    per_update = stds[:: len(stds) // 40]
+    assert per_update[:21:10] == pytest.approx([1.0, 0.55, 0.1])
+    assert per_update[20:] == pytest.approx([0.1] * 20)
 
 
 def test_noise_is_cut_off_with_the_action_and_lets_the_whole_gradient_pass():

@@ -40,7 +40,7 @@ def started(name: str) -> TD3BC:
     with torch.no_grad():
         policy.net[-1].weight.mul_(30)
     options = ALGORITHMS[name].options.fill({"gamma": 0.9, "alpha": 1.5})
-    algorithm = ALGORITHMS[name](policy, options, 1e-3, 40, torch.Generator().manual_seed(7))
+    algorithm = ALGORITHMS[name](policy, options, 1e-3, 550_000, torch.Generator().manual_seed(7))
     algorithm.updates = BEGUN[name]
     return algorithm
 

@@ -56,3 +56,14 @@ def test_padding_a_window_leaves_its_logits():
         inside = pairs.sum(1) < 4
         logits = objective.action_logits(padded)[:, inside]
         torch.testing.assert_close(logits, objective.action_logits(short), atol=1e-6, rtol=1e-6)
+
+
+def test_a_gap_that_a_method_never_scores_is_logged_by_no_number():
+    """Zero would read as a gap whose action is given away."""
+    objective = build("acro")
+    every = objective.pairs(ROWS)
+    objective.pairs = lambda rows: every[every[:, 1] % 2 == 0]
+    logs = objective.loss(batch(), 0.0)[1]
+    scored = {name: value for name, value in logs.items() if name.startswith("loss_k")}
+    assert scored.keys() == {"loss_k02"}, "of gaps 1 to 3"
+    assert all(value > 0 for value in scored.values())

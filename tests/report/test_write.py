@@ -107,6 +107,15 @@ def test_scores_are_as_trained_and_the_control_table_tells_of_both(tmp_path):
     assert re.findall(r"<td[^>]*>([^<]*)</td>", shown)[10:] == cells
 
 
+@pytest.mark.parametrize(("method", "noted"), [("supervised+a", True), ("acro", False)])
+def test_a_probe_of_what_was_told_the_states_is_not_read_as_the_others(tmp_path, method, noted):
+    """Its episodes are held out from the probe alone."""
+    run = write_run(tmp_path / "runs/0", method, 0, {10: [30.0]})
+    page, *_ = write_report([run], tmp_path / "out")
+    part = page.read_text().partition("<h2>Representations</h2>")[2].partition("<h2>")[0]
+    assert (f"{method}: trained on the states of all episodes" in " ".join(part.split())) == noted
+
+
 def test_what_was_trained_clean_counts_as_both(tmp_path):
     run = write_run(tmp_path / "runs/0", "acro", 0, {10: [30.0]}, labels={"corruption": "none"})
     write_report([run], tmp_path / "out")

@@ -16,7 +16,7 @@ from vd4rl_pomdp.buffers import FrameBuffers
 from vd4rl_pomdp.data.episodes import episode_returns
 from vd4rl_pomdp.data.store import Store, open_store
 from vd4rl_pomdp.envs.make import layout_of
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import OutOfMemoryError, UserError
 from vd4rl_pomdp.state_scale import StateScale
 from vd4rl_pomdp.tasks import FRAME_STACK, SET_QUALITIES, TASKS
 from vd4rl_pomdp.types import StepType, Transitions, Windows, row_key, unpack_row_key
@@ -137,10 +137,20 @@ class Dataset:
         return StateScale.fit(states, pose.shape[1])
 
     def to(self, device: torch.device | str) -> Dataset:
-        """Move frames and rows to a device, in place; returns the data set."""
-        for name, value in vars(self).items():
-            if isinstance(value, Tensor):
-                setattr(self, name, value.to(device))
+        """Move frames and rows to a device, in place; returns the data set.
+
+        Raises:
+            UserError: they do not fit into its memory.
+        """
+        try:
+            for name, value in vars(self).items():
+                if isinstance(value, Tensor):
+                    setattr(self, name, value.to(device))
+        except torch.OutOfMemoryError as error:
+            raise OutOfMemoryError(
+                f"{self.path}: {self.frames.nbytes / 1e9:.1f} GB of frames exceed the free memory of {device}: "
+                "choose --device cpu, a smaller set, or fewer runs a GPU"
+            ) from error
         return self
 
     def keys(self, rows: Tensor) -> Tensor:

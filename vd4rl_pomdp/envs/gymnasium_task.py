@@ -79,7 +79,7 @@ class GymnasiumEnv(PixelEnv):
         rescaled, total = self._rescaled(action), 0.0
         for _ in range(self.task.action_repeat):
             with self._telling("cannot make a step"):
-                self._observation, reward, terminated, truncated, _ = self.env.step(rescaled)
+                self._observation, reward, terminated, truncated, _ = self.env.step(rescaled.copy())
             total += self._finite(float(reward))
             if terminated or truncated:
                 return total, True, 0.0 if terminated else 1.0

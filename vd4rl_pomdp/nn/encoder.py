@@ -14,12 +14,13 @@ from torch import Tensor, nn
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, STATE, FrameEncoder, StateFrame, make_frame_encoder
 from vd4rl_pomdp.nn.sequence import run_gru
-from vd4rl_pomdp.runs.memory import ran_out
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.types import Windows
 
 MAX_LAYERS = 64
 """Most layers of a GRU."""
+_TOO_SMALL = ("Kernel size can't be greater", "Output size is too small")
+"""What torch says of convolutions and poolings whose input is smaller than their kernel."""
 Readout = Literal["state", "frame", "frame+state"]
 """What of an encoder with a memory its representation is: s_t, e(o_t), or both one after the other."""
 
@@ -64,8 +65,8 @@ def build_frame_encoder(config: EncoderConfig) -> FrameEncoder:
     options = FRAME_ENCODERS.named(config.frame_encoder).options.fill(told)
     try:
         return make_frame_encoder(config.frame_encoder, config.channels, config.size, options)
-    except RuntimeError as error:  # a convolution's, whose input is smaller than its kernel
-        if ran_out(error):
+    except RuntimeError as error:
+        if not any(said in str(error) for said in _TOO_SMALL):
             raise
         raise UserError(
             f"frame encoder {config.frame_encoder!r} cannot read pictures of {config.size}x{config.size} pixels: "

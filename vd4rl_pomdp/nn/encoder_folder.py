@@ -39,7 +39,7 @@ def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard, frames: int 
         card: where it comes from.
         frames: how many frames the batches of its pretraining held, if that is known.
     """
-    weights = {name: value.contiguous().cpu() for name, value in encoder.state_dict().items()}
+    weights = {name: value.cpu().contiguous().clone() for name, value in encoder.state_dict().items()}
     origin = EncoderOrigin(__version__, git_commit(), frames)
     _write(folder, save(weights), EncoderRecord(encoder.config, card, origin))
 

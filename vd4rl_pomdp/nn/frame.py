@@ -255,4 +255,7 @@ def make_frame_encoder(name: str, channels: int, size: int, options: FrameOption
             f"frame encoder {name!r} makes {('N', *encoder.map_shape)} of N pictures, not maps (N, C', H', W'): "
             "give its module's output height and width, 1 for none"
         )
-    return encoder.to(memory_format=torch.channels_last)  # type: ignore[call-overload]
+    for parameter in encoder.parameters():
+        if parameter.dim() == 4:
+            parameter.data = parameter.data.contiguous(memory_format=torch.channels_last)
+    return encoder

@@ -12,7 +12,7 @@ from vd4rl_pomdp.report.gaps import MISSING
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.layout import Line, ShownTable, interval, number, with_interval
 from vd4rl_pomdp.report.load import PROBES
-from vd4rl_pomdp.report.tables import grouped, label, setting, with_algorithm
+from vd4rl_pomdp.report.tables import TOLD_STATES, grouped, label, setting, with_algorithm
 from vd4rl_pomdp.runs.files import Row
 
 WIDEST = 6
@@ -124,7 +124,17 @@ def _chance(row: Row) -> str:
 def representations(rows: list[Row]) -> list[ShownTable]:
     """Encoders' measures beside returns, one table a setting."""
     columns = ("method", "action loss", "pose, %", "velocity, %", "return", "seeds")
-    return [_counted(name, columns, _measure_line, members) for name, members in by_setting(rows)]
+    return [
+        ShownTable(name, columns, list(map(_measure_line, members)), note=f"{seeds_note(members)}{_told_note(members)}")
+        for name, members in by_setting(rows)
+    ]
+
+
+def _told_note(rows: list[Row]) -> str:
+    """What the probes of methods that regress the states are not."""
+    told = [row["method"] for row in rows if row["method"] in TOLD_STATES]
+    names = " and ".join(dict.fromkeys(told))
+    return f" {names}: trained on the states of all episodes, those that the probe holds out, too." if told else ""
 
 
 def _measure_line(row: Row) -> Line:

@@ -12,7 +12,9 @@ from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import LoadedRun
 from vd4rl_pomdp.runs.files import Row
 
-REFERENCES = ("random", "bc", "drq_bc", "supervised", "supervised+a", "state")
+TOLD_STATES = ("supervised", "supervised+a")
+"""Methods whose encoders are trained on the simulator's states, those of the episodes that a probe holds out, too."""
+REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, "state")
 """Methods that are references, floors and ceilings: last in a table."""
 END_TO_END = ("bc", "drq_bc")
 """References that bring their own algorithm."""

@@ -175,7 +175,11 @@ def _split(node: Any, path: str, tensors: dict[str, Tensor]) -> Any:
         return {"__dict__": items}
     if isinstance(node, list | tuple):
         return [_split(value, f"{path}/{i}", tensors) for i, value in enumerate(node)]
-    assert node is None or isinstance(node, bool | int | float | str), f"{path}: cannot save a {type(node).__name__}"
+    if not (node is None or isinstance(node, bool | int | float | str)):
+        raise UserError(
+            f"a checkpoint cannot keep {path[1:]}, which is a {type(node).__name__}: give a tensor, a number of "
+            "Python's, a word, None, or lists and dicts of them"
+        )
     return node
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import copy
 from collections.abc import Iterator
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
@@ -11,7 +10,9 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.runs.checkpoint import pack, unpack
 from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
 
 if TYPE_CHECKING:
@@ -202,7 +203,7 @@ def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **option
     one, other = (make(name, seed=seed, **options) for seed in (0, 1))
     for number in range(3):
         one.update(batch(number))
-    other.load_state_dict(copy.deepcopy(one.state_dict()))
+    other.load_state_dict(_kept(one.state_dict()))
     for number in range(3, 3 + UPDATES):
         here, there = _numbers(one.update(batch(number))), _numbers(other.update(batch(number)))
         claim(here == there, f"update {number} logs {here} and {there}")
@@ -210,6 +211,14 @@ def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **option
     claim(here_state.keys() == there_state.keys(), f"their states hold {shown(here_state)} and {shown(there_state)}")
     differing = [key for key in here_state if not torch.equal(here_state[key], there_state[key])]
     claim(differing == [], f"these differ at the end: {shown(differing)}")
+
+
+def _kept(state: dict[str, Any]) -> dict[str, Any]:
+    """A state as a checkpoint gives it back."""
+    try:
+        return unpack(pack(state))
+    except UserError as error:
+        raise AssertionError(str(error)) from error
 
 
 def updates_draw_from_the_generator_alone(name: str, **options: Any) -> None:
