@@ -193,6 +193,8 @@ def is_test(name: str) -> bool:
 
 def _tried(mutants: list[Mutant], limit: float, whole_suite: bool) -> Iterator[tuple[Mutant, str]]:
     """Try all, after the unchanged tree has passed their tests."""
+    if not mutants:
+        return
     for mutant in mutants:
         mutant.apply(ROOT)
     named = tuple(dict.fromkeys(test for mutant in mutants for test in mutant.tests))

@@ -139,3 +139,9 @@ def test_settings_name_their_parts_and_where_these_come_from(registry, monkeypat
         "frame_encoder theirs": offered,
     }
     assert origins({"frame_encoder": "own+a"}) == {}
+
+
+def test_a_package_that_offers_a_taken_name_disables_no_other_part(registry, monkeypatch, capsys):
+    offer(monkeypatch, own="tests.test_registry:THEIRS")
+    assert registry.named("own") == "ours"
+    assert "a frame encoder called 'own' exists already" in capsys.readouterr().err

@@ -47,6 +47,16 @@ def test_what_a_task_does_not_tell_is_found(domain, task, layout):
     assert found.visible_state(physics[None]).shape == (1, width)
 
 
+def test_actions_of_a_task_with_other_bounds_reach_all_of_them():
+    env = make_env(DMCTask("quadruped", "walk"), size=None)
+    spec = env.simulator.action_spec()
+    assert (spec.maximum != 1).any()
+    for end, bound in ((-1.0, spec.minimum), (1.0, spec.maximum)):
+        env.reset(0)
+        env.step(np.full(env.action_dim, end, np.float32))
+        np.testing.assert_allclose(env.physics.control(), bound)
+
+
 def _alike(layout: Layout, physics: np.ndarray) -> np.ndarray:
     """Another simulator state of the same look."""
     other = physics.copy()

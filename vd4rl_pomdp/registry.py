@@ -76,13 +76,13 @@ class Registry(Mapping[str, Part], Generic[Part]):
     def named(self, name: str) -> Part:
         """The part called `name`; raises UserError listing the choices, or saying why it cannot be loaded."""
         self._load_offered()
+        if name in self._parts:  # whatever else a package offers under its name
+            return self._parts[name]
         if name in self.broken:
             raise UserError(
                 f"{self.kind} {name!r} cannot be loaded ({self.broken[name]}): mend or remove what offers it"
             )
-        if name not in self._parts:
-            raise UserError(f"unknown {self.kind} {name!r}: choose one of {', '.join(self._parts)}")
-        return self._parts[name]
+        raise UserError(f"unknown {self.kind} {name!r}: choose one of {', '.join(self._parts)}")
 
     def check(self, name: str) -> None:
         """Raise UserError unless there is a part called `name` that can be loaded."""

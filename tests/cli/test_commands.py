@@ -176,3 +176,10 @@ def test_results_stay_on_one_line_each(capsys):
         ["dtypes.reward", "float64"],
         ["seconds", "0.123457"],
     ]
+
+
+def test_a_tilde_before_no_user_is_a_word(tmp_path, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    with pytest.raises(SystemExit, match="2"):
+        main(["report", "nowhere", "--out=~no_such_user/x"])
+    assert "nowhere: no such folder" in capsys.readouterr().err

@@ -40,7 +40,7 @@ def test_a_set_against_itself_differs_in_nothing(tmp_path):
     runs, _ = two_sets(tmp_path)
     add_results([runs], tmp_path / "rows")
     for row in compare_results(runs, tmp_path / "rows").rows:
-        assert (row["difference"], row["settings"]) == (0.0, "")
+        assert (row["difference"], row["low"], row["high"], row["settings"]) == (0.0, None, None, "")
         assert row["score_a"] == row["score_b"]
 
 
@@ -74,10 +74,11 @@ def test_equal_settings_are_compared_however_each_set_names_them(tmp_path):
 def test_no_word_is_broken_at_eighty_columns(tmp_path):
     for seed in (0, 1):
         for share in (0.2, 0.5):
-            path = write_run(tmp_path / f"a/{share}{seed}", "mik+a", seed, {10: [50.0 + seed]})
-            describe(path, {}, random_histories=share)
+            for name, score in (("a", 50.0 + seed), ("b", 51.0 - seed)):
+                path = write_run(tmp_path / f"{name}/{share}{seed}", "mik+a", seed, {10: [score]})
+                describe(path, {}, random_histories=share)
     shown = io.StringIO()
-    print_comparison(compare_results(tmp_path / "a", tmp_path / "a"), Console(file=shown, width=80))
+    print_comparison(compare_results(tmp_path / "a", tmp_path / "b"), Console(file=shown, width=80))
     text = shown.getvalue()
     assert text.count("mik+a, random_histories") == 2
     for words in ("[50.0, 51.0]", "[-1.0, 1.0]", "2 | 2"):

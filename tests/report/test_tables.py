@@ -58,6 +58,16 @@ def test_aggregates_are_over_the_runs_of_all_tasks_at_their_end():
     assert (row["tasks"], row["seeds"]) == (2, 2)
 
 
+def test_what_lacks_tasks_stands_below_what_has_them_all():
+    """Its mean is of other tasks: easier ones, perhaps."""
+    lacking = [row for row in rows() if (row["method"], row["task"]) != ("mik", "cheetah_run")]
+    for row in of(lacking, method="mik"):
+        row["score"] = 95.0
+    found = overall.aggregate(lacking, [])
+    assert [(row["method"], row["tasks"], row["of_tasks"]) for row in found] == [("acro", 2, 2), ("mik", 1, 2)]
+    assert found[1]["iqm"] > found[0]["iqm"]
+
+
 def test_profiles_are_shares_of_runs_above_a_score():
     found = of(overall.profiles(rows()), method="mik")
     shares = {row["threshold"]: row["share"] for row in found}

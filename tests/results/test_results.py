@@ -188,6 +188,18 @@ def test_folders_and_results_mix_and_a_run_counts_once(tmp_path):
     assert [run.path for run in found if not run.folder] == [tmp_path / "some"]
 
 
+def test_runs_in_linked_folders_count_and_each_once(tmp_path):
+    """As where seeds lie on other disks; a link to a folder above must not be followed for ever."""
+    runs = grid(tmp_path / "disk")
+    (tmp_path / "mixed").mkdir()
+    (tmp_path / "mixed" / "seed0").symlink_to(runs / "acro0")
+    assert len(find_results([tmp_path / "mixed"])) == 1
+    (runs / "above").symlink_to(tmp_path)
+    found = find_results([runs])
+    assert len(found) == 6
+    assert {run.path.parent for run in found} == {runs}, "the real folder is named, not a link to it"
+
+
 def test_a_results_folder_within_another_is_another_experiment(tmp_path):
     for name, seed in (("outer", 0), ("outer/inner", 1)):
         run = write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [1.0]})

@@ -3,10 +3,11 @@ from pathlib import Path
 from zipfile import ZipFile
 
 import pytest
+import torch
 
 from tests.helpers_wheel import build_wheel
 from vd4rl_pomdp.runs import provenance
-from vd4rl_pomdp.runs.provenance import COMMIT_FILE, checkout_commit, command, recorded_commit
+from vd4rl_pomdp.runs.provenance import COMMIT_FILE, checkout_commit, command, machine, recorded_commit
 
 ROOT = Path(__file__).resolve().parents[2]
 
@@ -79,3 +80,11 @@ def test_a_wheel_carries_the_commit_it_was_built_from(checkout):
 def test_the_command_line_is_named_as_it_would_be_typed(monkeypatch, script, program):
     monkeypatch.setattr("sys.argv", [script, "--out", "a b"])
     assert command() == f"{program} --out 'a b'"
+
+
+@pytest.mark.parametrize(("device", "named"), [("cpu", None), ("cuda:1", "card 1"), ("auto", "card None")])
+def test_a_run_names_the_card_that_it_had_not_the_machines_first(monkeypatch, device, named):
+    monkeypatch.setattr(torch.cuda, "is_available", lambda: True)
+    monkeypatch.setattr(torch.cuda, "device_count", lambda: 2)
+    monkeypatch.setattr(torch.cuda, "get_device_name", lambda used: f"card {used.index}")
+    assert machine(device)["gpu"] == named

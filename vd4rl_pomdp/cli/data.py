@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import shlex
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -10,9 +11,14 @@ import tyro
 from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse, show
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.sweeps.own_file import program_here
 
 REPLAY_TOLERANCE = 1e-6
 """Largest difference between a stored and a replayed reward; on the machine that collected it is 0."""
+
+
+def _check_of(folder: Path) -> str:
+    return f"{program_here()} data check {shlex.quote(str(folder))}"
 
 
 def _collect(words: Arguments, program: str) -> None:
@@ -21,7 +27,7 @@ def _collect(words: Arguments, program: str) -> None:
     config = parse(CollectConfig, words, program)
     shards = collect(config)
     print(f"{len(shards)} shards in {config.out}, described in {config.out / 'card.md'}")
-    print(f"check them with `vd4rl-pomdp data check {config.out}`")
+    print(f"check them with `{_check_of(config.out)}`")
 
 
 @dataclass(frozen=True)
@@ -45,7 +51,7 @@ def _download(words: Arguments, program: str) -> None:
 
     command = parse(DownloadCommand, words, program)
     shards = download(command.task, command.quality, command.out, command.endpoint, command.verify)
-    print(f"{len(shards)} shards in {shards[0].parent}; check them with `vd4rl-pomdp data check {shards[0].parent}`")
+    print(f"{len(shards)} shards in {shards[0].parent}; check them with `{_check_of(shards[0].parent)}`")
 
 
 @dataclass(frozen=True)

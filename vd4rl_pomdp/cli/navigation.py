@@ -2,13 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
+from vd4rl_pomdp.errors import UserError
 
 
 def _collect(words: Arguments, program: str) -> None:
@@ -52,8 +55,16 @@ def _report(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.navigation.samples import sample_observations
 
     command = parse(NavigationReportCommand, words, program)
-    samples = sample_observations if command.pictures else None
+    samples = (lambda: _telling_the_flag(sample_observations)) if command.pictures else None
     print(f"report: {write_report(command.runs, command.out, samples)}")
+
+
+def _telling_the_flag(draw: Callable[[], Any]) -> Any:
+    """What `draw` draws; where nothing can be drawn, how to do without."""
+    try:
+        return draw()
+    except UserError as error:
+        raise UserError(f"{error}; --no-pictures leaves the sample observations out") from error
 
 
 COMMANDS = {

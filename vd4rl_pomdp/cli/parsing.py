@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import io
 import json
+import os
 import re
 from dataclasses import MISSING, fields, replace
 from itertools import pairwise
@@ -51,7 +52,7 @@ def parse(config: Any, words: Arguments, program: str, default: Any = None) -> A
 def _at_home(word: str) -> str:
     """A word with the user's folder in place of `~` in `--out=~/runs`, which shells leave as it is."""
     flag, _, value = word.partition("=")
-    return f"{flag}={Path(value).expanduser()}" if flag.startswith("--") and value.startswith("~") else word
+    return f"{flag}={os.path.expanduser(value)}" if flag.startswith("--") and value.startswith("~") else word
 
 
 def _refuse_empty(config: Any, words: Arguments) -> None:

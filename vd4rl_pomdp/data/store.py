@@ -122,8 +122,9 @@ class PlayedStore(Store):
 
 def default_cache() -> Path:
     """Where decoded sets are kept: $VD4RL_POMDP_CACHE, else the user's cache folder."""
-    base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-    return Path(os.environ.get("VD4RL_POMDP_CACHE") or Path(base) / "vd4rl-pomdp")
+    if chosen := os.environ.get("VD4RL_POMDP_CACHE"):
+        return Path(chosen)
+    return Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache") / "vd4rl-pomdp"
 
 
 def open_store(path: Path, cache: Path | None = None) -> Store:

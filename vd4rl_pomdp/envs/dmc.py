@@ -105,8 +105,13 @@ def start_from(env: Any, state: np.ndarray) -> None:
 
 
 def repeat_action(env: Any, action: np.ndarray, repeat: int) -> tuple[float, bool, float]:
-    """Apply one action for the action repeat, or until the task ends; the summed reward, whether it ended, discount."""
-    total = 0.0
+    """Apply one action for the action repeat, or until the task ends; the summed reward, whether it ended, discount.
+
+    It lies in [-1, 1], which stands for the bounds of the task's own.
+    """
+    total, spec = 0.0, env.action_spec()
+    if (spec.minimum != -1).any() or (spec.maximum != 1).any():
+        action = spec.minimum + (np.clip(action, -1, 1) + 1) / 2 * (spec.maximum - spec.minimum)
     for _ in range(repeat):
         step = env.step(action)
         total += step.reward

@@ -46,7 +46,7 @@ class GymnasiumEnv(PixelEnv):
 
     def _make(self, task: GymnasiumTask) -> gymnasium.Env:
         arguments = dict(task.arguments) | ({"render_mode": "rgb_array"} if self._renders else {})
-        with self._telling("cannot be made", (*_REFUSALS, TypeError)):
+        with self._telling("cannot be made", (*_REFUSALS, TypeError, AttributeError, RuntimeError)):
             if isinstance(task.environment, str):
                 return gymnasium.make(task.environment, disable_env_checker=True, **arguments)
             return task.environment(**arguments)

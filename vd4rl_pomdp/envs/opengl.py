@@ -7,9 +7,10 @@ nothing is drawn, and the picture read is an old one. dm_control, mujoco and Gym
 import contextlib
 import gc
 import os
+import sys
 from collections.abc import Iterator
 
-os.environ.setdefault("MUJOCO_GL", "egl")
+os.environ.setdefault("MUJOCO_GL", "egl" if sys.platform == "linux" else "glfw")  # macOS and Windows know no other
 os.environ.setdefault("LP_NUM_THREADS", "1")  # software rendering scales by processes, not by threads
 
 with contextlib.suppress(ImportError):  # not every PyTorch brings it

@@ -11,6 +11,7 @@ from __future__ import annotations
 import ctypes
 import hashlib
 import os
+import sys
 from functools import cache
 from pathlib import Path
 from typing import Any, get_args
@@ -25,9 +26,14 @@ from vd4rl_pomdp.tasks import FRAME_SIZE
 
 def gl_error(error: Exception) -> UserError:
     """A sentence for a machine on which no OpenGL context can be made."""
+    remedy = "set MUJOCO_GL=glfw"
+    if sys.platform == "linux":
+        remedy = (
+            "install Debian's libegl1, libgl1 and libgl1-mesa-dri for MUJOCO_GL=egl, or libosmesa6 for MUJOCO_GL=osmesa"
+        )
     return UserError(
-        f"cannot render with MUJOCO_GL={os.environ['MUJOCO_GL']} ({first_line(error)}): install Debian's "
-        "libegl1, libgl1 and libgl1-mesa-dri for MUJOCO_GL=egl, or libosmesa6 for MUJOCO_GL=osmesa"
+        f"cannot render with MUJOCO_GL={os.environ['MUJOCO_GL']} ({first_line(error)}): {remedy}; what draws nothing, "
+        "such as control-study, takes MUJOCO_GL=disable"
     )
 
 

@@ -136,7 +136,8 @@ def _resized(folder: Path) -> Iterator[Tensor]:
 def _files(folder: Path) -> list[Path]:
     """Files of a folder that hold images, in order."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
-    return [path for path in files if _is_cifar(path) or path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+    shown = (path for path in files if not path.name.startswith("."))  # macOS leaves ._x.png beside x.png
+    return [path for path in shown if _is_cifar(path) or path.suffix.lower() in (".png", ".jpg", ".jpeg")]
 
 
 def _is_cifar(path: Path) -> bool:

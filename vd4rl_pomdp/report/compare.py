@@ -115,16 +115,20 @@ def _what_was_done(runs: list[LoadedRun]) -> tuple:
 
 def _row(one: list[LoadedRun] | None, other: list[LoadedRun] | None, key: tuple) -> Row:
     """A condition's row; what a set does not have is None."""
-    scores = [None if runs is None else final_scores(evaluations(runs)) for runs in (one, other)]
     row: Row = dict(zip(CONDITION, key, strict=True))
-    for side, values in zip("ab", scores, strict=True):
-        row |= _score(side, values)
-    found: tuple[float | None, ...] = (None, None, None)
-    if scores[0] is not None and scores[1] is not None:
-        ends = stats.difference_interval(scores[1], scores[0], np.random.default_rng(0)) or (None, None)
-        found = (float(scores[1].mean() - scores[0].mean()), *ends)
+    for side, runs in zip("ab", (one, other), strict=True):
+        row |= _score(side, None if runs is None else final_scores(evaluations(runs)))
+    found = _difference(one, other) if one and other else (None, None, None)
     row |= dict(zip(("difference", "low", "high"), found, strict=True))
     return row | {"settings": _differing(one, other) if one and other else ""}
+
+
+def _difference(one: list[LoadedRun], other: list[LoadedRun]) -> tuple[float, float | None, float | None]:
+    """The second's mean score over the first's, with its interval; none where both are the same runs."""
+    first, second = (final_scores(evaluations(runs)) for runs in (one, other))
+    same = {run.result.id for run in one} == {run.result.id for run in other} and np.array_equal(first, second)
+    ends = None if same else stats.difference_interval(second, first, np.random.default_rng(0))
+    return float(second.mean() - first.mean()), *(ends or (None, None))
 
 
 def _score(side: str, scores: np.ndarray | None) -> Row:

@@ -25,7 +25,8 @@ def aggregate(rows: list[Row], gaps: list[Row]) -> list[Row]:
     """AGGREGATES over the tasks and qualities of every method and corruption, with stratified 95% intervals.
 
     `of_tasks` is the number of tasks and qualities under the corruption: a row with fewer `tasks` cannot be compared
-    with the others. `seeds` is the least number that a task has. A method that has not been run has no numbers.
+    with the others, and stands below them. `seeds` is the least number that a task has. A method that has not been run
+    has no numbers.
 
     Args:
         rows: evaluations of finished runs.
@@ -44,7 +45,13 @@ def aggregate(rows: list[Row], gaps: list[Row]) -> list[Row]:
         dict(zip(SERIES, group, strict=True)) | nothing | {"tasks": 0, "of_tasks": of_tasks[group[0]], "seeds": 0}
         for group in absent
     ]
-    return sorted(table, key=table_order)
+    return sorted(table, key=_whole_first)
+
+
+def _whole_first(row: Row) -> tuple:
+    """`table_order`, but what lacks tasks below what has them all."""
+    *place, score = table_order(row)
+    return *place, row["tasks"] < row["of_tasks"], score
 
 
 def _aggregates(strata: stats.Strata) -> Row:

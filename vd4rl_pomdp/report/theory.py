@@ -17,7 +17,7 @@ from rich.text import Text
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.report.figures import COLOURS, to_svg
 from vd4rl_pomdp.report.templates import render
-from vd4rl_pomdp.runs.files import Row, read_json, write_json
+from vd4rl_pomdp.runs.files import Row, files_below, read_json, write_json
 from vd4rl_pomdp.text import write_text
 
 Study = dict[str, Any]
@@ -36,7 +36,7 @@ def write_theory(study: Study, out: Path) -> Path:
 
 def load_section(paths: list[Path]) -> str | None:
     """The section about the study that `write_theory` left at or below some paths, if there is one."""
-    files = sorted({file.resolve(): file for path in paths for file in path.rglob(FILE)}.values())
+    files = sorted({file.resolve(): file for path in paths for file in files_below(path, FILE)}.values())
     if len(files) > 1:
         raise UserError(f"{files[0]} and {files[1]}: two studies of the theory; report one of them")
     for file in files:

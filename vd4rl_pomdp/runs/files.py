@@ -148,6 +148,21 @@ def synchronise(path: Path) -> None:
         os.close(handle)
 
 
+def files_below(folder: Path, name: str) -> list[Path]:
+    """Every file of a name at or below a folder, sorted; links to folders are followed, each folder counts once."""
+    found, seen, starts = [], set[str](), [folder]
+    for start in starts:  # what links name comes after what lies there
+        for place, folders, names in os.walk(start):
+            real = os.path.realpath(place)
+            if real in seen:
+                folders.clear()
+                continue
+            seen.add(real)
+            starts += [path for inner in sorted(folders) if (path := Path(place, inner)).is_symlink()]
+            found += [Path(place, name)] if name in names else []
+    return sorted(found)
+
+
 def holds_anything(folder: Path) -> bool:
     """Whether a folder exists and holds a file or folder that is not hidden; hidden ones are left by cut commands."""
     with disk_errors(folder):

@@ -72,13 +72,14 @@ def _git(root: Path, *words: str) -> str:
     return subprocess.run(["git", *words], cwd=root, capture_output=True, text=True, check=True).stdout.strip()
 
 
-def machine() -> dict[str, Any]:
-    """The hardware a run had: processor, cores, memory and GPU, without host or user names."""
+def machine(device: str = "auto") -> dict[str, Any]:
+    """The hardware a run had on a device: processor, cores, memory and its GPU, if any, without host or user names."""
     import torch
 
-    from vd4rl_pomdp.runs.device import has_bf16_kernels
+    from vd4rl_pomdp.runs.device import has_bf16_kernels, pick_device
 
-    gpu = torch.cuda.get_device_name(0) if torch.cuda.is_available() else None
+    used = pick_device(device)
+    gpu = torch.cuda.get_device_name(used) if used.type == "cuda" else None
     memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
     return {
         "processor": _processor(),

@@ -122,7 +122,7 @@ class RunFolder:
             write_json(self.path / "config.json", record | origin)
         (self.path / DIVERGED).unlink(missing_ok=True)
         if not (self.path / "machine.json").exists():
-            write_json(self.path / "machine.json", machine())
+            write_json(self.path / "machine.json", machine(self.config.get("device", "auto")))
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

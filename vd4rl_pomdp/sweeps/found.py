@@ -9,7 +9,7 @@ from typing import Any
 
 from vd4rl_pomdp.nn.encoder_folder import CONFIG
 from vd4rl_pomdp.results import Result, read_results
-from vd4rl_pomdp.runs.files import Row, read_json
+from vd4rl_pomdp.runs.files import Row, files_below, read_json
 from vd4rl_pomdp.runs.identity import recipe
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.sweeps.sets import DataSet
@@ -98,7 +98,7 @@ def _kept(run: Result) -> FoundRun:
 
 def runs_below(out: Path) -> Iterator[FoundRun]:
     """Every run below a folder; UserError for a damaged record."""
-    for path in sorted(out.rglob("config.json")):
+    for path in files_below(out, "config.json"):
         record = read_json(path)
         if "stage" in record and isinstance(record.get("config"), dict) and "seed" in record["config"]:
             yield _found(path.parent, record)

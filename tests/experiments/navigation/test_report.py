@@ -176,6 +176,24 @@ def test_samples_and_commands_are_those_of_the_runs_own_sets(tmp_path):
     assert f"{collect} one_curtain" not in page
 
 
+@pytest.mark.parametrize("changed", [{"note": "x"}, {"trajectories": "300"}, {"trajectory_rows": None}])
+def test_a_set_with_other_facts_is_no_reason_to_lose_a_report(tmp_path, changed):
+    tell_set(write_run(tmp_path / "runs", Condition("no_curtain", "mik+a"), 0, 1.0), 500, **changed)
+    page = write_report([tmp_path / "runs"], tmp_path / "out").read_text()
+    told = "--trajectories 300 --trajectory-rows 500" in page
+    assert told == ("note" in changed), "what is not whole is not told"
+
+
+def test_nothing_is_written_where_no_sample_can_be_drawn(tmp_path):
+    def samples():
+        raise UserError("cannot render")
+
+    write_run(tmp_path / "runs", Condition("no_curtain", "mik+a"), 0, 1.0)
+    with pytest.raises(UserError, match="cannot render"):
+        write_report([tmp_path / "runs"], tmp_path / "out", samples)
+    assert not (tmp_path / "out").exists()
+
+
 def test_what_was_not_trained_alike_is_said(tmp_path):
     alike = [write_run(tmp_path / "runs", Condition("no_curtain", method), 0, 1.0) for method in ("mik+a", "fj", "ah")]
     longer = write_run(tmp_path / "runs", Condition("no_curtain", "no_history"), 0, 1.0)
@@ -480,6 +498,18 @@ def test_the_bar_plot_has_the_papers_variants(runs, tmp_path, monkeypatch):
     figures.accuracy_bars(loaded(runs), STATE, tmp_path / "bars.png")
     paper = {condition_of(line, "three_curtains") for line in paper_rows() if line["exogenous"] == "N"}
     assert paper < set(drawn)
+
+
+def test_a_bar_below_zero_is_in_the_picture(tmp_path, monkeypatch):
+    """An error of more than 100 is drawn as an accuracy below zero, not as nothing."""
+    limits = []
+    monkeypatch.setattr("matplotlib.axes.Axes.set_ylim", lambda axes, *ends, **_: limits.append(ends))
+    for level in (5.0, 121.0):
+        write_run(tmp_path / f"{level}", Condition("three_curtains", "no_history"), 0, level)
+        figures.accuracy_bars(loaded(tmp_path / f"{level}"), STATE, tmp_path / "bars.png")
+    chosen = [low for low, high in (ends for ends in limits if len(ends) == 2) if high == 100]
+    assert chosen[0] == 0
+    assert chosen[-1] < -20
 
 
 def test_the_bar_plot_has_the_mazes_with_numbers_in_its_units(runs, tmp_path, monkeypatch):

@@ -51,16 +51,19 @@ def write_report(sources: Sequence[Path], out: Path, samples: Samples | None = N
     refuse_foreign(out, "navigation report", RUNS)
     found = find_navigation(sources, out)
     runs, unfinished = load_runs(found), [result for result in found if not result.finished]
+    drawn = samples() if samples is not None else None  # before anything is written: there may be no OpenGL
     with owned(out):
-        return _write(runs, unfinished, out, samples)
+        return _write(runs, unfinished, out, drawn)
 
 
-def _write(runs: list[NavigationRun], unfinished: list[Result], out: Path, samples: Samples | None) -> Path:
+def _write(
+    runs: list[NavigationRun], unfinished: list[Result], out: Path, samples: Mapping[str, np.ndarray] | None
+) -> Path:
     save_runs(runs, out)
     (out / "figures").mkdir(exist_ok=True)
     pictures = _draw(runs, out / "figures")
     if samples is not None:
-        figures.sample_observations(samples(), out / "figures" / "observations.png")
+        figures.sample_observations(samples, out / "figures" / "observations.png")
         pictures.append("observations.png")
     tables = make_tables(runs)
     write_tables(tables, out / "tables.csv")

@@ -8,7 +8,7 @@ import math
 import shlex
 import shutil
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -59,9 +59,15 @@ class NavigationRun:
 
     @property
     def collection(self) -> dict[str, Any]:
-        """How its set was made; early runs, which do not tell, took their preset's; {} if the set does not tell."""
-        usual = {name: getattr(PRESETS[self.preset], name) for name in ("trajectories", "trajectory_rows")}
-        return self.result.record.get("collection", usual)
+        """How its set was made, by setting of `MazeCollectConfig`; {} if nothing whole tells.
+
+        Early runs, which do not tell, took their preset's.
+        """
+        usual = asdict(PRESETS[self.preset])
+        sizes = {name: usual[name] for name in ("trajectories", "trajectory_rows")}
+        told = self.result.record.get("collection", sizes) or {}
+        kept = {name: value for name, value in told.items() if name in usual and type(value) is type(usual[name])}
+        return kept if sizes.keys() <= kept.keys() else {}
 
     @property
     def file_name(self) -> str:
