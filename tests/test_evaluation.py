@@ -206,6 +206,9 @@ def test_an_evaluation_names_its_step_and_touches_no_other_file(world, encoder, 
         evaluate_run(run.path, "fog", 1, 1)
     with pytest.raises(UserError, match="holds no evaluated run"):
         evaluate_run(encoder.parent, None, 1, 1)
+    with pytest.raises(SystemExit, match="2"):
+        main(["evaluate", str(encoder.parent), "--out", str(tmp_path / "new.csv")])
+    assert not (tmp_path / "new.csv").exists(), "nothing is left where nothing is played"
     assert [row["step"] for row in evaluate_run(run.path, None, 1, 1).rows] == [2, 2]
     (run.path / "labels.json").write_text("{}")
     with pytest.raises(UserError, match=r"labels\.json: has no 'method'"):

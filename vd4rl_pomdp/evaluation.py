@@ -252,6 +252,13 @@ class EvaluatedRun:
     """Their episodes, in the same order."""
 
 
+def evaluations_of(run: Path) -> list[dict[str, Any]]:
+    """The rows of a fine-tuning run's own evaluations; UserError for a folder without any."""
+    if rows := read_episodes(run / "episodes.csv"):
+        return rows
+    raise UserError(f"{run}: holds no evaluated run; name a folder that `vd4rl-pomdp finetune` wrote")
+
+
 def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int) -> EvaluatedRun:
     """Evaluate a fine-tuning run's policy.
 
@@ -271,9 +278,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     """
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
-    evaluated = read_episodes(run / "episodes.csv")
-    if not evaluated:
-        raise UserError(f"{run}: holds no evaluated run; name a folder that `vd4rl-pomdp finetune` wrote")
+    evaluated = evaluations_of(run)
     labels = read_json(run / "labels.json")
     missing = [name for name in LABELS if not isinstance(labels.get(name), str | int)]
     if missing:

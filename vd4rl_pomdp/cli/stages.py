@@ -51,7 +51,7 @@ class EvaluateCommand:
 
 def _evaluate(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.errors import refuse_number
-    from vd4rl_pomdp.evaluation import by_part, evaluate_run
+    from vd4rl_pomdp.evaluation import by_part, evaluate_run, evaluations_of
     from vd4rl_pomdp.reference import Reference, summarise
     from vd4rl_pomdp.runs.episodes import append_episodes, begin_episodes
     from vd4rl_pomdp.runs.files import flatten
@@ -61,6 +61,7 @@ def _evaluate(words: Arguments, program: str) -> None:
     refuse_number("parts", command.parts, 1)
     if command.out is not None:
         refuse_inside(command.out)
+        evaluations_of(command.run)
         begin_episodes(command.out)  # before any episode is played
     played = evaluate_run(command.run, command.corruption, command.episodes, command.workers)
     rows = played.rows
