@@ -75,7 +75,7 @@ class IQL(Algorithm):
     def __init__(
         self, policy: Policy, options: IQLOptions, learning_rate: float, updates: int, generator: torch.Generator
     ) -> None:
-        self.policy, self.settings, self.learning_rate, self.total = policy, options, learning_rate, updates
+        self.policy, self.settings, self.learning_rate, self.planned = policy, options, learning_rate, updates
         dim, action_dim, hidden = (policy.shape[name] for name in ("dim", "action_dim", "hidden"))
         device = policy.standardise.mean.device
         self.critic = TwinCritic(dim, action_dim, hidden).to(device)
@@ -126,7 +126,7 @@ class IQL(Algorithm):
     @property
     def policy_learning_rate(self) -> float:
         """Learning rate of the actor, which falls to 0 along a cosine."""
-        done = min(1.0, self.updates / self.total)
+        done = min(1.0, self.updates / self.planned)
         return self.learning_rate * (1 + math.cos(math.pi * done)) / 2
 
     def parts(self) -> dict[str, Any]:

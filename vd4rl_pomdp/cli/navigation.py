@@ -2,16 +2,19 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
 from vd4rl_pomdp.errors import UserError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 
 def _collect(words: Arguments, program: str) -> None:
@@ -52,17 +55,18 @@ class NavigationReportCommand:
 
 def _report(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.experiments.navigation.report import write_report
-    from vd4rl_pomdp.navigation.samples import sample_observations
 
     command = parse(NavigationReportCommand, words, program)
-    samples = (lambda: _telling_the_flag(sample_observations)) if command.pictures else None
+    samples = _samples if command.pictures else None
     print(f"report: {write_report(command.runs, command.out, samples)}")
 
 
-def _telling_the_flag(draw: Callable[[], Any]) -> Any:
-    """What `draw` draws; where nothing can be drawn, how to do without."""
+def _samples() -> Mapping[str, np.ndarray]:
+    """The sample observations; UserError that names the flag to do without where nothing can be drawn."""
+    from vd4rl_pomdp.navigation.samples import sample_observations
+
     try:
-        return draw()
+        return sample_observations()
     except UserError as error:
         raise UserError(f"{error}; --no-pictures leaves the sample observations out") from error
 

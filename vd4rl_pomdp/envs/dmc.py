@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.envs import rendering
-from vd4rl_pomdp.envs.pixels import PixelEnv, Render, TimeStep
+from vd4rl_pomdp.envs.pixels import PixelEnv, Render, TimeStep, between
 from vd4rl_pomdp.envs.rendering import mujoco, suite
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_SIZE, TASKS, DMCTask, Layout
@@ -109,11 +109,10 @@ def repeat_action(env: Any, action: np.ndarray, repeat: int) -> tuple[float, boo
 
     It lies in [-1, 1], which stands for the bounds of the task's own.
     """
-    total, spec = 0.0, env.action_spec()
-    if (spec.minimum != -1).any() or (spec.maximum != 1).any():
-        action = spec.minimum + (np.clip(action, -1, 1) + 1) / 2 * (spec.maximum - spec.minimum)
+    total, bounds = 0.0, env.action_spec()
+    rescaled = between(action, bounds.minimum, bounds.maximum)
     for _ in range(repeat):
-        step = env.step(action)
+        step = env.step(rescaled)
         total += step.reward
         if step.last():
             return float(total), True, float(step.discount)

@@ -12,7 +12,7 @@ import numpy as np
 from PIL import Image
 
 from vd4rl_pomdp.envs.opengl import undisturbed
-from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep
+from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep, between
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_SIZE, GymnasiumTask, Layout
 from vd4rl_pomdp.types import StepType
@@ -93,8 +93,7 @@ class GymnasiumEnv(PixelEnv):
     def _rescaled(self, action: np.ndarray) -> np.ndarray:
         """An (A,) action in [-1, 1] between the bounds of the environment's own, in its shape and dtype."""
         low, high = self._space.low.astype(np.float64), self._space.high.astype(np.float64)
-        within = np.clip(action, -1, 1).reshape(low.shape) * ((high - low) / 2) + (high + low) / 2
-        return within.astype(self._space.dtype)
+        return between(np.reshape(action, low.shape), low, high).astype(self._space.dtype)
 
     def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
         frame = self._frame(self.size) if self.size and self.drawing else None

@@ -43,6 +43,11 @@ class TimeStep:
         return self.last and self.discount == 0
 
 
+def between(action: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
+    """An action in [-1, 1] between the bounds of an environment's own, in float64; what lies outside is cut off."""
+    return np.clip(action, -1, 1) * ((high - low) / 2) + (high + low) / 2
+
+
 class PixelEnv(ABC):
     """One task. An episode's first state depends on its seed alone."""
 

@@ -124,10 +124,7 @@ def _chance(row: Row) -> str:
 def representations(rows: list[Row]) -> list[ShownTable]:
     """Encoders' measures beside returns, one table a setting."""
     columns = ("method", "action loss", "pose, %", "velocity, %", "return", "seeds")
-    return [
-        ShownTable(name, columns, list(map(_measure_line, members)), note=f"{seeds_note(members)}{_told_note(members)}")
-        for name, members in by_setting(rows)
-    ]
+    return [_counted(name, columns, _measure_line, members, _told_note(members)) for name, members in by_setting(rows)]
 
 
 def _told_note(rows: list[Row]) -> str:
@@ -179,9 +176,11 @@ def published(rows: list[dict[str, str]]) -> list[ShownTable]:
     return [ShownTable("", tuple(rows[0]), [Line(tuple(row.values())) for row in rows], words=2)] if rows else []
 
 
-def _counted(title: str, columns: tuple[str, ...], line: Callable[[Row], Line], rows: list[Row]) -> ShownTable:
-    """A table of rows with `seeds`, whose least and greatest number its note tells."""
-    return ShownTable(title, columns, list(map(line, rows)), note=seeds_note(rows))
+def _counted(
+    title: str, columns: tuple[str, ...], line: Callable[[Row], Line], rows: list[Row], more: str = ""
+) -> ShownTable:
+    """A table of rows with `seeds`, whose least and greatest number its note tells, and `more`."""
+    return ShownTable(title, columns, list(map(line, rows)), note=seeds_note(rows) + more)
 
 
 def by_setting(rows: list[Row]) -> list[tuple[str, list[Row]]]:

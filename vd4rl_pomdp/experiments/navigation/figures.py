@@ -53,7 +53,7 @@ def accuracy_bars(runs: list[NavigationRun], measure: Measure, path: Path) -> No
         axes.set_xticks(range(len(methods)), methods, rotation=40, ha="right", fontsize=8)
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_xlim(-0.6, len(methods) - 0.4)
-        axes.set_ylim(min(0.0, *(100 - run.values[measure] for run in runs if measure in run.values)), 100)
+    panels[0, 0].set_ylim(min(0.0, *(100 - run.values[measure] for run in runs if measure in run.values)), 100)
     for axes in panels[:, 0]:
         axes.set_ylabel(f"100 - state error ({'raw x 100' if measure.is_raw else '% of std'})")
     handles: list[Any] = [Rectangle((0, 0), 1, 1, color=colour) for *_, colour in _VARIANTS.values()]
