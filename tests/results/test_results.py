@@ -51,6 +51,20 @@ def test_a_run_comes_back_as_its_files_hold_it(tmp_path):
     assert [content(run) for run in (one, other)] == [content(read_run(path)) for path in (run, before)]
 
 
+def test_a_run_that_went_on_elsewhere_names_every_machine_and_commit(tmp_path):
+    run = whole_run(tmp_path / "run")
+    first = {"processor": "A", "cores": 2, "gpu": None}
+    later = [first | {"git_commit": "two"}, first | {"gpu": "B", "git_commit": "two"}]
+    write_json(run / "machine.json", first | {"continued": later})
+    write_json(run / "config.json", read_json(run / "config.json") | {"git_commit": "one"})
+    told = read_run(run)
+    assert (told.machine, told.commit) == ("A, 2 cores then B", "one then two")
+    for damaged in ("two", [1], 5):
+        write_json(run / "machine.json", first | {"continued": damaged})
+        with pytest.raises(UserError, match="its files are damaged"):
+            read_run(run)
+
+
 def test_runs_are_there_once_and_stay_as_they_are(tmp_path, capsys):
     run = whole_run(tmp_path / "runs/0")
     (whole_run(tmp_path / "runs/1", seed=1) / "timing.json").unlink()

@@ -85,6 +85,20 @@ def test_a_folder_with_something_else_is_refused(tmp_path, content):
     assert [path.name for path in tmp_path.iterdir()] == [content]
 
 
+def test_what_a_run_goes_on_with_is_recorded_where_it_is_new(tmp_path, monkeypatch):
+    now = {"processor": "A", "git_commit": "one"}
+    monkeypatch.setattr(module, "machine", lambda device: {"processor": now["processor"]})
+    monkeypatch.setattr(module, "git_commit", lambda: now["git_commit"])
+    for processor, commit in (("A", "one"), ("A", "one"), ("B", "one"), ("B", "one"), ("B", "two"), ("A", "one")):
+        now |= {"processor": processor, "git_commit": commit}
+        with begin(tmp_path):
+            pass
+    told = read_json(tmp_path / "machine.json")
+    later = [(part["processor"], part["git_commit"]) for part in told["continued"]]
+    assert (told["processor"], later) == ("A", [("B", "one"), ("B", "two"), ("A", "one")])
+    assert told["continued"][0]["versions"] == read_json(tmp_path / "config.json")["versions"]
+
+
 def test_a_second_owner_is_refused_and_finds_the_end_of_the_first(tmp_path):
     with begin(tmp_path) as run:
         second = begin(tmp_path)

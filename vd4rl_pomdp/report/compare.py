@@ -17,7 +17,6 @@ from vd4rl_pomdp.report.figures import seeds_note
 from vd4rl_pomdp.report.gaps import CONDITION
 from vd4rl_pomdp.report.layout import Line, ShownTable, interval, latex, with_interval
 from vd4rl_pomdp.report.load import LABELS, LoadedRun, load_runs
-from vd4rl_pomdp.report.measures import machine
 from vd4rl_pomdp.report.present import by_setting
 from vd4rl_pomdp.report.tables import SCORE, evaluations, final_scores, grouped, label
 from vd4rl_pomdp.report.templates import render
@@ -152,8 +151,8 @@ def _differing(one: list[LoadedRun], other: list[LoadedRun]) -> str:
 
 def _side(path: Path, runs: list[LoadedRun]) -> Side:
     finished = [run for run in runs if run.rows and run.finished]
-    commits = dict.fromkeys(str(run.record.get("git_commit") or "unknown") for run in finished)
-    machines = dict.fromkeys(machine(run) or "not recorded" for run in finished)
+    commits = dict.fromkeys(run.result.commit or "unknown" for run in finished)
+    machines = dict.fromkeys(run.result.machine or "not recorded" for run in finished)
     return Side(path, len(finished), len(runs) - len(finished), ", ".join(commits), "; ".join(machines))
 
 

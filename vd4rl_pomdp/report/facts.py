@@ -7,7 +7,6 @@ from typing import Any
 
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import LoadedRun, compare
-from vd4rl_pomdp.report.measures import machine
 from vd4rl_pomdp.report.tables import label, setting
 from vd4rl_pomdp.runs.settings import settings_of
 
@@ -68,8 +67,8 @@ def _facts(name: str, runs: list[LoadedRun]) -> dict[str, str]:
     first = runs[0].record
     return {
         "title": f"{name}, {'seeds' if len(seeds) > 1 else 'seed'} {', '.join(shown)}",
-        "commits": ", ".join(_distinct(run.record.get("git_commit") or "unknown" for run in runs)),
-        "machines": "; ".join(_distinct(machine(run) or "not recorded" for run in runs)),
+        "commits": ", ".join(_distinct(run.result.commit or "unknown" for run in runs)),
+        "machines": "; ".join(_distinct(run.result.machine or "not recorded" for run in runs)),
         "time": f"{min(seconds):.0f} to {max(seconds):.0f} s" if seconds else runs[0].progress,
         "command": first.get("command", ""),
         "config": json.dumps({"config": settings_of(first["config"]), "versions": first.get("versions")}, indent=1),

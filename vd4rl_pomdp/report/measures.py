@@ -49,16 +49,8 @@ def _run(run: LoadedRun, curve: list[Row]) -> Row:
     found = run.labels | run.representation | {"id": run.result.id, "variant": run.variant, "state": run.progress}
     found |= {"score": last["score"], "return": float(returns_of([run])[0])}
     found |= {"best_score": best["score"], "best_step": best["step"], "finetune_seconds": run.seconds}
-    found |= {"git_commit": run.record.get("git_commit", ""), "machine": machine(run)}
+    found |= {"git_commit": run.result.commit, "machine": run.result.machine}
     return {name: found[name] for name in _RUN}
-
-
-def machine(run: LoadedRun) -> str:
-    """What a run was computed on: its GPU, or its processor and cores; empty if it is not known."""
-    told = run.result.files.get("machine", {})
-    if told.get("gpu"):
-        return str(told["gpu"])
-    return f"{told['processor']}, {told.get('cores', '?')} cores" if told.get("processor") else ""
 
 
 def representations(table: list[Row]) -> list[Row]:

@@ -23,6 +23,7 @@ from vd4rl_pomdp.runs.episodes import COLUMNS, LABELS, episodes_until, read_epis
 from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_csv
 from vd4rl_pomdp.runs.identity import identity
 from vd4rl_pomdp.runs.metrics import read_metrics
+from vd4rl_pomdp.runs.provenance import CONTINUED
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs.run import remedy
 from vd4rl_pomdp.runs.settings import settings_of
@@ -67,6 +68,22 @@ class Result:
         return self.files[RECORD]
 
     @property
+    def parts(self) -> list[dict[str, Any]]:
+        """Hardware and `git_commit` of the run, and of each later part of it that had others."""
+        told = self.files.get("machine", {})
+        return [told | {"git_commit": self.record.get("git_commit")}, *told.get(CONTINUED, [])]
+
+    @property
+    def machine(self) -> str:
+        """What it was computed on: its GPU, or its processor and cores; empty if it is not known."""
+        return _in_turn(map(_hardware, self.parts))
+
+    @property
+    def commit(self) -> str:
+        """The commit it was computed with; empty if it is not known."""
+        return _in_turn(part.get("git_commit") for part in self.parts)
+
+    @property
     def encoder(self) -> dict[str, Any]:
         """What its encoder says of its pretraining; empty where there is none yet."""
         return self.files.get(ENCODER, {}).get("pretrain", {})
@@ -100,6 +117,18 @@ class Result:
     def settled(self) -> bool:
         """Whether nothing is left to be done: it has finished, or it diverged."""
         return self.finished or self.diverged is not None
+
+
+def _in_turn(words: Iterable[str | None]) -> str:
+    """What the parts of a run tell, each word once: "A then B"."""
+    return " then ".join(dict.fromkeys(filter(None, words)))
+
+
+def _hardware(part: dict[str, Any]) -> str | None:
+    if part.get("gpu"):
+        return str(part["gpu"])
+    processor, cores = part.get("processor"), part.get("cores")
+    return f"{processor}, {cores} cores" if processor and cores else processor
 
 
 def read_run(folder: Path) -> Result:
@@ -229,7 +258,7 @@ def _whole(where: Path | str) -> Iterator[None]:
 
 def _check(run: Result) -> None:
     """Look at the parts of a run that everything relies on; raises KeyError, TypeError or AttributeError."""
-    if not all(isinstance(part, dict) for part in (*run.files.values(), run.record["config"], run.encoder)):
+    if not all(isinstance(part, dict) for part in (*run.files.values(), *run.parts, run.record["config"], run.encoder)):
         raise TypeError("a part of it is no JSON object")
     if "seed" not in run.record["config"]:
         raise TypeError("its record holds no settings")

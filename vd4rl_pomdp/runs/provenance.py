@@ -24,6 +24,8 @@ PACKAGES = (
     "scikit-learn",
     "safetensors",
 )
+CONTINUED = "continued"
+"""Key in machine.json of the later parts of a run that went on with other hardware, commit or versions."""
 COMMIT_FILE = "vd4rl_pomdp/commit.txt"
 """Where a wheel keeps the commit it was built from, below the folder of its packages."""
 

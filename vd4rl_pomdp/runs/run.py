@@ -21,7 +21,7 @@ from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, State, fitting, pack, unpack
 from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_json
 from vd4rl_pomdp.runs.ownership import Owner, owned
-from vd4rl_pomdp.runs.provenance import command, git_commit, machine, versions
+from vd4rl_pomdp.runs.provenance import CONTINUED, command, git_commit, machine, versions
 from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS
 
 DIVERGED = "diverged.json"
@@ -121,8 +121,20 @@ class RunFolder:
             origin |= {"plugins": origins(self.config), "collection": collection_of(Path(self.config["data"]))}
             write_json(self.path / "config.json", record | origin)
         (self.path / DIVERGED).unlink(missing_ok=True)
-        if not (self.path / "machine.json").exists():
-            write_json(self.path / "machine.json", machine(self.config.get("device", "auto")))
+        self._keep_machine()
+
+    def _keep_machine(self) -> None:
+        """Record the hardware; of a run that goes on, that, commit and versions where they are others by now."""
+        path, now = self.path / "machine.json", machine(self.config.get("device", "auto"))
+        if not path.exists():
+            write_json(path, now)
+            return
+        told, record = read_json(path), read_json(self.path / "config.json")
+        parts = told.pop(CONTINUED, [])
+        begun = told | {name: record.get(name) for name in ("git_commit", "versions")}
+        part = now | {"git_commit": git_commit(), "versions": versions()}
+        if part != (parts[-1] if parts else begun):
+            write_json(path, told | {CONTINUED: [*parts, part]})
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None

@@ -62,7 +62,7 @@ def write_run(base: Path, condition: Condition, seed: int, level: float, raw: bo
         ("config.json", record),
         ("results.json", {"maze": condition.maze, "set": "f00", "rows": rows}),
         ("timing.json", {"steps": 2500, "seconds": 300.0}),
-        ("machine.json", {"processor": "some", "gpu": None}),
+        ("machine.json", {"processor": "some", "cores": 2, "gpu": None}),
     ):
         (folder / name).write_text(json.dumps(value))
     (folder / "trajectory.csv").write_text(header + points)
@@ -451,7 +451,7 @@ def test_the_page_says_which_statements_hold_and_what_the_paper_has(runs, tmp_pa
     waiting = page.count("| no run yet |")
     assert f"{answers[0]} of {sum(answers)} hold, {waiting} wait for runs." in page
     assert f"Of {sum(answers) - 2} that are judged in both units, none changes." in page
-    assert "Budget: 2,500 gradient steps on 100,000 samples, 5 minutes a run (some, no GPU)." in page
+    assert "Budget: 2,500 gradient steps on 100,000 samples, 5 minutes a run (some, 2 cores)." in page
     headings = [line for line in page.splitlines() if line.startswith("## ")]
     assert len(headings) == len(set(headings))
 

@@ -147,7 +147,7 @@ def _budget(runs: list[NavigationRun]) -> str:
     steps = " or ".join(f"{count:,}" for count in sorted({int(run.facts["steps"]) for run in trained}))
     minutes = sorted(round(float(run.facts["seconds"]) / 60) for run in trained)
     took = " to ".join(dict.fromkeys(map(str, (minutes[0], minutes[-1]))))
-    machines = markdown("; ".join(sorted({run.facts["gpu"] or f"{run.facts['processor']}, no GPU" for run in runs})))
+    machines = markdown("; ".join(sorted({run.facts["machine"] or "not recorded" for run in runs})))
     samples = " or ".join(f"{count:,}" for count in sorted({_samples(run) for run in runs} - {0})) or "unknown"
     return (
         f"Budget: {steps} gradient steps on {samples} samples, "

@@ -28,7 +28,6 @@ ROWS, TRAJECTORIES = "rows.csv", "trajectories"
 
 _IDENTITY = ("maze", "method", "max_k", "self_prediction", "exogenous", "literal_future", "preset", "seed")
 _MEASURED = (*Measure._fields, "value")
-_FILES = ("results", "timing", "machine")
 _DRAWN = ("x", "y", "estimated_x", "estimated_y")
 """Columns of a trajectory that figures and films draw."""
 
@@ -44,7 +43,7 @@ class NavigationRun:
     seed: int
     values: dict[Measure, float]
     facts: dict[str, str]
-    """Its provenance: steps, seconds, data, commit, machine, command."""
+    """Its provenance: steps, seconds, data, machine, command."""
     trajectory: Path | None
     """A held-out trajectory with estimated states."""
 
@@ -224,7 +223,7 @@ def _read_run(result: Result) -> NavigationRun:
 
 
 def _run_of(result: Result) -> NavigationRun:
-    record, (results, timing, machine) = result.record, (result.files[name] for name in _FILES)
+    record, results, timing = result.record, result.files["results"], result.files["timing"]
     config = record["config"]
     named = {
         "maze": results["maze"],
@@ -246,9 +245,7 @@ def _run_of(result: Result) -> NavigationRun:
         "steps": timing["steps"],
         "seconds": timing["seconds"],
         "set": results["set"],
-        "git_commit": record["git_commit"],
-        "processor": machine["processor"],
-        "gpu": machine["gpu"] or "",
+        "machine": result.machine,
         "command": results.get("command", record["command"]),
     }
     values = {measure_of(row): _finite(result.place, row, f"{row['value']:.6g}") for row in results["rows"]}
