@@ -47,6 +47,24 @@ def test_what_a_task_does_not_tell_is_found(domain, task, layout):
     assert found.visible_state(physics[None]).shape == (1, width)
 
 
+def test_where_a_ball_is_shows_beside_the_body_that_a_camera_follows():
+    task = DMCTask("quadruped", "fetch")
+    layout, physics = layout_of(task), suite.load(task.domain, task.task).physics.get_state()[None]
+    assert (layout.travel, layout.beside) == ((0, 1), (23,))
+    both, ball = physics.copy(), physics.copy()
+    for place in (0, 23):
+        both[:, place : place + 2] += (3, -2)
+    ball[:, 23:25] += (3, -2)
+    np.testing.assert_allclose(layout.visible_state(both), layout.visible_state(physics), atol=1e-5)
+    moved = layout.visible_state(ball) - layout.visible_state(physics)
+    assert sorted(moved[np.abs(moved) > 1e-5].round(4).tolist()) == [-2, 3]
+
+
+def test_a_camera_that_follows_a_hand_shows_where_things_are():
+    layout = layout_of(DMCTask("stacker", "stack_2", camera=1))
+    assert (layout.travel, layout.beside) == ((), ())
+
+
 def test_actions_of_a_task_with_other_bounds_reach_all_of_them():
     env = make_env(DMCTask("quadruped", "walk"), size=None)
     spec = env.simulator.action_spec()

@@ -56,14 +56,18 @@ class Layout:
     """Positions that are angles without limits: a full turn more looks the same."""
     quaternions: tuple[int, ...] = ()
     """First of the four positions of every unit quaternion: one of the other sign looks the same."""
+    beside: tuple[int, ...] = ()
+    """First of the two positions along the ground of other bodies, which are seen from where the travelling one is."""
 
     def pose(self, physics: np.ndarray) -> np.ndarray:
         """What (..., P) simulator states look like, in coordinates without winding: equal for equal looks.
 
         Limited positions, sine and cosine of turning angles, then two columns of every quaternion's rotation matrix
-        (Zhou et al. 2019, arXiv 1812.07035); nothing of the place on the ground.
+        (Zhou et al. 2019, arXiv 1812.07035); of places on the ground, where others are beside the travelling body.
         """
-        positions, turning = physics[..., : self.positions], physics[..., list(self.turning)]
+        positions, turning = physics[..., : self.positions].copy(), physics[..., list(self.turning)]
+        for first in self.beside:
+            positions[..., first : first + 2] -= positions[..., list(self.travel)]
         rotations = [_two_columns(positions[..., first : first + 4]) for first in self.quaternions]
         replaced = [column for first in self.quaternions for column in range(first, first + 4)]
         plain = np.delete(positions, [*self.travel, *self.turning, *replaced], axis=-1)

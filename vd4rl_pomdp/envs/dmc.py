@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -53,9 +54,10 @@ class DMCEnv(PixelEnv):
         model = self.physics.model
         self.simulator.reset()  # an episode of its own: some tasks observe nothing before
         state = flat_state(self.simulator.task.get_observation(self.physics))
-        travel = _ground_travel(model) if _tracks(model, camera) else ()
+        travel, beside = _ground_travel(model, camera)
         turning, quaternions = _free_joints(model)
-        return Layout(self.simulator.action_spec().shape[0], len(state), model.nq, travel, turning, quaternions)
+        widths = self.simulator.action_spec().shape[0], len(state), model.nq
+        return Layout(*widths, travel, turning, quaternions, beside)
 
     @property
     def rate(self) -> float:
@@ -158,17 +160,32 @@ def _tracks(model: Any, camera: int) -> bool:
     return model.cam_mode[camera] in (mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
 
 
-def _ground_travel(model: Any) -> tuple[int, ...]:
-    """Positions along the ground of the bodies that stand in the world: x and y of free joints, level slides."""
-    travel: list[int] = []
-    for kind, start, body, axis in zip(
-        model.jnt_type, model.jnt_qposadr, model.jnt_bodyid, model.jnt_axis, strict=True
-    ):
-        if model.body_parentid[body] == 0 and kind == mujoco.mjtJoint.mjJNT_FREE:
-            travel += [int(start), int(start) + 1]
-        elif model.body_parentid[body] == 0 and kind == mujoco.mjtJoint.mjJNT_SLIDE and abs(axis[2]) < 0.5:
-            travel.append(int(start))
-    return tuple(travel)
+def _ground_travel(model: Any, camera: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
+    """Positions along the ground of the body that a tracking camera follows, x and y of a free joint or level slides.
+
+    Behind them, if it is free, the first positions of the other free bodies. What stands in the world and is followed
+    all the same, such as a hand, shows all places.
+    """
+    if not _tracks(model, camera):
+        return (), ()
+    on_ground = [list(_ground_positions(model, joint)) for joint in range(model.njnt)]
+    moving = {int(model.jnt_bodyid[joint]): kind for joint, kind in enumerate(model.jnt_type) if on_ground[joint]}
+    followed = int(model.body_rootid[model.cam_bodyid[camera]])
+    subject = followed or next(iter(moving), 0)  # a camera of the world follows the centre of all that moves
+    travel = [place for joint, places in enumerate(on_ground) if model.jnt_bodyid[joint] == subject for place in places]
+    if moving.get(subject) != mujoco.mjtJoint.mjJNT_FREE:
+        return tuple(travel), ()
+    others = [places[0] for joint, places in enumerate(on_ground) if len(places) == 2 and places[0] != travel[0]]
+    return tuple(travel), tuple(others)
+
+
+def _ground_positions(model: Any, joint: int) -> Iterator[int]:
+    """Positions of a joint along the ground, if its body stands in the world."""
+    kind, start, body = model.jnt_type[joint], int(model.jnt_qposadr[joint]), model.jnt_bodyid[joint]
+    if model.body_parentid[body] == 0 and kind == mujoco.mjtJoint.mjJNT_FREE:
+        yield from (start, start + 1)
+    elif model.body_parentid[body] == 0 and kind == mujoco.mjtJoint.mjJNT_SLIDE and abs(model.jnt_axis[joint][2]) < 0.5:
+        yield start
 
 
 def _free_joints(model: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
