@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict
 from types import MappingProxyType
 from typing import Any
 
@@ -14,7 +13,7 @@ from pretrain.objectives import METHODS, Method
 from pretrain.objectives.untrained import StateOptions
 from vd4rl_pomdp.nn.action_target import ActionTarget, make_action_target
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
-from vd4rl_pomdp.nn.frame import STATE
+from vd4rl_pomdp.nn.frame import STATE, encoder_settings
 from vd4rl_pomdp.objective import ActionOptions, Objective
 from vd4rl_pomdp.options import Options, flat
 from vd4rl_pomdp.state_scale import StateScale
@@ -54,14 +53,12 @@ def build_objective(
     if method.reads_state and states is not None:
         return build_on_states(config, action_dim, target, len(states.std), _noise(config.options, states))
     channels, size = observation
-    frame = asdict(config.frame)
     return _build(
         config,
         states if method.regresses_state else target,
         action_dim=action_dim,
         frame_encoder=config.frame_encoder,
-        feature_dim=frame.pop("feature_dim"),
-        frame_options=frame,
+        **encoder_settings(config.frame),
         channels=channels,
         size=size,
     )

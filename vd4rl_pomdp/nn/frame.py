@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -24,6 +24,12 @@ class FrameOptions(Options):
     """Width of the frame encoder's output."""
 
     limits: ClassVar[Limits] = {"feature_dim": 1}
+
+
+def encoder_settings(options: Options) -> dict[str, Any]:
+    """What `EncoderConfig` is told of a frame encoder's options: `feature_dim`, and as `frame_options` all others."""
+    told = asdict(options)
+    return {"feature_dim": told.pop("feature_dim"), "frame_options": told}
 
 
 @dataclass(frozen=True)

@@ -6,12 +6,13 @@ A stage refuses the same once it has read its set; a sweep would have collected 
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cache
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError, refuse_outside
 from vd4rl_pomdp.nn.encoder import EncoderConfig, build_frame_encoder
+from vd4rl_pomdp.nn.frame import encoder_settings
 from vd4rl_pomdp.tasks import FRAME_STACK, TASKS
 
 
@@ -67,7 +68,5 @@ def _check_window(window: int, rows: int) -> None:
 
 def _check_frames(config: Any, channels: int, size: int) -> None:
     """Build the frame encoder, to see that it can be; its width plays no part."""
-    told = {name: value for name, value in asdict(config.frame).items() if name != "feature_dim"}
-    build_frame_encoder(
-        EncoderConfig(0, config.frame_encoder, feature_dim=1, channels=channels, size=size, frame_options=told)
-    )
+    told = encoder_settings(replace(config.frame, feature_dim=1))
+    build_frame_encoder(EncoderConfig(0, config.frame_encoder, channels=channels, size=size, **told))
