@@ -65,7 +65,6 @@ def world(monkeypatch) -> list[ScriptedEnv]:
     """Takes the place of the environments; holds those that were made."""
     made: list[ScriptedEnv] = []
     monkeypatch.setattr(evaluation, "_environment", cache(lambda *a: (made.append(ScriptedEnv()), made[-1])[1]))
-    monkeypatch.setattr(evaluation, "_AGENTS", {})
     return made
 
 

@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from dataclasses import dataclass, field
-from functools import cache
+from functools import cache, lru_cache
 from itertools import pairwise
 from pathlib import Path
 from typing import Any
@@ -15,7 +15,6 @@ import torch
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn, Observation
 from vd4rl_pomdp.envs.make import layout_of
-from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import encoder_hash, load_encoder
@@ -82,7 +81,6 @@ class EpisodeJob:
     corruption: CorruptionConfig
     episode: int
     film: bool
-    render: Render = "fast"
     length: int | None = None
     actor: Path | None = None
     """File of the actor that made the data; None: it is not known."""
@@ -114,16 +112,9 @@ class Episode:
         return float(np.mean(self.action_errors)) if self.action_errors else None
 
 
-def evaluate(
-    jobs: list[EpisodeJob], workers: int, on_episode: Callable[[Episode], None] | None = None
-) -> list[Episode]:
+def evaluate(jobs: list[EpisodeJob], workers: int) -> list[Episode]:
     """Run evaluation episodes; their results do not depend on `workers`."""
-    episodes = []
-    for episode in run_jobs(_run_episode, jobs, workers):
-        episodes.append(episode)
-        if on_episode is not None:
-            on_episode(episode)
-    return episodes
+    return list(run_jobs(_run_episode, jobs, workers))
 
 
 def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, Any]]:
@@ -144,13 +135,9 @@ def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[s
     ]
 
 
-_AGENTS: dict[tuple, Agent] = {}
-"""The agent of the last episode, by what its folders hold."""
-
-
 def _run_episode(job: EpisodeJob) -> Episode:
-    agent = _agent(job)
-    place = (job.task, job.corruption, job.render, job.length, agent.picture_size, _draws(agent, job))
+    agent = _agent(job.encoder, job.policy, _content(job.encoder, job.policy))
+    place = (job.task, job.corruption, "fast", job.length, agent.picture_size, _draws(agent, job))
     return _play(agent, _environment(*place), job)
 
 
@@ -160,13 +147,10 @@ def _environment(*place: Any) -> CorruptedEnv:
     return CorruptedEnv(*place)
 
 
-def _agent(job: EpisodeJob) -> Agent:
-    """The one of a job; kept as long as its folders hold the same."""
-    key = _content(job.encoder, job.policy)
-    if key not in _AGENTS:
-        _AGENTS.clear()
-        _AGENTS[key] = Agent(load_encoder(job.encoder)[0], load_policy(job.policy))
-    return _AGENTS[key]
+@lru_cache(maxsize=1)
+def _agent(encoder: Path, policy: Path, content: tuple[str, str]) -> Agent:
+    """The agent of two folders, read anew when another is asked for or they hold something else."""
+    return Agent(load_encoder(encoder)[0], load_policy(policy))
 
 
 def _content(encoder: Path, policy: Path) -> tuple[str, str]:

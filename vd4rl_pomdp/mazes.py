@@ -14,6 +14,8 @@ import numpy as np
 
 from vd4rl_pomdp.errors import UserError
 
+ACTION_REPEAT = 5
+"""Simulator steps of 0.01 s for one action."""
 MOST_STEPS = 1000
 """Most simulator steps for one action: ten seconds."""
 PICTURE_SIZE = 100

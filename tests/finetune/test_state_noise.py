@@ -12,7 +12,6 @@ from finetune.histories import Histories
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
-from vd4rl_pomdp import evaluation
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.corruptions.keys import draw_normals
 from vd4rl_pomdp.data import Dataset, open_dataset
@@ -126,8 +125,7 @@ def test_a_stream_of_rows_is_seen_as_a_batch_of_them_and_keyed_by_seed_episode_a
     assert (batch != torch.stack(states)).sum(1).tolist() == [17] * 5
 
 
-def test_evaluation_repeats_whatever_the_number_of_workers(noisy, with_states, tmp_path, monkeypatch):
-    monkeypatch.setattr(evaluation, "_AGENTS", {})
+def test_evaluation_repeats_whatever_the_number_of_workers(noisy, with_states, tmp_path):
     torch.manual_seed(0)
     policy = Policy(18, 6, 8)
     with torch.no_grad():

@@ -181,8 +181,7 @@ class Corruption:
     The newest frame may be among the zeroed ones.
     """
 
-    def __init__(self, name: str, stages: list[Stage], zeroed: int = 0) -> None:
-        self.name = name
+    def __init__(self, stages: list[Stage], zeroed: int = 0) -> None:
         self._stages, self._zeroed = stages, zeroed
         self._nothing = not stages and not zeroed
 
@@ -238,7 +237,7 @@ def make_corruption(config: CorruptionConfig | str) -> Corruption:
     config.check()
     zeroed = sum(stage.zeroed_frames for stage in config.stages if isinstance(stage, ZeroFrames))
     stages = [stage for stage in config.stages if not isinstance(stage, ZeroFrames)]
-    return Corruption(config.corruption, stages, zeroed)  # type: ignore[arg-type]
+    return Corruption(stages, zeroed)  # type: ignore[arg-type]
 
 
 def check_corruption_fits(config: CorruptionConfig, size: int = FRAME_SIZE) -> None:

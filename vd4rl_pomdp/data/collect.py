@@ -10,12 +10,13 @@ from collections.abc import Iterable, Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
 from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
 from vd4rl_pomdp.envs.make import layout_of
+from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.files import jsonable
@@ -62,7 +63,7 @@ class CollectConfig:
     """Seed of initial states and actions."""
     workers: int = 0
     """Processes that simulate and render; 0 uses every core."""
-    render: Literal["fast", "exact"] = "fast"
+    render: Render = "fast"
     """fast: a smaller shadow map, 0.03 of 255 away from exact; exact: dm_control's default."""
     frame_size: int = FRAME_SIZE
     """Height and width of the frames in pixels."""
@@ -83,7 +84,7 @@ class _Job:
     episode: int
     seed: int
     actor: Actor | None
-    render: Literal["fast", "exact"]
+    render: Render
     size: int | None
     """Height and width of the frames; None: physics alone."""
     length: int | None

@@ -12,10 +12,8 @@ from vd4rl_pomdp.envs.maze_model import COLLISION_RADIUS, HEADING, TIMESTEP, bui
 from vd4rl_pomdp.envs.maze_renderers import ExactRenderer, MazeRenderer, make_renderer
 from vd4rl_pomdp.envs.rendering import Render, check_render, mujoco
 from vd4rl_pomdp.errors import refuse_number
-from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, get_maze
+from vd4rl_pomdp.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, get_maze
 
-ACTION_REPEAT = 5
-"""Simulator steps of 0.01 s for one action."""
 ACCELERATION = 10.0
 """first_person without a `push`: units/s^2 along the heading for an action of 1 (from the top it is 23.9);
 what they come to in a decision is added at its beginning."""

@@ -35,14 +35,13 @@ _AMBIENT, _DIFFUSE, _SPECULAR, _SHININESS = 0.4, 0.8, 0.045, 64
 class ExactRenderer:
     """MuJoCo's picture from the camera `view`, drawn finer and averaged, so that edges are smooth."""
 
-    def __init__(self, model: mujoco.MjModel, fine: int = _FINE) -> None:
-        self._fine = fine
+    def __init__(self, model: mujoco.MjModel) -> None:
         refuse_after_fork()
         model.vis.quality.offsamples = 0
-        model.vis.global_.offwidth = model.vis.global_.offheight = PICTURE_SIZE * fine
+        side = model.vis.global_.offwidth = model.vis.global_.offheight = PICTURE_SIZE * _FINE
         try:
             with undisturbed():
-                self._renderer = mujoco.Renderer(model, PICTURE_SIZE * fine, PICTURE_SIZE * fine)
+                self._renderer = mujoco.Renderer(model, side, side)
         except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
             raise gl_error(error) from error
         _keep_display()
@@ -51,10 +50,10 @@ class ExactRenderer:
     def __call__(self, data: mujoco.MjData) -> np.ndarray:
         """Picture of a state that `mj_forward` has seen."""
         self._renderer.update_scene(data, camera="view")
-        return average(self._rendered(), self._fine)
+        return average(self._rendered(), _FINE)
 
     def fine_picture(self, data: mujoco.MjData) -> tuple[np.ndarray, np.ndarray]:
-        """Colours (H, H, 3) uint8 and depths (H, H) float32 before averaging, H = 100 * fine."""
+        """Colours (H, H, 3) uint8 and depths (H, H) float32 before averaging, H = 100 * 4."""
         self._renderer.update_scene(data, camera="view")
         colors = self._rendered().copy()
         self._renderer.enable_depth_rendering()

@@ -17,7 +17,7 @@ import numpy as np
 
 from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
 from vd4rl_pomdp.errors import MAX_SEED, MOST_ROWS, refuse_outside
-from vd4rl_pomdp.mazes import MOST_STEPS, PICTURE_SIZE, Style, check_maze, get_maze
+from vd4rl_pomdp.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, Style, check_maze, get_maze
 from vd4rl_pomdp.navigation.config import MazeCollectConfig
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.memory import CPU, require_memory
@@ -65,10 +65,10 @@ def collection(config: MazeCollectConfig) -> dict[str, Any]:
     return {name: value for name, value in jsonable(asdict(config)).items() if name not in _RUNTIME_FIELDS}
 
 
-def drive(maze: str, rows: int, action_repeat: int = 5, seed: int = 0) -> Columns:
-    """Rows of one trajectory, by key, without writing anything."""
+def drive(maze: str, rows: int) -> Columns:
+    """Rows of the first trajectory of seed 0, by key, without writing anything."""
     check_maze(maze)
-    return _roll_out(_Job(maze, 0, seed, rows, action_repeat))
+    return _roll_out(_Job(maze, 0, 0, rows, ACTION_REPEAT))
 
 
 def check_config(config: MazeCollectConfig) -> None:

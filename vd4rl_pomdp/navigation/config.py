@@ -5,6 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 from pathlib import Path
 
+from vd4rl_pomdp.mazes import ACTION_REPEAT
+
 
 @dataclass(frozen=True)
 class MazeCollectConfig:
@@ -20,7 +22,7 @@ class MazeCollectConfig:
     """Trajectories in all; the last tenth is held out from training."""
     trajectory_rows: int = 1000
     """Rows of each trajectory."""
-    action_repeat: int = 5
+    action_repeat: int = ACTION_REPEAT
     """Simulator steps of 0.01 s for one action."""
     seed: int = 0
     """Seed of starts, goals and what is random about actions."""

@@ -16,7 +16,7 @@ import gymnasium
 import numpy as np
 
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_no_folder, refuse_outside
-from vd4rl_pomdp.mazes import HARD, MOST_STEPS, MazeSpec, get_maze
+from vd4rl_pomdp.mazes import ACTION_REPEAT, HARD, MOST_STEPS, MazeSpec, get_maze
 from vd4rl_pomdp.navigation.planner import Planner
 from vd4rl_pomdp.policies.actor import Actor, check_actor, read_actor
 from vd4rl_pomdp.runs.outputs import refuse_inside
@@ -45,7 +45,7 @@ class FirstPersonConfig:
     """first_person, or hard_first_person."""
     decisions: int = 200_000
     """Environment decisions, at the least: PPO makes whole rounds of 2,048."""
-    action_repeat: int = 5
+    action_repeat: int = ACTION_REPEAT
     """Simulator steps of 0.01 s for one action."""
     seed: int = 0
     """Seed of the networks and the episodes."""

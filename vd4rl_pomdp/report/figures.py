@@ -37,8 +37,8 @@ _ENTRY, _LETTER, _LINE = 0.55, 0.075, 0.2
 """A legend's entry without its text, one letter of it, and a line, in inches."""
 _TITLE_LETTER, REMARK_LINE = 0.075, 0.11
 """A letter of a panel's title, and a line of a remark below it, in inches."""
-REMARK_WIDTH = 64
-"""Characters of a remark, of which the rest is in the caption's table."""
+REMARK_WIDTH, _NOTES = 64, 4
+"""Characters of a remark, and lines of them in a panel, of which the rest is in the caption's table."""
 NAME_WIDTH = 34
 """Characters of a method's name in a figure before it is wrapped."""
 
@@ -133,9 +133,9 @@ def remark(axes: Axes, notes: Sequence[str]) -> None:
     )
 
 
-def shortened(notes: Sequence[str], most: int = 4) -> list[str]:
+def shortened(notes: Sequence[str]) -> list[str]:
     """The first of some notes, and how many more there are."""
-    return [*notes[:most], *([f"and {len(notes) - most} more"] if len(notes) > most else [])]
+    return [*notes[:_NOTES], *([f"and {len(notes) - _NOTES} more"] if len(notes) > _NOTES else [])]
 
 
 def room_for(notes: Iterable[Sequence[str]]) -> float:

@@ -71,11 +71,11 @@ def _spaced(images: np.ndarray) -> Iterator[np.ndarray]:
         yield np.pad(image.transpose(1, 2, 0), ((1, 1), (1, 1), (0, 0)), constant_values=255)
 
 
-def movie(film: Film, scale: int = 2) -> bytes:
+def movie(film: Film) -> bytes:
     """Animated WebP of an episode: clean at the left, the newest corrupted frame at the right."""
     newest = film["corrupted"][:, -3:]
     pairs = np.concatenate([film["clean"], newest], axis=3).transpose(0, 2, 3, 1)
-    size = (pairs.shape[2] * scale, pairs.shape[1] * scale)
+    size = (pairs.shape[2] * 2, pairs.shape[1] * 2)
     frames = [Image.fromarray(pair).resize(size, Image.Resampling.NEAREST) for pair in pairs]
     buffer = io.BytesIO()
     frames[0].save(buffer, "WEBP", save_all=True, append_images=frames[1:], duration=80, loop=0, quality=60)

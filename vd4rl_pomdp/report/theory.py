@@ -88,9 +88,9 @@ def _mark(value: bool) -> str:
     return "yes" if value else "no"
 
 
-def print_theory(study: Study, console: Console | None = None) -> None:
+def print_theory(study: Study) -> None:
     """The study's main tables on the terminal."""
-    console = console or Console()
+    console = Console()
     appendix = study["counterexample"]["appendix"]
     for line in (
         "Counted over all sequences of finite worlds; nothing is sampled or trained.",

@@ -5,7 +5,6 @@ A folder belongs to the run, policy, encoder or data set in it. Every command ch
 
 from __future__ import annotations
 
-import json
 import os
 from pathlib import Path
 
@@ -13,6 +12,7 @@ import h5py
 
 from vd4rl_pomdp.data.format import FRAMES_KEY, PLAN, is_shard_name
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs.reading import parse_json
 
 _ROWS = {FRAMES_KEY, "action", "reward", "step_type"}
 """Keys that tell a shard from other HDF5 files."""
@@ -60,7 +60,7 @@ def kept_in(folder: Path) -> str | None:
 
 def _is_run(config: Path) -> bool:
     try:
-        record = json.loads(config.read_text(encoding="utf-8"))
+        record = parse_json(config.read_bytes())
     except (OSError, ValueError):
         return False
     return isinstance(record, dict) and "stage" in record

@@ -7,7 +7,6 @@ been seen for LEASE_S. `.owner.json` beside it says since when.
 
 from __future__ import annotations
 
-import json
 import os
 import secrets
 import socket
@@ -24,6 +23,7 @@ from filelock import SoftFileLease, Timeout
 from vd4rl_pomdp.errors import InUseError, disk_errors
 from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.runs.interrupt import handled
+from vd4rl_pomdp.runs.reading import parse_json
 
 LEASE_S = 60.0
 EMPTY_S = 2.0
@@ -147,7 +147,7 @@ def _heartbeat(folder: Path) -> int | None:
 
 def _read_note(folder: Path) -> dict[str, Any]:
     try:
-        note = json.loads((folder / _NOTE).read_text(encoding="utf-8"))
+        note = parse_json((folder / _NOTE).read_bytes())
     except (OSError, ValueError):
         return {}
     return note if isinstance(note, dict) else {}

@@ -71,13 +71,13 @@ def merged_phases(world: World) -> Row | None:
     return {"codes": codes, "states": len(world.states), "max_k": 2 * _reach(world)}
 
 
-def needed_noise(world: World, method: str = "fj+a") -> Row | None:
-    """Worlds whose past decodes, where what FJ or FJ+A predicts beyond m depends on the exogenous part of its past."""
-    m = past_memory(world, VIEWS[method].actions)
+def needed_noise(world: World) -> Row | None:
+    """Worlds whose past decodes, where what FJ+A predicts beyond m depends on the exogenous part of its past."""
+    m = past_memory(world, actions=True)
     if len(world.exogenous) < 2 or m is None or not 0 < m <= LONGEST:
         return None
     for max_k in (m + 1, m + 2):
-        if not discards_noise(relation(world, VIEWS[method], Memory(m, 0), range(1, max_k + 1))):
+        if not discards_noise(relation(world, VIEWS["fj+a"], Memory(m, 0), range(1, max_k + 1))):
             return {"m": m, "k": max_k}
     return None
 

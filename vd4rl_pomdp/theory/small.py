@@ -87,9 +87,9 @@ def small_worlds(size: Size) -> Iterator[World]:
             yield world
 
 
-def smallest(contradicts: Callable[[World], Any], sizes: Sequence[Size] = SIZES) -> World | None:
+def smallest(contradicts: Callable[[World], Any]) -> World | None:
     """The first world of the family, size by size, on which a claim fails; None if there is none."""
-    worlds = (world for size in sizes for world in small_worlds(size))
+    worlds = (world for size in SIZES for world in small_worlds(size))
     return next((world for world in worlds if contradicts(world) is not None), None)
 
 

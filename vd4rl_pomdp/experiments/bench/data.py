@@ -15,11 +15,11 @@ from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.experiments.bench.memory import touch
 from vd4rl_pomdp.experiments.bench.timing import alternating, seconds_of
-from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
+from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.types import StepType
 
 BATCH = 256
-EPISODE_ROWS = 501
+EPISODE_ROWS = EPISODE_TRANSITIONS + 1
 
 
 def synthetic_set(folder: Path, episodes: int) -> tuple[Dataset, dict[str, Any]]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 from vd4rl_pomdp.experiments.navigation.grid import Condition, condition_of, paper_rows
@@ -17,7 +17,6 @@ NEAR_ZERO = 5.0
 """Action loss (nats x 100) that counts as near zero; guessing among 20 codes is 300."""
 FEW = 15.0
 """State error (% of a standard deviation) below which a first person is said to know where it is."""
-Test = Callable[[float, float], bool]
 
 
 @dataclass(frozen=True)

@@ -25,6 +25,8 @@ _VARIANTS = {
     "K = 15, self-prediction": (15, True, "#009e73"),
 }
 """Bars of an objective: K, self-prediction, colour."""
+_DRIVEN, _DRIVEN_ROWS = ("mik+a", "ah+a", "no_history"), 100
+"""Methods whose trajectories are drawn, and how many rows of them."""
 _OFFSETS, _WIDTH = (-0.27, 0.0, 0.27), 0.25
 _SEED: dict[str, Any] = {"color": "black", "linestyle": "", "marker": ".", "markersize": 3}
 _MARK: dict[str, Any] = {"color": "#e69f00", "linestyle": "", "marker": "_", "markersize": 9, "markeredgewidth": 2.5}
@@ -83,16 +85,14 @@ def _in_the_paper(condition: Condition) -> bool:
     return condition in {condition_of(row, condition.maze) for row in paper_rows()}
 
 
-def trajectories(
-    runs: list[NavigationRun], path: Path, methods: tuple[str, ...] = ("mik+a", "ah+a", "no_history")
-) -> bool:
+def trajectories(runs: list[NavigationRun], path: Path) -> bool:
     """A held-out trajectory over the maze with the refitted probe's estimates; False if no run has one."""
-    chosen = [_first(runs, Condition(maze, method)) for maze in MAZES for method in methods]
+    chosen = [_first(runs, Condition(maze, method)) for maze in MAZES for method in _DRIVEN]
     found = [run for run in chosen if run is not None]
     if not found:
         return False
     mazes = [maze for maze in MAZES if any(run.condition.maze == maze for run in found)]
-    methods = tuple(method for method in methods if any(run.condition.method == method for run in found))
+    methods = tuple(method for method in _DRIVEN if any(run.condition.method == method for run in found))
     figure = Figure(figsize=(3.2 * len(methods), 3.3 * len(mazes)), layout="constrained")
     panels = figure.subplots(len(mazes), len(methods), squeeze=False)
     for maze, row in zip(mazes, panels, strict=True):
@@ -111,12 +111,14 @@ def _first(runs: list[NavigationRun], condition: Condition) -> NavigationRun | N
     return next((run for run in runs if run.condition == condition and run.trajectory is not None), None)
 
 
-def _draw_trajectory(axes: Any, run: NavigationRun, rows: int = 100) -> None:
+def _draw_trajectory(axes: Any, run: NavigationRun) -> None:
     assert run.trajectory is not None
     table = read_trajectory(run.trajectory)
     draw_maze(axes, MAZES[run.condition.maze])
     for names, colour, label in ((("x", "y"), "black", "true"), (("estimated_x", "estimated_y"), _ESTIMATE, "probe")):
-        axes.plot(*(table[name][:rows] for name in names), color=colour, lw=1, marker=".", markersize=2.5, label=label)
+        axes.plot(
+            *(table[name][:_DRIVEN_ROWS] for name in names), color=colour, lw=1, marker=".", markersize=2.5, label=label
+        )
     axes.set_title(f"{run.condition.maze}: {run.condition.method}", fontsize=9)
     axes.legend(fontsize=7, loc="center left", framealpha=0.9)
 
