@@ -13,9 +13,11 @@ from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.report.tables import TOLD_STATES, evaluations, grouped, label
 
 RESULTS = Path(__file__).parents[1] / "results" / "control"
-HEAD = """\
-| set | hidden | method | seeds | return (seeds) | nothing hidden | action error: data, loop | probe: pose, velocity |
-|---|---|---|---:|---|---:|---:|---:|"""
+HEAD = (
+    "| set | hidden | method | seeds | return (seeds) | played with nothing hidden |"
+    " action error: data, loop | probe: pose, velocity |",
+    "|---|---|---|---:|---|---:|---:|---:|",
+)
 
 
 def table_lines(folder: Path) -> Iterator[str]:
@@ -23,7 +25,7 @@ def table_lines(folder: Path) -> Iterator[str]:
     runs = load_runs([folder])
     of_runs = run_table(runs, evaluations(runs), [])
     seeds, encoders = dict(grouped(of_runs, CONDITION)), {condition_of(row): row for row in representations(of_runs)}
-    yield HEAD
+    yield from HEAD
     for policy in control(runs):
         key = condition_of(policy)
         returns = [row["return"] for row in sorted(seeds[key], key=lambda row: row["seed"])]

@@ -47,8 +47,8 @@ def main_runs() -> list[LoadedRun]:
 def readme_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
     """Returns of the main methods, a row for every set."""
     yield (
-        "| set (data's return) | `random` | `acro` | `ah+a` | `mik` | `mik+a` | told the states |"
-        " nothing hidden: `acro` | `mik+a` |"
+        "| set (data's return) | `random` | `acro` | `ah+a` | `mik` | `mik+a` | told the states: `supervised+a` |"
+        " trained with nothing hidden: `acro` | trained with nothing hidden: `mik+a` |"
     )
     yield "|---|" + "---:|" * len(COLUMNS)
     for place, words in SETS.items():
@@ -68,7 +68,7 @@ def page_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str]]:
 def set_lines(runs: Sequence[LoadedRun], task: str, quality: str) -> Iterator[str]:
     """All methods on one set, those that return most first."""
     yield (
-        "| method | seeds | return (seeds) | episodes | nothing hidden |"
+        "| method | seeds | return (seeds) | episodes | trained with nothing hidden |"
         " action error: data, loop | probe: pose, velocity |"
     )
     yield "|---|---:|---:|---:|---:|---:|---:|"

@@ -119,7 +119,7 @@ _OWN = {
         "gru",
         regresses_state=True,
         options=SupervisedOptions,
-        summary="mik's encoder, trained to regress the simulator's state: the ceiling of memory",
+        summary="mik's encoder, trained to regress the simulator's state: a reference for memory",
     ),
     "supervised+a": Method(
         Supervised,
@@ -138,7 +138,7 @@ _OWN = {
         trained=False,
         reads_state=True,
         options=StateOptions,
-        summary="the simulator's state in place of an encoder: the ceiling",
+        summary="the simulator's state in place of an encoder: a reference",
     ),
 }
 METHODS: Registry[Method] = Registry(

@@ -3,7 +3,7 @@
 random   stays as it is: the floor
 bc       is trained by fine-tuning, end to end, by behaviour cloning
 drq_bc   is trained by fine-tuning, end to end, by the critic's loss (DrQ-v2+BC of V-D4RL)
-state    is no network: the simulator state itself, the ceiling on sets that store it
+state    is no network: the simulator state itself, a reference on sets that store it
 """
 
 from __future__ import annotations

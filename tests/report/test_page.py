@@ -6,8 +6,9 @@ from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
 
+import pretrain.objectives
 from tests.helpers_report import METHODS, describe, grid, pretraining, write_grid, write_run
-from vd4rl_pomdp.report import figures, films, layout, write_report
+from vd4rl_pomdp.report import figures, films, layout, tables, write, write_report
 from vd4rl_pomdp.report.figures import style
 from vd4rl_pomdp.report.load import LoadedRun
 from vd4rl_pomdp.runs.files import read_json, write_json
@@ -64,6 +65,14 @@ def test_lines_of_many_methods_differ_in_more_than_colour():
         assert sum(a != b for a, b in zip(one, other, strict=True)) == 3
     alike = [(a, b) for a in looks[:14] for b in looks[:14] if a < b and a[0] == b[0]]
     assert all(a[1] != b[1] and a[2] != b[2] for a, b in alike), "what shares a colour has other dashes and markers"
+
+
+def test_the_packages_methods_look_the_same_whatever_else_a_report_tells_of():
+    assert set(tables.LOOKS) == set(pretrain.objectives.METHODS)
+    few, many = write._looks(["acro", "random"]), write._looks(["acro", "acro, m 4", "mine", "mik", "random"])
+    assert {name: many[name] for name in few} == few
+    assert list(many) == ["acro", "acro, m 4", "mine", "mik", "random"], "places are those of the names"
+    assert {many["acro, m 4"], many["mine"]} == {len(tables.LOOKS), len(tables.LOOKS) + 1}
 
 
 def test_last_and_best_evaluation_stand_apart(tmp_path):

@@ -290,7 +290,7 @@ def test_the_navigation_grid_holds_every_condition_of_the_papers_tables():
 
 
 def test_the_pages_grid_is_one(file):
-    (block,) = re.findall(r"^```toml\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
+    block, _ = re.findall(r"^```toml\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
     cells = load_grid(file(block)).cells()
     assert len(cells) == 3 * 2 * 2 * 2 + 3 * 2 * 2
     for cell in (*cells, *load_grid(file(block), testing=True).cells()):

@@ -1,6 +1,7 @@
 """Which runs are a grid's: by what they computed and on which sets, whoever made them."""
 
 import csv
+import re
 from dataclasses import replace
 from pathlib import Path
 
@@ -19,6 +20,7 @@ from vd4rl_pomdp.sweeps.members import GridMembers
 from vd4rl_pomdp.sweeps.stages import collection_of, recorded
 
 RESULTS = Path(__file__).parents[2] / "results"
+PAGE = Path(__file__).parents[2] / "docs" / "sweeps.md"
 GRID = """
 seed = [0, 1]
 preset = "smoke"
@@ -96,6 +98,15 @@ def test_the_offline_figures_page_counts_its_cells():
     assert {run.encoder["settings"]["history"] for run in found if run.encoder} == {"method"}
     told = f"has {len(cells)} cells, of which {len(found)} are measured"
     assert told in (RESULTS / "offline" / "README.md").read_text()
+
+
+def test_a_method_of_ones_own_is_all_that_is_left_of_the_grid_that_the_page_shows(tmp_path):
+    blocks = re.findall(r"```toml\n(.*?)```", PAGE.read_text(), re.DOTALL)
+    (text,) = (block for block in blocks if "past_to_frame" in block)
+    (tmp_path / "grid.toml").write_text(text.replace(', "past_to_frame"', ""))
+    cells = load_grid(str(tmp_path / "grid.toml")).cells()
+    kept = [run for name in ("control", "offline") for run in read_results(RESULTS / name)]
+    assert len(GridMembers("grid", cells).among(kept)) == len(cells) == 12
 
 
 def test_only_what_the_grid_asks_for_is_missed(grid, runs, tmp_path):

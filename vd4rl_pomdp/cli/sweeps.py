@@ -134,7 +134,9 @@ def carry_out(jobs: list[Job], folder: SweepFolder, kind: str, options: Options)
         for name, row in failures.items():
             print(f"{row['cause']}: {name}: {row['line']}", file=sys.stderr)
         left = f"{sum(not job.finished for job in jobs)} of {len(jobs)} jobs are not finished"
-        print(f"{left}, {len(failures)} failed; `{program_here()} sweep retry {folder.out}` takes those up again")
+        retry = f"sweep retry {folder.out}" + (f" --executor {kind}" if kind != "local" else "")
+        same = "" if kind == "local" else ", given this command's flags,"
+        print(f"{left}, {len(failures)} failed; `{program_here()} {retry}`{same} takes those up again")
         sys.exit(1)
 
 

@@ -14,7 +14,7 @@ from vd4rl_pomdp.text import plain
 
 PAPER_QUALITIES = ("expert", "medium_expert")
 """Those of the paper's figures, which come first; its appendix adds medium."""
-_HATCHES = ("", "////", "....")
+_HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "----")
 _NAME_WIDTH = 22
 _LEGEND = (
     "Methods in the order of their names. Bars: mean over seeds at the last evaluation, with 95% interval; dots: "

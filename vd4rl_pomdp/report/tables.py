@@ -16,6 +16,11 @@ TOLD_STATES = ("supervised", "supervised+a")
 """Methods whose encoders are trained on the simulator's states, those of the episodes that a probe holds out, too."""
 REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, "state")
 """Methods that are references, floors and ceilings: last in a table."""
+LOOKS = (
+    *("mik+a", "mik", "acro", "ah+a", "fj+a", "supervised+a", "random", "ah", "fj", "supervised", "state"),
+    *("curl", "driml", "homer", "one_step_inverse", "no_history", "bc", "drq_bc"),
+)
+"""The package's methods in the order of their looks, which are the same in every report: the first differ in colour."""
 END_TO_END = ("bc", "drq_bc")
 """References that bring their own algorithm."""
 SETTING = ("task", "quality", "corruption")

@@ -127,7 +127,7 @@ def _plots(runs: list[LoadedRun], made: dict[str, list[Row]]) -> dict[str, list[
     """All figures, by section."""
     losses = lines.loss_rows([run for run in runs if run.result.losses])
     named = (*made[_MARK], *made["curves"], *losses)
-    looks = {name: look for look, name in enumerate(sorted(set(map(tables.label, named)), key=_method_order))}
+    looks = _looks(sorted(set(map(tables.label, named)), key=_method_order))
     return {
         "scores": bars.bar_plots(made[_MARK], made["runs"], looks, _published_here(runs)),
         "profiles": lines.profile_plots(made["profiles"], made["aggregate"], looks),
@@ -139,8 +139,14 @@ def _plots(runs: list[LoadedRun], made: dict[str, list[Row]]) -> dict[str, list[
 
 
 def _method_order(name: str) -> tuple[bool, str]:
-    """References last: a method's look does not depend on its score."""
+    """References last: a method's place does not depend on its score."""
     return name.partition(",")[0] in tables.REFERENCES, name
+
+
+def _looks(names: list[str]) -> dict[str, int]:
+    """Numbers of looks, in the order of the names: the package's methods have their own, others those that follow."""
+    others = [name for name in names if name not in tables.LOOKS]
+    return {name: ([*tables.LOOKS, *others]).index(name) for name in names}
 
 
 def _published_here(runs: list[LoadedRun]) -> list[dict[str, str]]:
