@@ -92,8 +92,8 @@ class FrozenEncoder:
 
     def frames(self, number: int, view: View) -> Tensor:
         """Frame features (rows, F) of a whole episode; one shift for all of it."""
-        start, end = int(self.dataset.episode_start[number]), int(self.dataset.episode_end[number])
-        rows = torch.arange(start, end, device=self.device)
+        episode = self.dataset.rows_of(number)
+        rows = torch.arange(episode.start, episode.stop, device=self.device)
         key = derive_keys(view.shifts.seed, torch.tensor([number], device=self.device))
         return self.rows(rows, key.expand(len(rows)), view)
 
@@ -111,7 +111,7 @@ class FeatureFile:
         return self._path.exists() and self._origin.exists()
 
     def read(self) -> np.ndarray | None:
-        """What was written, None if that is missing, damaged or of other inputs."""
+        """What was written, None if that is missing or of other inputs."""
         if not self.exists:
             return None
         return np.load(self._path) if read_json(self._origin) == self._description() else None

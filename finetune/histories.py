@@ -141,21 +141,22 @@ class RandomHistories:
             episode: its number.
         """
         dataset = self.histories.dataset
-        start, end = int(dataset.episode_start[episode]), int(dataset.episode_end[episode])
-        out[start:end] = read_whole(encoder, frames, dataset, episode)
+        whole = dataset.rows_of(episode)
+        out[whole] = read_whole(encoder, frames, dataset, episode)
         row = self.histories.rows[self.chosen]
-        mine = torch.nonzero((row >= start) & (row < end))[:, 0]
+        mine = torch.nonzero((row >= whole.start) & (row < whole.stop))[:, 0]
         if len(mine):
             row, last = row[mine], self.histories.ends[self.chosen[mine]]
-            first = (row - self.length[mine] + 1).clamp(min=start)
-            z, next_z = read_both_ends(encoder, lambda rows: frames[rows - start], dataset, first, row, last)
+            first = (row - self.length[mine] + 1).clamp(min=whole.start)
+            z, next_z = read_both_ends(encoder, lambda rows: frames[rows - whole.start], dataset, first, row, last)
             number = (dataset.num_rows + mine).to(out.device)
             out[number], out[number + len(self.chosen)] = z.to(out), next_z.to(out)
 
 
 def read_whole(encoder: Encoder, frames: Tensor, dataset: Dataset, episode: int) -> Tensor:
     """Representations (L, D) of an episode's rows, whose (L, F) frame features are given, from its first row on."""
-    rows = torch.arange(int(dataset.episode_start[episode]), int(dataset.episode_end[episode]), device=frames.device)
+    whole = dataset.rows_of(episode)
+    rows = torch.arange(whole.start, whole.stop, device=frames.device)
     return encoder.from_features(frames[None], dataset.actions_before(rows)[None])[0]
 
 

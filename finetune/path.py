@@ -47,7 +47,7 @@ class DataPath:
         assert dataset.physics is not None
         task = TASKS.named(dataset.task)
         assert isinstance(task, DMCTask), "other tasks store no states"
-        rows = slice(int(dataset.episode_start[number]), int(dataset.episode_end[number]) - 1)
-        shown = [self._actor.act(state) for state in observed_states(task, dataset.physics[rows])]
+        physics = dataset.physics[dataset.rows_of(number)][:-1]
+        shown = [self._actor.act(state) for state in observed_states(task, physics)]
         actions = policy(self._encode(number)[:-1]).cpu().numpy()
         return np.square(actions - np.array(shown).reshape(actions.shape)).mean(1)

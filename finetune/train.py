@@ -128,7 +128,7 @@ def _trainer(
 
 def _cached(features: torch.Tensor, dataset: Dataset, number: int) -> torch.Tensor:
     """Representations (rows, D) of an episode in the first view."""
-    return features[0, int(dataset.episode_start[number]) : int(dataset.episode_end[number])].float()
+    return features[0, dataset.rows_of(number)].float()
 
 
 def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:

@@ -34,7 +34,7 @@ MAY_CALL_STAGES = (
 JUDGES = "vd4rl_pomdp.experiments"
 """What judges runs: the command line alone imports it."""
 JUDGES_MAZES_BY = ("errors", "experiments.navigation", "mazes", "navigation.config")
-JUDGES_MAZES_BY += ("navigation.measures", "navigation.methods", "report.stats", "results", "runs", "text")
+JUDGES_MAZES_BY += ("navigation.measures", "navigation.methods", "options", "report.stats", "results", "runs", "text")
 """What the navigation tables are made with: files, names and settings; no data, no environment and no network."""
 
 

@@ -112,10 +112,9 @@ def disk_error(path: Path | str | None, error: OSError) -> UserError:
     where = f"{path}: " if path is not None else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DiskFullError(f"{where}the disk is full: free some space and start the same command again")
-    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
-        reason = (error.strerror or str(error)).lower()
-        return UserError(f"{where}may not be used ({reason}); ask its owner for access, or choose another path")
     reason = (error.strerror or str(error)).lower()
+    if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
+        return UserError(f"{where}may not be used ({reason}); ask its owner for access, or choose another path")
     return UserError(f"{where}cannot be used ({reason}); check the path or choose another")
 
 

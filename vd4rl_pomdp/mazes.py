@@ -47,7 +47,7 @@ class Style:
     curtains: tuple[float, float] = (0.3, 0.7)
     """Bottom and top of the curtains."""
     curtain_color: tuple[float, float, float] = (0.7, 0.5, 0.3)
-    """The walls' colour."""
+    """By default the walls' colour."""
     camera_height: float = 7.0
     camera_fovy: float = 30.0
     """Degrees; the camera hangs over the centre and looks down."""

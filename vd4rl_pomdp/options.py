@@ -58,6 +58,18 @@ def flat(config: Any) -> dict[str, Any]:
     return found
 
 
+def words_of(settings: Mapping[str, Any]) -> list[str]:
+    """Settings as words of a command line."""
+    words: list[str] = []
+    for name, value in settings.items():
+        flag = flag_of(name)
+        if isinstance(value, bool):
+            words.append(flag if value else f"--no-{flag[2:]}")
+        else:
+            words += [f"{flag}={value}"] if str(value).startswith("-") else [flag, str(value)]
+    return words
+
+
 def _settings(config: Any) -> Iterator[tuple[str, str, Any]]:
     """Class, name and value of every setting of a config, its options' included."""
     for field in fields(config):

@@ -6,7 +6,7 @@ Rows follow dm_env: row t holds the frame o_t and the action and reward that led
     frame       o_0      o_1      o_2    ...   o_T
     action[t]   0        a_0      a_1    ...   a_{T-1}    so a_t = action[t+1]
     reward[t]   0        r_0      r_1    ...   r_{T-1}    r_t is paid for a_t, stored on row t+1
-    step_type   FIRST    MID      MID    ...   LAST       LAST is a time limit: its discount stays 1
+    step_type   FIRST    MID      MID    ...   LAST       its discount is 1 at a time limit, 0 where a task ends
 
 Shape suffixes: B batch, T rows of a window, S frames of a stack, C = 3*S channels, A action dimension.
 """

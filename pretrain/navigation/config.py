@@ -8,11 +8,11 @@ from typing import Any, ClassVar, Literal
 
 from pretrain.config import MemoryOptions, TrainingConfig, frame_options
 from pretrain.objectives import METHODS
-from vd4rl_pomdp.errors import UserError, flag_of, refuse_outside
+from vd4rl_pomdp.errors import UserError, refuse_outside
 from vd4rl_pomdp.navigation.methods import METHOD_NAMES, REFERENCES
 from vd4rl_pomdp.navigation.observations import SHAPES, Picture
 from vd4rl_pomdp.objective import ActionOptions
-from vd4rl_pomdp.options import NO_OPTIONS, Limits, Options, flat
+from vd4rl_pomdp.options import NO_OPTIONS, Limits, Options, flat, words_of
 
 _PAPER: dict[str, Any] = {
     "steps": 200_000,
@@ -81,6 +81,14 @@ class NoiseOptions(Options):
 
     exogenous_weight: float = 0.5
     """What the added images are multiplied by."""
+
+    limits: ClassVar[Limits] = {"exogenous_weight": (0, 1)}
+
+    def check(self) -> None:
+        """Raise UserError for values that cannot work."""
+        super().check()
+        if not self.exogenous_weight:
+            raise UserError("--exogenous-weight is 0, which adds nothing: leave --exogenous out")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -155,11 +163,7 @@ class NavigationConfig(TrainingConfig):
 
 def command_of(config: NavigationConfig) -> list[str]:
     """Words of the command that trains with a config: the preset, and every flag that differs from it."""
-    words = ["vd4rl-pomdp", "navigation", "train", "--preset", config.preset]
     usual = config.usual() | config.defaults(config.preset)
-    for name, value in flat(config).items():
-        if name in ("preset", "device", "wandb", "tensorboard") or value == usual.get(name):
-            continue
-        flag = flag_of(name)
-        words += [f"--{'' if value else 'no-'}{flag[2:]}"] if isinstance(value, bool) else [flag, str(value)]
-    return words
+    untold = ("preset", "device", "wandb", "tensorboard")
+    changed = {name: value for name, value in flat(config).items() if name not in untold and value != usual.get(name)}
+    return ["vd4rl-pomdp", "navigation", "train", "--preset", config.preset, *words_of(changed)]

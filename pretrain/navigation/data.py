@@ -39,9 +39,8 @@ class MazeData:
         rows = dataset.transition_rows
         self.training_actions = dataset.action_after(rows[rows < split])
         """(M, 2) float32."""
-        windows = (dataset.episode_end - dataset.episode_start - config.window + 1).clamp(min=0)
         self.total = dataset.num_windows(config.window)
-        self.training = int(windows[: self.first_held_out].sum())
+        self.training = int(dataset.windows_per_episode(config.window)[: self.first_held_out].sum())
         """Windows 0..training-1 are for training, the rest is held out."""
         self._view: View = MazeView(dataset, noise)
         self.inputs = {"data": dataset.fingerprint} | ({} if noise is None else {"exogenous": noise.fingerprint()})

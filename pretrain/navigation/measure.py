@@ -135,5 +135,4 @@ def write_trajectory(path: Path, trainer: NavigationTrainer, probe: StateProbe) 
 def _window_at(dataset: Dataset, row: int, length: int) -> int:
     """Number of the window of `length` rows that begins at a row."""
     episode = int(dataset.episode[row])
-    per_episode = (dataset.episode_end - dataset.episode_start - length + 1).clamp(min=0)
-    return int(per_episode[:episode].sum()) + int(dataset.t[row])
+    return int(dataset.windows_per_episode(length)[:episode].sum()) + int(dataset.t[row])

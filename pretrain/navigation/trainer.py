@@ -40,8 +40,8 @@ class NavigationTrainer:
 
     def __init__(self, objective: InverseObjective, data: MazeData, config: NavigationConfig) -> None:
         self.objective, self.data, self.config = objective, data, config
-        self.probe = StateProbe(objective.encoder.dim).to(next(objective.parameters()).device)
         self.device = next(objective.parameters()).device
+        self.probe = StateProbe(objective.encoder.dim).to(self.device)
         self.generator = stream_generator(config.seed, STAGE, "batches")
         parameters = [*objective.parameters(), *self.probe.parameters()]
         self.optimiser = torch.optim.Adam(parameters, lr=config.learning_rate)

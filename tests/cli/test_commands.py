@@ -82,6 +82,7 @@ SWEEP = ["sweep", "run", "quick", "--out", "y", "--dry-run"]
             "--only is given twice: name all its values behind one",
         ),
         ([*SWEEP, "--change=seed=1", "--dry-run", "--change=preset=cpu"], "--change is given twice"),
+        ([*SWEEP, "--preset", "cpu"], "--preset is a setting of the grid's trainings: change it by --change preset="),
         ([*SWEEP, "--executor", "cloud"], "unknown executor 'cloud': choose one of local"),
         (["sweep", "status", "file"], "file: holds no sweep; `vd4rl-pomdp sweep run GRID --out file` makes one"),
         (["sweep", "retry", "x"], "x: holds no sweep"),

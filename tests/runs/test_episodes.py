@@ -1,9 +1,12 @@
 """The table of evaluation episodes: what is damaged is named, what is there stays."""
 
+import threading
+
 import pytest
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.episodes import COLUMNS, append_episodes, begin_episodes, drop_episodes_after, read_episodes
+from vd4rl_pomdp.runs.files import appending
 
 EARLIER = """method,task,quality,corruption,algorithm,seed,step,episode,episode_seed,return,length,score
 acro,walker_walk,expert,patch,td3_bc,0,1,0,20000,719.1985,500,71.9199
@@ -60,6 +63,24 @@ def test_a_table_of_episodes_is_begun_before_any_is_played_and_only_once(tmp_pat
     assert path.read_text() == header
     with pytest.raises(UserError, match=r"nowhere/episodes\.csv: cannot be used"):
         begin_episodes(tmp_path / "nowhere" / "episodes.csv")
+
+
+def test_who_finds_another_appending_waits_and_writes_no_second_header(tmp_path):
+    path, begun = tmp_path / "episodes.csv", threading.Event()
+
+    def append() -> None:
+        begun.set()
+        append_episodes(path, [])
+
+    with appending(path) as file:
+        other = threading.Thread(target=append)
+        other.start()
+        begun.wait()
+        other.join(0.3)
+        assert other.is_alive()
+        file.write(",".join(COLUMNS) + "\n")
+    other.join()
+    assert path.read_text() == ",".join(COLUMNS) + "\n"
 
 
 def test_a_line_that_was_cut_is_dropped_with_what_follows_the_checkpoint(tmp_path):

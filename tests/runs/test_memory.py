@@ -1,5 +1,7 @@
 """What exceeds a machine is said in one line that names the flags, before anything is done where it can be known."""
 
+import os
+import sys
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -72,6 +74,12 @@ def test_a_limit_of_the_control_group_counts(tmp_path, monkeypatch):
     assert memory_of(CPU) == whole
     (tmp_path / "memory.max").write_text("1000\n")
     assert memory_of(CPU) == 1000
+
+
+def test_a_system_that_does_not_tell_its_memory_refuses_nothing(monkeypatch):
+    monkeypatch.delattr(os, "sysconf")
+    assert memory_of(CPU) == sys.maxsize or memory._LIMIT.exists()
+    require_memory(1e15, CPU, Settings(), "window")
 
 
 def test_what_a_module_keeps_for_its_gradient_is_counted():

@@ -78,6 +78,23 @@ def test_what_a_job_raises_is_raised_with_where_it_was():
     assert "in fail_or_die" in caught.value.__notes__[0]
 
 
+class TwoWordsError(Exception):
+    """Other people's, which no pipe gives back: it is made of two words and keeps one."""
+
+    def __init__(self, what: str, where: str) -> None:
+        super().__init__(f"{what} is lost in {where}")
+
+
+def fail_in_two_words(job: int) -> None:
+    raise TwoWordsError("job", "space")
+
+
+def test_an_error_that_no_pipe_carries_is_told_all_the_same():
+    with pytest.raises(RuntimeError, match="TwoWordsError: job is lost in space") as caught:
+        list(run_jobs(fail_in_two_words, [0, 1], 2))
+    assert "in fail_in_two_words" in caught.value.__notes__[0]
+
+
 def test_a_worker_that_dies_is_one_sentence():
     with pytest.raises(UserError, match=r"a worker process ended before its job \(exit code 7\)"):
         list(run_jobs(fail_or_die, [2, 3], 2))

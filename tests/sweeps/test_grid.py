@@ -11,6 +11,7 @@ from vd4rl_pomdp.mazes import PAPER_MAZES
 from vd4rl_pomdp.sweeps.grid import GridCell, narrow
 from vd4rl_pomdp.sweeps.grid_file import load_grid, names
 from vd4rl_pomdp.sweeps.stages import check_cell
+from vd4rl_pomdp.tasks import TASKS, GymnasiumTask
 
 PAGE = Path(__file__).parents[2] / "docs" / "sweeps.md"
 TOML = """
@@ -235,6 +236,7 @@ CELL = {
     "pretrain": {"frame_encoder": "nature", "steps": 10},
     "finetune": {},
 }
+NOISE = {"exogenous": "textures"}
 MAZE_CELL = {
     "navigation_collect": {"maze": "no_curtain", "trajectories": 2, "trajectory_rows": 64},
     "navigation_train": {},
@@ -252,6 +254,14 @@ MAZE_CELL = {
         (CELL, "finetune", {"n_step": 501}, "--n-step is 501; it must be at least 1 and at most 500"),
         (CELL, "collect", {"frame_size": 16}, "'nature' cannot read pictures of 16x16 pixels"),
         (MAZE_CELL, "navigation_train", {"method": "curl"}, "curl predicts no actions"),
+        (
+            MAZE_CELL,
+            "navigation_train",
+            NOISE | {"exogenous_weight": 2},
+            "--exogenous-weight is 2.0; it must be",
+        ),
+        (MAZE_CELL, "navigation_train", NOISE | {"exogenous_weight": 0}, "--exogenous-weight is 0, which adds nothing"),
+        (MAZE_CELL, "navigation_train", {"exogenous": "nowhere"}, "nowhere: no such folder; name one with images"),
         (MAZE_CELL, "navigation_train", {"window": 65}, "--window 65 is longer than an episode of the set, of 64 rows"),
         (MAZE_CELL, "navigation_collect", {"trajectories": 1}, "--trajectories is 1: a single trajectory leaves none"),
     ],
@@ -262,6 +272,16 @@ def test_a_training_that_cannot_read_the_set_of_its_cell_is_refused_before_the_s
     check_cell(GridCell({}, cell, {}))
     with pytest.raises(UserError, match=message):
         check_cell(GridCell({}, cell | {section: cell[section] | changes}, {}))
+
+
+@pytest.mark.parametrize("method", ["state", "supervised"])
+def test_a_method_that_reads_states_is_refused_on_a_task_that_has_none(method):
+    with TASKS.isolated():
+        TASKS.register("pictures", GymnasiumTask("MountainCarContinuous-v0"))
+        cell = {"collect": {"task": "pictures", "quality": "random"}, "pretrain": {"method": "acro"}}
+        check_cell(GridCell({}, cell, {}))
+        with pytest.raises(UserError, match=f"{method} needs the simulator's states, and pictures has none"):
+            check_cell(GridCell({}, cell | {"pretrain": {"method": method}}, {}))
 
 
 def test_the_papers_grids_are_its_figures_over_twelve_methods():

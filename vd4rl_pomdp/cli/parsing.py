@@ -85,7 +85,8 @@ def _one_line(box: str, program: str) -> str:
 
 def parse_stage(config: type[Stage], words: Arguments, program: str) -> Stage:
     """Parse a stage's config: preset, method and the like decide which flags there are, and their defaults."""
-    chosen = {name: value for name in (*config.choosers, "preset") if (value := _chosen(words, name)) is not None}
+    choosers = (*config.choosers, *["preset"] * (len(config.presets) > 1))
+    chosen = {name: value for name in choosers if (value := _chosen(words, name)) is not None}
     required = {f.name: tyro.MISSING for f in fields(config) if f.default == Path()}
     default = config.of(**chosen, **required)
     _refuse_unread(default, words)

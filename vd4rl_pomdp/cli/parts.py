@@ -8,6 +8,7 @@ from typing import Any
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse
+from vd4rl_pomdp.errors import flag_of
 from vd4rl_pomdp.registry import REGISTRIES, Registry
 
 
@@ -23,7 +24,7 @@ def _list(words: Arguments, program: str) -> None:
     import vd4rl_pomdp.tasks  # noqa: F401
 
     for setting, registry in sorted(REGISTRIES.items()):
-        print(f"--{setting.replace('_', '-')}   (packages offer theirs as entry points of {registry.group})")
+        print(f"{flag_of(setting)}   (packages offer theirs as entry points of {registry.group})")
         print("\n".join(_lines(registry)), end="\n\n")
 
 

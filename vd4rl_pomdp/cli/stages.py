@@ -53,7 +53,7 @@ def _evaluate(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.errors import refuse_number
     from vd4rl_pomdp.evaluation import by_part, evaluate_run, evaluations_of
     from vd4rl_pomdp.reference import Reference, summarise
-    from vd4rl_pomdp.runs.episodes import append_episodes, begin_episodes
+    from vd4rl_pomdp.runs.episodes import LABELS, append_episodes, begin_episodes
     from vd4rl_pomdp.runs.files import flatten
     from vd4rl_pomdp.runs.outputs import refuse_inside
 
@@ -68,7 +68,7 @@ def _evaluate(words: Arguments, program: str) -> None:
     if command.out is not None:
         append_episodes(command.out, rows)
     reference = Reference.read(command.run)
-    labels = {k: rows[0][k] for k in ("method", "task", "quality", "corruption", "algorithm", "seed", "step")}
+    labels = {k: rows[0][k] for k in (*LABELS, "step")}
     known = {"data_return": reference.data_return, "path_error": reference.path_error}
     under: dict[str, dict[str, Any]] = {}
     for name in dict.fromkeys(row["evaluated_under"] for row in rows):

@@ -14,6 +14,7 @@ import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, show
+from vd4rl_pomdp.errors import UserError, flag_of, refuse_no_folder
 from vd4rl_pomdp.options import NO_OPTIONS, Options, StageConfig
 from vd4rl_pomdp.sweeps.executors import executor_kind
 from vd4rl_pomdp.sweeps.own_file import program_here, refuse_unknown_to_jobs, refuse_within_a_job
@@ -67,14 +68,16 @@ class RunCommand(_ExecutorConfig):
 
 
 def _run(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.errors import refuse_no_folder
     from vd4rl_pomdp.runs.outputs import refuse_kept
     from vd4rl_pomdp.sweeps.folder import SweepFolder, plan_name
     from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
-    from vd4rl_pomdp.sweeps.grid import narrow
+    from vd4rl_pomdp.sweeps.grid import SHARED, narrow
     from vd4rl_pomdp.sweeps.grid_file import load_grid, names
     from vd4rl_pomdp.sweeps.plan import JobPlanner
 
+    for name in SHARED:
+        if flag_of(name) in (word.partition("=")[0] for word in words):
+            raise UserError(f"{flag_of(name)} is a setting of the grid's trainings: change it by --change {name}=VALUE")
     command = parse_stage(RunCommand, words, program)
     grid = load_grid(command.grid, command.change, command.testing)
     cells = narrow(grid.cells(), command.only)

@@ -121,6 +121,10 @@ class Dataset:
                 f"{self.path}: stores no simulator states; `data collect` makes sets of dm_control's tasks that do"
             )
 
+    def rows_of(self, episode: int) -> slice:
+        """The rows of an episode."""
+        return slice(int(self.episode_start[episode]), int(self.episode_end[episode]))
+
     def states(self) -> Tensor:
         """(N, P') float32 poses and velocities on the set's device; raises UserError if the set has no states."""
         self.require_states()
@@ -220,7 +224,7 @@ class Dataset:
         Raises:
             IndexError: an index is out of range.
         """
-        rows = self._starts(self._index(index, self.num_transitions), self._per_episode(2))
+        rows = self._starts(self._index(index, self.num_transitions), self.windows_per_episode(2))
         reward, discount, next_rows = self.n_step_returns(rows, n_step, gamma)
         observations = observations or (lambda rows: self.stacks(rows, frame_stack))
         return Transitions(
@@ -251,7 +255,7 @@ class Dataset:
     def num_windows(self, length: int) -> int:
         """Number of windows of `length` consecutive rows of one episode; raises UserError as `windows` does."""
         self.check_windows(length)
-        return int(self._per_episode(length).sum())
+        return int(self.windows_per_episode(length).sum())
 
     def windows(
         self, index: Index, length: int, frame_stack: int = FRAME_STACK, observations: Observations | None = None
@@ -272,7 +276,7 @@ class Dataset:
             IndexError: an index is out of range.
         """
         self.check_windows(length)
-        per_episode = self._per_episode(length)
+        per_episode = self.windows_per_episode(length)
         start = self._starts(self._index(index, int(per_episode.sum())), per_episode)
         rows = start[:, None] + torch.arange(length, device=start.device)
         has_action = rows + 1 < self.episode_end[self.episode[rows]]
@@ -298,7 +302,7 @@ class Dataset:
                 f"({len(short)} such episodes); choose a shorter window"
             )
 
-    def _per_episode(self, length: int) -> Tensor:
+    def windows_per_episode(self, length: int) -> Tensor:
         """(E,) rows from which `length` consecutive rows stay inside the episode: transitions for 2."""
         return (self.episode_end - self.episode_start - (length - 1)).clamp(min=0)
 

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import requests
 from huggingface_hub import hf_hub_url
@@ -69,6 +70,16 @@ def default_endpoint() -> str:
     return os.environ.get("HF_ENDPOINT") or HUB
 
 
+def check_endpoint(endpoint: str, name: str) -> None:
+    """Raise UserError unless what a mirror is called, by the flag or variable `name`, is an address."""
+    try:
+        parts = urlsplit(endpoint)
+    except ValueError:
+        parts = urlsplit("")
+    if parts.scheme not in ("http", "https") or not parts.hostname:
+        raise UserError(f"{name} {endpoint!r} is no address; it starts with https:// or http://")
+
+
 def download(
     task: str, quality: str, destination: Path, endpoint: str | None = None, verify: bool = False
 ) -> list[Path]:
@@ -94,8 +105,7 @@ def download(
     if quality not in QUALITIES:
         raise UserError(f"unknown quality {quality!r}: choose one of {', '.join(QUALITIES)}")
     endpoint = default_endpoint() if endpoint is None else endpoint
-    if not endpoint.startswith(("http://", "https://")):
-        raise UserError(f"endpoint {endpoint!r} is no address; it starts with https:// or http://")
+    check_endpoint(endpoint, "endpoint")
     refuse_kept(destination)
     wanted = [file for file in manifest() if file.path.split("/")[2:4] == [task, quality]]
     if lacking := [file for file in wanted if not _is_settled(file, file.target(destination), verify)]:

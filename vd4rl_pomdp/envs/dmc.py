@@ -53,7 +53,7 @@ class DMCEnv(PixelEnv):
         """Widths of a model; a camera that tracks its subject does not show where it is."""
         model = self.physics.model
         self.simulator.reset()  # an episode of its own: some tasks observe nothing before
-        state = flat_state(self.simulator.task.get_observation(self.physics))
+        state = flat_state(self.simulator)
         travel, beside = _ground_travel(model, camera)
         turning, quaternions = _free_joints(model)
         widths = self.simulator.action_spec().shape[0], len(state), model.nq
@@ -75,7 +75,7 @@ class DMCEnv(PixelEnv):
     def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
         return TimeStep(
             frame=self._frame_camera.frame() if self.size and self.drawing else None,
-            state=flat_state(self.simulator.task.get_observation(self.physics)),
+            state=flat_state(self.simulator),
             physics=self.physics.get_state(),
             reward=reward,
             discount=discount,
@@ -83,8 +83,9 @@ class DMCEnv(PixelEnv):
         )
 
 
-def flat_state(observation: dict[str, np.ndarray]) -> np.ndarray:
-    """dm_control's observations as one (D,) float32 vector, in their own order."""
+def flat_state(env: Any) -> np.ndarray:
+    """What dm_control's environment observes as one (D,) float32 vector, in its own order."""
+    observation = env.task.get_observation(env.physics)
     return np.concatenate([np.ravel(value) for value in observation.values()]).astype(np.float32)
 
 
@@ -97,7 +98,7 @@ def observed_states(task: DMCTask, physics: np.ndarray) -> np.ndarray:
 
 def _observed(env: Any, state: np.ndarray) -> np.ndarray:
     start_from(env, state)
-    return flat_state(env.task.get_observation(env.physics))
+    return flat_state(env)
 
 
 def start_from(env: Any, state: np.ndarray) -> None:

@@ -6,7 +6,6 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from urllib.parse import urlsplit
 
 from huggingface_hub import HfApi
 from huggingface_hub.errors import (
@@ -24,7 +23,7 @@ from huggingface_hub.hf_api import DatasetInfo, ModelInfo
 from huggingface_hub.utils import disable_progress_bars, validate_repo_id
 
 from vd4rl_pomdp import __version__
-from vd4rl_pomdp.data.download import default_endpoint
+from vd4rl_pomdp.data.download import check_endpoint, default_endpoint
 from vd4rl_pomdp.errors import UserError
 
 ENCODER, SET = "an encoder", "a data set"
@@ -68,20 +67,10 @@ class Repository:
 def hub_api() -> HfApi:
     """Client of the endpoint in the environment; raises UserError if that is no address."""
     endpoint = default_endpoint()
-    _check_endpoint(endpoint)
+    check_endpoint(endpoint, "HF_ENDPOINT")
     if not sys.stderr.isatty():
         disable_progress_bars()
     return HfApi(endpoint=endpoint, library_name="vd4rl-pomdp", library_version=__version__)
-
-
-def _check_endpoint(endpoint: str) -> None:
-    """Raise UserError unless HF_ENDPOINT is an address."""
-    try:
-        parts = urlsplit(endpoint)
-    except ValueError:
-        parts = urlsplit("")
-    if parts.scheme not in ("http", "https") or not parts.hostname:
-        raise UserError(f"HF_ENDPOINT {endpoint!r} is no address; it starts with https:// or http://")
 
 
 def hub_info(api: HfApi, repository: Repository, revision: str | None = None) -> ModelInfo | DatasetInfo:

@@ -39,8 +39,6 @@ class ExogenousNoise:
     """Adds `weight` times an image of the pool to each picture and clips."""
 
     def __init__(self, source: str, weight: float, seed: int) -> None:
-        if not 0 < weight <= 1:
-            raise UserError(f"--exogenous-weight is {weight}; it must be above 0 and at most 1")
         self._source, self._weight = source, weight
         self._seed = stream_seed(seed, "exogenous", "choice")
         self.pool = load_pool(source, seed)
@@ -63,18 +61,26 @@ class ExogenousNoise:
         return added.add_(pictures).round_().clamp_(max=255).to(torch.uint8)
 
 
-def load_pool(source: str, seed: int) -> Tensor:
-    """Images to add: (P, 3, 100, 100) uint8; raises UserError if there is none."""
-    rng = np.random.default_rng(stream_seed(seed, "exogenous", "images"))
+def check_source(source: str) -> None:
+    """Raise UserError for what is neither the name of a pool nor a folder with files of images."""
     if source in _MADE:
-        return _MADE[source](rng)
-    images = list(_resized(Path(source)))
-    if not images:
+        return
+    if not Path(source).is_dir():
+        raise UserError(f"{source}: no such folder; name one with images or use --exogenous {TEXTURES}")
+    if not _files(Path(source)):
         raise UserError(
             f"{source}: no readable image; name a folder with CIFAR-10's data_batch files (python or binary), with PNG "
             f"or JPEG files, or use --exogenous {TEXTURES}"
         )
-    pool = torch.cat(images)
+
+
+def load_pool(source: str, seed: int) -> Tensor:
+    """Images to add: (P, 3, 100, 100) uint8; raises UserError if there is none."""
+    check_source(source)
+    rng = np.random.default_rng(stream_seed(seed, "exogenous", "images"))
+    if source in _MADE:
+        return _MADE[source](rng)
+    pool = torch.cat(list(_resized(Path(source))))
     return pool[torch.from_numpy(rng.permutation(len(pool))[:POOL])]
 
 
@@ -121,8 +127,6 @@ _MADE = {TEXTURES: _textures, PHOTOGRAPHS: _photographs}
 
 def _resized(folder: Path) -> Iterator[Tensor]:
     """Batches of a folder's images, at most POOL of each file."""
-    if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; name one with images or use --exogenous {TEXTURES}")
     for path in _files(folder):
         if _is_cifar(path):
             yield _to_size(_read_cifar(path)[:POOL])

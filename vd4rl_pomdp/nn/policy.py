@@ -32,10 +32,7 @@ class Standardise(nn.Module):
     def fit(self, features: Tensor) -> None:
         """Take the statistics of (..., dim) features, in slices that keep memory small."""
         flat = features.view(-1, features.shape[-1])
-        total, squares = (
-            torch.zeros_like(self.mean, dtype=torch.float64),
-            torch.zeros_like(self.mean, dtype=torch.float64),
-        )
+        total = squares = torch.zeros_like(self.mean, dtype=torch.float64)
         for part in flat.split(65_536):
             values = part.double()
             total, squares = total + values.sum(0), squares + values.square().sum(0)

@@ -8,7 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from vd4rl_pomdp.report.figures import COLOURS, Plot, file_name, grid_of, panels, seeds_note
-from vd4rl_pomdp.report.tables import by_label, grouped, label
+from vd4rl_pomdp.report.tables import SETTING, by_label, grouped, label
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.text import plain
 
@@ -25,8 +25,7 @@ _PUBLISHED = {"bc": (":", "BC"), "drq_bc": ("--", "DrQ+BC")}
 """Published methods that are drawn as lines: their dashes and their names."""
 _WIDEST = 4
 """Panels in a row, at most."""
-_KEYS = ("task", "quality", "corruption")
-_COLUMNS = ("kind", *_KEYS, "method", "seed", "score", "low", "high", "seeds", "best_score", "missing")
+_COLUMNS = ("kind", *SETTING, "method", "seed", "score", "low", "high", "seeds", "best_score", "missing")
 
 
 def bar_plots(
@@ -69,10 +68,8 @@ def _plot(
                 _lines(panel, row)
     for panel in axes if "" in titles else axes[::columns]:
         panel.set_ylabel("score", fontsize=8)
-    rows = [_row(row) for row in summary] + [
-        {"kind": "seed", **{k: row[k] for k in _KEYS}, "method": label(row), "seed": row["seed"], "score": row["score"]}
-        for row in runs
-    ]
+    of_seeds = [{k: row[k] for k in (*SETTING, "seed", "score")} | {"method": label(row)} for row in runs]
+    rows = [*map(_row, summary), *({"kind": "seed"} | row for row in of_seeds)]
     return Plot(
         file_name("scores", corruption),
         f"Final scores under {corruption}. {_LEGEND} {seeds_note(summary)}{_published_note(published)}",

@@ -24,7 +24,7 @@ from vd4rl_pomdp.report.gates import (
     sides,
 )
 from vd4rl_pomdp.report.load import LoadedRun
-from vd4rl_pomdp.report.tables import END_TO_END, REFERENCES, grouped, label
+from vd4rl_pomdp.report.tables import REFERENCES, grouped, label
 from vd4rl_pomdp.runs.files import Row
 
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "not told apart", "too few seeds"
@@ -92,7 +92,7 @@ def judge_claims(runs: list[LoadedRun], unranked: Collection[tuple[str, ...]] = 
         runs: of a report.
         unranked: settings that do not discriminate: there nothing is judged.
     """
-    finished = [run for run in runs if run.rows and run.finished and run.labels["method"] not in END_TO_END]
+    finished = [run for run in runs if run.rows and run.finished and not run.end_to_end]
     settings = sorted({tuple(str(run.labels[name]) for name in GATED) for run in finished})
     rows = (_row(claim, place, finished, unranked) for claim in CLAIMS for place in settings)
     return [row for row in rows if row is not None]
@@ -155,7 +155,7 @@ def _runs_of(side: Contender, other: Contender, corruption: str, runs: Iterable[
 
 def _side(name: str, runs: list[LoadedRun]) -> Row:
     """Columns about one side."""
-    shown = label(runs[0].labels | {"variant": runs[0].variant})
+    shown = label(runs[0].named)
     return {name: shown, f"{name}_return": float(returns_of(runs).mean()), f"{name}_seeds": len(runs)}
 
 

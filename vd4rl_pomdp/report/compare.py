@@ -83,7 +83,7 @@ def _loaded(path: Path) -> list[LoadedRun]:
 
 
 def _conditions(runs: list[LoadedRun]) -> Conditions:
-    finished = [{**run.labels, "variant": run.variant, "run": run} for run in runs if run.rows and run.finished]
+    finished = [run.named | {"run": run} for run in runs if run.rows and run.finished]
     return {key: [row["run"] for row in members] for key, members in grouped(finished, CONDITION)}
 
 

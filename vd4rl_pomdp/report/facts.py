@@ -16,7 +16,7 @@ _SEEDS = 12
 
 def title(run: LoadedRun) -> str:
     """A run's stage, method and setting, all but its seed."""
-    return f"{run.stage} {label(_row(run))}, {setting(run.labels)}"
+    return f"{run.stage} {label(run.named)}, {setting(run.labels)}"
 
 
 def unfinished(runs: list[LoadedRun]) -> list[tuple[str, str, str]]:
@@ -39,7 +39,7 @@ def differing(runs: list[LoadedRun]) -> list[tuple[str, str]]:
     """
     told = zip(runs, compare(runs, brief=False), strict=True)
     named = {
-        label(_row(run)): ", ".join(filter(None, parts))
+        label(run.named): ", ".join(filter(None, parts))
         for run, parts in told
         if run.stage == "finetune" and run.variant
     }
@@ -77,7 +77,3 @@ def _facts(name: str, runs: list[LoadedRun]) -> dict[str, str]:
 
 def _distinct(words: Any) -> list[str]:
     return list(dict.fromkeys(map(str, words)))
-
-
-def _row(run: LoadedRun) -> dict[str, Any]:
-    return run.labels | {"variant": run.variant}

@@ -17,7 +17,7 @@ import numpy as np
 from vd4rl_pomdp.report.gaps import STATE
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import LoadedRun, of_corruptions
-from vd4rl_pomdp.report.tables import END_TO_END, REFERENCES, grouped
+from vd4rl_pomdp.report.tables import REFERENCES, grouped
 from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, is_plain, unlike
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.settings import settings_of
@@ -48,7 +48,7 @@ def gates(runs: list[LoadedRun]) -> list[Row]:
     method's, are shares of the return of their own. `above_random` is the best method's mean return less that of
     `random`, as `sides` finds them, `error` its standard error over seeds. What is not known is None.
     """
-    finished = [run for run in runs if run.rows and run.finished and run.labels["method"] not in END_TO_END]
+    finished = [run for run in runs if run.rows and run.finished and not run.end_to_end]
     return [_gate(key, finished) for key in sorted({_key(run) for run in finished})]
 
 

@@ -120,7 +120,7 @@ def _profile(axes: Axes, rows: list[Row], number: int) -> None:
 
 def loss_rows(runs: list[LoadedRun]) -> list[Row]:
     """Mean action loss over the finished pretraining runs of every condition, at most _POINTS of the steps of all."""
-    told = [run.labels | {"variant": run.variant, "losses": dict(run.result.losses)} for run in runs if run.finished]
+    told = [run.named | {"losses": dict(run.result.losses)} for run in runs if run.finished]
     return [
         dict(zip(CONDITION, group, strict=True))
         | {"step": step, "action_loss": float(np.mean([row["losses"][step] for row in members]))}

@@ -27,6 +27,8 @@ IDENTITY = ("task", "quality", "corruption", "algorithm", "method", "variant", "
 """Columns that tell a run's rows from all others of a report: LABELS, and its variant."""
 PROBES = ("probe_pose", "probe_velocity")
 """Errors of linear probes of an encoder."""
+END_TO_END = ("bc", "drq_bc")
+"""References that bring their own algorithm."""
 FILM = {"clean": 4, "corrupted": 4, "return": 1}
 """Arrays of a film and their axes."""
 
@@ -48,7 +50,7 @@ ALL = Choice()
 
 @dataclass(frozen=True)
 class LoadedRun:
-    """A run of pretraining or fine-tuning, finished or not."""
+    """A run of any stage, finished or not."""
 
     result: Result
     """Its files."""
@@ -84,7 +86,7 @@ class LoadedRun:
 
     @property
     def stage(self) -> str:
-        """What it does: "pretrain" or "finetune"."""
+        """What it does: "pretrain", "finetune" or "navigation"."""
         return self.result.record["stage"]
 
     @property
@@ -98,10 +100,19 @@ class LoadedRun:
         return ", ".join(filter(None, self.parts))
 
     @property
+    def named(self) -> dict[str, Any]:
+        """Its labels and its variant."""
+        return self.labels | {"variant": self.variant}
+
+    @property
     def identity(self) -> tuple[str, ...]:
         """Values of IDENTITY."""
-        labels = self.labels | {"variant": self.variant}
-        return tuple(str(labels[name]) for name in IDENTITY)
+        return tuple(str(self.named[name]) for name in IDENTITY)
+
+    @property
+    def end_to_end(self) -> bool:
+        """Whether its encoder was trained with the policy; what early versions did not record, the method tells."""
+        return bool(self.result.encoder.get("end_to_end")) or self.labels["method"] in END_TO_END
 
     @property
     def last(self) -> list[Row]:

@@ -38,7 +38,7 @@ def run_table(runs: list[LoadedRun], evaluated: list[Row], gaps: list[Row]) -> l
     table = []
     for run in runs:
         if run.rows and run.finished:
-            curve = curves[tuple((run.labels | {"variant": run.variant})[name] for name in IDENTITY)]
+            curve = curves[tuple(run.named[name] for name in IDENTITY)]
             table.append(_run(run, curve))
     return sorted([*table, *(dict.fromkeys(_RUN) | gap for gap in gaps)], key=table_order)
 
@@ -46,7 +46,7 @@ def run_table(runs: list[LoadedRun], evaluated: list[Row], gaps: list[Row]) -> l
 def _run(run: LoadedRun, curve: list[Row]) -> Row:
     """Values of _RUN of one run."""
     last, best = max(curve, key=lambda row: row["step"]), max(curve, key=lambda row: row["score"])
-    found = run.labels | run.representation | {"id": run.result.id, "variant": run.variant, "state": run.progress}
+    found = run.named | run.representation | {"id": run.result.id, "state": run.progress}
     found |= {"score": last["score"], "return": float(returns_of([run])[0])}
     found |= {"best_score": best["score"], "best_step": best["step"], "finetune_seconds": run.seconds}
     found |= {"git_commit": run.result.commit, "machine": run.result.machine}
@@ -85,7 +85,7 @@ def control(runs: list[LoadedRun]) -> list[Row]:
     evaluation: as trained, and under no corruption (`clean_`). What no seed knows is None.
     """
     finished = [run for run in runs if run.rows and run.finished]
-    measured = [run.labels | {"variant": run.variant} | _control(run) for run in finished]
+    measured = [run.named | _control(run) for run in finished]
     table = [
         dict(zip(CONDITION, group, strict=True))
         | {name: known_mean(row[name] for row in members) for name in _CONTROL}

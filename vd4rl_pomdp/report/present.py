@@ -12,6 +12,8 @@ from vd4rl_pomdp.report.gaps import MISSING
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.layout import Line, ShownTable, interval, number, with_interval
 from vd4rl_pomdp.report.load import PROBES
+from vd4rl_pomdp.report.measures import COSTS
+from vd4rl_pomdp.report.overall import AGGREGATES
 from vd4rl_pomdp.report.tables import TOLD_STATES, grouped, label, setting, with_algorithm
 from vd4rl_pomdp.runs.files import Row
 
@@ -85,10 +87,7 @@ def aggregates(rows: list[Row]) -> list[ShownTable]:
 def _aggregate_line(row: Row) -> Line:
     if row["iqm"] is None:
         return Line((label(row),), MISSING)
-    found = (
-        with_interval(row[name], row[f"{name}_low"], row[f"{name}_high"])
-        for name in ("iqm", "median", "mean", "optimality_gap")
-    )
+    found = (with_interval(row[name], row[f"{name}_low"], row[f"{name}_high"]) for name in AGGREGATES)
     tasks = str(row["tasks"]) if row["tasks"] == row["of_tasks"] else f"{row['tasks']} of {row['of_tasks']}"
     return Line((label(row), *found, tasks, _count(row["seeds"])))
 
@@ -149,7 +148,7 @@ def costs(rows: list[Row]) -> list[ShownTable]:
 
 def _cost_line(row: Row) -> Line:
     spans = []
-    for name in ("pretrain_seconds", "finetune_seconds"):
+    for name in COSTS:
         low, high = row[f"{name}_min"], row[f"{name}_max"]
         spans.append(number(row[name], 0) + (f" ({low:.0f} – {high:.0f})" if low != high else ""))
     return Line((row["method"], row["machines"] or "not recorded", *spans, str(row["runs"])))

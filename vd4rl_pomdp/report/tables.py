@@ -9,7 +9,7 @@ import numpy as np
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import CONDITION, condition_of, in_words
 from vd4rl_pomdp.report.grouping import groups
-from vd4rl_pomdp.report.load import LoadedRun
+from vd4rl_pomdp.report.load import END_TO_END, LoadedRun
 from vd4rl_pomdp.runs.files import Row
 
 TOLD_STATES = ("supervised", "supervised+a")
@@ -21,8 +21,6 @@ LOOKS = (
     *("curl", "driml", "homer", "one_step_inverse", "no_history", "bc", "drq_bc"),
 )
 """The package's methods in the order of their looks, which are the same in every report: the first differ in colour."""
-END_TO_END = ("bc", "drq_bc")
-"""References that bring their own algorithm."""
 SETTING = ("task", "quality", "corruption")
 """What methods are compared in."""
 SCORE = "Score = return / 10 or the task's own divisor"
@@ -57,7 +55,7 @@ def evaluations(runs: Iterable[LoadedRun]) -> list[Row]:
     """One row for every evaluation of a run: CONDITION, seed, step, mean `score` and number of its `episodes`."""
     table = []
     for run in runs:
-        named = run.labels | {"variant": run.variant}
+        named = run.named
         for (step, *_), episodes in grouped(run.rows, ("step",)):
             score = float(np.mean([row["score"] for row in episodes]))
             table.append(named | {"step": step, "score": score, "episodes": len(episodes)})

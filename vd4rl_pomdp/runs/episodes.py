@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import io
 import math
+import os
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -38,7 +39,7 @@ def append_episodes(path: Path, rows: list[dict[str, Any]]) -> None:
     header = _completed(path, read_episodes(path))
     with appending(path) as file:
         writer = csv.DictWriter(file, header or COLUMNS, lineterminator="\n")
-        if not header:
+        if not os.fstat(file.fileno()).st_size:  # asked while nobody else can write it
             writer.writeheader()
         writer.writerows(rows)
 

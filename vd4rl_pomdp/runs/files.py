@@ -9,9 +9,9 @@ import math
 import os
 import secrets
 from collections.abc import Collection, Iterable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.runs.reading import parse_json, read_bytes, regular
@@ -130,13 +130,24 @@ def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
 def appending(path: Path) -> Iterator[Any]:
     """A text file to append lines to, which are on the disk when the block ends: a checkpoint may tell of them.
 
+    Where the system can, a process that appends to the same file waits.
+
     Raises:
         UserError: the system refuses.
     """
     with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
+        _wait_for(file)
         yield file
         file.flush()
         os.fsync(file.fileno())
+
+
+def _wait_for(file: IO[str]) -> None:
+    """Lock an open file until it is closed, unless the system or the file system has no such locks."""
+    with suppress(ImportError, OSError):
+        import fcntl  # not on Windows
+
+        fcntl.flock(file.fileno(), fcntl.LOCK_EX)
 
 
 def synchronise(path: Path) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import os
 import shutil
+import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -14,6 +14,7 @@ from torch import Tensor, nn
 
 from vd4rl_pomdp.errors import DiskFullError, OutOfMemoryError, UserError, flag_of
 from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.runs.provenance import machine_memory
 
 _OUT = ("DefaultCPUAllocator", "not enough memory", "Storage size calculation overflowed", "out of memory")
 """What torch says on a CPU, where it has no exception of its own for it."""
@@ -27,7 +28,7 @@ def memory_of(device: torch.device) -> int:
     """Bytes of memory that a device has in all: of a CPU what this process may use of it."""
     if device.type == "cuda":
         return torch.cuda.get_device_properties(device).total_memory
-    whole = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")
+    whole = machine_memory() or sys.maxsize
     limit = _LIMIT.read_text(encoding="utf-8").strip() if _LIMIT.exists() else "max"
     return min(whole, int(limit)) if limit.isdigit() else whole
 

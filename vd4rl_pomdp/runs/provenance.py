@@ -82,15 +82,19 @@ def machine(device: str = "auto") -> dict[str, Any]:
 
     used = pick_device(device)
     gpu = torch.cuda.get_device_name(used) if used.type == "cuda" else None
-    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
         "bf16_kernels": has_bf16_kernels(),
-        "memory_gib": round(memory / 2**30, 1),
+        "memory_gib": round(machine_memory() / 2**30, 1),
         "gpu": gpu,
         "system": platform.system(),
     }
+
+
+def machine_memory() -> int:
+    """Bytes of memory that the machine has; 0 where the system does not say, as Windows."""
+    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
 
 
 def command() -> str:

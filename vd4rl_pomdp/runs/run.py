@@ -24,7 +24,7 @@ from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.runs.provenance import CONTINUED, command, git_commit, machine, versions
 from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS
 
-DIVERGED = "diverged.json"
+DIVERGED_FILE = "diverged.json"
 
 
 def remedy(folder: Path) -> str:
@@ -120,7 +120,7 @@ class RunFolder:
             origin = {"versions": versions(), "git_commit": git_commit(), "command": command()}
             origin |= {"plugins": origins(self.config), "collection": collection_of(Path(self.config["data"]))}
             write_json(self.path / "config.json", record | origin)
-        (self.path / DIVERGED).unlink(missing_ok=True)
+        (self.path / DIVERGED_FILE).unlink(missing_ok=True)
         self._keep_machine()
 
     def _keep_machine(self) -> None:
@@ -171,7 +171,7 @@ class RunFolder:
 
     def mark_diverged(self, step: int, message: str) -> None:
         """Say that a number was no longer finite after `step`; going on with the run takes the mark away."""
-        write_json(self.path / DIVERGED, {"step": step, "message": message})
+        write_json(self.path / DIVERGED_FILE, {"step": step, "message": message})
 
     def finish(self, **more: Any) -> None:
         """Mark the run as done, keeping its wall-clock seconds and the last checkpoint."""

@@ -12,6 +12,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
+from multiprocessing.reduction import ForkingPickler
 from pickle import PicklingError
 from typing import Any, TypeVar
 
@@ -159,8 +160,18 @@ def _attempt(function: Callable[[Any], Any], job: Any) -> tuple[Any, BaseExcepti
     try:
         return function(job), None
     except BaseException as error:
-        error.add_note(f"in a worker process:\n{traceback.format_exc()}")
+        where = f"in a worker process:\n{traceback.format_exc()}"
+        error = error if _crosses(error) else RuntimeError(f"{type(error).__name__}: {error}")
+        error.add_note(where)
         return None, error
+
+
+def _crosses(error: BaseException) -> bool:
+    """Whether an error of others' code comes out of a pipe as it went in."""
+    try:
+        return type(ForkingPickler.loads(ForkingPickler.dumps(error))) is type(error)
+    except Exception:
+        return False
 
 
 def _start_worker() -> None:

@@ -13,7 +13,7 @@ from typing import Any
 from vd4rl_pomdp.errors import UserError, refuse_outside
 from vd4rl_pomdp.nn.encoder import EncoderConfig, build_frame_encoder
 from vd4rl_pomdp.nn.frame import encoder_settings
-from vd4rl_pomdp.tasks import FRAME_STACK, TASKS
+from vd4rl_pomdp.tasks import FRAME_STACK, TASKS, GymnasiumTask
 
 
 def check_fit(configs: Mapping[str, Any]) -> None:
@@ -26,8 +26,10 @@ def check_fit(configs: Mapping[str, Any]) -> None:
     if (maze_set := configs.get("navigation_collect")) and (training := configs.get("navigation_train")):
         _check_maze(training, maze_set)
     if data_set := configs.get("collect"):
-        size, rows = data_set.frame_size, TASKS.named(data_set.task).decisions + 1
+        task, size = TASKS.named(data_set.task), data_set.frame_size
+        rows = task.decisions + 1
         if before := configs.get("pretrain"):
+            _check_states(before.method, data_set.task)
             _check_pretraining(before, size, rows)
         if after := configs.get("finetune"):
             _check_finetuning(after, size, rows)
@@ -35,8 +37,11 @@ def check_fit(configs: Mapping[str, Any]) -> None:
 
 @cache
 def _check_maze(training: Any, maze_set: Any) -> None:
+    from vd4rl_pomdp.navigation.exogenous import check_source
     from vd4rl_pomdp.navigation.observations import SHAPES, check_trajectories
 
+    if training.exogenous != "none":
+        check_source(training.exogenous)
     check_trajectories(maze_set.trajectories, "--trajectories is 1")
     _check_window(training.window, maze_set.trajectory_rows)
     _check_frames(training, *SHAPES[training.picture])
@@ -51,6 +56,14 @@ def _check_pretraining(config: Any, size: int, rows: int) -> None:
     _check_window(config.window, rows)
     if not METHODS.named(config.method).reads_state:
         _check_frames(config, 3 * FRAME_STACK, size)
+
+
+def _check_states(method: str, task: str) -> None:
+    from pretrain.objectives import METHODS
+
+    part = METHODS.named(method)
+    if (part.reads_state or part.regresses_state) and isinstance(TASKS.named(task), GymnasiumTask):
+        raise UserError(f"{method} needs the simulator's states, and {task} has none: leave one of them out")
 
 
 @cache

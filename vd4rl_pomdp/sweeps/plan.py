@@ -12,12 +12,13 @@ from typing import Any
 from vd4rl_pomdp.data.format import PLAN, RECORD
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.options import words_of
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.sweeps.found import FoundRuns, run_at
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.naming import run_folder
 from vd4rl_pomdp.sweeps.sets import DataSet, set_of
-from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, check_cell, recipe_of, recorded, told, words_of
+from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, check_cell, recipe_of, recorded, told
 
 DATA = "data"
 """Folder of the sets in a sweep's, unless another is named."""

@@ -11,8 +11,8 @@ from functools import cache
 from typing import Any
 
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
-from vd4rl_pomdp.errors import MAX_SEED, flag_of, refuse_number
-from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.errors import MAX_SEED, refuse_number
+from vd4rl_pomdp.options import flat, words_of
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.identity import recipe
@@ -43,18 +43,6 @@ def told(cell: GridCell, section: str) -> Values:
     """What a cell tells a stage, in the order of its command line."""
     takes = _TAKES.get(section, tuple(cell.shared))
     return {name: value for name, value in cell.shared.items() if name in takes} | cell.sections[section]
-
-
-def words_of(settings: Values) -> list[str]:
-    """Settings as words of a command line."""
-    words: list[str] = []
-    for name, value in settings.items():
-        flag = flag_of(name)
-        if isinstance(value, bool):
-            words.append(flag if value else f"--no-{flag[2:]}")
-        else:
-            words += [f"{flag}={value}"] if str(value).startswith("-") else [flag, str(value)]
-    return words
 
 
 def check_cell(cell: GridCell) -> None:

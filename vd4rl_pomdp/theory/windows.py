@@ -57,4 +57,4 @@ def exact_windows(world: World, rows: int) -> ExactWindows:
 
 def _codes(law: Law, kind: str, rows: int) -> np.ndarray:
     """(N, rows) int64 codes of one kind of variable."""
-    return np.stack([law.codes[:, law.variables.index((kind, j))] for j in range(rows)], axis=1)
+    return np.stack([law.column((kind, j)) for j in range(rows)], axis=1)

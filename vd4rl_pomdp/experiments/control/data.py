@@ -14,6 +14,7 @@ from torch import Tensor
 from vd4rl_pomdp.corruptions.keys import DRAWS, draw_integers
 from vd4rl_pomdp.data import Dataset, View
 from vd4rl_pomdp.data.collect import CollectConfig, play
+from vd4rl_pomdp.data.shards import join_rollouts
 from vd4rl_pomdp.data.store import PlayedStore
 from vd4rl_pomdp.envs.dmc import observed_states
 from vd4rl_pomdp.envs.make import layout_of
@@ -56,7 +57,7 @@ def played_set(task: str, action_noise: float, episodes: int, decisions: int) ->
     """
     config = CollectConfig(task, "expert", Path(), episodes, workers=1, action_noise=action_noise)
     played = list(play(config, decisions))
-    rows = {key: np.concatenate([columns[key] for columns in played]) for key in played[0]}
+    rows = join_rollouts(played)
     dataset = Dataset(Path(task), PlayedStore(Path(task), {"attributes": [{"task": task, "set": "expert"}]}, rows))
     states, expert = dataset.states(), load_actor(task, "expert")
     standardise = Standardise(states.shape[1])

@@ -23,7 +23,7 @@ class Condition:
 
     @property
     def name(self) -> str:
-        """Folder of the condition's runs."""
+        """What messages and files call it."""
         return f"{self.maze}/{self.short}"
 
     @property

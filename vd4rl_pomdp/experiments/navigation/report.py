@@ -31,6 +31,7 @@ from vd4rl_pomdp.mazes import HARD, MAZES
 from vd4rl_pomdp.navigation.config import PRESETS
 from vd4rl_pomdp.navigation.measures import refitted_error
 from vd4rl_pomdp.navigation.methods import UNTRAINED
+from vd4rl_pomdp.options import words_of
 from vd4rl_pomdp.results import RUNS, Result
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.ownership import owned
@@ -215,7 +216,5 @@ def _collect(run: NavigationRun) -> str:
     if not made:
         return ""
     words = ["vd4rl-pomdp", "navigation", "collect", "--preset", run.preset, "--maze", maze]
-    for name, value in made.items():
-        if name != "maze" and value != getattr(usual, name):
-            words += [f"--{name.replace('_', '-')}", str(value)]
+    words += words_of({n: value for n, value in made.items() if n != "maze" and value != getattr(usual, n)})
     return shlex.join([*words, "--out", flags_of(run.facts["command"]).get("data", f"data/{maze}")])

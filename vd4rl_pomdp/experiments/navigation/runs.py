@@ -8,7 +8,7 @@ import math
 import shlex
 import shutil
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from vd4rl_pomdp.runs.settings import settings_of
 
 ROWS, TRAJECTORIES = "rows.csv", "trajectories"
 
-_IDENTITY = ("maze", "method", "max_k", "self_prediction", "exogenous", "literal_future", "preset", "seed")
+_IDENTITY = (*(field.name for field in fields(Condition)), "preset", "seed")
 _MEASURED = (*Measure._fields, "value")
 _DRAWN = ("x", "y", "estimated_x", "estimated_y")
 """Columns of a trajectory that figures and films draw."""
@@ -50,11 +50,8 @@ class NavigationRun:
     @property
     def identity(self) -> dict[str, Any]:
         """What tells this run from others."""
-        fields = {name: getattr(self.condition, name) for name in _IDENTITY[:6]}
-        return {k: int(v) if isinstance(v, bool) else v for k, v in fields.items()} | {
-            "preset": self.preset,
-            "seed": self.seed,
-        }
+        told = {k: int(v) if isinstance(v, bool) else v for k, v in asdict(self.condition).items()}
+        return told | {"preset": self.preset, "seed": self.seed}
 
     @property
     def collection(self) -> dict[str, Any]:
