@@ -119,8 +119,7 @@ def with_presets(config: type, presets: dict[str, Any], words: Arguments, progra
     if name not in presets:
         raise UserError(f"unknown {flag.removeprefix('--')} {name!r}: choose one of {', '.join(presets)}")
     default = presets[name]
-    required = [f for f in ("encoder", "data", "out", "maze") if getattr(default, f, None) in (Path(), "")]
-    missing = {f: tyro.MISSING for f in required}
+    missing = {f.name: tyro.MISSING for f in fields(config) if getattr(default, f.name) in (Path(), "")}
     return parse(config, words, program, replace(default, **missing))
 
 

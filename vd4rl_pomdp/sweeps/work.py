@@ -97,6 +97,15 @@ def start_process(work: Work, environment: Mapping[str, str], cores: Sequence[in
         )
 
 
+def wait_or_kill(process: subprocess.Popen, seconds: float) -> None:
+    """Wait for a process that was asked to end, and kill it when its time is over."""
+    try:
+        process.wait(max(0.0, seconds))
+    except subprocess.TimeoutExpired:
+        process.kill()
+        process.wait()
+
+
 def code_of(cause: str) -> int:
     """Exit code of a process that ended for a cause."""
     return 0 if cause == DONE else _FIRST + CAUSES.index(cause)

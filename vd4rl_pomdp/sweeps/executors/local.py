@@ -13,7 +13,7 @@ from typing import ClassVar
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.sweeps.oom import oom_kills
-from vd4rl_pomdp.sweeps.work import Ended, Work, ended, start_process
+from vd4rl_pomdp.sweeps.work import Ended, Work, ended, start_process, wait_or_kill
 
 PATIENCE_S = 120.0
 """Seconds that a job has to end in after SIGTERM: it finishes a step and writes a checkpoint."""
@@ -75,7 +75,7 @@ class LocalExecutor:
         """Begin a job that fits."""
         chosen = self._choose(work.slots)
         cores = sorted({core for place in chosen for core in place.cores})
-        environment = {"OMP_NUM_THREADS": str(max(1, len(cores))), "LP_NUM_THREADS": "1"}
+        environment = {"OMP_NUM_THREADS": str(max(1, len(cores)))}
         if chosen[0].gpu is not None:
             environment["CUDA_VISIBLE_DEVICES"] = chosen[0].gpu
         before, process = oom_kills(), start_process(work, environment, cores)
@@ -97,11 +97,7 @@ class LocalExecutor:
             job.process.send_signal(signal.SIGTERM)
         until = time.monotonic() + PATIENCE_S
         for job in self._running:
-            try:
-                job.process.wait(max(0.0, until - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                job.process.kill()
-                job.process.wait()
+            wait_or_kill(job.process, until - time.monotonic())
 
 
 def _places(options: LocalOptions) -> list[Place]:

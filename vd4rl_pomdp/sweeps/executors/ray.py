@@ -9,7 +9,6 @@ from __future__ import annotations
 import logging
 import os
 import signal
-import subprocess
 import threading
 import time
 from collections.abc import Iterator
@@ -21,7 +20,7 @@ from vd4rl_pomdp.errors import OutOfMemoryError, UserError
 from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.sweeps.executors.local import PATIENCE_S
 from vd4rl_pomdp.sweeps.oom import oom_kills
-from vd4rl_pomdp.sweeps.work import FAILED, INTERRUPTED, KILLED, Ended, Work, ended, start_process
+from vd4rl_pomdp.sweeps.work import FAILED, INTERRUPTED, KILLED, Ended, Work, ended, start_process, wait_or_kill
 
 NODES_S = 5.0
 """Seconds between two looks at which nodes there are."""
@@ -152,22 +151,14 @@ def attempt(work: Work, threads: int, folder: str) -> Ended:
     except OSError as error:
         raise UserError(f"{folder}: not on node {os.uname().nodename}; use a disk that all nodes share") from error
     before = oom_kills()
-    process = start_process(work, {"OMP_NUM_THREADS": str(threads), "LP_NUM_THREADS": "1"})
+    process = start_process(work, {"OMP_NUM_THREADS": str(threads)})
     try:
         while process.poll() is None:
             time.sleep(POLL_S)
     except KeyboardInterrupt:  # as which a cancellation arrives
-        _end_process(process)
+        process.terminate()
+        wait_or_kill(process, PATIENCE_S)
     return ended(work, process.returncode, before)
-
-
-def _end_process(process: subprocess.Popen) -> None:
-    process.terminate()
-    try:
-        process.wait(PATIENCE_S)
-    except subprocess.TimeoutExpired:
-        process.kill()
-        process.wait()
 
 
 def _connected(address: str) -> Any:
@@ -191,9 +182,11 @@ def _connected(address: str) -> Any:
 def _own_signals() -> Iterator[None]:
     """Ray answers SIGTERM in its own way from `init` on; this program has its own."""
     before = signal.getsignal(signal.SIGTERM)
-    yield
-    if threading.current_thread() is threading.main_thread():
-        signal.signal(signal.SIGTERM, before)
+    try:
+        yield
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGTERM, before)
 
 
 def _line(error: BaseException) -> str:
