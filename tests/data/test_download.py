@@ -247,7 +247,7 @@ def test_a_dead_mirror_is_told_with_advice(mirror, tmp_path):
     assert len(mirror.requests) == 5
 
 
-@pytest.mark.parametrize("endpoint", ["http://127.0.0.1:9", "http://", "http://[", "https://nobody.invalid"])
+@pytest.mark.parametrize("endpoint", ["http://127.0.0.1:9", "https://nobody.invalid"])
 def test_where_nobody_is_nothing_is_waited_for(tmp_path, monkeypatch, endpoint):
     monkeypatch.setattr(module.time, "sleep", lambda _: pytest.fail("waited"))
     monkeypatch.setenv("NO_PROXY", "*")
@@ -283,6 +283,8 @@ def test_a_missing_file_is_told_at_once(mirror, tmp_path):
         (("walker_run", "expert"), "unknown task 'walker_run'"),
         (("walker_walk", "best"), "unknown quality 'best': choose one of random"),
         (("walker_walk", "expert", "hf.co"), "endpoint 'hf.co' is no address"),
+        (("walker_walk", "expert", "http://"), "endpoint 'http://' is no address"),
+        (("walker_walk", "expert", "http://["), r"endpoint 'http://\[' is no address"),
     ],
 )
 def test_what_is_not_published_is_refused(tmp_path, arguments, message):

@@ -97,6 +97,9 @@ def test_what_a_run_goes_on_with_is_recorded_where_it_is_new(tmp_path, monkeypat
     later = [(part["processor"], part["git_commit"]) for part in told["continued"]]
     assert (told["processor"], later) == ("A", [("B", "one"), ("B", "two"), ("A", "one")])
     assert told["continued"][0]["versions"] == read_json(tmp_path / "config.json")["versions"]
+    write_json(tmp_path / "machine.json", told | {"continued": 7})
+    with pytest.raises(UserError, match=r"machine\.json: is damaged"), begin(tmp_path):
+        pass
 
 
 def test_a_second_owner_is_refused_and_finds_the_end_of_the_first(tmp_path):

@@ -119,9 +119,9 @@ class Result:
         return self.finished or self.diverged is not None
 
 
-def _in_turn(words: Iterable[str | None]) -> str:
+def _in_turn(words: Iterable[Any]) -> str:
     """What the parts of a run tell, each word once: "A then B"."""
-    return " then ".join(dict.fromkeys(filter(None, words)))
+    return " then ".join(dict.fromkeys(str(word) for word in words if word))
 
 
 def _hardware(part: dict[str, Any]) -> str | None:
