@@ -132,7 +132,9 @@ class RunFolder:
         told, record = read_json(path), read_json(self.path / "config.json")
         parts = told.pop(CONTINUED, [])
         if not isinstance(parts, list):
-            raise UserError(f"{path}: is damaged ({CONTINUED!r} is no list); remove it and start the same command again")
+            raise UserError(
+                f"{path}: is damaged ({CONTINUED!r} is no list); remove it and start the same command again"
+            )
         begun = told | {name: record.get(name) for name in ("git_commit", "versions")}
         part = now | {"git_commit": git_commit(), "versions": versions()}
         if part != (parts[-1] if parts else begun):
