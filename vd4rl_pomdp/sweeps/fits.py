@@ -26,8 +26,7 @@ def check_fit(configs: Mapping[str, Any]) -> None:
     if (maze_set := configs.get("navigation_collect")) and (training := configs.get("navigation_train")):
         _check_maze(training, maze_set)
     if data_set := configs.get("collect"):
-        task, size = TASKS.named(data_set.task), data_set.frame_size
-        rows = task.decisions + 1
+        size, rows = data_set.frame_size, TASKS.named(data_set.task).decisions + 1
         if before := configs.get("pretrain"):
             _check_states(before.method, data_set.task)
             _check_pretraining(before, size, rows)
