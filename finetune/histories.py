@@ -94,7 +94,7 @@ class Histories:
         self._options = options if isinstance(options, HistoryOptions) else HistoryOptions()
         self.rows = dataset.transition_rows
         """(M,) int64: first end of every transition."""
-        self.ends = dataset.n_step_returns(self.rows, n_step, gamma=1.0)[2]
+        self.ends = dataset.successors(self.rows, n_step)
         """(M,) int64: last end of every transition."""
         self.random = round(self._options.random_histories * len(self.rows))
         """R."""

@@ -250,7 +250,11 @@ class Dataset:
         discount = torch.where(inside, self.discount[paid], 1.0).cumprod(1)
         before = torch.cat([torch.ones_like(discount[:, :1]), discount[:, :-1]], 1)
         reward = (self.reward[paid] * before * gamma**step * inside).sum(1)
-        return reward, discount[:, -1] * gamma ** (inside.sum(1) - 1).clamp(min=0), torch.minimum(rows + n_step, last)
+        return reward, discount[:, -1] * gamma ** (inside.sum(1) - 1).clamp(min=0), self.successors(rows, n_step)
+
+    def successors(self, rows: Tensor, n_step: int) -> Tensor:
+        """Rows (B,) int64 that lie `n_step` behind (B,) int64 rows, or their episode's last."""
+        return torch.minimum(rows + n_step, (self.episode_end - 1)[self.episode[rows]])
 
     def num_windows(self, length: int) -> int:
         """Number of windows of `length` consecutive rows of one episode; raises UserError as `windows` does."""
