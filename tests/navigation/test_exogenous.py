@@ -1,5 +1,6 @@
 import io
 import struct
+from unittest import mock
 
 import numpy as np
 import pytest
@@ -7,6 +8,7 @@ import torch
 from PIL import Image
 
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.navigation import exogenous
 from vd4rl_pomdp.navigation.exogenous import POOL, ExogenousNoise, load_pool
 
 
@@ -96,6 +98,18 @@ def test_other_images_are_read_too(tmp_path):
     Image.fromarray(np.full((30, 30), 10, np.uint8)).save(tmp_path / "b.JPG", "JPEG")
     pool = load_pool(str(tmp_path), 0)
     assert sorted(pool.float().mean((1, 2, 3)).tolist()) == pytest.approx([10, 99], abs=2)
+
+
+def test_of_a_folder_of_many_images_only_those_of_the_pool_are_read(tmp_path, monkeypatch):
+    for level in range(10, 130, 10):
+        Image.fromarray(np.full((20, 30, 3), level, np.uint8)).save(tmp_path / f"{level:03}.png")
+    cifar_binary(tmp_path, count=3)
+    whole = load_pool(str(tmp_path), 0)
+    assert len(whole) == 15
+    monkeypatch.setattr(exogenous, "POOL", 6)
+    with mock.patch.object(exogenous, "_read_image", wraps=exogenous._read_image) as read:
+        assert torch.equal(load_pool(str(tmp_path), 0), whole[:6])
+    assert 1 <= read.call_count <= 6
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,6 @@ or binary files, PNG, JPEG.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
 from pathlib import Path
 from pickletools import genops
 
@@ -80,8 +79,20 @@ def load_pool(source: str, seed: int) -> Tensor:
     rng = np.random.default_rng(stream_seed(seed, "exogenous", "images"))
     if source in _MADE:
         return _MADE[source](rng)
-    pool = torch.cat(list(_resized(Path(source))))
-    return pool[torch.from_numpy(rng.permutation(len(pool))[:POOL])]
+    return _drawn(_files(Path(source)), rng)
+
+
+def _drawn(files: list[Path], rng: np.random.Generator) -> Tensor:
+    """Images drawn from files, at most POOL; only those are decoded, however many there are."""
+    ends = np.cumsum([len(_read_cifar(path)) if _is_cifar(path) else 1 for path in files])
+    drawn = rng.permutation(ends[-1])[:POOL]
+    number = np.searchsorted(ends, drawn, side="right")
+    pool = torch.empty((len(drawn), 3, PICTURE_SIZE, PICTURE_SIZE), dtype=torch.uint8)
+    for file in np.unique(number):
+        mine = np.flatnonzero(number == file)
+        images = _read_cifar(files[file]) if _is_cifar(files[file]) else _read_image(files[file])
+        pool[mine] = _to_size(images[drawn[mine] - ends[file]])  # counted from the file's end
+    return pool
 
 
 def _textures(rng: np.random.Generator) -> Tensor:
@@ -125,18 +136,6 @@ _MADE = {TEXTURES: _textures, PHOTOGRAPHS: _photographs}
 """Pools that need no files: what makes them, by name."""
 
 
-def _resized(folder: Path) -> Iterator[Tensor]:
-    """Batches of a folder's images, at most POOL of each file."""
-    for path in _files(folder):
-        if _is_cifar(path):
-            yield _to_size(_read_cifar(path)[:POOL])
-        else:
-            try:
-                yield _to_size(np.asarray(Image.open(path).convert("RGB"))[None])
-            except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # Pillow's, by format
-                raise UserError(f"{path}: cannot be read as an image ({error}); remove or replace it") from error
-
-
 def _files(folder: Path) -> list[Path]:
     """Files of a folder that hold images, in order."""
     files = sorted(path for path in folder.rglob("*") if path.is_file())
@@ -148,10 +147,18 @@ def _is_cifar(path: Path) -> bool:
     return path.name.startswith(("data_batch", "test_batch"))
 
 
+def _read_image(path: Path) -> np.ndarray:
+    """(1, H, W, 3) uint8 of one PNG or JPEG file."""
+    try:
+        return np.asarray(Image.open(path).convert("RGB"))[None]
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # Pillow's, by format
+        raise UserError(f"{path}: cannot be read as an image ({error}); remove or replace it") from error
+
+
 def _read_cifar(path: Path) -> np.ndarray:
-    """(N, 32, 32, 3) uint8 of one CIFAR-10 file."""
+    """(N, 32, 32, 3) uint8 of one CIFAR-10 file, POOL of them at most."""
     data = _binary_records(path) if path.suffix == ".bin" else _python_records(path)
-    return data.reshape(-1, 3, _CIFAR_SIDE, _CIFAR_SIDE).transpose(0, 2, 3, 1)
+    return data.reshape(-1, 3, _CIFAR_SIDE, _CIFAR_SIDE)[:POOL].transpose(0, 2, 3, 1)
 
 
 def _binary_records(path: Path) -> np.ndarray:
