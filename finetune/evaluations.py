@@ -17,7 +17,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import EpisodeJob, episode_rows, evaluate, own_and_none
 from vd4rl_pomdp.nn.encoder_folder import EncoderCard, save_encoder
 from vd4rl_pomdp.reference import Reference
-from vd4rl_pomdp.runs import interrupt
+from vd4rl_pomdp.runs import EPISODES_FILE, interrupt
 from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import Row, replacing_file
 from vd4rl_pomdp.runs.loop import Loop
@@ -40,7 +40,7 @@ class Evaluations:
 
     @property
     def _rows(self) -> Path:
-        return self.run / "episodes.csv"
+        return self.run / EPISODES_FILE
 
     def require(self, step: int) -> None:
         """Raise UserError if rows of an evaluation before a step are gone: the run would end without them."""

@@ -36,6 +36,7 @@ from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.policies.actor import read_actor
 from vd4rl_pomdp.probes import probe_state
 from vd4rl_pomdp.reference import Reference
+from vd4rl_pomdp.runs import LABELS_FILE, PRETRAIN_TIMING_FILE, PROBE_FILE, RENDER_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.loop import training
@@ -83,7 +84,7 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
         require_room(config, dataset, encoder, device, FeatureFile(run.path, inputs).exists)
     with run:
         if not run.finished:
-            write_json(run.path / "labels.json", labels(config, card))
+            write_json(run.path / LABELS_FILE, labels(config, card))
             _keep_encoder(config, run.path)
             dataset.to(device)
             _trainer(config, dataset, encoder.to(device), card, run).run(run)
@@ -135,13 +136,13 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
     """Write how well the first view tells the simulator state, if the set stores it and has an episode to hold out."""
     if dataset.physics is None or dataset.task is None or dataset.num_episodes < 2:
         return
-    if (run.path / "probe.json").exists():
-        tell_probe(run.path / "encoder", read_json(run.path / "probe.json"))
+    if (run.path / PROBE_FILE).exists():
+        tell_probe(run.path / "encoder", read_json(run.path / PROBE_FILE))
         return
     arrays = features[0, : dataset.num_rows].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
     errors = probe_state(*arrays, layout_of(TASKS.named(dataset.task)))
     tell_probe(run.path / "encoder", errors)
-    write_json(run.path / "probe.json", errors)
+    write_json(run.path / PROBE_FILE, errors)
 
 
 class FinetuneTrainer:
@@ -186,7 +187,7 @@ class FinetuneTrainer:
         if self.path:
             self.reference.with_path_error(self.path.action_error(self.algorithm.policy)).write(run.path)
         FeatureFile(run.path, run.inputs).remove()
-        write_json(run.path / "render.json", render_info(self.card.task))
+        write_json(run.path / RENDER_FILE, render_info(self.card.task))
         run.finish(updates=self.step)
 
     def state(self) -> dict[str, Any]:
@@ -208,8 +209,8 @@ def _keep_encoder(config: FinetuneConfig, run: Path) -> None:
     source = config.encoder
     if all((run / name).exists() for name in FILES_OF_RUN):
         return
-    timing = source.parent / "timing.json"
+    timing = source.parent / TIMING_FILE
     if timing.exists():
-        write_json(run / "pretrain_timing.json", read_json(timing))
+        write_json(run / PRETRAIN_TIMING_FILE, read_json(timing))
     changes = config.memory.encoder_changes if isinstance(config.memory, HistoryOptions) else {}
     copy_encoder(source, run / "encoder", changes)

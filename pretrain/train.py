@@ -17,6 +17,7 @@ from vd4rl_pomdp.errors import UserError, refuse_outside
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, EncoderCard, save_encoder
 from vd4rl_pomdp.objective import Objective
 from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.runs import METRICS_FILE
 from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.loop import training
@@ -212,6 +213,6 @@ def _card(config: PretrainConfig, task: str, dataset: Dataset, run: RunFolder) -
 
 def _last_action_loss(run: RunFolder) -> float | None:
     """Mean of the last tenth of the rows that have one; each row is a mean, and all count the same."""
-    rows = read_metrics(run.path / "metrics.jsonl")
+    rows = read_metrics(run.path / METRICS_FILE)
     losses = [row["action_loss"] for row in rows if "action_loss" in row]
     return sum(last) / len(last) if (last := losses[-max(1, len(losses) // 10) :]) else None

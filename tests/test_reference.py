@@ -12,7 +12,8 @@ from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies import load_actor
 from vd4rl_pomdp.policies.actor import ASSETS
-from vd4rl_pomdp.reference import FILE, Reference, summarise
+from vd4rl_pomdp.reference import Reference, summarise
+from vd4rl_pomdp.runs import REFERENCE_FILE
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 EXPERT, MEDIUM = (load_actor("walker_walk", quality).sha256 for quality in ("expert", "medium"))
@@ -73,8 +74,8 @@ def test_a_reference_is_kept_in_the_run_and_an_actor_that_ships_no_more_is_unkno
 )
 def test_a_damaged_reference_is_one_line(tmp_path, change):
     Reference(1.0, ACTOR, 0.5).write(tmp_path)
-    whole = json.loads((tmp_path / FILE).read_text())
-    (tmp_path / FILE).write_text(json.dumps({} if change is None else whole | change))
+    whole = json.loads((tmp_path / REFERENCE_FILE).read_text())
+    (tmp_path / REFERENCE_FILE).write_text(json.dumps({} if change is None else whole | change))
     with pytest.raises(UserError, match=r"reference\.json: is damaged") as caught:
         Reference.read(Path(tmp_path))
     assert "\n" not in str(caught.value)

@@ -22,6 +22,7 @@ from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
 from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.reference import Reference, action_error
+from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, LABELS_FILE
 from vd4rl_pomdp.runs.episodes import LABELS, read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.run import remedy
@@ -238,7 +239,7 @@ class EvaluatedRun:
 
 def evaluations_of(run: Path) -> list[dict[str, Any]]:
     """The rows of a fine-tuning run's own evaluations; UserError for a folder without any."""
-    if rows := read_episodes(run / "episodes.csv"):
+    if rows := read_episodes(run / EPISODES_FILE):
         return rows
     raise UserError(f"{run}: holds no evaluated run; name a folder that `vd4rl-pomdp finetune` wrote")
 
@@ -263,10 +264,10 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
     evaluated = evaluations_of(run)
-    labels = read_json(run / "labels.json")
+    labels = read_json(run / LABELS_FILE)
     missing = [name for name in LABELS if not isinstance(labels.get(name), str | int)]
     if missing:
-        raise UserError(f"{run / 'labels.json'}: has no {missing[0]!r}; {remedy(run)}")
+        raise UserError(f"{run / LABELS_FILE}: has no {missing[0]!r}; {remedy(run)}")
     card = load_encoder(run / "encoder")[1]
     task = TASKS.named(card.task)
     chosen = own_and_none(CorruptionConfig.fill(card.corruption))
@@ -293,7 +294,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
 
 def _length(run: Path, task: Task) -> int:
     """Most decisions in an episode of a run's evaluations; the task's where the run does not tell."""
-    file = run / "config.json"
+    file = run / CONFIG_FILE
     config = read_json(file).get("config") if file.exists() else None
     told = config.get("eval_length") if isinstance(config, dict) else None
     return min(told, task.decisions) if isinstance(told, int) else task.decisions

@@ -13,10 +13,9 @@ import numpy as np
 from vd4rl_pomdp.data.dataset import Dataset
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import shipped_file
+from vd4rl_pomdp.runs import REFERENCE_FILE
 from vd4rl_pomdp.runs.files import read_json, write_json
 
-FILE = "reference.json"
-"""Where a fine-tuning run keeps its reference."""
 REACHED = 0.8
 """An episode above this share of the data's mean return counts as one that does what the data do."""
 
@@ -40,7 +39,7 @@ class Reference:
     @classmethod
     def read(cls, run: Path) -> Self:
         """What a run keeps, nothing known if it began before runs kept any; raises UserError for a damaged file."""
-        path = run / FILE
+        path = run / REFERENCE_FILE
         return cls.parse(path, read_json(path)) if path.exists() else cls()
 
     @classmethod
@@ -58,7 +57,7 @@ class Reference:
 
     def write(self, run: Path) -> None:
         """Keep it in a run's folder."""
-        write_json(run / FILE, asdict(self))
+        write_json(run / REFERENCE_FILE, asdict(self))
 
     @property
     def actor_file(self) -> Path | None:

@@ -17,6 +17,7 @@ from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.navigation.methods import UNTRAINED
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, EncoderCard, save_encoder
 from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.runs import METRICS_FILE, NAVIGATION_FILE
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import jsonable, write_json
 from vd4rl_pomdp.runs.memory import telling_memory
@@ -25,7 +26,7 @@ from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.seeding import seed_networks
 
-RESULTS = ("results.json", "trajectory.csv", *FILES_OF_RUN)
+RESULTS = (NAVIGATION_FILE, "trajectory.csv", *FILES_OF_RUN)
 """What a finished run holds."""
 
 
@@ -54,7 +55,7 @@ def _train(config: NavigationConfig) -> RunFolder:
 def _conclude(run: RunFolder, trainer: NavigationTrainer) -> None:
     """Measure, and write what is kept of a run."""
     config, data, trained = trainer.config, trainer.data, run.seconds
-    probe, rows = measure(trainer, run.path / "metrics.jsonl")
+    probe, rows = measure(trainer, run.path / METRICS_FILE)
     write_trajectory(run.path / "trajectory.csv", trainer, probe)
     card = EncoderCard(
         method=config.method,
@@ -70,5 +71,5 @@ def _conclude(run: RunFolder, trainer: NavigationTrainer) -> None:
     frames = trainer.step * config.batch_size * config.window
     save_encoder(run.path / "encoder", trainer.objective.encoder, card, frames)
     record = {"maze": data.maze.name, "set": data.dataset.fingerprint, "command": shlex.join(command_of(config))}
-    write_json(run.path / "results.json", record | {"rows": rows})
+    write_json(run.path / NAVIGATION_FILE, record | {"rows": rows})
     run.finish(seconds=round(trained, 2), steps=trainer.step, frames=frames, total_seconds=round(run.seconds, 2))

@@ -10,6 +10,7 @@ import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command, run_stage
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, show
+from vd4rl_pomdp.runs import EPISODES_FILE
 
 
 def _pretrain(words: Arguments, program: str) -> None:
@@ -25,7 +26,7 @@ def _finetune(words: Arguments, program: str) -> None:
     from finetune.train import finetune
 
     run = finetune(parse_stage(FinetuneConfig, words, program))
-    print(f"episodes: {run.path / 'episodes.csv'}")
+    print(f"episodes: {run.path / EPISODES_FILE}")
 
 
 @dataclass(frozen=True)

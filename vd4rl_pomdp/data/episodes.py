@@ -7,9 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from vd4rl_pomdp.data.format import PLAN, shard_number
+from vd4rl_pomdp.data.format import PLAN, read_plan, shard_number
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.types import StepType
 
 
@@ -62,7 +61,7 @@ def _agree(first: Path, expected: Mapping[str, np.ndarray], shard: Path, part: M
 
 def check_count(path: Path, episodes: int) -> None:
     """Refuse a collected set that lacks episodes; a set of other makers says nothing of their number."""
-    plan = read_json(path / PLAN) if (path / PLAN).is_file() else {}
+    plan = read_plan(path)
     planned = plan.get("episodes", plan.get("trajectories", episodes))  # as its command calls them
     if episodes != planned:
         raise UserError(

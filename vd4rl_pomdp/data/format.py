@@ -24,7 +24,7 @@ import h5py
 import numpy as np
 
 from vd4rl_pomdp.errors import UserError, disk_error
-from vd4rl_pomdp.runs.files import write_bytes
+from vd4rl_pomdp.runs.files import read_json, write_bytes
 from vd4rl_pomdp.runs.reading import parse_json, regular
 from vd4rl_pomdp.tasks import FRAME_SIZES
 from vd4rl_pomdp.types import StepType
@@ -46,6 +46,11 @@ _REPAIR = "download or collect it again"
 def is_shard_name(name: str) -> bool:
     """Whether a file of this name is a shard: hidden ones are none."""
     return not name.startswith(".") and name.lower().endswith(SUFFIXES)
+
+
+def read_plan(folder: Path) -> dict[str, Any]:
+    """How a set was collected, as its collection.json has it; empty for sets of other makers."""
+    return read_json(folder / PLAN) if (folder / PLAN).is_file() else {}
 
 
 def shard_paths(folder: Path) -> list[Path]:

@@ -19,6 +19,7 @@ from vd4rl_pomdp.navigation.measures import refitted_error
 from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.report.measures import PROBES
 from vd4rl_pomdp.report.stats import mean_and_error
+from vd4rl_pomdp.runs import EPISODES_FILE, PROBE_FILE
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.outputs import refuse_kept
@@ -98,10 +99,10 @@ def conclusion(jobs: list[Job]) -> Iterator[str]:
     yield "linear probe in % of a standard deviation; 60 to 80 knows nothing), and the"
     yield "return (mean ± standard error over episodes):"
     for settings, folder in policies:
-        rows = read_episodes(folder / "episodes.csv")
+        rows = read_episodes(folder / EPISODES_FILE)
         last = max(row["step"] for row in rows)
         returns = [row["return"] for row in rows if row["step"] == last]
-        probe = read_json(folder / "probe.json")
+        probe = read_json(folder / PROBE_FILE)
         known = ", ".join(f"{probe[name]:.0f}" for name in PROBES)
         yield f"  {settings['method']:<8}{known:<10}{mean_and_error(returns)} (n = {len(returns)})"
     yield "One seed each: with another, what is known hardly changes, and returns may end"

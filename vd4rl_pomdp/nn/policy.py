@@ -14,7 +14,7 @@ from vd4rl_pomdp.nn.heads import ExactLinear, mlp
 from vd4rl_pomdp.runs.files import read_json, write_bytes, write_json
 from vd4rl_pomdp.runs.reading import read_tensors, regular
 
-_WEIGHTS = "model.safetensors"
+_WEIGHTS, _SHAPE = "model.safetensors", "config.json"
 _STEP = "step"
 """Metadata of the weights' file."""
 
@@ -68,13 +68,13 @@ class Policy(nn.Module):
             folder.mkdir(parents=True, exist_ok=True)
         weights = {k: v.contiguous().cpu() for k, v in self.state_dict().items()}
         write_bytes(folder / _WEIGHTS, save(weights, None if step is None else {_STEP: str(step)}))
-        write_json(folder / "config.json", self.shape)
+        write_json(folder / _SHAPE, self.shape)
 
 
 def load_policy(folder: Path) -> Policy:
     """Read a policy folder; raises UserError if it is missing or damaged."""
     try:
-        policy = Policy(**read_json(folder / "config.json"))
+        policy = Policy(**read_json(folder / _SHAPE))
         policy.load_state_dict(read_tensors(folder / _WEIGHTS))
     except (FileNotFoundError, SafetensorError, RuntimeError, TypeError) as error:
         raise _no_policy(folder, error) from error

@@ -30,7 +30,8 @@ CARD_SEED = 10_000
 """Episode i of an actor's card starts from environment seed CARD_SEED + i."""
 NETWORKS = "networks.safetensors"
 CURVE_COLUMNS = ("decisions", "return_mean")
-PROGRESS = ("config.json", "curve.csv", NETWORKS)
+SETTINGS, CURVE = "config.json", "curve.csv"
+PROGRESS = (SETTINGS, CURVE, NETWORKS)
 """Files of a run from which another one can start."""
 LADDER_RUNGS = 15
 """Snapshots in a ladder, at most: the actors of all tasks together stay under 10 MB."""
@@ -55,14 +56,14 @@ def read_curve(run: Path) -> list[tuple[int, float]]:
     """Learning curve of a run: (decisions, mean return) rows; raises UserError if it is damaged."""
     steps, mean = CURVE_COLUMNS
     try:
-        with regular(run / "curve.csv").open(newline="", encoding="utf-8") as file:
+        with regular(run / CURVE).open(newline="", encoding="utf-8") as file:
             curve = [(int(row[steps]), float(row[mean])) for row in csv.DictReader(file)]
     except UserError:
         raise
     except (KeyError, TypeError, ValueError, csv.Error) as error:
-        raise UserError(f"{run / 'curve.csv'}: is no learning curve ({error}); take another copy of the run") from error
+        raise UserError(f"{run / CURVE}: is no learning curve ({error}); take another copy of the run") from error
     if not all(math.isfinite(mean) for _, mean in curve):
-        raise UserError(f"{run / 'curve.csv'}: a return in it is not finite; take another copy of the run")
+        raise UserError(f"{run / CURVE}: a return in it is not finite; take another copy of the run")
     return curve
 
 
@@ -84,10 +85,10 @@ def export_run(run: Path, out: Path) -> dict[str, Path]:
     Returns:
         The files by quality: `expert`, `medium`, `replay`.
     """
-    if not (run / "curve.csv").exists() or not (run / "config.json").exists():
+    if not (run / CURVE).exists() or not (run / SETTINGS).exists():
         raise UserError(f"{run}: is not the folder of a policy run with a snapshot; `policy train` makes one")
     refuse_no_folder(out)
-    config = read_json(run / "config.json")
+    config = read_json(run / SETTINGS)
     played = str(config.get("task"))
     task = TASKS.named(played)
     if out.resolve() != run.resolve():
@@ -115,8 +116,8 @@ def export_run(run: Path, out: Path) -> dict[str, Path]:
 
 def _refuse_other(out: Path, task: str) -> None:
     """Raise UserError for a folder to export to that holds anything but an earlier export for the same task."""
-    exported = (out / "curve.csv").is_file() and not (out / "snapshots").exists()
-    if exported and read_json(out / "config.json").get("task") == task:
+    exported = (out / CURVE).is_file() and not (out / "snapshots").exists()
+    if exported and read_json(out / SETTINGS).get("task") == task:
         refuse_inside(out)
     else:
         refuse_foreign(out, f"exported policy of {task}")

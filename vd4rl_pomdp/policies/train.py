@@ -23,9 +23,11 @@ from vd4rl_pomdp.policies.actor import Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
 from vd4rl_pomdp.policies.export import (
     CARD_SEED,
+    CURVE,
     CURVE_COLUMNS,
     NETWORKS,
     PROGRESS,
+    SETTINGS,
     episode_returns,
     export_run,
     exported_actors,
@@ -66,8 +68,8 @@ def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None]
     with owned(config.out) as owner:
         _check_folder(config)  # another process may have begun it since
         model = learner.build(config, task)
-        if not (config.out / "config.json").exists():
-            write_json(config.out / "config.json", _settings(config))
+        if not (config.out / SETTINGS).exists():
+            write_json(config.out / SETTINGS, _settings(config))
         _learn(model, config, owner, on_progress)
         return export_run(config.out, config.out)
 
@@ -136,7 +138,7 @@ def _settings(config: PolicyConfig) -> dict[str, Any]:
 
 def _check_folder(config: PolicyConfig) -> None:
     """Raise UserError for a folder that holds a run with other settings, or something else."""
-    settings, path = _settings(config), config.out / "config.json"
+    settings, path = _settings(config), config.out / SETTINGS
     if path.exists():
         stored = read_json(path)
         if stored.get("format", 1) != FORMAT:
@@ -159,7 +161,7 @@ def _check_start(config: PolicyConfig, start: Path) -> None:
     missing = [name for name in PROGRESS if not (start / name).exists()]
     if missing:
         raise UserError(f"{start}: has no {' and no '.join(missing)}; --start-from takes the folder of a policy run")
-    task = read_json(start / "config.json").get("task")
+    task = read_json(start / SETTINGS).get("task")
     if task != config.task:
         raise UserError(f"{start}: is a run of {task}, not of {config.task}")
     if not (curve := read_curve(start)):
@@ -199,15 +201,15 @@ def _record(run: Path, actor: Actor, decisions: int, mean: float) -> None:
 
 def _curve(run: Path) -> list[tuple[int, float]]:
     """What a run has of its curve; empty before the first evaluation."""
-    return read_curve(run) if (run / "curve.csv").exists() else []
+    return read_curve(run) if (run / CURVE).exists() else []
 
 
 def _write_curve(run: Path, curve: list[tuple[int, float]]) -> None:
     rows = ({"decisions": step, "return_mean": f"{mean:.3f}"} for step, mean in curve)
-    write_csv(run / "curve.csv", CURVE_COLUMNS, rows)
+    write_csv(run / CURVE, CURVE_COLUMNS, rows)
 
 
 def _forget_newer(run: Path, decisions: int) -> None:
     """Drop what a cut run wrote into its curve after its last checkpoint."""
-    if (run / "curve.csv").exists():
+    if (run / CURVE).exists():
         _write_curve(run, [row for row in read_curve(run) if row[0] <= decisions])

@@ -13,11 +13,11 @@ import numpy as np
 
 from vd4rl_pomdp.corruptions import corruption_settings
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.reference import FILE as REFERENCE
 from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.variants import DATA, Parts, Settings, differences, of_sets, read_settings
 from vd4rl_pomdp.results import Result, find_results
+from vd4rl_pomdp.runs import REFERENCE_FILE
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.reading import regular
 
@@ -274,7 +274,7 @@ def _load(result: Result) -> LoadedRun:
 
 def _reference(result: Result) -> Reference:
     stored = result.files.get("reference")
-    return Reference() if stored is None else Reference.parse(result.path / REFERENCE, stored)
+    return Reference() if stored is None else Reference.parse(result.path / REFERENCE_FILE, stored)
 
 
 def _representation(result: Result) -> dict[str, float | None]:

@@ -19,6 +19,7 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
 from vd4rl_pomdp.runs.episodes import COLUMNS, LABELS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_csv
 from vd4rl_pomdp.runs.identity import identity
@@ -28,13 +29,9 @@ from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs.run import remedy
 from vd4rl_pomdp.runs.settings import settings_of
 
-RUNS, EPISODES = "runs.jsonl", "episodes.csv"
+RUNS = "runs.jsonl"
 RECORD, ENCODER = "config", "encoder"
-FILES = {
-    **{name: f"{name}.json" for name in (RECORD, "labels", "timing", "diverged", "machine", "render")},
-    **{name: f"{name}.json" for name in ("pretrain_timing", "probe", "reference", "results")},
-    ENCODER: f"{ENCODER}/config.json",
-}
+FILES = {Path(file).stem: file for file in RECORDS} | {ENCODER: f"{ENCODER}/{CONFIG_FILE}"}
 """A run's small files: the name of their content in runs.jsonl, and their place in the run folder."""
 
 
@@ -136,7 +133,7 @@ def read_run(folder: Path) -> Result:
     files = {name: read_json(folder / place) for name, place in FILES.items() if (folder / place).exists()}
     if ENCODER in files and not isinstance(files[ENCODER].get("pretrain"), dict):
         raise UserError(f"{folder / FILES[ENCODER]}: does not say how the encoder was pretrained; pretrain it again")
-    metrics, rows = read_metrics(folder / "metrics.jsonl"), _folder_rows(folder / EPISODES, "timing" in files)
+    metrics, rows = read_metrics(folder / METRICS_FILE), _folder_rows(folder / EPISODES_FILE, "timing" in files)
     step = max((int(row["step"]) for row in (*metrics, *rows)), default=0)
     with _whole(folder):
         losses = [(int(row["step"]), row["action_loss"]) for row in metrics if "action_loss" in row]
@@ -159,7 +156,7 @@ def _check_last_evaluation(run: Result) -> None:
     found = [row for row in run.rows if row["step"] == last and row["evaluated_under"] == row["corruption"]]
     if last is not None and episodes is not None and len(found) < episodes:
         what = f"{len(found)} of {episodes} episodes of the last evaluation"
-        raise UserError(f"{run.path / EPISODES}: has {what}; {remedy(run.path)}")
+        raise UserError(f"{run.path / EPISODES_FILE}: has {what}; {remedy(run.path)}")
 
 
 def _labels(run: Result) -> dict[str, Any]:
@@ -180,9 +177,9 @@ def read_results(folder: Path) -> list[Result]:
     """All runs of a results folder; raises UserError if it is none, or damaged."""
     path, by_run = folder / RUNS, dict[str, list[Row]]()
     lines = _lines(path)  # before the rows, which are written first: one that is written meanwhile lacks none
-    for row in read_episodes(folder / EPISODES):
+    for row in read_episodes(folder / EPISODES_FILE):
         if "id" not in row:
-            raise UserError(f"{folder / EPISODES}: has no column 'id'; it was not written beside {RUNS}")
+            raise UserError(f"{folder / EPISODES_FILE}: has no column 'id'; it was not written beside {RUNS}")
         by_run.setdefault(row["id"], []).append({name: _shared(row[name]) for name in COLUMNS})
     runs = [_parse(path, number, line, by_run) for number, line in enumerate(lines, 1)]
     if len({run.id for run in runs}) != len(runs):
@@ -214,7 +211,7 @@ def write_results(out: Path, runs: Iterable[Result]) -> None:
     runs = list(runs)
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
-    write_csv(out / EPISODES, ("id", *COLUMNS), ({"id": run.id} | row for run in runs for row in run.rows))
+    write_csv(out / EPISODES_FILE, ("id", *COLUMNS), ({"id": run.id} | row for run in runs for row in run.rows))
     with replacing_file(out / RUNS) as fresh, fresh.open("w", encoding="utf-8") as file:
         file.writelines(json.dumps(_object(run)) + "\n" for run in runs)
 
@@ -241,7 +238,9 @@ def _rows(path: Path, run: str, rows: dict[str, list[Row]], count: int) -> list[
     """The rows that a run had when its line was written: a cut writing may have added later ones."""
     mine = rows.get(run, [])
     if len(mine) < count:
-        raise UserError(f"{path.parent / EPISODES}: has {len(mine)} of {count} rows of run {run}; take another copy")
+        raise UserError(
+            f"{path.parent / EPISODES_FILE}: has {len(mine)} of {count} rows of run {run}; take another copy"
+        )
     return mine[:count]
 
 

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.results.folder import RUNS, Result, read_results, read_run, write_results
+from vd4rl_pomdp.runs import CONFIG_FILE
 from vd4rl_pomdp.runs.files import files_below, read_json
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.ownership import owned
@@ -43,7 +44,7 @@ def _found(paths: Sequence[Path], but: Path | None) -> Iterator[Result]:
     for path in paths:
         if not path.exists():
             raise UserError(f"{path}: no such folder")
-    files = [p for path in paths for p in files_below(path, "config.json")]
+    files = [p for path in paths for p in files_below(path, CONFIG_FILE)]
     yield from (read_run(file.parent) for file in dict.fromkeys(files) if "stage" in read_json(file))
     places = [place for path in paths for place in _outermost(path)]
     for place in dict.fromkeys(places):

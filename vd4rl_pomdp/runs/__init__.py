@@ -2,3 +2,14 @@
 
 FORMAT = 3
 """Version of the content of run folders and checkpoints and of the random streams; only runs of this one can go on."""
+
+CONFIG_FILE, METRICS_FILE, EPISODES_FILE = "config.json", "metrics.jsonl", "episodes.csv"
+LABELS_FILE, MACHINE_FILE, RENDER_FILE, PROBE_FILE = "labels.json", "machine.json", "render.json", "probe.json"
+REFERENCE_FILE, NAVIGATION_FILE, DIVERGED_FILE = "reference.json", "results.json", "diverged.json"
+PRETRAIN_TIMING_FILE, TIMING_FILE = "pretrain_timing.json", "timing.json"
+"""Names of a run's files; the last is written at its end, and marks it as finished."""
+RECORDS = (
+    *(CONFIG_FILE, LABELS_FILE, TIMING_FILE, DIVERGED_FILE, MACHINE_FILE, RENDER_FILE),
+    *(PRETRAIN_TIMING_FILE, PROBE_FILE, REFERENCE_FILE, NAVIGATION_FILE),
+)
+"""Those that a results folder keeps whole, in its order."""

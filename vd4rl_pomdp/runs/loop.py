@@ -8,7 +8,7 @@ from typing import Any, Protocol
 
 from torch import Tensor, nn
 
-from vd4rl_pomdp.runs import interrupt
+from vd4rl_pomdp.runs import METRICS_FILE, interrupt
 from vd4rl_pomdp.runs.checkpoint import State
 from vd4rl_pomdp.runs.metrics import Means, MetricsLog
 from vd4rl_pomdp.runs.progress import ProgressLine
@@ -110,7 +110,7 @@ def training(
         means.load_state_dict(state["means"])
 
     run.restore(restore)
-    log = MetricsLog(run.path / "metrics.jsonl", learner.step, open_sinks(run, learner.step, labels, card or {}))
+    log = MetricsLog(run.path / METRICS_FILE, learner.step, open_sinks(run, learner.step, labels, card or {}))
     with closing(log), ProgressLine(title, total, unit, learner.step) as progress, interrupt.deferred():
         try:
             yield Loop(run, learner, means, total, log, progress)

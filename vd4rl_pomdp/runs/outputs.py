@@ -12,6 +12,7 @@ import h5py
 
 from vd4rl_pomdp.data.format import FRAMES_KEY, PLAN, is_shard_name
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs import CONFIG_FILE
 from vd4rl_pomdp.runs.reading import parse_json
 
 _ROWS = {FRAMES_KEY, "action", "reward", "step_type"}
@@ -47,7 +48,7 @@ def refuse_foreign(out: Path, what: str, *marks: str) -> None:
 
 def kept_in(folder: Path) -> str | None:
     """What a folder keeps: "a run", "a policy", "an encoder", "a data set", or None for nothing of the kind."""
-    config = folder / "config.json"
+    config = folder / CONFIG_FILE
     if config.is_file():
         if (folder / "model.safetensors").is_file():
             return "an encoder"

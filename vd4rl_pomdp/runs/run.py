@@ -13,31 +13,24 @@ from pathlib import Path
 from types import TracebackType
 from typing import Any, Self
 
-from vd4rl_pomdp.data.format import PLAN
+from vd4rl_pomdp.data.format import read_plan
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.registry import origins
-from vd4rl_pomdp.runs import FORMAT
+from vd4rl_pomdp.runs import CONFIG_FILE, DIVERGED_FILE, FORMAT, MACHINE_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, State, fitting, pack, unpack
 from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_json
 from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.runs.provenance import CONTINUED, command, git_commit, machine, versions
 from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS
 
-DIVERGED_FILE = "diverged.json"
-
 
 def remedy(folder: Path) -> str:
     """What to do about a result of a finished run that is lost or damaged."""
     return (
-        f"put it back, or remove {folder / 'timing.json'} and start the run's command again: it goes on from the last "
+        f"put it back, or remove {folder / TIMING_FILE} and start the run's command again: it goes on from the last "
         "checkpoint and writes it anew"
     )
-
-
-def collection_of(data: Path) -> dict[str, Any]:
-    """How a set was collected, which says more than its fingerprint where it is not at hand; empty for foreign sets."""
-    return read_json(data / PLAN) if (data / PLAN).exists() else {}
 
 
 class RunFolder:
@@ -72,7 +65,7 @@ class RunFolder:
 
     def _check(self) -> None:
         """Raise UserError if the folder holds anything but this run."""
-        file = self.path / "config.json"
+        file = self.path / CONFIG_FILE
         stored = read_json(file) if file.exists() else {}
         if "stage" not in stored:
             if holds_anything(self.path):
@@ -115,21 +108,21 @@ class RunFolder:
         return self
 
     def _begin(self) -> None:
-        if not (self.path / "config.json").exists():
+        if not (self.path / CONFIG_FILE).exists():
             record = {"format": FORMAT, "stage": self.stage, "config": self.config, "inputs": self.inputs}
             origin = {"versions": versions(), "git_commit": git_commit(), "command": command()}
-            origin |= {"plugins": origins(self.config), "collection": collection_of(Path(self.config["data"]))}
-            write_json(self.path / "config.json", record | origin)
+            origin |= {"plugins": origins(self.config), "collection": read_plan(Path(self.config["data"]))}
+            write_json(self.path / CONFIG_FILE, record | origin)
         (self.path / DIVERGED_FILE).unlink(missing_ok=True)
         self._keep_machine()
 
     def _keep_machine(self) -> None:
         """Record the hardware; of a run that goes on, that, commit and versions where they are others by now."""
-        path, now = self.path / "machine.json", machine(self.config.get("device", "auto"))
+        path, now = self.path / MACHINE_FILE, machine(self.config.get("device", "auto"))
         if not path.exists():
             write_json(path, now)
             return
-        told, record = read_json(path), read_json(self.path / "config.json")
+        told, record = read_json(path), read_json(self.path / CONFIG_FILE)
         parts = told.pop(CONTINUED, [])
         if not isinstance(parts, list):
             raise UserError(
@@ -148,7 +141,7 @@ class RunFolder:
     @property
     def finished(self) -> bool:
         """Whether the run has come to its end."""
-        return (self.path / "timing.json").exists()
+        return (self.path / TIMING_FILE).exists()
 
     @property
     def seconds(self) -> float:
@@ -181,4 +174,4 @@ class RunFolder:
         """Mark the run as done, keeping its wall-clock seconds and the last checkpoint."""
         self.require_owner()
         self._checkpoints.prune(1)
-        write_json(self.path / "timing.json", {"seconds": round(self.seconds, 2)} | more)
+        write_json(self.path / TIMING_FILE, {"seconds": round(self.seconds, 2)} | more)

@@ -9,6 +9,7 @@ from typing import Any
 
 from vd4rl_pomdp.nn.encoder_folder import CONFIG
 from vd4rl_pomdp.results import Result, read_results
+from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.files import Row, files_below, read_json
 from vd4rl_pomdp.runs.identity import recipe
 from vd4rl_pomdp.runs.settings import settings_of
@@ -98,7 +99,7 @@ def _kept(run: Result) -> FoundRun:
 
 def runs_below(out: Path) -> Iterator[FoundRun]:
     """Every run below a folder; UserError for a damaged record."""
-    for path in files_below(out, "config.json"):
+    for path in files_below(out, CONFIG_FILE):
         record = read_json(path)
         if "stage" in record and isinstance(record.get("config"), dict) and "seed" in record["config"]:
             yield _found(path.parent, record)
@@ -106,11 +107,11 @@ def runs_below(out: Path) -> Iterator[FoundRun]:
 
 def run_at(folder: Path) -> FoundRun:
     """The run of a folder that holds one; UserError for a damaged record."""
-    return _found(folder, read_json(folder / "config.json"))
+    return _found(folder, read_json(folder / CONFIG_FILE))
 
 
 def _found(folder: Path, record: Row) -> FoundRun:
-    timing, encoder = folder / "timing.json", folder / "encoder" / CONFIG
+    timing, encoder = folder / TIMING_FILE, folder / "encoder" / CONFIG
     seconds = read_json(timing).get("seconds") if timing.exists() else None
     card = read_json(encoder).get("pretrain") if encoder.exists() else None
     return FoundRun(folder, record, _whole(card), seconds)

@@ -13,6 +13,7 @@ from vd4rl_pomdp.data.format import PLAN, RECORD
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import words_of
+from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.sweeps.found import FoundRuns, run_at
 from vd4rl_pomdp.sweeps.grid import GridCell
@@ -49,12 +50,12 @@ class Job:
         """Whether there is nothing left to do now; a run of another recipe that came into the folder does not count."""
         if self.done or self.section not in STAGES:
             return self.done or (self.folder / RECORD).is_file()
-        return (self.folder / "timing.json").is_file() and run_at(self.folder).recipe == self.recipe
+        return (self.folder / TIMING_FILE).is_file() and run_at(self.folder).recipe == self.recipe
 
     @property
     def begun(self) -> bool:
         """Whether something of it is there."""
-        mark = "config.json" if self.section in STAGES else PLAN
+        mark = CONFIG_FILE if self.section in STAGES else PLAN
         return (self.folder / mark).is_file()
 
 
