@@ -10,7 +10,7 @@ from control_table import probes_of, with_seeds
 from vd4rl_pomdp.report.gates import returns_of
 from vd4rl_pomdp.report.layout import number
 from vd4rl_pomdp.report.load import PROBES, LoadedRun, load_runs
-from vd4rl_pomdp.report.measures import known_mean
+from vd4rl_pomdp.report.measures import mean_if_known
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
@@ -79,9 +79,9 @@ def set_lines(runs: Sequence[LoadedRun], task: str, quality: str) -> Iterator[st
         last = [row for run in mine for row in run.last]
         episodes = [row["return"] for row in last]
         spread = f"{min(episodes):.0f} to {max(episodes):.0f}"
-        loop = number(known_mean(row["action_error"] for row in last), 3)
-        data = number(known_mean(run.reference.path_error for run in mine), 3)
-        probes = probes_of(method, [known_mean(run.representation[name] for run in mine) for name in PROBES])
+        loop = number(mean_if_known(row["action_error"] for row in last), 3)
+        data = number(mean_if_known(run.reference.path_error for run in mine), 3)
+        probes = probes_of(method, [mean_if_known(run.representation[name] for run in mine) for name in PROBES])
         yield (
             f"| `{method}` | {len(mine)} | {with_seeds(returns_of(mine).tolist())} | {spread} |"
             f" {_told(_of(here, method, CLEAN))} | {data}, {loop} | {probes} |"

@@ -107,6 +107,16 @@ def test_scores_are_as_trained_and_the_control_table_tells_of_both(tmp_path):
     assert re.findall(r"<td[^>]*>([^<]*)</td>", shown)[10:] == cells
 
 
+def test_a_mean_that_a_seed_does_not_know_is_not_told(tmp_path):
+    """It would stand beside a number of seeds that are not behind it."""
+    runs = [write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [30.0 + seed]}) for seed in (0, 1)]
+    evaluated_clean(runs[0], [400.0], (0.1, 0.2))
+    write_report(runs, tmp_path / "out")
+    with (tmp_path / "out" / "control.csv").open() as file:
+        (row,) = csv.DictReader(file)
+    assert (row["return"], row["clean_return"], row["seeds"]) == ("305.0", "", "2")
+
+
 @pytest.mark.parametrize(("method", "noted"), [("supervised+a", True), ("acro", False)])
 def test_a_probe_of_what_was_told_the_states_is_not_read_as_the_others(tmp_path, method, noted):
     """Its episodes are held out from the probe alone."""

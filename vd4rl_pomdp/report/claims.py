@@ -128,17 +128,24 @@ def _row(
 def _decisive(left: list[LoadedRun], others: list[LoadedRun]) -> Sides:
     """The comparison that decides a claim about every other method.
 
-    It is the one that refutes the claim with most, or else that with the method and variant that returns most, however
-    few its seeds: one that may be the best is not passed over for another that has more of them.
+    Of those with other methods and variants it is the one that refutes it with the highest return, or else that leaves
+    it open, however few its seeds: the claim holds where it holds against every one.
     """
     pairs = [pair for seeds in seeds_by_variant(others) if (pair := sides(left, seeds)).left]
     alike = [pair for pair in pairs if not pair.unlike]
-    refuted = [pair for pair in alike if _is_below(*difference(pair))]
-    return max(refuted or alike or pairs, key=lambda pair: returns_of(pair.right).mean(), default=Sides([], [], []))
+    refuted = [pair for pair in alike if _beyond(*difference(pair)) == FAILS]
+    doubted = [pair for pair in alike if _beyond(*difference(pair)) != HOLDS]
+    decisive = refuted or doubted or alike or pairs
+    return max(decisive, key=lambda pair: returns_of(pair.right).mean(), default=Sides([], [], []))
 
 
-def _is_below(above: float | None, error: float | None) -> bool:
-    return above is not None and error is not None and above < -STANDARD_ERRORS * error
+def _beyond(above: float | None, error: float | None) -> str:
+    """What a difference of means says of its left side being above."""
+    if above is None or error is None:
+        return FEW
+    if abs(above) <= STANDARD_ERRORS * error:
+        return OPEN
+    return HOLDS if above > 0 else FAILS
 
 
 def _at(run: LoadedRun, *place: str) -> bool:
@@ -166,10 +173,5 @@ def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
         return ""
     if unranked:
         return f"not judged: the setting {FAILED}"
-    if row["error"] is None:
-        return FEW
-    if _is_below(row["difference"], row["error"]):
-        return FAILS
-    if row["difference"] > STANDARD_ERRORS * row["error"]:
-        return HOLDS
-    return NOT_REFUTED if row["kind"] == "not below" else OPEN
+    found = _beyond(row["difference"], row["error"])
+    return NOT_REFUTED if found == OPEN and row["kind"] == "not below" else found

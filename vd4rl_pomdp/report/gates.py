@@ -146,13 +146,14 @@ def returns_of(runs: list[LoadedRun]) -> np.ndarray:
 def difference(compared: Sides) -> tuple[float | None, float | None]:
     """Mean return of the left side less that of the right one, and its standard error over seeds.
 
-    None where a side has no run, or settings differ; no error where a side has a single seed.
+    None where a side has no run, or settings differ; no error where a side has a single seed, or where no seed differs
+    from another: that returns are equal to the last digit says nothing of how far the next seed's would be.
     """
     if not compared.left or compared.unlike:
         return None, None
     best, floor = returns_of(compared.left), returns_of(compared.right)
     above = float(best.mean() - floor.mean())
-    if min(len(best), len(floor)) < 2:
+    if min(len(best), len(floor)) < 2 or np.ptp(best) == np.ptp(floor) == 0:
         return above, None
     return above, math.sqrt(best.var(ddof=1) / len(best) + floor.var(ddof=1) / len(floor))
 
@@ -178,7 +179,7 @@ def _verdict(row: Row, state: list[LoadedRun], acro: list[LoadedRun], differing:
     if differing:
         unknown.append(f"best and random have other {', '.join(differing)}")
     elif row["error"] is None:
-        unknown.append("best and random need two seeds each")
+        unknown.append("best and random need two seeds each that differ")
     elif row["above_random"] <= STANDARD_ERRORS * row["error"]:
         missed.append(f"best minus random is {row['above_random']:.0f}, within {STANDARD_ERRORS:g} standard errors")
     if missed:

@@ -54,11 +54,14 @@ def _run(run: LoadedRun, curve: list[Row]) -> Row:
 
 
 def representations(table: list[Row]) -> list[Row]:
-    """Means over the finished seeds of every condition in a table of runs: encoder, return, costs; and the gaps."""
+    """Means over the finished seeds of every condition in a table of runs: encoder, return, costs; and the gaps.
+
+    What a seed does not know is None.
+    """
     found = []
     for group, members in grouped(table, CONDITION):
         finished = [row for row in members if row["score"] is not None]
-        means = {name: known_mean(row[name] for row in finished) for name in _MEANS}
+        means = {name: mean_if_known(row[name] for row in finished) for name in _MEANS}
         states = in_words([row for row in members if row["score"] is None])
         found.append(dict(zip(CONDITION, group, strict=True)) | means | {"seeds": len(finished), "missing": states})
     return sorted(found, key=table_order)
@@ -72,7 +75,7 @@ def costs(table: list[Row]) -> list[Row]:
         row: Row = {"method": name, "runs": len(members)}
         for cost in COSTS:
             known = [member[cost] for member in members if member[cost] is not None]
-            row |= {cost: known_mean(known), f"{cost}_min": min(known, default=None)}
+            row |= {cost: mean_if_known(known), f"{cost}_min": min(known, default=None)}
             row[f"{cost}_max"] = max(known, default=None)
         found.append(row | {"machines": "; ".join(sorted({member["machine"] for member in members} - {""}))})
     return found
@@ -82,13 +85,13 @@ def control(runs: list[LoadedRun]) -> list[Row]:
     """What the policies of every condition do, beside the data they learned from: means over the finished seeds.
 
     Return, share of episodes above 80% of the data's return, and action error in closed loop are those of the last
-    evaluation: as trained, and under no corruption (`clean_`). What no seed knows is None.
+    evaluation: as trained, and under no corruption (`clean_`). What a seed does not know is None.
     """
     finished = [run for run in runs if run.rows and run.finished]
     measured = [run.named | _control(run) for run in finished]
     table = [
         dict(zip(CONDITION, group, strict=True))
-        | {name: known_mean(row[name] for row in members) for name in _CONTROL}
+        | {name: mean_if_known(row[name] for row in members) for name in _CONTROL}
         | {"seeds": len(members)}
         for group, members in grouped(measured, CONDITION)
     ]
@@ -104,7 +107,8 @@ def _control(run: LoadedRun) -> Row:
     return found
 
 
-def known_mean(values: Iterable[float | None]) -> float | None:
-    """Mean of the values that are known; None if none is."""
-    known = [value for value in values if value is not None]
-    return float(np.mean(known)) if known else None
+def mean_if_known(values: Iterable[float | None]) -> float | None:
+    """Mean of values, None if there is none or one is not known: it is told beside their number."""
+    told = list(values)
+    known = [value for value in told if value is not None]
+    return float(np.mean(known)) if known and len(known) == len(told) else None
