@@ -62,6 +62,18 @@ def test_a_taken_name_is_refused(registry):
         registry.register("own", "mine")
 
 
+def test_what_a_call_added_may_be_replaced_where_that_is_said(registry):
+    registry.register("mine", "first")
+    with pytest.raises(UserError, match="'mine' exists already: choose another name, or replace=True"):
+        registry.register("mine", "second")
+    registry.register("mine", "second", replace=True)
+    assert registry["mine"] == "second"
+    with pytest.raises(UserError, match=r"'own' exists already: choose another name$"):
+        registry.register("own", "second", replace=True)
+    with pytest.raises(UserError, match="is called 3: a name is a string"):
+        registry.register(3, "third")
+
+
 def test_a_part_of_another_kind_is_refused(registry):
     with pytest.raises(UserError, match="frame encoder 'three' is a int, not a string"):
         registry.register("three", 3)

@@ -161,9 +161,10 @@ def test_a_task_whose_name_no_file_can_have_is_not_registered(name):
 @pytest.mark.parametrize(
     ("numbers", "message"),
     [
-        ({"decisions": 0}, "task 'mine': its decisions is 0: it must be at least 1"),
-        ({"decisions": 2**20}, "task 'mine': its decisions is 1048576: it must be at least 1 and at most 1048575"),
-        ({"action_repeat": 0}, "task 'mine': its action_repeat is 0: it must be at least 1"),
+        ({"decisions": 0}, "task 'mine': its decisions is 0: it must be an integer from 1"),
+        ({"decisions": 2**20}, "task 'mine': its decisions is 1048576: it must be an integer from 1 to 1048575"),
+        ({"action_repeat": 0}, "task 'mine': its action_repeat is 0: it must be an integer from 1"),
+        ({"decisions": 20.5}, "task 'mine': its decisions is 20.5: it must be an integer from 1"),
         ({"score_divisor": 0.0}, "task 'mine': its score_divisor is 0.0: it must be a positive number"),
         ({"score_divisor": -10.0}, "its score_divisor is -10.0: it must be a positive number"),
         ({"score_divisor": np.nan}, "its score_divisor is nan: it must be a positive number"),

@@ -1,6 +1,10 @@
 """Which representations survive partial observability in offline visual reinforcement learning."""
 
 from importlib.metadata import PackageNotFoundError, version
+from typing import TYPE_CHECKING
+
+if TYPE_CHECKING:
+    from vd4rl_pomdp.data import open_dataset
 
 try:
     __version__ = version("vd4rl-pomdp")

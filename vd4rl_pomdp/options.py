@@ -32,12 +32,26 @@ class Options:
 
     def check(self) -> None:
         """Raise UserError for a value that cannot work, here or in options within."""
+        _refuse_types(self)
         for kind in type(self).__mro__:
             refuse_outside(self, **vars(kind).get("limits", {}))
         check_options(self)
 
 
 NO_OPTIONS = Options()
+_KINDS = {bool: "True or False", int: "an integer", float: "a number", str: "a word"}
+
+
+def _refuse_types(options: Options) -> None:
+    """Raise UserError for a value of another type than its default's."""
+    for option in fields(options):
+        value, told = getattr(options, option.name), str(option.type)
+        kind = float if type(option.default) is int and "float" in told else type(option.default)
+        if kind not in _KINDS or (value is None and "None" in told):
+            continue
+        allowed = (int, float) if kind is float else kind
+        if not isinstance(value, allowed) or isinstance(value, bool) != (kind is bool):
+            raise UserError(f"{flag_of(option.name)} is {value!r}: it must be {_KINDS[kind]}")
 
 
 def flat(config: Any) -> dict[str, Any]:

@@ -31,6 +31,7 @@ def probe_error(features: np.ndarray, targets: np.ndarray, episode: np.ndarray) 
     Raises:
         UserError: one episode alone.
     """
+    episode = np.unique(episode, return_inverse=True)[1]
     if episode.max() == 0:
         raise UserError("a probe fits some episodes and is tested on others: one alone is too few")
     held_out = episode % HELD_OUT == HELD_OUT - 1 if episode.max() >= HELD_OUT - 1 else episode == episode.max()

@@ -160,8 +160,9 @@ def _refuse(name: str, task: Task) -> None:
     if name in ("", "..") or Path(name).name != name:
         raise UserError("sets have files and folders of this name, which it cannot be: choose one without '/'")
     for what, most in (("decisions", MOST_ROWS - 1), ("action_repeat", MOST)):
-        if not 1 <= (number := getattr(task, what)) <= most:
-            raise UserError(f"its {what} is {number}: it must be at least 1 and at most {most}")
+        number = getattr(task, what)
+        if not isinstance(number, int) or not 1 <= number <= most:
+            raise UserError(f"its {what} is {number!r}: it must be an integer from 1 to {most}")
     if not 0 < task.score_divisor < math.inf:
         raise UserError(f"its score_divisor is {task.score_divisor}: it must be a positive number")
 

@@ -6,7 +6,7 @@ import torch
 
 from finetune.algorithms import ALGORITHMS, BC, TD3BC, Loss
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.testing import check_algorithm
+from vd4rl_pomdp.testing import check_algorithm, check_corruption
 from vd4rl_pomdp.testing.algorithms import (
     CHECKS,
     a_batch_is_left_as_it_was,
@@ -25,6 +25,18 @@ from vd4rl_pomdp.testing.contract import run_check
 @pytest.mark.parametrize("name", ALGORITHMS)
 def test_an_algorithm_keeps_its_promises(name, check):
     run_check("algorithm", check, name)
+
+
+def test_checks_leave_the_callers_generators_alone():
+    torch.manual_seed(3)
+    np.random.seed(3)  # noqa: NPY002
+    expected = torch.rand(2), np.random.rand(2)  # noqa: NPY002
+    torch.manual_seed(3)
+    np.random.seed(3)  # noqa: NPY002
+    check_algorithm("bc")
+    check_corruption("patch")
+    assert torch.equal(torch.rand(2), expected[0])
+    np.testing.assert_array_equal(np.random.rand(2), expected[1])  # noqa: NPY002
 
 
 class Idle(BC):

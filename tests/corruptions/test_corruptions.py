@@ -29,6 +29,42 @@ def stacks(n: int = 64) -> torch.Tensor:
     return torch.randint(1, 256, (n, 9, 84, 84), generator=torch.Generator().manual_seed(0), dtype=torch.uint8)
 
 
+@pytest.mark.parametrize(
+    ("config", "message"),
+    [
+        (
+            CorruptionConfig(corruption="patch+zero_frames"),
+            r"make it by CorruptionConfig.of\('patch\+zero_frames', ...\)",
+        ),
+        (
+            CorruptionConfig("patch", "emision", (Patch(),)),
+            "--corruption-mode is 'emision': choose one of resample, emission",
+        ),
+        (CorruptionConfig.of("patch", patch_size=16.0), "--patch-size is 16.0: it must be an integer"),
+        (CorruptionConfig.of("patch", patch_size="16"), "--patch-size is '16': it must be an integer"),
+        (CorruptionConfig.of("patch", patch_shared="no"), "--patch-shared is 'no': it must be True or False"),
+        (CorruptionConfig.of("patch", patch_count=True), "--patch-count is True: it must be an integer"),
+    ],
+)
+def test_a_config_that_would_do_other_things_is_refused(dataset, config, message):
+    for made in (lambda: make_corruption(config), lambda: BatchCorruption(config, 0), lambda: View(dataset, config)):
+        with pytest.raises(UserError, match=message):
+            made()
+
+
+@pytest.mark.parametrize("key", [torch.arange(1), torch.arange(5), torch.arange(12).int(), torch.arange(12.0)])
+def test_every_stack_needs_a_key_of_its_own(key):
+    with pytest.raises(UserError, match=r"need int64 ones of shape \(12,\), one a stack"):
+        make_corruption("patch")(stacks(12), key)
+
+
+def test_a_view_takes_a_corruption_by_name_and_only_shifts_that_there_are(dataset):
+    shown = View(dataset, "patch+zero_frames").windows([0], 3)
+    assert torch.equal(shown.obs, View(dataset, CorruptionConfig.of("patch+zero_frames")).windows([0], 3).obs)
+    with pytest.raises(UserError, match="shared is 'windows': choose one of window, observation"):
+        View(dataset, shared="windows")
+
+
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory) -> Dataset:
     """Three short episodes of random pixels."""

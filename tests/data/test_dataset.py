@@ -1,3 +1,5 @@
+import pickle
+
 import h5py
 import numpy as np
 import pytest
@@ -163,6 +165,16 @@ def test_an_index_out_of_range_or_of_another_kind_is_refused(dataset, index):
         dataset.transitions(index)
     with pytest.raises(IndexError):
         dataset.windows(index, 2)
+
+
+def test_a_row_before_the_first_is_refused(dataset):
+    with pytest.raises(IndexError, match="row -1 is out of range"):
+        dataset.stacks(torch.tensor([0, -1]))
+
+
+def test_a_set_can_be_sent_to_other_processes(dataset):
+    there = pickle.loads(pickle.dumps(dataset))
+    assert torch.equal(there.windows([0, 7], 3).obs, dataset.windows([0, 7], 3).obs)
 
 
 def test_an_empty_index_gives_an_empty_batch(dataset):

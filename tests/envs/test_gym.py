@@ -20,6 +20,30 @@ def make(name, **arguments):
     return gymnasium.make(f"vd4rl_pomdp/{name}-v0", disable_env_checker=True, **arguments)
 
 
+@pytest.mark.parametrize("name", ["WalkerWalk", "MazeNoCurtain"])
+def test_an_action_of_another_shape_or_no_number_is_refused(name):
+    env = make(name)
+    env.reset(seed=0)
+    for action in (np.ones(1), np.ones(env.action_space.shape[0] + 1), np.full(env.action_space.shape, np.nan)):
+        with pytest.raises(UserError, match=f"is not one of {env.action_space.shape[0]} finite numbers"):
+            env.unwrapped.step(action)
+
+
+def test_what_is_shown_clean_is_a_copy():
+    env = make("WalkerWalk")
+    obs, info = env.reset(seed=0)
+    obs[:] = 0
+    assert info["clean"].any()
+
+
+def test_a_closed_environment_holds_no_simulator():
+    env = make("WalkerWalk").unwrapped
+    env.reset(seed=0)
+    for _ in range(2):
+        env.close()
+        assert env._env.env.physics._contexts is None
+
+
 @pytest.mark.parametrize("name", GYM_IDS)
 def test_every_id_passes_gymnasiums_checker(name):
     env = gymnasium.make(name, render_mode="rgb_array", disable_env_checker=True)

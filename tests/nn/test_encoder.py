@@ -45,6 +45,18 @@ def test_streaming_and_batch_encodings_agree(history: str, use_actions: bool, sp
             torch.testing.assert_close(z, whole[:, t], atol=1e-5, rtol=1e-4)
 
 
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"history": "GRU"}, "unknown history 'GRU': choose one of none, gru"),
+        ({"readout": "state+frame"}, r"unknown readout 'state\+frame': choose one of state, frame, frame\+state"),
+    ],
+)
+def test_what_would_be_another_encoder_is_refused(changes, message):
+    with pytest.raises(UserError, match=message):
+        Encoder(EncoderConfig(6, **changes))
+
+
 def test_observations_of_another_shape_are_refused():
     encoder, other = make("gru", True), window()
     for obs in (other.obs[..., :64, :64], other.obs[:, :, :3]):
@@ -93,7 +105,9 @@ def test_the_backward_gru_starts_at_each_windows_last_real_row():
 def test_an_encoder_folder_gives_back_the_same_encoder(tmp_path):
     encoder, batch = make("gru", True), window()
     save_encoder(tmp_path, encoder, CARD)
+    drawn = torch.get_rng_state()
     loaded, card = load_encoder(str(tmp_path), "walker_walk", 2)
+    assert torch.equal(torch.get_rng_state(), drawn), "loading draws nothing from the caller's generator"
     assert card == CARD
     with torch.no_grad():
         torch.testing.assert_close(loaded.encode(batch), encoder.encode(batch))

@@ -30,6 +30,26 @@ def square(job: int) -> int:
     return job * job
 
 
+NOTEBOOK = """
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs.workers import run_jobs
+from tests.runs.test_workers import square
+class Job(int):
+    pass
+try:
+    list(run_jobs(square, [Job(1), Job(2)], 2))
+except UserError as error:
+    print(error)
+"""
+
+
+def test_a_job_that_workers_cannot_read_is_told_as_that():
+    """What a notebook or `python -c` defines is not there in another process."""
+    run = subprocess.run([sys.executable, "-c", NOTEBOOK], capture_output=True, text=True, check=True)
+    assert "a job cannot be sent to a worker process (Can't get attribute 'Job'" in run.stdout
+    assert "or use --workers 1" in run.stdout
+
+
 @pytest.mark.parametrize("workers", [1, 2])
 def test_results_come_in_order(workers):
     assert list(run_jobs(square, range(5), workers)) == [0, 1, 4, 9, 16]

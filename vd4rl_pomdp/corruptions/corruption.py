@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
-from typing import Any, ClassVar, Literal, Protocol, Self
+from typing import Any, ClassVar, Literal, Protocol, Self, get_args
 
 import torch
 from torch import Tensor
@@ -165,6 +165,17 @@ class CorruptionConfig(Options):
         stages = tuple(kind.fill(values) for kind in _kinds(values.get("corruption", "none")))
         return cls(**{name: values[name] for name in _OWN if name in values}, stages=stages)
 
+    def check(self) -> None:
+        """Raise UserError for a mode that there is not, for stages that are not the name's, or for their options."""
+        if self.corruption_mode not in get_args(Mode):
+            raise UserError(f"--corruption-mode is {self.corruption_mode!r}: choose one of {', '.join(get_args(Mode))}")
+        if [type(stage) for stage in self.stages] != _kinds(self.corruption):
+            raise UserError(
+                f"this config has other stages than {self.corruption!r} names, so it would do other things: make it by "
+                f"CorruptionConfig.of({self.corruption!r}, ...)"
+            )
+        super().check()
+
 
 _OWN = ("corruption", "corruption_mode")
 NO_CORRUPTION = CorruptionConfig()
@@ -194,6 +205,9 @@ class Corruption:
 
         Returns:
             uint8 like `obs`; `obs` itself where there is nothing to do.
+
+        Raises:
+            UserError: keys of another shape or dtype.
         """
         if self._nothing:
             return obs
@@ -203,6 +217,11 @@ class Corruption:
         """The same in place, for a contiguous batch that is the caller's own."""
         if self._nothing:
             return obs
+        if key.shape != obs.shape[:-3] or key.dtype != torch.int64:
+            raise UserError(
+                f"keys are {key.dtype} of shape {tuple(key.shape)}: {tuple(obs.shape)} observations need int64 ones of "
+                f"shape {tuple(obs.shape[:-3])}, one a stack"
+            )
         stacks, key = obs.view(-1, obs.shape[-3] // _CHANNELS, _CHANNELS, *obs.shape[-2:]), key.reshape(-1)
         kept = self.kept(key, stacks.shape[1])
         if not self._zeroed:
@@ -253,7 +272,8 @@ class BatchCorruption:
     the streams of a run apart; under `emission` all of them share one, since a row always looks the same.
     """
 
-    def __init__(self, config: CorruptionConfig, seed: int, *name: str | int) -> None:
+    def __init__(self, config: CorruptionConfig | str, seed: int, *name: str | int) -> None:
+        config = CorruptionConfig.of(config) if isinstance(config, str) else config
         self._emission = config.corruption_mode == "emission"
         self.corruption = make_corruption(config)
         self.stream = KeyStream(stream_seed(seed, "corruption", *(["emission"] if self._emission else name)))

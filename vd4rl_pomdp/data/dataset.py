@@ -26,7 +26,7 @@ Observations = Callable[[Tensor], Tensor]
 """Observations (..., C, H, W) uint8 of (...,) int64 rows."""
 
 
-def open_dataset(path: Path | str, cache: Path | None = None) -> Dataset:
+def open_dataset(path: Path | str, cache: Path | str | None = None) -> Dataset:
     """Open a V-D4RL set: a folder of shards, or one shard.
 
     The first opening decodes the set into the store; later ones map it and take well under a second.
@@ -38,7 +38,7 @@ def open_dataset(path: Path | str, cache: Path | None = None) -> Dataset:
     Raises:
         UserError: the set is missing, empty, damaged, incomplete or of two frame sizes.
     """
-    return Dataset(Path(path), open_store(Path(path), cache))
+    return Dataset(Path(path), open_store(Path(path), Path(cache) if cache else None))
 
 
 class Dataset:
@@ -192,8 +192,10 @@ class Dataset:
         return frames.view(*rows.shape, self.frames.shape[1] * frame_stack, *self.frames.shape[2:])
 
     def stack_rows(self, rows: Tensor, frame_stack: int = FRAME_STACK) -> Tensor:
-        """Rows (..., frame_stack) int64 whose frames `stacks` puts together."""
+        """Rows (..., frame_stack) int64 whose frames `stacks` puts together; IndexError for a negative row."""
         require_positive(frame_stack=frame_stack)
+        if rows.device.type == "cpu" and (rows < 0).any():  # elsewhere to look would mean to wait
+            raise IndexError(f"row {int(rows.min())} is out of range for a set of {self.num_rows} rows")
         back = torch.arange(frame_stack - 1, -1, -1, device=rows.device)
         first = self.episode_start[self.episode[rows]]
         return torch.maximum(rows[..., None] - back, first[..., None])

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, get_args
 
 import torch
 from torch import Tensor
@@ -11,6 +11,7 @@ from vd4rl_pomdp import _shift
 from vd4rl_pomdp.augmentation import Sharing, random_shift
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream
 from vd4rl_pomdp.data.dataset import Dataset, Index
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.seeding import stream_seed
 from vd4rl_pomdp.tasks import FRAME_STACK
 from vd4rl_pomdp.types import Transitions, Windows
@@ -22,7 +23,7 @@ class View:
     def __init__(
         self,
         dataset: Dataset,
-        corruption: CorruptionConfig | None = None,
+        corruption: CorruptionConfig | str | None = None,
         shift: int = 0,
         seed: int = 0,
         *name: str | int,
@@ -33,13 +34,15 @@ class View:
 
         Args:
             dataset: the set; moving it to a device moves what the view shows.
-            corruption: what makes the observations partial; None for nothing.
+            corruption: what makes the observations partial, or its name; None for nothing.
             shift: largest random shift in pixels.
             seed: the run's seed.
             name: tells the views of a run apart: each draws from streams of its own.
             frame_stack: frames in an observation.
             shared: what one shift is shared by.
         """
+        if shared not in get_args(Sharing):
+            raise UserError(f"shared is {shared!r}: choose one of {', '.join(get_args(Sharing))}")
         self.dataset = dataset
         self.corruption = BatchCorruption(corruption or CorruptionConfig(), seed, *name)
         self.shifts = KeyStream(stream_seed(seed, "shift", *name))

@@ -64,6 +64,10 @@ class DMCEnv(PixelEnv):
         """Decisions a second of simulated time."""
         return 1 / (self.simulator.control_timestep() * self.task.action_repeat)
 
+    def close(self) -> None:
+        """Free the simulator and its OpenGL context."""
+        self.physics.free()
+
     def _begin(self, seed: int) -> None:
         self._random.seed(seed)
         self.simulator.reset()

@@ -11,7 +11,7 @@ import numpy as np
 from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption_fits
 from vd4rl_pomdp.envs import Info
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
-from vd4rl_pomdp.envs.pixels import Render
+from vd4rl_pomdp.envs.pixels import Render, checked_action
 from vd4rl_pomdp.errors import refuse_number
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_SIZES, FRAME_STACK, TASKS
 
@@ -58,8 +58,8 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._show(self._env.reset(self._draw(), self._corruption_seed, self._episode))
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """Apply one action for the action repeat; the reward is the sum."""
-        now = self._env.step(action)
+        """Apply one action for the action repeat; the reward is the sum. UserError for one of another shape, or NaN."""
+        now = self._env.step(checked_action(action, self._env.env.action_dim))
         obs, info = self._show(now)
         reward, terminated = now.time_step.reward, now.time_step.terminated
         return obs, reward, terminated, now.time_step.last and not terminated, info
@@ -68,13 +68,17 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         """The newest frame before corruption: (S, S, 3) uint8."""
         return self._frame
 
+    def close(self) -> None:
+        """Free the simulator and what it draws with; the environment cannot be used any more."""
+        self._env.env.close()
+
     def _draw(self) -> int:
         return int(self.np_random.integers(2**31))
 
     def _show(self, now: Observation) -> tuple[np.ndarray, Info]:
         clean = now.clean.numpy()
         self._frame = np.ascontiguousarray(clean[-3:].transpose(1, 2, 0))
-        return now.obs.numpy(), {"clean": clean, "physics": now.time_step.physics}
+        return now.obs.numpy(), {"clean": clean.copy(), "physics": now.time_step.physics}
 
 
 def _config(corruption: str, options: dict[str, Any], size: int) -> CorruptionConfig:

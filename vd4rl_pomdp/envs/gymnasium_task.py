@@ -44,6 +44,10 @@ class GymnasiumEnv(PixelEnv):
         """Decisions a second, as the environment's metadata tell; 30 steps a second if they do not."""
         return self.env.metadata.get("render_fps", 30) / self.task.action_repeat
 
+    def close(self) -> None:
+        """Close the Gymnasium environment."""
+        self.env.close()
+
     def _make(self, task: GymnasiumTask) -> gymnasium.Env:
         arguments = dict(task.arguments) | ({"render_mode": "rgb_array"} if self._renders else {})
         with self._telling("cannot be made", (*_REFUSALS, TypeError, AttributeError, RuntimeError)):

@@ -10,6 +10,7 @@ import numpy as np
 from vd4rl_pomdp.envs import Info
 from vd4rl_pomdp.envs.maze_model import COLLISION_RADIUS, HEADING, TIMESTEP, build_simulator
 from vd4rl_pomdp.envs.maze_renderers import ExactRenderer, MazeRenderer, make_renderer
+from vd4rl_pomdp.envs.pixels import checked_action
 from vd4rl_pomdp.envs.rendering import Render, check_render, mujoco
 from vd4rl_pomdp.errors import refuse_number
 from vd4rl_pomdp.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, get_maze
@@ -80,9 +81,9 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return self._observation_and_info()
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
-        """Apply one action for the action repeat."""
+        """Apply one action for the action repeat; UserError for one of another shape, or NaN."""
         before = self.state[:2]
-        self._simulate(np.clip(np.asarray(action, np.float64), -1, 1))
+        self._simulate(np.clip(np.asarray(checked_action(action, 2), np.float64), -1, 1))
         reached = self._at_goal(before)
         self._decisions += 1
         if reached or self._decisions == self.maze_spec.style.goal_decisions:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -46,6 +46,14 @@ class TimeStep:
 def between(action: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
     """An action in [-1, 1] between the bounds of an environment's own, in float64; what lies outside is cut off."""
     return np.clip(action, -1, 1) * ((high - low) / 2) + (high + low) / 2
+
+
+def checked_action(action: Any, dimensions: int) -> np.ndarray:
+    """A caller's action as an array; UserError for one that is not (A,) numbers."""
+    found = np.asarray(action)
+    if found.shape != (dimensions,) or not np.isfinite(found).all():
+        raise UserError(f"the action {action!r} is not one of {dimensions} finite numbers, of shape ({dimensions},)")
+    return found
 
 
 class PixelEnv(ABC):
@@ -94,6 +102,10 @@ class PixelEnv(ABC):
         self._decisions += 1
         last = ended or self._decisions == self._length
         return self._time_step(reward, discount, StepType.LAST if last else StepType.MID)
+
+    @abstractmethod
+    def close(self) -> None:
+        """Free the simulator and what it draws with."""
 
     @abstractmethod
     def _begin(self, seed: int) -> None:

@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
@@ -80,6 +80,9 @@ class Encoder(nn.Module):
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
         self.config = config
+        for name, choices in (("history", ("none", "gru")), ("readout", get_args(Readout))):
+            if (chosen := getattr(config, name)) not in choices:
+                raise UserError(f"unknown {name} {chosen!r}: choose one of {', '.join(choices)}")
         if config.frame_encoder == STATE:
             config = self.config = replace(config, feature_dim=config.channels)
             self.frame: FrameEncoder | StateFrame = StateFrame(config.channels, **config.frame_options)

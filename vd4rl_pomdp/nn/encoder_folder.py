@@ -13,6 +13,7 @@ from typing import Any
 
 from safetensors import SafetensorError
 from safetensors.torch import save
+from torch.random import fork_rng
 
 from vd4rl_pomdp import __version__
 from vd4rl_pomdp.corruptions import CorruptionConfig
@@ -127,7 +128,8 @@ def load_encoder(
             f"{folder}: this encoder was pretrained on {card.task}, not on {task}; pretrain one on this task"
         )
     try:
-        encoder = Encoder(encoder_config)
+        with fork_rng(devices=[]):  # weights that are drawn here are read over
+            encoder = Encoder(encoder_config)
         _check_corruption(card)
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise UserError(

@@ -8,6 +8,7 @@ import torch
 from safetensors import SafetensorError, safe_open
 from safetensors.torch import save
 from torch import Tensor, nn
+from torch.random import fork_rng
 
 from vd4rl_pomdp.errors import UserError, disk_errors, first_line
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp
@@ -71,10 +72,12 @@ class Policy(nn.Module):
         write_json(folder / _SHAPE, self.shape)
 
 
-def load_policy(folder: Path) -> Policy:
+def load_policy(folder: Path | str) -> Policy:
     """Read a policy folder; raises UserError if it is missing or damaged."""
+    folder = Path(folder)
     try:
-        policy = Policy(**read_json(folder / _SHAPE))
+        with fork_rng(devices=[]):  # weights that are drawn here are read over
+            policy = Policy(**read_json(folder / _SHAPE))
         policy.load_state_dict(read_tensors(folder / _WEIGHTS))
     except (FileNotFoundError, SafetensorError, RuntimeError, TypeError) as error:
         raise _no_policy(folder, error) from error

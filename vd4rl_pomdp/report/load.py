@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Collection, Iterable
+from collections.abc import Callable, Collection, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -161,7 +161,7 @@ class LoadedRun:
             raise UserError(f"{path}: cannot be read ({error}); remove it, and the report goes without") from error
 
 
-def load_runs(paths: list[Path], but: Path | None = None, choice: Choice = ALL) -> list[LoadedRun]:
+def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choice = ALL) -> list[LoadedRun]:
     """The chosen runs at or below the paths, of run folders and results folders; `but` as in `find_results`.
 
     Raises:

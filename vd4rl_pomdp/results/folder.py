@@ -173,8 +173,9 @@ def _labels(run: Result) -> dict[str, Any]:
     return {name: told.get(name) or "" for name in LABELS if name != "seed"} | {"seed": told["seed"]}
 
 
-def read_results(folder: Path) -> list[Result]:
+def read_results(folder: Path | str) -> list[Result]:
     """All runs of a results folder; raises UserError if it is none, or damaged."""
+    folder = Path(folder)
     path, by_run = folder / RUNS, dict[str, list[Row]]()
     lines = _lines(path)  # before the rows, which are written first: one that is written meanwhile lacks none
     for row in read_episodes(folder / EPISODES_FILE):

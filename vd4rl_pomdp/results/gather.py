@@ -14,7 +14,7 @@ from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.ownership import owned
 
 
-def find_results(paths: Sequence[Path], but: Path | None = None) -> list[Result]:
+def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[Result]:
     """Every run at or below some paths, each once: of a run folder, or else of a results folder.
 
     Results folders within a results folder are other experiments: they are read where they are named themselves.
@@ -29,7 +29,7 @@ def find_results(paths: Sequence[Path], but: Path | None = None) -> list[Result]
     if not paths:
         raise UserError("name at least one run folder, or a folder that contains some")
     found: dict[str, Result] = {}
-    for run in _found(paths, but):
+    for run in _found([Path(path) for path in paths], but):
         other = found.get(run.id)
         found[run.id] = run if other is None else _better(other, run)
     if not found:
@@ -94,7 +94,7 @@ class Added(NamedTuple):
         )
 
 
-def add_results(paths: Sequence[Path], out: Path) -> Added:
+def add_results(paths: Sequence[Path | str], out: Path | str) -> Added:
     """Append the runs at or below some paths to a results folder, each once; no row that is there changes.
 
     An unfinished run of the folder, such as a report of that time keeps, gives way to the same run when it is settled,
@@ -103,6 +103,7 @@ def add_results(paths: Sequence[Path], out: Path) -> Added:
     Raises:
         UserError: as `find_results`, or `out` holds something else, is damaged or is in use.
     """
+    out = Path(out)
     refuse_foreign(out, "results", RUNS, "README.md")  # whose page may be there before the first run
     found = find_results(paths, out)
     with owned(out):

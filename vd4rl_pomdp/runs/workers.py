@@ -13,10 +13,10 @@ from contextlib import contextmanager
 from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection
 from multiprocessing.reduction import ForkingPickler
-from pickle import PicklingError
+from pickle import PicklingError, UnpicklingError
 from typing import Any, TypeVar
 
-from vd4rl_pomdp.errors import UserError, WorkerDiedError
+from vd4rl_pomdp.errors import UserError, WorkerDiedError, first_line
 from vd4rl_pomdp.runs.interrupt import blocked
 
 Job = TypeVar("Job")
@@ -139,10 +139,14 @@ def _send(connection: Connection, job: Any) -> None:
     try:
         connection.send(job)
     except (PicklingError, AttributeError, TypeError) as error:
-        raise UserError(
-            f"a job cannot be sent to a worker process ({error}): define its classes and functions in a module, or use "
-            "--workers 1"
-        ) from error
+        raise _unsendable(error) from error
+
+
+def _unsendable(error: Exception) -> UserError:
+    return UserError(
+        f"a job cannot be sent to a worker process ({first_line(error)}): define its classes and functions in a "
+        "module, or use --workers 1"
+    )
 
 
 def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
@@ -153,6 +157,9 @@ def _serve(connection: Connection, function: Callable[[Any], Any]) -> None:
             number, job = connection.recv()
         except EOFError:
             return
+        except (AttributeError, ImportError, UnpicklingError) as error:  # what a job names is not in this process
+            connection.send((-1, None, _unsendable(error)))
+            continue
         connection.send((number, *_attempt(function, job)))
 
 

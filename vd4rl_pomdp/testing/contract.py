@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
+from contextlib import contextmanager
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -15,7 +17,7 @@ Check = Callable[..., None]
 
 
 def run_check(kind: str, check: Check, name: str, **options: Any) -> None:
-    """Check one promise of a part.
+    """Check one promise of a part; the global generators of torch and numpy are left where they were.
 
     Args:
         kind: what the part is called, `method`.
@@ -28,12 +30,24 @@ def run_check(kind: str, check: Check, name: str, **options: Any) -> None:
         UserError: there is no such part or option.
     """
     try:
-        check(name, **options)
+        with _generators_kept():
+            check(name, **options)
     except UserError:
         raise
     except Exception as error:  # other people's code may raise anything
         reason = str(error) if isinstance(error, AssertionError) else f"{type(error).__name__}: {error}"
         raise AssertionError(f"{kind} {name!r} breaks a promise.\n{promise(check)}\nBut: {reason}") from error
+
+
+@contextmanager
+def _generators_kept() -> Iterator[None]:
+    """Leave the global generators of torch and numpy, which checks seed, where the caller had them."""
+    drawn = np.random.get_state()  # noqa: NPY002
+    with torch.random.fork_rng(devices=[]):
+        try:
+            yield
+        finally:
+            np.random.set_state(drawn)  # noqa: NPY002
 
 
 def run_checks(kind: str, checks: Iterable[Check], name: str, **options: Any) -> None:
