@@ -104,7 +104,7 @@ def test_the_backward_gru_starts_at_each_windows_last_real_row():
 
 def test_an_encoder_folder_gives_back_the_same_encoder(tmp_path):
     encoder, batch = make("gru", True), window()
-    save_encoder(tmp_path, encoder, CARD)
+    save_encoder(str(tmp_path), encoder, CARD)
     drawn = torch.get_rng_state()
     loaded, card = load_encoder(str(tmp_path), "walker_walk", 2)
     assert torch.equal(torch.get_rng_state(), drawn), "loading draws nothing from the caller's generator"

@@ -39,7 +39,7 @@ def test_a_run_comes_back_as_its_files_hold_it(tmp_path):
     run, before = whole_run(tmp_path / "runs/a"), pretraining(tmp_path / "runs/b")
     added = add_results([tmp_path / "runs"], tmp_path / "out")
     assert added.in_words == "2 runs added"
-    (one, other) = read_results(tmp_path / "out")
+    (one, other) = read_results(str(tmp_path / "out"))
     for name in ("config", "labels", "timing", "machine", "render", "probe", "pretrain_timing", "reference"):
         assert one.files[name] == read_json(run / f"{name}.json"), name
     assert one.files["encoder"] == read_json(run / "encoder" / "config.json")

@@ -31,7 +31,7 @@ FILES_OF_RUN = (f"encoder/{CONFIG}", f"encoder/{WEIGHTS}")
 """An encoder's files, below the folder of the run that made it."""
 
 
-def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard, frames: int | None = None) -> None:
+def save_encoder(folder: Path | str, encoder: Encoder, card: EncoderCard, frames: int | None = None) -> None:
     """Write an encoder folder; whole files only, config last.
 
     Args:
@@ -42,7 +42,7 @@ def save_encoder(folder: Path, encoder: Encoder, card: EncoderCard, frames: int 
     """
     weights = {name: value.cpu().contiguous().clone() for name, value in encoder.state_dict().items()}
     origin = EncoderOrigin(__version__, git_commit(), frames)
-    _write(folder, save(weights), EncoderRecord(encoder.config, card, origin))
+    _write(Path(folder), save(weights), EncoderRecord(encoder.config, card, origin))
 
 
 def _write(folder: Path, weights: bytes, record: EncoderRecord) -> None:

@@ -63,8 +63,9 @@ class Policy(nn.Module):
         """Mean action for representations that are already standardised."""
         return torch.tanh(self.net(z))
 
-    def save(self, folder: Path, step: int | None = None) -> None:
+    def save(self, folder: Path | str, step: int | None = None) -> None:
         """Write the policy folder; with the weights goes the training step that they are of, if it is told."""
+        folder = Path(folder)
         with disk_errors(folder):
             folder.mkdir(parents=True, exist_ok=True)
         weights = {k: v.contiguous().cpu() for k, v in self.state_dict().items()}

@@ -128,8 +128,9 @@ def _hardware(part: dict[str, Any]) -> str | None:
     return f"{processor}, {cores} cores" if processor and cores else processor
 
 
-def read_run(folder: Path) -> Result:
+def read_run(folder: Path | str) -> Result:
     """What a run folder holds; raises UserError for damaged files."""
+    folder = Path(folder)
     files = {name: read_json(folder / place) for name, place in FILES.items() if (folder / place).exists()}
     if ENCODER in files and not isinstance(files[ENCODER].get("pretrain"), dict):
         raise UserError(f"{folder / FILES[ENCODER]}: does not say how the encoder was pretrained; pretrain it again")
