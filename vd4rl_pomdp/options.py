@@ -9,10 +9,11 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields
 from inspect import get_annotations
-from typing import Any, ClassVar, Self
+from typing import Any, ClassVar, Literal, Self, get_args, get_origin, get_type_hints
 
 from vd4rl_pomdp.errors import UserError, flag_of, refuse_outside
 from vd4rl_pomdp.registry import REGISTRIES
+from vd4rl_pomdp.runs.reading import fits
 
 Limits = Mapping[str, float | tuple[float, float]]
 """Lowest, or lowest and highest, value of numbers by name."""
@@ -43,15 +44,15 @@ _KINDS = {bool: "True or False", int: "an integer", float: "a number", str: "a w
 
 
 def _refuse_types(options: Options) -> None:
-    """Raise UserError for a value of another type than its default's."""
+    """Raise UserError for a value that is not of its annotated type."""
+    hints = get_type_hints(type(options))
     for option in fields(options):
-        value, told = getattr(options, option.name), str(option.type)
-        kind = float if type(option.default) is int and "float" in told else type(option.default)
-        if kind not in _KINDS or (value is None and "None" in told):
+        value, hint = getattr(options, option.name), hints[option.name]
+        if fits(value, hint):
             continue
-        allowed = (int, float) if kind is float else kind
-        if not isinstance(value, allowed) or isinstance(value, bool) != (kind is bool):
-            raise UserError(f"{flag_of(option.name)} is {value!r}: it must be {_KINDS[kind]}")
+        if get_origin(hint) is Literal:
+            raise UserError(f"{flag_of(option.name)} is {value!r}: choose one of {', '.join(map(str, get_args(hint)))}")
+        raise UserError(f"{flag_of(option.name)} is {value!r}: it must be {_KINDS.get(hint, hint)}")
 
 
 def flat(config: Any) -> dict[str, Any]:

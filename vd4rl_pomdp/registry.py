@@ -60,10 +60,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
         """
         if not isinstance(name, str):
             raise UserError(f"a {self.kind} is called {name!r}: a name is a string")
-        by_call = self._origins.get(name) == BY_CALL
-        if name in self._parts and not (replace and by_call):
-            raise self._taken(name, ", or replace=True to take its place" if by_call else "")
-        self._add(name, part, BY_CALL)
+        self._add(name, part, BY_CALL, replace)
 
     @property
     def has_added(self) -> bool:
@@ -116,14 +113,15 @@ class Registry(Mapping[str, Part], Generic[Part]):
         self._load_offered()
         return len(self._parts)
 
-    def _add(self, name: str, part: Any, origin: str) -> None:
+    def _add(self, name: str, part: Any, origin: str, replace: bool = False) -> None:
+        by_calls = origin == BY_CALL == self._origins.get(name)
+        if name in self._parts and not (replace and by_calls):
+            remedy = ", or replace=True to take its place" if by_calls else ""
+            raise UserError(f"a {self.kind} called {name!r} exists already: choose another name{remedy}")
         if not self._fits(part):
             raise UserError(f"{self.kind} {name!r} is a {type(part).__name__}, not {self._expected}")
         self._refuse_faulty(name, part)
         self._parts[name], self._origins[name] = part, origin
-
-    def _taken(self, name: str, remedy: str = "") -> UserError:
-        return UserError(f"a {self.kind} called {name!r} exists already: choose another name{remedy}")
 
     def _refuse_faulty(self, name: str, part: Any) -> None:
         try:
@@ -138,8 +136,6 @@ class Registry(Mapping[str, Part], Generic[Part]):
         self._loaded = True  # first: a package may look into this registry while it is loaded
         for entry in entry_points(group=self.group):
             try:
-                if entry.name in self._parts:
-                    raise self._taken(entry.name)
                 self._add(entry.name, entry.load(), _package_of(entry))
             except Exception as error:  # other people's code may raise anything
                 reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"

@@ -83,14 +83,15 @@ def load_pool(source: str, seed: int) -> Tensor:
 
 
 def _drawn(files: list[Path], rng: np.random.Generator) -> Tensor:
-    """Images drawn from files, at most POOL; only those are decoded, however many there are."""
-    ends = np.cumsum([len(_read_cifar(path)) if _is_cifar(path) else 1 for path in files])
+    """Images drawn from files, at most POOL; of PNG and JPEG files only those are decoded, however many there are."""
+    batches = {path: _read_cifar(path) for path in files if _is_cifar(path)}
+    ends = np.cumsum([len(batches[path]) if path in batches else 1 for path in files])
     drawn = rng.permutation(ends[-1])[:POOL]
     number = np.searchsorted(ends, drawn, side="right")
     pool = torch.empty((len(drawn), 3, PICTURE_SIZE, PICTURE_SIZE), dtype=torch.uint8)
     for file in np.unique(number):
         mine = np.flatnonzero(number == file)
-        images = _read_cifar(files[file]) if _is_cifar(files[file]) else _read_image(files[file])
+        images = batches[files[file]] if files[file] in batches else _read_image(files[file])
         pool[mine] = _to_size(images[drawn[mine] - ends[file]])  # counted from the file's end
     return pool
 

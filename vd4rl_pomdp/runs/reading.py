@@ -50,14 +50,17 @@ def build(kind: type[T], values: Any) -> T:
     """An instance of a dataclass from JSON values; wrong names, or a value of another type, raise TypeError."""
     made, hints = kind(**values), get_type_hints(kind)
     for field in fields(made):  # type: ignore[arg-type]
-        if not _fits(getattr(made, field.name), hints[field.name]):
+        if not fits(getattr(made, field.name), hints[field.name]):
             raise TypeError(f"{field.name} is {getattr(made, field.name)!r}")
     return made
 
 
-def _fits(value: Any, hint: Any) -> bool:
+def fits(value: Any, hint: Any) -> bool:
+    """Whether a value is of an annotated type: an int is a float, too, and a bool is no int."""
+    if hint is Any:
+        return True
     if get_origin(hint) in (Union, UnionType):
-        return any(_fits(value, part) for part in get_args(hint))
+        return any(fits(value, part) for part in get_args(hint))
     if get_origin(hint) is Literal:
         return value in get_args(hint)
     if isinstance(value, bool):
