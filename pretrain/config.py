@@ -11,7 +11,7 @@ import tyro
 
 from pretrain.objectives import METHODS, Method
 from vd4rl_pomdp.corruptions import NO_CORRUPTION, CorruptionConfig
-from vd4rl_pomdp.errors import MAX_SEED, UserError, flag_of, refuse_outside
+from vd4rl_pomdp.errors import MAX_SEED, UserError, flag_of, refuse_outside, refuse_unknown
 from vd4rl_pomdp.nn.encoder import MAX_LAYERS
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS
 from vd4rl_pomdp.options import NO_OPTIONS, Limits, Options, StageConfig
@@ -144,8 +144,7 @@ class PretrainConfig(TrainingConfig):
 
 def memory_of(name: str, method: Method, history: str) -> str:
     """Memory of a method's encoder, gru or none; one that it cannot have raises UserError."""
-    if history not in ("method", "gru"):
-        raise UserError(f"--history is {history!r}: choose one of method, gru")
+    refuse_unknown("--history", history, ("method", "gru"))
     if history == "method":
         return method.history
     if method.end_to_end or method.reads_state:

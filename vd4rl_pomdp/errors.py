@@ -7,7 +7,7 @@ of x (memory, disk, rows), `refuse_x` for something named x that cannot be accep
 from __future__ import annotations
 
 import errno
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from stat import S_ISDIR
@@ -79,6 +79,12 @@ def refuse_number(name: str, value: float, low: float, high: float = MOST) -> No
     """Raise UserError, naming the flag, for a number below `low`, above `high`, or NaN."""
     if not low <= value <= high:
         raise UserError(f"{flag_of(name)} is {value}; it must be at least {low} and at most {high}")
+
+
+def refuse_unknown(kind: str, name: object, choices: Iterable[object]) -> None:
+    """Raise UserError, listing the choices, for a name that is none of them; `kind` says what the name is of."""
+    if name not in (known := list(choices)):
+        raise UserError(f"unknown {kind} {name!r}: choose one of {', '.join(map(str, known))}")
 
 
 def first_line(error: BaseException) -> str:

@@ -12,7 +12,7 @@ from typing import Literal
 
 import numpy as np
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import refuse_unknown
 
 ACTION_REPEAT = 5
 """Simulator steps of 0.01 s for one action."""
@@ -194,8 +194,7 @@ MAZES = {
 
 def get_maze(name: str) -> MazeSpec:
     """The maze called `name`; raises UserError listing the choices for an unknown one."""
-    if name not in MAZES:
-        raise UserError(f"unknown maze {name!r}: choose one of {', '.join(MAZES)}")
+    refuse_unknown("maze", name, MAZES)
     return MAZES[name]
 
 

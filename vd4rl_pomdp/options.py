@@ -11,7 +11,7 @@ from dataclasses import MISSING, dataclass, fields
 from inspect import get_annotations
 from typing import Any, ClassVar, Literal, Self, get_args, get_origin, get_type_hints
 
-from vd4rl_pomdp.errors import UserError, flag_of, refuse_outside
+from vd4rl_pomdp.errors import UserError, flag_of, refuse_outside, refuse_unknown
 from vd4rl_pomdp.registry import REGISTRIES
 from vd4rl_pomdp.runs.reading import fits
 
@@ -193,8 +193,7 @@ class StageConfig:
     @classmethod
     def defaults(cls, preset: str) -> dict[str, Any]:
         """Default values of a preset: the stage's own, and those that it has for options of parts."""
-        if preset not in cls.presets:
-            raise UserError(f"unknown preset {preset!r}: choose one of {', '.join(cls.presets)}")
+        refuse_unknown("preset", preset, cls.presets)
         return flat(cls()) | dict(cls.presets[preset]) | {"preset": preset}
 
     @classmethod

@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from importlib.metadata import EntryPoint, entry_points
 from typing import Any, Generic, TypeVar
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_unknown
 
 Part = TypeVar("Part")
 BY_CALL = "registered by a call"
@@ -84,13 +84,12 @@ class Registry(Mapping[str, Part], Generic[Part]):
     def named(self, name: str) -> Part:
         """The part called `name`; raises UserError listing the choices, or saying why it cannot be loaded."""
         self._load_offered()
-        if name in self._parts:  # whatever else a package offers under its name
-            return self._parts[name]
-        if name in self.broken:
+        if name in self.broken and name not in self._parts:
             raise UserError(
                 f"{self.kind} {name!r} cannot be loaded ({self.broken[name]}): mend or remove what offers it"
             )
-        raise UserError(f"unknown {self.kind} {name!r}: choose one of {', '.join(self._parts)}")
+        refuse_unknown(self.kind, name, self._parts)
+        return self._parts[name]
 
     def check(self, name: str) -> None:
         """Raise UserError unless there is a part called `name` that can be loaded."""

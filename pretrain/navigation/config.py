@@ -8,7 +8,7 @@ from typing import Any, ClassVar, Literal
 
 from pretrain.config import MemoryOptions, TrainingConfig, frame_options
 from pretrain.objectives import METHODS
-from vd4rl_pomdp.errors import UserError, refuse_outside
+from vd4rl_pomdp.errors import UserError, refuse_outside, refuse_unknown
 from vd4rl_pomdp.navigation.methods import METHOD_NAMES, REFERENCES
 from vd4rl_pomdp.navigation.observations import SHAPES, Picture
 from vd4rl_pomdp.objective import ActionOptions
@@ -155,8 +155,7 @@ class NavigationConfig(TrainingConfig):
         trained = self.trained()
         if not isinstance(trained.options, ActionOptions):
             raise UserError(f"{trained.method} predicts no actions: choose one of {', '.join(METHOD_NAMES)}")
-        if self.picture not in SHAPES:
-            raise UserError(f"unknown picture {self.picture!r}: choose one of {', '.join(SHAPES)}")
+        refuse_unknown("picture", self.picture, SHAPES)
         if self.burn_in >= self.window:
             raise UserError(f"--burn-in {self.burn_in} leaves no row of a window of {self.window}: lower it")
 

@@ -13,7 +13,7 @@ from pretrain.objectives.masked_inverse import MaskedActionOptions, MaskedInvers
 from pretrain.objectives.supervised import Supervised, SupervisedOptions
 from pretrain.objectives.untrained import StateOptions, Untrained
 from vd4rl_pomdp.augmentation import Sharing
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_unknown
 from vd4rl_pomdp.objective import ActionOptions, InverseOptions, Objective
 from vd4rl_pomdp.options import Options, refuse_options
 from vd4rl_pomdp.registry import Registry
@@ -54,8 +54,7 @@ class Method:
     def __post_init__(self) -> None:
         """Raise UserError for a word that this class does not know, and for what cannot be together."""
         for name, words in (("history", ("none", "gru")), ("shift", (*get_args(Sharing), "own"))):
-            if (value := getattr(self, name)) not in words:
-                raise UserError(f"a Method's {name} is {value!r}: choose one of {', '.join(words)}")
+            refuse_unknown(f"{name} of a Method", getattr(self, name), words)
         if self.end_to_end and self.history != "none":
             raise UserError("a Method trained end to end has no memory: leave its history out")
         if self.reads_state and self.trained:

@@ -89,7 +89,7 @@ SWEEP = ["sweep", "run", "quick", "--out", "y", "--dry-run"]
         (["control-study"], "Missing from vd4rl-pomdp control-study: --out"),
         (
             ["control-study", "--out", "x", "--methods", "acro"],
-            "unknown method 'acro' of this study: choose from none,",
+            "unknown method of this study 'acro': choose one of none,",
         ),
         (["control-study", "--out", "x", "--hidden-shares", "2"], "--hidden-shares is 2.0; it must be at least 0 and"),
         (["control-study", "--out", "file/below", *STUDY], "file/below"),

@@ -237,5 +237,5 @@ def test_a_method_of_what_cannot_be_together_is_refused_where_it_is_made(parts, 
 
 @pytest.mark.parametrize("word", [{"shift": "windows"}, {"history": "lstm"}])
 def test_a_method_that_asks_for_what_there_is_not_is_refused_where_it_is_made(word):
-    with pytest.raises(UserError, match=f"a Method's {next(iter(word))} is .*: choose one of .*"):
+    with pytest.raises(UserError, match=f"unknown {next(iter(word))} of a Method .*: choose one of .*"):
         Method(Mean, **word)

@@ -61,7 +61,7 @@ def test_every_stack_needs_a_key_of_its_own(key):
 def test_a_view_takes_a_corruption_by_name_and_only_shifts_that_there_are(dataset):
     shown = View(dataset, "patch+zero_frames").windows([0], 3)
     assert torch.equal(shown.obs, View(dataset, CorruptionConfig.of("patch+zero_frames")).windows([0], 3).obs)
-    with pytest.raises(UserError, match="shared is 'windows': choose one of window, observation"):
+    with pytest.raises(UserError, match="unknown sharing 'windows': choose one of window, observation"):
         View(dataset, shared="windows")
 
 

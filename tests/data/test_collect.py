@@ -214,7 +214,7 @@ def test_a_folder_with_something_else_is_refused(tmp_path):
     ("change", "message"),
     [
         ({"task": "walker_run"}, "unknown task"),
-        ({"quality": "mixed"}, "cannot collect quality"),
+        ({"quality": "mixed"}, "unknown quality to collect 'mixed': choose one of"),
         ({"actor": Path("a.safetensors"), "quality": "medium_replay"}, "--actor is for medium or expert"),
         ({"episodes": 0}, "--episodes is 0; it must be at least 1"),
         ({"episodes": 1, "quality": "medium_expert"}, "at least 2 for medium_expert"),

@@ -128,8 +128,8 @@ def test_a_gap_beyond_the_window_is_refused(max_k, window):
         ({"method": "homer", "homer_codes": -1}, "--homer-codes is -1"),
         ({"action_target": "ordinal"}, "unknown action target 'ordinal'"),
         ({"frame_encoder": "vit"}, "unknown frame encoder 'vit'"),
-        ({"method": "mik", "history": "none"}, "--history is 'none': choose one of method, gru"),
-        ({"method": "ah+a", "history": "none"}, "--history is 'none': choose one of method, gru"),
+        ({"method": "mik", "history": "none"}, "unknown --history 'none': choose one of method, gru"),
+        ({"method": "ah+a", "history": "none"}, "unknown --history 'none': choose one of method, gru"),
         ({"method": "bc", "history": "gru"}, "bc has no memory"),
     ],
 )

@@ -15,7 +15,7 @@ from typing import Any, TypeVar
 import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments
-from vd4rl_pomdp.errors import UserError, flag_of
+from vd4rl_pomdp.errors import UserError, flag_of, refuse_unknown
 from vd4rl_pomdp.options import StageConfig, flat, option_names
 from vd4rl_pomdp.runs.files import flatten
 from vd4rl_pomdp.runs.interrupt import Terminated
@@ -116,8 +116,7 @@ def _chosen(words: Arguments, name: str) -> str | None:
 def with_presets(config: type, presets: dict[str, Any], words: Arguments, program: str, flag: str = "--preset") -> Any:
     """Parse a config with a flag, `--preset`, that chooses the defaults of all others."""
     name = _chosen(words, flag.removeprefix("--")) or next(iter(presets))
-    if name not in presets:
-        raise UserError(f"unknown {flag.removeprefix('--')} {name!r}: choose one of {', '.join(presets)}")
+    refuse_unknown(flag.removeprefix("--"), name, presets)
     default = presets[name]
     missing = {f.name: tyro.MISSING for f in fields(config) if getattr(default, f.name) in (Path(), "")}
     return parse(config, words, program, replace(default, **missing))

@@ -17,7 +17,7 @@ import numpy as np
 from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.envs.pixels import Render
-from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside, refuse_unknown
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.memory import CPU, require_memory
@@ -134,8 +134,7 @@ def check_config(config: CollectConfig) -> None:
     refuse_outside(config, action_noise=(0, MAX_NOISE), frame_size=FRAME_SIZES)
     shard = min(config.episodes, config.episodes_per_shard) * (task.decisions + 1)
     require_memory(shard * 3 * config.frame_size**2, CPU, config, "episodes", "episodes_per_shard", "frame_size")
-    if config.quality not in SET_QUALITIES:
-        raise UserError(f"cannot collect quality {config.quality!r}: choose one of {', '.join(SET_QUALITIES)}")
+    refuse_unknown("quality to collect", config.quality, SET_QUALITIES)
     base = _base(config)
     layout = layout_of(task)  # also refuses an environment that cannot be built
     if not layout.state_dim and base != "random":

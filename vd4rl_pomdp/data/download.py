@@ -27,7 +27,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from urllib3.exceptions import NewConnectionError
 
 from vd4rl_pomdp import __version__
-from vd4rl_pomdp.errors import UserError, disk_error, disk_errors
+from vd4rl_pomdp.errors import UserError, disk_error, disk_errors, refuse_unknown
 from vd4rl_pomdp.runs.files import replacing_file, sha256
 from vd4rl_pomdp.runs.outputs import refuse_kept
 from vd4rl_pomdp.runs.ownership import owned
@@ -100,10 +100,8 @@ def download(
             another process downloads.
     """
     published = list(dict.fromkeys(file.path.split("/")[2] for file in manifest()))
-    if task not in published:
-        raise UserError(f"unknown task {task!r}: choose one of {', '.join(published)}, of which sets are published")
-    if quality not in QUALITIES:
-        raise UserError(f"unknown quality {quality!r}: choose one of {', '.join(QUALITIES)}")
+    refuse_unknown("task of published sets", task, published)
+    refuse_unknown("quality", quality, QUALITIES)
     endpoint = default_endpoint() if endpoint is None else endpoint
     check_endpoint(endpoint, "endpoint")
     refuse_kept(destination)

@@ -11,7 +11,7 @@ from vd4rl_pomdp import _shift
 from vd4rl_pomdp.augmentation import Sharing, random_shift
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream
 from vd4rl_pomdp.data.dataset import Dataset, Index
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import refuse_unknown
 from vd4rl_pomdp.seeding import stream_seed
 from vd4rl_pomdp.tasks import FRAME_STACK
 from vd4rl_pomdp.types import Transitions, Windows
@@ -41,8 +41,7 @@ class View:
             frame_stack: frames in an observation.
             shared: what one shift is shared by.
         """
-        if shared not in get_args(Sharing):
-            raise UserError(f"shared is {shared!r}: choose one of {', '.join(get_args(Sharing))}")
+        refuse_unknown("sharing", shared, get_args(Sharing))
         self.dataset = dataset
         self.corruption = BatchCorruption(corruption or CorruptionConfig(), seed, *name)
         self.shifts = KeyStream(stream_seed(seed, "shift", *name))

@@ -10,7 +10,7 @@ import gymnasium
 import numpy as np
 
 from vd4rl_pomdp.envs import Info
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_unknown
 from vd4rl_pomdp.theory.gallery import WORLDS
 
 
@@ -24,8 +24,7 @@ class FiniteEnv(gymnasium.Env[np.ndarray, np.int64]):
     metadata = {"render_modes": ["ansi"], "render_fps": 4}  # noqa: RUF012 (Gymnasium's own name and type)
 
     def __init__(self, world: str, render_mode: str | None = None) -> None:
-        if world not in WORLDS:
-            raise UserError(f"unknown world {world!r}: choose one of {', '.join(WORLDS)}")
+        refuse_unknown("world", world, WORLDS)
         self.world = WORLDS[world]()
         self.render_mode = render_mode
         self.observation_space = gymnasium.spaces.Box(0, 255, (len(self.world.symbols), 1, 1), np.uint8)

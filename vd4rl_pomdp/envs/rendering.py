@@ -20,7 +20,7 @@ import numpy as np
 
 from vd4rl_pomdp.envs.opengl import undisturbed
 from vd4rl_pomdp.envs.pixels import Render
-from vd4rl_pomdp.errors import UserError, first_line
+from vd4rl_pomdp.errors import UserError, first_line, refuse_unknown
 from vd4rl_pomdp.tasks import FRAME_SIZE
 
 
@@ -77,8 +77,7 @@ def check_mujoco(version: str = mujoco.__version__) -> None:
 
 def check_render(render: str) -> None:
     """Raise UserError for a word that names no rendering."""
-    if render not in get_args(Render):
-        raise UserError(f"unknown rendering {render!r}: choose one of {', '.join(get_args(Render))}")
+    refuse_unknown("rendering", render, get_args(Render))
 
 
 def prepare(physics: Any, render: Render, size: int) -> None:

@@ -17,7 +17,7 @@ import numpy as np
 
 from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, replay_returns
 from vd4rl_pomdp.data.format import RECORD
-from vd4rl_pomdp.errors import UserError, refuse_number
+from vd4rl_pomdp.errors import refuse_number, refuse_unknown
 from vd4rl_pomdp.policies.actor import ships
 from vd4rl_pomdp.runs.files import Row, read_csv, read_json, write_csv, write_json
 from vd4rl_pomdp.runs.outputs import refuse_foreign
@@ -87,9 +87,8 @@ def tabulate(out: Path, tasks: Sequence[str], qualities: Sequence[str], timed_ep
 
 def _check(tasks: Sequence[str], qualities: Sequence[str], timed_episodes: int) -> None:
     """Raise UserError for an unknown task or quality, or for no episode to time."""
-    unknown = sorted(set(qualities) - set(SET_QUALITIES))
-    if unknown:
-        raise UserError(f"unknown quality {unknown[0]!r}: choose from {', '.join(SET_QUALITIES)}")
+    for quality in qualities:
+        refuse_unknown("quality", quality, SET_QUALITIES)
     refuse_number("timed_episodes", timed_episodes, 1, MOST_EPISODES)
     for task in tasks:
         TASKS.check(task)

@@ -11,7 +11,7 @@ import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 
-from vd4rl_pomdp.errors import UserError, refuse_no_folder
+from vd4rl_pomdp.errors import refuse_no_folder, refuse_unknown
 from vd4rl_pomdp.experiments.navigation.film import write_film
 from vd4rl_pomdp.experiments.navigation.runs import find_navigation, load_runs
 from vd4rl_pomdp.mazes import get_maze
@@ -41,8 +41,7 @@ MOST_AT_ONCE = 4
 
 def demo_jobs(out: Path, preset: str = "cpu") -> list[Job]:
     """The jobs of the demo, in order; UserError for an unknown preset."""
-    if preset not in PRESETS:
-        raise UserError(f"unknown preset {preset!r}: choose one of {', '.join(PRESETS)}")
+    refuse_unknown("preset", preset, PRESETS)
     jobs = []
     for folder, grid in GRIDS.items():
         runs, cells = out / folder, load_grid(grid, testing=PRESETS[preset]).cells()

@@ -10,7 +10,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_unknown
 from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.seeding import stream_seed
 
@@ -86,8 +86,7 @@ class CodeOptions(Options):
 
 def target_options(name: str) -> type[Options]:
     """Class of a target's options; an unknown name raises UserError listing the choices."""
-    if name not in ACTION_TARGETS:
-        raise UserError(f"unknown action target {name!r}: choose one of {', '.join(ACTION_TARGETS)}")
+    refuse_unknown("action target", name, ACTION_TARGETS)
     return CodeOptions if name in ("kmeans", "bins") else Options
 
 

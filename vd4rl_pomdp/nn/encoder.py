@@ -11,7 +11,7 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, refuse_unknown
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, STATE, FrameEncoder, StateFrame, make_frame_encoder
 from vd4rl_pomdp.nn.sequence import run_gru
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
@@ -81,8 +81,7 @@ class Encoder(nn.Module):
         super().__init__()
         self.config = config
         for name, choices in (("history", ("none", "gru")), ("readout", get_args(Readout))):
-            if (chosen := getattr(config, name)) not in choices:
-                raise UserError(f"unknown {name} {chosen!r}: choose one of {', '.join(choices)}")
+            refuse_unknown(name, getattr(config, name), choices)
         if config.frame_encoder == STATE:
             config = self.config = replace(config, feature_dim=config.channels)
             self.frame: FrameEncoder | StateFrame = StateFrame(config.channels, **config.frame_options)

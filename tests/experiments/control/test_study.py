@@ -145,7 +145,7 @@ def test_another_commands_folder_is_refused_and_stays_as_it_is(tmp_path):
     ("changes", "message"),
     [
         ({"tasks": ["ant"]}, "unknown task 'ant'"),
-        ({"methods": ["mik", "acro"]}, "unknown method 'acro' of this study: choose from none, random, ah"),
+        ({"methods": ["mik", "acro"]}, "unknown method of this study 'acro': choose one of none, random, ah"),
         ({"seeds": [0, -1]}, "--seeds is -1"),
         ({"action_noises": [3.0]}, "--action-noises is 3.0"),
         ({"hidden_shares": [1.5]}, "--hidden-shares is 1.5"),

@@ -8,7 +8,7 @@ from itertools import product
 from pathlib import Path
 
 from vd4rl_pomdp.data.collect import MAX_NOISE
-from vd4rl_pomdp.errors import MAX_SEED, MOST, UserError, refuse_number, refuse_outside
+from vd4rl_pomdp.errors import MAX_SEED, MOST, refuse_number, refuse_outside, refuse_unknown
 from vd4rl_pomdp.nn.encoder import Readout
 from vd4rl_pomdp.objective import ActionOptions
 from vd4rl_pomdp.policies.actor import load_actor
@@ -71,9 +71,8 @@ class ControlConfig:
             load_actor(task, "expert")
             refuse_number("decisions", self._decisions(task), _window(), TASKS.named(task).decisions)
             require_memory(_FEATURE_BYTES * self.episodes * self._decisions(task), CPU, self, "episodes")
-        unknown = [name for name in self.methods if name not in fitting_methods()]
-        if unknown:
-            raise UserError(f"unknown method {unknown[0]!r} of this study: choose from {', '.join(fitting_methods())}")
+        for method in self.methods:
+            refuse_unknown("method of this study", method, fitting_methods())
 
     def runs(self) -> Iterator[ControlRun]:
         """All runs, seed by seed, so that every method has its first seed early; none of them twice."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import refuse_unknown
 from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.sweeps.executors.local import LocalExecutor, LocalOptions
 from vd4rl_pomdp.sweeps.executors.ray import RayExecutor, RayOptions
@@ -34,6 +34,5 @@ EXECUTORS = {
 
 def executor_kind(name: str) -> Kind:
     """The kind called `name`; raises UserError listing the choices."""
-    if name not in EXECUTORS:
-        raise UserError(f"unknown executor {name!r}: choose one of {', '.join(EXECUTORS)}")
+    refuse_unknown("executor", name, EXECUTORS)
     return EXECUTORS[name]
