@@ -17,7 +17,7 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.evaluation import EpisodeJob, episode_rows, evaluate, own_and_none
 from vd4rl_pomdp.nn.encoder_folder import EncoderCard, save_encoder
 from vd4rl_pomdp.reference import Reference
-from vd4rl_pomdp.runs import EPISODES_FILE, interrupt
+from vd4rl_pomdp.runs import EPISODES_FILE, FILM_FILE, interrupt
 from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import Row, replacing_file
 from vd4rl_pomdp.runs.loop import Loop
@@ -106,7 +106,7 @@ class Evaluations:
         loop.require_owner()  # whoever took the run over meanwhile has rows of its own
         rows = episode_rows(episodes, labels(self.config, self.card) | {"step": step})
         if episodes[0].film is not None:
-            with replacing_file(self.run / "film.npz") as fresh, fresh.open("wb") as file:
+            with replacing_file(self.run / FILM_FILE) as fresh, fresh.open("wb") as file:
                 np.savez_compressed(file, **episodes[0].film)  # type: ignore[arg-type]
         append_episodes(self._rows, rows)
 

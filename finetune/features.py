@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import hashlib
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,10 +18,10 @@ from vd4rl_pomdp.data.samplers import Sampler
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.options import Options
+from vd4rl_pomdp.reading import regular
 from vd4rl_pomdp.runs.device import Precision, autocast
-from vd4rl_pomdp.runs.files import read_json, replacing_file, write_json
+from vd4rl_pomdp.runs.files import read_json, replacing_file, sha256, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
-from vd4rl_pomdp.runs.reading import regular
 from vd4rl_pomdp.types import Batch
 
 CHUNK = 128
@@ -128,8 +127,7 @@ class FeatureFile:
         self._path.unlink(missing_ok=True)
 
     def _description(self) -> dict[str, str]:
-        with regular(self._path).open("rb") as file:
-            return self._inputs | {"sha256": hashlib.file_digest(file, "sha256").hexdigest()}
+        return self._inputs | {"sha256": sha256(regular(self._path))}
 
 
 def feature_type(encoder: Encoder) -> type[np.floating]:

@@ -60,7 +60,7 @@ def _without_memory(config: FinetuneConfig, method: str) -> FinetuneConfig:
 
 def check_n_step(config: FinetuneConfig, longest: int) -> None:
     """Raise UserError for returns over more steps than the `longest` episode has."""
-    refuse_number("n_step", returns_of(config).n_step, 1, max(longest, ReturnOptions.n_step))
+    refuse_number("n_step", return_options(config).n_step, 1, max(longest, ReturnOptions.n_step))
 
 
 def require_room(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, device: torch.device, kept: bool) -> None:
@@ -77,6 +77,6 @@ def require_room(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, dev
     require_memory(4 * (config.batch_size * row + weights), device, config, "batch_size", "hidden_dim")
 
 
-def returns_of(config: FinetuneConfig) -> ReturnOptions:
+def return_options(config: FinetuneConfig) -> ReturnOptions:
     """How returns are summed, also for an algorithm that does not look at them."""
     return config.options if isinstance(config.options, ReturnOptions) else ReturnOptions()

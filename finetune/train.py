@@ -17,7 +17,7 @@ from finetune.evaluations import POLICY, Evaluations, labels
 from finetune.features import STAGE, ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories, HistoryOptions
 from finetune.path import DataPath
-from finetune.settings import as_trained, check_n_step, require_room, returns_of
+from finetune.settings import as_trained, check_n_step, require_room, return_options
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.data.parity import render_info
@@ -98,7 +98,7 @@ def _trainer(
     seed_networks(config.seed, STAGE)
     policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(dataset.t.device)
     generator = stream_generator(config.seed, STAGE, "batches")
-    corruption, returns = CorruptionConfig.fill(card.corruption), returns_of(config)
+    corruption, returns = CorruptionConfig.fill(card.corruption), return_options(config)
     frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed)
     encode = partial(frozen.episode, view=frozen.view(0))
     sampler: FeatureSampler | ExactSampler | TransitionSampler

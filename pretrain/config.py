@@ -123,7 +123,7 @@ class PretrainConfig(TrainingConfig):
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
         """Options of method, memory, frame encoder and corruption."""
         method = METHODS.named(values["method"])
-        recurrent = memory_of(values["method"], method, values["history"]) == "gru"
+        recurrent = history_of(values["method"], method, values["history"]) == "gru"
         return {
             "options": method.options.fill(values),
             "memory": (MemoryOptions if recurrent else Options).fill(values),
@@ -142,7 +142,7 @@ class PretrainConfig(TrainingConfig):
             raise UserError(f"--shift is not read by the method {self.method}, which shifts by itself: leave it out")
 
 
-def memory_of(name: str, method: Method, history: str) -> str:
+def history_of(name: str, method: Method, history: str) -> str:
     """Memory of a method's encoder, gru or none; one that it cannot have raises UserError."""
     refuse_unknown("--history", history, ("method", "gru"))
     if history == "method":

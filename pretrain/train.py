@@ -19,7 +19,6 @@ from vd4rl_pomdp.objective import Objective
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs import METRICS_FILE
 from vd4rl_pomdp.runs.device import autocast, pick_device
-from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.loop import training
 from vd4rl_pomdp.runs.memory import bytes_kept, bytes_of_parameters, require_memory, telling_memory
 from vd4rl_pomdp.runs.metrics import read_metrics
@@ -207,7 +206,7 @@ def _card(config: PretrainConfig, task: str, dataset: Dataset, run: RunFolder) -
         end_to_end=METHODS.named(config.method).end_to_end,
         action_loss=_last_action_loss(run),
         data=dataset.fingerprint,
-        settings=settings_of(jsonable(flat(replace(config, task=task)))),
+        settings=settings_of(run.config),
     )
 
 

@@ -5,9 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from vd4rl_pomdp.report.gaps import CONDITION, condition_of
+from vd4rl_pomdp.report.gaps import condition_of
 from vd4rl_pomdp.report.layout import number
-from vd4rl_pomdp.report.load import PROBES, load_runs
+from vd4rl_pomdp.report.load import CONDITION, PROBES, load_runs
 from vd4rl_pomdp.report.measures import control, representations, run_table
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.report.tables import TOLD_STATES, evaluations, grouped, label

@@ -19,6 +19,7 @@ from tests.helpers_wheel import build_wheel
 
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("vd4rl_pomdp", "pretrain", "finetune", "baselines")
+PACKAGE, OURS = ROOT / "vd4rl_pomdp", "vd4rl_pomdp."
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
 MAY_IMPORT = {
     "vd4rl_pomdp": {"vd4rl_pomdp"},
@@ -31,10 +32,24 @@ MAY_CALL_STAGES = (
     *("vd4rl_pomdp/experiments/bench/", "vd4rl_pomdp/experiments/control/"),
 )
 """Folders whose functions call the stages, and import them there: what is not called is not loaded."""
+MAY_LOOK_UP = {
+    *(("runs.outputs", "data"), ("runs.run", "data"), ("envs.finite", "theory"), ("experiments.demo", "sweeps")),
+    *(("sweeps.stages", "cli"), ("sweeps.worker", "cli")),
+}
+"""Modules that import from a floor above their own, see docs/structure.md."""
 JUDGES = "vd4rl_pomdp.experiments"
 """What judges runs: the command line alone imports it."""
 JUDGES_MAZES_BY = ("errors", "experiments.navigation", "mazes", "navigation.config")
-JUDGES_MAZES_BY += ("navigation.measures", "navigation.methods", "options", "report.stats", "results", "runs", "text")
+JUDGES_MAZES_BY += (
+    "navigation.measures",
+    "navigation.methods",
+    "options",
+    "reading",
+    "report.stats",
+    "results",
+    "runs",
+    "text",
+)
 """What the navigation tables are made with: files, names and settings; no data, no environment and no network."""
 
 
@@ -106,6 +121,19 @@ def test_no_modules_import_each_other_in_a_circle():
         imported = {name if name in modules else name.rpartition(".")[0] for name in names}
         graph[module] = imported & modules.keys() - {module}
     TopologicalSorter(graph).prepare()  # names the circle, if there is one
+
+
+def test_modules_import_from_their_floor_and_those_below_it():
+    page = (ROOT / "docs" / "structure.md").read_text().split("from the bottom up:")[1]
+    rows = [re.sub(r"\(.*?\)", "", line) for line in page.splitlines() if line.startswith("| ")][1:]
+    floor = {name: number for number, row in enumerate(rows) for name in re.findall(r"`(\w+)/?`", row)}
+    upwards = set()
+    for path in (path for path in SOURCES if path.is_relative_to(PACKAGE) and not path.match("vd4rl_pomdp/__*__.py")):
+        own = path.relative_to(PACKAGE).with_suffix("").parts
+        others = {name.split(".")[1] for name in everywhere(ast.parse(path.read_text())) if name.startswith(OURS)}
+        upwards |= {(".".join(own), name) for name in others & floor.keys() if floor[name] > floor[own[0]]}
+    assert upwards == MAY_LOOK_UP
+    assert all(f"`{own}`" in page for own, _ in upwards)
 
 
 def test_what_judges_runs_is_imported_by_the_command_line_alone():

@@ -92,6 +92,11 @@ def first_line(error: BaseException) -> str:
     return next(iter(str(error).splitlines()), type(error).__name__)
 
 
+def in_one_line(error: BaseException) -> str:
+    """All that an error says, line breaks and indentation as single blanks; nothing if it says nothing."""
+    return " ".join(str(error).split())
+
+
 def flag_of(name: str) -> str:
     """The flag that sets a config's field."""
     return f"--{name.replace('_', '-')}"

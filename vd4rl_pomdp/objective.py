@@ -142,7 +142,7 @@ class InverseObjective(Objective):
         pairs = self.pairs(window.obs.shape[1]).to(past.device)
         losses = self.target.loss(self.head(past, future, pairs), window.action[:, pairs[:, 0]])
         real = window.real[:, pairs.sum(1)].to(losses)
-        total = (losses * real).sum() / real.sum()
+        total = _mean_over(real, losses)
         logs = {"action_loss": total.detach()} | self._per_k(losses.detach() * real, real, pairs)
         if self.predictor is not None:
             term = self._self_prediction(past, pairs, real)
@@ -165,7 +165,7 @@ class InverseObjective(Objective):
         gap = (k / self.options.largest_gap).to(past).expand(past.shape[0], -1)[..., None]
         predicted = self.predictor(torch.cat([past[:, t], gap], dim=-1))
         error = (predicted - past[:, t + k].detach()).square().mean(-1)
-        return (error * real).sum() / real.sum()
+        return _mean_over(real, error)
 
 
 class StateInverse(InverseObjective):
@@ -189,5 +189,5 @@ class StateInverse(InverseObjective):
 
 
 def _mean_over(real: Tensor, values: Tensor) -> Tensor:
-    """Mean of (B, T) values over real rows."""
-    return (values * real).sum() / real.to(values).sum()
+    """Mean of (B, N) values over those that are real, by a mask of numbers or truths."""
+    return (values * real).sum() / real.sum()

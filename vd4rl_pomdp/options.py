@@ -12,8 +12,8 @@ from inspect import get_annotations
 from typing import Any, ClassVar, Literal, Self, get_args, get_origin, get_type_hints
 
 from vd4rl_pomdp.errors import UserError, flag_of, refuse_outside, refuse_unknown
+from vd4rl_pomdp.reading import fits
 from vd4rl_pomdp.registry import REGISTRIES
-from vd4rl_pomdp.runs.reading import fits
 
 Limits = Mapping[str, float | tuple[float, float]]
 """Lowest, or lowest and highest, value of numbers by name."""
@@ -187,7 +187,7 @@ class StageConfig:
         parts = cls.parts(values)
         own = {field.name for field in fields(cls)} - parts.keys()
         config = cls(**({name: values[name] for name in own} | parts))
-        cls.check_read(settings, config)
+        config.check_read(settings)
         return config
 
     @classmethod
@@ -196,13 +196,12 @@ class StageConfig:
         refuse_unknown("preset", preset, cls.presets)
         return flat(cls()) | dict(cls.presets[preset]) | {"preset": preset}
 
-    @classmethod
-    def check_read(cls, names: Iterable[str], config: Any) -> None:
-        """Raise UserError for the first of some settings that a config has not: set, it would change nothing."""
-        known = flat(config)
+    def check_read(self, names: Iterable[str]) -> None:
+        """Raise UserError for the first of some settings that this config has not: set, it would change nothing."""
+        known = flat(self)
         for name in names:
             if name not in known:
-                raise UserError(f"{flag_of(name)} is not read by {_reader(cls.choosers, name, known)}: leave it out")
+                raise UserError(f"{flag_of(name)} is not read by {_reader(self.choosers, name, known)}: leave it out")
 
     def check(self) -> None:
         """Refuse settings that cannot work, before anything is read or written."""

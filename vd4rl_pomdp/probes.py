@@ -10,6 +10,7 @@ from sklearn.linear_model import Ridge
 from sklearn.preprocessing import StandardScaler
 
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.state_scale import LEAST_VARIANCE
 from vd4rl_pomdp.tasks import Layout
 
 HELD_OUT = 5
@@ -36,7 +37,7 @@ def probe_error(features: np.ndarray, targets: np.ndarray, episode: np.ndarray) 
         raise UserError("a probe fits some episodes and is tested on others: one alone is too few")
     held_out = episode % HELD_OUT == HELD_OUT - 1 if episode.max() >= HELD_OUT - 1 else episode == episode.max()
     scale = StandardScaler().fit(targets[~held_out])
-    varying = scale.var_ > 1e-10
+    varying = scale.var_ > LEAST_VARIANCE
     if not varying.any():
         return 0.0
     targets = scale.transform(targets)[:, varying]

@@ -9,7 +9,7 @@ from typing import Self
 import torch
 from torch import Tensor
 
-_LEAST_VARIANCE = 1e-10
+LEAST_VARIANCE = 1e-10
 """A coordinate that varies less counts as constant, as for the probes."""
 
 
@@ -29,7 +29,7 @@ class StateScale:
         """The scale of (N, P) states, the first `pose` columns of which are poses."""
         values = states.double()
         variance = values.var(0, correction=0)
-        return cls(values.mean(0), torch.where(variance > _LEAST_VARIANCE, variance, 0).sqrt(), pose)
+        return cls(values.mean(0), torch.where(variance > LEAST_VARIANCE, variance, 0).sqrt(), pose)
 
     def noise(self, pose: float, velocity: float) -> Tensor:
         """Standard deviations (P,) float64 of normal noise whose mean absolute value is a share of each coordinate's.

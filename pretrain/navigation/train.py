@@ -17,16 +17,16 @@ from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.navigation.methods import UNTRAINED
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, EncoderCard, save_encoder
 from vd4rl_pomdp.options import flat
-from vd4rl_pomdp.runs import METRICS_FILE, NAVIGATION_FILE
+from vd4rl_pomdp.runs import METRICS_FILE, NAVIGATION_FILE, TRAJECTORY_FILE
 from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.files import jsonable, write_json
+from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.runs.memory import telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.seeding import seed_networks
 
-RESULTS = (NAVIGATION_FILE, "trajectory.csv", *FILES_OF_RUN)
+RESULTS = (NAVIGATION_FILE, TRAJECTORY_FILE, *FILES_OF_RUN)
 """What a finished run holds."""
 
 
@@ -56,7 +56,7 @@ def _conclude(run: RunFolder, trainer: NavigationTrainer) -> None:
     """Measure, and write what is kept of a run."""
     config, data, trained = trainer.config, trainer.data, run.seconds
     probe, rows = measure(trainer, run.path / METRICS_FILE)
-    write_trajectory(run.path / "trajectory.csv", trainer, probe)
+    write_trajectory(run.path / TRAJECTORY_FILE, trainer, probe)
     card = EncoderCard(
         method=config.method,
         task=data.maze.name,
@@ -66,7 +66,7 @@ def _conclude(run: RunFolder, trainer: NavigationTrainer) -> None:
         steps=trainer.step,
         preset=config.preset,
         data=data.dataset.fingerprint,
-        settings=settings_of(jsonable(flat(config))),
+        settings=settings_of(run.config),
     )
     frames = trainer.step * config.batch_size * config.window
     save_encoder(run.path / "encoder", trainer.objective.encoder, card, frames)

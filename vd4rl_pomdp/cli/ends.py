@@ -7,7 +7,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vd4rl_pomdp.cli.dispatch import run_stage
-from vd4rl_pomdp.errors import DIVERGED, DONE, INTERRUPTED, DivergedError, UserError, disk_error
+from vd4rl_pomdp.errors import DIVERGED, DONE, INTERRUPTED, DivergedError, UserError, disk_error, in_one_line
 from vd4rl_pomdp.runs import interrupt
 
 
@@ -34,7 +34,7 @@ def run_to_end(words: Sequence[str], second: signal.Handlers = signal.SIG_DFL) -
         with interrupt.handled(second):
             run_stage(list(words))
     except UserError as error:
-        return End(2, error.cause, f"error: {' '.join(str(error).split())}")
+        return End(2, error.cause, f"error: {in_one_line(error)}")
     except FloatingPointError as error:
         precision = "--update-precision" if words[:1] == ["finetune"] else "--precision"
         usual = f"lower --learning-rate or use {precision} fp32"

@@ -12,6 +12,7 @@ import tyro
 from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.runs import NAVIGATION_FILE
 
 if TYPE_CHECKING:
     import numpy as np
@@ -30,7 +31,7 @@ def _train(words: Arguments, program: str) -> None:
     from pretrain.navigation.train import train
 
     run = train(parse_stage(NavigationConfig, words, program))
-    print(f"results: {run.path / 'results.json'}")
+    print(f"results: {run.path / NAVIGATION_FILE}")
 
 
 def _policy(words: Arguments, program: str) -> None:

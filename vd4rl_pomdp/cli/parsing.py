@@ -100,7 +100,7 @@ def _refuse_unread(default: StageConfig, words: Arguments) -> None:
     flags = (word.partition("=")[0][2:].replace("-", "_") for word in words if word.startswith("--"))
     names = (flag.removeprefix("no_") for flag in flags)
     optional = option_names()
-    default.check_read((name for name in names if name in optional), default)
+    default.check_read(name for name in names if name in optional)
 
 
 def _chosen(words: Arguments, name: str) -> str | None:

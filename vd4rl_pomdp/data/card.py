@@ -12,9 +12,9 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
-from vd4rl_pomdp.data.dataset import identity
+from vd4rl_pomdp.data.dataset import task_and_quality
 from vd4rl_pomdp.data.episodes import episode_returns, join_shards
-from vd4rl_pomdp.data.format import RECORD, check_frames, read_attributes, read_rows, read_some_frames, shard_paths
+from vd4rl_pomdp.data.format import PROVENANCE, check_frames, read_attributes, read_rows, read_some_frames, shard_paths
 from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.files import read_json
@@ -63,7 +63,7 @@ def write_card(path: Path) -> Path:
     parts = [read_rows(shard) for shard in shards]
     rows = join_shards(path, shards, parts)
     attributes = [read_attributes(shard) for shard in shards]
-    names = identity(path, attributes)
+    names = task_and_quality(path, attributes)
     starts = np.flatnonzero(rows["step_type"] == StepType.FIRST)
     returns = episode_returns(rows["reward"], starts)
     lengths = np.diff([*starts, len(rows["reward"])])
@@ -166,7 +166,7 @@ def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, str]:
     facts = {"seed": first.get("seed"), "render": first.get("render")}
     facts["noise added to actions, standard deviation"] = first.get("action_noise")
     facts |= {f"actor {name}, SHA-256": sha for name, sha in actors.items()}
-    record = path / RECORD
+    record = path / PROVENANCE
     if record.exists():
         provenance = read_json(record)
         if not all(isinstance(provenance.get(name, {}), dict) for name in ("render", "versions")):

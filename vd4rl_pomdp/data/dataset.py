@@ -53,7 +53,7 @@ class Dataset:
         self._buffers = FrameBuffers()
         self.fingerprint = store.fingerprint
         """Name of the set's content, the same for copies of the set."""
-        self.task, self.quality = identity(path, store.meta["attributes"])
+        self.task, self.quality = task_and_quality(path, store.meta["attributes"])
         """Names as in `tasks`, None where neither the shards nor the folders tell."""
         step_type, reward = store.array("step_type"), store.array("reward")
         self.frames = _read_only_tensor(store.frames())
@@ -347,7 +347,7 @@ def _read_only_tensor(array: np.ndarray) -> Tensor:
         return torch.from_numpy(array)
 
 
-def identity(path: Path, attributes: list[dict[str, Any]]) -> tuple[str | None, str | None]:
+def task_and_quality(path: Path, attributes: list[dict[str, Any]]) -> tuple[str | None, str | None]:
     """Task and quality of a set: as the attributes of all its shards say, else as its folders are named."""
     return _name(path, attributes, "task", tuple(TASKS)), _name(path, attributes, "set", SET_QUALITIES)
 

@@ -23,14 +23,14 @@ from typing import Any
 import h5py
 import numpy as np
 
-from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.errors import UserError, disk_error, in_one_line
+from vd4rl_pomdp.reading import parse_json, regular
 from vd4rl_pomdp.runs.files import read_json, write_bytes
-from vd4rl_pomdp.runs.reading import parse_json, regular
 from vd4rl_pomdp.tasks import FRAME_SIZES
 from vd4rl_pomdp.types import StepType
 
 SUFFIXES = (".hdf5", ".h5")
-PLAN, RECORD = "collection.json", "provenance.json"
+PLAN, PROVENANCE = "collection.json", "provenance.json"
 """What a collection writes before its first shard, and after its last."""
 FRAMES_KEY = "observation"
 _ROW_KEYS = {"action": 2, "reward": 1, "discount": 1, "step_type": 1, "physics": 2}
@@ -53,6 +53,11 @@ def read_plan(folder: Path) -> dict[str, Any]:
     return read_json(folder / PLAN) if (folder / PLAN).is_file() else {}
 
 
+def shard_files(folder: Path) -> list[Path]:
+    """Files of a folder that are called shards, in no order; none without a folder. `shard_paths` checks them."""
+    return [path for path in folder.iterdir() if is_shard_name(path.name)] if folder.is_dir() else []
+
+
 def shard_paths(folder: Path) -> list[Path]:
     """Shards of a set in the order of their rows; `folder` may also name a single shard.
 
@@ -68,9 +73,9 @@ def shard_paths(folder: Path) -> list[Path]:
     if not folder.is_dir():
         raise UserError(f"{folder}: no such folder; collect a set there or download one with `vd4rl-pomdp data`")
     refuse_partial(folder)
-    if (folder / PLAN).exists() and not (folder / RECORD).exists():
+    if (folder / PLAN).exists() and not (folder / PROVENANCE).exists():
         raise UserError(f"{folder}: the set's collection is not finished; start the command that collects it again")
-    shards = [path for path in folder.iterdir() if is_shard_name(path.name)]
+    shards = shard_files(folder)
     if not shards:
         first = min((path for path in folder.rglob("*") if is_shard_name(path.name)), default=None)
         hint = f"name a folder of shards such as {first.parent}" if first else "collect or download a set there"
@@ -252,11 +257,7 @@ def _open(path: Path) -> Iterator[h5py.File]:
     except PermissionError as error:
         raise disk_error(path, error) from error
     except (OSError, RuntimeError, KeyError, ValueError) as error:
-        raise UserError(f"{path}: is truncated, damaged or no HDF5 file ({_one_line(error)}); {_REPAIR}") from error
-
-
-def _one_line(error: Exception) -> str:
-    return " ".join(str(error).split())
+        raise UserError(f"{path}: is truncated, damaged or no HDF5 file ({in_one_line(error)}); {_REPAIR}") from error
 
 
 def _present(path: Path, file: h5py.File) -> list[str]:

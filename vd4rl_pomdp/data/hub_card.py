@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 from pathlib import Path
 
-from vd4rl_pomdp.data.dataset import identity
+from vd4rl_pomdp.data.dataset import task_and_quality
 from vd4rl_pomdp.data.format import read_attributes, shard_paths
-from vd4rl_pomdp.runs.reading import read_bytes
+from vd4rl_pomdp.reading import read_bytes
 from vd4rl_pomdp.text import code, code_block, one_line
 
 TAGS = ("reinforcement-learning", "offline-reinforcement-learning", "vd4rl-pomdp")
@@ -21,7 +21,7 @@ def set_card(folder: Path, repository: str, license: str) -> str:
         repository: OWNER/NAME on the Hub.
         license: the licence that its owner gives it, as the Hub spells it.
     """
-    names = identity(folder, [read_attributes(shard) for shard in shard_paths(folder)])
+    names = task_and_quality(folder, [read_attributes(shard) for shard in shard_paths(folder)])
     tags = [*TAGS, *(one_line(name) for name in names if name)]
     task, quality = (code(name or "unknown") for name in names)
     told = folder / "card.md"

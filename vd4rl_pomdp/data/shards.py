@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.data.format import PLAN, RECORD, write_shard
+from vd4rl_pomdp.data.format import PLAN, PROVENANCE, write_shard
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.files import holds_anything, read_json, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
@@ -88,7 +88,7 @@ class _Record:
     """What a repeated collection would not reproduce: seconds and frames, over all its parts, and where it ran."""
 
     def __init__(self, out: Path) -> None:
-        self._path, self._parts_path = out / RECORD, out / ".parts.json"
+        self._path, self._parts_path = out / PROVENANCE, out / ".parts.json"
         self._told = read_json(self._path).get("parts", {}) if self._path.exists() else {}
         added = read_json(self._parts_path) if self._parts_path.exists() else {}
         self._parts: dict[str, list[float]] = self._told | added

@@ -13,7 +13,7 @@ from PIL import Image
 
 from vd4rl_pomdp.envs.opengl import undisturbed
 from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep, between
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, in_one_line
 from vd4rl_pomdp.tasks import FRAME_SIZE, GymnasiumTask, Layout
 from vd4rl_pomdp.types import StepType
 
@@ -61,7 +61,7 @@ class GymnasiumEnv(PixelEnv):
         try:
             yield
         except refusals as error:
-            reason = " ".join(str(error).split())
+            reason = in_one_line(error)
             raise UserError(
                 f"environment {self._name} {what} ({reason}): mend the task's registration, or install what the "
                 "environment needs"

@@ -16,7 +16,7 @@ from pathlib import Path
 import numpy as np
 
 from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, replay_returns
-from vd4rl_pomdp.data.format import RECORD
+from vd4rl_pomdp.data.format import PROVENANCE
 from vd4rl_pomdp.errors import refuse_number, refuse_unknown
 from vd4rl_pomdp.policies.actor import ships
 from vd4rl_pomdp.runs.files import Row, read_csv, read_json, write_csv, write_json
@@ -115,5 +115,5 @@ def _cost(task: str, episodes: int) -> Row:
         started = time.process_time()
         collect(CollectConfig(task, "random", Path(folder) / task, episodes, workers=1))
         spent = time.process_time() - started
-        rows = read_json(Path(folder) / task / RECORD)["frames"]
+        rows = read_json(Path(folder) / task / PROVENANCE)["frames"]
     return {"task": task, "episodes": episodes, "rows": rows, "cpu_seconds": f"{spent:.1f}", "commit": git_commit()}

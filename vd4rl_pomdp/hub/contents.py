@@ -8,15 +8,15 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from vd4rl_pomdp.data.episodes import join_shards
-from vd4rl_pomdp.data.format import check_frames, is_shard_name, read_rows, shard_paths
+from vd4rl_pomdp.data.format import check_frames, is_shard_name, read_rows, shard_files, shard_paths
 from vd4rl_pomdp.data.hub_card import set_card
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.hub.repository import ENCODER, SET, Repository
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, WEIGHTS, load_encoder, read_record
 from vd4rl_pomdp.nn.model_card import CARD, model_card
+from vd4rl_pomdp.reading import build
 from vd4rl_pomdp.runs.files import read_json, sha256, write_bytes
 from vd4rl_pomdp.runs.outputs import kept_in
-from vd4rl_pomdp.runs.reading import build
 
 LISTING = "vd4rl_pomdp.json"
 """Name of the listing beside the files."""
@@ -86,8 +86,7 @@ def checked(folder: Path, repository: Repository, license: str) -> tuple[list[Pa
 def _kind(folder: Path) -> str | None:
     """What a folder holds; files that are called shards make a set, so that it is told what is wrong with them."""
     kind = kept_in(folder)
-    named = kind is None and folder.is_dir() and any(is_shard_name(path.name) for path in folder.iterdir())
-    return SET if named else kind
+    return SET if kind is None and shard_files(folder) else kind
 
 
 def _check(folder: Path, kind: str) -> None:
@@ -108,7 +107,7 @@ def _is_name_of_set(name: str) -> bool:
 
 def is_there(folder: Path, listing: Listing) -> bool:
     """Whether a folder holds what a listing lists, and no shard that would make it another set."""
-    shards = {path.name for path in folder.glob("*") if is_shard_name(path.name)}
+    shards = {path.name for path in shard_files(folder)}
     return shards <= listing.sha256.keys() and all(
         (folder / n).is_file() and sha256(folder / n) == digest for n, digest in listing.sha256.items()
     )

@@ -24,7 +24,7 @@ from huggingface_hub.utils import disable_progress_bars, validate_repo_id
 
 from vd4rl_pomdp import __version__
 from vd4rl_pomdp.data.download import check_endpoint, default_endpoint
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, in_one_line
 
 ENCODER, SET = "an encoder", "a data set"
 """What a repository holds, in the words of `runs.outputs.kept_in`."""
@@ -128,7 +128,7 @@ def _refusal(error: Exception) -> str:
     if isinstance(error, RuntimeError) and isinstance(error.__cause__, HfHubHTTPError):
         error = error.__cause__
     if not isinstance(error, HfHubHTTPError):
-        return f"the Hub does not take it ({' '.join(str(error).split())})"
+        return f"the Hub does not take it ({in_one_line(error)})"
     status = error.response.status_code
     if status in (401, 403):
         return f"your token may not do this (status {status}); check HF_TOKEN or `hf auth login`, and its permissions"

@@ -18,7 +18,7 @@ import numpy as np
 from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_no_folder, refuse_outside
 from vd4rl_pomdp.mazes import ACTION_REPEAT, HARD, MOST_STEPS, MazeSpec, get_maze
 from vd4rl_pomdp.navigation.planner import Planner
-from vd4rl_pomdp.policies.actor import Actor, check_actor, read_actor
+from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.progress import ProgressLine
 
@@ -114,7 +114,7 @@ def _refuse_other(path: Path) -> None:
     """Raise UserError for a file to write that exists and holds anything but an earlier actor."""
     if path.exists() or path.is_symlink():
         try:
-            check_actor(path)
+            read_actor(path)
         except UserError as error:
             raise UserError(f"{path}: is there already and holds no actor; choose another --out") from error
 

@@ -22,9 +22,9 @@ from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.encoder_card import EncoderCard, EncoderOrigin, EncoderRecord
 from vd4rl_pomdp.nn.frame import STATE
 from vd4rl_pomdp.nn.model_card import CARD, model_card
+from vd4rl_pomdp.reading import build, parse_json, read_bytes, read_tensors
 from vd4rl_pomdp.runs.files import json_text, write_bytes, write_json
 from vd4rl_pomdp.runs.provenance import git_commit
-from vd4rl_pomdp.runs.reading import build, parse_json, read_bytes, read_tensors
 
 WEIGHTS, CONFIG = "model.safetensors", "config.json"
 FILES_OF_RUN = (f"encoder/{CONFIG}", f"encoder/{WEIGHTS}")

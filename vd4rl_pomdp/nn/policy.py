@@ -12,8 +12,8 @@ from torch.random import fork_rng
 
 from vd4rl_pomdp.errors import UserError, disk_errors, first_line
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp
+from vd4rl_pomdp.reading import read_tensors, regular
 from vd4rl_pomdp.runs.files import read_json, write_bytes, write_json
-from vd4rl_pomdp.runs.reading import read_tensors, regular
 
 _WEIGHTS, _SHAPE = "model.safetensors", "config.json"
 _STEP = "step"

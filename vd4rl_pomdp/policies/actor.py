@@ -21,8 +21,8 @@ from safetensors.numpy import save
 
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs.files import write_bytes
-from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 from vd4rl_pomdp.tasks import TASKS
 
 LOG_STD_RANGE = (-20.0, 2.0)
@@ -162,11 +162,6 @@ def read_actor(path: Path, task: str | None = None) -> Actor:
     actor = Actor(*_read(path, task))
     _check_weights(path, actor, task)
     return actor
-
-
-def check_actor(path: Path, task: str | None = None) -> None:
-    """Raise UserError unless a file is an actor that `read_actor` can read."""
-    read_actor(path, task)
 
 
 def read_ladder(path: Path, task: str | None = None) -> Ladder:

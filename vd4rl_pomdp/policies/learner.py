@@ -20,9 +20,9 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import OBSERVATION_CLIP, Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
 from vd4rl_pomdp.policies.state_env import StateEnv
+from vd4rl_pomdp.reading import read_bytes
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, fitting
 from vd4rl_pomdp.runs.files import write_bytes
-from vd4rl_pomdp.runs.reading import read_bytes
 from vd4rl_pomdp.seeding import stream_seed
 from vd4rl_pomdp.tasks import Task
 

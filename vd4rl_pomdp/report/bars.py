@@ -8,7 +8,8 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from vd4rl_pomdp.report.figures import COLOURS, Plot, file_name, grid_of, panels, seeds_note
-from vd4rl_pomdp.report.tables import SETTING, by_label, grouped, label
+from vd4rl_pomdp.report.load import SETTING
+from vd4rl_pomdp.report.tables import by_label, grouped, label
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.text import plain
 

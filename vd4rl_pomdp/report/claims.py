@@ -18,6 +18,7 @@ from vd4rl_pomdp.report.gates import (
     Sides,
     as_it_is,
     difference,
+    place_of,
     returns_of,
     seeds_by_variant,
     seen_under,
@@ -92,8 +93,8 @@ def judge_claims(runs: list[LoadedRun], unranked: Collection[tuple[str, ...]] = 
         runs: of a report.
         unranked: settings that do not discriminate: there nothing is judged.
     """
-    finished = [run for run in runs if run.rows and run.finished and not run.end_to_end]
-    settings = sorted({tuple(str(run.labels[name]) for name in GATED) for run in finished})
+    finished = [run for run in runs if run.evaluated and not run.end_to_end]
+    settings = sorted({place_of(run) for run in finished})
     rows = (_row(claim, place, finished, unranked) for claim in CLAIMS for place in settings)
     return [row for row in rows if row is not None]
 

@@ -13,14 +13,14 @@ from rich.text import Text
 
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.report import stats
+from vd4rl_pomdp.report.facts import commits, machines
 from vd4rl_pomdp.report.figures import seeds_note
-from vd4rl_pomdp.report.gaps import CONDITION
-from vd4rl_pomdp.report.layout import Line, ShownTable, interval, latex, with_interval
-from vd4rl_pomdp.report.load import LABELS, LoadedRun, load_runs
+from vd4rl_pomdp.report.layout import Line, ShownTable, interval, with_interval, write_latex
+from vd4rl_pomdp.report.load import CONDITION, LoadedRun, load_runs
 from vd4rl_pomdp.report.present import by_setting
-from vd4rl_pomdp.report.tables import SCORE, evaluations, final_scores, grouped, label
+from vd4rl_pomdp.report.tables import SCORE, SCORES_NOTE, evaluations, final_scores, grouped, label, mean_and_ends
 from vd4rl_pomdp.report.templates import render
-from vd4rl_pomdp.runs.files import Row, write_bytes, write_csv
+from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.text import write_text
 
@@ -77,13 +77,13 @@ def compare_results(one: Path, other: Path) -> SideBySide:
 
 def _loaded(path: Path) -> list[LoadedRun]:
     runs = [run for run in load_runs([path]) if run.stage == "finetune"]
-    if not any(run.rows and run.finished for run in runs):
+    if not any(run.evaluated for run in runs):
         raise UserError(f"{path}: holds no finished and evaluated run to compare")
     return runs
 
 
 def _conditions(runs: list[LoadedRun]) -> Conditions:
-    finished = [run.named | {"run": run} for run in runs if run.rows and run.finished]
+    finished = [run.named | {"run": run} for run in runs if run.evaluated]
     return {key: [row["run"] for row in members] for key, members in grouped(finished, CONDITION)}
 
 
@@ -107,9 +107,9 @@ def _of_like_name(mine: tuple, first: Conditions, second: Conditions) -> tuple |
 
 def _what_was_done(runs: list[LoadedRun]) -> tuple:
     """What a condition's runs computed on what, as their files have it: not by names that depend on other runs."""
-    labels = runs[0].result.labels
+    labels = (value for name, value in runs[0].result.labels.items() if name != "seed")
     settings = {frozenset(run.settings.items()) for run in runs}
-    return *(labels[name] for name in LABELS if name != "seed"), frozenset(settings)
+    return *labels, frozenset(settings)
 
 
 def _row(one: list[LoadedRun] | None, other: list[LoadedRun] | None, key: tuple) -> Row:
@@ -131,11 +131,8 @@ def _difference(one: list[LoadedRun], other: list[LoadedRun]) -> tuple[float, fl
 
 
 def _score(side: str, scores: np.ndarray | None) -> Row:
-    if scores is None:
-        return {f"score_{side}": None, f"low_{side}": None, f"high_{side}": None, f"seeds_{side}": 0}
-    low, high = stats.bootstrap_interval([scores], stats.mean, np.random.default_rng(0)) or (None, None)
-    ends = {f"low_{side}": low, f"high_{side}": high}
-    return {f"score_{side}": float(scores.mean())} | ends | {f"seeds_{side}": len(scores)}
+    values = (None, None, None, 0) if scores is None else (*mean_and_ends(scores), len(scores))
+    return dict(zip((f"{name}_{side}" for name in ("score", "low", "high", "seeds")), values, strict=True))
 
 
 def _differing(one: list[LoadedRun], other: list[LoadedRun]) -> str:
@@ -150,10 +147,8 @@ def _differing(one: list[LoadedRun], other: list[LoadedRun]) -> str:
 
 
 def _side(path: Path, runs: list[LoadedRun]) -> Side:
-    finished = [run for run in runs if run.rows and run.finished]
-    commits = dict.fromkeys(run.result.commit or "unknown" for run in finished)
-    machines = dict.fromkeys(run.result.machine or "not recorded" for run in finished)
-    return Side(path, len(finished), len(runs) - len(finished), ", ".join(commits), "; ".join(machines))
+    finished = [run for run in runs if run.evaluated]
+    return Side(path, len(finished), len(runs) - len(finished), commits(finished), machines(finished))
 
 
 def tables(comparison: SideBySide) -> list[ShownTable]:
@@ -216,8 +211,7 @@ def write_comparison(comparison: SideBySide, out: Path) -> Path:
         out.mkdir(parents=True, exist_ok=True)
     shown = tables(comparison)
     write_csv(out / f"{FILE}.csv", list(comparison.rows[0]), comparison.rows)
-    note = f"{SCORE}. Mean over seeds, 95% percentile bootstrap intervals."
-    write_bytes(out / f"{FILE}.tex", latex(shown, note).encode(errors="backslashreplace"))
+    write_latex(out / f"{FILE}.tex", shown, SCORES_NOTE)
     page = render("compare.html", score=SCORE, sides=comparison.sides, tables=shown, file=FILE)
     write_text(out / "index.html", page)
     return out / "index.html"

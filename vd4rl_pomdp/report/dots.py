@@ -7,7 +7,7 @@ from typing import Any
 from matplotlib.axes import Axes
 
 from vd4rl_pomdp.report.figures import COLOURS, Plot, file_name, panels, seeds_note, span, style
-from vd4rl_pomdp.report.load import PROBES
+from vd4rl_pomdp.report.load import PROBES, SETTING
 from vd4rl_pomdp.report.measures import COSTS
 from vd4rl_pomdp.report.tables import by_label, grouped, label
 from vd4rl_pomdp.runs.files import Row
@@ -18,7 +18,7 @@ _MANY = 300
 """Dots of a figure, above which they are one picture within it, and its words are of the best runs."""
 _TOLD = 20
 """Runs that the words of a panel tell of, at most."""
-_COLUMNS = ("task", "quality", "corruption", "method", "seed", *PROBES, "return")
+_COLUMNS = (*SETTING, "method", "seed", *PROBES, "return")
 
 
 def probe_plots(runs: list[Row], looks: dict[str, int]) -> list[Plot]:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from typing import Any
 
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import LoadedRun, compare
@@ -67,13 +66,19 @@ def _facts(name: str, runs: list[LoadedRun]) -> dict[str, str]:
     first = runs[0].record
     return {
         "title": f"{name}, {'seeds' if len(seeds) > 1 else 'seed'} {', '.join(shown)}",
-        "commits": ", ".join(_distinct(run.result.commit or "unknown" for run in runs)),
-        "machines": "; ".join(_distinct(run.result.machine or "not recorded" for run in runs)),
+        "commits": commits(runs),
+        "machines": machines(runs),
         "time": f"{min(seconds):.0f} to {max(seconds):.0f} s" if seconds else runs[0].progress,
         "command": first.get("command", ""),
         "config": json.dumps({"config": settings_of(first["config"]), "versions": first.get("versions")}, indent=1),
     }
 
 
-def _distinct(words: Any) -> list[str]:
-    return list(dict.fromkeys(map(str, words)))
+def commits(runs: list[LoadedRun]) -> str:
+    """The commits that runs were made with, in words."""
+    return ", ".join(dict.fromkeys(run.result.commit or "unknown" for run in runs))
+
+
+def machines(runs: list[LoadedRun]) -> str:
+    """The machines that runs were made on, in words."""
+    return "; ".join(dict.fromkeys(run.result.machine or "not recorded" for run in runs))

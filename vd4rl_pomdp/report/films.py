@@ -12,6 +12,7 @@ from PIL import Image
 
 from vd4rl_pomdp.report.facts import title
 from vd4rl_pomdp.report.load import LoadedRun
+from vd4rl_pomdp.runs import FILM_FILE
 
 STRIP_FRAMES = 8
 """Frames in a film strip, at most."""
@@ -38,12 +39,11 @@ def shown_films(runs: Iterable[LoadedRun]) -> tuple[list[Shown], int]:
     """The film of the first seed of every method and setting, each read once, and how many found no room."""
     chosen: dict[tuple[str, ...], LoadedRun] = {}
     for run in runs:
-        if run.rows and run.result.folder and (run.path / "film.npz").exists():
+        if run.rows and run.result.folder and (run.path / FILM_FILE).exists():
             chosen.setdefault(run.identity[:-1], run)
     shown, size = [], 0
     for run in chosen.values():
         film = run.film()
-        assert film is not None
         name = f"{title(run)}, seed {run.labels['seed']}"
         made = Shown(name, _base64(strip(film)), _base64(movie(film)), _share(film), film["return"][-1])
         size += len(made.strip) + len(made.movie)

@@ -4,19 +4,18 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Iterator
 from itertools import groupby
+from operator import attrgetter
 
 from vd4rl_pomdp.report.grouping import groups
-from vd4rl_pomdp.report.load import LABELS, LoadedRun
+from vd4rl_pomdp.report.load import CONDITION, SETTING, LoadedRun
 from vd4rl_pomdp.report.variants import ENCODER_SEED
 from vd4rl_pomdp.runs.files import Row
 
 Setting = tuple[str, str, str]
-"""Task, quality and corruption: what methods are compared in."""
+"""Values of SETTING."""
 MISSING = "missing"
 STATE = "state"
 """The method that sees the simulator's state, whatever a setting hides."""
-CONDITION = ("task", "quality", "corruption", "algorithm", "method", "variant")
-"""What all seeds of an experiment share: the columns that tell it from others."""
 
 
 def find_gaps(runs: list[LoadedRun]) -> list[Row]:
@@ -29,19 +28,16 @@ def find_gaps(runs: list[LoadedRun]) -> list[Row]:
     by_method = groups(grid, _method)
     rows = []
     for setting, here in groups(grid, _setting).items():
-        there = {(*_method(run), run.variant, run.labels["seed"]): run for run in sorted(here, key=_has_score)}
+        evaluated_last = sorted(here, key=attrgetter("evaluated"))
+        there = {(*_method(run), run.variant, run.labels["seed"]): run for run in evaluated_last}
         seeds = sorted({run.labels["seed"] for run in here})
         for algorithm, method, variant in _expected(by_method, setting):
             condition = dict(zip(CONDITION, (*setting, algorithm, method, variant), strict=True))
             for seed in seeds:
                 run = there.get((algorithm, method, variant, seed))
-                if not _is_own(variant, seed) and (run is None or not _has_score(run)):
+                if not _is_own(variant, seed) and (run is None or not run.evaluated):
                     rows.append(condition | {"seed": seed, "state": _state(run)})
     return rows
-
-
-def _has_score(run: LoadedRun) -> bool:
-    return run.finished and bool(run.rows)
 
 
 def _is_own(variant: str, seed: int) -> bool:
@@ -50,7 +46,7 @@ def _is_own(variant: str, seed: int) -> bool:
 
 
 def _setting(run: LoadedRun) -> Setting:
-    task, quality, corruption = (run.labels[name] for name in LABELS[:3])
+    task, quality, corruption = (run.labels[name] for name in SETTING)
     return task, quality, corruption
 
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from vd4rl_pomdp.report.gaps import STATE
 from vd4rl_pomdp.report.grouping import groups
-from vd4rl_pomdp.report.load import LoadedRun, of_corruptions
+from vd4rl_pomdp.report.load import SETTING, LoadedRun, of_corruptions
 from vd4rl_pomdp.report.tables import REFERENCES, grouped
 from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, is_plain, unlike
 from vd4rl_pomdp.runs.files import Row
@@ -27,7 +27,7 @@ STATE_SHARE, ACRO_SHARE = 0.9, 0.7
 STANDARD_ERRORS = 2.0
 """Least difference between the best method and `random`, in its standard errors over seeds."""
 PASSED, FAILED, UNKNOWN = "discriminates", "does not discriminate", "not known to discriminate"
-GATED = ("task", "quality", "corruption", "algorithm")
+GATED = (*SETTING, "algorithm")
 _NOT_PRETRAINED = ("random", STATE)
 """Methods of which no setting of pretraining counts."""
 
@@ -48,8 +48,8 @@ def gates(runs: list[LoadedRun]) -> list[Row]:
     method's, are shares of the return of their own. `above_random` is the best method's mean return less that of
     `random`, as `sides` finds them, `error` its standard error over seeds. What is not known is None.
     """
-    finished = [run for run in runs if run.rows and run.finished and not run.end_to_end]
-    return [_gate(key, finished) for key in sorted({_key(run) for run in finished})]
+    finished = [run for run in runs if run.evaluated and not run.end_to_end]
+    return [_gate(key, finished) for key in sorted({place_of(run) for run in finished})]
 
 
 def unranked(table: list[Row], names: Sequence[str] = GATED) -> set[tuple[str, ...]]:
@@ -58,13 +58,14 @@ def unranked(table: list[Row], names: Sequence[str] = GATED) -> set[tuple[str, .
     return {place for place, rows in places if all(row["verdict"].startswith(FAILED) for row in rows)}
 
 
-def _key(run: LoadedRun) -> tuple[str, ...]:
+def place_of(run: LoadedRun) -> tuple[str, ...]:
+    """Values of GATED: the setting in which a run is compared with others."""
     return tuple(str(run.labels[name]) for name in GATED)
 
 
 def _gate(key: tuple[str, ...], runs: list[LoadedRun]) -> Row:
     task, quality, corruption, algorithm = key
-    alike = [run for run in runs if _key(run)[:2] == (task, quality) and _key(run)[3] == algorithm]
+    alike = [run for run in runs if place_of(run)[:2] == (task, quality) and place_of(run)[3] == algorithm]
     here, clean = (seen_under(under, alike) for under in (corruption, "none"))
     state, acro = best_of(as_it_is("state", here)), best_of(as_it_is("acro", clean))
     learned = [run for run in here if run.labels["method"] not in REFERENCES]

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import NamedTuple
 
+from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.text import one_line
 
 _ESCAPES = {
@@ -52,6 +54,11 @@ def interval(low: float | None, high: float | None, digits: int = 1) -> str:
 def with_interval(value: float | None, low: float | None, high: float | None, digits: int = 1) -> str:
     """A number and its interval, as far as they are known."""
     return number(value, digits) if low is None else f"{number(value, digits)} {interval(low, high, digits)}"
+
+
+def write_latex(path: Path, tables: Sequence[ShownTable], note: str) -> None:
+    """Write tables as `latex` sets them; letters that UTF-8 cannot hold are written by their numbers."""
+    write_bytes(path, latex(tables, note).encode(errors="backslashreplace"))
 
 
 def latex(tables: Sequence[ShownTable], note: str) -> str:

@@ -8,8 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 
 from vd4rl_pomdp.report.figures import Plot, file_name, panels, remark, room_for, seeds_note, span, style
-from vd4rl_pomdp.report.gaps import CONDITION
-from vd4rl_pomdp.report.load import LoadedRun
+from vd4rl_pomdp.report.load import CONDITION, LoadedRun
 from vd4rl_pomdp.report.overall import THRESHOLDS
 from vd4rl_pomdp.report.tables import by_label, grouped, label
 from vd4rl_pomdp.runs.files import Row

@@ -13,18 +13,20 @@ import numpy as np
 
 from vd4rl_pomdp.corruptions import corruption_settings
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.reading import regular
 from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.variants import DATA, Parts, Settings, differences, of_sets, read_settings
-from vd4rl_pomdp.results import Result, find_results
-from vd4rl_pomdp.runs import REFERENCE_FILE
+from vd4rl_pomdp.results import Result, find_results, whole_files
+from vd4rl_pomdp.runs import FILM_FILE, REFERENCE_FILE
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.runs.reading import regular
 
-LABELS = ("task", "quality", "corruption", "algorithm", "method", "seed")
-"""Columns that a run's files name it by."""
-IDENTITY = ("task", "quality", "corruption", "algorithm", "method", "variant", "seed")
-"""Columns that tell a run's rows from all others of a report: LABELS, and its variant."""
+SETTING = ("task", "quality", "corruption")
+"""Columns of what methods are compared in."""
+CONDITION = (*SETTING, "algorithm", "method", "variant")
+"""What all seeds of an experiment share: the columns that tell it from others."""
+IDENTITY = (*CONDITION, "seed")
+"""Columns that tell a run's rows from all others of a report: what its files name it by, and its variant."""
 PROBES = ("probe_pose", "probe_velocity")
 """Errors of linear probes of an encoder."""
 END_TO_END = ("bc", "drq_bc")
@@ -41,7 +43,7 @@ class Choice:
         return results
 
     def asks(self, row: Row) -> bool:
-        """Whether a run that is not there, told by LABELS, is missed."""
+        """Whether a run that is not there, told by its labels, is missed."""
         return True
 
 
@@ -55,8 +57,8 @@ class LoadedRun:
     result: Result
     """Its files."""
     labels: dict[str, Any]
-    """Values of LABELS; the task is empty until the run has opened its data. The corruption is followed by its options
-    where other runs have others of the same name, "patch, patch_size 48": what they hide is another setting."""
+    """Values of `runs.episodes.LABELS`; the task is empty until the run has opened its data. The corruption is followed
+    by its options where other runs have others of the same name, "patch, patch_size 48": that is another setting."""
     settings: Settings
     """All settings in which runs of its method may differ, in words."""
     rows: list[Row]
@@ -134,6 +136,11 @@ class LoadedRun:
         return self.result.finished and self.result.diverged is None
 
     @property
+    def evaluated(self) -> bool:
+        """Whether it has come to its end, and its policy was evaluated: what is compared."""
+        return self.finished and bool(self.rows)
+
+    @property
     def progress(self) -> str:
         """How far it is: "finished", "diverged at update 20 of 40", or "unfinished at 20 of 40 updates"."""
         if self.finished:
@@ -144,11 +151,9 @@ class LoadedRun:
             return f"diverged at {unit[:-1]} {self.result.diverged.get('step', self.result.step)} of {last}"
         return f"unfinished at {self.result.step} of {last} {unit}"
 
-    def film(self) -> dict[str, np.ndarray] | None:
-        """Pictures of an evaluation episode, if the run kept them; raises UserError for a damaged file."""
-        path = self.path / "film.npz"
-        if not path.exists():
-            return None
+    def film(self) -> dict[str, np.ndarray]:
+        """Pictures of an evaluation episode, for a run that kept them; raises UserError for a damaged file."""
+        path = self.path / FILM_FILE
         try:
             with np.load(regular(path)) as file:
                 film = dict(file)
@@ -253,7 +258,7 @@ def _without(settings: Settings, names: Collection[str]) -> Settings:
 
 def _load(result: Result) -> LoadedRun:
     """A run of its files; raises UserError for files that are valid JSON, but not what a run writes."""
-    try:
+    with whole_files(result.place):
         return LoadedRun(
             result=result,
             labels=result.labels,
@@ -264,12 +269,6 @@ def _load(result: Result) -> LoadedRun:
             representation=_representation(result),
             reference=_reference(result),
         )
-    except UserError:
-        raise
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise UserError(
-            f"{result.place}: its files are damaged ({error}); take another copy, or leave it out"
-        ) from error
 
 
 def _reference(result: Result) -> Reference:

@@ -7,9 +7,9 @@ from collections.abc import Iterable
 import numpy as np
 
 from vd4rl_pomdp.reference import summarise
-from vd4rl_pomdp.report.gaps import CONDITION, in_words
+from vd4rl_pomdp.report.gaps import in_words
 from vd4rl_pomdp.report.gates import returns_of
-from vd4rl_pomdp.report.load import IDENTITY, PROBES, LoadedRun
+from vd4rl_pomdp.report.load import CONDITION, IDENTITY, PROBES, LoadedRun
 from vd4rl_pomdp.report.tables import by_label, grouped, table_order
 from vd4rl_pomdp.runs.files import Row
 
@@ -37,7 +37,7 @@ def run_table(runs: list[LoadedRun], evaluated: list[Row], gaps: list[Row]) -> l
     curves = dict(grouped(evaluated, IDENTITY))
     table = []
     for run in runs:
-        if run.rows and run.finished:
+        if run.evaluated:
             curve = curves[tuple(run.named[name] for name in IDENTITY)]
             table.append(_run(run, curve))
     return sorted([*table, *(dict.fromkeys(_RUN) | gap for gap in gaps)], key=table_order)
@@ -87,7 +87,7 @@ def control(runs: list[LoadedRun]) -> list[Row]:
     Return, share of episodes above 80% of the data's return, and action error in closed loop are those of the last
     evaluation: as trained, and under no corruption (`clean_`). What a seed does not know is None.
     """
-    finished = [run for run in runs if run.rows and run.finished]
+    finished = [run for run in runs if run.evaluated]
     measured = [run.named | _control(run) for run in finished]
     table = [
         dict(zip(CONDITION, group, strict=True))

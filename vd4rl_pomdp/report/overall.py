@@ -8,11 +8,11 @@ import numpy as np
 
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.figures import span
-from vd4rl_pomdp.report.gaps import CONDITION
+from vd4rl_pomdp.report.load import CONDITION
 from vd4rl_pomdp.report.tables import final_scores, grouped, label, table_order
 from vd4rl_pomdp.runs.files import Row
 
-SERIES = ("corruption", "algorithm", "method", "variant")
+SERIES = CONDITION[2:]
 THRESHOLDS = 101
 """Number of scores at which a performance profile is computed."""
 MANY = 2_000

@@ -7,9 +7,9 @@ from collections.abc import Collection, Iterable, Sequence
 import numpy as np
 
 from vd4rl_pomdp.report import stats
-from vd4rl_pomdp.report.gaps import CONDITION, condition_of, in_words
+from vd4rl_pomdp.report.gaps import condition_of, in_words
 from vd4rl_pomdp.report.grouping import groups
-from vd4rl_pomdp.report.load import END_TO_END, LoadedRun
+from vd4rl_pomdp.report.load import CONDITION, END_TO_END, SETTING, LoadedRun
 from vd4rl_pomdp.runs.files import Row
 
 TOLD_STATES = ("supervised", "supervised+a")
@@ -21,10 +21,10 @@ LOOKS = (
     *("curl", "driml", "homer", "one_step_inverse", "no_history", "bc", "drq_bc"),
 )
 """The package's methods in the order of their looks, which are the same in every report: the first differ in colour."""
-SETTING = ("task", "quality", "corruption")
-"""What methods are compared in."""
 SCORE = "Score = return / 10 or the task's own divisor"
 """What tables and pages say of their scores."""
+SCORES_NOTE = f"{SCORE}. Mean over seeds, 95% percentile bootstrap intervals."
+"""What stands below a table of scores."""
 _MEASURED = (
     *("step", "score", "low", "high", "seeds", "episodes", "few_seeds"),
     *("best_step", "best_score", "best_low", "best_high"),
@@ -96,7 +96,7 @@ def _scores(rows: list[Row]) -> Row:
     final = max(curve)
     best = max(curve, key=lambda step: _seeds(curve[step]).mean())
     found: Row = {"step": final, "best_step": best}
-    ends = {step: _mean_and_ends(_seeds(curve[step])) for step in {final, best}}
+    ends = {step: mean_and_ends(_seeds(curve[step])) for step in {final, best}}
     for prefix, step in (("", final), ("best_", best)):
         found |= dict(zip((f"{prefix}score", f"{prefix}low", f"{prefix}high"), ends[step], strict=True))
     count = len(curve[final])
@@ -104,7 +104,7 @@ def _scores(rows: list[Row]) -> Row:
     return {name: (found | {"few_seeds": count < stats.FEW_SEEDS})[name] for name in _MEASURED}
 
 
-def _mean_and_ends(scores: np.ndarray) -> tuple[float, float | None, float | None]:
+def mean_and_ends(scores: np.ndarray) -> tuple[float, float | None, float | None]:
     """Mean over seeds, and the ends of its interval."""
     interval = stats.bootstrap_interval([scores], stats.mean, np.random.default_rng(0)) or (None, None)
     return float(scores.mean()), *interval

@@ -20,13 +20,13 @@ from vd4rl_pomdp.report.figures import Plot, save_plot, to_svg
 from vd4rl_pomdp.report.films import shown_films
 from vd4rl_pomdp.report.gaps import find_gaps
 from vd4rl_pomdp.report.gates import gates, unranked
-from vd4rl_pomdp.report.layout import ShownTable, latex
-from vd4rl_pomdp.report.load import ALL, Choice, LoadedRun, load_runs
+from vd4rl_pomdp.report.layout import ShownTable, write_latex
+from vd4rl_pomdp.report.load import ALL, SETTING, Choice, LoadedRun, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.report.theory import load_section
 from vd4rl_pomdp.results import RUNS, refuse_loss, write_results
-from vd4rl_pomdp.runs.files import Row, write_bytes, write_csv
+from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.text import write_text
@@ -89,7 +89,7 @@ def _tables(runs: list[LoadedRun], choice: Choice) -> dict[str, list[Row]]:
     gated = gates(runs)
     of_runs = measures.run_table(runs, evaluated, gaps)
     return {
-        _MARK: tables.summary(final, gaps, unranked(gated, tables.SETTING)),
+        _MARK: tables.summary(final, gaps, unranked(gated, SETTING)),
         "gates": gated,
         "claims": judge_claims(runs, unranked(gated)),
         "curves": tables.curves(evaluated),
@@ -188,7 +188,7 @@ def _render(
 
 
 _NOTES = {
-    "summary": f"{tables.SCORE}. Mean over seeds, 95% percentile bootstrap intervals.",
+    "summary": tables.SCORES_NOTE,
     "aggregate": "Over all tasks and seeds, 95% stratified bootstrap intervals.",
     "improvement": "Probability that a run of the row's method ends above one of the column's.",
 }
@@ -207,7 +207,7 @@ def _write_tables(out: Path, made: dict[str, list[Row]], shown: dict[str, list[S
         path = out / f"{name}.tex"
         if group and made[name]:
             note = " ".join(filter(None, (_NOTES.get(name, ""), _DAGGER)))
-            write_bytes(path, latex(group, note).encode(errors="backslashreplace"))
+            write_latex(path, group, note)
         else:
             path.unlink(missing_ok=True)
 

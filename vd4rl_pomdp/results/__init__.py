@@ -1,6 +1,6 @@
 """Results folders: the small files and raw rows of finished runs, which outlive the run folders."""
 
-from vd4rl_pomdp.results.folder import RUNS, Result, read_results, read_run, write_results
+from vd4rl_pomdp.results.folder import RUNS, Result, read_results, read_run, whole_files, write_results
 from vd4rl_pomdp.results.gather import Added, add_results, find_results, refuse_loss
 
 __all__ = [
@@ -12,5 +12,6 @@ __all__ = [
     "read_results",
     "read_run",
     "refuse_loss",
+    "whole_files",
     "write_results",
 ]

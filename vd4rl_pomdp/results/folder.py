@@ -9,7 +9,6 @@ rows first: rows of a run that runs.jsonl does not name were left by a cut writi
 
 from __future__ import annotations
 
-import hashlib
 import json
 import sys
 from collections.abc import Iterable, Iterator
@@ -19,13 +18,13 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
 from vd4rl_pomdp.runs.episodes import COLUMNS, LABELS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_csv
-from vd4rl_pomdp.runs.identity import identity
+from vd4rl_pomdp.runs.identity import content_hash, identity
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.provenance import CONTINUED
-from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs.run import remedy
 from vd4rl_pomdp.runs.settings import settings_of
 
@@ -136,7 +135,7 @@ def read_run(folder: Path | str) -> Result:
         raise UserError(f"{folder / FILES[ENCODER]}: does not say how the encoder was pretrained; pretrain it again")
     metrics, rows = read_metrics(folder / METRICS_FILE), _folder_rows(folder / EPISODES_FILE, "timing" in files)
     step = max((int(row["step"]) for row in (*metrics, *rows)), default=0)
-    with _whole(folder):
+    with whole_files(folder):
         losses = [(int(row["step"]), row["action_loss"]) for row in metrics if "action_loss" in row]
         run = Result("", folder, files, step, losses if files[RECORD]["stage"] == "pretrain" else [], rows, True)
         _check(run)
@@ -226,7 +225,7 @@ def _object(run: Result) -> dict[str, Any]:
 
 
 def _parse(path: Path, number: int, line: str, rows: dict[str, list[Row]]) -> Result:
-    with _whole(f"{path}: line {number}"):
+    with whole_files(f"{path}: line {number}"):
         told = parse_json(line)
         files = {name: told[name] for name in FILES if name in told}
         losses = [(int(step), float(loss)) for step, loss in told.get("losses", [])]
@@ -247,7 +246,7 @@ def _rows(path: Path, run: str, rows: dict[str, list[Row]], count: int) -> list[
 
 
 @contextmanager
-def _whole(where: Path | str) -> Iterator[None]:
+def whole_files(where: Path | str) -> Iterator[None]:
     """Whatever is wrong with a run's content becomes a sentence that says where."""
     try:
         yield
@@ -274,4 +273,4 @@ def _id(run: Result) -> str:
     if recorded and data:
         return identity(run.record, run.card)
     told = [run.record["stage"], settings_of(run.record["config"]), run.labels, run.card, data]
-    return hashlib.blake2b(json.dumps(told, sort_keys=True).encode(), digest_size=12).hexdigest()
+    return content_hash(told)

@@ -25,9 +25,9 @@ from safetensors.torch import load, save
 from torch import Tensor
 
 from vd4rl_pomdp.errors import UserError, disk_errors, first_line
+from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import synchronise
-from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 
 KEPT = 2
 """Checkpoints that are kept: a damaged newest one costs the steps since the one before."""

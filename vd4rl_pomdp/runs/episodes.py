@@ -12,8 +12,8 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.reading import regular
 from vd4rl_pomdp.runs.files import appending, write_csv
-from vd4rl_pomdp.runs.reading import regular
 
 LABELS = ("method", "task", "quality", "corruption", "algorithm", "seed")
 """What names the rows of a run."""

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.runs.reading import parse_json, read_bytes, regular
+from vd4rl_pomdp.reading import parse_json, read_bytes, regular
 
 Row = dict[str, Any]
 """One row of a table, its values by column."""

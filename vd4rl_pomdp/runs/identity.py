@@ -24,15 +24,16 @@ def identity(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:
     named = record["config"].get("exogenous")
     images = inputs.get("exogenous", named)  # the content of a folder; the name again of those that are made
     own = [] if images == named else [images]
-    return _hash([recipe(record, card), inputs.get("data"), card.get("data"), *own])
+    return content_hash([recipe(record, card), inputs.get("data"), card.get("data"), *own])
 
 
 def recipe(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:
     """Name of what a run computes but for the content of its data, likewise."""
     own = settings_of(record["config"]) | {"seed": record["config"]["seed"]}
     before = {"settings": card["settings"], "seed": card["seed"]} if card else {}
-    return _hash([record.get("format", 1), record["stage"], own, before])
+    return content_hash([record.get("format", 1), record["stage"], own, before])
 
 
-def _hash(told: Any) -> str:
+def content_hash(told: Any) -> str:
+    """Name of what can be written as JSON, 24 characters."""
     return hashlib.blake2b(json.dumps(told, sort_keys=True).encode(), digest_size=12).hexdigest()

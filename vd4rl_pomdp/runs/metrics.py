@@ -12,8 +12,8 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs.files import appending, write_bytes
-from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.runs.sinks import Sink

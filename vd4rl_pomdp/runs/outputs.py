@@ -12,8 +12,8 @@ import h5py
 
 from vd4rl_pomdp.data.format import FRAMES_KEY, PLAN, is_shard_name
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.reading import parse_json
 from vd4rl_pomdp.runs import CONFIG_FILE
-from vd4rl_pomdp.runs.reading import parse_json
 
 _ROWS = {FRAMES_KEY, "action", "reward", "step_type"}
 """Keys that tell a shard from other HDF5 files."""

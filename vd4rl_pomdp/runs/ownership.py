@@ -21,9 +21,9 @@ from typing import Any
 from filelock import SoftFileLease, Timeout
 
 from vd4rl_pomdp.errors import InUseError, disk_errors
+from vd4rl_pomdp.reading import parse_json
 from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.runs.interrupt import handled
-from vd4rl_pomdp.runs.reading import parse_json
 
 LEASE_S = 60.0
 EMPTY_S = 2.0

@@ -9,6 +9,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
 
+from vd4rl_pomdp.errors import in_one_line
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.identity import recipe
 from vd4rl_pomdp.runs.run import RunFolder
@@ -53,7 +54,7 @@ class Forgiving:
         try:
             return act()
         except Exception as error:  # whatever a service or its library raises
-            reason = " ".join(str(error).split()) or type(error).__name__
+            reason = in_one_line(error) or type(error).__name__
             reason += "; `pip install '.[tracking]'` in the package's folder" if isinstance(error, ImportError) else ""
             print(
                 f"warning: {self._name} fails ({reason}); the run goes on, {self._folder} has it all", file=sys.stderr

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from statistics import median
 from typing import Any
 
-from vd4rl_pomdp.data.format import RECORD
+from vd4rl_pomdp.data.format import PROVENANCE
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.sweeps.found import FoundRun
 from vd4rl_pomdp.sweeps.plan import Job, cost_of
@@ -36,8 +36,8 @@ class Estimates:
             self._note(_SECTIONS.get(run.record["stage"]), run.settings, run.seconds)
             self._note("pretrain", run.card.get("settings", {}), run.encoder_seconds)
         for job in jobs:
-            if job.section not in STAGES and (job.folder / RECORD).is_file():
-                self._note(job.section, dict(job.settings), read_json(job.folder / RECORD).get("seconds"))
+            if job.section not in STAGES and (job.folder / PROVENANCE).is_file():
+                self._note(job.section, dict(job.settings), read_json(job.folder / PROVENANCE).get("seconds"))
 
     def _note(self, section: str | None, settings: Mapping[str, Any], seconds: float | None) -> None:
         if section and seconds is not None:

@@ -24,8 +24,8 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs.files import Row, jsonable, write_json
-from vd4rl_pomdp.runs.reading import parse_json, read_bytes
 from vd4rl_pomdp.sweeps.own_file import own_file
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.work import Work

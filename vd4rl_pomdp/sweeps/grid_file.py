@@ -36,8 +36,8 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError, disk_error
+from vd4rl_pomdp.reading import read_bytes, regular
 from vd4rl_pomdp.runs.interrupt import Terminated
-from vd4rl_pomdp.runs.reading import read_bytes, regular
 from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS
 from vd4rl_pomdp.sweeps.grid import (
     MAZES,

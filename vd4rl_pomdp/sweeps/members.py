@@ -53,7 +53,7 @@ class GridMembers(Choice):
         return found
 
     def asks(self, row: Row) -> bool:
-        """Whether a cell asks for a policy of these labels (`report.load.LABELS`), whatever its variant."""
+        """Whether a cell asks for a policy of these labels (`runs.episodes.LABELS`), whatever its variant."""
         corruption = row["corruption"].partition(",")[0]  # without what tells its options apart
         return (row["task"], row["quality"], corruption, row["algorithm"], row["method"], row["seed"]) in self._policies
 

@@ -9,7 +9,7 @@ from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.data.format import PLAN, RECORD
+from vd4rl_pomdp.data.format import PLAN, PROVENANCE
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import words_of
@@ -49,7 +49,7 @@ class Job:
     def finished(self) -> bool:
         """Whether there is nothing left to do now; a run of another recipe that came into the folder does not count."""
         if self.done or self.section not in STAGES:
-            return self.done or (self.folder / RECORD).is_file()
+            return self.done or (self.folder / PROVENANCE).is_file()
         return (self.folder / TIMING_FILE).is_file() and run_at(self.folder).recipe == self.recipe
 
     @property

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vd4rl_pomdp.data.format import is_shard_name
+from vd4rl_pomdp.data.format import shard_files
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.stages import STAGES
@@ -12,6 +12,4 @@ def progress_of(job: Job) -> int:
     """Step of a training's newest checkpoint, or shards of a set; 0 where there is nothing."""
     if job.section in STAGES:
         return max(Checkpoints(job.folder).steps(), default=0)
-    if not job.folder.is_dir():
-        return 0
-    return sum(is_shard_name(path.name) for path in job.folder.iterdir())
+    return len(shard_files(job.folder))

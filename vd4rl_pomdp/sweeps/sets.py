@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.data.format import PLAN, RECORD, is_shard_name, read_frame_size, refuse_partial, shard_paths
+from vd4rl_pomdp.data.format import PLAN, PROVENANCE, read_frame_size, refuse_partial, shard_files, shard_paths
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.data.store import open_store
 from vd4rl_pomdp.errors import UserError
@@ -36,12 +36,12 @@ class DataSet:
     @property
     def collected(self) -> bool:
         """Whether it is there and whole, having been collected."""
-        return (self.folder / RECORD).is_file()
+        return (self.folder / PROVENANCE).is_file()
 
     @property
     def foreign(self) -> bool:
         """Whether shards are there that nothing here collected, such as a downloaded set."""
-        return not (self.folder / PLAN).exists() and _has_shards(self.folder)
+        return not (self.folder / PLAN).exists() and bool(shard_files(self.folder))
 
     @property
     def there(self) -> bool:
@@ -98,7 +98,3 @@ def set_of(cell: GridCell, root: Path) -> DataSet:
 
 def _told(name: str, value: Any) -> str:
     return f"the default {name}" if value is None else f"{name} {value}"
-
-
-def _has_shards(folder: Path) -> bool:
-    return folder.is_dir() and any(is_shard_name(path.name) for path in folder.iterdir())

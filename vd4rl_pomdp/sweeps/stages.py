@@ -146,12 +146,12 @@ def recorded(cell: GridCell, section: str) -> Values:
 def _finetuning(cell: GridCell) -> Any:
     """The config that a fine-tuning trains with: what its encoder's method cannot read is no part of it."""
     from finetune.settings import as_trained
-    from pretrain.config import memory_of
+    from pretrain.config import history_of
     from pretrain.objectives import METHODS
 
     before = config_of(cell, "pretrain")
     method = METHODS.named(before.method)
-    remembers = memory_of(before.method, method, before.history) == "gru"
+    remembers = history_of(before.method, method, before.history) == "gru"
     task = TASKS.get(cell.value("task"))  # none in a cell that will be refused, for it has no set
     decisions = task.decisions if task else 0
     return as_trained(config_of(cell, "finetune"), before.method, method.end_to_end, remembers, decisions)

@@ -30,9 +30,9 @@ def future_memory(world: World, actions: bool, literal: bool = False) -> int | N
     if literal:
         pairs = world.reachable()
         led = {after for c in product(pairs, pairs) for after in _next(world, c, actions)}
-        return _rows_needed(couples, lambda left: _that_go_on(world, left, left, actions), led)
+        return _rows_needed(couples, lambda left: _that_go_on(world, left, actions), led)
     going = {c for c in couples if any(_next(world, c, actions))}
-    return _rows_needed(going, lambda left: _that_go_on(world, left, left, actions))
+    return _rows_needed(going, lambda left: _that_go_on(world, left, actions))
 
 
 def _rows_needed(
@@ -54,9 +54,9 @@ def _alike(world: World) -> set[Couple]:
     return {(one, other) for one in pairs for other in pairs if world.emission[one].keys() & world.emission[other]}
 
 
-def _that_go_on(world: World, couples: set[Couple], into: set[Couple], actions: bool) -> set[Couple]:
-    """Couples that some next step leads into a set of couples."""
-    return {c for c in couples if any(after in into for after in _next(world, c, actions))}
+def _that_go_on(world: World, couples: set[Couple], actions: bool) -> set[Couple]:
+    """Couples of a set that some next step leads into the set again."""
+    return {c for c in couples if any(after in couples for after in _next(world, c, actions))}
 
 
 def _next(world: World, couple: Couple, actions: bool) -> Iterator[Couple]:

@@ -19,9 +19,10 @@ from vd4rl_pomdp.experiments.navigation.grid import Condition
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.navigation.config import PRESETS
 from vd4rl_pomdp.navigation.measures import Measure, measure_of, measure_rows
+from vd4rl_pomdp.reading import build
 from vd4rl_pomdp.results import Result, find_results, refuse_loss, write_results
+from vd4rl_pomdp.runs import TRAJECTORY_FILE
 from vd4rl_pomdp.runs.files import write_csv
-from vd4rl_pomdp.runs.reading import build
 from vd4rl_pomdp.runs.settings import settings_of
 
 ROWS, TRAJECTORIES = "rows.csv", "trajectories"
@@ -253,7 +254,7 @@ def _run_of(result: Result) -> NavigationRun:
 def _with_trajectory(run: NavigationRun) -> NavigationRun:
     """A run with its trajectory: a run folder has one, a results folder may have it."""
     folder = run.result.path
-    path = folder / "trajectory.csv" if run.result.folder else folder / TRAJECTORIES / run.file_name
+    path = folder / TRAJECTORY_FILE if run.result.folder else folder / TRAJECTORIES / run.file_name
     if path.is_file():
         return replace(run, trajectory=path)
     if run.result.folder:
