@@ -350,6 +350,17 @@ def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
     assert [row["step"] for row in read_episodes(config.out / "episodes.csv")] == [6, 6, 12, 12, 12, 12]
 
 
+def test_a_run_whose_checkpoints_are_gone_keeps_its_evaluations(encoder, data, tmp_path):
+    config = smoke_finetune(encoder, data, tmp_path / "run", **FINETUNE)
+    run_finetune(config)
+    (config.out / "timing.json").unlink()
+    shutil.rmtree(config.out / "checkpoints")
+    before = (config.out / "episodes.csv").read_bytes()
+    with pytest.raises(UserError, match=r"run: has evaluations, but the checkpoints .* are gone: put them back"):
+        run_finetune(config)
+    assert (config.out / "episodes.csv").read_bytes() == before
+
+
 def _fail(*arguments: object) -> None:
     raise AssertionError("the checkpoint before the evaluation is kept")
 

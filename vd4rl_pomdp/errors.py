@@ -33,7 +33,13 @@ class OutOfMemoryError(UserError):
     cause = "out of memory"
 
 
-class DiskFullError(UserError):
+class UnavailableError(UserError):
+    """The system could not do now what it may do later: a disk that does not answer, too many open files."""
+
+    cause = "unavailable"
+
+
+class DiskFullError(UnavailableError):
     """No space was left where something was to be written."""
 
     cause = "disk full"
@@ -60,6 +66,11 @@ class DivergedError(FloatingPointError):
         """What its user can do, in words that end a sentence."""
 
 
+_PASSING = (
+    *(errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.EMFILE, errno.ENFILE),
+    *(errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH),
+)
+"""What a network file system or a busy machine answers for a while."""
 MAX_SEED = 2**31 - 1
 """Largest seed that every random generator in use takes."""
 MOST = 10**9
@@ -124,6 +135,10 @@ def disk_error(path: Path | str | None, error: OSError) -> UserError:
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
         return DiskFullError(f"{where}the disk is full: free some space and start the same command again")
     reason = (error.strerror or str(error)).lower()
+    if error.errno == errno.ENOMEM:
+        return OutOfMemoryError(f"{where}{reason}: end other programs, or run fewer jobs at a time")
+    if error.errno in _PASSING:
+        return UnavailableError(f"{where}cannot be used now ({reason}); start the same command again")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return UserError(f"{where}may not be used ({reason}); ask its owner for access, or choose another path")
     return UserError(f"{where}cannot be used ({reason}); check the path or choose another")

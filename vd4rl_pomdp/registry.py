@@ -5,7 +5,9 @@ from __future__ import annotations
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
+from hashlib import sha256
 from importlib.metadata import EntryPoint, entry_points
+from pathlib import Path
 from typing import Any, Generic, TypeVar
 
 from vd4rl_pomdp.errors import UserError, refuse_unknown
@@ -44,6 +46,8 @@ class Registry(Mapping[str, Part], Generic[Part]):
         """Offered parts that cannot be loaded, and why."""
         self._parts = dict(own)
         self._origins: dict[str, str] = {}
+        self._files: dict[str, Path] = {}
+        """The file that registered a part by a call, where that is one."""
         self._fits, self._expected, self._refuse = fits, expected, refuse
         self._loaded = False
         for name, part in own.items():
@@ -61,6 +65,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
         if not isinstance(name, str):
             raise UserError(f"a {self.kind} is called {name!r}: a name is a string")
         self._add(name, part, BY_CALL, replace)
+        self._files[name] = Path(sys._getframe(1).f_code.co_filename)
 
     @property
     def has_added(self) -> bool:
@@ -99,6 +104,13 @@ class Registry(Mapping[str, Part], Generic[Part]):
         """Where a part comes from: a package and its version, a call, or "" for this package's own."""
         self._load_offered()
         return self._origins.get(name, "")
+
+    def source(self, name: str) -> str:
+        """The file that registered a part by a call and the beginning of its SHA-256; "" for any other part."""
+        path = self._files.get(name)
+        if path is None or not path.is_file():  # of a package, or of a notebook
+            return ""
+        return f"{path.name} {sha256(path.read_bytes()).hexdigest()[:12]}"
 
     def __getitem__(self, name: str) -> Part:
         self._load_offered()
@@ -153,10 +165,28 @@ def origins(settings: Mapping[str, Any]) -> dict[str, str]:
     Args:
         settings: a stage's settings by name; those that name parts are called as the registries' `setting`.
     """
-    found = {}
+    return {part: origin for part, registry, name in _named(settings) if (origin := registry.origin(name))}
+
+
+def sources(settings: Mapping[str, Any]) -> dict[str, str]:
+    """Files that registered the parts that settings name, and hashes of them: {"method mine": "mine.py 0123456789ab"}.
+
+    Args:
+        settings: as `origins` takes them.
+    """
+    return {part: source for part, registry, name in _named(settings) if (source := registry.source(name))}
+
+
+def of_other_code(record: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
+    """The parts that settings name and whose file is another by now than the one that a run's record tells of."""
+    then = record.get("sources", {})
+    return [part for part, now in sources(settings).items() if then.get(part, now) != now]
+
+
+def _named(settings: Mapping[str, Any]) -> Iterator[tuple[str, Registry[Any], str]]:
+    """The parts that settings name: setting and name, the registry that has it, and the name."""
     for setting, registry in REGISTRIES.items():
         value = str(settings.get(setting, ""))
         for name in [value] if value in registry else value.split("+"):
-            if name in registry and (origin := registry.origin(name)):
-                found[f"{setting} {name}"] = origin
-    return found
+            if name in registry:
+                yield f"{setting} {name}", registry, name

@@ -64,7 +64,8 @@ class Batch:
 
     def to(self, device: torch.device | str) -> Self:
         """Copy of the batch with every tensor on `device`."""
-        return self.replace(**{name: self[name].to(device, non_blocking=True) for name in self.keys()})
+        ahead = torch.device(device).type != "cpu"  # a CPU would read before the copy has come
+        return self.replace(**{name: self[name].to(device, non_blocking=ahead) for name in self.keys()})
 
     def replace(self, **changes: Any) -> Self:
         """Copy of the batch with some tensors exchanged."""

@@ -8,9 +8,10 @@ import numpy as np
 import pytest
 
 from vd4rl_pomdp.data import collect as module
-from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data import open_dataset, parity
 from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import read_attributes, read_shard, shard_paths
+from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.envs.dmc import replay_rewards
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies import Actor, Ladder
@@ -95,6 +96,20 @@ def test_an_episode_does_not_depend_on_how_the_set_is_cut(whole, tmp_path):
     for key, value in second.items():
         np.testing.assert_array_equal(value, both[key][LENGTH + 1 :])
     assert not np.array_equal(both["physics"][0], second["physics"][0])
+
+
+def test_a_set_is_drawn_by_one_renderer(tmp_path, monkeypatch):
+    out, info = tmp_path / "set", render_info("walker_walk")
+    collect(config(out, episodes=2, episodes_per_shard=1), LENGTH)
+    shard = out / "1_walker_walk_random.hdf5"
+    shard.unlink()
+    with monkeypatch.context() as patch:
+        patch.setattr(parity, "render_info", lambda task: info | {"canary": "other", "gl_renderer": "another GPU"})
+        with pytest.raises(UserError, match=r"its shards so far were drawn by .*, and another GPU draws other pixels"):
+            collect(config(out, episodes=2, episodes_per_shard=1), LENGTH)
+    assert not shard.exists()
+    collect(config(out, episodes=2, episodes_per_shard=1), LENGTH)
+    assert json.loads((out / "provenance.json").read_text())["render"] == info
 
 
 @pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("killed")])

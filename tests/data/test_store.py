@@ -217,6 +217,15 @@ def test_an_unusable_cache_is_told(tmp_path):
         open_store(write_fake_set(tmp_path / "set"), tmp_path / "file")
 
 
+def test_a_cache_on_a_disk_that_locks_no_files_is_told(tmp_path, cache, monkeypatch):
+    def refuse(*arguments):
+        raise OSError(38, "Function not implemented")
+
+    monkeypatch.setattr(store_module.fcntl, "flock", refuse)
+    with pytest.raises(UserError, match=r"this disk locks no files \(.*\); set VD4RL_POMDP_CACHE"):
+        open_store(write_fake_set(tmp_path / "set"), cache)
+
+
 def set_step_type(path, row, value):
     with h5py.File(path, "a") as file:
         file["step_type"][row] = value

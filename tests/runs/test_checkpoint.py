@@ -102,6 +102,12 @@ def test_a_state_of_another_config_is_one_sentence(tmp_path):
         unpack(found.files)["updates"]
 
 
+def test_memory_that_runs_out_while_one_is_restored_does_not_make_it_anothers(tmp_path):
+    Checkpoints(tmp_path).add(1, pack({"step": 1}), 0.0)
+    with pytest.raises(torch.OutOfMemoryError), fitting(Checkpoints(tmp_path).newest()):
+        raise torch.OutOfMemoryError("CUDA out of memory")
+
+
 def killed_at(number: int, action) -> bool:
     """Run an action in a forked process that dies right before its `number`-th file system call; whether it did."""
     child = os.fork()

@@ -35,6 +35,7 @@ class Settings:
         RuntimeError(
             "[enforce fail at alloc_cpu.cpp:127] err == 0. DefaultCPUAllocator: can't allocate memory: you tried"
         ),
+        RuntimeError("CUDA error: CUBLAS_STATUS_ALLOC_FAILED when calling `cublasCreate(handle)`"),
         RuntimeError("Storage size calculation overflowed with sizes=[1000000000, 3000000000]"),
     ],
     ids=lambda error: type(error).__name__,

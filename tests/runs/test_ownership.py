@@ -8,6 +8,7 @@ import subprocess
 import sys
 from pathlib import Path
 
+import filelock
 import pytest
 
 from vd4rl_pomdp.errors import UserError
@@ -61,6 +62,16 @@ def test_an_owner_on_another_machine_lives_while_its_heart_beats(tmp_path, monke
         pass
     assert "waiting for a sign of its life" in capsys.readouterr().err
     end(holder)
+    with owned(tmp_path / "run") as owner:
+        owner.check()
+
+
+@pytest.mark.parametrize("host", [(), ("elsewhere",)])
+def test_a_dead_owner_frees_the_folder_where_names_cannot_be_exchanged_too(tmp_path, monkeypatch, host):
+    """On NFS and the like filelock leaves the lock of a dead process."""
+    monkeypatch.setattr(ownership, "LEASE_S", 1.2)
+    monkeypatch.setattr(filelock._soft, "exchange_names", lambda *names: False)
+    end(hold(tmp_path / "run", *host))
     with owned(tmp_path / "run") as owner:
         owner.check()
 

@@ -1,5 +1,7 @@
 """What is started when, what is tried again, and that nothing is done twice."""
 
+import errno
+import os
 import shutil
 from dataclasses import replace
 
@@ -50,7 +52,15 @@ def test_what_is_finished_is_not_run_again(jobs, tmp_path):
 
 @pytest.mark.parametrize(
     ("cause", "attempts"),
-    [("killed", 5), ("failed", 2), ("out of memory", 2), ("disk full", 21), ("refused", 1), ("diverged", 1)],
+    [
+        ("killed", 5),
+        ("failed", 2),
+        ("out of memory", 2),
+        ("disk full", 21),
+        ("unavailable", 21),
+        ("refused", 1),
+        ("diverged", 1),
+    ],
 )
 def test_a_cause_decides_how_often_a_job_is_tried(jobs, tmp_path, cause, attempts):
     finished, executor = carry_out(jobs, tmp_path, {"a": [cause] * 99})
@@ -184,18 +194,21 @@ def test_an_interruption_stops_the_jobs_and_is_told(jobs, tmp_path, monkeypatch)
     assert executor.stopped
 
 
-def test_a_full_disk_at_the_start_of_a_job_is_tried_again(jobs, tmp_path, monkeypatch):
+@pytest.mark.parametrize(
+    ("number", "cause"), [(errno.ENOSPC, "disk full"), (errno.EAGAIN, "unavailable"), (errno.ENOMEM, "out of memory")]
+)
+def test_what_passes_at_the_start_of_a_job_is_tried_again(jobs, tmp_path, monkeypatch, number, cause):
     executor = Scripted(jobs)
-    start, full = executor.start, [True, True]
+    start, refused = executor.start, [True]
 
-    def once_full(work):
-        if full and full.pop():
-            raise OSError(28, "No space left on device")
+    def refused_once(work):
+        if refused and refused.pop():
+            raise OSError(number, os.strerror(number))
         start(work)
 
-    monkeypatch.setattr(executor, "start", once_full)
+    monkeypatch.setattr(executor, "start", refused_once)
     assert Driver(jobs, executor, SweepFolder(tmp_path)).run()
-    assert [row["cause"] for row in SweepFolder(tmp_path).attempts()["set"]] == ["disk full", "disk full", "done"]
+    assert [row["cause"] for row in SweepFolder(tmp_path).attempts()["set"]] == [cause, "done"]
 
 
 def test_rows_tell_every_attempt(jobs, tmp_path):

@@ -2,6 +2,7 @@
 
 import json
 import os
+import shlex
 import subprocess
 import sys
 from pathlib import Path
@@ -67,6 +68,15 @@ def test_jobs_know_the_parts_of_the_file_that_a_sweep_was_started_from(tmp_path)
     told = json.loads(record.read_text())
     assert told["plugins"] == {"algorithm mine": "registered by a call"}
     assert told["command"].startswith("own.py finetune ")
+    with (tmp_path / "folder" / "own.py").open("a") as file:
+        file.write("# changed\n")
+    again = subprocess.run([*line.split(), "--dry-run"], **run).stderr
+    assert "warning: algorithm mine: 1 runs count, though its file has changed since they began\n" in again
+    (command,) = (words for words in planned.splitlines() if words.startswith("python folder/own.py finetune "))
+    finished = subprocess.run([sys.executable, *shlex.split(command)[1:]], **run).stderr
+    assert (
+        "the file of algorithm mine has changed since this run began, which goes on or counts all the same" in finished
+    )
 
 
 def test_a_module_is_imported_by_its_name(tmp_path, monkeypatch):

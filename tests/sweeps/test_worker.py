@@ -2,8 +2,11 @@
 
 import signal
 
+import pytest
+
 from tests.sweeps.executors.waiting import until
-from vd4rl_pomdp.sweeps.work import INTERRUPTED, Work, ended, start_process
+from vd4rl_pomdp.sweeps import work as work_module
+from vd4rl_pomdp.sweeps.work import INTERRUPTED, KILLED, Work, code_of, ended, start_process
 
 GRID = """
 import time
@@ -19,6 +22,23 @@ with interrupt.deferred():
         time.sleep(0.05)
     (here / "written").touch()
 """
+
+
+def test_a_job_imports_these_packages_whatever_the_working_directory_holds(tmp_path, monkeypatch):
+    (tmp_path / "pretrain").mkdir()
+    (tmp_path / "pretrain" / "__init__.py").write_text("raise ImportError('of another project')")
+    monkeypatch.chdir(tmp_path)
+    work = Work("job", ("pretrain", "--method", "nothing"), tmp_path / "log")
+    assert ended(work, start_process(work, {}).wait(120)).cause == "refused"
+    assert "unknown method 'nothing'" in work.log.read_text()
+
+
+@pytest.mark.parametrize("code", [-signal.SIGKILL, code_of(KILLED)])
+def test_a_job_whose_worker_was_killed_for_want_of_memory_is_short_of_it(tmp_path, monkeypatch, code):
+    monkeypatch.setattr(work_module, "oom_kills", lambda: 3)
+    work = Work("job", (), tmp_path / "log")
+    assert ended(work, code, 2).cause == "out of memory"
+    assert ended(work, code, 3).cause == "killed"
 
 
 def test_a_job_that_writes_its_checkpoint_is_ended_by_no_further_signal(tmp_path):

@@ -3,8 +3,13 @@
 from __future__ import annotations
 
 import io
+import os
 import sys
 from collections.abc import Sequence
+
+if os.name != "posix":
+    print("error: vd4rl-pomdp runs on Linux and macOS; on Windows use its subsystem for Linux (WSL)", file=sys.stderr)
+    sys.exit(2)
 
 from vd4rl_pomdp.cli import data, hub, navigation, parts, policy, stages, studies, sweeps
 from vd4rl_pomdp.cli.dispatch import COMMANDS

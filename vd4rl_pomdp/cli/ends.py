@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import select
 import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -45,11 +46,25 @@ def run_to_end(words: Sequence[str], second: signal.Handlers = signal.SIG_DFL) -
     except interrupt.Terminated as error:
         return End(143, INTERRUPTED, _ended("terminated", error.reason))
     except BrokenPipeError:
+        if not _nobody_reads():  # a pipe of its own
+            raise
         return End(141, INTERRUPTED)
     except OSError as error:
         told = disk_error(error.filename, error)
         return End(2, told.cause, f"error: {told}")
+    except Exception:
+        if (number := interrupt.arrived()) is None:
+            raise
+        return End(128 + number, INTERRUPTED, _ended("ended by a signal", ""))  # raised in an import, which hid it
     return End()
+
+
+def _nobody_reads() -> bool:
+    """Whether what read this process's output is gone, as `head` goes."""
+    poll = select.poll()
+    for stream in (1, 2):
+        poll.register(stream, 0)  # what is always told: that the other end is closed
+    return any(event & (select.POLLERR | select.POLLHUP) for _, event in poll.poll(0))
 
 
 def _ended(how: str, kept: str) -> str:

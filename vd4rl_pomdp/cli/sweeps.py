@@ -94,6 +94,8 @@ def _run(words: Arguments, program: str) -> None:
     for name, number in planner.of_other_content.items():
         line = f"{number} kept runs are of a set collected alike, but with other content (from another machine?)"
         print(f"warning: {name}: {line}: they do not count", file=sys.stderr)
+    for part, number in planner.changed_since.items():
+        print(f"warning: {part}: {number} runs count, though its file has changed since they began", file=sys.stderr)
     if command.dry_run:
         _print_plan(jobs, [*here.runs, *kept.runs])
         return

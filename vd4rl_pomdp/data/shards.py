@@ -17,6 +17,7 @@ from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
 from vd4rl_pomdp.runs.workers import count_workers, run_jobs
 
+_RENDER = ".render.json"
 Columns = dict[str, np.ndarray]
 """An episode's rows, by key."""
 
@@ -44,7 +45,8 @@ def collect_shards(
         title: what is going on, and the unit of a job.
         task: name of the task or maze, for what rendered it.
     """
-    record = _Record(out)
+    record = _Record(out, task)
+    record.begin([shard.path.exists() for shard in shards])
     with ProgressLine(title[0], sum(len(shard.jobs) for shard in shards), title[1]) as progress:
         for shard in shards:
             if shard.path.exists():
@@ -58,7 +60,7 @@ def collect_shards(
                 progress.advance(1, ret=float(rollout["reward"].sum()), frames_per_s=speed)
             record.note(shard.path, time.monotonic() - started, frames)
             write_shard(shard.path, join_rollouts(rollouts), shard.attributes)
-    record.write(workers, task)
+    record.write(workers)
 
 
 def claim_set(out: Path, settings: dict[str, Any]) -> None:
@@ -87,26 +89,47 @@ def join_rollouts(rollouts: list[Columns]) -> Columns:
 class _Record:
     """What a repeated collection would not reproduce: seconds and frames, over all its parts, and where it ran."""
 
-    def __init__(self, out: Path) -> None:
-        self._path, self._parts_path = out / PROVENANCE, out / ".parts.json"
+    def __init__(self, out: Path, task: str) -> None:
+        self._path, self._parts_path, self._render_path = (out / name for name in (PROVENANCE, ".parts.json", _RENDER))
+        self._task = task
         self._told = read_json(self._path).get("parts", {}) if self._path.exists() else {}
         added = read_json(self._parts_path) if self._parts_path.exists() else {}
         self._parts: dict[str, list[float]] = self._told | added
+
+    def begin(self, there: list[bool]) -> None:
+        """Keep who draws the shards that are not there; raises UserError where those that are show other pixels."""
+        if all(there) and self._path.exists():
+            return
+        from vd4rl_pomdp.data.parity import render_info
+
+        now = render_info(self._task)
+        if any(there) and (drawn := self._drawn()) and drawn.get("canary") != now.get("canary"):
+            before, here = (told.get("gl_renderer") or "another renderer" for told in (drawn, now))
+            raise UserError(
+                f"{self._path.parent}: its shards so far were drawn by {before}, and {here} draws other pixels: go on "
+                "on a machine like the first, or choose another --out"
+            )
+        write_json(self._render_path, now)
+
+    def _drawn(self) -> dict[str, Any]:
+        """Who drew the shards that are there; empty if nobody is known to have."""
+        if self._render_path.exists():
+            return read_json(self._render_path)
+        return read_json(self._path).get("render", {}) if self._path.exists() else {}
 
     def note(self, shard: Path, seconds: float, frames: int) -> None:
         """Remember a shard's part, just before it is written, until the set is whole."""
         self._parts[shard.name] = [round(seconds, 1), frames]
         write_json(self._parts_path, self._parts)
 
-    def write(self, workers: int, task: str) -> None:
+    def write(self, workers: int) -> None:
         """Write the set's record, unless it has one and nothing was added."""
         if self._path.exists() and self._parts == self._told:
             return
-        from vd4rl_pomdp.data.parity import render_info
-
         seconds, frames = (sum(part[i] for part in self._parts.values()) for i in (0, 1))
         facts: dict[str, Any] = {"seconds": round(seconds, 1), "frames": int(frames)}
         facts |= {"workers": count_workers(workers), "parts": self._parts}
         origin = {"command": command(), "git_commit": git_commit(), "versions": versions()}
-        write_json(self._path, facts | origin | {"render": render_info(task)})
-        self._parts_path.unlink(missing_ok=True)
+        write_json(self._path, facts | origin | {"render": read_json(self._render_path)})
+        for path in (self._parts_path, self._render_path):
+            path.unlink(missing_ok=True)

@@ -177,7 +177,13 @@ def _locked(folder: Path) -> Iterator[None]:
     except OSError as error:
         raise disk_error(folder.parent, error) from error
     with file:
-        fcntl.flock(file, fcntl.LOCK_EX)
+        try:
+            fcntl.flock(file, fcntl.LOCK_EX)
+        except OSError as error:
+            raise UserError(
+                f"{folder.parent}: this disk locks no files ({error.strerror}); set VD4RL_POMDP_CACHE to a folder on a "
+                "local one"
+            ) from error
         yield
 
 

@@ -28,6 +28,7 @@ from vd4rl_pomdp.errors import UserError, disk_errors, first_line
 from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import synchronise
+from vd4rl_pomdp.runs.memory import ran_out
 
 KEPT = 2
 """Checkpoints that are kept: a damaged newest one costs the steps since the one before."""
@@ -159,6 +160,8 @@ def fitting(checkpoint: Checkpoint) -> Iterator[None]:
     except UserError:
         raise
     except (SafetensorError, ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
+        if ran_out(error):
+            raise
         raise UserError(
             f"{checkpoint.path}: this checkpoint does not fit the run ({first_line(error)}); choose another --out, or "
             f"remove {checkpoint.path.parent} to start the run again"

@@ -42,8 +42,8 @@ def pick_device(name: str) -> torch.device:
 def autocast(device: torch.device, precision: Precision) -> Iterator[None]:
     """Context in which a forward pass runs in `precision`, and its gradients are computed in it, too.
 
-    bf16 products are of bf16 numbers, summed in fp32 and rounded, on every device: what a set of instructions computes
-    at once, other CPUs compute in fp32, from the same rounded numbers.
+    bf16 products are of bf16 numbers, summed in fp32 and rounded: what a set of instructions computes at once, other
+    CPUs compute in fp32, from the same rounded numbers. A GPU's autocast leaves other operations (norms) in fp32.
     """
     bf16 = precision == "bf16"
     rounded = RoundedProducts() if bf16 and device.type == "cpu" and not has_bf16_kernels() else nullcontext()

@@ -6,6 +6,7 @@ step, whose checkpoint is then written. A job of a sweep leaves a second one una
 
 from __future__ import annotations
 
+import os
 import signal
 import sys
 import threading
@@ -70,6 +71,19 @@ def handled(second: signal.Handlers | None = None) -> Iterator[None]:
 
 
 @contextmanager
+def hangups() -> Iterator[None]:
+    """Within the block a terminal that is closed or a lost connection counts as SIGTERM; nohup stays nohup."""
+    if threading.current_thread() is not threading.main_thread() or signal.getsignal(signal.SIGHUP) != signal.SIG_DFL:
+        yield
+        return
+    signal.signal(signal.SIGHUP, lambda number, frame: os.kill(os.getpid(), signal.SIGTERM))
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+
+
+@contextmanager
 def deferred() -> Iterator[None]:
     """Within the block a signal waits for the next `check`, at the latest the one at the block's end."""
     with _deferring(True):
@@ -95,8 +109,13 @@ def _deferring(value: bool) -> Iterator[None]:
 
 
 def asked() -> bool:
-    """Whether a signal has arrived."""
+    """Whether a signal has arrived and waits for an answer."""
     return _Signals.handled and _Signals.asked is not None
+
+
+def arrived() -> int | None:
+    """The signal that has arrived since signals were last begun to be answered, if one has."""
+    return _Signals.asked
 
 
 def check(reason: str = "") -> None:

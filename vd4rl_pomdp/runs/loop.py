@@ -74,10 +74,10 @@ class Loop:
 
     def step_done(self, save: bool) -> None:
         """Count a step; save a checkpoint if it is time to, or if a signal asks for the end, which then comes."""
-        self._progress.advance()
         if save or interrupt.asked():
             state = {"learner": self._learner.state(), "means": self._means.state_dict()}
             self._run.save(self._learner.step, state)
+        self._progress.advance()
         interrupt.check(f"{self._run.path} keeps step {self._learner.step}")
 
 

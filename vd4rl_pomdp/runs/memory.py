@@ -16,8 +16,11 @@ from vd4rl_pomdp.errors import DiskFullError, OutOfMemoryError, UserError, flag_
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.provenance import machine_memory
 
-_OUT = ("DefaultCPUAllocator", "not enough memory", "Storage size calculation overflowed", "out of memory")
-"""What torch says on a CPU, where it has no exception of its own for it."""
+_OUT = (
+    *("DefaultCPUAllocator", "not enough memory", "Storage size calculation overflowed", "out of memory"),
+    *("CUBLAS_STATUS_ALLOC_FAILED", "CUDNN_STATUS_ALLOC_FAILED"),
+)
+"""What torch says on a CPU, and of a GPU's libraries, where it has no exception of its own for it."""
 _LIMIT = Path("/sys/fs/cgroup/memory.max")
 CPU = torch.device("cpu")
 _COPIES = 4

@@ -23,7 +23,7 @@ from filelock import SoftFileLease, Timeout
 from vd4rl_pomdp.errors import InUseError, disk_errors
 from vd4rl_pomdp.reading import parse_json
 from vd4rl_pomdp.runs.files import write_json
-from vd4rl_pomdp.runs.interrupt import handled
+from vd4rl_pomdp.runs.interrupt import handled, hangups
 
 LEASE_S = 60.0
 EMPTY_S = 2.0
@@ -68,7 +68,7 @@ def owned(folder: Path) -> Iterator[Owner]:
     try:
         owner = Owner(folder)
         try:
-            with handled():
+            with handled(), hangups():
                 yield owner
         finally:
             owner.release()
@@ -97,6 +97,10 @@ def _acquire(lease: SoftFileLease, folder: Path) -> None:
         seen = _heartbeat(folder)
         if _take(lease, 1.5 * LEASE_S, lambda: _heartbeat(folder) not in (seen, None)):
             return
+        if _heartbeat(folder) == seen:  # NFS and the like cannot exchange names, by which filelock takes a dead one's
+            lease.force_break()
+            if _take(lease):
+                return
     raise InUseError(
         f"{folder}: is in use by {_name(_read_note(folder))}; wait until it ends, or choose another folder"
     )

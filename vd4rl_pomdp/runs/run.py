@@ -6,6 +6,7 @@ interrupted or not. One process owns the folder at a time.
 
 from __future__ import annotations
 
+import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
@@ -16,9 +17,10 @@ from typing import Any, Self
 from vd4rl_pomdp.data.format import read_plan
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import flat
-from vd4rl_pomdp.registry import origins
-from vd4rl_pomdp.runs import CONFIG_FILE, DIVERGED_FILE, FORMAT, MACHINE_FILE, TIMING_FILE
+from vd4rl_pomdp.registry import of_other_code, origins, sources
+from vd4rl_pomdp.runs import CONFIG_FILE, DIVERGED_FILE, EPISODES_FILE, FORMAT, MACHINE_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, State, fitting, pack, unpack
+from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_json
 from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.runs.provenance import CONTINUED, command, git_commit, machine, versions
@@ -97,6 +99,7 @@ class RunFolder:
                 )
 
     def __enter__(self) -> Self:
+        self._warn_of_other_code()
         if not self.finished:
             self._owner = self._stack.enter_context(owned(self.path))
             try:
@@ -107,11 +110,21 @@ class RunFolder:
                 raise
         return self
 
+    def _warn_of_other_code(self) -> None:
+        file = self.path / CONFIG_FILE
+        for part in of_other_code(read_json(file), self.config) if file.exists() else ():
+            print(
+                f"warning: {self.path}: the file of {part} has changed since this run began, which goes on or counts "
+                "all the same; remove the run to compute it anew",
+                file=sys.stderr,
+            )
+
     def _begin(self) -> None:
         if not (self.path / CONFIG_FILE).exists():
             record = {"format": FORMAT, "stage": self.stage, "config": self.config, "inputs": self.inputs}
             origin = {"versions": versions(), "git_commit": git_commit(), "command": command()}
-            origin |= {"plugins": origins(self.config), "collection": read_plan(Path(self.config["data"]))}
+            origin |= {"plugins": origins(self.config), "sources": sources(self.config)}
+            origin |= {"collection": read_plan(Path(self.config["data"]))}
             write_json(self.path / CONFIG_FILE, record | origin)
         (self.path / DIVERGED_FILE).unlink(missing_ok=True)
         self._keep_machine()
@@ -149,8 +162,17 @@ class RunFolder:
         return self._before + time.monotonic() - self._started
 
     def restore(self, take: Callable[[State], None]) -> None:
-        """Hand the state of the newest whole checkpoint to `take`, if there is one."""
+        """Hand the state of the newest whole checkpoint to `take`, if there is one.
+
+        Raises:
+            UserError: it does not fit the run, or evaluations are there, which follow a checkpoint, and none is.
+        """
         checkpoint = self._checkpoints.newest()
+        if checkpoint is None and read_episodes(self.path / EPISODES_FILE):
+            raise UserError(
+                f"{self.path}: has evaluations, but the checkpoints that they were made after are gone: put them back, "
+                "or remove the folder to start the run again"
+            )
         if checkpoint is not None:
             self._before = checkpoint.seconds
             with fitting(checkpoint):

@@ -12,7 +12,7 @@ import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
-from vd4rl_pomdp.errors import DiskFullError, InUseError, OutOfMemoryError, UserError, disk_errors
+from vd4rl_pomdp.errors import DiskFullError, InUseError, OutOfMemoryError, UnavailableError, UserError, disk_errors
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.ownership import in_use
@@ -38,6 +38,7 @@ _ALWAYS = 10**6
 RETRIES = {
     KILLED: Retry(4),
     DiskFullError.cause: Retry(20, 30.0),
+    UnavailableError.cause: Retry(20, 30.0),
     InUseError.cause: Retry(_ALWAYS, 10.0),
     INTERRUPTED: Retry(_ALWAYS),
     OutOfMemoryError.cause: Retry(1),
@@ -124,7 +125,7 @@ class Driver:
         try:
             with disk_errors(job.folder):
                 self._executor.start(self._folder.work(job, slots))
-        except DiskFullError as error:
+        except (UnavailableError, OutOfMemoryError) as error:
             self._end(Ended(job.name, error.cause, str(error)))
 
     def _ready(self, job: Job) -> bool:
@@ -165,7 +166,7 @@ class Driver:
         self._say(ended, seconds)
 
     def _note(self, ended: Ended, seconds: float, slots: int, largest: int) -> None:
-        """Keep the row of an attempt, here and on the disk, unless that is full."""
+        """Keep the row of an attempt, here and on the disk, unless that takes nothing now."""
         row: Row = {"job": ended.name, "cause": ended.cause, "line": ended.line}
         row |= {"ended": round(time.time(), 1), "seconds": round(seconds, 1), "slots": slots, "largest": largest}
         job = self._jobs[ended.name]
@@ -173,7 +174,7 @@ class Driver:
         self._rows[ended.name].append(row)
         try:
             self._folder.add(row)
-        except DiskFullError as error:
+        except UnavailableError as error:
             print(f"warning: {error}", file=sys.stderr)
 
     def _say(self, ended: Ended, seconds: float) -> None:

@@ -5,6 +5,7 @@ has its processes do: everything but what stands below `if __name__ == "__main__
 from __future__ import annotations
 
 import multiprocessing.spawn
+import os
 import shlex
 import sys
 from collections.abc import Iterable
@@ -37,6 +38,8 @@ def load(file: OwnFile) -> None:
     """Import a file so that it is this process's main module, and that of the processes it starts in turn."""
     if _PATH in file:
         sys.path.insert(0, str(Path(file[_PATH]).parent))
+    elif _NAME in file:  # which `python -m` found from there
+        sys.path.insert(0, os.getcwd())
     multiprocessing.spawn.prepare(dict(file))
     if file:
         sys.argv[0] = str(sys.modules["__main__"].__file__)

@@ -13,6 +13,7 @@ from vd4rl_pomdp.data.format import PLAN, PROVENANCE
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import words_of
+from vd4rl_pomdp.registry import of_other_code
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.sweeps.found import FoundRuns, run_at
@@ -84,6 +85,9 @@ class JobPlanner:
         self.of_other_content: Counter[str] = Counter()
         """Kept runs that do not count, by set: theirs was collected alike, and its content is another."""
 
+        self.changed_since: Counter[str] = Counter()
+        """Runs that count, though the file of a part of one's own has changed since, by part."""
+
     def plan(self, cells: Iterable[GridCell]) -> list[Job]:
         """The jobs of some cells, each after those it needs; what only finished jobs would need is left out.
 
@@ -127,6 +131,7 @@ class JobPlanner:
             return self._jobs[key]
         run = self._here.of(recipe, data)
         if run is not None:
+            self.changed_since.update(of_other_code(run.record, values))
             name = run.folder.relative_to(self._out).as_posix()
         else:
             name = self._free(run_folder(cell, section, data.name, values), recipe)

@@ -19,6 +19,7 @@ from vd4rl_pomdp.errors import (
     DiskFullError,
     InUseError,
     OutOfMemoryError,
+    UnavailableError,
     UserError,
     WorkerDiedError,
 )
@@ -27,7 +28,8 @@ from vd4rl_pomdp.sweeps.oom import oom_kills
 FAILED = "failed"
 KILLED = WorkerDiedError.cause
 _FIRST = 64
-_CAUSES = (UserError, OutOfMemoryError, DiskFullError, InUseError, WorkerDiedError)
+_ROOT = Path(__file__).parents[2]
+_CAUSES = (UserError, OutOfMemoryError, DiskFullError, UnavailableError, InUseError, WorkerDiedError)
 CAUSES = (*(kind.cause for kind in _CAUSES), DIVERGED, INTERRUPTED)
 """Causes that a job's process tells; its exit code is _FIRST and the position here."""
 
@@ -88,13 +90,18 @@ def start_process(work: Work, environment: Mapping[str, str], cores: Sequence[in
     work.log.parent.mkdir(parents=True, exist_ok=True)
     with work.log.open("ab") as log:
         return subprocess.Popen(
-            [sys.executable, "-m", "vd4rl_pomdp.sweeps.worker", json.dumps(told)],
-            env=os.environ | dict(environment),
+            [sys.executable, "-P", "-m", "vd4rl_pomdp.sweeps.worker", json.dumps(told)],
+            env=os.environ | {"PYTHONPATH": _path()} | dict(environment),
             stdin=subprocess.DEVNULL,
             stdout=log,
             stderr=log,
             start_new_session=True,  # Ctrl-C is the driver's business
         )
+
+
+def _path() -> str:
+    """Where a job imports from first: these very packages, whatever ones of their names the working directory holds."""
+    return os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
 
 
 def wait_or_kill(process: subprocess.Popen, seconds: float) -> None:
@@ -121,9 +128,10 @@ def ended(work: Work, code: int, oom_kills_before: int | None = None) -> Ended:
     """
     if code == 0:
         return Ended(work.name, DONE, "")
-    if code == -signal.SIGKILL and oom_kills_before is not None and oom_kills() > oom_kills_before:
-        return Ended(work.name, OutOfMemoryError.cause, "the kernel killed it for want of memory")
     told = CAUSES[code - _FIRST] if _FIRST <= code < _FIRST + len(CAUSES) else None
+    killed = code == -signal.SIGKILL or told == KILLED  # the job itself, or a worker of it
+    if killed and oom_kills_before is not None and oom_kills() > oom_kills_before:
+        return Ended(work.name, OutOfMemoryError.cause, "the kernel killed it for want of memory")
     return Ended(work.name, told or (KILLED if code < 0 else FAILED), last_line(work.log))
 
 

@@ -14,7 +14,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from vd4rl_pomdp.errors import DiskFullError, UserError, disk_errors
+from vd4rl_pomdp.errors import UnavailableError, UserError, disk_errors
 from vd4rl_pomdp.sweeps.executors.handover import Handover
 from vd4rl_pomdp.sweeps.executors.local import LocalExecutor, LocalOptions, visible_gpus
 from vd4rl_pomdp.sweeps.work import INTERRUPTED, KILLED, Ended, Work
@@ -90,14 +90,14 @@ class Allocation:
                 self._untold.append(Ended(work.name, error.cause, str(error)))
 
     def _tell(self, executor: LocalExecutor, handed: Handover) -> None:
-        """Write how jobs ended; on a full disk, the next time."""
+        """Write how jobs ended; on a disk that takes nothing now, the next time."""
         self._untold += executor.ended()
         while self._untold:
             ended = self._untold[0]
             if not self._goes_on(ended):
                 try:
                     handed.end(self._attempts[ended.name], ended)
-                except DiskFullError:
+                except UnavailableError:
                     return
             del self._attempts[ended.name], self._untold[0]
 

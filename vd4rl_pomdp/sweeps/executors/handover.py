@@ -28,7 +28,7 @@ class Handover:
         """Hand a job to a task; the name of the attempt.
 
         Raises:
-            DiskFullError: it could not be written.
+            UnavailableError: it could not be written.
         """
         attempt = f"{time.time_ns():020d}-{secrets.token_hex(3)}"
         path = self._work(task) / f"{attempt}.json"
@@ -45,7 +45,7 @@ class Handover:
         }
 
     def end(self, attempt: str, ended: Ended) -> None:
-        """Tell how an attempt ended; raises DiskFullError if it could not be written."""
+        """Tell how an attempt ended; raises UnavailableError if it could not be written."""
         path = self.folder / "ended" / f"{attempt}.json"
         with disk_errors(path):
             path.parent.mkdir(exist_ok=True)
