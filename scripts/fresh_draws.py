@@ -3,7 +3,7 @@
     python scripts/fresh_draws.py --runs RUN/finetune-td3_bc ... --out fresh_draws.csv
 
 `reference.json` tells the error on the first of the views (draws of shift and corruption) that the policy's cached
-features were made of. Here it is measured on that one again, and on as many as it was trained on and has never seen.
+features were made of. Here it is measured on that one again, and on the first that it has never seen.
 The sets are opened where the runs' records say, from the present folder. Columns: what names the run, its number of
 views, whether the policy was trained on the view, the view's number, and the mean squared difference from the actor.
 """
@@ -11,7 +11,6 @@ views, whether the policy was trained on the view, the view's number, and the me
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -44,7 +43,7 @@ class Config:
 
 
 def errors(folder: Path) -> list[Row]:
-    """One row for a view of training and for each that the policy has not seen."""
+    """One row for a view that the policy was trained on, and one for a view that it has not seen."""
     config = run_at(folder).record["config"]
     actor = Reference.read(folder).actor_file
     if actor is None or not config.get("views"):
@@ -58,11 +57,13 @@ def errors(folder: Path) -> list[Row]:
     named |= {"corruption": hiding.corruption, "algorithm": config["algorithm"], "seed": config["seed"]}
 
     def row(view: int) -> Row:
-        path = DataPath(dataset, shown, partial(frozen.episode, view=frozen.view(view)))
+        drawn = frozen.view(view)
+        seen = [frozen.episode(number, drawn) for number in range(dataset.num_episodes)]  # draws follow one another
+        error = DataPath(dataset, shown, seen.__getitem__).action_error(policy)
         told: dict[str, Any] = {"views": config["views"], "trained_on": view < config["views"], "view": view}
-        return named | told | {"action_error": round(path.action_error(policy), 6)}
+        return named | told | {"action_error": round(error, 6)}
 
-    return [row(view) for view in (0, config["views"], config["views"] + 1)]
+    return [row(view) for view in (0, config["views"])]
 
 
 def main(config: Config) -> None:
