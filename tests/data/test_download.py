@@ -280,7 +280,7 @@ def test_a_missing_file_is_told_at_once(mirror, tmp_path):
 @pytest.mark.parametrize(
     ("arguments", "message"),
     [
-        (("walker_run", "expert"), "unknown task 'walker_run'"),
+        (("walker_run", "expert"), "unknown task of published sets 'walker_run': choose one of cheetah_run"),
         (("walker_walk", "best"), "unknown quality 'best': choose one of random"),
         (("walker_walk", "expert", "hf.co"), "endpoint 'hf.co' is no address"),
         (("walker_walk", "expert", "http://"), "endpoint 'http://' is no address"),

@@ -135,15 +135,16 @@ def test_a_library_caller_gets_the_exceptions_and_its_handlers_back():
 
 
 def test_a_terminal_that_is_closed_counts_as_sigterm_unless_it_is_ignored():
-    with pytest.raises(interrupt.Terminated), interrupt.handled(), interrupt.hangups():
-        signal.raise_signal(signal.SIGHUP)
-    assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
-    signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
     try:
+        with pytest.raises(interrupt.Terminated), interrupt.handled(), interrupt.hangups():
+            signal.raise_signal(signal.SIGHUP)
+        assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
+        signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup has it
         with interrupt.handled(), interrupt.hangups():
             signal.raise_signal(signal.SIGHUP)
     finally:
-        signal.signal(signal.SIGHUP, signal.SIG_DFL)
+        signal.signal(signal.SIGHUP, before)
 
 
 def test_a_signal_waits_for_the_end_of_a_deferred_step_except_where_it_need_not():
