@@ -46,8 +46,8 @@ class Registry(Mapping[str, Part], Generic[Part]):
         """Offered parts that cannot be loaded, and why."""
         self._parts = dict(own)
         self._origins: dict[str, str] = {}
-        self._files: dict[str, Path] = {}
-        """The file that registered a part by a call, where that is one."""
+        self._sources: dict[str, str] = {}
+        """Of parts that a call added, what `source` says: of the file as it was then, since that is what runs."""
         self._fits, self._expected, self._refuse = fits, expected, refuse
         self._loaded = False
         for name, part in own.items():
@@ -65,7 +65,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
         if not isinstance(name, str):
             raise UserError(f"a {self.kind} is called {name!r}: a name is a string")
         self._add(name, part, BY_CALL, replace)
-        self._files[name] = Path(sys._getframe(1).f_code.co_filename)
+        self._sources[name] = _source_of(Path(sys._getframe(1).f_code.co_filename))
 
     @property
     def has_added(self) -> bool:
@@ -80,11 +80,11 @@ class Registry(Mapping[str, Part], Generic[Part]):
     def isolated(self) -> Iterator[None]:
         """Within the block parts may be registered; after it they are forgotten, as tests want it."""
         self._load_offered()
-        parts, origins = dict(self._parts), dict(self._origins)
+        before = dict(self._parts), dict(self._origins), dict(self._sources)
         try:
             yield
         finally:
-            self._parts, self._origins = parts, origins
+            self._parts, self._origins, self._sources = before
 
     def named(self, name: str) -> Part:
         """The part called `name`; raises UserError listing the choices, or saying why it cannot be loaded."""
@@ -107,10 +107,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
 
     def source(self, name: str) -> str:
         """The file that registered a part by a call and the beginning of its SHA-256; "" for any other part."""
-        path = self._files.get(name)
-        if path is None or not path.is_file():  # of a package, or of a notebook
-            return ""
-        return f"{path.name} {sha256(path.read_bytes()).hexdigest()[:12]}"
+        return self._sources.get(name, "")
 
     def __getitem__(self, name: str) -> Part:
         self._load_offered()
@@ -157,6 +154,11 @@ class Registry(Mapping[str, Part], Generic[Part]):
 
 def _package_of(entry: EntryPoint) -> str:
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "an installed package"
+
+
+def _source_of(path: Path) -> str:
+    """A file's name and the beginning of its SHA-256; "" for a notebook's cell, which is none."""
+    return f"{path.name} {sha256(path.read_bytes()).hexdigest()[:12]}" if path.is_file() else ""
 
 
 def origins(settings: Mapping[str, Any]) -> dict[str, str]:

@@ -29,6 +29,7 @@ from vd4rl_pomdp.data.episodes import check_count, join_shards
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows, shard_paths
 from vd4rl_pomdp.errors import DiskFullError, UserError, disk_error
 from vd4rl_pomdp.reading import parse_json, read_bytes
+from vd4rl_pomdp.runs.identity import content_hash
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.types import StepType
 
@@ -54,7 +55,7 @@ class Store:
         """
         checksums = {name: file["blake2b"] for name, file in self.meta["files"].items()}
         checksums["reward.npy"] = _checksum_of(_trained(self.array("reward")))
-        return hashlib.blake2b(json.dumps(checksums, sort_keys=True).encode(), digest_size=12).hexdigest()
+        return content_hash(checksums)
 
     @property
     def frame_size(self) -> int:
