@@ -187,9 +187,7 @@ class FeatureSampler:
 
     def sample(self) -> FeatureBatch:
         """The next batch."""
-        device = self._action.device
-        index = torch.randint(len(self._action), (self._batch_size,), generator=self._generator).to(device)
-        view = torch.randint(len(self._features), (self._batch_size,), generator=self._generator).to(device)
+        index, view = self._draw(len(self._action)), self._draw(len(self._features))
         return FeatureBatch(
             z=self._features[view, self._first[view, index]].float(),
             action=self._action[index],
@@ -197,6 +195,10 @@ class FeatureSampler:
             discount=self._discount[index],
             next_z=self._features[view, self._last[view, index]].float(),
         )
+
+    def _draw(self, count: int) -> Tensor:
+        drawn = torch.randint(count, (self._batch_size,), generator=self._generator)
+        return drawn.to(self._action.device, non_blocking=True)
 
 
 class ExactSampler(Sampler):

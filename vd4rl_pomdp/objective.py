@@ -122,7 +122,7 @@ class InverseObjective(Objective):
         return set(range(first, t + 1)), set(range(first, t)) if shape.use_actions else set()
 
     def pairs(self, rows: int) -> Tensor:
-        """The (t, k) that are scored in a window of `rows` rows: (P, 2) int64."""
+        """The (t, k) that are scored in a window of `rows` rows: (P, 2) int64 on the CPU, not to be changed."""
         return all_pairs(rows, self.options.largest_gap)
 
     def action_logits(self, window: Windows) -> Tensor:
@@ -139,11 +139,13 @@ class InverseObjective(Objective):
         self, past: Tensor, future: Tensor, window: Windows, progress: float
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """`loss`, given the `representations` of the window."""
-        pairs = self.pairs(window.obs.shape[1]).to(past.device)
+        scored = self.pairs(window.obs.shape[1])
+        pairs = scored.to(past.device, non_blocking=True)
         losses = self.target.loss(self.head(past, future, pairs), window.action[:, pairs[:, 0]])
         real = window.real[:, pairs.sum(1)].to(losses)
         total = _mean_over(real, losses)
-        logs = {"action_loss": total.detach()} | self._per_k(losses.detach() * real, real, pairs)
+        means = self._means_by_k(losses.detach() * real, real, pairs[:, 1])
+        logs = {"action_loss": total.detach()} | {f"loss_k{k:02d}": means[k] for k in scored[:, 1].unique().tolist()}
         if self.predictor is not None:
             term = self._self_prediction(past, pairs, real)
             total, logs["self_prediction"] = total + self.options.self_prediction * term, term.detach()
@@ -153,11 +155,11 @@ class InverseObjective(Objective):
         logs["loss"] = total.detach()
         return total, logs
 
-    def _per_k(self, losses: Tensor, real: Tensor, pairs: Tensor) -> dict[str, Tensor]:
+    def _means_by_k(self, losses: Tensor, real: Tensor, gaps: Tensor) -> Tensor:
+        """Mean loss at every k of 0..K, from (B, P) losses that are zero where `real` is, and (P,) gaps."""
         sums = losses.new_zeros(2, self.options.largest_gap + 1)
-        sums.index_add_(1, pairs[:, 1], torch.stack([losses.sum(0), real.sum(0)]))
-        means = sums[0] / sums[1].clamp(min=1)
-        return {f"loss_k{k:02d}": means[k] for k in pairs[:, 1].unique().tolist()}
+        sums.index_add_(1, gaps, torch.stack([losses.sum(0), real.sum(0)]))
+        return sums[0] / sums[1].clamp(min=1)
 
     def _self_prediction(self, past: Tensor, pairs: Tensor, real: Tensor) -> Tensor:
         assert self.predictor is not None

@@ -30,6 +30,7 @@ def noise_at(update: int, planned: int) -> float:
 
 def with_noise(action: Tensor, std: float, generator: torch.Generator) -> Tensor:
     """Noisy copy of (B, A) actions, within -1..1; the gradient passes as if nothing had been cut off."""
-    noise = torch.randn(action.shape, generator=generator, dtype=action.dtype).to(action.device) * std
+    noise = torch.randn(action.shape, generator=generator, dtype=action.dtype) * std
+    noise = noise.to(action.device, non_blocking=True)
     noisy = action + noise.clamp(-NOISE_CLIP, NOISE_CLIP)
     return noisy + (noisy.clamp(MARGIN - 1, 1 - MARGIN) - noisy).detach()

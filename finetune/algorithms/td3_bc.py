@@ -78,7 +78,7 @@ class TD3BC(NoisyAlgorithm):
     def _next_action(self, next_z: Tensor) -> Tensor:
         """Action of the target policy, smoothed by clipped noise."""
         action = self.target_policy.from_standardised(next_z)
-        noise = torch.randn(action.shape, generator=self.generator).to(action.device) * TARGET_NOISE
+        noise = torch.randn(action.shape, generator=self.generator).to(action.device, non_blocking=True) * TARGET_NOISE
         return (action + noise.clamp(-NOISE_CLIP, NOISE_CLIP)).clamp(-1, 1)
 
     def _policy_value(self, z: Tensor, action: Tensor) -> Tensor:

@@ -71,12 +71,12 @@ class ErrorSums:
         self._counts = torch.zeros(2, dtype=torch.float64)
 
     def add(self, estimate: Tensor, truth: Tensor, hidden: Tensor, burn_in: int) -> None:
-        """Count (B, T, 4) estimates against truths; rows before `burn_in` are left out."""
+        """Count (B, T, 4) estimates against truths, a GPU is not waited for; rows before `burn_in` are left out."""
         error = (estimate.detach().float() - truth)[:, burn_in:].abs().flatten(0, 1)
         under = hidden[:, burn_in:].flatten()
         weights = torch.stack([torch.ones_like(under), under]).to(error)
-        self._sums += (weights @ error).double().cpu()
-        self._counts += weights.sum(1).double().cpu()
+        self._sums = self._sums.to(error.device) + (weights @ error).double()
+        self._counts = self._counts.to(error.device) + weights.sum(1).double()
 
     def state(self) -> list[Tensor]:
         """The sums and counts, for `restore`."""
@@ -97,9 +97,10 @@ class ErrorSums:
 
     def _times(self, scale: Tensor) -> dict[str, float]:
         named: dict[str, float] = {}
+        sums, counts = self._sums.cpu(), self._counts.cpu()
         for number, suffix in enumerate(("", "_hidden")):
-            if self._counts[number]:
-                means = 100 * scale * self._sums[number] / self._counts[number]
+            if counts[number]:
+                means = 100 * scale * sums[number] / counts[number]
                 named |= {f"{name}{suffix}": float(means[part].mean()) for name, part in COMPONENTS.items()}
         return named
 
@@ -113,7 +114,7 @@ def refit(features: Tensor, truth: Tensor, steps: int, seed: int) -> StateProbe:
     schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, steps)
     generator = stream_generator(seed, "refit", "batches")
     for _ in range(steps):
-        rows = torch.randint(len(features), (_BATCH,), generator=generator).to(features.device)
+        rows = torch.randint(len(features), (_BATCH,), generator=generator).to(features.device, non_blocking=True)
         loss = (probe(features[rows]) - truth[rows]).square().mean()
         optimiser.zero_grad(set_to_none=True)
         loss.backward()

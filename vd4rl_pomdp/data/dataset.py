@@ -51,6 +51,8 @@ class Dataset:
         self.path = path
         self.store = store
         self._buffers = FrameBuffers()
+        self._windows: dict[int, int] = {}
+        """How many there are of each length that was asked for: to count anew would mean to wait for a GPU."""
         self.fingerprint = store.fingerprint
         """Name of the set's content, the same for copies of the set."""
         self.task, self.quality = task_and_quality(path, store.meta["attributes"])
@@ -260,8 +262,10 @@ class Dataset:
 
     def num_windows(self, length: int) -> int:
         """Number of windows of `length` consecutive rows of one episode; raises UserError as `windows` does."""
-        self.check_windows(length)
-        return int(self.windows_per_episode(length).sum())
+        if length not in self._windows:
+            self.check_windows(length)
+            self._windows[length] = int(self.windows_per_episode(length).sum())
+        return self._windows[length]
 
     def windows(
         self, index: Index, length: int, frame_stack: int = FRAME_STACK, observations: Observations | None = None
@@ -281,9 +285,7 @@ class Dataset:
             UserError: an episode is shorter than the window.
             IndexError: an index is out of range.
         """
-        self.check_windows(length)
-        per_episode = self.windows_per_episode(length)
-        start = self._starts(self._index(index, int(per_episode.sum())), per_episode)
+        start = self._starts(self._index(index, self.num_windows(length)), self.windows_per_episode(length))
         rows = start[:, None] + torch.arange(length, device=start.device)
         has_action = rows + 1 < self.episode_end[self.episode[rows]]
         following = self.action_after(torch.where(has_action, rows, 0))
@@ -331,7 +333,7 @@ class Dataset:
         low, high = int(number.min()), int(number.max())
         if low < 0 or high >= size:
             raise IndexError(f"index {low if low < 0 else high} is outside 0..{size - 1}")
-        return number.to(self.t.device)
+        return number.to(self.t.device, non_blocking=True)
 
 
 def require_positive(**values: int) -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from functools import cache
 from itertools import pairwise
 
 import torch
@@ -59,8 +60,9 @@ def mlp(inputs: int, hidden: int, outputs: int, layers: int = 2, last: type[nn.L
     return nn.Sequential(*modules, last(hidden, outputs))
 
 
+@cache
 def all_pairs(rows: int, max_k: int) -> Tensor:
-    """Every (t, k) with 1 <= k <= max_k and t + k < rows: (P, 2) int64, ordered by k, then t."""
+    """Every (t, k) with 1 <= k <= max_k and t + k < rows: (P, 2) int64, ordered by k, then t; not to be changed."""
     pairs = [(t, k) for k in range(1, min(max_k, rows - 1) + 1) for t in range(rows - k)]
     return torch.tensor(pairs, dtype=torch.int64).view(-1, 2)
 
