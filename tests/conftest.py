@@ -5,6 +5,8 @@ the tests were started in the background of a shell, which lets its jobs ignore 
 it sets up logging, which closes the stream of absl's handler unless that is stderr. Within a test that captures stderr
 itself it is not, but pytest's own, and every later test would fail.
 
+GPUs are hidden, unless `-m gpu` chooses the tests that need one.
+
 Where a process crashed is told at the end: what it writes at that moment is lost among the dots.
 """
 
@@ -29,6 +31,18 @@ signal.signal(signal.SIGINT, signal.default_int_handler)
 
 CRASHES = Path(__file__).parents[1] / ".pytest_cache" / "crashes"
 """A file for each process of the tests, empty unless it crashed."""
+
+
+def pytest_configure(config):
+    """A GPU rounds from run to run, and tests ask for equality to the bit."""
+    if config.option.markexpr != "gpu":
+        os.environ["CUDA_VISIBLE_DEVICES"] = ""
+
+
+def pytest_collection_modifyitems(items):
+    for item in items:
+        if item.get_closest_marker("gpu") and not torch.cuda.is_available():
+            item.add_marker(pytest.mark.skip(reason="needs a GPU, and -m gpu"))
 
 
 def pytest_sessionstart(session):

@@ -254,7 +254,7 @@ def test_samplers_draw_uniformly_over_transitions(dataset):
     assert short == pytest.approx(6 / 265, abs=0.012)
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_a_device_changes_nothing(tmp_path):
     folder = write_fake_set(tmp_path / "set", (9, 5))
     for make in (

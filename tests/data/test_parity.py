@@ -15,6 +15,8 @@ def exact():
 
 @pytest.mark.parametrize("task", TASKS)
 def test_the_environment_shows_the_golden_frames(exact, task):
+    if not render_info()["gl_vendor"].startswith("Mesa"):
+        pytest.skip("another renderer draws other edges")
     result = compare(exact[task], parity._golden()[f"{task}/frames"])
     assert result["equal"]
     assert result["mean_difference"] < 0.05
@@ -94,11 +96,13 @@ def test_the_background_of_frames_under_another_sky_differs(monkeypatch, own_fra
     assert not background(monkeypatch, task, others, frames)["equal"]
 
 
-def test_a_different_background_fails_the_verdict_although_the_canaries_pass(monkeypatch):
-    monkeypatch.setattr(parity, "_compare_background", lambda path: {"equal": False})
-    result = check_parity("somewhere")
-    assert all(canary["equal"] for canary in result["canary"].values())
-    assert not result["equal"]
+@pytest.mark.parametrize("equal", [False, True])
+def test_the_background_of_a_set_decides_whatever_the_canaries_say(monkeypatch, equal):
+    """A GPU draws other canaries, and the same pixels as a set that a GPU drew."""
+    monkeypatch.setattr(parity, "_compare_background", lambda path: {"equal": equal})
+    monkeypatch.setattr(parity, "compare", lambda *frames: {"equal": not equal})
+    assert check_parity("somewhere")["equal"] is equal
+    assert check_parity()["equal"] is not equal
 
 
 def test_a_set_of_an_unknown_task_is_refused(monkeypatch):

@@ -36,7 +36,7 @@ def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
     assert [results[name]["device"] for name in named] == ["cpu", "meta", "meta", "meta"]
 
 
-@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a GPU")
+@pytest.mark.gpu
 def test_a_set_on_a_gpu_can_be_measured(tmp_path, monkeypatch):
     monkeypatch.setattr(training, "BATCH", 4)
     dataset = data.synthetic_set(tmp_path, 8)[0].to("cuda")

@@ -129,7 +129,7 @@ class ParityCommand:
     """Compare rendered canary frames with golden ones, and a data set's background with the environment's."""
 
     path: tyro.conf.Positional[Path | None] = None
-    """A data set; without one only the canaries are compared."""
+    """A data set, whose background decides; without one the canaries do."""
     json: bool = False
     """Print one JSON object."""
 
@@ -140,8 +140,13 @@ def _parity(words: Arguments, program: str) -> None:
     command = parse(ParityCommand, words, program)
     result = check_parity(command.path)
     show(result, command.json)
+    if not result["equal"] and command.path:
+        raise UserError(f"the environment shows another background than {command.path}: see `background` above")
     if not result["equal"]:
-        raise UserError("the environment shows other pixels than the data: see the comparison that is not equal")
+        raise UserError(
+            f"{result['render']['gl_renderer']} draws other pixels than the golden frames' software renderer did: name "
+            "a set, to see whether they are its own"
+        )
 
 
 COMMANDS = {

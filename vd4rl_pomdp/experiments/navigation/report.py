@@ -152,7 +152,7 @@ def _budget(runs: list[NavigationRun]) -> str:
     samples = " or ".join(f"{count:,}" for count in sorted({_samples(run) for run in runs} - {0})) or "unknown"
     return (
         f"Budget: {steps} gradient steps on {samples} samples, "
-        f"{took} minutes a run ({machines}). "
+        f"{took} minute{'s' * (took != '1')} a run ({machines}). "
         "The paper's: 200,000 steps on 500,000 samples."
     )
 
