@@ -116,6 +116,11 @@ class Windows(Batch):
         return torch.arange(self.has_action.shape[1], device=self.length.device) < self.length[:, None]
 
 
+def previous(action: Tensor) -> Tensor:
+    """a_{j-1} of every row, zero in the first, from (B, T, A) a_j: what `Windows` show where no action came before."""
+    return torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], dim=1)
+
+
 @dataclass(frozen=True)
 class StateWindows(Windows):
     """Windows that also tell the true state: for methods that are trained on it, and for no other."""

@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp.objective import InverseObjective
-from vd4rl_pomdp.types import Windows
+from vd4rl_pomdp.types import Windows, previous
 
 Seen = tuple[set[int], set[int]]
 """Observation rows j (of o_j) and action indices j (of a_j)."""
@@ -130,5 +130,5 @@ def _window(obs: Tensor, actions: Tensor, lengths: Sequence[int]) -> Windows:
     has_action = torch.arange(rows) < length[:, None] - 1
     has_action[0] = torch.arange(rows) < length[0]
     action = actions * has_action[..., None]
-    prev_action = torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], 1)
-    return Windows(obs, prev_action, action, has_action, length, torch.zeros(obs.shape[:2], dtype=torch.int64))
+    key = torch.zeros(obs.shape[:2], dtype=torch.int64)
+    return Windows(obs, previous(action), action, has_action, length, key)

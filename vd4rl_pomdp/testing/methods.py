@@ -14,7 +14,7 @@ from vd4rl_pomdp.nn.action_target import ACTION_TARGETS, CodeOptions, target_opt
 from vd4rl_pomdp.objective import InverseObjective, Objective
 from vd4rl_pomdp.state_scale import StateScale
 from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_check, run_checks, shown
-from vd4rl_pomdp.types import StateWindows, Windows
+from vd4rl_pomdp.types import StateWindows, Windows, previous
 from vd4rl_pomdp.visibility import declared, dependence, response, wrong_pairs
 
 ROWS, ACTIONS, STATE, POSE = 6, 2, 5, 3
@@ -91,9 +91,8 @@ def batch(lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0, state: bool
     length = torch.tensor(lengths)
     has_action = torch.arange(ROWS) < length[:, None] - 1
     action = (torch.rand(len(lengths), ROWS, ACTIONS, generator=g) * 2 - 1) * has_action[..., None]
-    prev_action = torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], 1)
     key = torch.arange(len(lengths) * ROWS).view(len(lengths), ROWS)
-    return Windows(obs, prev_action, action, has_action, length, key)
+    return Windows(obs, previous(action), action, has_action, length, key)
 
 
 def windows(name: str, lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0) -> Windows:

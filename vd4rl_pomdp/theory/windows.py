@@ -10,7 +10,7 @@ from torch import Tensor
 
 from vd4rl_pomdp.theory.law import Law, joint_law
 from vd4rl_pomdp.theory.world import World
-from vd4rl_pomdp.types import Windows, row_key
+from vd4rl_pomdp.types import Windows, previous, row_key
 
 
 @dataclass(frozen=True)
@@ -44,7 +44,7 @@ def exact_windows(world: World, rows: int) -> ExactWindows:
     count = len(law.counts)
     windows = Windows(
         obs=torch.from_numpy((obs * 255).astype(np.uint8))[..., None, None],
-        prev_action=torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], dim=1),
+        prev_action=previous(action),
         action=action,
         has_action=torch.ones(count, rows, dtype=torch.bool),
         length=torch.full((count,), rows),
