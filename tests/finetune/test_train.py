@@ -46,6 +46,7 @@ def finetune_cut_and_whole(monkeypatch, encoder: Path, data: Path, out: Path, **
 def test_finetuning_resumes_to_the_bit(encoder, data, tmp_path, monkeypatch, algorithm, views):
     changes = {"algorithm": algorithm, "views": views, "eval_length": 2, "updates": 30, "eval_every": 15}
     changes |= {"checkpoint_every": 10, "batch_size": 4}
+    monkeypatch.setattr(train, "STANDARDISED_BY", 16)
     whole = finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
     rows = list(csv.DictReader((whole / "episodes.csv").open()))
     assert [(row["step"], row["evaluated_under"]) for row in rows] == [
