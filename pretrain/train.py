@@ -15,7 +15,7 @@ from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError, refuse_outside
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, EncoderCard, save_encoder
-from vd4rl_pomdp.objective import Objective
+from vd4rl_pomdp.objective import Objective, require_loss
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs import METRICS_FILE
 from vd4rl_pomdp.runs.device import autocast, pick_device
@@ -91,7 +91,8 @@ class PretrainTrainer:
         """One gradient step; returns the objective's scalars."""
         window = self.batch()
         with autocast(self.device, self.config.precision):
-            loss, logs = self.objective.loss(window, self.step / max(1, self.config.steps))
+            given = self.objective.loss(window, self.step / max(1, self.config.steps))
+        loss, logs = require_loss(self.config.method, given)
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         self.optimiser.step()

@@ -14,6 +14,7 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.action_target import ActionTarget, target_options
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.heads import PairHead, all_pairs, mlp
@@ -40,6 +41,20 @@ class Objective(nn.Module, ABC):
 
     def after_step(self) -> None:
         """Called after every optimiser step: the place for what no gradient moves, such as momentum encoders."""
+
+
+def require_loss(name: str, given: Any) -> tuple[Tensor, dict[str, Tensor]]:
+    """What `Objective.loss` of a method gave; raises UserError unless it is what the contract says."""
+    match given:
+        case (Tensor() as loss, dict() as logs) if "loss" in logs and all(map(_is_scalar, (loss, *logs.values()))):
+            return loss, logs
+    raise UserError(
+        f"the loss of the method {name} must be a scalar tensor and a dictionary of detached ones, `loss` among them"
+    )
+
+
+def _is_scalar(value: Any) -> bool:
+    return isinstance(value, Tensor) and value.numel() == 1
 
 
 @dataclass(frozen=True)

@@ -12,6 +12,7 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from finetune.features import FeatureBatch
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.runs.device import Precision, autocast
@@ -82,15 +83,19 @@ class Algorithm(ABC):
         Returns:
             Detached scalars of all losses.
         """
-        logs: dict[str, Tensor] = {}
+        logs: dict[str, Tensor] | None = None
         for loss in self._computed(self.losses(batch), batch.z.device):
             _step(loss.value, [loss.optimiser] if encoder is None else [loss.optimiser, encoder])
-            logs |= loss.logs
+            logs = (logs or {}) | loss.logs
             encoder = None
+        if logs is None:
+            raise UserError(f"{type(self).__name__}.losses yields no loss: an update steps along one at least")
         return logs
 
     def _computed(self, losses: Iterator[Loss], device: torch.device) -> Iterator[Loss]:
         """The same losses, each computed in the algorithm's precision."""
+        if not isinstance(losses, Iterator):
+            raise UserError(f"{type(self).__name__}.losses gives a {type(losses).__name__}: let it yield every loss")
         while True:
             with autocast(device, self.precision):
                 loss = next(losses, None)
@@ -131,6 +136,14 @@ class NoisyAlgorithm(Algorithm):
         super().load_state_dict(state)
         self.updates = state["updates"]
         self.generator.set_state(state["noise"])
+
+
+def require_policy(algorithm: Algorithm) -> None:
+    """Raise UserError for an algorithm that would leave its policy out of checkpoints."""
+    if not any(part is algorithm.policy for part in algorithm.parts().values()):
+        raise UserError(
+            f"{type(algorithm).__name__}.parts lacks the policy: name all that has a state, or it is not kept"
+        )
 
 
 def _step(loss: Tensor, optimisers: list[Optimizer]) -> None:

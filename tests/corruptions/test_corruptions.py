@@ -19,6 +19,7 @@ from vd4rl_pomdp.corruptions import (
     draw_integers,
     make_corruption,
 )
+from vd4rl_pomdp.corruptions.corruption import Corruption
 from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.errors import UserError
@@ -162,10 +163,15 @@ def test_a_key_stream_goes_on_from_its_position():
     assert not torch.equal(KeyStream(2).take((10,)), whole)
 
 
+def test_a_stage_that_returns_frames_is_refused():
+    with pytest.raises(UserError, match="function returns frames, which nobody reads: a stage changes them in place"):
+        Corruption([lambda frames, key, number: torch.zeros_like(frames)])(stacks(1), torch.zeros(1, dtype=torch.int64))
+
+
 def test_unknown_and_impossible_corruptions_are_refused():
     with pytest.raises(UserError, match=r"unknown corruption 'fog'.*patch\+zero_frames"):
         make_corruption("fog")
-    with pytest.raises(UserError, match=r"unknown corruption 'zero_frames\+patch'"):
+    with pytest.raises(UserError, match=r"'zero_frames\+patch': zero_frames may only end a name: patch\+zero_frames$"):
         make_corruption("zero_frames+patch")
     with pytest.raises(UserError, match="--patch-size"):
         make_corruption(CorruptionConfig.of("patch", patch_size=85))(stacks(1), torch.zeros(1, dtype=torch.int64))

@@ -9,12 +9,14 @@ import torch
 import torch.nn.functional as F
 
 from finetune.algorithms import ALGORITHMS, Loss, noise, td3_bc
+from finetune.algorithms.algorithm import require_policy
 from finetune.algorithms.bc import BC
 from finetune.algorithms.critic import TwinCritic
 from finetune.algorithms.drqv2_bc import DrQv2BC
 from finetune.algorithms.iql import IQL, IQLOptions, expectile_loss
 from finetune.algorithms.td3_bc import TD3BC
 from finetune.features import FeatureBatch
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.policy import Policy
 
 DIM, ACTIONS, SIZE = 3, 2, 32
@@ -33,6 +35,36 @@ def make(kind: type, learning_rate: float = 1e-3, seed: int = 0) -> TD3BC:
                 for parameter in target.parameters():
                     parameter.add_(0.2 * torch.randn_like(parameter))
     return algorithm
+
+
+class Silent(BC):
+    def losses(self, batch):
+        yield from ()
+
+
+class Returning(BC):
+    def losses(self, batch):
+        return next(super().losses(batch))
+
+
+class Forgetful(BC):
+    def parts(self):
+        return {"optimiser": self.optimiser}
+
+
+@pytest.mark.parametrize(
+    ("kind", "told"),
+    [(Silent, "Silent.losses yields no loss"), (Returning, "Returning.losses gives a Loss: let it yield")],
+)
+def test_losses_that_are_not_yielded_are_refused(kind, told):
+    with pytest.raises(UserError, match=told):
+        make(kind).update(batch())
+
+
+def test_an_algorithm_that_would_not_keep_its_policy_is_refused():
+    require_policy(make(BC))
+    with pytest.raises(UserError, match=r"Forgetful\.parts lacks the policy"):
+        require_policy(make(Forgetful))
 
 
 def batch(seed: int = 0) -> FeatureBatch:

@@ -3,6 +3,7 @@ from dataclasses import replace
 
 import pytest
 import torch
+from safetensors.torch import save_file
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn import Encoder, EncoderCard, EncoderConfig, load_encoder, save_encoder, sequence
@@ -124,6 +125,15 @@ def test_a_runs_folder_in_place_of_its_encoders_is_told_of_the_encoder(tmp_path)
 def test_an_encoder_of_a_corruption_whose_file_was_not_run_says_so(tmp_path):
     save_encoder(tmp_path, Encoder(EncoderConfig(action_dim=6)), replace(CARD, corruption={"corruption": "fog"}))
     with pytest.raises(UserError, match=r"unknown corruption 'fog'.*; run the file that adds what it names, or"):
+        load_encoder(tmp_path)
+
+
+def test_weights_of_another_network_say_which_numbers_are_missing(tmp_path):
+    save_encoder(tmp_path, make("none", False), CARD)
+    save_file({"frame.other": torch.zeros(1)}, tmp_path / "model.safetensors")
+    with pytest.raises(
+        UserError, match=r"whose code may have changed \(.*Unexpected key.*frame\.other.*\); take the code"
+    ):
         load_encoder(tmp_path)
 
 

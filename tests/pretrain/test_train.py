@@ -13,6 +13,7 @@ from tests.helpers_data import write_fake_set
 from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_pretrain
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn import load_encoder
+from vd4rl_pomdp.objective import require_loss
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -32,6 +33,22 @@ def test_pretraining_resumes_to_the_bit(data, tmp_path, monkeypatch, method):
     assert contents(tmp_path / "cut") == contents(whole.path)
     again = run_pretrain(cut)
     assert contents(again.path) == contents(whole.path)
+
+
+@pytest.mark.parametrize(
+    "given",
+    [
+        torch.tensor(1.0),
+        (torch.tensor(1.0), {}),
+        (torch.tensor(1.0), {"loss": 1.0}),
+        (torch.ones(2), {"loss": torch.tensor(1.0)}),
+        (torch.tensor(1.0), {"loss": torch.tensor(1.0), "more": torch.ones(2)}),
+    ],
+    ids=str,
+)
+def test_a_loss_that_breaks_its_contract_is_one_line(given):
+    with pytest.raises(UserError, match="loss of the method mine must be a scalar tensor and a dictionary of detached"):
+        require_loss("mine", given)
 
 
 def test_an_encoder_tells_how_it_was_pretrained_and_an_older_one_still_loads(encoder, data):

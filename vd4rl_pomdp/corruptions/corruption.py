@@ -124,7 +124,10 @@ def _kinds(corruption: str) -> list[type[Options]]:
     names = [] if corruption == "none" else corruption.split("+")
     for name in (name for name in names if names.count(name) > 1):
         raise UserError(f"corruption {corruption!r} names {name} twice, and its options are one set: name it once")
-    if any(name not in STAGES and name not in STAGES.broken for name in names) or ZERO_FRAMES in names[:-1]:
+    if ZERO_FRAMES in names[:-1]:
+        sorted_names = "+".join(sorted(names, key=ZERO_FRAMES.__eq__))
+        raise UserError(f"unknown corruption {corruption!r}: {ZERO_FRAMES} may only end a name: {sorted_names}")
+    if any(name not in STAGES and name not in STAGES.broken for name in names):
         own = [name for name in STAGES if STAGES.origin(name)]
         raise UserError(f"unknown corruption {corruption!r}: choose one of {', '.join([*CORRUPTIONS, *own])}")
     return [STAGES.named(name) for name in names]
@@ -243,7 +246,10 @@ class Corruption:
     def change_(self, frames: Tensor, key: Tensor, kept: Tensor) -> None:
         """Apply the stages, in place, to the (N, K, 3, H, W) frames that (N, K) `kept` names."""
         for number, stage in enumerate(self._stages):
-            stage(frames, derive_keys(number, key), kept)
+            if stage(frames, derive_keys(number, key), kept) is not None:  # type: ignore[func-returns-value]
+                raise UserError(
+                    f"{type(stage).__name__} returns frames, which nobody reads: a stage changes them in place"
+                )
 
 
 def make_corruption(config: CorruptionConfig | str) -> Corruption:

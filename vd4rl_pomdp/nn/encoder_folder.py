@@ -17,7 +17,7 @@ from torch.random import fork_rng
 
 from vd4rl_pomdp import __version__
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.errors import UserError, disk_errors, first_line
+from vd4rl_pomdp.errors import UserError, disk_errors, first_line, in_one_line
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.encoder_card import EncoderCard, EncoderOrigin, EncoderRecord
 from vd4rl_pomdp.nn.frame import STATE
@@ -138,7 +138,12 @@ def load_encoder(
         ) from error
     try:
         encoder.load_state_dict(read_tensors(folder / WEIGHTS))
-    except (FileNotFoundError, SafetensorError, RuntimeError) as error:
+    except RuntimeError as error:
+        raise UserError(
+            f"{folder}/model.safetensors: does not fit the network that config.json beside it names, whose code may "
+            f"have changed ({in_one_line(error)}); take the code it was pretrained with, or pretrain the encoder again"
+        ) from error
+    except (FileNotFoundError, SafetensorError) as error:
         reason = first_line(error)
         raise UserError(f"{folder}/model.safetensors: cannot be read ({reason}); pretrain the encoder again") from error
     return encoder.eval().requires_grad_(False), card
