@@ -152,7 +152,7 @@ class Writing(BC):
 
 
 MUTANTS = [
-    (Idle, losses_are_finite_scalars, "update 0 has none"),
+    (Idle, losses_are_finite_scalars, "Idle.losses yields no loss"),
     (Silent, losses_are_finite_scalars, "update 0 logs nothing"),
     (Attached, losses_are_finite_scalars, "bc_loss is logged with its graph"),
     (Overwriting, losses_are_finite_scalars, "two losses log under one name: loss, loss"),
