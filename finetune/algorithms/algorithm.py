@@ -83,25 +83,27 @@ class Algorithm(ABC):
         Returns:
             Detached scalars of all losses.
         """
-        logs: dict[str, Tensor] | None = None
+        logs: dict[str, Tensor] = {}
         for loss in self._computed(self.losses(batch), batch.z.device):
             _step(loss.value, [loss.optimiser] if encoder is None else [loss.optimiser, encoder])
-            logs = (logs or {}) | loss.logs
+            logs |= loss.logs
             encoder = None
-        if logs is None:
-            raise UserError(f"{type(self).__name__}.losses yields no loss: an update steps along one at least")
         return logs
 
     def _computed(self, losses: Iterator[Loss], device: torch.device) -> Iterator[Loss]:
-        """The same losses, each computed in the algorithm's precision."""
+        """The same losses, at least one, each computed in the algorithm's precision."""
         if not isinstance(losses, Iterator):
             raise UserError(f"{type(self).__name__}.losses gives a {type(losses).__name__}: let it yield every loss")
-        while True:
-            with autocast(device, self.precision):
-                loss = next(losses, None)
-            if loss is None:
-                return
+        loss = self._next(losses, device)
+        if loss is None:
+            raise UserError(f"{type(self).__name__}.losses yields no loss: an update steps along one at least")
+        while loss is not None:
             yield loss
+            loss = self._next(losses, device)
+
+    def _next(self, losses: Iterator[Loss], device: torch.device) -> Loss | None:
+        with autocast(device, self.precision):
+            return next(losses, None)
 
     @abstractmethod
     def parts(self) -> dict[str, Any]:
