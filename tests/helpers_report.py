@@ -148,6 +148,8 @@ RECORDED = {
         **{"preset": "paper", "steps": 50_000, "batch_size": 16, "window": 32, "learning_rate": 0.0003, "max_k": 15},
         **{"frame_encoder": "drq", "precision": "bf16", "feature_dim": 256, "hidden_dim": 256, "gru_layers": 1},
         **{"shift": 4, "history": "method", "head": "kmeans", "codes": 20, "k_embedding": True, "norm_weight": 0.0},
+    },
+    "corruption": {
         **{"corruption_mode": "resample", "patch_size": 16, "patch_count": 1, "patch_fill": 0, "zeroed_frames": 2},
     },
     "config": {
@@ -198,9 +200,11 @@ def grid_run(out: Path, labels: dict[str, Any], evaluations: int, episodes: int,
             | {"score": score, "evaluated_under": labels["corruption"], "action_error": None}
             for i, score in enumerate(scores)
         ]
-    settings = RECORDED["settings"] | {"method": labels["method"], "corruption": labels["corruption"]}
+    corruption = RECORDED["corruption"] | {"corruption": labels["corruption"]}
+    settings = RECORDED["settings"] | {"method": labels["method"]} | corruption
     data = f"{labels['task']}-{labels['quality']}"
     card = {"method": labels["method"], "seed": labels["seed"], "settings": settings, "data": data}
+    card |= {"corruption": corruption}
     config = RECORDED["config"] | {"seed": labels["seed"], "updates": 1000 * evaluations, "out": f"runs/{labels}"}
     record = {"format": 3, "stage": "finetune", "config": config, "inputs": {"data": data}, "git_commit": "0" * 40}
     record |= {"versions": RECORDED["versions"], "command": f"vd4rl-pomdp finetune --preset paper {labels}"}

@@ -107,14 +107,32 @@ def test_a_corruption_of_other_options_is_another_setting_whatever_the_method(tm
     assert f"walker_walk expert, {few}" in page
 
 
+def under_own_corruption(run, options, **config):
+    """Give a run an encoder that was trained under a corruption with options of its own, and settings."""
+    describe(run, options, **config)
+    card = read_json(run / "encoder" / "config.json")
+    card["pretrain"]["corruption"] = {"corruption": "patch"} | options
+    write_json(run / "encoder" / "config.json", card)
+
+
 def test_options_are_a_corruptions_whether_or_not_its_file_was_run(tmp_path):
     runs = tmp_path / "runs"
     for height in (8, 24):
-        run = describe(write_run(runs / f"acro{height}", "acro", 0, {10: [1.0]}), {"bar_height": height})
-        card = read_json(run / "encoder" / "config.json")
-        card["pretrain"]["corruption"] = {"corruption": "patch", "bar_height": height}
-        write_json(run / "encoder" / "config.json", card)
+        under_own_corruption(write_run(runs / f"acro{height}", "acro", 0, {10: [1.0]}), {"bar_height": height})
     assert settings_of(runs) == {"acro": {"patch, bar_height 8", "patch, bar_height 24"}}
+
+
+def test_an_option_is_not_a_corruptions_because_it_is_called_like_one_of_it(tmp_path):
+    runs = tmp_path / "runs"
+    for gamma, discount in ((1, 0.9), (1, 0.99), (2, 0.99)):
+        run = write_run(runs / f"acro{gamma}{discount}", "acro", 0, {10: [1.0]})
+        under_own_corruption(run, {"gamma": gamma}, gamma=discount)
+    found = {(run.labels["corruption"], run.variant) for run in load_runs([runs])}
+    assert found == {
+        ("patch, gamma 1", "gamma 0.9"),
+        ("patch, gamma 1", "gamma 0.99"),
+        ("patch, gamma 2", "gamma 0.99"),
+    }
 
 
 def test_where_nothing_is_hidden_no_option_counts(tmp_path):

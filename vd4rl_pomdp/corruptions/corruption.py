@@ -182,9 +182,10 @@ _OWN = ("corruption", "corruption_mode")
 NO_CORRUPTION = CorruptionConfig()
 
 
-def corruption_settings() -> set[str]:
-    """Names of all settings that say how observations are corrupted."""
-    return {*_OWN, *(field.name for kind in STAGES.values() for field in fields(kind))}
+def corruption_settings(corruption: str) -> set[str]:
+    """Names of the settings that say how a corruption hides pixels, without those of stages that are not here."""
+    kinds = (STAGES[name] for name in corruption.split("+") if name in STAGES)
+    return {*_OWN, *(field.name for kind in kinds for field in fields(kind))}
 
 
 class Corruption:

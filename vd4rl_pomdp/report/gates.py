@@ -16,9 +16,9 @@ import numpy as np
 
 from vd4rl_pomdp.report.gaps import STATE
 from vd4rl_pomdp.report.grouping import groups
-from vd4rl_pomdp.report.load import SETTING, LoadedRun, of_corruptions
+from vd4rl_pomdp.report.load import SETTING, LoadedRun
 from vd4rl_pomdp.report.tables import REFERENCES, grouped
-from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, is_plain, unlike
+from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, is_plain, of_corruption, unlike
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.settings import settings_of
 
@@ -132,7 +132,7 @@ def _unlike(one: LoadedRun, other: LoadedRun) -> list[str]:
 
     Of a method that is not pretrained, only settings of fine-tuning count.
     """
-    names = (one.settings.keys() & other.settings.keys()) - of_corruptions([one, other])
+    names = (one.settings.keys() & other.settings.keys()) - of_corruption(one.settings).keys()
     for run in (one, other):
         if run.labels["method"] in _NOT_PRETRAINED:
             names &= settings_of(run.record["config"]).keys() | {DATA[0]}

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Collection, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -11,12 +11,21 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from vd4rl_pomdp.corruptions import corruption_settings
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.reading import regular
 from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.report.grouping import groups
-from vd4rl_pomdp.report.variants import DATA, Parts, Settings, differences, of_sets, read_settings
+from vd4rl_pomdp.report.variants import (
+    DATA,
+    OF_CORRUPTION,
+    Parts,
+    Settings,
+    differences,
+    of_corruption,
+    of_sets,
+    read_settings,
+    without,
+)
 from vd4rl_pomdp.results import Result, find_results, whole_files
 from vd4rl_pomdp.runs import FILM_FILE, REFERENCE_FILE
 from vd4rl_pomdp.runs.files import Row
@@ -183,8 +192,8 @@ def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choi
 
 def _corruptions(runs: list[LoadedRun]) -> list[str]:
     """What hides pixels from each run, in words; an option that early runs do not record is not told apart."""
-    unknown = dict.fromkeys(sorted(of_corruptions(runs)), "")
-    settings = [{name: own.get(name, value) for name, value in unknown.items()} for own in _settings(runs)]
+    options = sorted({name for run in runs for name in of_corruption(run.settings)})
+    settings = [{name.removeprefix(OF_CORRUPTION): own.get(name, "") for name in options} for own in _settings(runs)]
     words = _differences(runs, settings, lambda run: run.labels["corruption"])
     names = [str(run.labels["corruption"]) for run in runs]
     return [
@@ -195,8 +204,8 @@ def _corruptions(runs: list[LoadedRun]) -> list[str]:
 
 def compare(runs: list[LoadedRun], brief: bool = True) -> list[Parts]:
     """The settings in which each run differs from others of its stage, method and algorithm."""
-    hiding, settings = of_corruptions(runs), _settings(runs)
-    methods = [_without(own, {*hiding, *DATA}) for own in settings]
+    settings = _settings(runs)
+    methods = [without(own, {*of_corruption(own), *DATA}) for own in settings]
     data = [{name: own[name] for name in DATA if name in own} for own in settings]
     of_methods = _differences(runs, methods, _method, brief)
     of_data = _differences(runs, data, lambda run: (*_method(run), run.set_name, run.labels["corruption"]))
@@ -216,12 +225,7 @@ def _differences(
 
 def _settings(runs: list[LoadedRun]) -> list[Settings]:
     """The runs' settings, without what goes by the set."""
-    return [_without(run.settings, run.of_set) for run in runs]
-
-
-def of_corruptions(runs: Iterable[LoadedRun]) -> set[str]:
-    """Settings that are corruptions' options: those of the parts that are here, and what encoders say of theirs."""
-    return corruption_settings().union(*(run.result.encoder.get("corruption", {}) for run in runs))
+    return [without(run.settings, run.of_set) for run in runs]
 
 
 def _of_sets(runs: list[LoadedRun]) -> list[Settings]:
@@ -230,10 +234,9 @@ def _of_sets(runs: list[LoadedRun]) -> list[Settings]:
     A corruption's options do if they do in all runs, since it has one name whatever learns under it; other settings if
     they do in all runs of one stage and algorithm.
     """
-    hiding = of_corruptions(runs)
-    options = _by_set(runs, [_without(run.settings, run.settings.keys() - hiding) for run in runs])
+    options = _by_set(runs, [of_corruption(run.settings) for run in runs])
     others = {
-        _kind(members[0]): _by_set(members, [_without(run.settings, hiding) for run in members])
+        _kind(members[0]): _by_set(members, [without(run.settings, of_corruption(run.settings)) for run in members])
         for members in groups(runs, _kind).values()
     }
     found = (options[run.set_name] | others[_kind(run)][run.set_name] for run in runs)
@@ -250,10 +253,6 @@ def _kind(run: LoadedRun) -> tuple[str, str]:
 
 def _method(run: LoadedRun) -> tuple[str, str, str]:
     return *_kind(run), str(run.labels["method"])
-
-
-def _without(settings: Settings, names: Collection[str]) -> Settings:
-    return {name: value for name, value in settings.items() if name not in names}
 
 
 def _load(result: Result) -> LoadedRun:

@@ -9,6 +9,7 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
+from vd4rl_pomdp.corruptions import corruption_settings
 from vd4rl_pomdp.runs.settings import settings_of
 
 Settings = dict[str, str]
@@ -23,6 +24,8 @@ _UNSET = "unset"
 _PRESETS = ("preset", "pretraining preset")
 DATA = ("data", "pretraining data")
 """Names of the sets' fingerprints."""
+OF_CORRUPTION = "corruption "
+"""What the names of a corruption's settings begin with: other parts may have options of the same names."""
 ENCODER_SEED = "pretraining seed"
 """The seed of a run's encoder, where the run's own is another: its seeds share what they were pretrained with."""
 PLAIN = {
@@ -35,16 +38,19 @@ _LABELS = ("method", "task", "quality")
 
 
 def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Settings:
-    """All settings behind a run.
+    """All settings behind a run, those of a corruption with OF_CORRUPTION before their names.
 
     Args:
         record: its config.json.
         card: its encoder's card, empty for a pretraining run or where there is none.
     """
-    own = settings_of(record["config"])
-    before = dict(card.get("corruption", {})) | {name: card[name] for name in ("steps", "preset") if name in card}
-    before |= card.get("settings") or {}
-    found = own | {(f"pretraining {k}" if k in own else k): v for k, v in before.items()}
+    own, hiding = settings_of(record["config"]), dict(card.get("corruption", {}))
+    if record["stage"] == "pretrain":
+        hiding = {name: own[name] for name in corruption_settings(str(own.get("corruption"))) if name in own}
+        own = without(own, hiding)
+    before = {name: card[name] for name in ("steps", "preset") if name in card} | (card.get("settings") or {})
+    found = own | {(f"pretraining {k}" if k in own else k): v for k, v in without(before, hiding).items()}
+    found |= {OF_CORRUPTION + name: value for name, value in hiding.items()}
     found |= {"format": record["format"]} if "format" in record else {}
     words = {name: _words(value) for name, value in found.items() if name not in _LABELS}
     if record["stage"] == "finetune" and not card.get("settings"):
@@ -52,6 +58,16 @@ def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Setting
     if card.get("seed", record["config"]["seed"]) != record["config"]["seed"]:
         words[ENCODER_SEED] = str(card["seed"])
     return words | _data(record.get("inputs", {}).get("data"), card.get("data"))
+
+
+def of_corruption(settings: Settings) -> Settings:
+    """Those of some settings that are a corruption's."""
+    return {name: value for name, value in settings.items() if name.startswith(OF_CORRUPTION)}
+
+
+def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, Any]:
+    """Settings but those of some names."""
+    return {name: value for name, value in settings.items() if name not in names}
 
 
 def is_plain(settings: Settings, history: str = "method") -> bool:
