@@ -35,6 +35,13 @@ EXAMPLES = {
     "frame_encoder": ("tiny", "tiny_channels", 12),
 }
 """Kind: name of the part on its page, an option of its own and a value that is not the default."""
+USED_IN = {
+    "method": ["pretrain"],
+    "corruption": ["pretrain", "finetune"],
+    "algorithm": ["finetune"],
+    "frame_encoder": ["pretrain", "finetune"],
+}
+"""Kind: the stages that run its code; the first is told of it by name."""
 PLAYED = ("corruption", "frame_encoder")
 """Kinds that worker processes meet when they evaluate: they run the script's module level."""
 
@@ -67,10 +74,12 @@ def test_an_example_runs_through_every_stage_and_the_record_names_it(tmp_path, k
     workers = 2 if kind in PLAYED else 1
     run(script, f"{finetune} --workers {workers} --eval-episodes 2", tmp_path)
     write_report([runs], tmp_path / "report")
-    stage = "finetune" if kind == "algorithm" else "pretrain"
-    record = json.loads((runs / stage / "config.json").read_text())
-    assert record["plugins"] == {f"{kind} {name}": BY_CALL}
-    assert (record["config"][kind], record["config"][option]) == (name, value)
+    records = {stage: json.loads((runs / stage / "config.json").read_text()) for stage in ("pretrain", "finetune")}
+    for stage in USED_IN[kind]:
+        assert records[stage]["plugins"] == {f"{kind} {name}": BY_CALL}
+        assert records[stage]["sources"][f"{kind} {name}"].startswith(f"my_{kind}.py ")
+    config = records[USED_IN[kind][0]]["config"]
+    assert (config[kind], config[option]) == (name, value)
     (row,) = csv.DictReader((tmp_path / "report" / "summary.csv").open())
     assert row.get(kind, name) == name
     rows = list(csv.DictReader((runs / "finetune" / "episodes.csv").open()))

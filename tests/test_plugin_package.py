@@ -159,12 +159,13 @@ def test_the_command_line_finds_an_installed_packages_parts_and_the_record_names
     python("-m", "vd4rl_pomdp", "pretrain", *first, *common, "--out", out / "pretrain")
     encoder = ["--encoder", out / "pretrain" / "encoder", "--workers", 1, "--eval-episodes", 2]
     python("-m", "vd4rl_pomdp", "finetune", *second, *encoder, *common, "--out", out / "finetune")
-    for stage, kinds in (
-        ("pretrain", ("method", "corruption", "frame_encoder", "task")),
-        ("finetune", ("algorithm",)),
+    of_encoders = ("corruption", "frame_encoder", "task")
+    for stage, kinds, brought in (
+        ("pretrain", ("method", *of_encoders), ()),
+        ("finetune", ("algorithm",), of_encoders),
     ):
         record = json.loads((out / stage / "config.json").read_text())
-        assert record["plugins"] == {f"{kind} {PARTS[kind][0]}": ORIGIN for kind in kinds}
+        assert record["plugins"] == {f"{kind} {PARTS[kind][0]}": ORIGIN for kind in (*kinds, *brought)}
         for name, _, option, value in (PARTS[kind] for kind in kinds):
             assert name in record["config"].values()
             assert option is None or record["config"][option] == value

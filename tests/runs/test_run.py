@@ -91,8 +91,8 @@ def test_what_a_run_goes_on_with_is_recorded_where_it_is_new(tmp_path, monkeypat
     monkeypatch.setattr(module, "git_commit", lambda: now["git_commit"])
     for processor, commit in (("A", "one"), ("A", "one"), ("B", "one"), ("B", "one"), ("B", "two"), ("A", "one")):
         now |= {"processor": processor, "git_commit": commit}
-        with begin(tmp_path):
-            pass
+        with begin(tmp_path) as run:
+            run.save(1, {})
     told = read_json(tmp_path / "machine.json")
     later = [(part["processor"], part["git_commit"]) for part in told["continued"]]
     assert (told["processor"], later) == ("A", [("B", "one"), ("B", "two"), ("A", "one")])
@@ -100,6 +100,19 @@ def test_what_a_run_goes_on_with_is_recorded_where_it_is_new(tmp_path, monkeypat
     write_json(tmp_path / "machine.json", told | {"continued": 7})
     with pytest.raises(UserError, match=r"machine\.json: is damaged"), begin(tmp_path):
         pass
+
+
+def test_the_record_of_a_run_that_has_kept_nothing_is_of_the_start_that_counts(tmp_path, monkeypatch):
+    for commit, size in (("one", 1), ("two", 2), ("three", 2)):
+        monkeypatch.setattr(module, "git_commit", lambda commit=commit: commit)
+        monkeypatch.setattr(module, "machine", lambda device, commit=commit: {"processor": commit})
+        monkeypatch.setattr(module, "sources", lambda parts, size=size: {"method mine": f"mine.py {size}"})
+        with begin(tmp_path) as run:
+            if commit != "one":
+                run.save(1, {})
+    record, told = (read_json(tmp_path / f"{name}.json") for name in ("config", "machine"))
+    assert (record["git_commit"], record["sources"], told["processor"]) == ("two", {"method mine": "mine.py 2"}, "two")
+    assert [part["git_commit"] for part in told["continued"]] == ["three"]
 
 
 def test_a_second_owner_is_refused_and_finds_the_end_of_the_first(tmp_path):

@@ -8,10 +8,10 @@ from __future__ import annotations
 
 import sys
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from types import TracebackType
+from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
 from vd4rl_pomdp.data.format import read_plan
@@ -39,7 +39,13 @@ class RunFolder:
     """A run's files; `with` begins the run or goes on with it, owns its folder meanwhile, and answers signals."""
 
     def __init__(
-        self, path: Path, stage: str, config: Any, inputs: dict[str, str], results: Sequence[str] = ()
+        self,
+        path: Path,
+        stage: str,
+        config: Any,
+        inputs: dict[str, str],
+        results: Sequence[str] = (),
+        parts: Mapping[str, str] = MappingProxyType({}),
     ) -> None:
         """Nothing is written yet.
 
@@ -49,6 +55,7 @@ class RunFolder:
             config: the stage's settings, a dataclass.
             inputs: hashes of what the run reads, by name: the data's fingerprint, the encoder's hash.
             results: files that a finished run holds.
+            parts: names of parts that the inputs bring along, by the registries' `setting`: an encoder's corruption.
 
         Raises:
             UserError: the folder holds something else, a run with other settings, inputs or of another format, or one
@@ -63,6 +70,7 @@ class RunFolder:
         self._stack = ExitStack()
         self._owner: Owner | None = None
         self._results = results
+        self._parts = self.config | parts
         self._check()
 
     def _check(self) -> None:
@@ -111,19 +119,24 @@ class RunFolder:
         return self
 
     def _warn_of_other_code(self) -> None:
-        file = self.path / CONFIG_FILE
-        for part in of_other_code(read_json(file), self.config) if file.exists() else ():
+        kept = {} if self._begins else read_json(self.path / CONFIG_FILE)
+        for part in of_other_code(kept, self._parts):
             print(
                 f"warning: {self.path}: the file of {part} has changed since this run began, which goes on or counts "
                 "all the same; remove the run to compute it anew",
                 file=sys.stderr,
             )
 
+    @property
+    def _begins(self) -> bool:
+        """Whether nothing is there that the run could go on with: what was recorded before tells of nothing."""
+        return not (self.finished or self._checkpoints.steps() or (self.path / EPISODES_FILE).exists())
+
     def _begin(self) -> None:
-        if not (self.path / CONFIG_FILE).exists():
+        if self._begins:
             record = {"format": FORMAT, "stage": self.stage, "config": self.config, "inputs": self.inputs}
             origin = {"versions": versions(), "git_commit": git_commit(), "command": command()}
-            origin |= {"plugins": origins(self.config), "sources": sources(self.config)}
+            origin |= {"plugins": origins(self._parts), "sources": sources(self._parts)}
             origin |= {"collection": read_plan(Path(self.config["data"]))}
             write_json(self.path / CONFIG_FILE, record | origin)
         (self.path / DIVERGED_FILE).unlink(missing_ok=True)
@@ -132,7 +145,7 @@ class RunFolder:
     def _keep_machine(self) -> None:
         """Record the hardware; of a run that goes on, that, commit and versions where they are others by now."""
         path, now = self.path / MACHINE_FILE, machine(self.config.get("device", "auto"))
-        if not path.exists():
+        if self._begins or not path.exists():
             write_json(path, now)
             return
         told, record = read_json(path), read_json(self.path / CONFIG_FILE)
