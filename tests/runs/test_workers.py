@@ -116,8 +116,17 @@ def test_an_error_that_no_pipe_carries_is_told_all_the_same():
 
 
 def test_a_worker_that_dies_is_one_sentence():
-    with pytest.raises(UserError, match=r"a worker process ended before its job \(exit code 7\)"):
+    with pytest.raises(UserError, match=r"a worker process ended before its job \(exit code 7\), as what it printed"):
         list(run_jobs(fail_or_die, [2, 3], 2))
+
+
+def be_killed(job: int) -> None:
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def test_a_worker_that_was_killed_may_have_lacked_memory(capfd):
+    with pytest.raises(UserError, match=r"\(exit code -9\), perhaps for want of memory: use fewer --workers and start"):
+        list(run_jobs(be_killed, [0, 1], 2))
 
 
 def test_a_job_that_no_other_process_can_read_is_one_sentence():

@@ -111,6 +111,18 @@ def test_a_job_of_another_command_has_not_been_tried(jobs, tmp_path):
     assert names(executor) == ["a", "b"]
 
 
+def test_a_job_whose_own_part_was_mended_has_not_been_tried(jobs, tmp_path, monkeypatch):
+    of_files = {"sources": {"method mine": "mine.py 1"}}
+    monkeypatch.setattr("vd4rl_pomdp.sweeps.driver.sources", lambda settings: of_files["sources"])
+    monkeypatch.setattr("vd4rl_pomdp.registry.sources", lambda settings: of_files["sources"])
+    carry_out(jobs, tmp_path, {"a": ["refused"]})
+    assert "a" not in names(carry_out(jobs, tmp_path)[1])
+    of_files["sources"] = {"method mine": "mine.py 2"}
+    finished, executor = carry_out(jobs, tmp_path)
+    assert finished
+    assert names(executor) == ["a", "b"]
+
+
 def test_failures_stay_until_they_are_taken_up_again(jobs, tmp_path):
     carry_out(jobs, tmp_path, {"a": ["diverged"]})
     assert "a" not in names(carry_out(jobs, tmp_path)[1])

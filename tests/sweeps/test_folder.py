@@ -10,6 +10,7 @@ from tests.helpers_sweeps import job
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import DiskFullError, UserError
 from vd4rl_pomdp.runs import files
+from vd4rl_pomdp.sweeps import folder as module
 from vd4rl_pomdp.sweeps.folder import SweepFolder, plan_name
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.work import CAUSES, DONE, FAILED, Work, code_of, ended, told_seconds
@@ -76,6 +77,22 @@ def test_a_sweep_that_was_moved_is_judged_by_its_own_folders(tmp_path):
     assert [job.folder for job in moved.jobs()] == [data, tmp_path / "moved" / "a"]
     with pytest.raises(UserError, match=r"was planned in .*plan it anew by `sweep run GRID --out .*moved`"):
         moved.refuse_elsewhere()
+
+
+def test_a_sweep_of_a_file_of_ones_own_is_taken_up_again_by_that_file_alone(tmp_path, monkeypatch):
+    mine, other = ({"init_main_from_path": f"{name}.py"} for name in ("mine", "other"))
+    folder = SweepFolder(tmp_path)
+    monkeypatch.setattr(module, "own_file", lambda: mine)
+    folder.keep_plan("one", [job(tmp_path, "a")])
+    folder.refuse_elsewhere()
+    for here in ({}, other):
+        monkeypatch.setattr(module, "own_file", lambda here=here: here)
+        with pytest.raises(UserError, match=r"was planned by `python mine.py sweep run`, .* sweep retry /"):
+            folder.refuse_elsewhere()
+    folder.keep_plan("one", [job(tmp_path, "a")])
+    monkeypatch.setattr(module, "own_file", dict)
+    with pytest.raises(UserError, match=r"was planned by `python other.py sweep run`"):
+        folder.refuse_elsewhere()
 
 
 def test_absolute_folders_are_the_same_from_everywhere(tmp_path, monkeypatch):

@@ -109,9 +109,11 @@ class _Crew:
         except (EOFError, ConnectionError):
             process = self._workers[connection]
             process.join()
+            killed = process.exitcode is not None and process.exitcode < 0
+            why = "perhaps for want of memory: use fewer --workers" if killed else "as what it printed tells: mend that"
             raise WorkerDiedError(
-                f"a worker process ended before its job (exit code {process.exitcode}), perhaps for want of memory: "
-                "use fewer --workers and start the same command again"
+                f"a worker process ended before its job (exit code {process.exitcode}), {why} "
+                "and start the same command again"
             ) from None
 
     def end(self) -> None:

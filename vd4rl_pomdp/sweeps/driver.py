@@ -13,6 +13,7 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 
 from vd4rl_pomdp.errors import DiskFullError, InUseError, OutOfMemoryError, UnavailableError, UserError, disk_errors
+from vd4rl_pomdp.registry import of_other_code, sources
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.ownership import in_use
@@ -50,9 +51,13 @@ RETRIES = {
 
 
 def attempts_at(job: Job, attempts: dict[str, list[Row]]) -> list[Row]:
-    """A job's attempts, oldest first: those at the command that it has now, which a corrected grid changes."""
-    words = list(job.words)
-    return [row for row in attempts.get(job.name, []) if row.get("words", words) == words]
+    """A job's attempts, oldest first: those at its present command, and with its parts as their files now have them.
+
+    A corrected grid changes the one, a mended part of one's own the others.
+    """
+    words, settings = list(job.words), dict(job.settings)
+    rows = (row for row in attempts.get(job.name, []) if row.get("words", words) == words)
+    return [row for row in rows if not of_other_code(row, settings)]
 
 
 def given_up(rows: list[Row]) -> str:
@@ -171,6 +176,7 @@ class Driver:
         row |= {"ended": round(time.time(), 1), "seconds": round(seconds, 1), "slots": slots, "largest": largest}
         job = self._jobs[ended.name]
         row |= {"step": progress_of(job), "host": socket.gethostname(), "words": list(job.words)}
+        row |= {"sources": sources(dict(job.settings))}
         self._rows[ended.name].append(row)
         try:
             self._folder.add(row)

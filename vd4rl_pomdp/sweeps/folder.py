@@ -1,10 +1,12 @@
 """What a sweep keeps beside its runs: its plans, one row for every attempt at a job, and what the jobs printed.
 
-    OUT/sweep/plans/GRID.json    from (the working directory), out, and the jobs of a grid: name, stage, folder,
-                                 command, needs; GRID~*.json those of a grid of one's own, of a part of one, or of one
+    OUT/sweep/plans/GRID.json    from (the working directory), out, own_file (the file of one's own that the sweep was
+                                 started from, if it was), and the jobs of a grid: name, stage, folder, command,
+                                 needs; GRID~*.json those of a grid of one's own, of a part of one, or of one
                                  with other settings
     OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, step, slots, largest
-                                 (the most slots it could have had), host, words (of its command)
+                                 (the most slots it could have had), host, words (of its command), sources (files of its
+                                 parts that are one's own)
     OUT/sweep/logs/JOB.log
     OUT/sweep/slurm/             what the Slurm executor keeps
 
@@ -26,7 +28,7 @@ from typing import Any
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs.files import Row, jsonable, write_json
-from vd4rl_pomdp.sweeps.own_file import own_file
+from vd4rl_pomdp.sweeps.own_file import OwnFile, own_file, program_of
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.work import Work
 
@@ -55,7 +57,8 @@ class SweepFolder:
         """Write the jobs of a plan, in place of what was written of it before; other drivers may do so at once."""
         with disk_errors(self.path):
             (self.path / "plans").mkdir(parents=True, exist_ok=True)
-        plan = {"from": str(Path.cwd()), "out": str(self.out), "jobs": [jsonable(asdict(job)) for job in jobs]}
+        plan = {"from": str(Path.cwd()), "out": str(self.out), "own_file": own_file()}
+        plan |= {"jobs": [jsonable(asdict(job)) for job in jobs]}
         write_json(self.path / "plans" / f"{name}.json", plan, shared=True)
 
     def jobs(self) -> list[Job]:
@@ -68,8 +71,14 @@ class SweepFolder:
         return [job for path in self._plan_files() if path.stem != name for job in _read_plan(path).jobs]
 
     def refuse_elsewhere(self) -> None:
-        """Raise UserError if the commands of a plan name other folders here than where it was made."""
+        """Raise UserError if a plan's commands mean something else here: other folders, or none of the same parts."""
         for plan in self._plans():
+            if plan.own_file and plan.own_file != own_file():
+                program = program_of(plan.own_file)
+                raise UserError(
+                    f"{self.out}: was planned by `{program} sweep run`, whose parts this process has not: start "
+                    f"`{program} sweep retry {self.out}`"
+                )
             if plan.out_there.resolve() != self.out.resolve() or not (plan.absolute or plan.made_in == Path.cwd()):
                 raise UserError(
                     f"{self.out}: was planned in {plan.made_in} as {plan.out}: `sweep retry` it there, or plan it "
@@ -141,6 +150,8 @@ class _Plan:
     """The working directory, which relative paths begin at."""
     out: Path
     jobs: list[Job]
+    own_file: OwnFile
+    """Empty for a plan of the program itself, and of an earlier version."""
 
     @property
     def out_there(self) -> Path:
@@ -162,7 +173,8 @@ def _read_plan(path: Path) -> _Plan:
         told = parse_json(read_bytes(path).decode())
         if not isinstance(told, dict) or not told["jobs"]:
             raise TypeError("it does not tell its jobs and where they were planned")
-        return _Plan(Path(told["from"]), Path(told["out"]), [_job(one) for one in told["jobs"]])
+        jobs = [_job(one) for one in told["jobs"]]
+        return _Plan(Path(told["from"]), Path(told["out"]), jobs, dict(told.get("own_file", {})))
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path}: is damaged ({error}); remove it and start `sweep run` again") from error
 

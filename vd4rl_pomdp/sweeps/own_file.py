@@ -48,9 +48,14 @@ def load(file: OwnFile) -> None:
 def program_here() -> str:
     """What one types in place of `vd4rl-pomdp` to have the parts that this process has."""
     file = own_file()
+    return program_of({_PATH: sys.argv[0]} if _PATH in file else file)
+
+
+def program_of(file: OwnFile) -> str:
+    """What one types in place of `vd4rl-pomdp` to have a file's parts."""
     if _NAME in file:
         return f"python -m {file[_NAME]}"
-    return f"python {shlex.quote(sys.argv[0])}" if file else _PROGRAM
+    return f"python {shlex.quote(file[_PATH])}" if file else _PROGRAM
 
 
 def refuse_unknown_to_jobs(jobs: Iterable[Job]) -> None:
