@@ -10,7 +10,7 @@ from vd4rl_pomdp.experiments.navigation.grid import condition_of, paper_rows
 from vd4rl_pomdp.mazes import PAPER_MAZES
 from vd4rl_pomdp.sweeps.grid import GridCell, narrow
 from vd4rl_pomdp.sweeps.grid_file import load_grid, names
-from vd4rl_pomdp.sweeps.stages import check_cell
+from vd4rl_pomdp.sweeps.stages import check_cell, check_cells
 from vd4rl_pomdp.tasks import TASKS, GymnasiumTask
 
 PAGE = Path(__file__).parents[2] / "docs" / "sweeps.md"
@@ -226,9 +226,9 @@ def test_every_shipped_cell_is_one_that_its_stages_take(name, testing):
     "section", ['[collect]\nquality = "expert"\ntask = "nope"', '[navigation_collect]\nmaze = "nope"']
 )
 def test_a_set_that_cannot_be_collected_is_refused_before_anything_is_run(file, section):
-    (cell,) = load_grid(file(section)).cells()
-    with pytest.raises(UserError, match="'nope'"):
-        check_cell(cell)
+    cells = load_grid(file(section)).cells()
+    with pytest.raises(UserError, match=r"^mine\.toml: .*'nope'"):
+        check_cells(cells, "mine.toml")
 
 
 CELL = {

@@ -74,6 +74,7 @@ def _run(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.sweeps.grid import SHARED, narrow
     from vd4rl_pomdp.sweeps.grid_file import load_grid, names
     from vd4rl_pomdp.sweeps.plan import JobPlanner
+    from vd4rl_pomdp.sweeps.stages import check_cells
 
     for name in SHARED:
         if flag_of(name) in (word.partition("=")[0] for word in words):
@@ -81,6 +82,7 @@ def _run(words: Arguments, program: str) -> None:
     command = parse_stage(RunCommand, words, program)
     grid = load_grid(command.grid, command.change, command.testing)
     cells = narrow(grid.cells(), command.only)
+    check_cells(cells, command.grid)
     for place in (command.out, command.data or command.out):
         refuse_no_folder(place)
     refuse_kept(command.out)

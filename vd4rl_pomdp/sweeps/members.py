@@ -13,7 +13,7 @@ from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.sweeps.found import FoundRun, found_in
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.sets import DataSet, set_of
-from vd4rl_pomdp.sweeps.stages import check_cell, recipe_of, recorded
+from vd4rl_pomdp.sweeps.stages import check_cells, recipe_of, recorded
 
 _NOWHERE = Path()
 """Sets are told by how they were collected, not by where they lie."""
@@ -35,8 +35,8 @@ class GridMembers(Choice):
         self._asked = f"one of the {len(cells)} cells of {name} that are asked for"
         self._sets: dict[str, list[DataSet]] = defaultdict(list)
         self._policies: set[tuple[Any, ...]] = set()
+        check_cells(cells, name)
         for cell in cells:
-            check_cell(cell)
             if "navigation_train" in cell.chain:
                 raise UserError(f"{name}: its cells are mazes; `vd4rl-pomdp navigation report` reports them")
             data = set_of(cell, _NOWHERE)

@@ -20,7 +20,7 @@ from vd4rl_pomdp.sweeps.found import FoundRuns, run_at
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.naming import run_folder
 from vd4rl_pomdp.sweeps.sets import DataSet, set_of
-from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, check_cell, recipe_of, recorded, told
+from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, recipe_of, recorded, told
 
 DATA = "data"
 """Folder of the sets in a sweep's, unless another is named."""
@@ -91,11 +91,13 @@ class JobPlanner:
     def plan(self, cells: Iterable[GridCell]) -> list[Job]:
         """The jobs of some cells, each after those it needs; what only finished jobs would need is left out.
 
+        Args:
+            cells: those that `check_cells` lets pass.
+
         Raises:
-            UserError: a stage would refuse a cell's settings, or a folder holds another set.
+            UserError: a folder holds another set, or cells want two sets in one.
         """
         for cell in cells:
-            check_cell(cell)
             self._add(cell)
         return self._needed()
 

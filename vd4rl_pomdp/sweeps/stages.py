@@ -5,13 +5,13 @@ Settings are parsed once for all seeds and folders, by the stage's own command l
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from functools import cache
 from typing import Any
 
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
-from vd4rl_pomdp.errors import MAX_SEED, refuse_number
+from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_number
 from vd4rl_pomdp.options import flat, words_of
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
@@ -43,6 +43,15 @@ def told(cell: GridCell, section: str) -> Values:
     """What a cell tells a stage, in the order of its command line."""
     takes = _TAKES.get(section, tuple(cell.shared))
     return {name: value for name, value in cell.shared.items() if name in takes} | cell.sections[section]
+
+
+def check_cells(cells: Iterable[GridCell], grid: str) -> None:
+    """`check_cell` for cells of a grid, whose name goes before what is wrong with one."""
+    try:
+        for cell in cells:
+            check_cell(cell)
+    except UserError as error:
+        raise UserError(f"{grid}: {error}") from error
 
 
 def check_cell(cell: GridCell) -> None:
