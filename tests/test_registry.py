@@ -1,5 +1,7 @@
 """Parts of one's own, by call and by entry point; what an installed package breaks, breaks nothing else."""
 
+import re
+from hashlib import sha256
 from importlib.metadata import EntryPoint
 
 import pytest
@@ -157,3 +159,34 @@ def test_a_package_that_offers_a_taken_name_disables_no_other_part(registry, mon
     offer(monkeypatch, own="tests.test_registry:THEIRS")
     assert registry.named("own") == "ours"
     assert "a frame encoder called 'own' exists already" in capsys.readouterr().err
+
+
+def test_the_source_of_a_part_is_its_file_and_what_that_imports_from_its_folder(registry, tmp_path):
+    file, helper, deeper, other = (tmp_path / f"{name}.py" for name in ("mine", "helper", "deeper", "other"))
+    file.write_text("import torch\nfrom helper import PART\nregistry.register('mine', PART, replace=True)\n")
+    helper.write_text("from deeper import PART\n")
+    deeper.write_text("PART = 'first'\n")
+    other.write_text("")
+
+    def source() -> str:
+        exec(
+            compile(file.read_text().replace("from helper import PART", "PART = ''"), file, "exec"),
+            {"registry": registry},
+        )
+        return registry.source("mine")
+
+    first = source()
+    assert re.fullmatch(r"mine\.py [0-9a-f]{12}", first)
+    other.write_text("changed = True\n")
+    assert source() == first
+    deeper.write_text("PART = 'second'\n")
+    second = source()
+    file.write_text(file.read_text() + "# changed\n")
+    assert len({first, second, source()}) == 3
+
+
+def test_a_file_that_imports_nothing_of_its_folder_is_named_by_its_own_hash(registry, tmp_path):
+    file = tmp_path / "mine.py"
+    file.write_text("import numpy\nimport vd4rl_pomdp\nregistry.register('mine', 'my own')\n")
+    exec(compile(file.read_text(), file, "exec"), {"registry": registry})
+    assert registry.source("mine") == f"mine.py {sha256(file.read_bytes()).hexdigest()[:12]}"

@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from hashlib import sha256
 from importlib.metadata import EntryPoint, entry_points
+from modulefinder import ModuleFinder
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -15,6 +16,8 @@ from vd4rl_pomdp.errors import UserError, refuse_unknown
 Part = TypeVar("Part")
 BY_CALL = "registered by a call"
 """Origin of the parts that a process has added itself."""
+_OWN_PACKAGES = ("vd4rl_pomdp", "pretrain", "finetune", "baselines")
+"""This project's, whose commit a record tells."""
 REGISTRIES: dict[str, Registry[Any]] = {}
 """Every registry by its kind, in the order in which they were made."""
 
@@ -106,7 +109,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
         return self._origins.get(name, "")
 
     def source(self, name: str) -> str:
-        """The file that registered a part by a call and the beginning of its SHA-256; "" for any other part."""
+        """The file that registered a part by a call, and a hash of its code; "" for any other part."""
         return self._sources.get(name, "")
 
     def __getitem__(self, name: str) -> Part:
@@ -157,8 +160,14 @@ def _package_of(entry: EntryPoint) -> str:
 
 
 def _source_of(path: Path) -> str:
-    """A file's name and the beginning of its SHA-256; "" for a notebook's cell, which is none."""
-    return f"{path.name} {sha256(path.read_bytes()).hexdigest()[:12]}" if path.is_file() else ""
+    """A file's name, and a hash of it and of what it imports from its own folder; "" for a notebook's cell."""
+    if not path.is_file():
+        return ""
+    finder = ModuleFinder([str(path.parent)], excludes=_OWN_PACKAGES)
+    finder.run_script(str(path))
+    imported = {Path(file) for module in finder.modules.values() if (file := getattr(module, "__file__", None))}
+    content = b"".join(file.read_bytes() for file in (path, *sorted(imported - {path})))
+    return f"{path.name} {sha256(content).hexdigest()[:12]}"
 
 
 def origins(settings: Mapping[str, Any]) -> dict[str, str]:
