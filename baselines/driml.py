@@ -2,9 +2,10 @@
 
     L = sum over N, M in {local, global} of InfoNCE[ psi_N(s_t, a_t), phi_M(s_{t+k}) ]
 
-A state and its action must tell the state k steps later from all other states of the batch, those of its own window
-among them. "Global" is the encoder's output, "local" its feature map, place by place; all four combinations are
-trained, each with projections of its own. A score is the inner product of projections, softly clipped to -20..20.
+A state and its action must tell the state k steps later from those k steps after all other rows of the batch, those of
+its own window among them. "Global" is the encoder's output, "local" its feature map, place by place; all four
+combinations are trained, each with projections of its own. A score is the inner product of projections over sqrt(64),
+softly clipped to -20..20.
 
 Authors' code: github.com/bmazoure/DRIML (within a C51 agent for Procgen).
 

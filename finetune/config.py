@@ -23,7 +23,8 @@ class FinetuneConfig(StageConfig):
     """Settings of `vd4rl-pomdp finetune`."""
 
     encoder: Path = Path()
-    """Encoder folder, RUN/encoder of a pretraining run; it stays frozen. Its corruption is used here too."""
+    """Encoder folder, RUN/encoder of a pretraining run; it stays frozen but for the references bc and drq_bc. Its
+    corruption is used here too."""
     data: Path = Path()
     """Folder of the data set."""
     out: Path = Path()
@@ -31,7 +32,7 @@ class FinetuneConfig(StageConfig):
     algorithm: str = "td3_bc"
     """Algorithm, `vd4rl-pomdp list` shows all; the references bc and drq_bc bring their own."""
     seed: int = 0
-    """Seed of the networks, the views and the batches."""
+    """Seed of the networks, the views, the batches, the noise and the random histories."""
     updates: int = 500_000
     """Gradient updates."""
     batch_size: int = 256
@@ -43,9 +44,10 @@ class FinetuneConfig(StageConfig):
     views: int = 4
     """Draws of corruption and shift under which the set is encoded once; 0 encodes every batch anew."""
     shift: int = 4
-    """Random shift in pixels, one for each episode and view."""
+    """Random shift in pixels, one for each episode and view; for each transition with --views 0, for each observation
+    where the encoder is trained."""
     precision: Precision = "fp32"
-    """Precision of the frozen encoder: fp32, or bf16 autocast."""
+    """Precision of the encoder: fp32, or bf16 autocast."""
     update_precision: Precision = "fp32"
     """Precision of the algorithm's matrix products, but for last layers: fp32, or bf16 autocast."""
     eval_every: int = 50_000

@@ -33,7 +33,7 @@ class HistoryOptions(Options):
     random_histories: float = 0.0
     """Share of the transitions whose history begins at a random row, and not with the episode."""
     shortest_history: int = 2
-    """Least rows of a history that begins at a random row."""
+    """Least rows of a history that begins at a random row; fewer where the episode begins sooner."""
     longest_history: int = 8
     """Most rows of a history that begins at a random row."""
 

@@ -32,7 +32,7 @@ class DataPath:
         self._dataset, self._actor, self._encode = dataset, actor, encode
 
     def action_error(self, policy: Policy) -> float:
-        """Mean, over all decisions, of the mean squared difference from the actor's mean action."""
+        """Mean squared difference from the actor's mean action, over all decisions of 20 episodes at most."""
         rows = (self._dataset.episode_end - self._dataset.episode_start).cpu().numpy()
         deciding = np.flatnonzero(rows > 1)
         last = len(deciding) - 1

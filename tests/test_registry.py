@@ -1,8 +1,12 @@
 """Parts of one's own, by call and by entry point; what an installed package breaks, breaks nothing else."""
 
+import os
 import re
+import subprocess
+import sys
 from hashlib import sha256
 from importlib.metadata import EntryPoint
+from pathlib import Path
 
 import pytest
 
@@ -11,6 +15,11 @@ from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.registry import REGISTRIES, Registry, origins
 
 THEIRS, PAGE = "theirs", 3
+SHOW = """registry = Registry("kind", {}, lambda part: True, "anything")
+registry.register("mine", PART)
+print(registry.source("mine"))
+"""
+ENVIRONMENT = os.environ | {"PYTHONPATH": str(Path(__file__).parents[1])}
 
 
 @pytest.fixture
@@ -161,25 +170,38 @@ def test_a_package_that_offers_a_taken_name_disables_no_other_part(registry, mon
     assert "a frame encoder called 'own' exists already" in capsys.readouterr().err
 
 
-def test_the_source_of_a_part_is_its_file_and_what_that_imports_from_its_folder(registry, tmp_path):
-    file, helper, deeper, other = (tmp_path / f"{name}.py" for name in ("mine", "helper", "deeper", "other"))
-    file.write_text("import torch\nfrom helper import PART\nregistry.register('mine', PART, replace=True)\n")
-    helper.write_text("from deeper import PART\n")
-    deeper.write_text("PART = 'first'\n")
-    other.write_text("")
+LAYOUTS = {
+    "a sibling": ("mine.py", "from helper import PART", "helper.py"),
+    "a folder that is no package": ("mine.py", "import parts.helper\nPART = parts.helper.PART", "parts/helper.py"),
+    "a package, relative": ("study/mine.py", "from . import helper\nPART = helper.PART", "study/helper.py"),
+    "a package, by its name": ("study/mine.py", "from study.helper import PART", "study/helper.py"),
+    "the sibling of a sibling": ("mine.py", "from between import PART", "helper.py"),
+}
+
+
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_the_source_of_a_part_is_its_file_and_what_that_imports_from_its_folder(tmp_path, layout):
+    mine, statement, helper = LAYOUTS[layout]
+    for folder in ("study", "wandb"):
+        (tmp_path / folder).mkdir()
+    (tmp_path / "parts").mkdir()
+    (tmp_path / "study" / "__init__.py").touch()
+    (tmp_path / "between.py").write_text("from helper import PART\n")
+    file, other = tmp_path / mine, tmp_path / "other.py"
+    file.write_text(f"import sys\nimport numpy, wandb\nfrom vd4rl_pomdp.registry import Registry\n{statement}\n{SHOW}")
+    words = ["-m", mine[:-3].replace("/", ".")] if "/" in mine else [mine]
 
     def source() -> str:
-        exec(
-            compile(file.read_text().replace("from helper import PART", "PART = ''"), file, "exec"),
-            {"registry": registry},
-        )
-        return registry.source("mine")
+        done = subprocess.run([sys.executable, *words], cwd=tmp_path, env=ENVIRONMENT, capture_output=True, text=True)
+        assert done.returncode == 0, done.stderr
+        return done.stdout.strip()
 
+    (tmp_path / helper).write_text("PART = 'first'\n")
     first = source()
     assert re.fullmatch(r"mine\.py [0-9a-f]{12}", first)
     other.write_text("changed = True\n")
     assert source() == first
-    deeper.write_text("PART = 'second'\n")
+    (tmp_path / helper).write_text("PART = 'second'\n")
     second = source()
     file.write_text(file.read_text() + "# changed\n")
     assert len({first, second, source()}) == 3

@@ -70,7 +70,7 @@ class ActionOptions(Options):
     head_dim: int = 256
     """Units of the action head's two hidden layers."""
     self_prediction: float = 0.0
-    """Weight of ||sg(s_{t+k}) - g(s_t, k)||^2 / D for states of D numbers, with g a 3-layer MLP of 512 units."""
+    """Weight of ||sg(s_{t+k}) - g(s_t, k)||^2 / D for states of D numbers; g is an MLP with 3 hidden layers of 512."""
     l2_states: float = 0.0
     """Weight of ||s_t||^2 / D of forward states of D numbers; it decays linearly to zero over the training."""
 

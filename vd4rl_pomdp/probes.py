@@ -14,7 +14,7 @@ from vd4rl_pomdp.state_scale import LEAST_VARIANCE
 from vd4rl_pomdp.tasks import Layout
 
 HELD_OUT = 5
-"""Every fifth episode is for testing."""
+"""Every fifth episode is for testing; of fewer than five, the last."""
 
 
 def probe_error(features: np.ndarray, targets: np.ndarray, episode: np.ndarray) -> float:
@@ -27,7 +27,7 @@ def probe_error(features: np.ndarray, targets: np.ndarray, episode: np.ndarray) 
     Args:
         features: (N, D) representations.
         targets: (N, P) state variables; constant ones are left out (all constant: the error is 0).
-        episode: (N,) episode of every row, two at least. Every fifth episode is held out, the others are fitted.
+        episode: (N,) episode of every row, two at least; every fifth is held out, of fewer the last, others are fitted.
 
     Raises:
         UserError: one episode alone.

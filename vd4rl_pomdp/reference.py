@@ -29,7 +29,7 @@ class Reference:
     actor: dict[str, str] | None = None
     """`task`, `quality` and `sha256` of the one actor that made all of the data, if its very file ships."""
     path_error: float | None = None
-    """The trained policy's mean squared difference from the actor's mean action on the data's own rows."""
+    """The trained policy's mean squared difference from the actor's mean action on rows of the data, as it saw them."""
 
     @classmethod
     def of(cls, dataset: Dataset) -> Self:

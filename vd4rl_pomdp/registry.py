@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import ast
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from hashlib import sha256
 from importlib.metadata import EntryPoint, entry_points
-from modulefinder import ModuleFinder
+from itertools import accumulate
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -68,7 +69,8 @@ class Registry(Mapping[str, Part], Generic[Part]):
         if not isinstance(name, str):
             raise UserError(f"a {self.kind} is called {name!r}: a name is a string")
         self._add(name, part, BY_CALL, replace)
-        self._sources[name] = _source_of(Path(sys._getframe(1).f_code.co_filename))
+        caller = sys._getframe(1)
+        self._sources[name] = _source_of(Path(caller.f_code.co_filename), caller.f_globals.get("__package__") or "")
 
     @property
     def has_added(self) -> bool:
@@ -159,15 +161,43 @@ def _package_of(entry: EntryPoint) -> str:
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "an installed package"
 
 
-def _source_of(path: Path) -> str:
-    """A file's name, and a hash of it and of what it imports from its own folder; "" for a notebook's cell."""
-    if not path.is_file():
+def _source_of(file: Path, package: str) -> str:
+    """A file's name, and a hash of it and of what it has imported from its own folder; "" for a notebook's cell."""
+    if not file.is_file():
         return ""
-    finder = ModuleFinder([str(path.parent)], excludes=_OWN_PACKAGES)
-    finder.run_script(str(path))
-    imported = {Path(file) for module in finder.modules.values() if (file := getattr(module, "__file__", None))}
-    content = b"".join(file.read_bytes() for file in (path, *sorted(imported - {path})))
-    return f"{path.name} {sha256(content).hexdigest()[:12]}"
+    first = file.resolve()
+    found, waiting = {first: package}, [first]
+    while waiting:
+        path = waiting.pop()
+        for module in filter(None, map(sys.modules.get, _imported_by(path, found[path]))):
+            other = Path(getattr(module, "__file__", None) or "").resolve()
+            if other not in found and _is_beside(other, first.parent, module.__name__):
+                found[other] = module.__package__ or ""
+                waiting.append(other)
+    content = b"".join(path.read_bytes() for path in (first, *sorted(found.keys() - {first})))
+    return f"{file.name} {sha256(content).hexdigest()[:12]}"
+
+
+def _imported_by(file: Path, package: str) -> Iterator[str]:
+    """Full names of the modules, and perhaps of some things in them, that a file's statements import."""
+    for node in ast.walk(ast.parse(file.read_bytes())) if file.suffix == ".py" else ():
+        if isinstance(node, ast.Import):
+            names = [alias.name for alias in node.names]
+        elif isinstance(node, ast.ImportFrom):
+            parents = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
+            base = [*parents, *filter(None, [node.module])]
+            names = [".".join([*base, alias.name]) for alias in node.names]
+        else:
+            continue
+        for name in names:
+            yield from accumulate(name.split("."), "{}.{}".format)
+
+
+def _is_beside(file: Path, folder: Path, name: str) -> bool:
+    """Whether a module's file lies in a folder or below it, and neither an environment nor this project brings it."""
+    if not (file.is_file() and file.is_relative_to(folder)) or name.partition(".")[0] in _OWN_PACKAGES:
+        return False
+    return "site-packages" not in file.relative_to(folder).parts
 
 
 def origins(settings: Mapping[str, Any]) -> dict[str, str]:

@@ -9,8 +9,8 @@ is the mean of the actions cut off that comes to be the data's.
 Authors' code: github.com/conglu1997/v-d4rl (drqbc/bcagent.py).
 
 Differences:
-- Representations are standardised and go straight into the policy; the authors' actor begins with a trunk (Linear,
-  LayerNorm, Tanh), with which the encoder here ends, frozen or not (see `end_to_end`).
+- Representations go straight into the policy, standardised where the encoder is frozen; the authors' actor begins with
+  a trunk (Linear, LayerNorm, Tanh), with which memoryless encoders here end, frozen or not (see `end_to_end`).
 - Initial weights are PyTorch's (theirs: orthogonal); V-D4RL's learning rate is 1e-4 (`--learning-rate`).
 """
 

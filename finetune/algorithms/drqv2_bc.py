@@ -11,9 +11,10 @@ Differences to TD3+BC here: no target actor, an actor step with every critic ste
 to 0.1 over 250k updates, or half of a shorter training, and is on the cloned action, too, tau 0.01.
 
 Differences to the authors' loop:
-- Representations are standardised and go straight into the networks. The authors' actor and critic each begin with a
-  trunk of their own (Linear, LayerNorm, Tanh) on the convolutions' output, and the target critic's trunk is averaged
-  like the rest of it; here the encoder ends in such a layer, which all share, frozen or not (see `end_to_end`).
+- Representations go straight into the networks, standardised where the encoder is frozen. The authors' actor and critic
+  each begin with a trunk of their own (Linear, LayerNorm, Tanh) on the convolutions' output, and the target critic's
+  trunk is averaged like the rest of it; here memoryless encoders end in such a layer, which all share, frozen or not
+  (see `end_to_end`).
 - Initial weights are PyTorch's (theirs: orthogonal); V-D4RL's learning rate is 1e-4 (`--learning-rate`).
 """
 

@@ -140,7 +140,8 @@ class CorruptionConfig(Options):
     corruption: str = "none"
     """none, patch, zero_frames or patch+zero_frames."""
     corruption_mode: Mode = "resample"
-    """resample: drawn anew whenever a row enters a batch, as in the paper; emission: a row always looks the same."""
+    """resample: drawn anew whenever a row enters a batch, as in the paper (where features are cached: once a view);
+    emission: whatever reads a row, runs of one seed hide the same of it."""
     stages: tuple[Options, ...] = ()
     """One for every part of the name."""
 
@@ -274,7 +275,7 @@ class BatchCorruption:
     """A corruption with its source of keys, for batches of a data set.
 
     The keys come from a stream of their own, so that two methods with the same seed see identical masks. `name` tells
-    the streams of a run apart; under `emission` all of them share one, since a row always looks the same.
+    the streams of a run apart; under `emission` all of them share one, so that the same of a row is hidden.
     """
 
     def __init__(self, config: CorruptionConfig | str, seed: int, *name: str | int) -> None:

@@ -48,7 +48,7 @@ class View:
         self._pad, self._frame_stack, self._shared = shift, frame_stack, shared
 
     def observe(self, rows: Tensor, shift_key: Tensor | None = None) -> Tensor:
-        """Observations of rows. On a CPU, frames that the corruption zeroes are never read.
+        """Observations of rows. On a CPU, under a shift, frames that the corruption zeroes are never read.
 
         Args:
             rows: (N, ...) int64; everything under one leading index is shifted alike, unless shifts are shared by the

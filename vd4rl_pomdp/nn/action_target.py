@@ -26,7 +26,7 @@ class ActionTarget(Protocol):
 
 
 class KMeansTarget(nn.Module):
-    """Cross-entropy over the nearest of `codes` K-means centres of the training actions (Islam et al.'s lineage)."""
+    """Cross-entropy over the nearest of `codes` K-means centres of the training actions (the navigation lineage's)."""
 
     def __init__(self, actions: np.ndarray, codes: int, seed: int) -> None:
         super().__init__()

@@ -21,7 +21,7 @@ _STEP = "step"
 
 
 class Standardise(nn.Module):
-    """Subtract the mean and divide by the standard deviation of the training features, dimension by dimension."""
+    """Subtract the training features' mean and divide by their standard deviation + 1e-3, dimension by dimension."""
 
     def __init__(self, dim: int) -> None:
         super().__init__()

@@ -21,7 +21,7 @@ def run_gru_backward(gru: nn.GRU, x: Tensor, length: Tensor) -> Tensor:
         length: (B,) int64.
 
     Returns:
-        (B, T, H): row j has seen rows j..length-1. Padding rows hold no information and must not be used.
+        (B, T, H): row j has seen rows j..length-1. Padding rows mean nothing and must not be used.
     """
     rows = torch.arange(x.shape[1], device=x.device)
     flip = length[:, None] - 1 - rows

@@ -160,7 +160,7 @@ def difference(compared: Sides) -> tuple[float | None, float | None]:
 
 
 def _share(runs: list[LoadedRun]) -> float | None:
-    """Mean share of its own data's return that a run returns; None where there is no run, or none that is above 0."""
+    """Mean share of its own data's return that a run returns; None if there is no run, or a data return not above 0."""
     data = [run.reference.data_return for run in runs]
     known = [value for value in data if value is not None and value > 0]
     return float((returns_of(runs) / known).mean()) if runs and len(known) == len(runs) else None

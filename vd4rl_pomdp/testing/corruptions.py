@@ -110,7 +110,7 @@ def _frames(obs: Tensor) -> Tensor:
 
 
 def emission_never_changes_a_row(name: str, **options: Any) -> None:
-    """Under `emission` a row always looks the same; under `resample` runs with equal seeds see equal masks."""
+    """Runs of one seed see equal masks; under `emission` a row has one, whenever it is seen."""
     row = torch.arange(STACKS)
     always = BatchCorruption(CorruptionConfig.of(name, "emission", **options), 0)
     claim(torch.equal(always(stacks(), row), always(stacks(), row)), "a row looked otherwise when it came again")
