@@ -76,6 +76,19 @@ def test_a_dead_owner_frees_the_folder_where_names_cannot_be_exchanged_too(tmp_p
         owner.check()
 
 
+def test_a_process_with_the_number_of_a_dead_owner_does_not_keep_its_folder(tmp_path, monkeypatch):
+    """As in a container that is started again, whose first process has the same number each time."""
+    monkeypatch.setattr(ownership, "LEASE_S", 1.2)
+    monkeypatch.setattr(filelock._soft, "exchange_names", lambda *names: False)
+    end(hold(tmp_path))
+    note = json.loads((tmp_path / ".owner.json").read_text())
+    (tmp_path / ".owner.json").write_text(json.dumps(note | {"pid": os.getpid()}))
+    assert not in_use(tmp_path)
+    with owned(tmp_path) as owner:
+        assert in_use(tmp_path)
+        owner.check()
+
+
 def test_a_note_without_a_sign_of_life_holds_nothing(tmp_path):
     """As after a power cut: the number of the process that died is another's by now."""
     holder = hold(tmp_path)

@@ -123,6 +123,21 @@ def test_a_job_whose_own_part_was_mended_has_not_been_tried(jobs, tmp_path, monk
     assert names(executor) == ["a", "b"]
 
 
+def test_a_disk_that_does_not_answer_costs_one_attempt_and_no_other_job(jobs, tmp_path, monkeypatch):
+    silent, progress_of = [errno.ESTALE, errno.EIO], driver.progress_of
+
+    def ask(job):
+        if job.name == "a" and silent:
+            raise OSError(silent.pop(), "it does not answer")
+        return progress_of(job)
+
+    monkeypatch.setattr(driver, "progress_of", ask)
+    finished, executor = carry_out(jobs, tmp_path, {"a": ["failed"]})
+    assert finished
+    assert not executor.stopped
+    assert [row["cause"] for row in SweepFolder(tmp_path).attempts()["a"]] == ["unavailable", "unavailable"]
+
+
 def test_failures_stay_until_they_are_taken_up_again(jobs, tmp_path):
     carry_out(jobs, tmp_path, {"a": ["diverged"]})
     assert "a" not in names(carry_out(jobs, tmp_path)[1])
@@ -245,6 +260,12 @@ def test_a_cause_counts_in_a_row_only():
     rows = [{"cause": cause, "step": 0, "slots": 1} for cause in ["killed"] * 4 + ["interrupted"] + ["killed"] * 4]
     assert given_up(rows) == ""
     assert given_up([*rows, rows[0]]) == "killed"
+
+
+def test_causes_that_take_turns_at_one_step_are_given_up():
+    rows = [{"cause": cause, "step": 0, "slots": 1} for cause in ("failed", "killed", "failed")]
+    assert (given_up(rows[:2]), given_up(rows)) == ("", "failed")
+    assert given_up([rows[0], rows[1] | {"step": 5}, rows[2] | {"step": 5}]) == ""
 
 
 def test_a_job_that_waits_for_its_time_is_not_forgotten(jobs, tmp_path, monkeypatch):

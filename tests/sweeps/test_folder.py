@@ -61,12 +61,12 @@ def test_a_plan_is_read_from_elsewhere_and_carried_out_where_it_was_made(tmp_pat
     out, data = Path("runs"), Path("../sets/walker")
     jobs = [Job("data/walker", "collect", data, ()), job(out, "mik", "data/walker")]
     SweepFolder(out).keep_plan("one", jobs)
-    SweepFolder(out).refuse_elsewhere()
+    SweepFolder(out).own_jobs()
     monkeypatch.chdir(tmp_path)
     seen = SweepFolder(Path("made/runs"))
     assert [paths(job) for job in seen.jobs()] == [tmp_path / "sets" / "walker", tmp_path / "made" / "runs" / "mik"]
     with pytest.raises(UserError, match=r"^made/runs: was planned in /.*/made as runs: `sweep retry` it there, or"):
-        seen.refuse_elsewhere()
+        seen.own_jobs()
 
 
 def test_a_sweep_that_was_moved_is_judged_by_its_own_folders(tmp_path):
@@ -76,29 +76,43 @@ def test_a_sweep_that_was_moved_is_judged_by_its_own_folders(tmp_path):
     moved = SweepFolder(tmp_path / "moved")
     assert [job.folder for job in moved.jobs()] == [data, tmp_path / "moved" / "a"]
     with pytest.raises(UserError, match=r"was planned in .*plan it anew by `sweep run GRID --out .*moved`"):
-        moved.refuse_elsewhere()
+        moved.own_jobs()
 
 
-def test_a_sweep_of_a_file_of_ones_own_is_taken_up_again_by_that_file_alone(tmp_path, monkeypatch):
-    mine, other = ({"init_main_from_path": f"{name}.py"} for name in ("mine", "other"))
+def test_a_sweep_of_a_file_of_ones_own_is_taken_up_again_by_that_file_alone(tmp_path, monkeypatch, capsys):
+    mine, other = ({"init_main_from_path": str(tmp_path / f"{name}.py")} for name in ("mine", "other"))
     folder = SweepFolder(tmp_path)
-    monkeypatch.setattr(module, "own_file", lambda: mine)
+
+    def from_file(file):
+        monkeypatch.setattr(module, "own_file", lambda: file)
+
+    from_file(mine)
     folder.keep_plan("one", [job(tmp_path, "a")])
-    folder.refuse_elsewhere()
+    assert [job.name for job in folder.own_jobs()] == ["a"]
+    (tmp_path / "link.py").symlink_to(tmp_path / "mine.py")
+    from_file({"init_main_from_path": str(tmp_path / "link.py")})
+    assert [job.name for job in folder.own_jobs()] == ["a"]
     for here in ({}, other):
-        monkeypatch.setattr(module, "own_file", lambda here=here: here)
-        with pytest.raises(UserError, match=r"was planned by `python mine.py sweep run`, .* sweep retry /"):
-            folder.refuse_elsewhere()
-    folder.keep_plan("one", [job(tmp_path, "a")])
-    monkeypatch.setattr(module, "own_file", dict)
-    with pytest.raises(UserError, match=r"was planned by `python other.py sweep run`"):
-        folder.refuse_elsewhere()
+        from_file(here)
+        with pytest.raises(UserError, match=r"parts that this process has not: start `python .*/mine.py sweep retry /"):
+            folder.own_jobs()
+    folder.keep_plan("two", [job(tmp_path, "b")])
+    from_file({})
+    folder.keep_plan("plain", [job(tmp_path, "c")])
+    for here, names in ((mine, ["a", "c"]), (other, ["b", "c"]), ({}, ["c"])):
+        from_file(here)
+        capsys.readouterr()
+        assert sorted(job.name for job in folder.own_jobs()) == names
+        told = capsys.readouterr().err
+        assert [file for file in ("mine", "other") if f"/{file}.py sweep retry" in told] == [
+            file for file, own in (("mine", "a"), ("other", "b")) if own not in names
+        ]
 
 
 def test_absolute_folders_are_the_same_from_everywhere(tmp_path, monkeypatch):
     SweepFolder(tmp_path).keep_plan("one", [job(tmp_path, "a")])
     monkeypatch.chdir("/")
-    SweepFolder(tmp_path).refuse_elsewhere()
+    SweepFolder(tmp_path).own_jobs()
 
 
 @pytest.mark.parametrize("text", ["{}", "[3]", '[{"name": "a"}]', '{"from": "/", "out": "runs", "jobs": []}'])

@@ -204,6 +204,15 @@ def test_a_where_that_says_nothing_is_refused(file, table, message):
         load_grid(file(f"{TOML}[[where]]\n{table}\n"))
 
 
+def test_a_condition_means_a_number_however_it_is_written(file):
+    told = TOML.replace("updates = 40", "learning_rate = [1e-3, 0.0001]\neval_clean = true")
+    cells = load_grid(f"{file(told)}").cells()
+    for only in ("finetune.learning_rate=1e-3", "finetune.learning_rate=0.001", "eval_clean=true"):
+        assert len(narrow(cells, [only])) == len(cells) / (1 if "clean" in only else 2)
+    where = '[[where]]\nonly = ["finetune.learning_rate=0.1e-2"]\nfinetune = { updates = 7 }\n'
+    assert [cell.value("updates") for cell in load_grid(file(told + where)).cells()].count(7) == len(cells) / 2
+
+
 @pytest.mark.parametrize("only", ["method", "method=curl", "colour=red"])
 def test_only_names_what_there_is(file, only):
     with pytest.raises(UserError, match=f"'{only}'"):

@@ -5,17 +5,20 @@ from dataclasses import replace
 from pathlib import Path
 
 import pytest
+from PIL import Image
 
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.cli.parsing import parse_stage
 from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.navigation.exogenous import source_fingerprint
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
+from vd4rl_pomdp.sweeps import plan as module
 from vd4rl_pomdp.sweeps.estimate import Estimates
 from vd4rl_pomdp.sweeps.folder import SweepFolder
-from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
+from vd4rl_pomdp.sweeps.found import FoundRun, FoundRuns, runs_below, runs_kept
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.plan import JobPlanner
 from vd4rl_pomdp.sweeps.stages import recorded
@@ -188,6 +191,16 @@ def test_rows_that_were_kept_are_finished_runs(copy, tmp_path):
     assert len(left(plan(new, ["seed=0,1"], kept=kept))) == 9, "the other seed's"
 
 
+def test_a_kept_row_whose_part_has_changed_counts_and_is_told(copy, tmp_path, monkeypatch):
+    main(["results", "add", *map(str, sorted(copy.rglob("finetune-*"))), "--out", str(tmp_path / "rows")])
+    kept = FoundRuns(runs_kept([tmp_path / "rows"]))
+    monkeypatch.setattr(module, "of_other_code", lambda record, settings: ["method mine"])
+    shutil.copytree(copy / "data", tmp_path / "new" / "data")
+    planner = JobPlanner(tmp_path / "new", None, kept, FoundRuns([]))
+    assert left(planner.plan(load_grid(str(copy / "grid.toml")).cells())) == []
+    assert planner.changed_since == {"method mine": len(kept.runs)}
+
+
 def test_rows_of_early_versions_finish_nothing(copy):
     kept = FoundRuns(runs_kept([ROOT / "results" / "control" / "earlier"]))
     assert [run.card for run in kept.runs] == [{}] * 10
@@ -340,6 +353,20 @@ def test_a_grid_without_a_set_is_refused(tmp_path, more):
     (tmp_path / "grid.toml").write_text("[pretrain]\nmethod = 'acro'" + more)
     with pytest.raises(UserError, match="trains on no set: add a section collect"):
         plan(tmp_path)
+
+
+def test_a_run_that_added_other_images_is_another(tmp_path):
+    class AnySet:
+        def made(self, record):
+            return True
+
+    Image.new("RGB", (9, 9), "red").save(tmp_path / "one.png")
+    config = {"seed": 0, "exogenous": str(tmp_path)}
+    record = {"stage": "navigation", "config": config, "inputs": {"exogenous": source_fingerprint(str(tmp_path))}}
+    run = FoundRun(tmp_path / "run", record, {}, 1.0)
+    assert FoundRuns([run]).of(run.recipe, AnySet()) is run
+    Image.new("RGB", (9, 9), "blue").save(tmp_path / "one.png")
+    assert FoundRuns([run]).of(run.recipe, AnySet()) is None
 
 
 def test_a_navigation_run_is_planned_as_it_is_recorded():

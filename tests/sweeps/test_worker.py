@@ -6,7 +6,7 @@ import pytest
 
 from tests.sweeps.executors.waiting import until
 from vd4rl_pomdp.sweeps import work as work_module
-from vd4rl_pomdp.sweeps.work import INTERRUPTED, KILLED, Work, code_of, ended, start_process
+from vd4rl_pomdp.sweeps.work import INTERRUPTED, KILLED, Ended, Work, code_of, ended, start_process
 
 GRID = """
 import time
@@ -39,6 +39,26 @@ def test_a_job_whose_worker_was_killed_for_want_of_memory_is_short_of_it(tmp_pat
     work = Work("job", (), tmp_path / "log")
     assert ended(work, code, 2).cause == "out of memory"
     assert ended(work, code, 3).cause == "killed"
+
+
+def test_what_an_earlier_attempt_printed_is_not_told_of_the_next(tmp_path):
+    work = Work("job", ("list",), tmp_path / "log")
+    work.log.write_text("error: the disk is full\n")
+    process = start_process(work, {})
+    process.kill()
+    assert ended(work, process.wait(60)) == Ended("job", KILLED, "")
+
+
+def test_a_job_that_is_ended_while_it_imports_its_file_was_interrupted(tmp_path):
+    file = tmp_path / "own.py"
+    file.write_text(
+        "import time\nfrom pathlib import Path\nPath(__file__).with_name('begun').touch()\ntime.sleep(60)\n"
+    )
+    work = Work("job", ("list",), tmp_path / "log", own_file={"init_main_from_path": str(file)})
+    process = start_process(work, {})
+    until((tmp_path / "begun").exists)
+    process.terminate()
+    assert ended(work, process.wait(60)).cause == INTERRUPTED
 
 
 def test_a_job_that_writes_its_checkpoint_is_ended_by_no_further_signal(tmp_path):

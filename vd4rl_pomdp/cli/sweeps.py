@@ -141,7 +141,7 @@ def carry_out(jobs: list[Job], folder: SweepFolder, kind: str, options: Options)
         for name, row in failures.items():
             print(f"{row['cause']}: {name}: {row['line']}", file=sys.stderr)
         left = f"{sum(not job.finished for job in jobs)} of {len(jobs)} jobs are not finished"
-        retry = f"sweep retry {folder.out}" + (f" --executor {kind}" if kind != "local" else "")
+        retry = f"sweep retry {shlex.quote(str(folder.out))}" + (f" --executor {kind}" if kind != "local" else "")
         same = "" if kind == "local" else ", given this command's flags,"
         print(f"{left}, {len(failures)} failed; `{program_here()} {retry}`{same} takes those up again")
         sys.exit(1)
@@ -192,8 +192,7 @@ def _retry(words: Arguments, program: str) -> None:
 
     command = parse_stage(RetryCommand, words, program)
     folder = SweepFolder(command.out)
-    folder.refuse_elsewhere()
-    jobs = folder.jobs()
+    jobs = folder.own_jobs()
     for name in _status(folder, jobs).failures:
         folder.forget(name)
     _carry_out(jobs, command, folder)

@@ -44,13 +44,8 @@ class ExogenousNoise:
         """(P, 3, 100, 100) uint8."""
 
     def fingerprint(self) -> str:
-        """Hash of the files of the pool; for a pool that needs none, only its name."""
-        if self._source in _MADE:
-            return self._source
-        digest = hashlib.blake2b(digest_size=12)
-        for path in _files(Path(self._source)):
-            digest.update(hashlib.blake2b(path.read_bytes()).digest())
-        return digest.hexdigest()
+        """`source_fingerprint` of the pool's."""
+        return source_fingerprint(self._source)
 
     def __call__(self, pictures: Tensor, key: Tensor) -> Tensor:
         """Noisy copies of (N, 3, 100, 100) uint8 pictures, drawn by (N,) int64 row keys."""
@@ -58,6 +53,16 @@ class ExogenousNoise:
         chosen = draw_integers(derive_keys(self._seed, key), len(self.pool), 1)[:, 0]
         added = self.pool[chosen].float().mul_(self._weight)
         return added.add_(pictures).round_().clamp_(max=255).to(torch.uint8)
+
+
+def source_fingerprint(source: str) -> str:
+    """Hash of the files of a pool; for one that needs none, only its name."""
+    if source in _MADE:
+        return source
+    digest = hashlib.blake2b(digest_size=12)
+    for path in _files(Path(source)):
+        digest.update(hashlib.blake2b(path.read_bytes()).digest())
+    return digest.hexdigest()
 
 
 def check_source(source: str) -> None:

@@ -38,6 +38,7 @@ class Owner:
         self._folder = folder
         since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         self._note = {"host": socket.gethostname(), "pid": os.getpid(), "since": since, "token": secrets.token_hex(8)}
+        self._note |= {"started": _started(os.getpid())}
         write_json(folder / _NOTE, self._note)
 
     def check(self) -> None:
@@ -128,7 +129,7 @@ def _stays_empty(lock: Path) -> bool:
 
 
 def _runs_here(note: dict[str, Any]) -> bool:
-    """Whether the owner is a living process of this machine."""
+    """Whether the owner is a living process of this machine: one of its number may be of a later container."""
     if note.get("host") != socket.gethostname():
         return False
     try:
@@ -137,7 +138,15 @@ def _runs_here(note: dict[str, Any]) -> bool:
         return False
     except PermissionError:
         pass
-    return True
+    return note.get("started") in (None, _started(int(note["pid"])))
+
+
+def _started(pid: int) -> str | None:
+    """When a process began, in the system's ticks since it was started; None where the system does not tell."""
+    try:
+        return Path(f"/proc/{pid}/stat").read_bytes().rpartition(b")")[2].split()[19].decode()
+    except (OSError, IndexError):
+        return None
 
 
 def _heartbeat(folder: Path) -> int | None:

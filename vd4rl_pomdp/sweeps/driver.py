@@ -11,6 +11,7 @@ import sys
 import time
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
+from itertools import takewhile
 
 from vd4rl_pomdp.errors import DiskFullError, InUseError, OutOfMemoryError, UnavailableError, UserError, disk_errors
 from vd4rl_pomdp.registry import of_other_code, sources
@@ -30,7 +31,7 @@ class Retry:
     """What is done about a cause."""
 
     times: int
-    """How often a job is tried again in a row without having got further."""
+    """How often a job is tried again without having got further or having been ended from outside."""
     wait_s: float = 0.0
     """Before that."""
 
@@ -68,11 +69,8 @@ def given_up(rows: list[Row]) -> str:
     if not rows or rows[-1]["cause"] == DONE:
         return ""
     last = rows[-1]
-    alike = 0
-    for row in reversed(rows):
-        if (row["cause"], row["step"]) != (last["cause"], last["step"]):
-            break
-        alike += 1
+    here = takewhile(lambda row: (row["step"], row["cause"] == INTERRUPTED) == (last["step"], False), reversed(rows))
+    alike = sum(row["cause"] == last["cause"] for row in here)
     hopeless = last["cause"] == OutOfMemoryError.cause and last["slots"] >= last.get("largest", 1)
     return last["cause"] if hopeless or alike > RETRIES.get(last["cause"], Retry(0)).times else ""
 
@@ -138,13 +136,18 @@ class Driver:
         return free and job.name not in self._lost and not any(name in self._left for name in job.needs)
 
     def _elsewhere(self, job: Job) -> bool:
-        """Whether another process has finished a job, or is at it."""
-        if job.finished:
-            del self._left[job.name]
-            return True
-        if busy := in_use(job.folder):
-            self._not_before[job.name] = time.monotonic() + RETRIES[InUseError.cause].wait_s
-        return busy
+        """Whether another process has finished a job, or is at it, or the disk does not tell now."""
+        try:
+            with disk_errors(job.folder):
+                if job.finished:
+                    del self._left[job.name]
+                    return True
+                cause = InUseError.cause if in_use(job.folder) else ""
+        except UnavailableError as error:
+            cause = error.cause
+        if cause:
+            self._not_before[job.name] = time.monotonic() + RETRIES[cause].wait_s
+        return bool(cause)
 
     def _slots(self, job: Job) -> int:
         """One, or twice as many as when the memory last did not suffice."""
@@ -158,11 +161,8 @@ class Driver:
     def _end(self, ended: Ended) -> None:
         began, slots, largest = self._running.pop(ended.name)
         seconds = time.monotonic() - began
-        job = self._jobs[ended.name]
-        finished = job.finished
-        if ended.cause == DONE and not finished:
-            ended = Ended(job.name, FAILED, f"{job.folder}: holds nothing finished, though the command ended well")
-        self._note(ended, seconds, slots, largest)
+        ended, finished, step = self._outcome(ended)
+        self._note(ended, {"seconds": round(seconds, 1), "slots": slots, "largest": largest, "step": step})
         if finished:
             del self._left[ended.name]
         else:
@@ -170,13 +170,24 @@ class Driver:
             self._lost = lost_among(self._left.values(), self._rows)
         self._say(ended, seconds)
 
-    def _note(self, ended: Ended, seconds: float, slots: int, largest: int) -> None:
-        """Keep the row of an attempt, here and on the disk, unless that takes nothing now."""
-        row: Row = {"job": ended.name, "cause": ended.cause, "line": ended.line}
-        row |= {"ended": round(time.time(), 1), "seconds": round(seconds, 1), "slots": slots, "largest": largest}
+    def _outcome(self, ended: Ended) -> tuple[Ended, bool, int]:
+        """How an attempt ended, whether its job is finished, and how far it is, as far as the disk tells now."""
         job = self._jobs[ended.name]
-        row |= {"step": progress_of(job), "host": socket.gethostname(), "words": list(job.words)}
-        row |= {"sources": sources(dict(job.settings))}
+        try:
+            with disk_errors(job.folder):
+                finished, step = job.finished, progress_of(job)
+        except UnavailableError as error:
+            before = [row.get("step") or 0 for row in self._rows[job.name]]
+            return Ended(job.name, error.cause, str(error)), False, max(before, default=0)
+        if ended.cause == DONE and not finished:
+            ended = Ended(job.name, FAILED, f"{job.folder}: holds nothing finished, though the command ended well")
+        return ended, finished, step
+
+    def _note(self, ended: Ended, took: Row) -> None:
+        """Keep the row of an attempt, here and on the disk, unless that takes nothing now."""
+        job = self._jobs[ended.name]
+        row: Row = {"job": ended.name, "cause": ended.cause, "line": ended.line, "ended": round(time.time(), 1)} | took
+        row |= {"host": socket.gethostname(), "words": list(job.words), "sources": sources(dict(job.settings))}
         self._rows[ended.name].append(row)
         try:
             self._folder.add(row)

@@ -20,6 +20,8 @@ import errno
 import hashlib
 import json
 import os
+import shlex
+import sys
 from collections.abc import Iterable
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -28,7 +30,7 @@ from typing import Any
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs.files import Row, jsonable, write_json
-from vd4rl_pomdp.sweeps.own_file import OwnFile, own_file, program_of
+from vd4rl_pomdp.sweeps.own_file import OwnFile, own_file, program_of, same_file
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.work import Work
 
@@ -63,22 +65,38 @@ class SweepFolder:
 
     def jobs(self) -> list[Job]:
         """The jobs of all plans, their folders as seen from here; UserError if there is none."""
-        jobs = [replace(job, folder=plan.place(job.folder, self.out)) for plan in self._plans() for job in plan.jobs]
+        return self._jobs_of(self._plans())
+
+    def _jobs_of(self, plans: list[_Plan]) -> list[Job]:
+        jobs = [replace(job, folder=plan.place(job.folder, self.out)) for plan in plans for job in plan.jobs]
         return list({job.name: job for job in jobs}.values())
+
+    def own_jobs(self) -> list[Job]:
+        """The jobs of the plans that this process can carry out: of the program itself, or its own file's.
+
+        Those of other files are told of in a warning each.
+
+        Raises:
+            UserError: there is none, or the commands of one name other folders here than where it was made.
+        """
+        plans, here = self._plans(), own_file()
+        own = [plan for plan in plans if not plan.own_file or same_file(plan.own_file, here)]
+        others = dict.fromkeys(program_of(plan.own_file) for plan in plans if plan not in own)
+        told = [f"`{program} sweep retry {shlex.quote(str(self.out))}`" for program in others]
+        if not own:
+            raise UserError(f"{self.out}: was planned with parts that this process has not: start {' and '.join(told)}")
+        for command in told:
+            print(f"warning: {self.out}: jobs with parts of another file are left to {command}", file=sys.stderr)
+        self._refuse_elsewhere(own)
+        return self._jobs_of(own)
 
     def jobs_of_others(self, name: str) -> list[Job]:
         """The jobs of all plans but one, as they were written."""
         return [job for path in self._plan_files() if path.stem != name for job in _read_plan(path).jobs]
 
-    def refuse_elsewhere(self) -> None:
-        """Raise UserError if a plan's commands mean something else here: other folders, or none of the same parts."""
-        for plan in self._plans():
-            if plan.own_file and plan.own_file != own_file():
-                program = program_of(plan.own_file)
-                raise UserError(
-                    f"{self.out}: was planned by `{program} sweep run`, whose parts this process has not: start "
-                    f"`{program} sweep retry {self.out}`"
-                )
+    def _refuse_elsewhere(self, plans: list[_Plan]) -> None:
+        """Raise UserError if the commands of a plan name other folders here than where it was made."""
+        for plan in plans:
             if plan.out_there.resolve() != self.out.resolve() or not (plan.absolute or plan.made_in == Path.cwd()):
                 raise UserError(
                     f"{self.out}: was planned in {plan.made_in} as {plan.out}: `sweep retry` it there, or plan it "

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from vd4rl_pomdp.navigation.exogenous import source_fingerprint
 from vd4rl_pomdp.nn.encoder_folder import CONFIG
 from vd4rl_pomdp.results import Result, read_results
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
@@ -60,11 +61,24 @@ class FoundRuns:
         for run in self.runs:
             self._by_recipe.setdefault(run.recipe, []).append(run)
         self._folders = {run.folder for run in self.runs}
+        self._images: dict[str, str] = {}
+        """Content of the folders of images that were looked at."""
 
     def of(self, name: str, data: DataSet) -> FoundRun | None:
-        """The run of a recipe on a set, a finished one if there is one."""
-        fitting = [run for run in self._by_recipe.get(name, ()) if run.on_one_set and data.made(run.record)]
+        """The run of a recipe on a set, a finished one if there is one; images that it adds are those of now."""
+        fitting = [
+            run
+            for run in self._by_recipe.get(name, ())
+            if run.on_one_set and data.made(run.record) and self._adds_the_same(run.record)
+        ]
         return max(fitting, key=lambda run: run.seconds is not None, default=None)
+
+    def _adds_the_same(self, record: Row) -> bool:
+        """Whether the images that a run in a maze added, if it did, are still in their folder."""
+        told, source = record.get("inputs", {}).get("exogenous"), record["config"].get("exogenous")
+        if told is not None and source not in self._images:
+            self._images[source] = source_fingerprint(source)
+        return told in (None, self._images.get(source))
 
     def alike(self, name: str, data: DataSet) -> bool:
         """Whether there is a run of a recipe on a set that was collected as this one is."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -70,7 +71,7 @@ class Where:
 
     def applied(self, cell: GridCell, last: Sections) -> GridCell:
         """The cell with these settings, if it meets all conditions; what stands in `last` stays."""
-        if not all(str(cell.value(name)) in values for name, values in map(condition, self.only)):
+        if not all(in_words(cell.value(name)) in values for name, values in map(condition, self.only)):
             return cell
         shared, sections = dict(cell.shared), {name: dict(values) for name, values in cell.sections.items()}
         for section, settings in self.sections.items():
@@ -135,7 +136,7 @@ def narrow(cells: list[GridCell], only: Sequence[str]) -> list[GridCell]:
     """
     for text in only:
         name, wanted = condition(text)
-        found = [str(cell.value(name)) for cell in cells]
+        found = [in_words(cell.value(name)) for cell in cells]
         check_values(text, wanted, found)
         cells = [cell for cell, value in zip(cells, found, strict=True) if value in wanted]
     return cells
@@ -146,7 +147,20 @@ def condition(text: str) -> tuple[str, list[str]]:
     name, equals, values = (part.strip() for part in text.partition("="))
     if not equals or not name:
         raise UserError(f"{text!r} is no condition: write name=value,value, such as method=mik+a,acro")
-    return name, [value.strip() for value in values.split(",")]
+    return name, [in_words(toml_value(value.strip())) for value in values.split(",")]
+
+
+def toml_value(text: str) -> Any:
+    """A TOML value, or else the text itself: words need no quotation marks."""
+    try:
+        return tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        return text
+
+
+def in_words(value: Any) -> str:
+    """A setting's value as conditions compare it: equal for equal numbers, however they are written."""
+    return str(toml_value(value) if isinstance(value, str) else value)
 
 
 def check_values(text: str, wanted: list[str], found: list[str]) -> None:

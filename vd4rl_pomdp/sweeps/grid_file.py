@@ -51,7 +51,9 @@ from vd4rl_pomdp.sweeps.grid import (
     Where,
     check_values,
     condition,
+    in_words,
     merge,
+    toml_value,
     value_of,
 )
 
@@ -132,7 +134,7 @@ def _where(table: Any, blocks: list[Sections]) -> Where:
         raise UserError('a [[where]] has no conditions: write only = ["task=cheetah_run"], or several')
     for text in only:
         name, wanted = condition(text)
-        check_values(text, wanted, [str(value) for block in blocks for value in _values_of(block, name)])
+        check_values(text, wanted, [in_words(value) for block in blocks for value in _values_of(block, name)])
     for section, settings in sections.items():
         _check_settings(section, settings, axes=False)
         if section and not all(section in block for block in blocks):
@@ -165,16 +167,8 @@ def _change(text: str) -> Sections:
         raise UserError(f"{text!r} is no change: write section.name=value, such as pretrain.steps=100 or seed=0,1")
     if (section and section not in SECTIONS) or (not section and name not in SHARED):
         raise UserError(f"{where!r} is no setting of a grid: write one of {', '.join(SHARED)}, or SECTION.NAME")
-    values = [_value(part.strip()) for part in value.split(",")]
+    values = [toml_value(part.strip()) for part in value.split(",")]
     return {section: {name: values if len(values) > 1 else values[0]}}
-
-
-def _value(text: str) -> Any:
-    """A TOML value, or else the text itself: words need no quotation marks."""
-    try:
-        return tomllib.loads(f"value = {text}")["value"]
-    except tomllib.TOMLDecodeError:
-        return text
 
 
 def _check_block(block: Sections) -> None:

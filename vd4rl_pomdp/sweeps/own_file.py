@@ -51,6 +51,12 @@ def program_here() -> str:
     return program_of({_PATH: sys.argv[0]} if _PATH in file else file)
 
 
+def same_file(one: OwnFile, other: OwnFile) -> bool:
+    """Whether two name the same file, by whatever path."""
+    paths = [Path(file[_PATH]).resolve() if _PATH in file else None for file in (one, other)]
+    return one == other if None in paths else paths[0] == paths[1]
+
+
 def program_of(file: OwnFile) -> str:
     """What one types in place of `vd4rl-pomdp` to have a file's parts."""
     if _NAME in file:

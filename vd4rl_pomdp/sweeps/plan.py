@@ -154,6 +154,7 @@ class JobPlanner:
         if kept is None and self._kept.alike(job.recipe, data):
             self.of_other_content[data.name] += 1
         if kept is not None and kept.seconds is not None:
+            self.changed_since.update(of_other_code(kept.record, dict(job.settings)))
             self._jobs[job.section, job.recipe, data.name] = replace(job, done=True)
 
     def _needed(self) -> list[Job]:

@@ -28,6 +28,8 @@ from vd4rl_pomdp.sweeps.oom import oom_kills
 FAILED = "failed"
 KILLED = WorkerDiedError.cause
 _FIRST = 64
+_BEGINS = b"-- an attempt begins --\n"
+"""What stands in a log before what an attempt prints."""
 _ROOT = Path(__file__).parents[2]
 _CAUSES = (UserError, OutOfMemoryError, DiskFullError, UnavailableError, InUseError, WorkerDiedError)
 CAUSES = (*(kind.cause for kind in _CAUSES), DIVERGED, INTERRUPTED)
@@ -89,6 +91,8 @@ def start_process(work: Work, environment: Mapping[str, str], cores: Sequence[in
     told = {"words": work.words, "own_file": work.own_file, "cores": list(cores), "parent": os.getpid()}
     work.log.parent.mkdir(parents=True, exist_ok=True)
     with work.log.open("ab") as log:
+        log.write(_BEGINS)
+        log.flush()
         return subprocess.Popen(
             [sys.executable, "-P", "-m", "vd4rl_pomdp.sweeps.worker", json.dumps(told)],
             env=os.environ | {"PYTHONPATH": _path()} | dict(environment),
@@ -136,9 +140,9 @@ def ended(work: Work, code: int, oom_kills_before: int | None = None) -> Ended:
 
 
 def last_line(log: Path) -> str:
-    """The last line of a log that is not empty."""
+    """The last line that is not empty in a log, of its last attempt if it is a job's."""
     try:
-        text = log.read_bytes()[-4096:].decode(errors="replace")
+        text = log.read_bytes()[-4096:].rpartition(_BEGINS)[2].decode(errors="replace")
     except OSError:
         return ""
     return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")

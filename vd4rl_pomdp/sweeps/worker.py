@@ -13,8 +13,9 @@ import json
 import os
 import signal
 import sys
+from types import FrameType
 
-from vd4rl_pomdp.sweeps.work import code_of
+from vd4rl_pomdp.sweeps.work import INTERRUPTED, code_of
 
 _PR_SET_PDEATHSIG = 1
 
@@ -27,6 +28,7 @@ def main() -> None:
         _end_with(told["parent"])
         if told["cores"]:
             os.sched_setaffinity(0, told["cores"])
+    signal.signal(signal.SIGTERM, _end_interrupted)  # importing what follows takes a while
     words = told["words"]
     sys.argv = ["vd4rl-pomdp", *words]  # what a run records as its command
     from vd4rl_pomdp.cli.ends import run_to_end
@@ -37,6 +39,11 @@ def main() -> None:
     with contextlib.suppress(OSError):  # a full disk
         print(end.line or end.cause, file=sys.stderr, flush=True)
     sys.exit(code_of(end.cause))
+
+
+def _end_interrupted(number: int, frame: FrameType | None) -> None:
+    """End before the job has begun."""
+    os._exit(code_of(INTERRUPTED))
 
 
 def _end_with(parent: int) -> None:

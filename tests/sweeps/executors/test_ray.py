@@ -45,6 +45,7 @@ def options(cluster, monkeypatch) -> RayOptions:
 def test_jobs_share_gpus_and_a_cancelled_one_ends_in_peace(options, tmp_path):
     before = signal.getsignal(signal.SIGTERM)
     assert (RayExecutor(options).slots, RayExecutor(options).largest) == (4, 2)
+    assert RayExecutor(replace(options, jobs=1)).largest == 1, "no job may wait for more than there will ever be"
     assert signal.getsignal(signal.SIGTERM) is before
     executor = RayExecutor(replace(options, cpus=0.5, gpus=0.25))
     assert (executor.slots, executor.largest) == (4, 4)

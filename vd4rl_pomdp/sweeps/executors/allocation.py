@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import signal
 import time
+from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import FrameType
@@ -66,7 +67,8 @@ class Allocation:
         handed = Handover(self.folder)
         until = time.monotonic() + self.idle_s
         while time.monotonic() < until and not self._asked:
-            self._begin(executor, handed.left(self.number))
+            with suppress(UnavailableError), disk_errors(self.folder):  # the next time, then
+                self._begin(executor, handed.left(self.number))
             time.sleep(POLL_S)
             if self._attempts:
                 until = time.monotonic() + self.idle_s

@@ -16,7 +16,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from vd4rl_pomdp.errors import OutOfMemoryError, UserError
+from vd4rl_pomdp.errors import OutOfMemoryError, UserError, disk_errors
 from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.sweeps.executors.local import PATIENCE_S
 from vd4rl_pomdp.sweeps.oom import oom_kills
@@ -78,9 +78,8 @@ class RayExecutor:
     @property
     def largest(self) -> int:
         """The most slots that share a memory: a GPU's, or a node's."""
-        if self._options.gpus:
-            return max(1, int(1 / self._options.gpus))
-        return max(1, *self._room())
+        shared = int(1 / self._options.gpus) if self._options.gpus else max(self._room())
+        return max(1, min(self.slots, shared))
 
     def fits(self, slots: int) -> bool:
         """Whether so many slots wait for a job."""
@@ -144,14 +143,15 @@ def attempt(work: Work, threads: int, folder: str) -> Ended:
         folder: the driver's, in which relative paths begin.
 
     Raises:
-        UserError: this node does not have the folder.
+        UserError: this node does not have the folder, or the log's disk takes nothing now.
     """
     try:
         os.chdir(folder)
     except OSError as error:
         raise UserError(f"{folder}: not on node {os.uname().nodename}; use a disk that all nodes share") from error
     before = oom_kills()
-    process = start_process(work, {"OMP_NUM_THREADS": str(threads)})
+    with disk_errors(work.log):
+        process = start_process(work, {"OMP_NUM_THREADS": str(threads)})
     try:
         while process.poll() is None:
             time.sleep(POLL_S)

@@ -10,11 +10,12 @@ from __future__ import annotations
 import sys
 import time
 from collections.abc import Iterator
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from secrets import token_hex
 
-from vd4rl_pomdp.errors import OutOfMemoryError, UserError
+from vd4rl_pomdp.errors import OutOfMemoryError, UnavailableError, UserError, disk_errors
 from vd4rl_pomdp.sweeps.executors.allocation import IDLE_S, Allocation
 from vd4rl_pomdp.sweeps.executors.handover import Handover
 from vd4rl_pomdp.sweeps.executors.local import PATIENCE_S
@@ -90,13 +91,15 @@ class _Task:
         return found is not None
 
     def told(self) -> Iterator[Ended]:
-        """What has ended since the last call."""
-        for attempt in self.array.ended() & self.left.keys():
-            name = self.left.pop(attempt).name
-            self.busy = time.monotonic()
-            if self.mine.get(name) == attempt:
-                del self.mine[name]
-                yield self.array.end_of(attempt)
+        """What has ended since the last call; where the disk does not tell now, the next one does."""
+        with suppress(UnavailableError), disk_errors(self.array.folder):
+            for attempt in self.array.ended() & self.left.keys():
+                ended, name = self.array.end_of(attempt), self.left[attempt].name
+                del self.left[attempt]
+                self.busy = time.monotonic()
+                if self.mine.get(name) == attempt:
+                    del self.mine[name]
+                    yield ended
 
     def untold(self, state: TaskState, stopped: bool) -> list[Ended]:
         """How its jobs ended when it has ended itself; what this driver has `stopped` was not killed."""
