@@ -1,9 +1,9 @@
 """What a sweep keeps beside its runs: its plans, one row for every attempt at a job, and what the jobs printed.
 
-    OUT/sweep/plans/GRID.json    from (the working directory), out, own_file (the file of one's own that the sweep was
-                                 started from, if it was), and the jobs of a grid: name, stage, folder, command,
-                                 needs; GRID~*.json those of a grid of one's own, of a part of one, or of one
-                                 with other settings
+    OUT/sweep/plans/GRID.json    from (the working directory), out, own_file (the file of one's own that registers parts
+                                 of its jobs, if one does), and the jobs of a grid: name, stage, folder, command, needs;
+                                 GRID~*.json those of a grid of one's own, of a part of one, or of one with other
+                                 settings
     OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, step, slots, largest
                                  (the most slots it could have had), host, words (of its command), sources (files of its
                                  parts that are one's own)
@@ -30,7 +30,7 @@ from typing import Any
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs.files import Row, jsonable, write_json
-from vd4rl_pomdp.sweeps.own_file import OwnFile, own_file, program_of, same_file
+from vd4rl_pomdp.sweeps.own_file import OwnFile, own_file, parts_by_call, program_of, same_file
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.work import Work
 
@@ -59,7 +59,12 @@ class SweepFolder:
         """Write the jobs of a plan, in place of what was written of it before; other drivers may do so at once."""
         with disk_errors(self.path):
             (self.path / "plans").mkdir(parents=True, exist_ok=True)
-        plan = {"from": str(Path.cwd()), "out": str(self.out), "own_file": own_file()}
+        jobs = list(jobs)
+        plan = {
+            "from": str(Path.cwd()),
+            "out": str(self.out),
+            "own_file": own_file() if any(parts_by_call(jobs)) else {},
+        }
         plan |= {"jobs": [jsonable(asdict(job)) for job in jobs]}
         write_json(self.path / "plans" / f"{name}.json", plan, shared=True)
 

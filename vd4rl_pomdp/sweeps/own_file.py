@@ -8,7 +8,7 @@ import multiprocessing.spawn
 import os
 import shlex
 import sys
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -66,15 +66,17 @@ def program_of(file: OwnFile) -> str:
 
 def refuse_unknown_to_jobs(jobs: Iterable[Job]) -> None:
     """Raise UserError if a job names a part that its process could not know."""
-    if own_file():
-        return
+    if (part := next(parts_by_call(jobs), None)) and not own_file():
+        raise UserError(
+            f"{part}: was registered in this process alone, and jobs have processes of their own: register it "
+            "in a file that ends in `main()`, and start the sweep by `python FILE sweep run`"
+        )
+
+
+def parts_by_call(jobs: Iterable[Job]) -> Iterator[str]:
+    """The parts that jobs name and that a call has added to this process: "method mine"."""
     for job in jobs:
-        for part, origin in origins(dict(job.settings)).items():
-            if origin == BY_CALL:
-                raise UserError(
-                    f"{part}: was registered in this process alone, and jobs have processes of their own: register it "
-                    "in a file that ends in `main()`, and start the sweep by `python FILE sweep run`"
-                )
+        yield from (part for part, origin in origins(dict(job.settings)).items() if origin == BY_CALL)
 
 
 def refuse_within_a_job() -> None:
