@@ -78,8 +78,8 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     untold = card.quality if card.data == dataset.fingerprint else UNKNOWN_QUALITY
     card = replace(card, quality=dataset.quality or untold)  # the policy's set names its rows
     inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
-    parts = {"task": card.task, "frame_encoder": encoder.config.frame_encoder}
-    parts |= {"corruption": str(card.corruption["corruption"])}
+    corruption, frame_encoder = card.corruption["corruption"], encoder.config.frame_encoder
+    parts = {"task": card.task, "corruption": corruption, "frame_encoder": frame_encoder}
     run = RunFolder(config.out, STAGE, config, inputs, RESULTS, parts)
     if run.finished:
         Evaluations(run.path, config, card, Reference()).require_all()

@@ -69,7 +69,7 @@ def given_up(rows: list[Row]) -> str:
     if not rows or rows[-1]["cause"] == DONE:
         return ""
     last = rows[-1]
-    here = takewhile(lambda row: (row["step"], row["cause"] == INTERRUPTED) == (last["step"], False), reversed(rows))
+    here = takewhile(lambda row: row["step"] == last["step"] and row["cause"] != INTERRUPTED, reversed(rows))
     alike = sum(row["cause"] == last["cause"] for row in here)
     hopeless = last["cause"] == OutOfMemoryError.cause and last["slots"] >= last.get("largest", 1)
     return last["cause"] if hopeless or alike > RETRIES.get(last["cause"], Retry(0)).times else ""

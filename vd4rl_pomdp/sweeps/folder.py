@@ -59,12 +59,9 @@ class SweepFolder:
         """Write the jobs of a plan, in place of what was written of it before; other drivers may do so at once."""
         with disk_errors(self.path):
             (self.path / "plans").mkdir(parents=True, exist_ok=True)
-        jobs = list(jobs)
-        plan = {
-            "from": str(Path.cwd()),
-            "out": str(self.out),
-            "own_file": own_file() if any(parts_by_call(jobs)) else {},
-        }
+        jobs, here = list(jobs), own_file()
+        needed = here if here and any(parts_by_call(jobs)) else {}
+        plan = {"from": str(Path.cwd()), "out": str(self.out), "own_file": needed}
         plan |= {"jobs": [jsonable(asdict(job)) for job in jobs]}
         write_json(self.path / "plans" / f"{name}.json", plan, shared=True)
 

@@ -7,7 +7,6 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.navigation.exogenous import source_fingerprint
 from vd4rl_pomdp.nn.encoder_folder import CONFIG
 from vd4rl_pomdp.results import Result, read_results
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
@@ -75,6 +74,8 @@ class FoundRuns:
 
     def _adds_the_same(self, record: Row) -> bool:
         """Whether the images that a run in a maze added, if it did, are still in their folder."""
+        from vd4rl_pomdp.navigation.exogenous import source_fingerprint
+
         told, source = record.get("inputs", {}).get("exogenous"), record["config"].get("exogenous")
         if told is not None and source not in self._images:
             self._images[source] = source_fingerprint(source)

@@ -66,7 +66,7 @@ def program_of(file: OwnFile) -> str:
 
 def refuse_unknown_to_jobs(jobs: Iterable[Job]) -> None:
     """Raise UserError if a job names a part that its process could not know."""
-    if (part := next(parts_by_call(jobs), None)) and not own_file():
+    if not own_file() and (part := next(parts_by_call(jobs), None)):
         raise UserError(
             f"{part}: was registered in this process alone, and jobs have processes of their own: register it "
             "in a file that ends in `main()`, and start the sweep by `python FILE sweep run`"
