@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 from pathlib import Path
 
 from vd4rl_pomdp.experiments.navigation.grid import Condition
@@ -29,6 +30,13 @@ REFERENCES = {
 }
 """Methods that no objective trains, as the pages call them."""
 COMPASS = "compass_first_person"
+ADDED = {"self_prediction": "self-prediction", "exogenous": "textures"}
+"""What is added to a training or its pictures, as the pages call it."""
+_ORDER = ("mik+a", "fj+a", "ah", "mik", "fj", "ah+a", "no_history")
+_HEAD = (
+    "| | seeds | " + " | ".join(f"`{name}`" for name in _ORDER) + " |",
+    "|---|---:|" + "---:|" * len(_ORDER),
+)
 
 
 def main_runs() -> list[NavigationRun]:
@@ -63,16 +71,28 @@ def maze_lines(runs: list[NavigationRun], maze: str) -> Iterator[str]:
 
 def state_lines(runs: list[NavigationRun], ks: Sequence[int]) -> Iterator[str]:
     """State errors of all objectives by maze and K."""
-    methods = ("mik+a", "fj+a", "ah", "mik", "fj", "ah+a", "no_history")
-    yield "| | seeds | " + " | ".join(f"`{name}`" for name in methods) + " |"
-    yield "|---|---:|" + "---:|" * len(methods)
+    yield from _HEAD
     for k in ks:
         for maze in measured(runs):
-            entries = [entry_of(Condition(maze, name, k), MEASURES[0], runs) for name in methods]
-            counts = {len(entry.numbers) for entry in entries} - {0}
-            if counts:
-                seeds = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
-                yield f"| {maze.replace('_', ' ')}, K = {k} | {seeds} | {' | '.join(map(_cell, entries))} |"
+            yield from _state_line(runs, f"K = {k}", Condition(maze, "", k))
+
+
+def added_lines(runs: list[NavigationRun], added: str) -> Iterator[str]:
+    """State errors at K = 15 with what a field of `Condition` adds (one of `ADDED`), and without it."""
+    yield from _HEAD
+    for maze in measured(runs):
+        with_it = list(_state_line(runs, ADDED[added], Condition(maze, "", **{added: True})))
+        yield from with_it
+        yield from _state_line(runs, "without", Condition(maze, "")) if with_it else ()
+
+
+def _state_line(runs: list[NavigationRun], words: str, cell: Condition) -> Iterator[str]:
+    """State errors of all objectives under a condition, whose method is left open; no line if none was trained."""
+    entries = [entry_of(replace(cell, method=name), MEASURES[0], runs) for name in _ORDER]
+    counts = {len(entry.numbers) for entry in entries} - {0}
+    if counts:
+        seeds = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
+        yield f"| {cell.maze.replace('_', ' ')}, {words} | {seeds} | {' | '.join(map(_cell, entries))} |"
 
 
 def first_person_lines(runs: list[NavigationRun]) -> Iterator[str]:
