@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import control_table
+import methods_table
 import navigation_table
 import offline_table
 from script import run_script
@@ -46,6 +47,7 @@ def pages() -> dict[str, Tables]:
             "first person": navigation_table.first_person_lines(navigation_table.first_person_runs()),
         },
         "results/control/README.md": {"control": control_table.table_lines(control_table.RESULTS)},
+        "results/methods/README.md": {"methods": methods_table.table_lines(methods_table.main_runs())},
         "results/offline/README.md": {
             ", ".join(place): offline_table.set_lines(returns, *place) for place in offline_table.page_sets(returns)
         },
