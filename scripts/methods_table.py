@@ -29,7 +29,8 @@ def main_runs() -> list[LoadedRun]:
 
 def table_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
     """A row for every method, those that return most where patches and frames are hidden first."""
-    yield f"| | {' | '.join(f'{words} hidden: return (episodes) | probe: pose, velocity' for words in HIDDEN.values())} |"
+    told = "hidden: return (episodes) | probe: pose, velocity"
+    yield f"| | {' | '.join(f'{words} {told}' for words in HIDDEN.values())} |"
     yield "|---|---:|---:|---:|---:|"
     cells = {(run.labels["method"], run.labels["corruption"]): run for run in runs}
     ranks = {method: _rank(cells, method) for method, _ in cells}
