@@ -11,13 +11,13 @@ _RECORD = {"stage": "pretrain", "config": {"seed": 0}}
 
 
 def job(out: Path, name: str, *needs: str, section: str = "pretrain") -> Job:
-    return Job(name, section, out / name, ("list",), needs, recipe=recipe(_RECORD, {}))
+    return Job(name, section, out / name, ("list",), needs, recipe=recipe(_RECORD, {}), content="its set")
 
 
-def finish(folder: Path, seed: int = 0) -> None:
-    """Leave what a finished run leaves, one of another recipe for another seed."""
+def finish(folder: Path, seed: int = 0, content: str = "its set") -> None:
+    """Leave what a finished run leaves, one of another recipe for another seed, or on another set."""
     folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "config.json", _RECORD | {"config": {"seed": seed}})
+    write_json(folder / "config.json", _RECORD | {"config": {"seed": seed}, "inputs": {"data": content}})
     write_json(folder / "timing.json", {"seconds": 1.0})
 
 

@@ -185,8 +185,9 @@ def test_a_job_that_another_process_is_at_is_waited_for(jobs, tmp_path, monkeypa
     assert asked.count("a") == 5
 
 
-def test_a_run_of_another_recipe_that_came_into_a_jobs_folder_does_not_finish_it(jobs, tmp_path):
-    finish(jobs[0].folder, seed=1)
+@pytest.mark.parametrize("other", [{"seed": 1}, {"content": "another set"}])
+def test_another_run_that_came_into_a_jobs_folder_does_not_finish_it(jobs, tmp_path, other):
+    finish(jobs[0].folder, **other)
     _, executor = carry_out(jobs, tmp_path)
     assert names(executor)[0] == "set"
 

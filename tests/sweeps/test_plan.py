@@ -64,8 +64,9 @@ def copy(swept, tmp_path, monkeypatch):
     return tmp_path / "copy"
 
 
-def plan(out: Path, changes=(), kept=None, data=None, others=()):
-    cells = load_grid(str(out / "grid.toml"), changes).cells()
+def plan(folder: Path, changes=(), kept=None, data=None, others=(), out=None):
+    """Jobs of a folder's grid, in the folder itself unless `out` names another."""
+    cells, out = load_grid(str(folder / "grid.toml"), changes).cells(), out or folder
     return JobPlanner(out, data, kept or FoundRuns([]), FoundRuns(runs_below(out)), others).plan(cells)
 
 
@@ -160,6 +161,21 @@ def test_a_run_on_other_data_is_not_the_same(copy):
     shutil.rmtree(copy / "data" / "walker_walk")
     write_fake_set(copy / "data" / "walker_walk" / "expert", [20, 25, 31])
     assert len(left(plan(copy))) == 9
+
+
+def test_a_run_of_another_driver_on_another_set_finishes_nothing(copy, tmp_path):
+    """Two drivers plan into one empty folder, each for data of its own."""
+    out, other = tmp_path / "out", tmp_path / "other"
+    write_fake_set(other / "walker_walk" / "expert", [20, 25, 31])
+    first, second = ({job.name: job for job in plan(copy, out=out, data=data)} for data in (copy / "data", other))
+    name = "walker_walk/expert/patch/bc/seed0/pretrain"
+    main(list(first[name].words))
+    assert first[name].finished
+    assert not second[name].finished
+    with pytest.raises(SystemExit, match="2"):
+        main(list(second[name].words))
+    again = plan(copy, out=out, data=other)
+    assert name not in {job.name for job in again}, "planned anew it has a folder of its own"
 
 
 def test_a_run_goes_on_in_its_own_folder(copy):

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections import Counter
 from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, replace
-from itertools import chain, count
+from itertools import chain, count, pairwise
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from vd4rl_pomdp.options import words_of
 from vd4rl_pomdp.registry import of_other_code
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.settings import settings_of
-from vd4rl_pomdp.sweeps.found import FoundRuns, run_at
+from vd4rl_pomdp.sweeps.found import FoundRun, FoundRuns, run_at
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.naming import run_folder
 from vd4rl_pomdp.sweeps.sets import DataSet, set_of
@@ -45,13 +45,26 @@ class Job:
     """Settings that its cost depends on."""
     recipe: str = ""
     """What a training computes; empty for a set."""
+    content: str = ""
+    """Fingerprint of the set of the run that was found in its folder; empty where none was."""
 
     @property
     def finished(self) -> bool:
-        """Whether there is nothing left to do now; a run of another recipe that came into the folder does not count."""
+        """Whether there is nothing left to do now.
+
+        A run of another recipe, or on another set, that came into the folder does not count.
+        """
         if self.done or self.section not in STAGES:
             return self.done or (self.folder / PROVENANCE).is_file()
-        return (self.folder / TIMING_FILE).is_file() and run_at(self.folder).recipe == self.recipe
+        return (self.folder / TIMING_FILE).is_file() and self._made(run_at(self.folder))
+
+    def _made(self, run: FoundRun) -> bool:
+        """Whether a run is its own; on which set that of a folder that was free must be, the command tells."""
+        if run.recipe != self.recipe:
+            return False
+        if self.content:
+            return run.data == self.content
+        return ("--data", run.record["config"]["data"]) in pairwise(self.words)
 
     @property
     def begun(self) -> bool:
@@ -134,15 +147,16 @@ class JobPlanner:
         run = self._here.of(recipe, data)
         if run is not None:
             self.changed_since.update(of_other_code(run.record, values))
-            name = run.folder.relative_to(self._out).as_posix()
+            name, content = run.folder.relative_to(self._out).as_posix(), run.data
         else:
-            name = self._free(run_folder(cell, section, data.name, values), recipe)
+            name, content = self._free(run_folder(cell, section, data.name, values), recipe), ""
         self._taken.add(name)
         folder = self._out / name
         places = {"data": data.folder} | ({"encoder": before[-1].folder / "encoder"} if section == "finetune" else {})
         words = (*COMMANDS[section], *words_of(told(cell, section) | places | {"out": folder}))
         needs = tuple(job.name for job in before)
-        self._jobs[key] = Job(name, section, folder, words, needs, settings=cost_of(values), recipe=recipe)
+        costs = cost_of(values)
+        self._jobs[key] = Job(name, section, folder, words, needs, settings=costs, recipe=recipe, content=content)
         return self._jobs[key]
 
     def _ask(self, job: Job, data: DataSet) -> None:
