@@ -64,7 +64,7 @@ class Job:
             return False
         if self.content:
             return run.data == self.content
-        return ("--data", run.record["config"]["data"]) in pairwise(self.words)
+        return ("--data", run.record["config"].get("data")) in pairwise(self.words)
 
     @property
     def begun(self) -> bool:
