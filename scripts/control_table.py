@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
 from vd4rl_pomdp.report.gaps import condition_of
 from vd4rl_pomdp.report.layout import number
-from vd4rl_pomdp.report.load import CONDITION, PROBES, load_runs
+from vd4rl_pomdp.report.load import CONDITION, PROBES, LoadedRun, load_runs
 from vd4rl_pomdp.report.measures import control, representations, run_table
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.report.tables import TOLD_STATES, evaluations, grouped, label
@@ -39,6 +39,12 @@ def table_lines(folder: Path) -> Iterator[str]:
 def probes_of(method: str, errors: Sequence[float | None]) -> str:
     """Errors of the probes, marked where the encoder was trained on the states of held-out episodes, too."""
     return ", ".join(number(error, 1) for error in errors) + ("†" if method in TOLD_STATES else "")
+
+
+def spread_of(runs: Iterable[LoadedRun]) -> str:
+    """Lowest and highest return of single evaluation episodes."""
+    episodes = [row["return"] for run in runs for row in run.last]
+    return f"{min(episodes):.0f} to {max(episodes):.0f}"
 
 
 def with_seeds(returns: Sequence[float]) -> str:

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from control_table import probes_of
+from control_table import probes_of, spread_of
 
 from vd4rl_pomdp.report.gates import returns_of
 from vd4rl_pomdp.report.layout import number
@@ -48,6 +48,5 @@ def _told(method: str, run: LoadedRun | None) -> str:
     """Return, lowest and highest episode, and probe errors; dashes if there is no run."""
     if run is None:
         return f"{number(None)} | {number(None)}"
-    episodes = [row["return"] for row in run.last]
     probes = probes_of(method, [run.representation[name] for name in PROBES])
-    return f"{returns_of([run]).item():.0f} ({min(episodes):.0f} to {max(episodes):.0f}) | {probes}"
+    return f"{returns_of([run]).item():.0f} ({spread_of([run])}) | {probes}"

@@ -81,9 +81,8 @@ def added_lines(runs: list[NavigationRun], added: str) -> Iterator[str]:
     """State errors at K = 15 with what a field of `Condition` adds (one of `ADDED`), and without it."""
     yield from _HEAD
     for maze in measured(runs):
-        with_it = list(_state_line(runs, ADDED[added], Condition(maze, "", **{added: True})))
-        yield from with_it
-        yield from _state_line(runs, "without", Condition(maze, "")) if with_it else ()
+        if with_it := list(_state_line(runs, ADDED[added], Condition(maze, "", **{added: True}))):
+            yield from (*with_it, *_state_line(runs, "without", Condition(maze, "")))
 
 
 def _state_line(runs: list[NavigationRun], words: str, cell: Condition) -> Iterator[str]:

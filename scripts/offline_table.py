@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from control_table import probes_of, with_seeds
+from control_table import probes_of, spread_of, with_seeds
 
 from vd4rl_pomdp.report.gates import returns_of
 from vd4rl_pomdp.report.layout import number
@@ -76,14 +76,11 @@ def set_lines(runs: Sequence[LoadedRun], task: str, quality: str) -> Iterator[st
     methods = {run.labels["method"]: _of(here, run.labels["method"], HIDDEN) for run in here}
     shown = [(method, mine) for method, mine in methods.items() if mine]
     for method, mine in sorted(shown, key=lambda one: -returns_of(one[1]).mean()):
-        last = [row for run in mine for row in run.last]
-        episodes = [row["return"] for row in last]
-        spread = f"{min(episodes):.0f} to {max(episodes):.0f}"
-        loop = number(mean_if_known(row["action_error"] for row in last), 3)
+        loop = number(mean_if_known(row["action_error"] for run in mine for row in run.last), 3)
         data = number(mean_if_known(run.reference.path_error for run in mine), 3)
         probes = probes_of(method, [mean_if_known(run.representation[name] for run in mine) for name in PROBES])
         yield (
-            f"| `{method}` | {len(mine)} | {with_seeds(returns_of(mine).tolist())} | {spread} |"
+            f"| `{method}` | {len(mine)} | {with_seeds(returns_of(mine).tolist())} | {spread_of(mine)} |"
             f" {_told(_of(here, method, CLEAN))} | {data}, {loop} | {probes} |"
         )
 
