@@ -10,7 +10,7 @@ from vd4rl_pomdp.experiments.navigation.grid import Condition
 from vd4rl_pomdp.experiments.navigation.runs import NavigationRun, load_runs
 from vd4rl_pomdp.experiments.navigation.tables import Entry, entry_of
 from vd4rl_pomdp.mazes import PAPER_MAZES
-from vd4rl_pomdp.navigation.measures import online_error, refitted_error
+from vd4rl_pomdp.navigation.measures import Measure, online_error, refitted_error
 from vd4rl_pomdp.navigation.methods import METHOD_NAMES, OBJECTIVES, UNTRAINED
 from vd4rl_pomdp.report.layout import number
 from vd4rl_pomdp.report.stats import mean_and_error
@@ -19,7 +19,7 @@ from vd4rl_pomdp.results import read_results
 RESULTS = Path(__file__).parents[1] / "results" / "navigation"
 MEASURES = (
     *(online_error(component).raw() for component in ("state", "position", "velocity")),
-    *(refitted_error(component) for component in ("position", "velocity")),
+    *(refitted_error(component) for component in ("state", "position", "velocity")),
 )
 """Of a maze's table: the paper's way and units, then percent by the refitted probe."""
 REFERENCES = {
@@ -29,7 +29,7 @@ REFERENCES = {
     "supervised_picture": "told the states: one picture",
 }
 """Methods that no objective trains, as the pages call them."""
-COMPASS = "compass_first_person"
+STARS, COMPASS = "first_person", "compass_first_person"
 ADDED = {"self_prediction": "self-prediction", "exogenous": "textures"}
 """What is added to a training or its pictures, as the pages call it."""
 _ORDER = ("mik+a", "fj+a", "ah", "mik", "fj", "ah+a", "no_history")
@@ -49,6 +49,11 @@ def first_person_runs() -> list[NavigationRun]:
     return load_runs(read_results(RESULTS / "first_person"))
 
 
+def first_rung_runs() -> list[NavigationRun]:
+    """The runs of that grid at its smallest budget."""
+    return load_runs(read_results(RESULTS / "first_person" / "small"))
+
+
 def measured(runs: list[NavigationRun]) -> list[str]:
     """The paper's own mazes in which every objective was trained at K = 15."""
     return [
@@ -60,7 +65,7 @@ def measured(runs: list[NavigationRun]) -> list[str]:
 
 def maze_lines(runs: list[NavigationRun], maze: str) -> Iterator[str]:
     """All methods at K = 15 in one maze, those with the smallest state errors first, then the references."""
-    yield "| | seeds | state | position | velocity | position, velocity in % |"
+    yield "| | seeds | state | position | velocity | state, position, velocity in % |"
     yield "|---|---:|---:|---:|---:|---:|"
     rows = {name: [entry_of(Condition(maze, name), one, runs) for one in MEASURES] for name in METHOD_NAMES}
     for method in sorted(OBJECTIVES, key=lambda name: rows[name][0].numbers.mean()):
@@ -70,24 +75,39 @@ def maze_lines(runs: list[NavigationRun], maze: str) -> Iterator[str]:
 
 
 def state_lines(runs: list[NavigationRun], ks: Sequence[int]) -> Iterator[str]:
-    """State errors of all objectives by maze and K."""
+    """State errors of all objectives by maze and K, in the paper's way and units."""
     yield from _HEAD
     for k in ks:
         for maze in measured(runs):
             yield from _state_line(runs, f"K = {k}", Condition(maze, "", k))
 
 
+def both_units(runs: list[NavigationRun], k: int) -> Iterator[str]:
+    """State errors of all objectives at one K by maze, in both units."""
+    yield from _HEAD
+    for maze in measured(runs):
+        yield from _state_lines(runs, f"K = {k}", Condition(maze, "", k))
+
+
 def added_lines(runs: list[NavigationRun], added: str) -> Iterator[str]:
     """State errors at K = 15 with what a field of `Condition` adds (one of `ADDED`), and without it."""
     yield from _HEAD
     for maze in measured(runs):
-        if with_it := list(_state_line(runs, ADDED[added], Condition(maze, "", **{added: True}))):
-            yield from (*with_it, *_state_line(runs, "without", Condition(maze, "")))
+        if with_it := list(_state_lines(runs, ADDED[added], Condition(maze, "", **{added: True}))):
+            yield from (*with_it, *_state_lines(runs, "without", Condition(maze, "")))
 
 
-def _state_line(runs: list[NavigationRun], words: str, cell: Condition) -> Iterator[str]:
-    """State errors of all objectives under a condition, whose method is left open; no line if none was trained."""
-    entries = [entry_of(replace(cell, method=name), MEASURES[0], runs) for name in _ORDER]
+def _state_lines(runs: list[NavigationRun], words: str, cell: Condition) -> Iterator[str]:
+    """State errors under a condition in the paper's way and units, then in percent by the refitted probe."""
+    yield from _state_line(runs, words, cell)
+    yield from _state_line(runs, f"{words}, in %", cell, refitted_error("state"))
+
+
+def _state_line(
+    runs: list[NavigationRun], words: str, cell: Condition, measure: Measure = MEASURES[0]
+) -> Iterator[str]:
+    """One error of all objectives under a condition, whose method is left open; no line if none was trained."""
+    entries = [entry_of(replace(cell, method=name), measure, runs) for name in _ORDER]
     counts = {len(entry.numbers) for entry in entries} - {0}
     if counts:
         seeds = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
@@ -96,8 +116,8 @@ def _state_line(runs: list[NavigationRun], words: str, cell: Condition) -> Itera
 
 def first_person_lines(runs: list[NavigationRun]) -> Iterator[str]:
     """Errors under the compass of all that was trained there, those with the smallest state errors first."""
-    yield "| | seeds | state | position, velocity | probe beside the model: position, velocity |"
-    yield "|---|---:|---:|---:|---:|"
+    yield "| | seeds | state | position, velocity | raw x 100 | probe beside the model: position, velocity |"
+    yield "|---|---:|---:|---:|---:|---:|"
     objectives = {
         f"`{name}`{words}": Condition(COMPASS, name, self_prediction=bool(words))
         for name in OBJECTIVES
@@ -105,21 +125,41 @@ def first_person_lines(runs: list[NavigationRun]) -> Iterator[str]:
     }
     told = objectives | {words: Condition(COMPASS, name) for name, words in REFERENCES.items()}
     measures = [refitted_error(component) for component in ("state", "position", "velocity")]
-    measures += [one._replace(probe="online") for one in measures[1:]]
+    measures += [one.raw() for one in measures[1:]] + [one._replace(probe="online") for one in measures[1:]]
     rows = {name: [entry_of(condition, one, runs) for one in measures] for name, condition in told.items()}
     trained = [name for name, (state, *_) in rows.items() if len(state.numbers)]
     for name in sorted(trained, key=lambda one: rows[one][0].numbers.mean()):
         state, *others = map(_cell, rows[name])
-        yield f"| {name} | {len(rows[name][0].numbers)} | {state} | {', '.join(others[:2])} | {', '.join(others[2:])} |"
+        pairs = " | ".join(", ".join(others[i : i + 2]) for i in (0, 2, 4))
+        yield f"| {name} | {len(rows[name][0].numbers)} | {state} | {pairs} |"
+
+
+def first_rung_lines(runs: list[NavigationRun]) -> Iterator[str]:
+    """Errors of position and velocity at the smallest budget, under the stars and under the compass, in both units."""
+    yield "| | `first_person` | raw x 100 | `compass_first_person` | raw x 100 |"
+    yield "|---|---:|---:|---:|---:|"
+    percent = [refitted_error(component) for component in ("position", "velocity")]
+    units = percent, [one.raw() for one in percent]
+    for method, words in (REFERENCES | {name: f"`{name}`" for name in ("no_history", "mik+a", "ah+a")}).items():
+        cells = [
+            ", ".join(_mean(entry_of(Condition(maze, method), one, runs)) for one in unit)
+            for maze in (STARS, COMPASS)
+            for unit in units
+        ]
+        yield f"| {words} | {' | '.join(cells)} |"
 
 
 def _line(name: str, entries: list[Entry]) -> str:
-    *raw, position, velocity = map(_cell, entries)
-    return f"| {name} | {len(entries[-1].numbers)} | {' | '.join(raw)} | {position}, {velocity} |"
+    cells = list(map(_cell, entries))
+    return f"| {name} | {len(entries[-1].numbers)} | {' | '.join(cells[:3])} | {', '.join(cells[3:])} |"
 
 
 def _cell(entry: Entry) -> str:
     """Mean and standard error over seeds, and the paper's number; a dash if there is no seed."""
-    if not len(entry.numbers):
-        return number(None)
-    return mean_and_error(entry.numbers.tolist(), 1) + ("" if entry.paper is None else f" ({entry.paper:.1f})")
+    shown = len(entry.numbers) and entry.paper is not None
+    return _mean(entry) + (f" ({entry.paper:.1f})" if shown else "")
+
+
+def _mean(entry: Entry) -> str:
+    """Mean and standard error over seeds; a dash if there is no seed."""
+    return mean_and_error(entry.numbers.tolist(), 1) if len(entry.numbers) else number(None)

@@ -5,13 +5,15 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+import numpy as np
 from control_table import probes_of, spread_of, with_seeds
 
-from vd4rl_pomdp.report.gates import returns_of
+from vd4rl_pomdp.report.gates import PASSED, gates, returns_of
 from vd4rl_pomdp.report.layout import number
 from vd4rl_pomdp.report.load import PROBES, LoadedRun, load_runs
 from vd4rl_pomdp.report.measures import mean_if_known
 from vd4rl_pomdp.report.stats import mean_and_error
+from vd4rl_pomdp.report.tables import TOLD_STATES
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
 
@@ -83,6 +85,58 @@ def set_lines(runs: Sequence[LoadedRun], task: str, quality: str) -> Iterator[st
             f"| `{method}` | {len(mine)} | {with_seeds(returns_of(mine).tolist())} | {spread_of(mine)} |"
             f" {_told(_of(here, method, CLEAN))} | {data}, {loop} | {probes} |"
         )
+
+
+def gate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """What has to hold on a set before methods are ranked on it, and how well a probe orders the returns there."""
+    yield (
+        "| set | data's return | `state`, of it | `acro` with nothing hidden, of it | best of it | best less `random` |"
+        " passed | probe and return: rank correlation (runs): pose, velocity |"
+    )
+    yield "|---|---:|---:|---:|---:|---:|---|---:|"
+    for row in gates(list(runs)):
+        place = row["task"], row["quality"]
+        if row["corruption"] == HIDDEN and place in SETS:
+            shares = [number(row[name], 2) for name in ("data_return", "state_share", "acro_share", "best_share")]
+            above = f"{number(row['above_random'], 0)} ± {number(row['error'], 0)}"
+            here = [run for run in runs if _place(run) == place and run.labels["corruption"] == HIDDEN]
+            ranks = f"{_rank_correlation(here, PROBES[0])}, {_rank_correlation(here, PROBES[1])}"
+            passed = "yes" if row["verdict"] == PASSED else "no"
+            yield (
+                f"| {' '.join(place)} | {row['data_return']:.0f} | {' | '.join(shares[1:])} | {above} | {passed} |"
+                f" {ranks} ({len(_probed(here))}) |"
+            )
+
+
+def _rank_correlation(runs: Sequence[LoadedRun], probe: str) -> str:
+    """Spearman's, of a probe's error and the return over runs: -1 where the better of two always returns more."""
+    probed = _probed(runs)
+    errors = np.array([run.representation[probe] for run in probed])
+    ranks = [values.argsort().argsort() for values in (errors, returns_of(probed))]
+    return f"{np.corrcoef(ranks)[0, 1]:.2f}"
+
+
+def _probed(runs: Sequence[LoadedRun]) -> list[LoadedRun]:
+    """Those with a probe that is held out: not of methods that were told the states."""
+    known = (run for run in runs if run.representation[PROBES[0]] is not None)
+    return [run for run in known if run.labels["method"] not in TOLD_STATES]
+
+
+def cost_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """Minutes of both stages by task and method under corruption: the median cell, the fastest and the slowest."""
+    yield "| task | method | cells | pretraining, minutes | fine-tuning, minutes |"
+    yield "|---|---|---:|---:|---:|"
+    for task in sorted({run.labels["task"] for run in runs}):
+        here = [run for run in runs if (run.labels["task"], run.labels["corruption"]) == (task, HIDDEN)]
+        for method in sorted({run.labels["method"] for run in here}):
+            mine = [run for run in here if run.labels["method"] == method]
+            stages = [run.representation["pretrain_seconds"] for run in mine], [run.seconds for run in mine]
+            yield f"| {task} | `{method}` | {len(mine)} | {_minutes(stages[0])} | {_minutes(stages[1])} |"
+
+
+def _minutes(seconds: Sequence[float]) -> str:
+    least, middle, most = np.quantile(seconds, (0, 0.5, 1)) / 60
+    return f"{middle:.1f} ({least:.1f} to {most:.1f})" if len(seconds) > 1 else f"{middle:.1f}"
 
 
 def _place(run: LoadedRun) -> tuple[str, str]:

@@ -42,14 +42,19 @@ def pages() -> dict[str, Tables]:
         },
         "docs/navigation.md": {
             **{maze: navigation_table.maze_lines(mazes, maze) for maze in navigation_table.measured(mazes)},
-            "K = 1": navigation_table.state_lines(mazes, (1,)),
+            "K = 1": navigation_table.both_units(mazes, 1),
             **{words: navigation_table.added_lines(mazes, added) for added, words in navigation_table.ADDED.items()},
+            "first rung": navigation_table.first_rung_lines(navigation_table.first_rung_runs()),
             "first person": navigation_table.first_person_lines(navigation_table.first_person_runs()),
         },
         "results/control/README.md": {"control": control_table.table_lines(control_table.RESULTS)},
         "results/methods/README.md": {"methods": methods_table.table_lines(methods_table.main_runs())},
         "results/offline/README.md": {
-            ", ".join(place): offline_table.set_lines(returns, *place) for place in offline_table.page_sets(returns)
+            "gates": offline_table.gate_lines(returns),
+            **{
+                ", ".join(place): offline_table.set_lines(returns, *place) for place in offline_table.page_sets(returns)
+            },
+            "minutes": offline_table.cost_lines(returns),
         },
     }
 

@@ -95,6 +95,12 @@ Case = tuple[str, tuple[str, ...]]
 LINES = [line.split() for line in DRAWN.strip().splitlines()[2:] if line]
 
 
+def test_only_forward_jumps_are_bounded_unless_it_is_asked_for():
+    """The windows below are too short to show it."""
+    bounded = {name: method.past for name, method in METHODS.items() if method.past is not None}
+    assert bounded == {"fj": JUMPS_PAST, "fj+a": JUMPS_PAST}
+
+
 def test_every_inverse_method_is_drawn():
     assert {line[0] for line in LINES} == {name for name in METHODS if predicts_actions(name)}
 
@@ -132,6 +138,8 @@ def marked(drawing: str) -> set[int]:
 
 FAR = 99
 """m or n of a past or future without a bound."""
+JUMPS_PAST = 8
+"""m of FJ and FJ+A unless another is asked for: the paper names none, docs/navigation.md says 8."""
 Seen = Callable[[int, int, int, int, int], bool]
 """(j, t, u = t+k, m, n) -> whether row or action j is seen."""
 ROW_OF: dict[str, Seen] = {
@@ -163,7 +171,7 @@ BOUNDED = [
 def from_the_paper(method: str, words: tuple[str, ...], t: int, k: int, last: int, acts: int) -> tuple:
     """Table 1's sets: rows up to `last`, actions up to `acts`. A memoryless method with a GRU sees what AH does."""
     told = settings(words)
-    m, n = told.get("m", FAR if METHODS.named(method).past is None else 8), told.get("n", FAR)
+    m, n = told.get("m", JUMPS_PAST if method in ("fj", "fj+a") else FAR), told.get("n", FAR)
     table = "ah" if told.get("history") == "gru" else method.removesuffix("+a")
     row = ROW_OF[table]
     action = ACTION_OF.get(method + " literal" * told.get("literal_future", False), lambda *_: False)

@@ -9,6 +9,8 @@ from gymnasium.utils.env_checker import check_env
 
 import vd4rl_pomdp.envs
 from vd4rl_pomdp.envs.maze import MazeEnv
+from vd4rl_pomdp.envs.maze_model import build_simulator
+from vd4rl_pomdp.envs.maze_sky import panorama, sky_texture
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.mazes import HARD, MAZES, get_maze
 
@@ -183,6 +185,19 @@ def test_a_decision_in_first_person_turns_and_pushes_as_the_generators_does():
     assert after["state"][5] == pytest.approx(spin * 0.403**5, rel=0.02), "no action: nothing is set"
     _, _, _, _, info = env.step(np.array([1.0, 0.0]))
     assert info["state"][5] == 0
+
+
+def test_cameras_and_sky_are_the_generators():
+    """From the top 30 degrees, 7 above the centre; in first person 60, in the ball, under a blue that fades."""
+    for maze, fovy, height in (("three_curtains", 30, 7), ("first_person", 60, 0)):
+        model = build_simulator(MAZES[maze])[0].model
+        assert (model.cam_fovy[0], model.cam_pos[0, 2]) == (fovy, height), maze
+    sky = panorama(sky_texture("stars"), np.radians([89, 1, -89])).astype(float)
+    above, ahead, below = np.median(sky, 0)  # between the stars
+    np.testing.assert_allclose(above, 255 * np.array([0.4, 0.6, 0.8]), atol=3)
+    np.testing.assert_allclose(ahead, above / 2, atol=3)
+    np.testing.assert_allclose(below, 0, atol=3)
+    assert 0.02 < (sky[:, 1] > ahead + 30).all(1).mean() < 0.06, "white stars"
 
 
 def test_the_sky_tells_headings_apart_where_it_is_a_compass():

@@ -7,13 +7,15 @@ import pytest
 import torch
 from torch import Tensor, nn
 
-from finetune.algorithms import ALGORITHMS
+from finetune.algorithms import ALGORITHMS, Algorithm
 from finetune.algorithms.td3_bc import TD3BC
+from finetune.config import FinetuneConfig
+from finetune.end_to_end import EndToEnd
 from finetune.features import FeatureBatch
-from vd4rl_pomdp.nn import policy as policies
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.types import Transitions
 
-DIM, ACTIONS, SIZE, UPDATES = 3, 2, 64, 20
+DIM, ACTIONS, SIZE, UPDATES, PIXELS = 3, 2, 64, 20, 12
 BEGUN = {"drqv2_bc": 249_990, "bc": 249_990, "td3_bc": 0}
 """Updates before the first: the noise of V-D4RL ends to fall at the tenth of those made here."""
 
@@ -21,7 +23,7 @@ BEGUN = {"drqv2_bc": 249_990, "bc": 249_990, "td3_bc": 0}
 @pytest.fixture(autouse=True)
 def _in_float64(monkeypatch):
     torch.set_default_dtype(torch.float64)
-    monkeypatch.setattr(policies.Standardise, "forward", lambda self, z: (z - self.mean) / self.std)
+    monkeypatch.setattr(Tensor, "float", Tensor.double)
     yield
     torch.set_default_dtype(torch.float32)
 
@@ -100,8 +102,9 @@ def drqv2_bc(nets: Nets, b: FeatureBatch, step: int) -> None:
     with torch.no_grad():
         next_action = truncated(torch.tanh(nets.actor(b.next_z)), std, nets.normal())
     nets.learn_values(b, next_action)
-    action = truncated(torch.tanh(nets.actor(b.z)), std, nets.normal())
-    q1, q2 = (q(torch.cat([b.z, action], 1))[:, 0] for q in nets.critics)
+    z = b.z.detach()  # of the encoder before this update's step
+    action = truncated(torch.tanh(nets.actor(z)), std, nets.normal())
+    q1, q2 = (q(torch.cat([z, action], 1))[:, 0] for q in nets.critics)
     q = torch.min(q1, q2)
     nets.improve(-q.mean() * 1.5 / q.detach().abs().mean() + ((action - b.action) ** 2).mean())
     nets.follow(nets.target_critics, nets.critics, 0.01)
@@ -136,9 +139,49 @@ def test_updates_end_in_the_weights_of_the_authors_rule(theirs: Callable):
     for number in range(UPDATES):
         algorithm.update(batch(number))
         theirs(nets, batch(number), BEGUN[name] + number)
+    check_equal_weights(algorithm, nets)
+
+
+def check_equal_weights(algorithm: Algorithm, nets: Nets) -> None:
     pairs = [(algorithm.policy.net, nets.actor)]
-    if name != "bc":
+    if isinstance(algorithm, TD3BC):
         pairs += [(algorithm.critic.first, nets.critics[0]), (algorithm.target_critic.second, nets.target_critics[1])]
     for mine, their in pairs:
-        for p, q in zip(mine.parameters(), their.parameters(), strict=True):
-            torch.testing.assert_close(p, q, atol=1e-12, rtol=1e-12)
+        check_equal(mine, their)
+
+
+def check_equal(mine: nn.Module, their: nn.Module) -> None:
+    for p, q in zip(mine.parameters(), their.parameters(), strict=True):
+        torch.testing.assert_close(p, q, atol=1e-12, rtol=1e-12)
+
+
+class Eye(nn.Module):
+    """The part of an encoder that a memoryless method without a frozen stage has."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.frame = nn.Sequential(nn.Linear(PIXELS, DIM), nn.LayerNorm(DIM), nn.Tanh())
+
+
+def transitions(number: int) -> Transitions:
+    g, b = torch.Generator().manual_seed(100 + number), batch(number)
+    obs, next_obs = (torch.randn(SIZE, PIXELS, generator=g) for _ in range(2))
+    keys = torch.zeros(SIZE, dtype=torch.int64)
+    return Transitions(obs, b.action, b.reward, b.discount, next_obs, keys, keys)
+
+
+@pytest.mark.parametrize("theirs", [drqv2_bc, bc])
+def test_without_a_frozen_stage_the_encoder_ends_in_the_authors_weights_too(theirs: Callable):
+    """V-D4RL steps its encoder along the critics' loss alone (bc along its only one), before the actor's step."""
+    name = theirs.__name__
+    algorithm, encoder = started(name), Eye()
+    nets, eye = Nets(algorithm), copy.deepcopy(encoder.frame)
+    (nets.actor_steps if name == "bc" else nets.critic_steps).add_param_group({"params": eye.parameters()})
+    mine = EndToEnd(algorithm, encoder, FinetuneConfig(learning_rate=1e-3, precision="fp32"))
+    for number in range(UPDATES):
+        t = transitions(number)
+        mine.update(t)
+        features = FeatureBatch(eye(t.obs), t.action, t.reward, t.discount, eye(t.next_obs).detach())
+        theirs(nets, features, BEGUN[name] + number)
+    check_equal_weights(algorithm, nets)
+    check_equal(encoder.frame, eye)

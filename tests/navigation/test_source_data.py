@@ -1,5 +1,7 @@
 """The data agree with what is known of the paper's own: its generator's constants, and its printed ignorance."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
@@ -30,7 +32,11 @@ def top() -> np.ndarray:
 
 
 def test_three_curtains_hide_the_mass_a_fifth_of_the_time_and_the_hard_ones_a_third(top):
-    assert MAZES["three_curtains"].hidden(top).mean() == pytest.approx(0.20, abs=0.03)
+    """Theirs is hidden some 22% of the time: ours, if a seventh of the ball's radius may be left to see."""
+    three = MAZES["three_curtains"]
+    assert three.hidden(top).mean() == pytest.approx(0.185, abs=0.02)
+    nearly = replace(three, style=replace(three.style, hidden_reach=0.17))
+    assert nearly.hidden(top).mean() == pytest.approx(0.22, abs=0.02)
     hard = np.concatenate(drive("hard_three_curtains", 4)[0])
     assert MAZES["hard_three_curtains"].hidden(hard).mean() == pytest.approx(0.36, abs=0.04)
 

@@ -45,6 +45,18 @@ def test_a_count_of_missing_seeds_stands_on_a_bar_below_zero(tmp_path, monkeypat
     assert [text.xy[1] for text in panel.texts] == [0.0, 0.0]
 
 
+def test_a_panel_names_what_its_data_return_and_marks_what_was_better_before_the_end(tmp_path, monkeypatch):
+    run = write_run(tmp_path / "runs/acro", "acro", 0, {5: [70.0], 10: [40.0]})
+    write_json(run / "reference.json", {"data_return": 512.3, "path_error": None, "actor": None})
+    write_run(tmp_path / "runs/stood", "mik", 0, {10: [50.0]}, labels={"task": "cheetah_run"})
+    told, untold = drawn(tmp_path, monkeypatch, {"mik+a": 60.0})["scores_patch"]
+    if told.get_title() < untold.get_title():
+        told, untold = untold, told
+    assert (told.get_title(), untold.get_title()) == ("walker_walk expert (data return 512)", "cheetah_run expert")
+    diamonds = [panel.collections[1].get_offsets().tolist() for panel in (told, untold)]
+    assert diamonds == [[[0.0, 70.0]], []], "the two other methods end where they are best"
+
+
 def test_axes_of_positive_returns_begin_at_zero(tmp_path, monkeypatch):
     shown = drawn(tmp_path, monkeypatch, {"mik+a": 60.0, "acro": 40.0})
     assert shown["scores_patch"][0].get_ylim()[0] == 0

@@ -197,7 +197,7 @@ def test_the_documentation_shows_the_computed_numbers(shown):
         for world in fact["worlds"]:
             name = world["world"] + (r"\*" if world["smallest"] else "")
             assert f"*{name}*" in text or name == "counterexample"
-    assert f"{sum(1 for size in SIZES for _ in small_worlds(size)):,} worlds of up to four pairs" in text
+    assert f"{sum(1 for size in SIZES for _ in small_worlds(size)):,} worlds: all of up to three pairs" in text
     code = re.search(r"```python\n(.*?)```", text, re.DOTALL)[1]
     names: dict = {}
     exec(code.replace("print(", "found = ("), names)

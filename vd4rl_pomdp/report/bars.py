@@ -19,8 +19,8 @@ _HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "----")
 _NAME_WIDTH = 22
 _LEGEND = (
     "Methods in the order of their names. Bars: mean over seeds at the last evaluation, with 95% interval; dots: "
-    "seeds; open diamonds: mean at the best evaluation; a cross with a number: so many seeds are missing, unfinished "
-    "or diverged."
+    "seeds; open diamonds: mean at the best evaluation, where the last is not the best; a cross with a number: so many "
+    "seeds are missing, unfinished or diverged."
 )
 _PUBLISHED = {"bc": (":", "BC"), "drq_bc": ("--", "DrQ+BC")}
 """Published methods that are drawn as lines: their dashes and their names."""
@@ -30,13 +30,18 @@ _COLUMNS = ("kind", *SETTING, "method", "seed", "score", "low", "high", "seeds",
 
 
 def bar_plots(
-    summary: list[Row], runs: list[Row], looks: dict[str, int], published: list[dict[str, str]]
+    summary: list[Row],
+    runs: list[Row],
+    gates: list[Row],
+    looks: dict[str, int],
+    published: list[dict[str, str]],
 ) -> list[Plot]:
     """One figure a corruption.
 
     Args:
         summary: scores of every condition.
         runs: table of runs, whose final scores are the dots.
+        gates: table of gates, of which each panel names the data's return.
         looks: numbers of all methods of the report in `style`.
         published: scores by `env` and `dataset` that were reached on V-D4RL's own sets; drawn where the
             corruption is none.
@@ -45,12 +50,18 @@ def bar_plots(
     for (corruption,), members in grouped(summary, ("corruption",)):
         mine = [row for row in runs if row["corruption"] == corruption and row["score"] is not None]
         lines = published if corruption == "none" else []
-        plots.append(_plot(corruption, members, mine, looks, lines))
+        data = {(row["task"], row["quality"]): row["data_return"] for row in gates if row["data_return"] is not None}
+        plots.append(_plot(corruption, members, mine, data, looks, lines))
     return plots
 
 
 def _plot(
-    corruption: str, summary: list[Row], runs: list[Row], looks: dict[str, int], published: list[dict[str, str]]
+    corruption: str,
+    summary: list[Row],
+    runs: list[Row],
+    data: dict[tuple[str, str], float],
+    looks: dict[str, int],
+    published: list[dict[str, str]],
 ) -> Plot:
     places, tasks = grid_of(summary, _quality_order)
     columns = min(tasks, _WIDEST)
@@ -59,7 +70,7 @@ def _plot(
     names = {label(row) for row in summary}
     looks = {name: look for name, look in looks.items() if name in names}
     longest = max(len(line) for name in names for line in plain(name, _NAME_WIDTH).split("\n"))
-    titles = [f"{task} {quality}" if (task, quality) in by_place else "" for task, quality in places]
+    titles = [_title(*place, data.get(place)) if place in by_place else "" for place in places]
     figure, axes = panels(titles, {}, columns, room=max(0.0, 0.06 * longest - 0.25))
     shown = [place for place in places if place in by_place]
     for panel, place in zip(axes, shown, strict=True):
@@ -78,6 +89,10 @@ def _plot(
         figure,
         [dict.fromkeys(_COLUMNS) | row for row in rows],
     )
+
+
+def _title(task: str, quality: str, data_return: float | None) -> str:
+    return f"{task} {quality}" + ("" if data_return is None else f" (data return {data_return:.0f})")
 
 
 def _row(row: Row) -> Row:
@@ -113,7 +128,9 @@ def _draw(axes: Axes, rows: list[Row], looks: list[int]) -> None:
     known = [row for row in rows if row["low"] is not None]
     middles, lows, highs = ([row[name] for row in known] for name in ("place", "low", "high"))
     axes.vlines(middles, lows, highs, color="black", lw=1.4, zorder=3)
-    axes.scatter(places, [row["best_score"] for row in rows], 16, marker="D", fc="none", ec="black", lw=0.7, zorder=4)
+    better = [row for row in rows if row["best_score"] > row["score"]]
+    middles, scores = ([row[name] for row in better] for name in ("place", "best_score"))
+    axes.scatter(middles, scores, 16, marker="D", fc="none", ec="black", lw=0.7, zorder=4)
 
 
 def _dots(axes: Axes, seeds: dict[str, list[Row]], places: dict[str, int], looks: dict[str, int]) -> None:

@@ -129,7 +129,7 @@ def _plots(runs: list[LoadedRun], made: dict[str, list[Row]]) -> dict[str, list[
     named = (*made[_MARK], *made["curves"], *losses)
     looks = _looks(sorted(set(map(tables.label, named)), key=_method_order))
     return {
-        "scores": bars.bar_plots(made[_MARK], made["runs"], looks, _published_here(runs)),
+        "scores": bars.bar_plots(made[_MARK], made["runs"], made["gates"], looks, _published_here(runs)),
         "profiles": lines.profile_plots(made["profiles"], made["aggregate"], looks),
         "curves": lines.curve_plots(made["curves"], made[_MARK], looks),
         "probes": dots.probe_plots(made["runs"], looks),
