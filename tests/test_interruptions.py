@@ -25,7 +25,7 @@ from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import InUseError, UserError
 from vd4rl_pomdp.navigation.measures import RAW_PREFIX
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
@@ -374,3 +374,23 @@ def test_an_old_format_is_refused_before_anything_is_written(data, tmp_path):
     with pytest.raises(UserError, match="holds a run of format 1"):
         run_pretrain(smoke_pretrain(data, tmp_path / "run", method="no_history"))
     assert contents(run.path) == before
+
+
+@pytest.mark.parametrize("diverges", [False, True])
+def test_a_run_that_was_taken_over_adds_no_row_and_no_mark(data, tmp_path, monkeypatch, diverges):
+    """Between two checkpoints: its successor writes there by now, and rows of both would be one too many."""
+    config = smoke_pretrain(data, tmp_path / "out", steps=20, log_every=5, checkpoint_every=20)
+    update = pretrain.train.PretrainTrainer.update
+
+    def taken_over(trainer):
+        if trainer.step == 7:
+            (config.out / ".owner.json").write_text(json.dumps({"host": "elsewhere", "pid": 1}))
+            if diverges:
+                raise FloatingPointError("its loss is not finite")
+        return update(trainer)
+
+    monkeypatch.setattr(pretrain.train.PretrainTrainer, "update", taken_over)
+    with pytest.raises(InUseError, match="was taken over by process 1 on elsewhere"):
+        run_pretrain(config)
+    assert [row["step"] for row in read_metrics(config.out / "metrics.jsonl")] == [5]
+    assert not (config.out / "diverged.json").exists()

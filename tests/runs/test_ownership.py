@@ -10,6 +10,7 @@ from pathlib import Path
 
 import filelock
 import pytest
+from filelock import SoftFileLease
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs import ownership
@@ -125,3 +126,37 @@ def test_a_folder_that_may_not_be_written_says_so(tmp_path, monkeypatch):
     monkeypatch.setattr(Path, "mkdir", refuse)
     with pytest.raises(UserError, match=r"run: may not be used \(permission denied\); ask its owner"):
         owned(tmp_path / "run").__enter__()
+
+
+def test_a_lock_names_its_owner_on_the_disk_at_once(tmp_path, monkeypatch):
+    """A network file system shows others an empty one until then, which would be broken after EMPTY_S."""
+    synchronised, fsync = set(), os.fsync
+
+    def noted(handle):
+        synchronised.add(os.fstat(handle).st_ino)
+        fsync(handle)
+
+    monkeypatch.setattr(os, "fsync", noted)
+    with owned(tmp_path):
+        assert (tmp_path / ".lock").stat().st_ino in synchronised
+
+
+def test_of_two_that_find_a_dead_lock_one_removes_it_and_no_later_one(tmp_path, monkeypatch):
+    monkeypatch.setattr(ownership, "EMPTY_S", 0.05)
+    lease, lock, breaking = SoftFileLease(tmp_path / ".lock"), tmp_path / ".lock", tmp_path / ".lock.break"
+    lock.touch()
+    breaking.touch()
+    assert not ownership._broken(lease, tmp_path, lambda: True), "another process is at it"
+    assert lock.exists()
+    os.utime(breaking, (0, 0))
+    assert not ownership._broken(lease, tmp_path, lambda: True), "the other was killed at it"
+    assert not breaking.exists()
+    assert not ownership._broken(lease, tmp_path, lambda: False), "by now it is a successor's"
+    assert lock.exists()
+    assert ownership._broken(lease, tmp_path, lambda: True)
+    assert not lock.exists()
+    assert not breaking.exists()
+    lock.touch()
+    with owned(tmp_path) as owner:
+        owner.check()
+    assert not list(tmp_path.iterdir())

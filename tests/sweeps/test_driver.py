@@ -4,6 +4,7 @@ import errno
 import os
 import shutil
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
@@ -136,6 +137,51 @@ def test_a_disk_that_does_not_answer_costs_one_attempt_and_no_other_job(jobs, tm
     assert finished
     assert not executor.stopped
     assert [row["cause"] for row in SweepFolder(tmp_path).attempts()["a"]] == ["unavailable", "unavailable"]
+
+
+@pytest.mark.parametrize("where", ["in_use", "progress_of"])
+def test_a_folder_that_may_not_be_used_costs_its_own_job_alone(jobs, tmp_path, monkeypatch, where):
+    """As one that another user's driver made: before the job begins, or after it has ended."""
+    done = getattr(driver, where)
+
+    def ask(asked):
+        folder = asked if where == "in_use" else asked.folder
+        if folder.name == "c":
+            raise PermissionError(errno.EACCES, "Permission denied")
+        return done(asked)
+
+    monkeypatch.setattr(driver, where, ask)
+    finished, executor = carry_out(jobs, tmp_path)
+    assert finished == (where == "progress_of"), "its folder tells it in the end"
+    assert [name for name in names(executor) if name != "c"] == ["set", "a", "b"]
+    (row,) = SweepFolder(tmp_path).attempts()["c"]
+    assert row["cause"] == "refused"
+    assert "may not be used" in row["line"]
+
+
+def test_a_job_that_cannot_be_started_costs_itself_alone(jobs, tmp_path, monkeypatch):
+    executor = Scripted(jobs)
+    start = executor.start
+
+    def refused(work):
+        if work.name == "c":
+            raise OSError(errno.ENAMETOOLONG, "File name too long")
+        start(work)
+
+    monkeypatch.setattr(executor, "start", refused)
+    assert not Driver(jobs, executor, SweepFolder(tmp_path)).run()
+    assert names(executor) == ["set", "a", "b"]
+    assert SweepFolder(tmp_path).attempts()["c"][-1]["cause"] == "refused"
+
+
+def test_what_a_network_disk_shows_late_is_looked_for_anew(jobs, tmp_path, monkeypatch):
+    """NFS may remember that a file was not there, until its folder is listed."""
+    listed, is_file, listdir = set(), Path.is_file, os.listdir
+    monkeypatch.setattr(Path, "is_file", lambda path: str(path.parent) in listed and is_file(path))
+    monkeypatch.setattr(os, "listdir", lambda folder: listed.add(str(folder)) or listdir(folder))
+    finished, executor = carry_out(jobs, tmp_path)
+    assert finished
+    assert names(executor) == ["set", "a", "c", "b"], "once each"
 
 
 def test_failures_stay_until_they_are_taken_up_again(jobs, tmp_path):

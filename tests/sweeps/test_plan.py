@@ -178,6 +178,18 @@ def test_a_run_of_another_driver_on_another_set_finishes_nothing(copy, tmp_path)
     assert name not in {job.name for job in again}, "planned anew it has a folder of its own"
 
 
+def test_a_run_of_another_driver_on_the_same_set_counts_whatever_it_calls_it(copy, tmp_path, monkeypatch):
+    """Two drivers plan into one empty folder: one names the set by its path from here, one has a copy of it."""
+    monkeypatch.chdir(copy)
+    shutil.copytree(copy / "data", tmp_path / "elsewhere")
+    places = copy / "data", Path("data"), tmp_path / "elsewhere"
+    first, *others = ({job.name: job for job in plan(copy, out=tmp_path / "out", data=data)} for data in places)
+    name = "walker_walk/expert/patch/bc/seed0/pretrain"
+    assert not any(other[name].finished for other in others)
+    main(list(first[name].words))
+    assert all(other[name].finished for other in others)
+
+
 def test_a_run_goes_on_in_its_own_folder(copy):
     folder = copy / "walker_walk" / "expert" / "patch" / "acro" / "seed0" / "finetune-td3_bc"
     (folder / "timing.json").unlink()

@@ -52,11 +52,15 @@ class Loop:
         The numbers named in `shown`, or all, stand in the progress line.
         """
         row = self._means.take() | more
-        self._log.write(self._learner.step, row)
+        self._write(row)
         self.show(**{name: row[name] for name in shown or row})
 
     def log_evaluation(self, row: dict[str, float]) -> None:
         """Write what an evaluation after the step just done gave, by names that begin with `metrics.EVALUATION`."""
+        self._write(row)
+
+    def _write(self, row: dict[str, float]) -> None:
+        self.require_owner()
         self._log.write(self._learner.step, row)
 
     def require_finite(self, module: nn.Module) -> None:

@@ -13,7 +13,7 @@ import socket
 import sys
 import time
 from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from datetime import UTC, datetime
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,13 @@ from filelock import SoftFileLease, Timeout
 
 from vd4rl_pomdp.errors import InUseError, disk_errors
 from vd4rl_pomdp.reading import parse_json
-from vd4rl_pomdp.runs.files import write_json
+from vd4rl_pomdp.runs.files import synchronise, write_json
 from vd4rl_pomdp.runs.interrupt import handled, hangups
 
 LEASE_S = 60.0
-EMPTY_S = 2.0
+EMPTY_S = 5.0
 """Seconds after which a lock that does not name its owner counts as left behind."""
-_LOCK, _NOTE = ".lock", ".owner.json"
+_LOCK, _NOTE, _BREAKING = ".lock", ".owner.json", ".lock.break"
 
 
 class Owner:
@@ -39,7 +39,7 @@ class Owner:
         since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         self._note = {"host": socket.gethostname(), "pid": os.getpid(), "since": since, "token": secrets.token_hex(8)}
         self._note |= {"started": _started(os.getpid())}
-        write_json(folder / _NOTE, self._note)
+        write_json(folder / _NOTE, self._note, shared=True)
 
     def check(self) -> None:
         """Raise InUseError unless the folder is still this process's; called before what cannot be undone."""
@@ -66,6 +66,7 @@ def owned(folder: Path) -> Iterator[Owner]:
         folder.mkdir(parents=True, exist_ok=True)
         lease = SoftFileLease(folder / _LOCK, lease_duration=LEASE_S)
         _acquire(lease, folder)
+        synchronise(folder / _LOCK)  # else a network file system shows others an empty one until the first heartbeat
     try:
         owner = Owner(folder)
         try:
@@ -88,20 +89,17 @@ def in_use(folder: Path) -> bool:
 def _acquire(lease: SoftFileLease, folder: Path) -> None:
     if _take(lease):
         return
-    if _stays_empty(folder / _LOCK):
-        lease.force_break()
-        if _take(lease):
-            return
+    if _stays_empty(folder) and _broken(lease, folder, lambda: _size(folder) == 0) and _take(lease):
+        return
     note = _read_note(folder)
     if not _runs_here(note):
         print(f"{folder}: held by {_name(note)}; waiting for a sign of its life", file=sys.stderr)
         seen = _heartbeat(folder)
         if _take(lease, 1.5 * LEASE_S, lambda: _heartbeat(folder) not in (seen, None)):
             return
-        if _heartbeat(folder) == seen:  # NFS and the like cannot exchange names, by which filelock takes a dead one's
-            lease.force_break()
-            if _take(lease):
-                return
+        # NFS and the like cannot exchange names, by which filelock takes a dead one's
+        if _broken(lease, folder, lambda: _heartbeat(folder) == seen) and _take(lease):
+            return
     raise InUseError(
         f"{folder}: is in use by {_name(_read_note(folder))}; wait until it ends, or choose another folder"
     )
@@ -116,16 +114,34 @@ def _take(lease: SoftFileLease, wait_s: float = 0.0, refused: Callable[[], bool]
     return True
 
 
-def _stays_empty(lock: Path) -> bool:
+def _stays_empty(folder: Path) -> bool:
     """Whether a process was killed, or a machine lost power, between making the lock and writing its name there."""
     for _ in range(20):
-        try:
-            if lock.stat().st_size:
-                return False
-        except FileNotFoundError:
+        if _size(folder) != 0:
             return False
         time.sleep(EMPTY_S / 20)
     return True
+
+
+def _broken(lease: SoftFileLease, folder: Path, is_dead: Callable[[], bool]) -> bool:
+    """Remove a lock that is dead; one process at a time does: a slower one would remove its successor's.
+
+    Whether it was this one.
+    """
+    breaking = folder / _BREAKING
+    try:
+        breaking.touch(exist_ok=False)
+    except FileExistsError:
+        with suppress(FileNotFoundError):
+            if time.time() - breaking.stat().st_mtime > LEASE_S:  # of a process that was killed at it
+                breaking.unlink()
+        return False
+    try:
+        if dead := is_dead():
+            lease.force_break()
+        return dead
+    finally:
+        breaking.unlink(missing_ok=True)
 
 
 def _runs_here(note: dict[str, Any]) -> bool:
@@ -151,9 +167,21 @@ def _started(pid: int) -> str | None:
 
 def _heartbeat(folder: Path) -> int | None:
     """When the owner last gave a sign of life."""
+    lock = _lock(folder)
+    return None if lock is None else lock.st_mtime_ns
+
+
+def _size(folder: Path) -> int | None:
+    """Bytes of the lock."""
+    lock = _lock(folder)
+    return None if lock is None else lock.st_size
+
+
+def _lock(folder: Path) -> os.stat_result | None:
+    """What is known of the lock, None if there is none."""
     try:
         with (folder / _LOCK).open("rb") as file:  # opening makes network file systems look anew
-            return os.fstat(file.fileno()).st_mtime_ns
+            return os.fstat(file.fileno())
     except OSError:
         return None
 

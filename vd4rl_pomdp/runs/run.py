@@ -203,6 +203,7 @@ class RunFolder:
 
     def mark_diverged(self, step: int, message: str) -> None:
         """Say that a number was no longer finite after `step`; going on with the run takes the mark away."""
+        self.require_owner()
         write_json(self.path / DIVERGED_FILE, {"step": step, "message": message})
 
     def finish(self, **more: Any) -> None:

@@ -6,6 +6,7 @@ next one goes on with whatever is left.
 
 from __future__ import annotations
 
+import os
 import socket
 import sys
 import time
@@ -84,6 +85,22 @@ def lost_among(jobs: Iterable[Job], rows: Mapping[str, list[Row]]) -> set[str]:
     return lost
 
 
+def _is_finished(job: Job) -> bool:
+    """Whether a job's folder says that it is finished, which one that cannot be read does not."""
+    try:
+        with disk_errors(job.folder):
+            return job.finished
+    except UserError:
+        return False
+
+
+def _finished_anew(job: Job) -> bool:
+    """Whether a job is finished, listing its folder first: NFS may remember for a minute that a file was not there."""
+    if job.folder.is_dir():
+        os.listdir(job.folder)
+    return job.finished
+
+
 class Driver:
     """One process's part in a sweep."""
 
@@ -112,31 +129,33 @@ class Driver:
             self._executor.stop()
             self._collect()
             raise
-        return all(job.finished for job in self._left.values())  # others may have finished what was given up here
+        return all(map(_is_finished, self._left.values()))  # others may have finished what was given up here
 
     def _start(self) -> None:
         """Start every job that can be."""
-        for job in list(self._left.values()):
+        for job in filter(self._ready, list(self._left.values())):
             if not self._executor.fits(1):
                 break
-            if self._ready(job) and self._executor.fits(self._slots(job)) and not self._elsewhere(job):
+            if self._executor.fits(self._slots(job)) and not self._elsewhere(job):
                 self._begin(job)
 
     def _begin(self, job: Job) -> None:
-        slots = self._slots(job)
-        self._running[job.name] = (time.monotonic(), slots, self._executor.largest)
+        self._count(job)
         try:
             with disk_errors(job.folder):
-                self._executor.start(self._folder.work(job, slots))
-        except (UnavailableError, OutOfMemoryError) as error:
+                self._executor.start(self._folder.work(job, self._slots(job)))
+        except UserError as error:
             self._end(Ended(job.name, error.cause, str(error)))
+
+    def _count(self, job: Job) -> None:
+        self._running[job.name] = (time.monotonic(), self._slots(job), self._executor.largest)
 
     def _ready(self, job: Job) -> bool:
         free = job.name not in self._running and time.monotonic() >= self._not_before.get(job.name, 0)
         return free and job.name not in self._lost and not any(name in self._left for name in job.needs)
 
     def _elsewhere(self, job: Job) -> bool:
-        """Whether another process has finished a job, or is at it, or the disk does not tell now."""
+        """Whether another process has finished a job, or is at it, or its folder does not tell, now or ever."""
         try:
             with disk_errors(job.folder):
                 if job.finished:
@@ -145,6 +164,10 @@ class Driver:
                 cause = InUseError.cause if in_use(job.folder) else ""
         except UnavailableError as error:
             cause = error.cause
+        except UserError as error:
+            self._count(job)
+            self._end(Ended(job.name, error.cause, str(error)))
+            return True
         if cause:
             self._not_before[job.name] = time.monotonic() + RETRIES[cause].wait_s
         return bool(cause)
@@ -175,8 +198,8 @@ class Driver:
         job = self._jobs[ended.name]
         try:
             with disk_errors(job.folder):
-                finished, step = job.finished, progress_of(job)
-        except UnavailableError as error:
+                finished, step = job.finished or (ended.cause == DONE and _finished_anew(job)), progress_of(job)
+        except UserError as error:
             before = [row.get("step") or 0 for row in self._rows[job.name]]
             return Ended(job.name, error.cause, str(error)), False, max(before, default=0)
         if ended.cause == DONE and not finished:

@@ -19,7 +19,7 @@ from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.sweeps.found import FoundRun, FoundRuns, run_at
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.naming import run_folder
-from vd4rl_pomdp.sweeps.sets import DataSet, set_of
+from vd4rl_pomdp.sweeps.sets import DataSet, content_of, set_of
 from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, recipe_of, recorded, told
 
 DATA = "data"
@@ -59,12 +59,16 @@ class Job:
         return (self.folder / TIMING_FILE).is_file() and self._made(run_at(self.folder))
 
     def _made(self, run: FoundRun) -> bool:
-        """Whether a run is its own; on which set that of a folder that was free must be, the command tells."""
+        """Whether a run is its own; on which set that of a folder that was free must be, the command tells.
+
+        Another driver may have called the set otherwise, or have a copy of it.
+        """
         if run.recipe != self.recipe:
             return False
         if self.content:
             return run.data == self.content
-        return ("--data", run.record["config"].get("data")) in pairwise(self.words)
+        told, own = run.record["config"].get("data"), dict(pairwise(self.words)).get("--data")
+        return told == own or (own is not None and bool(run.data) and run.data == content_of(Path(own)))
 
     @property
     def begun(self) -> bool:

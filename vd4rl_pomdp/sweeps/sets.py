@@ -50,8 +50,8 @@ class DataSet:
 
     @cached_property
     def fingerprint(self) -> str:
-        """Name of the content of a set that is there; one that was never opened is decoded first."""
-        return open_store(self.folder).fingerprint
+        """As `content_of`, which is asked once."""
+        return content_of(self.folder)
 
     def check(self) -> None:
         """Raise UserError if its folder holds a set that was collected otherwise, or not downloaded to its end."""
@@ -81,6 +81,11 @@ class DataSet:
         """Whether a run was trained on a set that was collected as this one is, whatever came of it."""
         collection = record.get("collection") or {}
         return bool(collection) and not differing(collection, self.wanted)
+
+
+def content_of(folder: Path) -> str:
+    """Name of the content of the set in a folder, empty if there is none; one never opened before is decoded first."""
+    return open_store(folder).fingerprint if shard_files(folder) else ""
 
 
 def set_of(cell: GridCell, root: Path) -> DataSet:

@@ -1,12 +1,18 @@
 """What the Slurm executor makes of the queue's words, and what it asks for, without Slurm."""
 
+import errno
+import os
+import signal
 import sys
+from types import SimpleNamespace
 
 import pytest
 
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.errors import OutOfMemoryError, UserError
+from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.sweeps.executors import slurm as module
+from vd4rl_pomdp.sweeps.executors import slurm_queue
 from vd4rl_pomdp.sweeps.executors.handover import Handover
 from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor
 from vd4rl_pomdp.sweeps.executors.slurm_queue import SlurmOptions, TaskState, parameters
@@ -218,3 +224,57 @@ def test_the_package_loads_neither_submitit_nor_ray():
 
     script = "import sys, vd4rl_pomdp.sweeps.executors as e; print({'submitit', 'ray', 'torch'} & sys.modules.keys())"
     assert subprocess.run([sys.executable, "-c", script], capture_output=True, text=True).stdout == "set()\n"
+
+
+def test_a_disk_that_is_full_at_a_submission_is_waited_for(fake, tmp_path, monkeypatch, capsys):
+    """submitit writes a file for each task: nothing is in the queue then, and it is no refusal of Slurm's."""
+    full, submit = [True], module.submit
+
+    class Full:
+        def __init__(self, folder, **options):
+            self.folder = folder
+
+        def update_parameters(self, **options): ...
+
+        def submit_array(self, tasks):
+            if full:
+                raise OSError(errno.ENOSPC, "No space left on device")
+            submit(self.folder, tasks, None)
+
+    monkeypatch.setitem(sys.modules, "submitit", SimpleNamespace(SlurmExecutor=Full))
+    monkeypatch.setattr(module, "submit", slurm_queue.submit)
+    monkeypatch.setattr(module, "AGAIN_S", 0.0)
+    made = executor(tmp_path)
+    made.start(work(tmp_path, "job"))
+    assert made.ended() == []
+    assert "the disk is full" in capsys.readouterr().err
+    full.clear()
+    made.ended()
+    assert fake.arrays == [[["job"]]]
+
+
+def test_a_signal_during_a_submission_waits_until_the_array_is_known(fake, tmp_path, monkeypatch):
+    submit = module.submit
+
+    def submitted(folder, tasks, options):
+        submit(folder, tasks, options)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(module, "submit", submitted)
+    made = executor(tmp_path)
+    made.start(work(tmp_path, "job"))
+    with interrupt.handled(), pytest.raises(interrupt.Interrupted):
+        made.ended()
+    assert [task.key for task in made._tasks] == list(fake.queue)
+    assert made._live() == ["7_0"], "what stopping takes out of the queue"
+
+
+def test_how_an_arrays_jobs_ended_is_listed_once_a_look(fake, tmp_path, monkeypatch):
+    looks, ended = [], Handover.ended
+    made = executor(tmp_path, tasks=5)
+    for name in "abcde":
+        made.start(work(tmp_path, name))
+    made.ended()
+    monkeypatch.setattr(Handover, "ended", lambda array: looks.append(array) or ended(array))
+    made.ended()
+    assert len(looks) == 1

@@ -16,6 +16,7 @@ from pathlib import Path
 from secrets import token_hex
 
 from vd4rl_pomdp.errors import OutOfMemoryError, UnavailableError, UserError, disk_errors
+from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.sweeps.executors.allocation import IDLE_S, Allocation
 from vd4rl_pomdp.sweeps.executors.handover import Handover
 from vd4rl_pomdp.sweeps.executors.local import PATIENCE_S
@@ -90,10 +91,13 @@ class _Task:
             self.mine[work.name] = found
         return found is not None
 
-    def told(self) -> Iterator[Ended]:
-        """What has ended since the last call; where the disk does not tell now, the next one does."""
+    def told(self, over: set[str]) -> Iterator[Ended]:
+        """Of the attempts that are over, what has ended since the last call.
+
+        Where the disk does not tell now, the next one does.
+        """
         with suppress(UnavailableError), disk_errors(self.array.folder):
-            for attempt in self.array.ended() & self.left.keys():
+            for attempt in over & self.left.keys():
                 ended, name = self.array.end_of(attempt), self.left[attempt].name
                 del self.left[attempt]
                 self.busy = time.monotonic()
@@ -172,7 +176,8 @@ class SlurmExecutor:
         if not answered and now < self._next_files:
             return []
         self._next_files = now + FILES_S
-        found = [ended for task in self._tasks for ended in task.told()]  # after the queue: none is overlooked
+        over = {array: _over(array) for array in {task.array for task in self._tasks}}
+        found = [ended for task in self._tasks for ended in task.told(over[task.array])]  # after the queue: all of them
         return found + self._gone() if answered else found
 
     def _ask(self) -> bool:
@@ -200,18 +205,22 @@ class SlurmExecutor:
         return [ended for task in over for ended in task.untold(self._state(task), self._stopped)]
 
     def _submit(self) -> None:
-        """Submit what was gathered; where Slurm took such an array before, a failure is waited out."""
-        try:
-            array = self._fresh[0].array.folder
-            submit(array, [Allocation(array, task.number, task.places) for task in self._fresh], self._options)
-        except UserError as error:
-            if not self._accepted:
-                raise
-            print(f"warning: {error}; trying again in {AGAIN_S:.0f} s", file=sys.stderr)
-            self._next_submission = time.monotonic() + AGAIN_S
-            return
-        self._accepted = True
-        self._tasks, self._fresh = self._tasks + self._fresh, []
+        """Submit what was gathered; a failure is waited out where Slurm took such an array before, or the disk is full.
+
+        A signal waits until the array is known, which could not be taken out of the queue otherwise.
+        """
+        array = self._fresh[0].array.folder
+        with interrupt.deferred():
+            try:
+                submit(array, [Allocation(array, task.number, task.places) for task in self._fresh], self._options)
+            except UserError as error:
+                if not (self._accepted or isinstance(error, UnavailableError)):
+                    raise
+                print(f"warning: {error}; trying again in {AGAIN_S:.0f} s", file=sys.stderr)
+                self._next_submission = time.monotonic() + AGAIN_S
+                return
+            self._accepted = True
+            self._tasks, self._fresh = self._tasks + self._fresh, []
 
     def stop(self) -> None:
         """Take what waits out of the queue, ask every job to end where nothing is lost, and wait for it."""
@@ -228,6 +237,13 @@ class SlurmExecutor:
         """Slurm's numbers of this sweep's tasks that have not ended, as far as it has told."""
         self._ask()
         return [state.job for state in map(self._state, self._tasks) if state.name not in OVER]
+
+
+def _over(array: Handover) -> set[str]:
+    """Attempts of an array that have ended, as far as the disk tells now."""
+    with suppress(UnavailableError), disk_errors(array.folder):
+        return array.ended()
+    return set()
 
 
 def _known(folder: Path, places: int) -> list[_Task]:

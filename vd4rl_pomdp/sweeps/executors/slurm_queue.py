@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.sweeps.executors.allocation import Allocation
 from vd4rl_pomdp.sweeps.executors.local import PATIENCE_S
@@ -94,6 +94,7 @@ def submit(folder: Path, tasks: list[Allocation], options: SlurmOptions) -> None
     """Submit tasks as one array, called as its folder is.
 
     Raises:
+        UnavailableError: its files could not be written, or the machine starts no process now.
         UserError: Slurm did not take it.
     """
     import submitit
@@ -101,7 +102,8 @@ def submit(folder: Path, tasks: list[Allocation], options: SlurmOptions) -> None
     executor = submitit.SlurmExecutor(folder, max_num_timeout=REQUEUES)
     executor.update_parameters(job_name=folder.name, **parameters(options))
     try:
-        executor.submit_array(tasks)
+        with disk_errors(folder):
+            executor.submit_array(tasks)
     except RuntimeError as error:  # submitit's for a command that failed
         told = str(error).strip().splitlines()
         raise UserError(f"Slurm took no array ({told[-1] if told else 'it does not say why'})") from error
