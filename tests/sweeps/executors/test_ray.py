@@ -14,7 +14,7 @@ from vd4rl_pomdp.sweeps.driver import Driver
 from vd4rl_pomdp.sweeps.executors import ray as module
 from vd4rl_pomdp.sweeps.executors.ray import RayExecutor, RayOptions
 from vd4rl_pomdp.sweeps.folder import SweepFolder
-from vd4rl_pomdp.sweeps.work import DONE, INTERRUPTED, KILLED, Work
+from vd4rl_pomdp.sweeps.work import DONE, INTERRUPTED, KILLED, Ended, Work
 
 ray_is_there = pytest.importorskip("ray")
 NODE = {"num_cpus": 2, "object_store_memory": 80 * 2**20, "include_dashboard": False}
@@ -97,18 +97,18 @@ def test_all_is_finished_although_a_node_dies(cluster, options, tmp_path):
     """The last test, since the node does not come back."""
     jobs = [waiting_job(tmp_path, f"job{number}") for number in range(4)]
     executor = RayExecutor(options)
-    fits, nodes, history = executor.fits, list(cluster.worker_nodes), SweepFolder(tmp_path)
+    ended, nodes, history = executor.ended, list(cluster.worker_nodes), SweepFolder(tmp_path)
 
-    def interfere(slots: int) -> bool:
+    def interfere() -> list[Ended]:
         """Kill a node while all jobs run, and let them end once it is known which of them that killed."""
         if nodes and all(begun(job) for job in jobs):
             cluster.remove_node(nodes.pop(), allow_graceful=False)
         killed = history.attempts()
         if killed and not any(in_use(tmp_path / name) for name in killed):
             (tmp_path / "go").touch()
-        return fits(slots)
+        return ended()
 
-    executor.fits = interfere
+    executor.ended = interfere
     assert Driver(jobs, executor, history).run()
     assert nodes == []
     causes = {name: [row["cause"] for row in rows] for name, rows in history.attempts().items()}
