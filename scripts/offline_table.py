@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from control_table import probes_of, spread_of, with_seeds
 
-from vd4rl_pomdp.report.gates import PASSED, gates, returns_of
+from vd4rl_pomdp.report.gates import FAILED, PASSED, UNKNOWN, gates, returns_of
 from vd4rl_pomdp.report.layout import number
 from vd4rl_pomdp.report.load import PROBES, LoadedRun, load_runs
 from vd4rl_pomdp.report.measures import mean_if_known
@@ -19,7 +19,7 @@ from vd4rl_pomdp.sweeps.members import GridMembers
 
 RESULTS = Path(__file__).parents[1] / "results"
 GRIDS = ("offline", "control")
-HIDDEN, CLEAN = "patch+zero_frames", "none"
+HIDDEN, PATCHES, CLEAN = "patch+zero_frames", "patch", "none"
 SETS = {
     ("walker_walk", "expert_noisy"): "walker_walk, noisy expert",
     ("walker_walk", "expert"): "walker_walk, expert",
@@ -60,22 +60,29 @@ def readme_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
             yield f"| {words} ({here[0].reference.data_return:.0f}) | {' | '.join(cells)} |"
 
 
-def page_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str]]:
-    """Sets of which results/offline/README.md has a table."""
-    for place in SETS:
-        if place != CONTROL_ONLY and any(_place(run) == place and run.labels["corruption"] == HIDDEN for run in runs):
-            yield place
+def page_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str, str]]:
+    """Task, quality and corruption of which results/offline/README.md has a table."""
+    measured = {(*_place(run), run.labels["corruption"]) for run in runs}
+    for corruption in (HIDDEN, PATCHES):
+        for place in SETS:
+            if place != CONTROL_ONLY and (*place, corruption) in measured:
+                yield *place, corruption
 
 
-def set_lines(runs: Sequence[LoadedRun], task: str, quality: str) -> Iterator[str]:
-    """All methods on one set, those that return most first."""
+def table_name(task: str, quality: str, corruption: str) -> str:
+    """What the table of a set is called."""
+    return f"{task}, {quality}" + (", patches alone" if corruption == PATCHES else "")
+
+
+def set_lines(runs: Sequence[LoadedRun], task: str, quality: str, corruption: str) -> Iterator[str]:
+    """All methods on one set under a corruption, those that return most first."""
     yield (
         "| method | seeds | return (seeds) | episodes | trained with nothing hidden |"
         " action error: data, loop | probe: pose, velocity |"
     )
     yield "|---|---:|---:|---:|---:|---:|---:|"
     here = [run for run in runs if _place(run) == (task, quality)]
-    methods = {run.labels["method"]: _of(here, run.labels["method"], HIDDEN) for run in here}
+    methods = {run.labels["method"]: _of(here, run.labels["method"], corruption) for run in here}
     shown = [(method, mine) for method, mine in methods.items() if mine]
     for method, mine in sorted(shown, key=lambda one: -returns_of(one[1]).mean()):
         loop = number(mean_if_known(row["action_error"] for run in mine for row in run.last), 3)
@@ -96,14 +103,15 @@ def gate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
     yield "|---|---:|---:|---:|---:|---:|---|---:|"
     for row in gates(list(runs)):
         place = row["task"], row["quality"]
-        if row["corruption"] == HIDDEN and place in SETS:
+        if row["corruption"] in (HIDDEN, PATCHES) and place in SETS:
             shares = [number(row[name], 2) for name in ("data_return", "state_share", "acro_share", "best_share")]
             above = f"{number(row['above_random'], 0)} ± {number(row['error'], 0)}"
-            here = [run for run in runs if _place(run) == place and run.labels["corruption"] == HIDDEN]
+            here = [run for run in runs if _place(run) == place and run.labels["corruption"] == row["corruption"]]
             ranks = f"{_rank_correlation(here, PROBES[0])}, {_rank_correlation(here, PROBES[1])}"
-            passed = "yes" if row["verdict"] == PASSED else "no"
+            passed = {PASSED: "yes", FAILED: "no", UNKNOWN: "not known"}[row["verdict"].partition(":")[0]]
+            name = table_name(*place, row["corruption"])
             yield (
-                f"| {' '.join(place)} | {row['data_return']:.0f} | {' | '.join(shares[1:])} | {above} | {passed} |"
+                f"| {name} | {row['data_return']:.0f} | {' | '.join(shares[1:])} | {above} | {passed} |"
                 f" {ranks} ({len(_probed(here))}) |"
             )
 

@@ -52,7 +52,8 @@ def pages() -> dict[str, Tables]:
         "results/offline/README.md": {
             "gates": offline_table.gate_lines(returns),
             **{
-                ", ".join(place): offline_table.set_lines(returns, *place) for place in offline_table.page_sets(returns)
+                offline_table.table_name(*place): offline_table.set_lines(returns, *place)
+                for place in offline_table.page_sets(returns)
             },
             "minutes": offline_table.cost_lines(returns),
         },

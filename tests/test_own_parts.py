@@ -15,6 +15,7 @@ from finetune.algorithms import BC
 from finetune.config import FinetuneConfig
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS, Method
+from pretrain.objectives.all_history import AllHistory
 from tests.helpers_data import write_fake_set
 from tests.helpers_pages import isolated_registries, load_example, write_example
 from vd4rl_pomdp import testing
@@ -233,6 +234,11 @@ def test_options_that_flags_or_records_would_lose_are_refused_where_a_part_is_re
 def test_what_is_no_class_of_options_is_refused(registries, kind, options):
     with pytest.raises(UserError, match=r"'mine': its options are .*: name a class that is derived from vd4rl_pomdp\."):
         registries[kind].register("mine", part_with(kind, options))
+
+
+def test_a_method_that_predicts_actions_has_their_options(registries):
+    with pytest.raises(UserError, match="whose objective predicts actions has their options: say options="):
+        Method(AllHistory)
 
 
 def test_the_options_of_a_frame_encoder_have_its_width(registries):

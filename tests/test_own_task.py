@@ -28,7 +28,7 @@ from vd4rl_pomdp.policies.config import PolicyConfig, recipes
 from vd4rl_pomdp.policies.train import train_policy
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.runs.episodes import read_episodes
-from vd4rl_pomdp.tasks import TASKS
+from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask
 
 PAGE = Path(__file__).parents[1] / "docs" / "add_a_task.md"
 CODE = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]
@@ -148,6 +148,21 @@ def test_what_a_task_cannot_give_is_refused_before_anything_is_written(tasks, tm
     with pytest.raises(UserError, match=message):
         collect(config)
     assert not (tmp_path / "set").exists()
+
+
+@pytest.mark.parametrize(
+    ("task", "told"),
+    [
+        (GymnasiumTask("Centre-v0", pixels="Render"), "unknown pixels 'Render'"),
+        (GymnasiumTask("Centre-v0", action_noise=-1.0), "its action_noise is -1.0: it must be a number that is not"),
+        (GymnasiumTask("Centre-v0", action_noise="0.3"), "its action_noise is '0.3'"),
+        (GymnasiumTask("Centre-v0", score_divisor="10"), "its score_divisor is '10': it must be a positive number"),
+        (DMCTask("cartpole", "swingup", camera="side"), "its camera is 'side': it must be the camera's number"),
+    ],
+)
+def test_what_makes_no_task_is_refused_where_it_is_registered(tasks, task, told):
+    with pytest.raises(UserError, match=f"task 'mine': {told}"):
+        TASKS.register("mine", task)
 
 
 def test_pictures_too_small_for_a_patch_a_shift_or_an_encoder_are_refused_before_training(tasks, tmp_path):

@@ -85,6 +85,12 @@ def test_what_a_call_added_may_be_replaced_where_that_is_said(registry):
         registry.register(3, "third")
 
 
+@pytest.mark.parametrize("name", ["", "..", "a,b", "lab/mine", "my own", "a=b"])
+def test_a_name_that_no_folder_or_flag_could_have_is_refused(registry, name):
+    with pytest.raises(UserError, match=f"is called '{name}': folders and `--only` are made of names"):
+        registry.register(name, "my own")
+
+
 def test_a_part_of_another_kind_is_refused(registry):
     with pytest.raises(UserError, match="frame encoder 'three' is a int, not a string"):
         registry.register("three", 3)

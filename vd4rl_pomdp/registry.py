@@ -68,6 +68,11 @@ class Registry(Mapping[str, Part], Generic[Part]):
         """
         if not isinstance(name, str):
             raise UserError(f"a {self.kind} is called {name!r}: a name is a string")
+        if name in ("", ".", "..") or any(sign in name for sign in "/,= "):
+            raise UserError(
+                f"a {self.kind} is called {name!r}: folders and `--only` are made of names, without slashes, commas, "
+                "blanks or equals signs"
+            )
         self._add(name, part, BY_CALL, replace)
         caller = sys._getframe(1)
         self._sources[name] = _source_of(Path(caller.f_code.co_filename), caller.f_globals.get("__package__") or "")

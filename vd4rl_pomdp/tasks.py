@@ -14,7 +14,7 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vd4rl_pomdp.errors import MOST, MOST_ROWS, UserError
+from vd4rl_pomdp.errors import MOST, MOST_ROWS, UserError, refuse_unknown
 from vd4rl_pomdp.registry import Registry
 
 FRAME_SIZE = 84
@@ -163,8 +163,15 @@ def _refuse(name: str, task: Task) -> None:
         number = getattr(task, what)
         if not isinstance(number, int) or not 1 <= number <= most:
             raise UserError(f"its {what} is {number!r}: it must be an integer from 1 to {most}")
-    if not 0 < task.score_divisor < math.inf:
-        raise UserError(f"its score_divisor is {task.score_divisor}: it must be a positive number")
+    if not (isinstance(task.score_divisor, int | float) and 0 < task.score_divisor < math.inf):
+        raise UserError(f"its score_divisor is {task.score_divisor!r}: it must be a positive number")
+    noise = 0.0 if task.action_noise is None else task.action_noise
+    if not (isinstance(noise, int | float) and 0 <= noise < math.inf):
+        raise UserError(f"its action_noise is {noise!r}: it must be a number that is not negative, or None")
+    if isinstance(task, DMCTask) and not isinstance(task.camera, int):
+        raise UserError(f"its camera is {task.camera!r}: it must be the camera's number")
+    if isinstance(task, GymnasiumTask):
+        refuse_unknown("pixels", task.pixels, ("render", "observation"))
 
 
 TASKS: Registry[Task] = Registry(

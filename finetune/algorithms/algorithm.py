@@ -141,11 +141,21 @@ class NoisyAlgorithm(Algorithm):
 
 
 def require_policy(algorithm: Algorithm) -> None:
-    """Raise UserError for an algorithm that would leave its policy out of checkpoints."""
+    """Raise UserError for an algorithm whose policy could not be played again, or would be left out of checkpoints."""
+    policy = algorithm.policy
+    if not isinstance(policy, Policy) or _shapes(policy) != _shapes(Policy(**policy.shape)):
+        raise UserError(
+            f"{type(algorithm).__name__}.policy is not the one that it was given: train that, or what is evaluated and "
+            "kept is another"
+        )
     if not any(part is algorithm.policy for part in algorithm.parts().values()):
         raise UserError(
             f"{type(algorithm).__name__}.parts lacks the policy: name all that has a state, or it is not kept"
         )
+
+
+def _shapes(policy: Policy) -> dict[str, torch.Size]:
+    return {name: value.shape for name, value in policy.state_dict().items()}
 
 
 def _step(loss: Tensor, optimisers: list[Optimizer]) -> None:

@@ -14,7 +14,7 @@ from pretrain.objectives.supervised import Supervised, SupervisedOptions
 from pretrain.objectives.untrained import StateOptions, Untrained
 from vd4rl_pomdp.augmentation import Sharing
 from vd4rl_pomdp.errors import UserError, refuse_unknown
-from vd4rl_pomdp.objective import ActionOptions, InverseOptions, Objective
+from vd4rl_pomdp.objective import ActionOptions, InverseObjective, InverseOptions, Objective
 from vd4rl_pomdp.options import Options, refuse_options
 from vd4rl_pomdp.registry import Registry
 
@@ -57,8 +57,14 @@ class Method:
             refuse_unknown(f"{name} of a Method", getattr(self, name), words)
         if self.end_to_end and self.history != "none":
             raise UserError("a Method trained end to end has no memory: leave its history out")
+        if _is(self.build, InverseObjective) and not _is(self.options, ActionOptions):
+            raise UserError("a Method whose objective predicts actions has their options: say options=InverseOptions")
         if self.reads_state and self.trained:
             raise UserError("a Method that reads states is not trained: say trained=False")
+
+
+def _is(built: object, kind: type) -> bool:
+    return isinstance(built, type) and issubclass(built, kind)
 
 
 _OWN = {

@@ -103,6 +103,14 @@ def test_a_written_shard_has_the_published_layout(tmp_path):
         np.testing.assert_array_equal(back[key], rows[key])
 
 
+def test_frames_that_are_no_bytes_are_refused(tmp_path):
+    """As of pictures from 0 to 1, of which nothing but black would be left."""
+    rows = fake_rows([4])
+    with pytest.raises(UserError, match="observation is of float64; frames are of uint8, from 0 to 255"):
+        write_shard(tmp_path / "0_mine.hdf5", rows | {"observation": rows["observation"] / 255}, {})
+    assert not list(tmp_path.iterdir())
+
+
 def test_equal_rows_give_equal_bytes(tmp_path):
     for name in ("a.hdf5", "b.hdf5"):
         write_shard(tmp_path / name, fake_rows((3,)), {"seed": 1, "task": "x"})

@@ -67,6 +67,24 @@ def test_an_algorithm_that_would_not_keep_its_policy_is_refused():
         require_policy(make(Forgetful))
 
 
+class Wider(BC):
+    def __init__(self, policy, *given):
+        super().__init__(policy, *given)
+        policy.net = torch.nn.Linear(policy.shape["dim"], policy.shape["action_dim"])
+
+
+class Other(BC):
+    def __init__(self, policy, *given):
+        super().__init__(policy, *given)
+        self.policy = torch.nn.Linear(policy.shape["dim"], policy.shape["action_dim"])
+
+
+@pytest.mark.parametrize("kind", [Wider, Other])
+def test_an_algorithm_whose_policy_could_not_be_played_again_is_refused(kind):
+    with pytest.raises(UserError, match=rf"{kind.__name__}\.policy is not the one that it was given"):
+        require_policy(make(kind))
+
+
 def batch(seed: int = 0) -> FeatureBatch:
     """Transitions of which every other one ends its episode for good."""
     g = torch.Generator().manual_seed(seed)

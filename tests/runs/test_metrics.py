@@ -5,6 +5,7 @@ import math
 import pytest
 import torch
 
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.checkpoint import pack, unpack
 from vd4rl_pomdp.runs.metrics import Means
 
@@ -23,6 +24,12 @@ def test_a_scalar_counts_the_steps_that_gave_it_and_each_row_begins_anew():
     means.add(logs(STEPS[3]))
     assert means.take() == pytest.approx({"loss": 0.7})
     assert means.take() == {}
+
+
+@pytest.mark.parametrize("name", ["step", "eval/return/none"])
+def test_a_scalar_has_no_name_that_is_anothers(name):
+    with pytest.raises(UserError, match=f"is called '{name}', as something else is in metrics.jsonl"):
+        Means().add(logs({"loss": 1.0, name: 2.0}))
 
 
 @pytest.mark.parametrize("cut", range(len(STEPS)))

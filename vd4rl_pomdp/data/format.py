@@ -135,8 +135,10 @@ def write_shard(path: Path, rows: Mapping[str, np.ndarray], attributes: Mapping[
         attributes: JSON values to keep with the shard: `task`, `set` (the quality), seed, versions.
 
     Raises:
-        UserError: the disk is full or the folder cannot be written; nothing is left behind.
+        UserError: frames are not of uint8, the disk is full or the folder cannot be written; nothing is left behind.
     """
+    if (dtype := np.asarray(rows.get(FRAMES_KEY, np.uint8(0))).dtype) != np.uint8:
+        raise UserError(f"{path}: {FRAMES_KEY} is of {dtype}; frames are of uint8, from 0 to 255")
     write_bytes(path, _encode(rows, attributes))  # compressed in memory: HDF5 cannot close a file on a full disk
 
 

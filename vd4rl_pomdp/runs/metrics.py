@@ -13,6 +13,7 @@ from torch import Tensor
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.reading import parse_json, read_bytes
+from vd4rl_pomdp.runs import METRICS_FILE
 from vd4rl_pomdp.runs.files import appending, write_bytes
 
 if TYPE_CHECKING:
@@ -31,7 +32,13 @@ class Means:
         """Of each scalar: its sum, float32, where it was computed, and how many steps gave it."""
 
     def add(self, logs: dict[str, Tensor]) -> None:
-        """Count a step's scalars, each a tensor of one element; a GPU is not waited for."""
+        """Count a step's scalars, each a tensor of one element; a GPU is not waited for.
+
+        Raises:
+            UserError: one is called what a row calls something else.
+        """
+        if taken := [name for name in logs if name == "step" or name.startswith(EVALUATION)]:
+            raise UserError(f"a scalar of the loss is called {taken[0]!r}, as something else is in {METRICS_FILE}")
         for name, value in logs.items():
             value = value.detach().float()
             total, steps = self._sums.get(name) or (torch.zeros_like(value), 0)
