@@ -46,14 +46,18 @@ class Objective(nn.Module, ABC):
 def require_loss(name: str, given: Any) -> tuple[Tensor, dict[str, Tensor]]:
     """What `Objective.loss` of a method gave; raises UserError unless it is what the contract says."""
     match given:
-        case (Tensor() as loss, dict() as logs) if "loss" in logs and all(map(_is_scalar, (loss, *logs.values()))):
+        case (Tensor(requires_grad=True) as loss, dict() as logs) if "loss" in logs and all(
+            map(is_scalar, (loss, *logs.values()))
+        ):
             return loss, logs
     raise UserError(
-        f"the loss of the method {name} must be a scalar tensor and a dictionary of detached ones, `loss` among them"
+        f"the loss of the method {name} must be a scalar tensor with a gradient and a dictionary of detached ones, "
+        "`loss` among them"
     )
 
 
-def _is_scalar(value: Any) -> bool:
+def is_scalar(value: Any) -> bool:
+    """Whether a value is a tensor of one element."""
     return isinstance(value, Tensor) and value.numel() == 1
 
 

@@ -14,6 +14,7 @@ from torch.optim import Optimizer
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.objective import is_scalar
 from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.runs.device import Precision, autocast
 
@@ -103,7 +104,13 @@ class Algorithm(ABC):
 
     def _next(self, losses: Iterator[Loss], device: torch.device) -> Loss | None:
         with autocast(device, self.precision):
-            return next(losses, None)
+            given = next(losses, None)
+        if given is not None and not _is_loss(given):
+            raise UserError(
+                f"{type(self).__name__}.losses must yield Loss(a scalar tensor with a gradient, its optimiser, a "
+                "dictionary of detached scalars)"
+            )
+        return given
 
     @abstractmethod
     def parts(self) -> dict[str, Any]:
@@ -152,6 +159,13 @@ def require_policy(algorithm: Algorithm) -> None:
         raise UserError(
             f"{type(algorithm).__name__}.parts lacks the policy: name all that has a state, or it is not kept"
         )
+
+
+def _is_loss(given: Any) -> bool:
+    match given:
+        case Loss(Tensor(requires_grad=True) as value, Optimizer(), dict() as logs):
+            return all(map(is_scalar, (value, *logs.values())))
+    return False
 
 
 def _shapes(policy: Policy) -> dict[str, torch.Size]:

@@ -88,6 +88,14 @@ class Centred(nn.Module):
         return x - x.mean(0)
 
 
+class Backbone(nn.Conv2d):
+    """Weights that were trained elsewhere and stay as they are."""
+
+    def __init__(self):
+        super().__init__(4, 4, 1)
+        self.requires_grad_(False)
+
+
 MUTANTS = [
     (Bounded, features_have_one_shape, "some are not finite"),
     (
@@ -116,6 +124,11 @@ def test_a_frame_encoder_that_breaks_a_promise_is_told_which_and_how(encoders, l
         run_check("frame encoder", check, "mine", size=SIZE)
     with pytest.raises(AssertionError, match="frame encoder 'mine' breaks a promise"):
         check_frame_encoder("mine", size=SIZE)
+
+
+def test_a_frozen_backbone_breaks_no_promise(encoders):
+    encoders.register("mine", FrameEncoderPart(with_layer(Backbone)))
+    check_frame_encoder("mine", size=SIZE)
 
 
 def test_a_right_one_passes_at_any_size_and_what_cannot_be_is_refused(encoders):

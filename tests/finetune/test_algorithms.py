@@ -47,6 +47,26 @@ class Returning(BC):
         return next(super().losses(batch))
 
 
+@pytest.mark.parametrize(
+    "changed",
+    [
+        tuple,
+        lambda loss: loss.value,
+        lambda loss: loss._replace(value=loss.value.detach()),
+        lambda loss: loss._replace(value=loss.value.expand(2)),
+        lambda loss: loss._replace(logs={"bc_loss": 0.5}),
+        lambda loss: loss._replace(logs={"bc_loss": torch.zeros(2)}),
+        lambda loss: loss._replace(optimiser=None),
+    ],
+)
+def test_a_loss_that_no_step_or_row_could_be_made_of_is_refused(changed):
+    algorithm = make(BC)
+    losses = algorithm.losses
+    algorithm.losses = lambda given: map(changed, losses(given))
+    with pytest.raises(UserError, match=r"BC\.losses must yield Loss\(a scalar tensor with a gradient"):
+        algorithm.update(batch())
+
+
 class Forgetful(BC):
     def parts(self):
         return {"optimiser": self.optimiser}

@@ -39,15 +39,16 @@ def test_pretraining_resumes_to_the_bit(data, tmp_path, monkeypatch, method):
     "given",
     [
         torch.tensor(1.0),
-        (torch.tensor(1.0), {}),
-        (torch.tensor(1.0), {"loss": 1.0}),
-        (torch.ones(2), {"loss": torch.tensor(1.0)}),
-        (torch.tensor(1.0), {"loss": torch.tensor(1.0), "more": torch.ones(2)}),
+        (torch.tensor(1.0, requires_grad=True), {}),
+        (torch.tensor(1.0, requires_grad=True), {"loss": 1.0}),
+        (torch.ones(2, requires_grad=True), {"loss": torch.tensor(1.0)}),
+        (torch.tensor(1.0), {"loss": torch.tensor(1.0)}),
+        (torch.tensor(1.0, requires_grad=True), {"loss": torch.tensor(1.0), "more": torch.ones(2)}),
     ],
     ids=str,
 )
 def test_a_loss_that_breaks_its_contract_is_one_line(given):
-    with pytest.raises(UserError, match="loss of the method mine must be a scalar tensor and a dictionary of detached"):
+    with pytest.raises(UserError, match="loss of the method mine must be a scalar tensor with a gradient and a dict"):
         require_loss("mine", given)
 
 
