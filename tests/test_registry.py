@@ -87,7 +87,7 @@ def test_what_a_call_added_may_be_replaced_where_that_is_said(registry):
 
 @pytest.mark.parametrize("name", ["", "..", "a,b", "lab/mine", "my own", "a=b"])
 def test_a_name_that_no_folder_or_flag_could_have_is_refused(registry, name):
-    with pytest.raises(UserError, match=f"is called '{name}': folders and `--only` are made of names"):
+    with pytest.raises(UserError, match=f"frame encoder '{name}': folders and `--only` are made of names"):
         registry.register(name, "my own")
 
 

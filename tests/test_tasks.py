@@ -154,7 +154,7 @@ def test_what_is_no_task_is_not_registered():
 
 @pytest.mark.parametrize("name", ["my/cartpole", "/cartpole", "cartpole/", "", ".", ".."])
 def test_a_task_whose_name_no_file_can_have_is_not_registered(name):
-    with TASKS.isolated(), pytest.raises(UserError, match=f"task '{name}': sets have files and folders of this name"):
+    with TASKS.isolated(), pytest.raises(UserError, match=f"task '{name}': folders and `--only` are made of names"):
         TASKS.register(name, DMCTask("cartpole", "swingup"))
 
 

@@ -68,11 +68,6 @@ class Registry(Mapping[str, Part], Generic[Part]):
         """
         if not isinstance(name, str):
             raise UserError(f"a {self.kind} is called {name!r}: a name is a string")
-        if name in ("", ".", "..") or any(sign in name for sign in "/,= "):
-            raise UserError(
-                f"a {self.kind} is called {name!r}: folders and `--only` are made of names, without slashes, commas, "
-                "blanks or equals signs"
-            )
         self._add(name, part, BY_CALL, replace)
         caller = sys._getframe(1)
         self._sources[name] = _source_of(Path(caller.f_code.co_filename), caller.f_globals.get("__package__") or "")
@@ -138,6 +133,11 @@ class Registry(Mapping[str, Part], Generic[Part]):
             raise UserError(f"a {self.kind} called {name!r} exists already: choose another name{remedy}")
         if not self._fits(part):
             raise UserError(f"{self.kind} {name!r} is a {type(part).__name__}, not {self._expected}")
+        if name in ("", ".", "..") or any(sign in name for sign in "/,= "):
+            raise UserError(
+                f"{self.kind} {name!r}: folders and `--only` are made of names, without slashes, commas, blanks or "
+                "equals signs: choose another"
+            )
         self._refuse_faulty(name, part)
         self._parts[name], self._origins[name] = part, origin
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, field
-from pathlib import Path
 from typing import Any, Literal, get_args
 
 import numpy as np
@@ -156,9 +155,7 @@ class GymnasiumTask(Task):
 
 
 def _refuse(name: str, task: Task) -> None:
-    """Raise UserError for a name under which no file of a set could be written, and for numbers that make no task."""
-    if name in ("", "..") or Path(name).name != name:
-        raise UserError("sets have files and folders of this name, which it cannot be: choose one without '/'")
+    """Raise UserError for numbers and words that make no task."""
     for what, most in (("decisions", MOST_ROWS - 1), ("action_repeat", MOST)):
         number = getattr(task, what)
         if not isinstance(number, int) or not 1 <= number <= most:
