@@ -74,19 +74,13 @@ def maze_lines(runs: list[NavigationRun], maze: str) -> Iterator[str]:
         yield _line(words, rows[method])
 
 
-def state_lines(runs: list[NavigationRun], ks: Sequence[int]) -> Iterator[str]:
-    """State errors of all objectives by maze and K, in the paper's way and units."""
+def state_lines(runs: list[NavigationRun], ks: Sequence[int], both_units: bool = False) -> Iterator[str]:
+    """State errors of all objectives by maze and K, in the paper's way and units; with `both_units` in percent, too."""
+    lines = _state_lines if both_units else _state_line
     yield from _HEAD
     for k in ks:
         for maze in measured(runs):
-            yield from _state_line(runs, f"K = {k}", Condition(maze, "", k))
-
-
-def both_units(runs: list[NavigationRun], k: int) -> Iterator[str]:
-    """State errors of all objectives at one K by maze, in both units."""
-    yield from _HEAD
-    for maze in measured(runs):
-        yield from _state_lines(runs, f"K = {k}", Condition(maze, "", k))
+            yield from lines(runs, f"K = {k}", Condition(maze, "", k))
 
 
 def added_lines(runs: list[NavigationRun], added: str) -> Iterator[str]:

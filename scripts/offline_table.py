@@ -107,20 +107,20 @@ def gate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
             shares = [number(row[name], 2) for name in ("data_return", "state_share", "acro_share", "best_share")]
             above = f"{number(row['above_random'], 0)} ± {number(row['error'], 0)}"
             here = [run for run in runs if _place(run) == place and run.labels["corruption"] == row["corruption"]]
-            ranks = f"{_rank_correlation(here, PROBES[0])}, {_rank_correlation(here, PROBES[1])}"
+            probed = _probed(here)
+            ranks = ", ".join(_rank_correlation(probed, probe) for probe in PROBES)
             passed = {PASSED: "yes", FAILED: "no", UNKNOWN: "not known"}[row["verdict"].partition(":")[0]]
             name = table_name(*place, row["corruption"])
             yield (
                 f"| {name} | {row['data_return']:.0f} | {' | '.join(shares[1:])} | {above} | {passed} |"
-                f" {ranks} ({len(_probed(here))}) |"
+                f" {ranks} ({len(probed)}) |"
             )
 
 
-def _rank_correlation(runs: Sequence[LoadedRun], probe: str) -> str:
+def _rank_correlation(runs: list[LoadedRun], probe: str) -> str:
     """Spearman's, of a probe's error and the return over runs: -1 where the better of two always returns more."""
-    probed = _probed(runs)
-    errors = np.array([run.representation[probe] for run in probed])
-    ranks = [values.argsort().argsort() for values in (errors, returns_of(probed))]
+    errors = np.array([run.representation[probe] for run in runs])
+    ranks = [values.argsort().argsort() for values in (errors, returns_of(runs))]
     return f"{np.corrcoef(ranks)[0, 1]:.2f}"
 
 

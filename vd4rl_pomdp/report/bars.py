@@ -47,10 +47,10 @@ def bar_plots(
             corruption is none.
     """
     plots = []
+    data = {(row["task"], row["quality"]): row["data_return"] for row in gates if row["data_return"] is not None}
     for (corruption,), members in grouped(summary, ("corruption",)):
         mine = [row for row in runs if row["corruption"] == corruption and row["score"] is not None]
         lines = published if corruption == "none" else []
-        data = {(row["task"], row["quality"]): row["data_return"] for row in gates if row["data_return"] is not None}
         plots.append(_plot(corruption, members, mine, data, looks, lines))
     return plots
 

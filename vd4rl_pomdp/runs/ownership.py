@@ -66,8 +66,9 @@ def owned(folder: Path) -> Iterator[Owner]:
         folder.mkdir(parents=True, exist_ok=True)
         lease = SoftFileLease(folder / _LOCK, lease_duration=LEASE_S)
         _acquire(lease, folder)
-        synchronise(folder / _LOCK)  # else a network file system shows others an empty one until the first heartbeat
     try:
+        with disk_errors(folder):  # else a network file system shows others an empty lock until the first heartbeat
+            synchronise(folder / _LOCK)
         owner = Owner(folder)
         try:
             with handled(), hangups():

@@ -67,8 +67,8 @@ class Job:
             return False
         if self.content:
             return run.data == self.content
-        told, own = run.record["config"].get("data"), dict(pairwise(self.words)).get("--data")
-        return told == own or (own is not None and bool(run.data) and run.data == content_of(Path(own)))
+        told, own = run.record["config"].get("data"), dict(pairwise(self.words))["--data"]
+        return told == own or (run.data != "" and run.data == content_of(Path(own)))
 
     @property
     def begun(self) -> bool:
