@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
+from itertools import pairwise
 from pathlib import Path
 
 from vd4rl_pomdp.experiments.navigation.grid import Condition
@@ -17,11 +18,14 @@ from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.results import read_results
 
 RESULTS = Path(__file__).parents[1] / "results" / "navigation"
+REFITTED = [refitted_error(component) for component in ("state", "position", "velocity")]
+"""In percent, on held-out trajectories."""
 MEASURES = (
     *(online_error(component).raw() for component in ("state", "position", "velocity")),
-    *(refitted_error(component) for component in ("state", "position", "velocity")),
+    *REFITTED,
+    *(error.raw() for error in REFITTED),
 )
-"""Of a maze's table: the paper's way and units, then percent by the refitted probe."""
+"""Of a maze's table: the paper's way and units, then both units by the refitted probe."""
 REFERENCES = {
     UNTRAINED: "untrained",
     "supervised+a": "told the states: memory and actions",
@@ -65,8 +69,8 @@ def measured(runs: list[NavigationRun]) -> list[str]:
 
 def maze_lines(runs: list[NavigationRun], maze: str) -> Iterator[str]:
     """All methods at K = 15 in one maze, those with the smallest state errors first, then the references."""
-    yield "| | seeds | state | position | velocity | state, position, velocity in % |"
-    yield "|---|---:|---:|---:|---:|---:|"
+    yield "| | seeds | state | position | velocity | state, position, velocity in % | the same raw x 100 |"
+    yield "|---|---:|---:|---:|---:|---:|---:|"
     rows = {name: [entry_of(Condition(maze, name), one, runs) for one in MEASURES] for name in METHOD_NAMES}
     for method in sorted(OBJECTIVES, key=lambda name: rows[name][0].numbers.mean()):
         yield _line(f"`{method}`", rows[method])
@@ -74,13 +78,12 @@ def maze_lines(runs: list[NavigationRun], maze: str) -> Iterator[str]:
         yield _line(words, rows[method])
 
 
-def state_lines(runs: list[NavigationRun], ks: Sequence[int], both_units: bool = False) -> Iterator[str]:
-    """State errors of all objectives by maze and K, in the paper's way and units; with `both_units` in percent, too."""
-    lines = _state_lines if both_units else _state_line
+def state_lines(runs: list[NavigationRun], ks: Sequence[int]) -> Iterator[str]:
+    """State errors of all objectives by maze and K, in both units."""
     yield from _HEAD
     for k in ks:
         for maze in measured(runs):
-            yield from lines(runs, f"K = {k}", Condition(maze, "", k))
+            yield from _state_lines(runs, f"K = {k}", Condition(maze, "", k))
 
 
 def added_lines(runs: list[NavigationRun], added: str) -> Iterator[str]:
@@ -110,7 +113,7 @@ def _state_line(
 
 def first_person_lines(runs: list[NavigationRun]) -> Iterator[str]:
     """Errors under the compass of all that was trained there, those with the smallest state errors first."""
-    yield "| | seeds | state | position, velocity | raw x 100 | probe beside the model: position, velocity |"
+    yield "| | seeds | state, position, velocity | raw x 100 | probe beside the model: position, velocity | raw x 100 |"
     yield "|---|---:|---:|---:|---:|---:|"
     objectives = {
         f"`{name}`{words}": Condition(COMPASS, name, self_prediction=bool(words))
@@ -118,21 +121,21 @@ def first_person_lines(runs: list[NavigationRun]) -> Iterator[str]:
         for words in ("", " with self-prediction")
     }
     told = objectives | {words: Condition(COMPASS, name) for name, words in REFERENCES.items()}
-    measures = [refitted_error(component) for component in ("state", "position", "velocity")]
-    measures += [one.raw() for one in measures[1:]] + [one._replace(probe="online") for one in measures[1:]]
+    online = [one._replace(probe="online") for one in REFITTED[1:]]
+    measures = [*REFITTED, *(one.raw() for one in REFITTED), *online, *(one.raw() for one in online)]
     rows = {name: [entry_of(condition, one, runs) for one in measures] for name, condition in told.items()}
     trained = [name for name, (state, *_) in rows.items() if len(state.numbers)]
     for name in sorted(trained, key=lambda one: rows[one][0].numbers.mean()):
-        state, *others = map(_cell, rows[name])
-        pairs = " | ".join(", ".join(others[i : i + 2]) for i in (0, 2, 4))
-        yield f"| {name} | {len(rows[name][0].numbers)} | {state} | {pairs} |"
+        cells = list(map(_cell, rows[name]))
+        columns = " | ".join(", ".join(cells[i:j]) for i, j in pairwise((0, 3, 6, 8, 10)))
+        yield f"| {name} | {len(rows[name][0].numbers)} | {columns} |"
 
 
 def first_rung_lines(runs: list[NavigationRun]) -> Iterator[str]:
     """Errors of position and velocity at the smallest budget, under the stars and under the compass, in both units."""
     yield "| | `first_person` | raw x 100 | `compass_first_person` | raw x 100 |"
     yield "|---|---:|---:|---:|---:|"
-    percent = [refitted_error(component) for component in ("position", "velocity")]
+    percent = REFITTED[1:]
     units = percent, [one.raw() for one in percent]
     for method, words in (REFERENCES | {name: f"`{name}`" for name in ("no_history", "mik+a", "ah+a")}).items():
         cells = [
@@ -144,8 +147,9 @@ def first_rung_lines(runs: list[NavigationRun]) -> Iterator[str]:
 
 
 def _line(name: str, entries: list[Entry]) -> str:
-    cells = list(map(_cell, entries))
-    return f"| {name} | {len(entries[-1].numbers)} | {' | '.join(cells[:3])} | {', '.join(cells[3:])} |"
+    cells = list(map(_mean, entries[3:]))
+    averages = " | ".join(map(_cell, entries[:3]))
+    return f"| {name} | {len(entries[-1].numbers)} | {averages} | {', '.join(cells[:3])} | {', '.join(cells[3:])} |"
 
 
 def _cell(entry: Entry) -> str:

@@ -2,7 +2,8 @@
 
 Twice: drawn by hand for single pairs, and as formulas for all pairs of all windows. What a prediction
 depends on is found by changing one input at a time, and by gradients; `visible`, which reads the code's own settings,
-must say the same.
+must say the same. Of `mik+a` they are the table's in the reading that this project chose: its later view begins with
+o_{t+k} and the action taken there, not with the one before, which the option `literal` restores.
 """
 
 from collections.abc import Callable

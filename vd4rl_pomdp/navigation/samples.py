@@ -7,7 +7,7 @@ import torch
 
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.navigation.collect import drive
-from vd4rl_pomdp.navigation.exogenous import PHOTOGRAPHS, ExogenousNoise
+from vd4rl_pomdp.navigation.exogenous import TEXTURES, ExogenousNoise
 from vd4rl_pomdp.navigation.observations import to_grey50
 
 SAMPLES = 6
@@ -18,9 +18,9 @@ def sample_observations() -> dict[str, np.ndarray]:
     """Pictures of every maze, then of one in grey and with exogenous noise: (SAMPLES, 3, H, W) uint8 by name."""
     samples = {maze: _drive(maze) for maze in MAZES}
     pictures = torch.from_numpy(samples["three_curtains"])
-    noise = ExogenousNoise(PHOTOGRAPHS, 0.5, 0)
+    noise = ExogenousNoise(TEXTURES, 0.5, 0)
     samples["three_curtains, grey50"] = to_grey50(pictures).expand(-1, 3, -1, -1).numpy()
-    samples["three_curtains, exogenous"] = noise(pictures, torch.arange(len(pictures))).numpy()
+    samples[f"three_curtains, exogenous {TEXTURES}"] = noise(pictures, torch.arange(len(pictures))).numpy()
     return samples
 
 

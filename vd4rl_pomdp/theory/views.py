@@ -70,4 +70,5 @@ VIEWS = {
         ObjectiveView("mik+a literal", "window", actions=True, masked=True, literal=True),
     )
 }
-"""Every view by the name of its method; `literal` variants read the paper's formulas word for word."""
+"""Every view by the name of its method; of the paper's formulas `mik+a literal` reads the future word for word, and
+`fj+a literal` the past."""

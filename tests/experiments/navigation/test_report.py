@@ -18,7 +18,7 @@ from vd4rl_pomdp.experiments.navigation.report import write_report
 from vd4rl_pomdp.experiments.navigation.runs import NavigationRun, find_navigation, load_runs, read_trajectory
 from vd4rl_pomdp.mazes import FREE_CELLS, PAPER_MAZES
 from vd4rl_pomdp.navigation.measures import RAW_PREFIX, Measure, refitted_error
-from vd4rl_pomdp.navigation.methods import OBJECTIVES
+from vd4rl_pomdp.navigation.methods import OBJECTIVES, REFERENCES
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.results import add_results
 
@@ -363,7 +363,8 @@ def test_missing_cells_seeds_and_unfinished_runs_are_shown(runs, tmp_path, monke
     monkeypatch.setattr("matplotlib.axes.Axes.plot", lambda axes, *at, **style: marked.append(style.get("marker")))
     figures.accuracy_bars(loaded(runs), STATE, tmp_path / "bars.png")
     in_the_paper, ran = 19, 9
-    assert marked.count("x") == (in_the_paper - ran) + (in_the_paper - 1) + 1, "three_curtains, no_curtain, its random"
+    references = (len(REFERENCES) - 1) + len(REFERENCES)
+    assert marked.count("x") == (in_the_paper - ran) + (in_the_paper - 1) + references, "three_curtains, no_curtain"
 
 
 def test_a_navigation_report_writes_over_nothing_but_an_earlier_one(runs, tmp_path):
@@ -500,6 +501,19 @@ def test_the_bar_plot_has_the_papers_variants(runs, tmp_path, monkeypatch):
     figures.accuracy_bars(loaded(runs), STATE, tmp_path / "bars.png")
     paper = {condition_of(line, "three_curtains") for line in paper_rows() if line["exogenous"] == "N"}
     assert paper < set(drawn)
+
+
+def test_every_reference_has_a_place_and_a_cross_where_it_has_no_run(runs, tmp_path, monkeypatch):
+    crosses = []
+
+    def note(axes, at, *rest, **style):
+        if style.get("marker") == "x" and at != []:
+            crosses.append(at)
+
+    monkeypatch.setattr("matplotlib.axes.Axes.plot", note)
+    figures.accuracy_bars(loaded(runs), STATE, tmp_path / "bars.png")
+    places = [*OBJECTIVES, *REFERENCES]
+    assert {at for at in crosses if at > len(OBJECTIVES) - 0.5} == {places.index(name) for name in REFERENCES[1:]}
 
 
 def test_a_bar_below_zero_is_in_the_picture(tmp_path, monkeypatch):

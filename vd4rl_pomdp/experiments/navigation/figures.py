@@ -36,15 +36,15 @@ _NO_RUN: dict[str, Any] = {"color": "#999999", "linestyle": "", "marker": "x", "
 def accuracy_bars(runs: list[NavigationRun], measure: Measure, path: Path) -> None:
     """State prediction accuracy, 100 - error, of every objective and maze, as in the paper's bar plot.
 
-    A panel for each maze whose runs have the measure. The paper's marks stand beside raw units alone. What the paper or
-    another maze has and a maze lacks is crossed.
+    A panel for each maze whose runs have the measure. The paper's marks stand beside raw units alone. What a maze lacks
+    and the paper, another maze or the references have is crossed.
     """
     mazes = [maze for maze in MAZES if any(run.condition.maze == maze and measure in run.values for run in runs)]
     columns = min(2, len(mazes))
     rows = -(-len(mazes) // columns)
     figure = Figure(figsize=(1 + 5.2 * columns, 0.8 + 2.9 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
-    methods = [*OBJECTIVES, *(name for name in REFERENCES if any(run.condition.method == name for run in runs))]
+    methods = [*OBJECTIVES, *REFERENCES]
     for axes in panels.flat[len(mazes) :]:
         axes.set_axis_off()
     for axes, maze in zip(panels.flat, mazes, strict=False):
@@ -73,7 +73,7 @@ def _bar(
     if accuracy:
         axes.bar(place, np.mean(accuracy), _WIDTH, color=colour)
         axes.plot([place] * len(accuracy), accuracy, **_SEED)
-    elif is_missing(condition, runs) or _in_the_paper(condition):
+    elif is_missing(condition, runs) or _in_the_paper(condition) or _is_reference(condition):
         axes.plot(place, 2, **_NO_RUN)
     paper = paper_number(condition, measure)
     if paper is not None:
@@ -83,6 +83,11 @@ def _bar(
 def _in_the_paper(condition: Condition) -> bool:
     """Whether the paper's tables have it."""
     return condition in {condition_of(row, condition.maze) for row in paper_rows()}
+
+
+def _is_reference(condition: Condition) -> bool:
+    """Whether it is a reference at its only K, which every maze is held against."""
+    return condition == Condition(condition.maze, condition.method) and condition.method in REFERENCES
 
 
 def trajectories(runs: list[NavigationRun], path: Path) -> bool:

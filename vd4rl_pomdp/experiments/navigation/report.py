@@ -100,6 +100,7 @@ def _page(runs: list[NavigationRun], unfinished: list[Result], tables: list[Tabl
         "",
         *_unlike(runs),
         *_variants(runs),
+        *_images(runs),
         *(f"Unfinished, in no table: {code(str(result.path))} {progress(result)}.  " for result in unfinished),
         *([""] if unfinished else []),
         *_UNITS,
@@ -140,6 +141,17 @@ def _variants(runs: list[NavigationRun]) -> list[str]:
     if "compass_first_person" in mazes:
         found += ["`compass_first_person` is `first_person` under a sky that is coloured by azimuth.", ""]
     return found
+
+
+def _images(runs: list[NavigationRun]) -> list[str]:
+    """What was added to the pictures of runs with exogenous noise, maze by maze."""
+    noisy = [run for run in runs if run.condition.exogenous]
+    told = [
+        f"{markdown(' and '.join(dict.fromkeys(run.result.record['config']['exogenous'] for run in members)))} in "
+        f"{code(maze)}"
+        for maze, members in _by_maze(noisy).items()
+    ]
+    return [f"Exogenous noise adds {', '.join(told)}.", ""] if told else []
 
 
 def _budget(runs: list[NavigationRun]) -> str:
