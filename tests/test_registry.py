@@ -61,7 +61,9 @@ def test_what_packages_offer_outlives_a_block_that_met_it_first(registry, monkey
 
 
 def test_an_unknown_name_is_told_the_choices(registry):
-    with pytest.raises(UserError, match="unknown frame encoder 'owl': choose one of own, own\\+a"):
+    with pytest.raises(
+        UserError, match="unknown frame encoder 'owl': choose one of own, own\\+a, or run the file that registers it"
+    ):
         registry.named("owl")
     with pytest.raises(UserError, match="unknown frame encoder 'owl'"):
         registry.check("owl")

@@ -92,10 +92,21 @@ def refuse_number(name: str, value: float, low: float, high: float = MOST) -> No
         raise UserError(f"{flag_of(name)} is {value}; it must be at least {low} and at most {high}")
 
 
-def refuse_unknown(kind: str, name: object, choices: Iterable[object]) -> None:
-    """Raise UserError, listing the choices, for a name that is none of them; `kind` says what the name is of."""
+OR_ONES_OWN = ", or run the file that registers it"
+"""What else to do about an unknown name of a kind that parts of one's own can be of."""
+
+
+def refuse_unknown(kind: str, name: object, choices: Iterable[object], remedy: str = "") -> None:
+    """Raise UserError for a name that is none of the choices.
+
+    Args:
+        kind: what the name is of.
+        name: the name.
+        choices: what is listed.
+        remedy: what else may be done.
+    """
     if name not in (known := list(choices)):
-        raise UserError(f"unknown {kind} {name!r}: choose one of {', '.join(map(str, known))}")
+        raise UserError(f"unknown {kind} {name!r}: choose one of {', '.join(map(str, known))}{remedy}")
 
 
 def first_line(error: BaseException) -> str:

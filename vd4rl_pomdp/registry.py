@@ -12,7 +12,7 @@ from itertools import accumulate
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
-from vd4rl_pomdp.errors import UserError, refuse_unknown
+from vd4rl_pomdp.errors import OR_ONES_OWN, UserError, refuse_unknown
 
 Part = TypeVar("Part")
 BY_CALL = "registered by a call"
@@ -98,7 +98,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
             raise UserError(
                 f"{self.kind} {name!r} cannot be loaded ({self.broken[name]}): mend or remove what offers it"
             )
-        refuse_unknown(self.kind, name, self._parts)
+        refuse_unknown(self.kind, name, self._parts, OR_ONES_OWN)
         return self._parts[name]
 
     def check(self, name: str) -> None:

@@ -124,7 +124,7 @@ def test_a_runs_folder_in_place_of_its_encoders_is_told_of_the_encoder(tmp_path)
 
 def test_an_encoder_of_a_corruption_whose_file_was_not_run_says_so(tmp_path):
     save_encoder(tmp_path, Encoder(EncoderConfig(action_dim=6)), replace(CARD, corruption={"corruption": "fog"}))
-    with pytest.raises(UserError, match=r"unknown corruption 'fog'.*; run the file that adds what it names, or"):
+    with pytest.raises(UserError, match=r"unknown corruption 'fog'.*, or run the file that registers it\); mend"):
         load_encoder(tmp_path)
 
 

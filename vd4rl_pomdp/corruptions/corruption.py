@@ -14,7 +14,7 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp.corruptions.keys import DRAWS, KeyStream, derive_keys, draw_integers, draw_numbered, hash_keys
-from vd4rl_pomdp.errors import UserError, flag_of
+from vd4rl_pomdp.errors import OR_ONES_OWN, UserError, flag_of, refuse_unknown
 from vd4rl_pomdp.options import Limits, Options, flat, refuse_options
 from vd4rl_pomdp.registry import Registry
 from vd4rl_pomdp.seeding import stream_seed
@@ -129,7 +129,7 @@ def _kinds(corruption: str) -> list[type[Options]]:
         raise UserError(f"unknown corruption {corruption!r}: {ZERO_FRAMES} may only end a name: {sorted_names}")
     if any(name not in STAGES and name not in STAGES.broken for name in names):
         own = [name for name in STAGES if STAGES.origin(name)]
-        raise UserError(f"unknown corruption {corruption!r}: choose one of {', '.join([*CORRUPTIONS, *own])}")
+        refuse_unknown("corruption", corruption, [*CORRUPTIONS, *own], OR_ONES_OWN)
     return [STAGES.named(name) for name in names]
 
 

@@ -133,8 +133,7 @@ def load_encoder(
         _check_corruption(card)
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise UserError(
-            f"{folder}/config.json: names no encoder ({first_line(error)}); run the file that adds what it "
-            "names, or pretrain it again"
+            f"{folder}/config.json: names no encoder ({first_line(error)}); mend that, or pretrain it again"
         ) from error
     try:
         encoder.load_state_dict(read_tensors(folder / WEIGHTS))
