@@ -1,9 +1,9 @@
 """Baselines, one file each, on the library's contracts."""
 
-from baselines.acro import ACRO
+from baselines.acro import ACRO, ACROOptions
 from baselines.curl import CURL
 from baselines.driml import DRIML, DRIMLOptions
 from baselines.homer import HOMER, HOMEROptions
 from baselines.one_step_inverse import OneStepInverse
 
-__all__ = ["ACRO", "CURL", "DRIML", "HOMER", "DRIMLOptions", "HOMEROptions", "OneStepInverse"]
+__all__ = ["ACRO", "CURL", "DRIML", "HOMER", "ACROOptions", "DRIMLOptions", "HOMEROptions", "OneStepInverse"]

@@ -6,7 +6,6 @@ Authors' code: github.com/manantomar/agent-centric-representations (V-D4RL's DrQ
 
 Differences:
 - All pairs of a window are scored at once; the published code draws one k in 1..14 for each transition.
-- The two observations of a pair, as all of a window, share one random shift; the authors shift them independently.
 - The head's output is linear, theirs goes through a tanh; weights begin as PyTorch's do, theirs are orthogonal.
 - The action target is a choice (K-means codes by default, as in the navigation lineage); `mse_l2` is the published one.
 - The head's first layer is a sum of terms for e(o_t), e(o_{t+k}) and k; the published MLP (512-256-256) has no k unless
@@ -16,7 +15,18 @@ Differences:
 
 from __future__ import annotations
 
-from vd4rl_pomdp.objective import StateInverse
+from dataclasses import dataclass
+
+from vd4rl_pomdp.objective import InverseOptions, StateInverse
+
+
+@dataclass(frozen=True)
+class ACROOptions(InverseOptions):
+    """Options of `acro`."""
+
+    shift_shared: bool = False
+    """Whether the observations of a window share one random shift, as in the other inverse models here; the authors
+    shift each by itself."""
 
 
 class ACRO(StateInverse):

@@ -6,8 +6,8 @@ Authors' code: github.com/pathak22/noreward-rl (the inverse model of the intrins
 
 Differences:
 - The inverse model alone: no forward model, no curiosity reward, no policy trained with it.
-- It is ACRO with K = 1, so that nothing but K differs between the two; the action target is a choice.
-- The two observations share one random shift, as in ACRO here; the authors do not augment (`--shift 0`).
+- It is ACRO with K = 1; the action target is a choice.
+- The two observations share one random shift, as in `acro --shift-shared`; the authors do not augment (`--shift 0`).
 """
 
 from __future__ import annotations

@@ -176,6 +176,8 @@ def _build(dataset: Dataset, config: PretrainConfig) -> Objective:
 def view_of(dataset: Dataset, config: PretrainConfig) -> View:
     """What is seen of a set, shifted as the method has it."""
     shared = METHODS.named(config.method).shift
+    if getattr(config.options, "shift_shared", False):
+        shared = "window"
     if shared == "own":
         return View(dataset, config.corruption, 0, config.seed, STAGE)
     return View(dataset, config.corruption, config.shift, config.seed, STAGE, shared=shared)

@@ -6,7 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from baselines import ACRO, CURL, DRIML, HOMER, DRIMLOptions, HOMEROptions, OneStepInverse
+from baselines import ACRO, CURL, DRIML, HOMER, ACROOptions, DRIMLOptions, HOMEROptions, OneStepInverse
 from pretrain.objectives.all_history import AllHistory
 from pretrain.objectives.forward_jump import ForwardJump
 from pretrain.objectives.masked_inverse import MaskedActionOptions, MaskedInverse, MaskedOptions
@@ -35,7 +35,8 @@ class Method:
     """Rows before t that a GRU's state is computed from unless the user chooses m; None: all."""
     shift: Sharing | Literal["own"] = "window"
     """What shares one random shift: the observations of a window, or the frames of one observation, where what a window
-    shares would give the answer away; own: the objective shifts by itself, and what it is given is not shifted."""
+    shares would give the answer away, or where its authors have it so; own: the objective shifts by itself, and what it
+    is given is not shifted. An option `shift_shared` of its options, where it is True, makes it the window."""
     trained: bool = True
     """False for references that take no gradient step."""
     end_to_end: str = ""
@@ -103,7 +104,9 @@ _OWN = {
         options=MaskedActionOptions,
         summary="mik with past and future actions: the paper's method",
     ),
-    "acro": Method(ACRO, options=InverseOptions, summary="memoryless multi-step inverse model"),
+    "acro": Method(
+        ACRO, shift="observation", options=ACROOptions, summary="memoryless multi-step inverse model, as published"
+    ),
     "one_step_inverse": Method(
         OneStepInverse, options=ActionOptions, summary="inverse model on the observations t and t+1"
     ),
