@@ -86,7 +86,10 @@ def _draw(runs: list[NavigationRun], folder: Path) -> list[str]:
 _CAPTIONS = {
     "accuracy.png": ("Accuracy of every objective", "Bars: held-out trajectories, probe refitted on frozen states."),
     "accuracy_raw.png": ("The same in raw units", "The paper's marks are training averages."),
-    "trajectories.png": ("True and estimated trajectories", ""),
+    "trajectories.png": (
+        "True and estimated trajectories",
+        "From the first row on, where little was seen: errors count later ones.",
+    ),
     "observations.png": ("Sample observations", ""),
 }
 
