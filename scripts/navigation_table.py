@@ -34,6 +34,8 @@ REFERENCES = {
 }
 """Methods that no objective trains, as the pages call them."""
 STARS, COMPASS = "first_person", "compass_first_person"
+PICTURES = {"rgb50": "colour, 50x50", "rgb100": "colour, 100x100"}
+"""Pictures other than the preset's, as the pages call them."""
 ADDED = {"self_prediction": "self-prediction", "exogenous": "textures"}
 """What is added to a training or its pictures, as the pages call it."""
 _ORDER = ("mik+a", "fj+a", "ah", "mik", "fj", "ah+a", "no_history")
@@ -56,6 +58,11 @@ def first_person_runs() -> list[NavigationRun]:
 def first_rung_runs() -> list[NavigationRun]:
     """The runs of that grid at its smallest budget."""
     return load_runs(read_results(RESULTS / "first_person" / "small"))
+
+
+def picture_runs() -> list[NavigationRun]:
+    """Runs in first person with other pictures, or another learning rate, than the preset's: one seed of each."""
+    return [load_runs([result])[0] for result in read_results(RESULTS / "first_person" / "pictures")]
 
 
 def measured(runs: list[NavigationRun]) -> list[str]:
@@ -144,6 +151,31 @@ def first_rung_lines(runs: list[NavigationRun]) -> Iterator[str]:
             for unit in units
         ]
         yield f"| {words} | {' | '.join(cells)} |"
+
+
+def picture_lines(runs: list[NavigationRun], usual: list[NavigationRun]) -> Iterator[str]:
+    """Errors of position and velocity under the stars by what is changed, in both units, below those of the preset.
+
+    Args:
+        runs: those with one setting changed.
+        usual: runs of the preset.
+    """
+    methods = REFERENCES | {"mik+a": "`mik+a`"}
+    methods = {name: methods[name] for name in ("supervised_picture", "supervised", "mik+a")}
+    yield "| | " + " | ".join(f"{words} | raw x 100" for words in methods.values()) + " |"
+    yield "|---|" + "---:|" * (2 * len(methods))
+    groups: dict[str, list[NavigationRun]] = {"the preset: grey, 50x50, rate 0.002": usual}
+    for run in runs:
+        config = run.result.record["config"]
+        told = PICTURES.get(config["picture"]) or f"rate {config['learning_rate']:g}"
+        groups.setdefault(told, []).append(run)
+    for words, members in groups.items():
+        pairs = [
+            ", ".join(_mean(entry_of(Condition(STARS, name), one, members)) for one in unit)
+            for name in methods
+            for unit in (REFITTED[1:], [one.raw() for one in REFITTED[1:]])
+        ]
+        yield f"| {words} | {' | '.join(pairs)} |"
 
 
 def _line(name: str, entries: list[Entry]) -> str:

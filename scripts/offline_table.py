@@ -118,7 +118,12 @@ def gate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
 
 
 def _rank_correlation(runs: list[LoadedRun], probe: str) -> str:
-    """Spearman's, of a probe's error and the return over runs: -1 where the better of two always returns more."""
+    """Spearman's, of a probe's error and the return over runs: -1 where the better of two always returns more.
+
+    A dash for a single run, which has no order.
+    """
+    if len(runs) < 2:
+        return number(None)
     errors = np.array([run.representation[probe] for run in runs])
     ranks = [values.argsort().argsort() for values in (errors, returns_of(runs))]
     return f"{np.corrcoef(ranks)[0, 1]:.2f}"

@@ -45,6 +45,7 @@ def pages() -> dict[str, Tables]:
             "K = 1": navigation_table.state_lines(mazes, (1,)),
             **{words: navigation_table.added_lines(mazes, added) for added, words in navigation_table.ADDED.items()},
             "first rung": navigation_table.first_rung_lines(navigation_table.first_rung_runs()),
+            "pictures": navigation_table.picture_lines(navigation_table.picture_runs(), mazes),
             "first person": navigation_table.first_person_lines(navigation_table.first_person_runs()),
         },
         "results/control/README.md": {"control": control_table.table_lines(control_table.RESULTS)},
