@@ -33,6 +33,12 @@ REFERENCES = {
     "supervised_picture": "told the states: one picture",
 }
 """Methods that no objective trains, as the pages call them."""
+HARD_SPREADS = {
+    **dict.fromkeys(("hard_no_curtain", "hard_one_curtain", "hard_three_curtains"), ((0.66, 0.85), (2.26, 2.44))),
+    "hard_first_person": ((0.81, 0.93), (1.65, 1.87)),
+}
+"""The lesser and the greater deviation of position and of velocity in the sets, which were collected again for them:
+a percentage is a mean over both coordinates, so the raw error lies between its products with the two."""
 STARS, COMPASS = "first_person", "compass_first_person"
 PICTURES = {"rgb50": "colour, 50x50", "rgb100": "colour, 100x100"}
 """Pictures other than the preset's, as the pages call them."""
@@ -176,6 +182,27 @@ def picture_lines(runs: list[NavigationRun], usual: list[NavigationRun]) -> Iter
             for unit in (REFITTED[1:], [one.raw() for one in REFITTED[1:]])
         ]
         yield f"| {words} | {' | '.join(pairs)} |"
+
+
+def hard_lines(runs: list[NavigationRun]) -> Iterator[str]:
+    """Errors of position and velocity at K = 15 in the harder mazes, with what they can be in raw units."""
+    yield f"| | {' | '.join(f'`{maze}`' for maze in HARD_SPREADS)} |"
+    yield "|---|" + "---:|" * len(HARD_SPREADS)
+    for method, words in ({name: f"`{name}`" for name in _ORDER} | REFERENCES).items():
+        cells = []
+        for maze, spreads in HARD_SPREADS.items():
+            entries = [entry_of(Condition(maze, method), error, runs) for error in REFITTED[1:]]
+            cells.append(", ".join(filter(None, map(_bounded, entries, spreads))))
+        if any(cells):
+            yield f"| {words} | {' | '.join(cell or number(None) for cell in cells)} |"
+
+
+def _bounded(entry: Entry, spread: tuple[float, float]) -> str:
+    """Percent of deviations, and the raw x 100 that it lies between; nothing if there is no seed."""
+    if not len(entry.numbers):
+        return ""
+    low, high = (entry.numbers.mean() * deviation for deviation in spread)
+    return f"{_mean(entry)} ({low:.1f} to {high:.1f})"
 
 
 def _line(name: str, entries: list[Entry]) -> str:

@@ -105,7 +105,7 @@ def gate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
         place = row["task"], row["quality"]
         if row["corruption"] in (HIDDEN, PATCHES) and place in SETS:
             shares = [number(row[name], 2) for name in ("data_return", "state_share", "acro_share", "best_share")]
-            above = f"{number(row['above_random'], 0)} ± {number(row['error'], 0)}"
+            above = number(row["above_random"], 0) + ("" if row["error"] is None else f" ± {row['error']:.0f}")
             here = [run for run in runs if _place(run) == place and run.labels["corruption"] == row["corruption"]]
             probed = _probed(here)
             ranks = ", ".join(_rank_correlation(probed, probe) for probe in PROBES)

@@ -42,6 +42,7 @@ def pages() -> dict[str, Tables]:
         },
         "docs/navigation.md": {
             **{maze: navigation_table.maze_lines(mazes, maze) for maze in navigation_table.measured(mazes)},
+            "hard": navigation_table.hard_lines(mazes),
             "K = 1": navigation_table.state_lines(mazes, (1,)),
             **{words: navigation_table.added_lines(mazes, added) for added, words in navigation_table.ADDED.items()},
             "first rung": navigation_table.first_rung_lines(navigation_table.first_rung_runs()),
