@@ -20,10 +20,11 @@ from vd4rl_pomdp.results import read_results
 RESULTS = Path(__file__).parents[1] / "results" / "navigation"
 REFITTED = [refitted_error(component) for component in ("state", "position", "velocity")]
 """In percent, on held-out trajectories."""
+REFITTED_RAW = [error.raw() for error in REFITTED]
 MEASURES = (
     *(online_error(component).raw() for component in ("state", "position", "velocity")),
     *REFITTED,
-    *(error.raw() for error in REFITTED),
+    *REFITTED_RAW,
 )
 """Of a maze's table: the paper's way and units, then both units by the refitted probe."""
 REFERENCES = {
@@ -85,10 +86,8 @@ def maze_lines(runs: list[NavigationRun], maze: str) -> Iterator[str]:
     yield "| | seeds | state | position | velocity | state, position, velocity in % | the same raw x 100 |"
     yield "|---|---:|---:|---:|---:|---:|---:|"
     rows = {name: [entry_of(Condition(maze, name), one, runs) for one in MEASURES] for name in METHOD_NAMES}
-    for method in sorted(OBJECTIVES, key=lambda name: rows[name][0].numbers.mean()):
-        yield _line(f"`{method}`", rows[method])
-    for method, words in REFERENCES.items():
-        yield _line(words, rows[method])
+    for method in (*sorted(OBJECTIVES, key=lambda name: rows[name][0].numbers.mean()), *REFERENCES):
+        yield _line(_called(method), rows[method])
 
 
 def state_lines(runs: list[NavigationRun], ks: Sequence[int]) -> Iterator[str]:
@@ -135,7 +134,7 @@ def first_person_lines(runs: list[NavigationRun]) -> Iterator[str]:
     }
     told = objectives | {words: Condition(COMPASS, name) for name, words in REFERENCES.items()}
     online = [one._replace(probe="online") for one in REFITTED[1:]]
-    measures = [*REFITTED, *(one.raw() for one in REFITTED), *online, *(one.raw() for one in online)]
+    measures = [*REFITTED, *REFITTED_RAW, *online, *(one.raw() for one in online)]
     rows = {name: [entry_of(condition, one, runs) for one in measures] for name, condition in told.items()}
     trained = [name for name, (state, *_) in rows.items() if len(state.numbers)]
     for name in sorted(trained, key=lambda one: rows[one][0].numbers.mean()):
@@ -148,15 +147,9 @@ def first_rung_lines(runs: list[NavigationRun]) -> Iterator[str]:
     """Errors of position and velocity at the smallest budget, under the stars and under the compass, in both units."""
     yield "| | `first_person` | raw x 100 | `compass_first_person` | raw x 100 |"
     yield "|---|---:|---:|---:|---:|"
-    percent = REFITTED[1:]
-    units = percent, [one.raw() for one in percent]
-    for method, words in (REFERENCES | {name: f"`{name}`" for name in ("no_history", "mik+a", "ah+a")}).items():
-        cells = [
-            ", ".join(_mean(entry_of(Condition(maze, method), one, runs)) for one in unit)
-            for maze in (STARS, COMPASS)
-            for unit in units
-        ]
-        yield f"| {words} | {' | '.join(cells)} |"
+    for method in (*REFERENCES, "no_history", "mik+a", "ah+a"):
+        cells = [_place_and_speed(Condition(maze, method), runs) for maze in (STARS, COMPASS)]
+        yield f"| {_called(method)} | {' | '.join(cells)} |"
 
 
 def picture_lines(runs: list[NavigationRun], usual: list[NavigationRun]) -> Iterator[str]:
@@ -166,9 +159,8 @@ def picture_lines(runs: list[NavigationRun], usual: list[NavigationRun]) -> Iter
         runs: those with one setting changed.
         usual: runs of the preset.
     """
-    methods = REFERENCES | {"mik+a": "`mik+a`"}
-    methods = {name: methods[name] for name in ("supervised_picture", "supervised", "mik+a")}
-    yield "| | " + " | ".join(f"{words} | raw x 100" for words in methods.values()) + " |"
+    methods = ("supervised_picture", "supervised", "mik+a")
+    yield "| | " + " | ".join(f"{_called(name)} | raw x 100" for name in methods) + " |"
     yield "|---|" + "---:|" * (2 * len(methods))
     groups: dict[str, list[NavigationRun]] = {"the preset: grey, 50x50, rate 0.002": usual}
     for run in runs:
@@ -176,25 +168,32 @@ def picture_lines(runs: list[NavigationRun], usual: list[NavigationRun]) -> Iter
         told = PICTURES.get(config["picture"]) or f"rate {config['learning_rate']:g}"
         groups.setdefault(told, []).append(run)
     for words, members in groups.items():
-        pairs = [
-            ", ".join(_mean(entry_of(Condition(STARS, name), one, members)) for one in unit)
-            for name in methods
-            for unit in (REFITTED[1:], [one.raw() for one in REFITTED[1:]])
-        ]
-        yield f"| {words} | {' | '.join(pairs)} |"
+        cells = [_place_and_speed(Condition(STARS, name), members) for name in methods]
+        yield f"| {words} | {' | '.join(cells)} |"
+
+
+def _place_and_speed(condition: Condition, runs: list[NavigationRun]) -> str:
+    """Two cells: errors of position and velocity by the refitted probe, in percent and in raw units."""
+    entries = [[entry_of(condition, error, runs) for error in unit] for unit in (REFITTED[1:], REFITTED_RAW[1:])]
+    return " | ".join(", ".join(map(_mean, unit)) for unit in entries)
+
+
+def _called(method: str) -> str:
+    """A method's name, or what the pages call a reference."""
+    return REFERENCES.get(method, f"`{method}`")
 
 
 def hard_lines(runs: list[NavigationRun]) -> Iterator[str]:
     """Errors of position and velocity at K = 15 in the harder mazes, with what they can be in raw units."""
     yield f"| | {' | '.join(f'`{maze}`' for maze in HARD_SPREADS)} |"
     yield "|---|" + "---:|" * len(HARD_SPREADS)
-    for method, words in ({name: f"`{name}`" for name in _ORDER} | REFERENCES).items():
+    for method in (*_ORDER, *REFERENCES):
         cells = []
         for maze, spreads in HARD_SPREADS.items():
             entries = [entry_of(Condition(maze, method), error, runs) for error in REFITTED[1:]]
             cells.append(", ".join(filter(None, map(_bounded, entries, spreads))))
         if any(cells):
-            yield f"| {words} | {' | '.join(cell or number(None) for cell in cells)} |"
+            yield f"| {_called(method)} | {' | '.join(cell or number(None) for cell in cells)} |"
 
 
 def _bounded(entry: Entry, spread: tuple[float, float]) -> str:
