@@ -12,6 +12,7 @@ from types import ModuleType
 import numpy as np
 import pytest
 
+from vd4rl_pomdp.experiments.navigation.report import write_report
 from vd4rl_pomdp.navigation.measures import online_error, refitted_error
 from vd4rl_pomdp.report.gates import returns_of
 from vd4rl_pomdp.report.load import load_runs
@@ -22,6 +23,7 @@ TOLD = re.compile(r"[-+]?\d+(?:\.\d+)? ± \d+(?:\.\d+)?")
 MAIN = ("control", "offline")
 """Folders whose rows count as one."""
 ASIDE = ("control/budget", "control/histories", "control/expert")
+REPORTS = sorted(found.parent for found in (ROOT / "results" / "navigation").rglob("tables.csv"))
 MEASURES = (
     *(online_error(component).raw() for component in ("state", "position", "velocity")),
     *(refitted_error(component) for component in ("state", "position", "velocity")),
@@ -107,3 +109,13 @@ def test_what_a_page_tells_is_in_the_rows(page, known):
 @pytest.mark.parametrize("text", ["`mik+a` returns 521 ± 60", "`mik` minus `acro` +181 ± 13", "missed by 5.15 ± 0.11"])
 def test_what_no_row_says_is_found(text, known):
     assert unknown(text, known) == TOLD.findall(text)
+
+
+@pytest.mark.parametrize("place", REPORTS, ids=lambda place: place.name)
+def test_a_report_on_mazes_is_what_its_rows_and_todays_code_make_of_it(place, tmp_path):
+    """But for the sample observations, which take a renderer."""
+    write_report([place], tmp_path / "again")
+    for name in ("README.md", "rows.csv", "tables.csv"):
+        committed = (place / name).read_text(encoding="utf-8")
+        sample = "![Sample observations](figures/observations.png)\n\n"
+        assert (tmp_path / "again" / name).read_text(encoding="utf-8") == committed.replace(sample, ""), name
