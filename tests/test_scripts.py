@@ -9,6 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from pretrain.train import pretrain
+from tests.helpers_data import write_fake_set
+from tests.helpers_stages import smoke_pretrain
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
 from vd4rl_pomdp.errors import UserError
@@ -102,6 +105,32 @@ def test_the_measurement_is_refused_in_a_line(tmp_path, monkeypatch, settings, m
     script = importlib.import_module("noisy_states")
     with pytest.raises(UserError, match=message):
         script.main(script.Config(**settings, out=tmp_path / "table.csv"))
+
+
+def test_what_a_cell_saves_leaves_its_return_as_it_is(tmp_path, monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    script = importlib.import_module("cell_cost")
+    data = write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25, 30])
+    encoder = pretrain(smoke_pretrain(data, tmp_path / "made", method="mik")).path / "encoder"
+    cell = {"updates": 4, "eval_every": 4, "eval_episodes": 2, "eval_length": 6, "eval_clean": False, "workers": 1}
+    monkeypatch.setattr(script, "CELL", cell | {"batch_size": 4, "hidden_dim": 8, "views": 1})
+    monkeypatch.setitem(script.CHANGES, "a second evaluation", {"eval_every": 2})
+    undrawn, frame = [], CorruptedEnv._frame
+    monkeypatch.setattr(
+        CorruptedEnv, "_frame", lambda *words: (undrawn.append(words[1].frame is None), frame(*words))[1]
+    )
+    returns, hidden = {}, {}
+    for change in script.CHANGES:
+        undrawn.clear()
+        script.main(script.Config((encoder,), data, (change,), tmp_path / "table.csv"))
+        with (tmp_path / "table.csv").open() as file:
+            (row,) = csv.DictReader(file)
+        assert float(row["seconds"]) > 0
+        returns[row["change"]], hidden[row["change"]] = row["return"], (sum(undrawn), len(undrawn))
+    assert len({told for change, told in returns.items() if change != "float32 updates"}) == 1
+    assert hidden["all frames drawn"] == (0, 14)
+    assert hidden["none"][0] > 0
+    assert hidden["a second evaluation"][1] == 28
 
 
 def test_another_python_makes_the_environment_anew(tmp_path):
