@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -14,12 +14,17 @@ from vd4rl_pomdp.report.load import PROBES, LoadedRun, load_runs
 from vd4rl_pomdp.report.measures import mean_if_known
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.report.tables import TOLD_STATES
+from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
+from vd4rl_pomdp.sweeps.sets import set_of
+from vd4rl_pomdp.sweeps.stages import recorded
 
 RESULTS = Path(__file__).parents[1] / "results"
 GRIDS = ("offline", "control")
 HIDDEN, PATCHES, CLEAN = "patch+zero_frames", "patch", "none"
+UNTRAINED = "random"
 SETS = {
     ("walker_walk", "expert_noisy"): "walker_walk, noisy expert",
     ("walker_walk", "expert"): "walker_walk, expert",
@@ -85,8 +90,7 @@ def set_lines(runs: Sequence[LoadedRun], task: str, quality: str, corruption: st
     methods = {run.labels["method"]: _of(here, run.labels["method"], corruption) for run in here}
     shown = [(method, mine) for method, mine in methods.items() if mine]
     for method, mine in sorted(shown, key=lambda one: -returns_of(one[1]).mean()):
-        loop = number(mean_if_known(row["action_error"] for run in mine for row in run.last), 3)
-        data = number(mean_if_known(run.reference.path_error for run in mine), 3)
+        data, loop = (number(mean_if_known(map(known, mine)), 3) for known in (_path_error, _loop_error))
         probes = probes_of(method, [mean_if_known(run.representation[name] for run in mine) for name in PROBES])
         yield (
             f"| `{method}` | {len(mine)} | {with_seeds(returns_of(mine).tolist())} | {spread_of(mine)} |"
@@ -95,44 +99,129 @@ def set_lines(runs: Sequence[LoadedRun], task: str, quality: str, corruption: st
 
 
 def gate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
-    """What has to hold on a set before methods are ranked on it, and how well a probe orders the returns there."""
+    """What has to hold on a set before methods are ranked on it."""
     yield (
         "| set | data's return | `state`, of it | `acro` with nothing hidden, of it | best of it | best less `random` |"
-        " passed | probe and return: rank correlation (runs): pose, velocity |"
+        " passed |"
     )
-    yield "|---|---:|---:|---:|---:|---:|---|---:|"
+    yield "|---|---:|---:|---:|---:|---:|---|"
+    for row in _judged(runs):
+        shares = [number(row[name], 2) for name in ("state_share", "acro_share", "best_share")]
+        above = number(row["above_random"], 0) + ("" if row["error"] is None else f" ± {row['error']:.0f}")
+        yield f"| {row['name']} | {row['data_return']:.0f} | {' | '.join(shares)} | {above} | {row['passed']} |"
+
+
+def rank_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """How well what is known of a policy orders the returns on a set, with and without untrained encoders."""
+    yield "| set | passed | runs | " + " | ".join(GOING_WITH) + " |"
+    yield "|---|---|---:|" + "---:|" * len(GOING_WITH)
+    for row in _judged(runs):
+        place = row["task"], row["quality"]
+        probed = _probed(
+            [run for run in runs if (*_place(run), run.labels["corruption"]) == (*place, row["corruption"])]
+        )
+        trained = [run for run in probed if run.labels["method"] != UNTRAINED]
+        cells = (
+            f"{_rank_correlation(probed, known)}, {_rank_correlation(trained, known)}" for known in GOING_WITH.values()
+        )
+        yield f"| {row['name']} | {row['passed']} | {len(probed)}, {len(trained)} | {' | '.join(cells)} |"
+
+
+def _judged(runs: Sequence[LoadedRun]) -> Iterator[Row]:
+    """Gates of the sets that pages tell of, by their `name`s there, and whether they are `passed`."""
     for row in gates(list(runs)):
         place = row["task"], row["quality"]
         if row["corruption"] in (HIDDEN, PATCHES) and place in SETS:
-            shares = [number(row[name], 2) for name in ("data_return", "state_share", "acro_share", "best_share")]
-            above = number(row["above_random"], 0) + ("" if row["error"] is None else f" ± {row['error']:.0f}")
-            here = [run for run in runs if _place(run) == place and run.labels["corruption"] == row["corruption"]]
-            probed = _probed(here)
-            ranks = ", ".join(_rank_correlation(probed, probe) for probe in PROBES)
             passed = {PASSED: "yes", FAILED: "no", UNKNOWN: "not known"}[row["verdict"].partition(":")[0]]
-            name = table_name(*place, row["corruption"])
-            yield (
-                f"| {name} | {row['data_return']:.0f} | {' | '.join(shares[1:])} | {above} | {passed} |"
-                f" {ranks} ({len(probed)}) |"
-            )
+            yield row | {"name": table_name(*place, row["corruption"]), "passed": passed}
 
 
-def _rank_correlation(runs: list[LoadedRun], probe: str) -> str:
-    """Spearman's, of a probe's error and the return over runs: -1 where the better of two always returns more.
+def _rank_correlation(runs: list[LoadedRun], known: Callable[[LoadedRun], float | None]) -> str:
+    """Spearman's, of an error and the return over runs: -1 where the one that errs less always returns more.
 
-    A dash for a single run, which has no order.
+    A dash for a single run, which has no order, and where a run does not know its error.
     """
-    if len(runs) < 2:
+    errors = [known(run) for run in runs]
+    if len(runs) < 2 or None in errors:
         return number(None)
-    errors = np.array([run.representation[probe] for run in runs])
-    ranks = [values.argsort().argsort() for values in (errors, returns_of(runs))]
+    ranks = [np.array(values).argsort().argsort() for values in (errors, returns_of(runs))]
     return f"{np.corrcoef(ranks)[0, 1]:.2f}"
+
+
+def _probe_error(probe: str) -> Callable[[LoadedRun], float | None]:
+    return lambda run: run.representation[probe]
+
+
+def _path_error(run: LoadedRun) -> float | None:
+    return run.reference.path_error
+
+
+def _loop_error(run: LoadedRun) -> float | None:
+    return mean_if_known(row["action_error"] for row in run.last)
+
+
+GOING_WITH: dict[str, Callable[[LoadedRun], float | None]] = {
+    "probe of the pose": _probe_error(PROBES[0]),
+    "probe of the velocity": _probe_error(PROBES[1]),
+    "actions on the data": _path_error,
+    "actions in closed loop": _loop_error,
+}
+"""Errors that returns may go with."""
 
 
 def _probed(runs: Sequence[LoadedRun]) -> list[LoadedRun]:
     """Those with a probe that is held out: not of methods that were told the states."""
     known = (run for run in runs if run.representation[PROBES[0]] is not None)
     return [run for run in known if run.labels["method"] not in TOLD_STATES]
+
+
+def layer_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """How many cells of each layer of the grid are measured, by task."""
+    cells = load_grid(GRIDS[0]).cells()
+    wanted = {(*_labels_of(cell), cell.seed) for cell in cells}
+    measured = {tuple(run.labels[name] for name in (*_CELL, "seed")) for run in runs} & wanted
+    tasks = list(dict.fromkeys(task for task, *_ in map(_labels_of, cells)))
+    yield f"| layer | {' | '.join(tasks)} |"
+    yield "|---|" + "---:|" * len(tasks)
+    for layer, words in LAYERS.items():
+        counts = []
+        for task in tasks:
+            asked, found = (
+                sum(one[0] == task and _layer(*one[:4]) == layer for one in ours) for ours in (wanted, measured)
+            )
+            counts.append(f"{found} of {asked}" if asked else "–")
+        yield f"| ({layer}) {words} | {' | '.join(counts)} |"
+
+
+_CELL = ("task", "quality", "corruption", "method")
+LAYERS = {
+    "a": "sets that leave the expert's path, patches and zeroed frames",
+    "b": "the paper's qualities, patches and zeroed frames, and their references",
+    "c": "the paper's qualities, patches alone",
+    "d": "the other methods, patches and zeroed frames",
+    "e": "a third task, patches and zeroed frames, and its references",
+    "f": "`medium` and `medium_replay`, five seeds",
+}
+"""Of the grid `offline`, in their order."""
+_MAIN_METHODS = ("mik+a", "mik", "ah+a", "acro", UNTRAINED, "supervised+a", "state")
+
+
+def _layer(task: str, quality: str, corruption: str, method: str) -> str:
+    if quality in ("medium", "medium_replay"):
+        return "f"
+    if task == "humanoid_walk":
+        return "e"
+    if method not in _MAIN_METHODS:
+        return "d"
+    if corruption == PATCHES:
+        return "c"
+    return "a" if quality == "expert_noisy" else "b"
+
+
+def _labels_of(cell: GridCell) -> tuple[str, ...]:
+    """Values of _CELL."""
+    before, wanted = recorded(cell, "pretrain"), set_of(cell, Path()).wanted
+    return wanted["task"], wanted["quality"], before["corruption"], before["method"]
 
 
 def cost_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:

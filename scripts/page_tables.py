@@ -52,7 +52,9 @@ def pages() -> dict[str, Tables]:
         "results/control/README.md": {"control": control_table.table_lines(control_table.RESULTS)},
         "results/methods/README.md": {"methods": methods_table.table_lines(methods_table.main_runs())},
         "results/offline/README.md": {
+            "layers": offline_table.layer_lines(returns),
             "gates": offline_table.gate_lines(returns),
+            "ranks": offline_table.rank_lines(returns),
             **{
                 offline_table.table_name(*place): offline_table.set_lines(returns, *place)
                 for place in offline_table.page_sets(returns)

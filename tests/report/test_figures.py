@@ -8,6 +8,7 @@ import pytest
 from matplotlib.axes import Axes
 
 from tests.helpers_report import write_run
+from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.report import write, write_report
 from vd4rl_pomdp.report.lines import loss_rows
 from vd4rl_pomdp.report.load import load_runs
@@ -63,6 +64,27 @@ def test_axes_of_positive_returns_begin_at_zero(tmp_path, monkeypatch):
     assert shown["curves_patch"][0].get_ylim() == (0, pytest.approx(1.05 * 61))
     assert shown["probes_patch"][0].get_ylim() == (pytest.approx(-0.04 * 610), pytest.approx(1.06 * 610))
     assert shown["profiles"][0].get_xlim() == (0, 100)
+
+
+def test_returns_stand_over_the_errors_of_their_actions(tmp_path, monkeypatch):
+    for name, told, errors in (("told", 0.25, (0.5, 0.7)), ("untold", None, ())):
+        run = write_run(tmp_path / f"runs/{name}", name, 0, {10: [30.0, 50.0]})
+        Reference(500.0, None, told).write(run)
+        lines = (run / "episodes.csv").read_text().splitlines()
+        place = lines[0].split(",").index("action_error")
+        for number, error in enumerate(errors, 1):
+            cells = lines[number].split(",")
+            lines[number] = ",".join([*cells[:place], str(error), *cells[place + 1 :]])
+        (run / "episodes.csv").write_text("\n".join(lines) + "\n")
+    shown = drawn(tmp_path, monkeypatch, {"mik+a": 60.0})
+    panels = {
+        panel.get_title(): [dots.get_offsets().tolist() for dots in panel.collections]
+        for panel in shown["errors_patch"]
+    }
+    assert panels == {
+        "walker_walk expert, actions on the data": [[[0.25, 400.0]]],
+        "walker_walk expert, actions in closed loop": [[[0.6, 400.0]]],
+    }
 
 
 def pretrained(place: Path, seed: int, every: int, loss: float, steps: int = 50_000, finished: bool = True) -> None:

@@ -8,6 +8,7 @@ from pathlib import Path
 
 import pretrain.objectives
 from tests.helpers_report import METHODS, describe, grid, pretraining, write_grid, write_run
+from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.report import figures, films, layout, tables, write, write_report
 from vd4rl_pomdp.report.figures import style
 from vd4rl_pomdp.report.load import LoadedRun
@@ -36,9 +37,10 @@ def test_every_figure_has_its_files_its_words_and_n(tmp_path, figure_files):
     pretraining(runs / "pretrain")
     for seed in (0, 1):
         write_json(runs / f"acro{seed}" / "probe.json", {"probe_pose": 20.0 + seed, "probe_velocity": 40.0})
+        Reference(500.0, None, 0.01).write(runs / f"acro{seed}")
     page, *_ = write_report([runs], tmp_path / "out")
     found = {path.name for path in (tmp_path / "out" / "figures").iterdir()}
-    names = {"scores_patch", "profiles", "curves_patch", "probes_patch", "costs", "losses"}
+    names = {"scores_patch", "profiles", "curves_patch", "probes_patch", "errors_patch", "costs", "losses"}
     assert found == {f"{name}.{kind}" for name in names for kind in ("csv", "png", "pdf")}
     shown = Page(page)
     assert {link for link in shown.links if link.startswith("figures/")} == {f"figures/{name}" for name in found}

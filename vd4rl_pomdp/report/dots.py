@@ -1,45 +1,82 @@
-"""Returns against what linear probes read from representations, and what runs cost."""
+"""Returns against what probes read from representations and how actions err, and what runs cost."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from dataclasses import dataclass
 from typing import Any
 
 from matplotlib.axes import Axes
 
 from vd4rl_pomdp.report.figures import COLOURS, Plot, file_name, panels, seeds_note, span, style
 from vd4rl_pomdp.report.load import PROBES, SETTING
-from vd4rl_pomdp.report.measures import COSTS
+from vd4rl_pomdp.report.measures import ACTION_ERRORS, COSTS
 from vd4rl_pomdp.report.tables import by_label, grouped, label
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.text import plain
 
-_NAMES = dict(zip(PROBES, ("pose", "velocity"), strict=True))
 _MANY = 300
 """Dots of a figure, above which they are one picture within it, and its words are of the best runs."""
 _TOLD = 20
 """Runs that the words of a panel tell of, at most."""
-_COLUMNS = (*SETTING, "method", "seed", *PROBES, "return")
 
 
-def probe_plots(runs: list[Row], looks: dict[str, int]) -> list[Plot]:
-    """Return against the probes' errors, one figure a corruption, two panels a setting, one dot a run."""
-    probed = [row for row in runs if row["return"] is not None and any(row[probe] is not None for probe in PROBES)]
+@dataclass(frozen=True)
+class Against:
+    """What returns are drawn against: two measures of a run, a panel each."""
+
+    name: str
+    errors: str
+    """What they are, in two words."""
+    panels: Mapping[str, str]
+    """Titles of the panels, by the measures' columns in the table of runs."""
+    axis: str
+    caption: str
+    words: str
+    """How a value is told."""
+
+
+PROBED = Against(
+    "probes",
+    "probe errors",
+    dict(zip(PROBES, ("pose", "velocity"), strict=True)),
+    "error, %",
+    "the error of a linear probe of pose and of velocity, in percent of a standard deviation",
+    "{:.1f}%",
+)
+ACTED = Against(
+    "errors",
+    "action errors",
+    dict(zip(ACTION_ERRORS, ("actions on the data", "actions in closed loop"), strict=True)),
+    "mean squared error",
+    "the mean squared difference between its actions and those of the data's actor, on the data and in closed loop",
+    "{:.3f}",
+)
+
+
+def return_plots(runs: list[Row], looks: dict[str, int], against: Against) -> list[Plot]:
+    """Return against two measures, one figure a corruption, two panels a setting, one dot a run."""
+    measured = [
+        row for row in runs if row["return"] is not None and any(row[name] is not None for name in against.panels)
+    ]
     plots = []
-    for (corruption,), members in grouped(probed, ("corruption",)):
+    for (corruption,), members in grouped(measured, ("corruption",)):
         places = grouped(members, ("task", "quality"))
-        titles = [f"{' '.join(place)}, {measured}" for place, _ in places for measured in _NAMES.values()]
+        titles = [f"{' '.join(place)}, {title}" for place, _ in places for title in against.panels.values()]
         figure, axes = panels(titles, _of(looks, members), 4 if len(places) > 1 else 2)
         for number, (_, rows) in enumerate(places):
-            for panel, probe in zip(axes[2 * number :], PROBES, strict=False):
-                _dots(panel, rows, probe, looks, rasterized=len(members) > _MANY)
+            for panel, column in zip(axes[2 * number :], against.panels, strict=False):
+                _dots(panel, rows, column, looks, rasterized=len(members) > _MANY)
+                panel.set_xlabel(against.axis, fontsize=8)
+        columns = (*SETTING, "method", "seed", *against.panels, "return")
         plots.append(
             Plot(
-                file_name("probes", corruption),
-                f"Final return under {corruption} against the error of a linear probe of pose and of velocity, in "
-                f"percent of a standard deviation; further left is better. One dot a run, n = {len(members)} runs.",
-                f"Return against probe errors. {'; '.join(_words(rows) for _, rows in places)}.",
+                file_name(against.name, corruption),
+                f"Final return under {corruption} against {against.caption}; further left is better. "
+                f"One dot a run, n = {len(members)} runs.",
+                f"Return against {against.errors}. {'; '.join(_words(rows, against) for _, rows in places)}.",
                 figure,
-                [{name: row[name] for name in _COLUMNS} | {"method": label(row)} for row in members],
+                [{name: row[name] for name in columns} | {"method": label(row)} for row in members],
             )
         )
     return plots
@@ -51,28 +88,29 @@ def _of(looks: dict[str, int], rows: list[Row]) -> dict[str, int]:
     return {name: look for name, look in looks.items() if name in here}
 
 
-def _dots(axes: Axes, rows: list[Row], probe: str, looks: dict[str, int], rasterized: bool) -> None:
-    known = [row for row in rows if row[probe] is not None]
+def _dots(axes: Axes, rows: list[Row], column: str, looks: dict[str, int], rasterized: bool) -> None:
+    known = [row for row in rows if row[column] is not None]
     for method, mine in by_label(known):
         look = {name: value for name, value in style(looks[method]).items() if name != "linestyle"}
-        errors, returns = [row[probe] for row in mine], [row["return"] for row in mine]
+        errors, returns = [row[column] for row in mine], [row["return"] for row in mine]
         axes.scatter(errors, returns, 26, ec="white", lw=0.5, zorder=-1 if rasterized else 3, **look)
     axes.set_rasterization_zorder(0)
-    for set_limits, name in ((axes.set_xlim, probe), (axes.set_ylim, "return")):
+    for set_limits, name in ((axes.set_xlim, column), (axes.set_ylim, "return")):
         low, high = span(row[name] for row in known)
         set_limits(low - 0.04 * (high - low), low + 1.06 * (high - low))
-    axes.set_xlabel("error, %", fontsize=8)
     axes.set_ylabel("return", fontsize=8)
 
 
-def _words(rows: list[Row]) -> str:
+def _words(rows: list[Row], against: Against) -> str:
     ordered = sorted(rows, key=lambda row: -row["return"])
     more = f"; and {len(rows) - _TOLD} runs with lower returns" if len(rows) > _TOLD else ""
-    return f"{rows[0]['task']} {rows[0]['quality']}: {'; '.join(map(_run_words, ordered[:_TOLD]))}{more}"
+    told = "; ".join(_run_words(row, against) for row in ordered[:_TOLD])
+    return f"{rows[0]['task']} {rows[0]['quality']}: {told}{more}"
 
 
-def _run_words(row: Row) -> str:
-    errors = (f"{name} {row[probe]:.1f}%" for probe, name in _NAMES.items() if row[probe] is not None)
+def _run_words(row: Row, against: Against) -> str:
+    known = {title: row[column] for column, title in against.panels.items() if row[column] is not None}
+    errors = (f"{title} {against.words.format(value)}" for title, value in known.items())
     return f"{label(row)}, seed {row['seed']}: return {row['return']:.0f}, {', '.join(errors)}"
 
 

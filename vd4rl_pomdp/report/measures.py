@@ -14,8 +14,10 @@ from vd4rl_pomdp.report.tables import by_label, grouped, table_order
 from vd4rl_pomdp.runs.files import Row
 
 COSTS = ("pretrain_seconds", "finetune_seconds")
+ACTION_ERRORS = ("path_error", "action_error")
+"""Of a policy, on the data's rows and in closed loop."""
 _RUN = (
-    *("id", *IDENTITY, "action_loss", *PROBES, "score", "return", "best_score", "best_step"),
+    *("id", *IDENTITY, "action_loss", *PROBES, *ACTION_ERRORS, "score", "return", "best_score", "best_step"),
     *(*COSTS, "git_commit", "machine", "state"),
 )
 _EVALUATED = {"return": "return_mean", "share_above_80": "share_above_80", "action_error": "action_error"}
@@ -48,6 +50,10 @@ def _run(run: LoadedRun, curve: list[Row]) -> Row:
     last, best = max(curve, key=lambda row: row["step"]), max(curve, key=lambda row: row["score"])
     found = run.named | run.representation | {"id": run.result.id, "state": run.progress}
     found |= {"score": last["score"], "return": float(returns_of([run])[0])}
+    found |= {
+        "path_error": run.reference.path_error,
+        "action_error": summarise(run.last, run.reference)["action_error"],
+    }
     found |= {"best_score": best["score"], "best_step": best["step"], "finetune_seconds": run.seconds}
     found |= {"git_commit": run.result.commit, "machine": run.result.machine}
     return {name: found[name] for name in _RUN}

@@ -132,7 +132,8 @@ def _plots(runs: list[LoadedRun], made: dict[str, list[Row]]) -> dict[str, list[
         "scores": bars.bar_plots(made[_MARK], made["runs"], made["gates"], looks, _published_here(runs)),
         "profiles": lines.profile_plots(made["profiles"], made["aggregate"], looks),
         "curves": lines.curve_plots(made["curves"], made[_MARK], looks),
-        "probes": dots.probe_plots(made["runs"], looks),
+        "probes": dots.return_plots(made["runs"], looks, dots.PROBED),
+        "errors": dots.return_plots(made["runs"], looks, dots.ACTED),
         "costs": dots.cost_plots(made["costs"]),
         "losses": lines.loss_plots(losses, looks),
     }
