@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,6 +20,7 @@ from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.reading import regular
+from vd4rl_pomdp.runs import PROBE_FILE
 from vd4rl_pomdp.runs.device import Precision, autocast
 from vd4rl_pomdp.runs.files import read_json, replacing_file, sha256, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
@@ -98,25 +100,26 @@ class FrozenEncoder:
 
 
 class FeatureFile:
-    """A run's features on disk, for its resumption; they count only while they are what these inputs gave."""
+    """A run's features on disk, for its resumption; they count only if they were made of these inputs by this code."""
 
-    def __init__(self, run: Path, inputs: dict[str, str]) -> None:
+    def __init__(self, run: Path, made_of: Mapping[str, Any]) -> None:
         self._path, self._origin = run / "features.npy", run / "features.json"
-        self._inputs = inputs
+        self._made_of, self._probed = made_of, run / PROBE_FILE
 
     @property
     def exists(self) -> bool:
-        """Whether there are features, be they what these inputs gave or not."""
+        """Whether there are features, be they made of these or not."""
         return self._path.exists() and self._origin.exists()
 
     def read(self) -> np.ndarray | None:
-        """What was written, None if that is missing or of other inputs."""
+        """What was written, None if that is missing or was made of something else."""
         if not self.exists:
             return None
         return np.load(self._path) if read_json(self._origin) == self._description() else None
 
     def write(self, features: np.ndarray) -> None:
-        """Keep the features."""
+        """Keep the features; what was probed on others goes."""
+        self._probed.unlink(missing_ok=True)
         with replacing_file(self._path) as fresh, fresh.open("wb") as file:
             np.save(file, features)
         write_json(self._origin, self._description())
@@ -126,8 +129,8 @@ class FeatureFile:
         self._origin.unlink(missing_ok=True)
         self._path.unlink(missing_ok=True)
 
-    def _description(self) -> dict[str, str]:
-        return self._inputs | {"sha256": sha256(regular(self._path))}
+    def _description(self) -> dict[str, Any]:
+        return {**self._made_of} | {"sha256": sha256(regular(self._path))}
 
 
 def feature_type(encoder: Encoder) -> type[np.floating]:

@@ -79,7 +79,7 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     card = replace(card, quality=dataset.quality or untold)  # the policy's set names its rows
     inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
     corruption, frame_encoder = card.corruption["corruption"], encoder.config.frame_encoder
-    parts = {"task": card.task, "corruption": corruption, "frame_encoder": frame_encoder}
+    parts = {"method": card.method, "task": card.task, "corruption": corruption, "frame_encoder": frame_encoder}
     run = RunFolder(config.out, STAGE, config, inputs, RESULTS, parts)
     if run.finished:
         Evaluations(run.path, config, card, Reference()).require_all()
@@ -110,7 +110,7 @@ def _trainer(
         sampler = TransitionSampler(view, config.batch_size, generator, returns.n_step, returns.gamma)
     elif config.views:
         histories = Histories(dataset, config.memory, returns.n_step, config.seed)
-        features = encode_views(frozen, histories, config.views, FeatureFile(run.path, run.inputs))
+        features = encode_views(frozen, histories, config.views, FeatureFile(run.path, run.inputs | run.code))
         policy.standardise.fit(features)
         _probe(features, dataset, run)
         encode = partial(_cached, features, dataset)

@@ -14,6 +14,7 @@ import pytest
 import torch
 
 import finetune.evaluations
+import finetune.features
 import pretrain.navigation.trainer
 import pretrain.train
 from finetune.algorithms import bc, td3_bc
@@ -27,8 +28,9 @@ from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.errors import InUseError, UserError
 from vd4rl_pomdp.navigation.measures import RAW_PREFIX
+from vd4rl_pomdp.runs import run as run_module
 from vd4rl_pomdp.runs.episodes import read_episodes
-from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.interrupt import Terminated
 from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
 from vd4rl_pomdp.runs.ownership import owned
@@ -314,12 +316,29 @@ def test_features_of_other_inputs_or_damaged_ones_are_made_anew(encoder, data, t
         with pytest.raises(UserError):
             run_finetune(config)
     features, origin = config.out / "features.npy", config.out / "features.json"
-    assert read_json(origin).keys() == {"data", "encoder", "sha256"}
+    assert read_json(origin).keys() == {"data", "encoder", "sha256", "versions", "git_commit", "plugins", "sources"}
     features.write_bytes(features.read_bytes()[:-100] + bytes(100))
     run_finetune(config)
     assert contents(config.out) == contents(whole.path)
     assert not features.exists()
     assert not origin.exists()
+
+
+@pytest.mark.parametrize("changed", [False, True])
+def test_features_that_other_code_made_are_made_anew_and_probed_anew(encoder, data, tmp_path, monkeypatch, changed):
+    config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
+    encode, encoded = finetune.features._encode_all, []
+    monkeypatch.setattr(finetune.features, "_encode_all", lambda *words: (encoded.append(words), encode(*words))[1])
+    with monkeypatch.context() as patch:
+        fill_disk(patch, "state.safetensors", 1)
+        with pytest.raises(UserError):
+            run_finetune(config)
+    write_json(config.out / "probe.json", {"probe_pose": 1.0, "probe_velocity": 2.0})
+    if changed:
+        monkeypatch.setattr(run_module, "sources", lambda parts: {"corruption mine": "mine.py 2"})
+    run_finetune(config)
+    assert len(encoded) == 1 + changed
+    assert (config.out / "probe.json").exists() != changed, "this set has no states to probe anew"
 
 
 @pytest.mark.parametrize(("evaluation", "rows_written"), [(1, 0), (1, 1), (2, 0), (2, 2)])

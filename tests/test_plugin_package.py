@@ -4,6 +4,7 @@ import json
 import os
 import subprocess
 import sys
+from hashlib import sha256
 from pathlib import Path
 
 import pytest
@@ -162,16 +163,43 @@ def test_the_command_line_finds_an_installed_packages_parts_and_the_record_names
     of_encoders = ("corruption", "frame_encoder", "task")
     for stage, kinds, brought in (
         ("pretrain", ("method", *of_encoders), ()),
-        ("finetune", ("algorithm",), of_encoders),
+        ("finetune", ("algorithm",), ("method", *of_encoders)),
     ):
         record = json.loads((out / stage / "config.json").read_text())
         assert record["plugins"] == {f"{kind} {PARTS[kind][0]}": ORIGIN for kind in (*kinds, *brought)}
+        assert record["sources"] == dict.fromkeys(record["plugins"], f"their_parts.py {file_hash(tmp_path)}")
         for name, _, option, value in (PARTS[kind] for kind in kinds):
             assert name in record["config"].values()
             assert option is None or record["config"][option] == value
     rows = (out / "finetune" / "episodes.csv").read_text().splitlines()[1:]
     assert len(rows) == 6, "two evaluations of two, the last one clean, too"
     assert all(",dot," in row and ",slow_bc," in row and ",column," in row for row in rows)
+
+
+def file_hash(place: Path) -> str:
+    return sha256((place / "site" / "their_parts.py").read_bytes()).hexdigest()[:12]
+
+
+def test_another_version_of_a_package_is_other_code_and_so_is_another_file(python, tmp_path):
+    asked = "from vd4rl_pomdp.registry import *; from pretrain.objectives import METHODS; named = {'method': 'sharp'}; "
+    told = python("-c", f"{asked}print({{'plugins': origins(named), 'sources': sources(named)}})")
+    assert (
+        told
+        == str(
+            {"plugins": {"method sharp": ORIGIN}, "sources": {"method sharp": f"their_parts.py {file_hash(tmp_path)}"}}
+        )
+        + "\n"
+    )
+    changed = f"{asked}print(of_other_code({told.strip()}, named))"
+    assert python("-c", changed) == "[]\n"
+    (info,) = (tmp_path / "site").glob("*.dist-info")
+    metadata = (info / "METADATA").read_text()
+    (info / "METADATA").write_text(metadata.replace("1.2", "1.3"))
+    assert python("-c", changed) == "['method sharp']\n"
+    (info / "METADATA").write_text(metadata)
+    with (tmp_path / "site" / "their_parts.py").open("a") as file:
+        file.write("# changed\n")
+    assert python("-c", changed) == "['method sharp']\n"
 
 
 USE = f"""

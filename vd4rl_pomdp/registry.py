@@ -17,6 +17,8 @@ from vd4rl_pomdp.errors import OR_ONES_OWN, UserError, refuse_unknown
 Part = TypeVar("Part")
 BY_CALL = "registered by a call"
 """Origin of the parts that a process has added itself."""
+_INSTALLED = "site-packages"
+"""Folder of an environment's packages, which are one another's neighbours by chance."""
 _OWN_PACKAGES = ("vd4rl_pomdp", "pretrain", "finetune", "baselines")
 """This project's, whose commit a record tells."""
 REGISTRIES: dict[str, Registry[Any]] = {}
@@ -51,7 +53,8 @@ class Registry(Mapping[str, Part], Generic[Part]):
         self._parts = dict(own)
         self._origins: dict[str, str] = {}
         self._sources: dict[str, str] = {}
-        """Of parts that a call added, what `source` says: of the file as it was then, since that is what runs."""
+        """Of parts that are not this package's, what `source` says: of the file as it was when it was loaded, since
+        that is what runs."""
         self._fits, self._expected, self._refuse = fits, expected, refuse
         self._loaded = False
         for name, part in own.items():
@@ -111,7 +114,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
         return self._origins.get(name, "")
 
     def source(self, name: str) -> str:
-        """The file that registered a part by a call, and a hash of its code; "" for any other part."""
+        """The file that registered or offers a part, and a hash of its code; "" for this package's own."""
         return self._sources.get(name, "")
 
     def __getitem__(self, name: str) -> Part:
@@ -155,6 +158,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
         for entry in entry_points(group=self.group):
             try:
                 self._add(entry.name, entry.load(), _package_of(entry))
+                self._sources[entry.name] = _source_of_module(entry.module)
             except Exception as error:  # other people's code may raise anything
                 reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
                 self.broken[entry.name] = f"{entry.value}: {' '.join(reason.split())}"
@@ -166,17 +170,27 @@ def _package_of(entry: EntryPoint) -> str:
     return f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "an installed package"
 
 
+def _source_of_module(name: str) -> str:
+    """As `_source_of`, of a module that has been imported; "" for one that is no file."""
+    module = sys.modules[name]
+    return _source_of(Path(getattr(module, "__file__", None) or ""), module.__package__ or "")
+
+
 def _source_of(file: Path, package: str) -> str:
-    """A file's name, and a hash of it and of what it has imported from its own folder; "" for a notebook's cell."""
+    """A file's name, and a hash of it and of what it has imported from its own folder, or from anywhere in its package.
+
+    Empty for a notebook's cell.
+    """
     if not file.is_file():
         return ""
     first = file.resolve()
+    folder = first.parents[package.count(".")]
     found, waiting = {first: package}, [first]
     while waiting:
         path = waiting.pop()
         for module in filter(None, map(sys.modules.get, _imported_by(path, found[path]))):
             other = Path(getattr(module, "__file__", None) or "").resolve()
-            if other not in found and _is_beside(other, first.parent, module.__name__):
+            if other not in found and _is_beside(other, folder, module.__name__):
                 found[other] = module.__package__ or ""
                 waiting.append(other)
     content = b"".join(path.read_bytes() for path in (first, *sorted(found.keys() - {first})))
@@ -202,7 +216,7 @@ def _is_beside(file: Path, folder: Path, name: str) -> bool:
     """Whether a module's file lies in a folder or below it, and neither an environment nor this project brings it."""
     if not (file.is_file() and file.is_relative_to(folder)) or name.partition(".")[0] in _OWN_PACKAGES:
         return False
-    return "site-packages" not in file.relative_to(folder).parts
+    return _INSTALLED not in (folder.name, *file.relative_to(folder).parts)
 
 
 def origins(settings: Mapping[str, Any]) -> dict[str, str]:
@@ -215,7 +229,9 @@ def origins(settings: Mapping[str, Any]) -> dict[str, str]:
 
 
 def sources(settings: Mapping[str, Any]) -> dict[str, str]:
-    """Files that registered the parts that settings name, and hashes of them: {"method mine": "mine.py 0123456789ab"}.
+    """Files of the parts that settings name and that are not this package's own, and hashes of them.
+
+    Such as {"method mine": "mine.py 0123456789ab"}.
 
     Args:
         settings: as `origins` takes them.
@@ -224,14 +240,19 @@ def sources(settings: Mapping[str, Any]) -> dict[str, str]:
 
 
 def of_other_code(record: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
-    """The parts that settings name and whose file is another by now than the one that a run's record tells of."""
-    then = record.get("sources", {})
-    return [part for part, now in sources(settings).items() if then.get(part, now) != now]
+    """The parts that settings name and whose file or package is another by now than the one a run's record tells of."""
+    changed = [
+        part
+        for name, there in (("plugins", origins(settings)), ("sources", sources(settings)))
+        for part, now in there.items()
+        if record.get(name, {}).get(part, now) != now
+    ]
+    return list(dict.fromkeys(changed))
 
 
 def _named(settings: Mapping[str, Any]) -> Iterator[tuple[str, Registry[Any], str]]:
     """The parts that settings name: setting and name, the registry that has it, and the name."""
-    for setting, registry in REGISTRIES.items():
+    for setting, registry in list(REGISTRIES.items()):  # a package that is loaded may make further ones
         value = str(settings.get(setting, ""))
         for name in [value] if value in registry else value.split("+"):
             if name in registry:

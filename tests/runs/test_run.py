@@ -97,6 +97,11 @@ def test_what_a_run_goes_on_with_is_recorded_where_it_is_new(tmp_path, monkeypat
     later = [(part["processor"], part["git_commit"]) for part in told["continued"]]
     assert (told["processor"], later) == ("A", [("B", "one"), ("B", "two"), ("A", "one")])
     assert told["continued"][0]["versions"] == read_json(tmp_path / "config.json")["versions"]
+    monkeypatch.setattr(module, "sources", lambda parts: {"method mine": "mine.py 2"})
+    with begin(tmp_path):
+        pass
+    assert read_json(tmp_path / "config.json")["sources"] == {}
+    assert read_json(tmp_path / "machine.json")["continued"][-1]["sources"] == {"method mine": "mine.py 2"}
     write_json(tmp_path / "machine.json", told | {"continued": 7})
     with pytest.raises(UserError, match=r"machine\.json: is damaged"), begin(tmp_path):
         pass

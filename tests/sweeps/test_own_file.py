@@ -75,7 +75,7 @@ def test_jobs_know_the_parts_of_the_file_that_a_sweep_was_started_from(tmp_path)
     (command,) = (words for words in planned.splitlines() if words.startswith("python folder/own.py finetune "))
     finished = subprocess.run([sys.executable, *shlex.split(command)[1:]], **run).stderr
     assert (
-        "the file of algorithm mine has changed since this run began, which goes on or counts all the same" in finished
+        "the code of algorithm mine has changed since this run began, which goes on or counts all the same" in finished
     )
 
 

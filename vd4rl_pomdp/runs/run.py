@@ -122,7 +122,7 @@ class RunFolder:
         kept = {} if self._begins else read_json(self.path / CONFIG_FILE)
         for part in of_other_code(kept, self._parts):
             print(
-                f"warning: {self.path}: the file of {part} has changed since this run began, which goes on or counts "
+                f"warning: {self.path}: the code of {part} has changed since this run began, which goes on or counts "
                 "all the same; remove the run to compute it anew",
                 file=sys.stderr,
             )
@@ -132,31 +132,38 @@ class RunFolder:
         """Whether nothing is there that the run could go on with: what was recorded before tells of nothing."""
         return not (self.finished or self._checkpoints.steps() or (self.path / EPISODES_FILE).exists())
 
+    @property
+    def code(self) -> dict[str, Any]:
+        """What the run began with, once it has: versions, commit, and where parts not of this package come from."""
+        record = read_json(self.path / CONFIG_FILE)
+        return {name: record.get(name, {}) for name in self._code_now()}  # early ones tell of no parts
+
+    def _code_now(self) -> dict[str, Any]:
+        parts = {"plugins": origins(self._parts), "sources": sources(self._parts)}
+        return {"versions": versions(), "git_commit": git_commit()} | parts
+
     def _begin(self) -> None:
         if self._begins:
             record = {"format": FORMAT, "stage": self.stage, "config": self.config, "inputs": self.inputs}
-            origin = {"versions": versions(), "git_commit": git_commit(), "command": command()}
-            origin |= {"plugins": origins(self._parts), "sources": sources(self._parts)}
-            origin |= {"collection": read_plan(Path(self.config["data"]))}
-            write_json(self.path / CONFIG_FILE, record | origin)
+            origin = {"command": command(), "collection": read_plan(Path(self.config["data"]))}
+            write_json(self.path / CONFIG_FILE, record | self._code_now() | origin)
         (self.path / DIVERGED_FILE).unlink(missing_ok=True)
         self._keep_machine()
 
     def _keep_machine(self) -> None:
-        """Record the hardware; of a run that goes on, that, commit and versions where they are others by now."""
+        """Record the hardware; of a run that goes on, that and the code where they are others by now."""
         path, now = self.path / MACHINE_FILE, machine(self.config.get("device", "auto"))
         if self._begins or not path.exists():
             write_json(path, now)
             return
-        told, record = read_json(path), read_json(self.path / CONFIG_FILE)
+        told = read_json(path)
         parts = told.pop(CONTINUED, [])
         if not isinstance(parts, list):
             raise UserError(
                 f"{path}: is damaged ({CONTINUED!r} is no list); remove it and start the same command again"
             )
-        begun = told | {name: record.get(name) for name in ("git_commit", "versions")}
-        part = now | {"git_commit": git_commit(), "versions": versions()}
-        if part != (parts[-1] if parts else begun):
+        part, begun = now | self._code_now(), told | self.code
+        if part != (begun | parts[-1] if parts else begun):
             write_json(path, told | {CONTINUED: [*parts, part]})
 
     def __exit__(
