@@ -1,7 +1,7 @@
 """Which runs are missing."""
 
 from tests.helpers_report import describe, write_run
-from vd4rl_pomdp.report.gaps import find_gaps
+from vd4rl_pomdp.report.gaps import find_gaps, never_begun
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.runs.files import read_json, write_json
 
@@ -53,6 +53,22 @@ def test_a_finished_seed_is_no_gap_whatever_else_was_begun(tmp_path):
     loaded = load_runs([runs])
     assert [run.finished for run in loaded] == [True, False]
     assert find_gaps(loaded) == []
+
+
+def test_policies_that_are_wanted_are_missed_where_anything_of_their_setting_is_there(tmp_path):
+    runs = tmp_path / "runs"
+    labels = {"task": "walker_walk", "quality": "expert", "corruption": "patch", "algorithm": "td3_bc"}
+    for size in (16, 48):
+        describe(write_run(runs / str(size), "acro", 0, {10: [1.0]}), {"patch_size": size}, data=f"f{size}")
+    wanted = [labels | {"method": method, "seed": seed} for method, seed in (("acro", 0), ("acro", 1), ("mik", 4))]
+    loaded = load_runs([runs])
+    found = never_begun(loaded, [], [*wanted, wanted[2] | {"quality": "medium"}])
+    assert [(row["method"], row["seed"], row["state"]) for row in found] == [
+        ("acro", 1, "missing"),
+        ("mik", 4, "missing"),
+    ]
+    assert {row["corruption"] for row in found} <= {"patch, patch_size 16", "patch, patch_size 48"}
+    assert never_begun(loaded, found, wanted) == []
 
 
 def test_a_seed_on_the_encoder_of_its_own_is_no_gap_of_those_that_share_it(tmp_path):

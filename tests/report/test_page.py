@@ -2,12 +2,14 @@
 
 import csv
 import re
+import shutil
 from html.parser import HTMLParser
 from itertools import pairwise
 from pathlib import Path
 
 import pretrain.objectives
 from tests.helpers_report import METHODS, describe, grid, pretraining, write_grid, write_run
+from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.report import figures, films, layout, tables, write, write_report
 from vd4rl_pomdp.report.figures import style
@@ -172,3 +174,32 @@ def test_files_of_figures_have_plain_names_of_their_own():
     assert len(set(found)) == len(names)
     assert all(re.fullmatch(r"[A-Za-z0-9+._-]+", name) for name in found)
     assert not any(".." in name for name in found[1:])
+
+
+def test_what_was_not_made_of_the_same_is_told(tmp_path, capsys):
+    parts = {"plugins": {"method mine": "theirs 1.0"}, "sources": {"method mine": "mine.py 1"}}
+    for number, (method, data, told) in enumerate(
+        (
+            ("acro", "one", {}),
+            ("mine", "one", parts),
+            ("mine", "one", parts | {"sources": {"method mine": "mine.py 2"}}),
+        )
+    ):
+        run = describe(write_run(tmp_path / f"runs/{number}", method, number, {10: [1.0]}), data=data)
+        write_json(run / "config.json", read_json(run / "config.json") | told)
+    other = describe(write_run(tmp_path / "runs/other", "random", 0, {10: [1.0]}), data="two")
+    describe(write_run(tmp_path / "runs/medium", "acro", 0, {10: [1.0]}, labels={"quality": "medium"}), data="three")
+    words = ["report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
+    main(words)
+    told = [
+        "the set of walker_walk expert has 2 contents: one (acro, mine); two (random)",
+        "method mine has 2 states of its code: theirs 1.0, mine.py 1 (mine); theirs 1.0, mine.py 2 (mine)",
+    ]
+    assert capsys.readouterr().err == "".join(f"warning: {sentence}\n" for sentence in told)
+    page = (tmp_path / "out" / "index.html").read_text()
+    assert [sentence in page for sentence in told] == [True, True]
+    for run in (other, tmp_path / "runs/2"):
+        shutil.rmtree(run)
+    main([*words[:3], str(tmp_path / "again")])
+    assert capsys.readouterr().err == ""
+    assert "Not made of the same" not in (tmp_path / "again" / "index.html").read_text()

@@ -124,6 +124,30 @@ def test_only_what_the_grid_asks_for_is_missed(grid, runs, tmp_path):
     assert not (tmp_path / "report" / "missing.csv").exists()
 
 
+def test_cells_of_which_nothing_is_there_are_missed_where_their_setting_is_reported(grid, runs, tmp_path):
+    (one,) = (run for run in runs if (run.labels["method"], run.labels["seed"]) == ("acro", 0))
+    write_results(tmp_path / "rows", [one])
+    grid.write_text(GRID.replace('"expert"', '["expert", "medium"]'))
+    words = ["report", str(tmp_path / "rows"), "--out", str(tmp_path / "report")]
+    main([*words, "--grid", str(grid)])
+    rows = list(csv.DictReader((tmp_path / "report" / "missing.csv").open()))
+    assert {(row["quality"], row["method"], row["seed"], row["state"]) for row in rows} == {
+        ("expert", method, seed, "missing") for method, seed in (("acro", "1"), ("mik+a", "0"), ("mik+a", "1"))
+    }
+    with (tmp_path / "report" / "summary.csv").open() as file:
+        assert {row["method"]: row["missing"] for row in csv.DictReader(file)} == {
+            "acro": "seed 1 missing", "mik+a": "seeds 0, 1 missing",
+        }  # fmt: skip
+
+
+def test_sets_with_noise_of_ones_own_are_missed_by_the_name_that_their_files_tell(grid, runs, tmp_path):
+    grid.write_text(GRID.replace('quality = "expert"', 'quality = "random"\naction_noise = 0.4'))
+    asked = GridMembers("grid", load_grid(str(grid)).cells())
+    assert {row["quality"] for row in asked.wanted} == {"random_noise0.4"}
+    assert asked.asks(runs[0].labels | {"quality": "random_noise0.4"})
+    assert not asked.asks(runs[0].labels | {"quality": "random"})
+
+
 def test_a_report_is_about_the_cells_that_are_asked_for(grid, runs, tmp_path, capsys):
     write_results(tmp_path / "rows", runs)
     words = ["report", str(tmp_path / "rows"), "--out", str(tmp_path / "report")]

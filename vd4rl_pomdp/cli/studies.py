@@ -65,6 +65,8 @@ def _report(words: Arguments, program: str) -> None:
     command = parse(ReportCommand, words, program)
     report = write_report(command.runs, command.out, _choice(command))
     print_summary(report)
+    for sentence in report.unlike:
+        print(f"warning: {sentence}", file=sys.stderr)
     print(f"report: {report.page}")
 
 

@@ -171,6 +171,11 @@ def _suffix(config: CollectConfig) -> str:
     return f"_noise{config.action_noise:g}" if config.action_noise else ""
 
 
+def set_quality(config: CollectConfig) -> str:
+    """The quality that the set's own files and the runs on it tell, noise of one's own included."""
+    return _base(config) + _suffix(config)
+
+
 def actor_hashes(config: CollectConfig) -> list[str]:
     """SHA-256 of the files whose actors make the set, sorted."""
     return _hashes(_plan(config))
@@ -273,7 +278,7 @@ def _environment(*arguments: Any) -> Any:
 def _attributes(config: CollectConfig, path: Path, collector: Collector) -> dict[str, Any]:
     return {
         "task": config.task,
-        "set": _base(config) + _suffix(config),
+        "set": set_quality(config),
         "policy": path.stem.split("_", 1)[1].removeprefix(f"{config.task}_"),
         "seed": config.seed,
         "render": config.render,

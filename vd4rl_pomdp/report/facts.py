@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import LoadedRun, compare
@@ -52,6 +53,40 @@ def _own_to_sets(runs: list[LoadedRun]) -> dict[str, str]:
         told = (f"{name} {value}" for name, value in run.of_set.items() if run.stage == "finetune")
         words.setdefault(run.set_name, {}).update(dict.fromkeys(told))
     return {place: ", ".join(texts) for place, texts in words.items() if texts}
+
+
+def unlike(runs: list[LoadedRun]) -> list[str]:
+    """What stands side by side and was not made of the same, in sentences: contents of a set, code of a part."""
+    policies = [run for run in runs if run.stage == "finetune" and run.rows]
+    contents = [(f"the set of {run.set_name}", _content(run), run) for run in policies if _content(run)]
+    codes = [(part, code, run) for run in policies for part, code in _code(run).items()]
+    return [*_unlike(contents, "contents"), *_unlike(codes, "states of its code")]
+
+
+def _unlike(told: list[tuple[str, str, LoadedRun]], noun: str) -> Iterator[str]:
+    """A sentence for each subject of which runs tell different things.
+
+    Args:
+        told: subjects, what is told of them, and by which runs.
+        noun: what such things are called.
+    """
+    for subject, members in groups(told, lambda one: one[0]).items():
+        by_value = groups(members, lambda one: one[1])
+        if len(by_value) > 1:
+            methods = (sorted({label(run.named) for *_, run in some}) for some in by_value.values())
+            words = (f"{value} ({', '.join(some)})" for value, some in zip(by_value, methods, strict=True))
+            yield f"{subject} has {len(by_value)} {noun}: {'; '.join(words)}"
+
+
+def _content(run: LoadedRun) -> str:
+    return run.record.get("inputs", {}).get("data", "")[:12]
+
+
+def _code(run: LoadedRun) -> dict[str, str]:
+    """Package and file of each part that is not this project's."""
+    parts = [run.record.get(name, {}) for name in ("plugins", "sources")]
+    names = dict.fromkeys(name for one in parts for name in one)
+    return {name: ", ".join(filter(None, (one.get(name) for one in parts))) for name in names}
 
 
 def facts(runs: list[LoadedRun]) -> list[dict[str, str]]:

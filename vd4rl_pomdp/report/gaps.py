@@ -2,13 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from itertools import groupby
 from operator import attrgetter
+from typing import Any
 
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import CONDITION, SETTING, LoadedRun
 from vd4rl_pomdp.report.variants import ENCODER_SEED
+from vd4rl_pomdp.runs.episodes import LABELS
 from vd4rl_pomdp.runs.files import Row
 
 Setting = tuple[str, str, str]
@@ -38,6 +40,32 @@ def find_gaps(runs: list[LoadedRun]) -> list[Row]:
                 if not _is_own(variant, seed) and (run is None or not run.evaluated):
                     rows.append(condition | {"seed": seed, "state": _state(run)})
     return rows
+
+
+def never_begun(runs: list[LoadedRun], gaps: Iterable[Row], wanted: Iterable[Row]) -> list[Row]:
+    """One row, as of `find_gaps`, for each policy that is wanted and of which neither a run nor a gap tells.
+
+    Of settings in which there is any run.
+
+    Args:
+        runs: all of the report.
+        gaps: of `find_gaps`.
+        wanted: labels (`runs.episodes.LABELS`) of policies.
+    """
+    policies = [run.labels for run in runs if run.stage == "finetune"]
+    known = {_bare(row, LABELS) for row in (*policies, *gaps)}
+    settings = {_bare(row, SETTING): row["corruption"] for row in policies}
+    return [
+        {name: row.get(name, "") for name in CONDITION}
+        | {"corruption": settings[_bare(row, SETTING)], "seed": row["seed"], "state": MISSING}
+        for row in wanted
+        if _bare(row, LABELS) not in known and _bare(row, SETTING) in settings
+    ]
+
+
+def _bare(row: Mapping[str, Any], names: Iterable[str]) -> tuple[Any, ...]:
+    """Some labels, without what tells a corruption's options apart."""
+    return tuple(row[name].partition(",")[0] if name == "corruption" else row[name] for name in names)
 
 
 def _is_own(variant: str, seed: int) -> bool:

@@ -55,6 +55,11 @@ class Choice:
         """Whether a run that is not there, told by its labels, is missed."""
         return True
 
+    @property
+    def wanted(self) -> Sequence[Row]:
+        """Labels of the policies that are asked for, where it is told."""
+        return ()
+
 
 ALL = Choice()
 

@@ -15,10 +15,10 @@ from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.report import bars, dots, lines, measures, overall, present, tables
 from vd4rl_pomdp.report.claims import judge_claims
-from vd4rl_pomdp.report.facts import differing, facts, unfinished
+from vd4rl_pomdp.report.facts import differing, facts, unfinished, unlike
 from vd4rl_pomdp.report.figures import Plot, save_plot, to_svg
 from vd4rl_pomdp.report.films import shown_films
-from vd4rl_pomdp.report.gaps import find_gaps
+from vd4rl_pomdp.report.gaps import find_gaps, never_begun
 from vd4rl_pomdp.report.gates import gates, unranked
 from vd4rl_pomdp.report.layout import ShownTable, write_latex
 from vd4rl_pomdp.report.load import ALL, SETTING, Choice, LoadedRun, load_runs
@@ -46,6 +46,8 @@ class Report(NamedTuple):
     """Table of what has to hold before methods are ranked."""
     claims: list[Row]
     """Table of the paper's claims and what becomes of them."""
+    unlike: list[str]
+    """What stands side by side and was not made of the same, in sentences."""
 
 
 def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
@@ -78,7 +80,7 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
         _write_plots(out / FIGURES, plots)
         write_results(out, results)
         write_text(out / "index.html", page)
-    return Report(out / "index.html", made[_MARK], made["gates"], made["claims"])
+    return Report(out / "index.html", made[_MARK], made["gates"], made["claims"], unlike(runs))
 
 
 def _tables(runs: list[LoadedRun], choice: Choice) -> dict[str, list[Row]]:
@@ -86,6 +88,7 @@ def _tables(runs: list[LoadedRun], choice: Choice) -> dict[str, list[Row]]:
     evaluated = tables.evaluations(runs)
     final = tables.evaluations(run for run in runs if run.finished)
     gaps = [row for row in find_gaps(runs) if choice.asks(row)]
+    gaps += never_begun(runs, gaps, choice.wanted)
     gated = gates(runs)
     of_runs = measures.run_table(runs, evaluated, gaps)
     return {
@@ -179,6 +182,7 @@ def _render(
         "tables": shown,
         "plots": {name: [(plot, to_svg(plot.figure)) for plot in group] for name, group in plots.items()},
         "differing": differing(runs),
+        "unlike": unlike(runs),
         "films": films,
         "left_out": left_out,
         "published": present.published([r for r in published_scores() if (r["env"], r["dataset"]) in wanted]),

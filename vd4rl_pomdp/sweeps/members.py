@@ -6,14 +6,16 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+from vd4rl_pomdp.data.collect import set_quality
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.report.load import Choice
 from vd4rl_pomdp.results import Result
+from vd4rl_pomdp.runs.episodes import LABELS
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.sweeps.found import FoundRun, found_in
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.sets import DataSet, set_of
-from vd4rl_pomdp.sweeps.stages import check_cells, recipe_of, recorded
+from vd4rl_pomdp.sweeps.stages import check_cells, config_of, recipe_of, recorded
 
 _NOWHERE = Path()
 """Sets are told by how they were collected, not by where they lie."""
@@ -55,7 +57,12 @@ class GridMembers(Choice):
     def asks(self, row: Row) -> bool:
         """Whether a cell asks for a policy of these labels (`runs.episodes.LABELS`), whatever its variant."""
         corruption = row["corruption"].partition(",")[0]  # without what tells its options apart
-        return (row["task"], row["quality"], corruption, row["algorithm"], row["method"], row["seed"]) in self._policies
+        return tuple((row | {"corruption": corruption})[name] for name in LABELS) in self._policies
+
+    @property
+    def wanted(self) -> list[Row]:
+        """Labels of the policies that the cells ask for."""
+        return [dict(zip(LABELS, policy, strict=True)) for policy in sorted(self._policies)]
 
     def _has(self, run: Result, seen: FoundRun) -> bool:
         """Whether some cell asks for it; one on a set that nobody collected is told by task and quality."""
@@ -67,6 +74,7 @@ class GridMembers(Choice):
 
 
 def _policy(cell: GridCell, data: DataSet) -> tuple[Any, ...]:
-    """Labels of the policy that a cell trains on its set."""
+    """Values of LABELS of the policy that a cell trains on its set."""
     before, algorithm = recorded(cell, "pretrain"), recorded(cell, "finetune")["algorithm"]
-    return (data.wanted["task"], data.wanted["quality"], before["corruption"], algorithm, before["method"], cell.seed)
+    quality = set_quality(config_of(cell, data.section))
+    return before["method"], data.wanted["task"], quality, before["corruption"], algorithm, cell.seed
