@@ -239,6 +239,13 @@ def sources(settings: Mapping[str, Any]) -> dict[str, str]:
     return {part: source for part, registry, name in _named(settings) if (source := registry.source(name))}
 
 
+def changed_since(told: Mapping[str, str]) -> list[str]:
+    """The parts, of some that `sources` told of in another process, that this one has from another file."""
+    named = [(part, then, *part.split(" ", 1)) for part, then in told.items()]
+    known = ((part, then, REGISTRIES[kind].source(name)) for part, then, kind, name in named if kind in REGISTRIES)
+    return [part for part, then, now in known if now not in ("", then)]
+
+
 def of_other_code(record: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
     """The parts that settings name and whose file or package is another by now than the one a run's record tells of."""
     changed = [

@@ -5,6 +5,7 @@ import os
 import shlex
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 from types import ModuleType
 
@@ -14,7 +15,8 @@ from finetune.algorithms import ALGORITHMS
 from finetune.algorithms.bc import BC
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.sweeps.work import FAILED, Ended, Work, ended, start_process
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.sweeps.work import DONE, FAILED, Ended, Work, ended, start_process
 
 FILE = """
 from sibling import SUMMARY
@@ -52,6 +54,16 @@ def write_file(folder: Path, last: str) -> Path:
 
 def attempt(work: Work) -> Ended:
     return ended(work, start_process(work, {}).wait(120))
+
+
+def test_a_job_is_refused_whose_file_changed_after_its_sweep_was_started(tmp_path):
+    own = write_file(tmp_path / "folder", GUARD + "main()")
+    then = "own.py 0123456789ab"
+    work = Work("a", ("list",), tmp_path / "log", own_file={"init_main_from_path": str(own)})
+    assert attempt(work).cause == DONE
+    told = attempt(replace(work, sources={"algorithm mine": then}))
+    words = "the file of algorithm mine has changed since the sweep was started: start the sweep again, or put it back"
+    assert (told.cause, told.line) == (UserError.cause, f"error: {words}")
 
 
 def test_jobs_know_the_parts_of_the_file_that_a_sweep_was_started_from(tmp_path):

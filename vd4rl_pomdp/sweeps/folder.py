@@ -29,6 +29,7 @@ from typing import Any
 
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.reading import parse_json, read_bytes
+from vd4rl_pomdp.registry import sources
 from vd4rl_pomdp.runs.files import Row, jsonable, write_json
 from vd4rl_pomdp.sweeps.own_file import OwnFile, own_file, parts_by_call, program_of, same_file
 from vd4rl_pomdp.sweeps.plan import Job
@@ -116,7 +117,7 @@ class SweepFolder:
     def work(self, job: Job, slots: int) -> Work:
         """A job as an executor takes it."""
         log = self.path / "logs" / f"{job.name}.log"
-        return Work(job.name, job.words, log, slots, own_file())
+        return Work(job.name, job.words, log, slots, own_file(), sources(dict(job.settings)))
 
     def of_executor(self, name: str) -> Path:
         """Folder of what an executor keeps."""

@@ -10,7 +10,7 @@ import sys
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Protocol
+from typing import Any, Protocol
 
 from vd4rl_pomdp.errors import (
     DIVERGED,
@@ -48,6 +48,8 @@ class Work:
     """Share of the executor's places that it takes."""
     own_file: dict[str, str] = field(default_factory=dict)
     """Where the parts of one's own come from that its process imports, as `sweeps.own_file` has it."""
+    sources: dict[str, str] = field(default_factory=dict)
+    """What the parts that it names were when the sweep was started, as `registry.sources` tells them."""
 
 
 @dataclass(frozen=True)
@@ -88,7 +90,8 @@ def start_process(work: Work, environment: Mapping[str, str], cores: Sequence[in
         environment: what is added to this process's environment.
         cores: those that it may use; none: all.
     """
-    told = {"words": work.words, "own_file": work.own_file, "cores": list(cores), "parent": os.getpid()}
+    told: dict[str, Any] = {"words": work.words, "own_file": work.own_file, "sources": work.sources}
+    told |= {"cores": list(cores), "parent": os.getpid()}
     work.log.parent.mkdir(parents=True, exist_ok=True)
     with work.log.open("ab") as log:
         log.write(_BEGINS)

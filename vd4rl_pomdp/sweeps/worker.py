@@ -31,11 +31,19 @@ def main() -> None:
     signal.signal(signal.SIGTERM, _end_interrupted)  # importing what follows takes a while
     words = told["words"]
     sys.argv = ["vd4rl-pomdp", *words]  # what a run records as its command
-    from vd4rl_pomdp.cli.ends import run_to_end
+    from vd4rl_pomdp.cli.ends import End, run_to_end
+    from vd4rl_pomdp.errors import UserError
+    from vd4rl_pomdp.registry import changed_since
     from vd4rl_pomdp.sweeps.own_file import load
 
     load(told["own_file"])
-    end = run_to_end(words, signal.SIG_IGN)
+    if changed := changed_since(told["sources"]):
+        line = (
+            f"the file of {changed[0]} has changed since the sweep was started: start the sweep again, or put it back"
+        )
+        end = End(2, UserError.cause, f"error: {line}")
+    else:
+        end = run_to_end(words, signal.SIG_IGN)
     with contextlib.suppress(OSError):  # a full disk
         print(end.line or end.cause, file=sys.stderr, flush=True)
     sys.exit(code_of(end.cause))
