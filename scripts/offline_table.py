@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -24,6 +25,8 @@ from vd4rl_pomdp.sweeps.stages import recorded
 RESULTS = Path(__file__).parents[1] / "results"
 GRIDS = ("offline", "control")
 HIDDEN, PATCHES, CLEAN = "patch+zero_frames", "patch", "none"
+ALONE = ", patches alone"
+"""What is added to the name of a set where no frames were zeroed."""
 UNTRAINED = "random"
 SETS = {
     ("walker_walk", "expert_noisy"): "walker_walk, noisy expert",
@@ -37,11 +40,8 @@ SETS = {
 """What the README calls a set."""
 CONTROL_ONLY = ("cheetah_run", "medium_noisy")
 """The set that results/offline does not tell of."""
-COLUMNS = (
-    *((name, HIDDEN) for name in ("random", "acro", "ah+a", "mik", "mik+a", "supervised+a")),
-    *((name, CLEAN) for name in ("acro", "mik+a")),
-)
-"""What the README tells of a set: methods, and what was hidden from them."""
+HIDDEN_FROM, SHOWN_ALL = ("random", "acro", "ah+a", "mik", "mik+a", "supervised+a"), ("acro", "mik+a")
+"""What the README tells of a set: methods under its corruption, and with nothing hidden."""
 
 
 def main_runs() -> list[LoadedRun]:
@@ -52,17 +52,19 @@ def main_runs() -> list[LoadedRun]:
 
 
 def readme_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
-    """Returns of the main methods, a row for every set."""
+    """Returns of the main methods, a row for every set and corruption."""
     yield (
         "| set (data's return) | `random` | `acro` | `ah+a` | `mik` | `mik+a` | told the states: `supervised+a` |"
         " trained with nothing hidden: `acro` | trained with nothing hidden: `mik+a` |"
     )
-    yield "|---|" + "---:|" * len(COLUMNS)
-    for place, words in SETS.items():
+    yield "|---|" + "---:|" * len((*HIDDEN_FROM, *SHOWN_ALL))
+    for corruption, (place, words) in product((HIDDEN, PATCHES), SETS.items()):
         here = [run for run in runs if _place(run) == place]
-        if here:
-            cells = [_told(_of(here, method, corruption)) for method, corruption in COLUMNS]
-            yield f"| {words} ({here[0].reference.data_return:.0f}) | {' | '.join(cells)} |"
+        if any(run.labels["corruption"] == corruption for run in here):
+            cells = [_told(_of(here, method, corruption)) for method in HIDDEN_FROM]
+            cells += [_told(_of(here, method, CLEAN)) for method in SHOWN_ALL]
+            name = f"{words} ({here[0].reference.data_return:.0f})" + ALONE * (corruption == PATCHES)
+            yield f"| {name} | {' | '.join(cells)} |"
 
 
 def page_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str, str]]:
@@ -76,7 +78,7 @@ def page_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str, str]]:
 
 def table_name(task: str, quality: str, corruption: str) -> str:
     """What the table of a set is called."""
-    return f"{task}, {quality}" + (", patches alone" if corruption == PATCHES else "")
+    return f"{task}, {quality}" + ALONE * (corruption == PATCHES)
 
 
 def set_lines(runs: Sequence[LoadedRun], task: str, quality: str, corruption: str) -> Iterator[str]:

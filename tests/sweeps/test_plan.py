@@ -229,6 +229,22 @@ def test_a_kept_row_whose_part_has_changed_counts_and_is_told(copy, tmp_path, mo
     assert planner.changed_since == {"method mine": len(kept.runs)}
 
 
+def test_policies_on_an_encoder_that_was_made_anew_count_and_are_told(copy):
+    cells = load_grid(str(copy / "grid.toml")).cells()
+
+    def told():
+        planner = JobPlanner(copy, None, FoundRuns([]), FoundRuns(runs_below(copy)))
+        assert left(planner.plan(cells)) == []
+        return planner.on_other_encoders
+
+    assert told() == 0
+    config = next(copy.rglob("pretrain/encoder/config.json"))
+    write_json(config, read_json(config) | {"changed": True})
+    assert told() == len(list(config.parents[2].glob("finetune-*/config.json")))
+    shutil.rmtree(config.parents[1])
+    assert told() == 0
+
+
 def test_rows_of_early_versions_finish_nothing(copy):
     kept = FoundRuns(runs_kept([ROOT / "results" / "control" / "earlier"]))
     assert [run.card for run in kept.runs] == [{}] * 10

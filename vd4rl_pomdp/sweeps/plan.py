@@ -12,6 +12,7 @@ from typing import Any
 from vd4rl_pomdp.data.format import PLAN, PROVENANCE
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.nn.encoder_folder import CONFIG, encoder_hash
 from vd4rl_pomdp.options import words_of
 from vd4rl_pomdp.registry import of_other_code
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
@@ -105,6 +106,9 @@ class JobPlanner:
         self.changed_since: Counter[str] = Counter()
         """Runs that count, though the file of a part of one's own has changed since, by part."""
 
+        self.on_other_encoders = 0
+        """Policies that count, though the encoder that their pretraining's folder holds now is another than theirs."""
+
     def plan(self, cells: Iterable[GridCell]) -> list[Job]:
         """The jobs of some cells, each after those it needs; what only finished jobs would need is left out.
 
@@ -151,6 +155,7 @@ class JobPlanner:
         run = self._here.of(recipe, data)
         if run is not None:
             self.changed_since.update(of_other_code(run.record, values))
+            self.on_other_encoders += section == "finetune" and _is_on_another(run, before[-1].folder / "encoder")
             name, content = run.folder.relative_to(self._out).as_posix(), run.data
         else:
             name, content = self._free(run_folder(cell, section, data.name, values), recipe), ""
@@ -197,6 +202,11 @@ class JobPlanner:
 
     def _of_another(self, name: str, recipe: str) -> bool:
         return self._out / name in self._here or self._of_others.get(name, recipe) != recipe
+
+
+def _is_on_another(run: FoundRun, encoder: Path) -> bool:
+    """Whether a fine-tuning began with another encoder than the one that lies in a folder, if one does."""
+    return (encoder / CONFIG).is_file() and run.record.get("inputs", {}).get("encoder") != encoder_hash(encoder)
 
 
 def cost_of(values: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
