@@ -335,7 +335,9 @@ def test_features_that_other_code_made_are_made_anew_and_probed_anew(encoder, da
             run_finetune(config)
     write_json(config.out / "probe.json", {"probe_pose": 1.0, "probe_velocity": 2.0})
     if changed:
-        monkeypatch.setattr(run_module, "sources", lambda parts: {"corruption mine": "mine.py 2"})
+        monkeypatch.setattr(
+            run_module, "code_of", lambda parts: {"plugins": {}, "sources": {"corruption mine": "mine.py 2"}}
+        )
     run_finetune(config)
     assert len(encoded) == 1 + changed
     assert (config.out / "probe.json").exists() != changed, "this set has no states to probe anew"

@@ -7,6 +7,7 @@ import re
 import subprocess
 import sys
 from dataclasses import replace
+from hashlib import sha256
 from pathlib import Path
 
 import numpy as np
@@ -229,6 +230,27 @@ def test_registered_tasks_have_gymnasium_ids(tmp_path):
     )
     done = subprocess.run([sys.executable, script], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines() == ["(9, 32, 32) 200", "500"]
+
+
+def test_a_set_that_is_not_whole_is_not_continued_by_a_task_whose_file_changed(tmp_path):
+    file, config = tmp_path / "my_task.py", CollectConfig("centre", "random", tmp_path / "set", episodes=2, workers=1)
+    config = replace(config, episodes_per_shard=1, frame_size=50)
+
+    def collect_by(text):
+        file.write_text(text)
+        with TASKS.isolated():
+            exec(compile(text, file, "exec"), {"__name__": "my_task"})
+            return collect(config, 8)
+
+    first, second = collect_by(CODE)
+    told = json.loads((tmp_path / "set" / "collection.json").read_text())["sources"]
+    assert told == {"task centre": f"my_task.py {sha256(CODE.encode()).hexdigest()[:12]}"}
+    assert collect_by(CODE + "# changed\n") == [first, second], "a set that is whole stays one"
+    for path in (second, tmp_path / "set" / "provenance.json"):
+        path.unlink()
+    with pytest.raises(UserError, match=r"set: was begun before the code of task centre changed, and is not whole"):
+        collect_by(CODE + "# changed\n")
+    assert collect_by(CODE) == [first, second]
 
 
 def test_a_set_is_not_continued_in_another_size(tasks, tmp_path):

@@ -239,6 +239,11 @@ def sources(settings: Mapping[str, Any]) -> dict[str, str]:
     return {part: source for part, registry, name in _named(settings) if (source := registry.source(name))}
 
 
+def code_of(settings: Mapping[str, Any]) -> dict[str, dict[str, str]]:
+    """What a record keeps of the parts that settings name and that are not this package's own."""
+    return {"plugins": origins(settings), "sources": sources(settings)}
+
+
 def changed_since(told: Mapping[str, str]) -> list[str]:
     """The parts, of some that `sources` told of in another process, that this one has from another file."""
     named = [(part, then, *part.split(" ", 1)) for part, then in told.items()]
@@ -250,7 +255,7 @@ def of_other_code(record: Mapping[str, Any], settings: Mapping[str, Any]) -> lis
     """The parts that settings name and whose file or package is another by now than the one a run's record tells of."""
     changed = [
         part
-        for name, there in (("plugins", origins(settings)), ("sources", sources(settings)))
+        for name, there in code_of(settings).items()
         for part, now in there.items()
         if record.get(name, {}).get(part, now) != now
     ]

@@ -97,7 +97,7 @@ def test_what_a_run_goes_on_with_is_recorded_where_it_is_new(tmp_path, monkeypat
     later = [(part["processor"], part["git_commit"]) for part in told["continued"]]
     assert (told["processor"], later) == ("A", [("B", "one"), ("B", "two"), ("A", "one")])
     assert told["continued"][0]["versions"] == read_json(tmp_path / "config.json")["versions"]
-    monkeypatch.setattr(module, "sources", lambda parts: {"method mine": "mine.py 2"})
+    monkeypatch.setattr(module, "code_of", lambda parts: {"plugins": {}, "sources": {"method mine": "mine.py 2"}})
     with begin(tmp_path):
         pass
     assert read_json(tmp_path / "config.json")["sources"] == {}
@@ -111,7 +111,8 @@ def test_the_record_of_a_run_that_has_kept_nothing_is_of_the_start_that_counts(t
     for commit, size in (("one", 1), ("two", 2), ("three", 2)):
         monkeypatch.setattr(module, "git_commit", lambda commit=commit: commit)
         monkeypatch.setattr(module, "machine", lambda device, commit=commit: {"processor": commit})
-        monkeypatch.setattr(module, "sources", lambda parts, size=size: {"method mine": f"mine.py {size}"})
+        told = {"plugins": {}, "sources": {"method mine": f"mine.py {size}"}}
+        monkeypatch.setattr(module, "code_of", lambda parts, told=told: told)
         with begin(tmp_path) as run:
             if commit != "one":
                 run.save(1, {})

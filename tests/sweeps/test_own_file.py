@@ -83,7 +83,7 @@ def test_jobs_know_the_parts_of_the_file_that_a_sweep_was_started_from(tmp_path)
     with (tmp_path / "folder" / "own.py").open("a") as file:
         file.write("# changed\n")
     again = subprocess.run([*line.split(), "--dry-run"], **run).stderr
-    assert "warning: algorithm mine: 1 runs count, though its code has changed since they began\n" in again
+    assert "warning: algorithm mine: 1 sets or runs count, though its code has changed since they began\n" in again
     (command,) = (words for words in planned.splitlines() if words.startswith("python folder/own.py finetune "))
     finished = subprocess.run([sys.executable, *shlex.split(command)[1:]], **run).stderr
     assert (

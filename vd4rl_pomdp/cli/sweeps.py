@@ -97,7 +97,10 @@ def _run(words: Arguments, program: str) -> None:
         line = f"{number} kept runs are of a set collected alike, but with other content (from another machine?)"
         print(f"warning: {name}: {line}: they do not count", file=sys.stderr)
     for part, number in planner.changed_since.items():
-        print(f"warning: {part}: {number} runs count, though its code has changed since they began", file=sys.stderr)
+        print(
+            f"warning: {part}: {number} sets or runs count, though its code has changed since they began",
+            file=sys.stderr,
+        )
     if number := planner.on_other_encoders:
         line = f"{number} policies count that began with other encoders than their pretrainings' folders now hold"
         print(f"warning: {line}", file=sys.stderr)

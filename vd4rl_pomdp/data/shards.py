@@ -12,6 +12,7 @@ import numpy as np
 
 from vd4rl_pomdp.data.format import PLAN, PROVENANCE, write_shard
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.registry import code_of, of_other_code
 from vd4rl_pomdp.runs.files import holds_anything, read_json, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
@@ -64,16 +65,24 @@ def collect_shards(
 
 
 def claim_set(out: Path, settings: dict[str, Any]) -> None:
-    """Write collection.json, or check that the folder holds the same collection."""
+    """Write collection.json, or check that the folder holds the same collection, begun with the same code of its task.
+
+    A set that is whole stays one, whatever its task's code has become.
+    """
     path = out / PLAN
     if path.exists():
         stored = read_json(path)
         if others := differing(stored, settings):
             raise UserError(f"{out}: holds a set collected with another {', '.join(others)}; choose another --out")
+        if not (out / PROVENANCE).exists() and (parts := of_other_code(stored, settings)):
+            raise UserError(
+                f"{out}: was begun before the code of {parts[0]} changed, and is not whole; put that back, or choose "
+                "another --out"
+            )
         return
     if holds_anything(out):
         raise UserError(f"{out}: is not empty and holds no collected set; choose another --out")
-    write_json(path, settings)
+    write_json(path, settings | {name: told for name, told in code_of(settings).items() if told})
 
 
 def differing(stored: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:

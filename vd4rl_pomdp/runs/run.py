@@ -17,7 +17,7 @@ from typing import Any, Self
 from vd4rl_pomdp.data.format import read_plan
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import flat
-from vd4rl_pomdp.registry import of_other_code, origins, sources
+from vd4rl_pomdp.registry import code_of, of_other_code
 from vd4rl_pomdp.runs import CONFIG_FILE, DIVERGED_FILE, EPISODES_FILE, FORMAT, MACHINE_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, State, fitting, pack, unpack
 from vd4rl_pomdp.runs.episodes import read_episodes
@@ -139,8 +139,7 @@ class RunFolder:
         return {name: record.get(name, {}) for name in self._code_now()}  # early ones tell of no parts
 
     def _code_now(self) -> dict[str, Any]:
-        parts = {"plugins": origins(self._parts), "sources": sources(self._parts)}
-        return {"versions": versions(), "git_commit": git_commit()} | parts
+        return {"versions": versions(), "git_commit": git_commit()} | code_of(self._parts)
 
     def _begin(self) -> None:
         if self._begins:

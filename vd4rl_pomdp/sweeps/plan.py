@@ -9,7 +9,7 @@ from itertools import chain, count, pairwise
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.data.format import PLAN, PROVENANCE
+from vd4rl_pomdp.data.format import PLAN, PROVENANCE, read_plan
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, encoder_hash
@@ -135,6 +135,7 @@ class JobPlanner:
         found = set_of(cell, self._data)
         if found.name not in self._sets:
             found.check()
+            self.changed_since.update(of_other_code(read_plan(found.folder), found.wanted))
         data = self._sets.setdefault(found.name, found)
         if others := differing(data.wanted, found.wanted):
             raise UserError(f"{found.name} is asked for with two values of {others[0]}: make it an axis or a block's")
