@@ -1,5 +1,6 @@
 """Jobs and what is finished: by what runs computed, on which data, wherever they lie."""
 
+import re
 import shutil
 from dataclasses import replace
 from pathlib import Path
@@ -122,6 +123,18 @@ def test_a_name_that_another_grid_has_planned_is_left_to_it(tmp_path, capsys):
     assert {job.name for job in first} & named == shared
     assert folder.jobs_of_others("first") == []
     assert plan(tmp_path, ["finetune.updates=30"], others=first) == first, "a job of both is one"
+
+
+def test_settings_that_are_too_many_for_a_folders_name_are_told_by_a_hash(tmp_path):
+    many = {name: 2 for name in ("batch_size", "hidden_dim", "views", "shift", "eval_every", "log_every", "n_step")}
+    many |= {"checkpoint_every": 2, "eval_length": 2, "updates": 2, "learning_rate": 0.01, "alpha": 0.5, "gamma": 0.5}
+    told = ", ".join(f"{name} = {value}" for name, value in many.items())
+    blocks = [f"[[block]]\nfinetune = {{ {told}, eval_episodes = {episodes} }}\n" for episodes in (3, 4)]
+    first = GRID.partition("[finetune]")[0] + 'method = "acro"\n'
+    (tmp_path / "grid.toml").write_text(first + "".join(blocks))
+    names = [Path(job.name).name for job in plan(tmp_path) if job.section == "finetune"]
+    assert len(set(names)) == 2
+    assert all(re.fullmatch(r"finetune-td3_bc,[0-9a-f]{24}", name) for name in names)
 
 
 def test_runs_on_every_further_content_of_a_set_have_folders_of_their_own(copy):

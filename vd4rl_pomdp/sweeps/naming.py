@@ -4,8 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+from vd4rl_pomdp.runs.identity import content_hash
 from vd4rl_pomdp.sweeps.grid import GridCell
 
+_LONGEST = 160
+"""Bytes of settings in a folder's name, which has room for 255 in all."""
 _OWN = {
     "collect": ("task", "quality"),
     "pretrain": ("method", "corruption"),
@@ -17,9 +20,10 @@ _OWN = {
 
 
 def extras(cell: GridCell, section: str) -> str:
-    """The other settings of a section that tell a cell from others: ",history=gru,max_k=1"."""
+    """The other settings of a section that tell a cell from others: ",history=gru,max_k=1"; or their hash."""
     named = [name for name in cell.named.get(section, ()) if name not in _OWN[section]]
-    return "".join(f",{name}={_word(cell.sections[section][name])}" for name in named)
+    told = "".join(f",{name}={_word(cell.sections[section][name])}" for name in named)
+    return told if len(told.encode()) <= _LONGEST else f",{content_hash(told)}"
 
 
 def run_folder(cell: GridCell, section: str, data: str, values: dict[str, Any]) -> str:
