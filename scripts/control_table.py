@@ -1,7 +1,8 @@
-"""The table of results/control/README.md, made from its rows."""
+"""The tables of results/control/README.md, made from its rows."""
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -34,6 +35,17 @@ def table_lines(folder: Path) -> Iterator[str]:
         probes = probes_of(policy["method"], [encoders[key][name] for name in PROBES])
         place = f"{policy['task']} {policy['quality']} | {policy['corruption']} | {label(policy)}"
         yield f"| {place} | {len(returns)} | {with_seeds(returns)} | {clean} | {errors} | {probes} |"
+
+
+def cost_lines(file: Path) -> Iterator[str]:
+    """What `cell_cost` measured, a row for every change."""
+    yield "| fine-tuning | processor, seconds | wall clock, seconds | return |"
+    yield "|---|---:|---:|---:|"
+    with file.open(newline="", encoding="utf-8") as rows:
+        for row in csv.DictReader(rows):
+            seconds = f"{float(row['processor_seconds']):.0f} | {float(row['seconds']):.0f}"
+            name = "as it is" if row["change"] == "none" else row["change"]
+            yield f"| {name} | {seconds} | {float(row['return']):.2f} |"
 
 
 def probes_of(method: str, errors: Sequence[float | None]) -> str:

@@ -49,7 +49,10 @@ def pages() -> dict[str, Tables]:
             "pictures": navigation_table.picture_lines(navigation_table.picture_runs(), mazes),
             "first person": navigation_table.first_person_lines(navigation_table.first_person_runs()),
         },
-        "results/control/README.md": {"control": control_table.table_lines(control_table.RESULTS)},
+        "results/control/README.md": {
+            "control": control_table.table_lines(control_table.RESULTS),
+            "costs": control_table.cost_lines(control_table.RESULTS / "cell_cost.csv"),
+        },
         "results/methods/README.md": {"methods": methods_table.table_lines(methods_table.main_runs())},
         "results/offline/README.md": {
             "layers": offline_table.layer_lines(returns),
