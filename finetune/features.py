@@ -130,7 +130,7 @@ class FeatureFile:
         self._path.unlink(missing_ok=True)
 
     def _description(self) -> dict[str, Any]:
-        return {**self._made_of} | {"sha256": sha256(regular(self._path))}
+        return {**self._made_of, "sha256": sha256(regular(self._path))}
 
 
 def feature_type(encoder: Encoder) -> type[np.floating]:

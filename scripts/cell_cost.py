@@ -29,15 +29,10 @@ from vd4rl_pomdp.results import read_run
 from vd4rl_pomdp.runs.episodes import LABELS
 from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_inside
+from vd4rl_pomdp.sweeps.grid_file import load_grid
 
-CELL = {
-    "updates": 20_000,
-    "update_precision": "bf16",
-    "eval_every": 20_000,
-    "eval_episodes": 20,
-    "eval_clean": False,
-    "workers": 1,
-}
+_FIRST = next(cell for cell in load_grid("offline").cells() if cell.value("task") == "walker_walk")
+CELL = _FIRST.sections["finetune"] | {"workers": 1}
 """The grid's settings, beside the preset `cpu`."""
 Change = Literal["none", "float32 updates", "all frames drawn", "a second evaluation"]
 CHANGES: Mapping[Change, Mapping[str, Any]] = {

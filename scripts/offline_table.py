@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
@@ -16,11 +17,9 @@ from vd4rl_pomdp.report.measures import mean_if_known
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.report.tables import TOLD_STATES
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
-from vd4rl_pomdp.sweeps.sets import set_of
-from vd4rl_pomdp.sweeps.stages import recorded
+from vd4rl_pomdp.tasks import TASKS
 
 RESULTS = Path(__file__).parents[1] / "results"
 GRIDS = ("offline", "control")
@@ -58,22 +57,24 @@ def readme_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
         " trained with nothing hidden: `acro` | trained with nothing hidden: `mik+a` |"
     )
     yield "|---|" + "---:|" * len((*HIDDEN_FROM, *SHOWN_ALL))
-    for corruption, (place, words) in product((HIDDEN, PATCHES), SETS.items()):
-        here = [run for run in runs if _place(run) == place]
-        if any(run.labels["corruption"] == corruption for run in here):
-            cells = [_told(_of(here, method, corruption)) for method in HIDDEN_FROM]
-            cells += [_told(_of(here, method, CLEAN)) for method in SHOWN_ALL]
-            name = f"{words} ({here[0].reference.data_return:.0f})" + ALONE * (corruption == PATCHES)
-            yield f"| {name} | {' | '.join(cells)} |"
+    for *place, corruption in measured_sets(runs):
+        here = [run for run in runs if _place(run) == tuple(place)]
+        cells = [_told(_of(here, method, corruption)) for method in HIDDEN_FROM]
+        cells += [_told(_of(here, method, CLEAN)) for method in SHOWN_ALL]
+        name = f"{SETS[tuple(place)]} ({here[0].reference.data_return:.0f})" + ALONE * (corruption == PATCHES)
+        yield f"| {name} | {' | '.join(cells)} |"
+
+
+def measured_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str, str]]:
+    """Task, quality and corruption of which the pages tell and of which anything is there."""
+    measured = {(*_place(run), run.labels["corruption"]) for run in runs}
+    asked = ((*place, corruption) for corruption, place in product((HIDDEN, PATCHES), SETS))
+    return (one for one in asked if one in measured)
 
 
 def page_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str, str]]:
-    """Task, quality and corruption of which results/offline/README.md has a table."""
-    measured = {(*_place(run), run.labels["corruption"]) for run in runs}
-    for corruption in (HIDDEN, PATCHES):
-        for place in SETS:
-            if place != CONTROL_ONLY and (*place, corruption) in measured:
-                yield *place, corruption
+    """Those of which results/offline/README.md has a table."""
+    return (one for one in measured_sets(runs) if one[:2] != CONTROL_ONLY)
 
 
 def table_name(task: str, quality: str, corruption: str) -> str:
@@ -179,23 +180,18 @@ def _probed(runs: Sequence[LoadedRun]) -> list[LoadedRun]:
 
 def layer_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
     """How many cells of each layer of the grid are measured, by task."""
-    cells = load_grid(GRIDS[0]).cells()
-    wanted = {(*_labels_of(cell), cell.seed) for cell in cells}
-    measured = {tuple(run.labels[name] for name in (*_CELL, "seed")) for run in runs} & wanted
-    tasks = list(dict.fromkeys(task for task, *_ in map(_labels_of, cells)))
+    grid = GridMembers(GRIDS[0], load_grid(GRIDS[0]).cells())
+    asked = Counter((row["task"], _layer(row)) for row in grid.wanted)
+    found = Counter((run.labels["task"], _layer(run.labels)) for run in runs if grid.asks(run.labels))
+    tasks = [task for task in TASKS if any(task == one for one, _ in asked)]
     yield f"| layer | {' | '.join(tasks)} |"
     yield "|---|" + "---:|" * len(tasks)
     for layer, words in LAYERS.items():
-        counts = []
-        for task in tasks:
-            asked, found = (
-                sum(one[0] == task and _layer(*one[:4]) == layer for one in ours) for ours in (wanted, measured)
-            )
-            counts.append(f"{found} of {asked}" if asked else "–")
+        places = [(task, layer) for task in tasks]
+        counts = (f"{found[place]} of {asked[place]}" if place in asked else "–" for place in places)
         yield f"| ({layer}) {words} | {' | '.join(counts)} |"
 
 
-_CELL = ("task", "quality", "corruption", "method")
 LAYERS = {
     "a": "sets that leave the expert's path, patches and zeroed frames",
     "b": "the paper's qualities, patches and zeroed frames, and their references",
@@ -208,22 +204,16 @@ LAYERS = {
 _MAIN_METHODS = ("mik+a", "mik", "ah+a", "acro", UNTRAINED, "supervised+a", "state")
 
 
-def _layer(task: str, quality: str, corruption: str, method: str) -> str:
-    if quality in ("medium", "medium_replay"):
+def _layer(labels: Row) -> str:
+    if labels["quality"] in ("medium", "medium_replay"):
         return "f"
-    if task == "humanoid_walk":
+    if labels["task"] == "humanoid_walk":
         return "e"
-    if method not in _MAIN_METHODS:
+    if labels["method"] not in _MAIN_METHODS:
         return "d"
-    if corruption == PATCHES:
+    if labels["corruption"] == PATCHES:
         return "c"
-    return "a" if quality == "expert_noisy" else "b"
-
-
-def _labels_of(cell: GridCell) -> tuple[str, ...]:
-    """Values of _CELL."""
-    before, wanted = recorded(cell, "pretrain"), set_of(cell, Path()).wanted
-    return wanted["task"], wanted["quality"], before["corruption"], before["method"]
+    return "a" if labels["quality"] == "expert_noisy" else "b"
 
 
 def cost_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator
 from itertools import groupby
 from operator import attrgetter
-from typing import Any
 
 from vd4rl_pomdp.report.grouping import groups
-from vd4rl_pomdp.report.load import CONDITION, SETTING, LoadedRun
+from vd4rl_pomdp.report.load import CONDITION, SETTING, LoadedRun, without_options
 from vd4rl_pomdp.report.variants import ENCODER_SEED
 from vd4rl_pomdp.runs.episodes import LABELS
 from vd4rl_pomdp.runs.files import Row
@@ -53,19 +52,14 @@ def never_begun(runs: list[LoadedRun], gaps: Iterable[Row], wanted: Iterable[Row
         wanted: labels (`runs.episodes.LABELS`) of policies.
     """
     policies = [run.labels for run in runs if run.stage == "finetune"]
-    known = {_bare(row, LABELS) for row in (*policies, *gaps)}
-    settings = {_bare(row, SETTING): row["corruption"] for row in policies}
+    known = {without_options(row, LABELS) for row in (*policies, *gaps)}
+    settings = {without_options(row, SETTING): row["corruption"] for row in policies}
     return [
         {name: row.get(name, "") for name in CONDITION}
-        | {"corruption": settings[_bare(row, SETTING)], "seed": row["seed"], "state": MISSING}
+        | {"corruption": settings[without_options(row, SETTING)], "seed": row["seed"], "state": MISSING}
         for row in wanted
-        if _bare(row, LABELS) not in known and _bare(row, SETTING) in settings
+        if without_options(row, LABELS) not in known and without_options(row, SETTING) in settings
     ]
-
-
-def _bare(row: Mapping[str, Any], names: Iterable[str]) -> tuple[Any, ...]:
-    """Some labels, without what tells a corruption's options apart."""
-    return tuple(row[name].partition(",")[0] if name == "corruption" else row[name] for name in names)
 
 
 def _is_own(variant: str, seed: int) -> bool:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import zlib
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -62,6 +62,11 @@ class Choice:
 
 
 ALL = Choice()
+
+
+def without_options(row: Row, names: Iterable[str]) -> tuple[Any, ...]:
+    """Some labels of a run or gap, without what tells a corruption's options apart."""
+    return tuple(row[name].partition(",")[0] if name == "corruption" else row[name] for name in names)
 
 
 @dataclass(frozen=True)

@@ -48,12 +48,8 @@ def run_table(runs: list[LoadedRun], evaluated: list[Row], gaps: list[Row]) -> l
 def _run(run: LoadedRun, curve: list[Row]) -> Row:
     """Values of _RUN of one run."""
     last, best = max(curve, key=lambda row: row["step"]), max(curve, key=lambda row: row["score"])
-    found = run.named | run.representation | {"id": run.result.id, "state": run.progress}
+    found = run.named | run.representation | _control(run) | {"id": run.result.id, "state": run.progress}
     found |= {"score": last["score"], "return": float(returns_of([run])[0])}
-    found |= {
-        "path_error": run.reference.path_error,
-        "action_error": summarise(run.last, run.reference)["action_error"],
-    }
     found |= {"best_score": best["score"], "best_step": best["step"], "finetune_seconds": run.seconds}
     found |= {"git_commit": run.result.commit, "machine": run.result.machine}
     return {name: found[name] for name in _RUN}

@@ -71,7 +71,8 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
     made = _tables(runs, choice)
     shown = _shown(made)
     plots = _plots(runs, made)
-    page = _render(runs, made, shown, plots, load_section(paths))
+    mixed = unlike(runs)
+    page = _render(runs, made, shown, plots, mixed, load_section(paths))
     with owned(out):
         refuse_loss(results, out)  # of runs that were added while this was drawn
         with disk_errors(out):
@@ -80,7 +81,7 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
         _write_plots(out / FIGURES, plots)
         write_results(out, results)
         write_text(out / "index.html", page)
-    return Report(out / "index.html", made[_MARK], made["gates"], made["claims"], unlike(runs))
+    return Report(out / "index.html", made[_MARK], made["gates"], made["claims"], mixed)
 
 
 def _tables(runs: list[LoadedRun], choice: Choice) -> dict[str, list[Row]]:
@@ -168,6 +169,7 @@ def _render(
     made: dict[str, list[Row]],
     shown: dict[str, list[ShownTable]],
     plots: dict[str, list[Plot]],
+    mixed: list[str],
     theory: str | None,
 ) -> str:
     wanted = {(row["task"], row["quality"]) for row in made[_MARK]}
@@ -182,7 +184,7 @@ def _render(
         "tables": shown,
         "plots": {name: [(plot, to_svg(plot.figure)) for plot in group] for name, group in plots.items()},
         "differing": differing(runs),
-        "unlike": unlike(runs),
+        "unlike": mixed,
         "films": films,
         "left_out": left_out,
         "published": present.published([r for r in published_scores() if (r["env"], r["dataset"]) in wanted]),

@@ -26,6 +26,9 @@ from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.runs.provenance import CONTINUED, command, git_commit, machine, versions
 from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS
 
+_CODE = ("versions", "git_commit", "plugins", "sources")
+"""What a record tells of the code."""
+
 
 def remedy(folder: Path) -> str:
     """What to do about a result of a finished run that is lost or damaged."""
@@ -136,7 +139,7 @@ class RunFolder:
     def code(self) -> dict[str, Any]:
         """What the run began with, once it has: versions, commit, and where parts not of this package come from."""
         record = read_json(self.path / CONFIG_FILE)
-        return {name: record.get(name, {}) for name in self._code_now()}  # early ones tell of no parts
+        return {name: record.get(name, {}) for name in _CODE}  # early ones tell of no parts
 
     def _code_now(self) -> dict[str, Any]:
         return {"versions": versions(), "git_commit": git_commit()} | code_of(self._parts)

@@ -8,7 +8,7 @@ from typing import Any
 
 from vd4rl_pomdp.data.collect import set_quality
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.report.load import Choice
+from vd4rl_pomdp.report.load import Choice, without_options
 from vd4rl_pomdp.results import Result
 from vd4rl_pomdp.runs.episodes import LABELS
 from vd4rl_pomdp.runs.files import Row
@@ -56,8 +56,7 @@ class GridMembers(Choice):
 
     def asks(self, row: Row) -> bool:
         """Whether a cell asks for a policy of these labels (`runs.episodes.LABELS`), whatever its variant."""
-        corruption = row["corruption"].partition(",")[0]  # without what tells its options apart
-        return tuple((row | {"corruption": corruption})[name] for name in LABELS) in self._policies
+        return without_options(row, LABELS) in self._policies
 
     @property
     def wanted(self) -> list[Row]:
