@@ -54,7 +54,7 @@ class TrainingConfig(StageConfig):
     learning_rate: float = 3e-4
     """Adam's learning rate."""
     frame_encoder: str = "drq"
-    """Frame encoder: drq, nature (a fraction of its cost), small or mixer (MLP-Mixer)."""
+    """Frame encoder: drq, nature (a fraction of its cost), nature_half (half the resolution), small or mixer."""
     precision: Precision = "fp32"
     """fp32, or bf16 autocast."""
     device: str = "auto"

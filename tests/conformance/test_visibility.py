@@ -125,7 +125,7 @@ def test_more_mutants_are_caught():
         wrong_pairs(across, [ROWS, ROWS])
 
 
-@pytest.mark.parametrize("name", ["drq", "nature", "small"])
+@pytest.mark.parametrize("name", ["drq", "nature", "nature_half", "small"])
 def test_frame_encoders_mix_no_rows(name: str):
     assert wrong_pairs(inverse("mik+a", frame_encoder=name, max_k=1), [4, 4, 3], rows=4) == []
 

@@ -2,7 +2,7 @@ import pytest
 import torch
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.nn.frame import StateFrame
+from vd4rl_pomdp.nn.frame import FrameOptions, StateFrame, make_frame_encoder
 
 
 def test_a_state_of_another_width_is_refused_in_a_line():
@@ -10,3 +10,17 @@ def test_a_state_of_another_width_is_refused_in_a_line():
     assert frame(torch.zeros(2, 17, 1, 1)).shape == (2, 17)
     with pytest.raises(UserError, match="reads states of 17 coordinates, the task's have 18: pretrain the reference"):
         frame(torch.zeros(2, 18, 1, 1))
+
+
+@pytest.mark.parametrize("size", [84, 83])
+def test_half_the_resolution_is_means_over_two_by_two_pixels_and_none_is_lost(size: int):
+    encoder = make_frame_encoder("nature_half", 1, size, FrameOptions(8)).double()
+    picture = torch.randint(0, 128, (1, 1, size, size)).double() * 2
+    moved = picture.clone()
+    moved[..., 10, 20:22] += torch.tensor([1.0, -1.0])
+    torch.testing.assert_close(encoder(moved), encoder(picture))
+    picture.requires_grad_()
+    encoder.convolutions(picture).square().sum().backward()
+    assert picture.grad is not None
+    assert picture.grad[0, 0].count_nonzero() == size**2
+    assert encoder.map_shape == (64, 7, 7)

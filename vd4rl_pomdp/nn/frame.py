@@ -94,8 +94,18 @@ def _drq(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
 
 def _nature(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     """Three convolutions, two of them strided (Mnih et al. 2015): a fraction of DrQ's cost."""
+    return _three_convolutions(nn.Conv2d(channels, 32, 8, stride=4))
+
+
+def _nature_half(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
+    """The same at half the resolution: means over 2x2 pixels, which a first convolution of half the extent reads."""
+    half = nn.AvgPool2d(2, ceil_mode=True)
+    return nn.Sequential(half, *_three_convolutions(nn.Conv2d(channels, 32, 4, stride=2)))
+
+
+def _three_convolutions(first: nn.Conv2d) -> nn.Sequential:
     return nn.Sequential(
-        nn.Conv2d(channels, 32, 8, stride=4),
+        first,
         nn.ReLU(),
         nn.Conv2d(32, 64, 4, stride=2),
         nn.ReLU(),
@@ -183,6 +193,7 @@ FRAME_ENCODERS: Registry[FrameEncoderPart] = Registry(
         "nature": FrameEncoderPart(
             _nature, summary="three convolutions of 32 and 64 channels, at a fraction of drq's cost"
         ),
+        "nature_half": FrameEncoderPart(_nature_half, summary="nature on pictures of half the resolution"),
         "small": FrameEncoderPart(
             _small, summary="three strided convolutions of few channels, for grey 50x50 pictures"
         ),
