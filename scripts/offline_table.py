@@ -9,6 +9,7 @@ from pathlib import Path
 
 import numpy as np
 from control_table import probes_of, spread_of, with_seeds
+from scipy.stats import spearmanr
 
 from vd4rl_pomdp.report.gates import FAILED, PASSED, UNKNOWN, gates, returns_of
 from vd4rl_pomdp.report.layout import number
@@ -147,8 +148,7 @@ def _rank_correlation(runs: list[LoadedRun], known: Callable[[LoadedRun], float 
     errors = [known(run) for run in runs]
     if len(runs) < 2 or None in errors:
         return number(None)
-    ranks = [np.array(values).argsort().argsort() for values in (errors, returns_of(runs))]
-    return f"{np.corrcoef(ranks)[0, 1]:.2f}"
+    return f"{spearmanr(errors, returns_of(runs)).statistic:.2f}"
 
 
 def _probe_error(probe: str) -> Callable[[LoadedRun], float | None]:

@@ -1,8 +1,9 @@
 """The mazes of the navigation experiment: names, how each is built, seen and driven, what a state's numbers are.
 
 Distances are PointMaze's: a cell is 1 wide, the maze spans [-2.5, 2.5] in x and y, free cells form a U open to the
-left. The first four are built like the paper's own data: the numbers are those of the generator that one of its
-authors published (a fork of D4RL, github.com/bennevans/D4RL). The others are variants of them under names of their own.
+left. The first four are built like the paper's: the numbers are those of the generator that one of its authors
+published (a fork of D4RL, github.com/bennevans/D4RL), also those of actions, where the paper's text has Gaussian noise.
+The others are variants of them under names of their own.
 """
 
 from __future__ import annotations

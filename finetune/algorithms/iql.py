@@ -12,9 +12,10 @@ Authors' code: github.com/ikostrikov/implicit_q_learning, as it is for locomotio
 
 Differences: states are frozen representations, standardised; returns are n-step. The critics step first, since theirs
 is the loss that trains an encoder: the authors' cycle (value, actor, critics, targets) is entered at the critics, so
-that V(z') has learnt from the batches before only. Rewards are as stored: the authors scale those of locomotion so
-that the returns of a set span 1000, which the control suite's returns do by themselves. Initial weights are PyTorch's
-(theirs: orthogonal).
+that V(z') has learnt from the batches before only. Rewards are as stored: the authors multiply those of locomotion
+so that the returns of a set span 1000. Those of trained actors' sets here span 88 (cheetah_run `expert`) to
+946 (walker_walk `medium_expert`): to scale them would be to multiply the temperature by 11 to 1. Initial weights are
+PyTorch's (theirs: orthogonal).
 """
 
 from __future__ import annotations

@@ -1,4 +1,4 @@
-"""FJ and FJ+A: forward-jump inverse models on states of a bounded past (Wu et al. 2024, section 3.2, Table 1).
+"""FJ and FJ+A: forward-jump inverse models on states of a bounded past (Wu et al. 2024, section 3.1, Table 1).
 
     FJ     P(a_t | f(o_{t-m}..o_t), f(o_{t+k-m}..o_{t+k})),   k in 1..K
     FJ+A   the same with the actions inside each window: a_{t-m}..a_{t-1} and a_{t+k-m}..a_{t+k-1}

@@ -8,9 +8,10 @@ Only f is kept. "+A" (actions in both) is the field `use_actions` of the encoder
 Authors' code: not published.
 
 Differences and readings:
-- Read literally, the future's first item (o_{t+k}, a_{t+k-1}) hands b the last masked action, which for k = 1 is the
-  target. Here b reads (o_j, a_j) for j >= t+k, so that it never sees a_t..a_{t+k-1}. `literal_future` restores the
-  literal reading, to measure what it does.
+- The paper's rows are (o_t, a_{t-1}): the future's first, (o_{t+k}, a_{t+k-1}), hands b the last masked action, which
+  for k = 1 is the target. Here b reads (o_j, a_j) for j >= t+k, so that it never sees a_t..a_{t+k-1}.
+  `literal_future` restores the literal rows, to measure what they do.
+- The future of row h is printed as rows min(h+n, H) to H; here it begins at h = t+k, as in the paper's proof.
 - An episode's last row has no action: b reads zeros and a flag there.
 - The future reaches to the window's end, or n rows beyond t+k (the paper's n is not stated for these experiments);
   the past to the window's start, or m rows before t. Of n+1 rows of the future b reads n+1 actions, not n: each row is
@@ -48,7 +49,7 @@ class MaskedActionOptions(MaskedOptions):
     """Options of MIK+A."""
 
     literal_future: bool = False
-    """Give the future encoder a_{t+k-1}, as the paper's formula reads literally (a leak at k = 1)."""
+    """Give the future encoder a_{t+k-1}, as the paper's rows (o_t, a_{t-1}) have it (a leak at k = 1)."""
 
 
 class MaskedInverse(InverseObjective):

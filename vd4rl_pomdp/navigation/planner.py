@@ -71,7 +71,7 @@ class Planner:
 
 
 class WaypointPlanner:
-    """The planner of the paper's data: it halts at a waypoint beside every cell's centre, and then at the goal.
+    """The planner of the published generator: it halts at a waypoint beside every cell's centre, and then at the goal.
 
     A waypoint is passed at walking pace: within NEAR of it by a mass that moved less than NEAR in the last decision.
     """

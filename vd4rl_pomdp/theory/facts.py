@@ -123,8 +123,8 @@ FACTS = (
         "leaked_target",
         "Read literally, the later view holds the action that is asked for",
         ("mik+a literal", "fj+a literal"),
-        f"row t is (o_t, a_{{t-1}}), the later view begins with row t+k (section 2), and MIK+A is {ON_STATES} from "
-        "k = 1 on (section 3.1)",
+        f"row t is (o_t, a_{{t-1}}) (section 2), the later view begins with row t+k (appendix), MIK+A is {ON_STATES} "
+        "from k = 1 on (section 3.1)",
         AT,
         "without a_{t+k-1} MIK+A is the multi-step inverse wherever past and future decode",
         (idle,),

@@ -70,5 +70,5 @@ VIEWS = {
         ObjectiveView("mik+a literal", "window", actions=True, masked=True, literal=True),
     )
 }
-"""Every view by the name of its method; of the paper's formulas `mik+a literal` reads the future word for word, and
-`fj+a literal` the past."""
+"""Every view by the name of its method. Literal are rows (o_t, a_{t-1}), as the paper defines them: those of the future
+in `mik+a literal`, those of the past in `fj+a literal`."""

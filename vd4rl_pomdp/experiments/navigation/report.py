@@ -137,7 +137,7 @@ def _variants(runs: list[NavigationRun]) -> list[str]:
     if any(MAZES[maze].style is HARD for maze in mazes):
         found += [
             "`hard_` mazes are variants of the paper's. Three wider curtains hide the mass 36% of the time (its own:",
-            "some 22%), every action is noisy (there a tenth is zero and a tenth random), and the first person has",
+            "some 22%), every action is noisy (not a tenth of them zero and a tenth random), and the first person has",
             "another camera, a black sky and other kinematics. The paper's numbers are of its own mazes.",
             "",
         ]
