@@ -104,9 +104,9 @@ class FinetuneConfig(StageConfig):
 
     def check(self) -> None:
         """Refuse settings that cannot work, before anything is read or written."""
+        super().check()
         refuse_outside(
             self, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, views=0,
             shift=(0, FRAME_SIZES[1] - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
             eval_length=1, log_every=1, checkpoint_every=1, workers=0,
         )  # fmt: skip
-        super().check()

@@ -31,12 +31,14 @@ from vd4rl_pomdp.nn.encoder_folder import (
     copy_encoder,
     encoder_hash,
     load_encoder,
+    read_record,
     tell_probe,
 )
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.policies.actor import read_actor
 from vd4rl_pomdp.probes import probe_state
 from vd4rl_pomdp.reference import Reference
+from vd4rl_pomdp.registry import warn_of_other_code
 from vd4rl_pomdp.runs import LABELS_FILE, PRETRAIN_TIMING_FILE, PROBE_FILE, RENDER_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import read_json, write_json
@@ -78,15 +80,15 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     untold = card.quality if card.data == dataset.fingerprint else UNKNOWN_QUALITY
     card = replace(card, quality=dataset.quality or untold)  # the policy's set names its rows
     inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
-    corruption, frame_encoder = card.corruption["corruption"], encoder.config.frame_encoder
-    parts = {"method": card.method, "task": card.task, "corruption": corruption, "frame_encoder": frame_encoder}
-    run = RunFolder(config.out, STAGE, config, inputs, RESULTS, parts)
+    before = read_record(config.encoder)
+    run = RunFolder(config.out, STAGE, config, inputs, RESULTS, before.parts)
     if run.finished:
         Evaluations(run.path, config, card, Reference()).require_all()
     else:
         require_room(config, dataset, encoder, device, FeatureFile(run.path, inputs).exists)
     with run:
         if not run.finished:
+            warn_of_other_code(config.encoder, before.code, before.parts, "it was pretrained; pretrain it again")
             write_json(run.path / LABELS_FILE, labels(config, card))
             _keep_encoder(config, run.path)
             dataset.to(device)

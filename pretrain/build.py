@@ -11,6 +11,7 @@ import numpy as np
 from pretrain.config import MemoryOptions, TrainingConfig
 from pretrain.objectives import METHODS, Method
 from pretrain.objectives.untrained import StateOptions
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.action_target import ActionTarget, make_action_target
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE, encoder_settings
@@ -96,7 +97,10 @@ def _build(config: TrainingConfig, target: ActionTarget | StateScale | None, **s
     """The objective of a config on an encoder of a given shape, with the memory that the config says."""
     method = METHODS.named(config.method)
     encoder = EncoderConfig(**shape, **_memory(config, method))
-    return method.build(Encoder(encoder), target, config.options, config.seed)
+    objective = method.build(Encoder(encoder), target, config.options, config.seed)
+    if not isinstance(getattr(objective, "encoder", None), Encoder):
+        raise UserError(f"the objective of the method {config.method} has no `encoder`: keep the one that it is given")
+    return objective
 
 
 def _noise(options: Options, states: StateScale) -> dict[str, Any]:

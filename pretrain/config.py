@@ -78,10 +78,10 @@ class TrainingConfig(StageConfig):
 
     def check(self) -> None:
         """Refuse settings that cannot work, before anything is read or written."""
+        super().check()
         refuse_outside(
             self, seed=(0, MAX_SEED), steps=0, batch_size=1, window=2, learning_rate=0, log_every=1, checkpoint_every=1
         )
-        super().check()
         if (gap := getattr(self.options, "max_k", 0)) >= self.window:
             raise UserError(f"--max-k {gap} needs windows of more than that many rows: raise --window or lower it")
 

@@ -24,8 +24,8 @@ from vd4rl_pomdp.runs.memory import bytes_kept, bytes_of_parameters, require_mem
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
-from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.seeding import seed_networks, stream_generator
+from vd4rl_pomdp.settings import settings_of
 from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_SIZES, FRAME_STACK, TASKS, UNKNOWN_QUALITY
 from vd4rl_pomdp.types import StateWindows, Windows
 
@@ -138,7 +138,7 @@ def check_config(config: PretrainConfig) -> None:
     least = METHODS.named(config.method).least_batch
     if config.batch_size < least:
         raise UserError(f"--batch-size is {config.batch_size}; {config.method} tells windows apart: give it {least}")
-    check_pictures(config, FRAME_SIZES[1])
+    refuse_outside(config, shift=(0, FRAME_SIZES[1] - 1))
 
 
 def check_pictures(config: PretrainConfig, size: int) -> None:

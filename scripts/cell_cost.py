@@ -26,9 +26,9 @@ from finetune.train import finetune
 from vd4rl_pomdp import evaluation
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.results import read_run
-from vd4rl_pomdp.runs.episodes import LABELS
 from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_inside
+from vd4rl_pomdp.settings import LABELS
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 
 _FIRST = next(cell for cell in load_grid("offline").cells() if cell.value("task") == "walker_walk")

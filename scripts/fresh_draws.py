@@ -25,9 +25,9 @@ from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.policy import load_policy
 from vd4rl_pomdp.policies.actor import read_actor
 from vd4rl_pomdp.reference import Reference
-from vd4rl_pomdp.runs.episodes import LABELS
 from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_inside
+from vd4rl_pomdp.settings import LABELS
 from vd4rl_pomdp.sweeps.found import run_at
 
 

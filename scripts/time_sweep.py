@@ -24,7 +24,7 @@ from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.found import FoundRuns
 from vd4rl_pomdp.sweeps.grid_file import load_grid
-from vd4rl_pomdp.sweeps.plan import JobPlanner
+from vd4rl_pomdp.sweeps.plan import DATA, JobPlanner
 
 
 @dataclass(frozen=True)
@@ -37,7 +37,7 @@ class TimeCommand:
 
 def by_hand(out: Path, grid: Path) -> None:
     """Run all commands one after the other."""
-    for job in JobPlanner(out, None, FoundRuns([]), FoundRuns([])).plan(load_grid(str(grid)).cells()):
+    for job in JobPlanner(out, out / DATA, FoundRuns([]), FoundRuns([])).plan(load_grid(str(grid)).cells()):
         _run(["-m", "vd4rl_pomdp", *job.words])
 
 

@@ -16,6 +16,7 @@ from finetune.config import FinetuneConfig
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS, Method
 from pretrain.objectives.all_history import AllHistory
+from pretrain.train import pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_pages import isolated_registries, load_example, write_example
 from vd4rl_pomdp import testing
@@ -24,7 +25,7 @@ from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.frame import FrameEncoderPart, FrameOptions
 from vd4rl_pomdp.objective import InverseOptions
-from vd4rl_pomdp.options import Options
+from vd4rl_pomdp.options import Options, flat
 from vd4rl_pomdp.registry import REGISTRIES
 from vd4rl_pomdp.report import write_report
 
@@ -280,8 +281,8 @@ def option_called(name: str, base: type[Options] = Options) -> type[Options]:
         ("method", "steps", "PretrainConfig"),
         ("method", "feature_dim", "FrameOptions"),
         ("method", "patch_size", "Patch"),
-        ("corruption", "seed", "PretrainConfig"),
-        ("corruption", "corruption", "CorruptionConfig"),
+        ("corruption", "window", "PretrainConfig"),
+        ("corruption", "corruption_mode", "CorruptionConfig"),
         ("corruption", "max_k", "InverseOptions|MaskedActionOptions"),
         ("frame_encoder", "hidden_dim", "MemoryOptions"),
         ("algorithm", "updates", "FinetuneConfig"),
@@ -305,6 +306,48 @@ def test_an_option_with_the_name_of_another_setting_is_refused_wherever_both_are
     assert end.value.code == 2
     (line,) = capsys.readouterr().err.splitlines()
     assert f"'{option}'" in line
+
+
+@pytest.mark.parametrize("option", ["quality", "method", "seed", "encoder", "eval_clean", "workers", "format", "help"])
+@pytest.mark.parametrize("kind", EXAMPLES)
+def test_an_option_with_a_name_by_which_runs_are_known_is_refused(registries, kind, option):
+    options = option_called(option, FrameOptions if kind == "frame_encoder" else Options)
+    with pytest.raises(UserError, match=f"'mine': the option '{option}' of Mine has a name by which runs are known"):
+        registries[kind].register("mine", part_with(kind, options))
+
+
+@dataclass(frozen=True)
+class Scaled(Options):
+    scale: float = 1
+    least: float | None = None
+
+    __call__ = Stage.__call__
+
+
+def test_an_integer_that_stands_for_a_float_is_one_in_every_record(registries):
+    registries["corruption"].register("mine", Scaled)
+    told = [{}, {"scale": 1}, {"scale": 1.0, "least": None}, {"least": 2}]
+    records = [json.dumps(flat(PretrainConfig.of(corruption="mine", **settings)), default=str) for settings in told]
+    assert records[0] == records[1] == records[2] != records[3]
+    assert '"scale": 1.0, "least": 2.0' in records[3]
+    whole, decimal = (PretrainConfig.of("smoke", self_prediction=value).options for value in (1, 1.0))
+    assert str(whole) == str(decimal)
+
+
+@dataclass(frozen=True)
+class Dirt(Options):
+    def __call__(self, frames, key, number):
+        if frames.shape[-1] != 84:
+            raise UserError(f"the mask is 84x84, the frames are {frames.shape[-1]}")
+        frames[..., :9, :] = 0
+
+
+def test_a_corruption_that_fits_the_set_is_not_tried_on_other_frames(registries, tmp_path, monkeypatch):
+    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+    registries["corruption"].register("dirt", Dirt)
+    data = write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25])
+    config = PretrainConfig.of("smoke", method="random", corruption="dirt", data=data, out=tmp_path / "out")
+    assert pretrain(config).finished
 
 
 def test_two_stages_with_an_option_of_one_name_are_not_chosen_together(registries):

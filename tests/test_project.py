@@ -48,6 +48,7 @@ JUDGES_MAZES_BY += (
     "report.stats",
     "results",
     "runs",
+    "settings",
     "text",
 )
 """What the navigation tables are made with: files, names and settings; no data, no environment and no network."""

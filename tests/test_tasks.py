@@ -1,5 +1,6 @@
 """Tasks of one's own: what is found from their models, and what is refused."""
 
+import re
 import subprocess
 import sys
 from dataclasses import replace
@@ -208,13 +209,31 @@ class Unpaid(gymnasium.Env):
         return np.zeros((84, 84), np.uint8)
 
 
-@pytest.mark.parametrize("paid", [np.nan, np.inf, -np.inf])
+@pytest.mark.parametrize("paid", [np.nan, np.inf, -np.inf, None, "much", np.ones(2)])
 def test_a_reward_that_is_no_number_is_refused_in_the_step_that_pays_it(paid):
     env = make_env(GymnasiumTask(Unpaid, {"paid": paid}))
     env.reset(0)
     assert env.step(np.zeros(2, np.float32)).reward == 1
-    with pytest.raises(UserError, match=f"environment Unpaid pays {paid}, expected a number: mend its rewards"):
+    with pytest.raises(
+        UserError, match=rf"environment Unpaid pays {re.escape(str(paid))}, expected a number: mend its rewards"
+    ):
         env.step(np.zeros(2, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("method", "given", "told"),
+    [
+        ("step", (np.zeros(1), 0.0, False, {}), "gives 4 values in step, where Gymnasium's interface has 5: wrap it"),
+        ("reset", np.zeros(1), "gives a ndarray in reset, where Gymnasium's interface has 2: wrap it"),
+    ],
+)
+def test_an_environment_of_another_interface_is_one_line(monkeypatch, method, given, told):
+    monkeypatch.setattr(Unpaid, method, lambda self, *words, **more: given)
+    env = make_env(GymnasiumTask(Unpaid, {"paid": 1.0}))
+    if method == "step":
+        env.reset(0)
+    with pytest.raises(UserError, match=told):
+        env.step(np.zeros(2, np.float32)) if method == "step" else env.reset(0)
 
 
 def test_an_environment_that_does_not_exist_is_one_line():

@@ -17,16 +17,18 @@ from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn, Observation
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError, refuse_number
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.encoder_folder import encoder_hash, load_encoder
+from vd4rl_pomdp.nn.encoder_folder import encoder_hash, load_encoder, read_record
 from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
 from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.reference import Reference, action_error
+from vd4rl_pomdp.registry import warn_of_other_code
 from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, LABELS_FILE
-from vd4rl_pomdp.runs.episodes import LABELS, read_episodes
+from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.run import remedy
 from vd4rl_pomdp.runs.workers import run_jobs
+from vd4rl_pomdp.settings import LABELS
 from vd4rl_pomdp.tasks import FRAME_SIZE, MOST_EPISODES, TASKS, Task
 
 EVALUATION_SEED = 20_000
@@ -269,6 +271,8 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     if missing:
         raise UserError(f"{run / LABELS_FILE}: has no {missing[0]!r}; {remedy(run)}")
     card = load_encoder(run / "encoder")[1]
+    what = "this policy was trained, and it plays by the new; take the earlier code, or train it again"
+    warn_of_other_code(run, _record(run), read_record(run / "encoder").parts, what)
     task = TASKS.named(card.task)
     chosen = own_and_none(CorruptionConfig.fill(card.corruption))
     if corruption is not None:
@@ -294,10 +298,15 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
 
 def _length(run: Path, task: Task) -> int:
     """Most decisions in an episode of a run's evaluations; the task's where the run does not tell."""
-    file = run / CONFIG_FILE
-    config = read_json(file).get("config") if file.exists() else None
+    config = _record(run).get("config")
     told = config.get("eval_length") if isinstance(config, dict) else None
     return min(told, task.decisions) if isinstance(told, int) else task.decisions
+
+
+def _record(run: Path) -> dict[str, Any]:
+    """A run's config.json; nothing where an early version kept none."""
+    file = run / CONFIG_FILE
+    return read_json(file) if file.exists() else {}
 
 
 def own_and_none(corruption: CorruptionConfig) -> list[CorruptionConfig]:

@@ -146,13 +146,24 @@ class InverseObjective(Objective):
 
     def action_logits(self, window: Windows) -> Tensor:
         """Predictions for every pair: (B, P, target.outputs)."""
-        past, future = self.representations(window)
+        past, future = self._states(window)
         return self.head(past, future, self.pairs(window.obs.shape[1]).to(past.device))
 
     def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean action loss over all real pairs, plus the optional terms; `loss_kNN` is the mean at each k."""
-        past, future = self.representations(window)
+        past, future = self._states(window)
         return self.loss_of(past, future, window, progress)
+
+    def _states(self, window: Windows) -> tuple[Tensor, Tensor]:
+        """`representations`; raises UserError unless they are what its contract says."""
+        given, rows = self.representations(window), window.obs.shape[:2]
+        match given:
+            case (Tensor() as past, Tensor() as future) if past.shape[:-1] == future.shape[:-1] == rows:
+                return past, future
+        raise UserError(
+            f"{type(self).__name__}.representations must give two tensors (B, T, D), of the past and of the future at "
+            f"every row: here of {rows[0]} windows of {rows[1]} rows"
+        )
 
     def loss_of(
         self, past: Tensor, future: Tensor, window: Windows, progress: float

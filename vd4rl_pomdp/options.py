@@ -9,11 +9,13 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import MISSING, dataclass, fields
 from inspect import get_annotations
+from pathlib import Path
 from typing import Any, ClassVar, Literal, Self, get_args, get_origin, get_type_hints
 
 from vd4rl_pomdp.errors import UserError, flag_of, refuse_outside, refuse_unknown
 from vd4rl_pomdp.reading import fits
 from vd4rl_pomdp.registry import REGISTRIES
+from vd4rl_pomdp.settings import LABELS, NO_SETTINGS
 
 Limits = Mapping[str, float | tuple[float, float]]
 """Lowest, or lowest and highest, value of numbers by name."""
@@ -25,6 +27,9 @@ class Options:
 
     limits: ClassVar[Limits] = {}
     """What the numbers among a class's own fields may be."""
+
+    def __post_init__(self) -> None:
+        _adapt(self)
 
     @classmethod
     def fill(cls, values: Mapping[str, Any]) -> Self:
@@ -39,15 +44,31 @@ class Options:
         check_options(self)
 
 
+_KINDS = {bool: "True or False", int: "an integer", float: "a number", str: "a word", Path: "a path"}
+_TAKEN = NO_SETTINGS | {*LABELS, "format", "help"}
+"""Names by which runs are known, and which no option of a part can have: records and reports take them for these."""
+
+
+def _adapt(config: Any) -> None:
+    """Make an integer a float, and a word a path, where that is what is wanted: records know one form of each."""
+    hints = get_type_hints(type(config))
+    for field in fields(config):
+        value, hint = getattr(config, field.name), hints[field.name]
+        wanted = get_args(hint) or (hint,)
+        if type(value) is int and float in wanted and int not in wanted:
+            object.__setattr__(config, field.name, float(value))
+        if type(value) is str and Path in wanted and str not in wanted:
+            object.__setattr__(config, field.name, Path(value))
+
+
 NO_OPTIONS = Options()
-_KINDS = {bool: "True or False", int: "an integer", float: "a number", str: "a word"}
 
 
-def _refuse_types(options: Options) -> None:
+def _refuse_types(config: Any) -> None:
     """Raise UserError for a value that is not of its annotated type."""
-    hints = get_type_hints(type(options))
-    for option in fields(options):
-        value, hint = getattr(options, option.name), hints[option.name]
+    hints = get_type_hints(type(config))
+    for option in fields(config):
+        value, hint = getattr(config, option.name), hints[option.name]
         if fits(value, hint):
             continue
         if get_origin(hint) is Literal:
@@ -140,6 +161,8 @@ def _unkept(kind: type[Options]) -> Iterator[str]:
         where = f"the option {field.name!r} of {kind.__name__}"
         if hasattr(Options, field.name):
             yield f"{where} hides Options.{field.name}: rename it"
+        if field.name in _TAKEN:
+            yield f"{where} has a name by which runs are known (labels, seed, folders, logging): rename it"
         default = field.default if field.default_factory is MISSING else field.default_factory()
         if not isinstance(default, bool | int | float | str | Options | None):
             yield f"{where} needs a default that is a number, a word, a truth value or None: records keep nothing else"
@@ -166,6 +189,9 @@ class StageConfig:
     """Values by setting, by preset; an option is taken where the chosen parts have it."""
     choosers: ClassVar[tuple[str, ...]] = ()
     """Settings that choose parts, and with them which options there are."""
+
+    def __post_init__(self) -> None:
+        _adapt(self)
 
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
@@ -205,6 +231,7 @@ class StageConfig:
 
     def check(self) -> None:
         """Refuse settings that cannot work, before anything is read or written."""
+        _refuse_types(self)
         check_options(self)
 
     def altered(self, **changes: Any) -> Self:

@@ -262,6 +262,19 @@ def of_other_code(record: Mapping[str, Any], settings: Mapping[str, Any]) -> lis
     return list(dict.fromkeys(changed))
 
 
+def warn_of_other_code(place: object, record: Mapping[str, Any], settings: Mapping[str, Any], what: str) -> None:
+    """Tell of each part whose code is another by now.
+
+    Args:
+        place: what was made with the earlier code.
+        record: what it says of that, as `code_of` does.
+        settings: what names the parts.
+        what: since when, and what that means: ends the sentence.
+    """
+    for part in of_other_code(record, settings):
+        print(f"warning: {place}: the code of {part} has changed since {what}", file=sys.stderr)
+
+
 def _named(settings: Mapping[str, Any]) -> Iterator[tuple[str, Registry[Any], str]]:
     """The parts that settings name: setting and name, the registry that has it, and the name."""
     for setting, registry in list(REGISTRIES.items()):  # a package that is loaded may make further ones

@@ -155,7 +155,12 @@ def require_policy(algorithm: Algorithm) -> None:
             f"{type(algorithm).__name__}.policy is not the one that it was given: train that, or what is evaluated and "
             "kept is another"
         )
-    if not any(part is algorithm.policy for part in algorithm.parts().values()):
+    parts = algorithm.parts()
+    if not isinstance(parts, dict) or not all(hasattr(part, "state_dict") for part in parts.values()):
+        raise UserError(
+            f"{type(algorithm).__name__}.parts must be a dictionary of networks and optimisers, which have a state_dict"
+        )
+    if not any(part is algorithm.policy for part in parts.values()):
         raise UserError(
             f"{type(algorithm).__name__}.parts lacks the policy: name all that has a state, or it is not kept"
         )

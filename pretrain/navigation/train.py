@@ -23,8 +23,8 @@ from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.runs.memory import telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
-from vd4rl_pomdp.runs.settings import settings_of
 from vd4rl_pomdp.seeding import seed_networks
+from vd4rl_pomdp.settings import settings_of
 
 RESULTS = (NAVIGATION_FILE, TRAJECTORY_FILE, *FILES_OF_RUN)
 """What a finished run holds."""

@@ -1,5 +1,6 @@
 """Ends that no command asks for: a signal that an import hides, a pipe of a command's own, a system that is none."""
 
+import multiprocessing
 import os
 import signal
 import subprocess
@@ -7,7 +8,7 @@ import sys
 
 import pytest
 
-from vd4rl_pomdp.cli import ends
+from vd4rl_pomdp.cli import ends, main
 from vd4rl_pomdp.cli.ends import run_to_end
 
 
@@ -36,6 +37,14 @@ def test_a_defect_without_a_signal_is_raised(monkeypatch):
     during(monkeypatch, fail)
     with pytest.raises(AttributeError, match="a defect"):
         run_to_end(["pretrain"])
+
+
+def test_a_file_that_calls_main_while_a_worker_imports_it_is_told_where_to_put_that(monkeypatch, capsys):
+    monkeypatch.setattr(multiprocessing.current_process(), "_inheriting", True, raising=False)
+    with pytest.raises(SystemExit) as end:
+        main(["list"])
+    assert end.value.code == 2
+    assert 'put that call below if __name__ == "__main__":' in capsys.readouterr().err
 
 
 def test_a_pipe_of_a_commands_own_is_no_reader_that_has_gone(monkeypatch):

@@ -190,6 +190,24 @@ def test_a_module_that_makes_no_maps_is_refused_where_it_is_built(encoders):
             build("mine", size=SIZE)
 
 
+class Twice(nn.Module):
+    def forward(self, x):
+        return x, x
+
+
+@pytest.mark.parametrize(
+    ("build", "told"),
+    [
+        (lambda channels, size, options: None, "frame encoder 'mine' builds a NoneType, not a module: return what"),
+        (lambda channels, size, options: Twice(), r"module must give feature maps \(N, C', H', W'\), not a tuple"),
+    ],
+)
+def test_what_builds_no_module_of_maps_is_refused(encoders, build, told):
+    encoders.register("mine", FrameEncoderPart(build))
+    with pytest.raises(UserError, match=told):
+        make("mine", size=SIZE)
+
+
 def test_the_name_of_what_reads_states_is_refused(encoders):
     with pytest.raises(UserError, match="frame encoder 'state': encoders of simulator states have this name"):
         encoders.register("state", FrameEncoderPart(convolution))

@@ -78,6 +78,22 @@ def test_differing_dtypes_are_all_listed(tmp_path):
     assert check_dataset(folder, tmp_path / "cache")["dtypes"]["step_type"] == ["float64", "int64"]
 
 
+@pytest.mark.parametrize(
+    ("row", "key", "value", "told"),
+    [
+        (0, "action", 0.5, "an episode's first row has an action or a reward, which led to no frame"),
+        (0, "reward", 0.5, "an episode's first row has an action or a reward, which led to no frame"),
+        (1, "action", -1.5, r"has actions of up to 1.5: scale them to \[-1, 1\]"),
+    ],
+)
+def test_what_can_be_no_action_is_refused(tmp_path, row, key, value, told):
+    folder = write_fake_set(tmp_path / "walker_walk" / "expert", (5, 4))
+    with h5py.File(next(folder.glob("0_*.hdf5")), "a") as file:
+        file[key][row] = value
+    with pytest.raises(UserError, match=told):
+        check_dataset(folder, tmp_path / "cache")
+
+
 def test_physics_without_a_task_is_refused(tmp_path):
     with pytest.raises(UserError, match="has physics but names no task"):
         check_dataset(write_fake_set(tmp_path / "set", (4,), physics_dim=2), tmp_path / "cache", true_replay)

@@ -72,6 +72,16 @@ class Forgetful(BC):
         return {"optimiser": self.optimiser}
 
 
+class Listing(BC):
+    def parts(self):
+        return [self.policy, self.optimiser]
+
+
+class Counting(BC):
+    def parts(self):
+        return super().parts() | {"steps": torch.zeros(())}
+
+
 @pytest.mark.parametrize(
     ("kind", "told"),
     [(Silent, "Silent.losses yields no loss"), (Returning, "Returning.losses gives a Loss: let it yield")],
@@ -85,6 +95,9 @@ def test_an_algorithm_that_would_not_keep_its_policy_is_refused():
     require_policy(make(BC))
     with pytest.raises(UserError, match=r"Forgetful\.parts lacks the policy"):
         require_policy(make(Forgetful))
+    for kind in (Listing, Counting):
+        with pytest.raises(UserError, match=rf"{kind.__name__}\.parts must be a dictionary of networks and optimisers"):
+            require_policy(make(kind))
 
 
 class Wider(BC):

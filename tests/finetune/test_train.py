@@ -17,10 +17,12 @@ from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_finetune, smoke_pretrain
+from vd4rl_pomdp import registry
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.errors import InUseError, UserError
-from vd4rl_pomdp.nn import load_encoder
+from vd4rl_pomdp.evaluation import evaluate_run
+from vd4rl_pomdp.nn import encoder_folder, load_encoder
 from vd4rl_pomdp.runs import memory
 from vd4rl_pomdp.runs.metrics import read_metrics
 
@@ -97,11 +99,47 @@ def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_th
         run_pretrain(smoke_pretrain(data, tmp_path / "gru", method="drq_bc", history="gru"))
 
 
+def test_code_that_has_changed_since_is_told(data, tmp_path, monkeypatch, capsys):
+    code = {"frame_encoder tiny": "tiny.py 1"}
+    for module in (registry, encoder_folder):
+        monkeypatch.setattr(module, "sources", lambda settings: code)
+    encoder = run_pretrain(smoke_pretrain(data, tmp_path / "made", method="random")).path / "encoder"
+    brief = {"updates": 2, "batch_size": 4, "eval_length": 2}
+    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "alike", **brief)).path
+    evaluate_run(run, "none", 1, 1)
+    assert "warning" not in capsys.readouterr().err
+    code = {"frame_encoder tiny": "tiny.py 2"}
+    run_finetune(smoke_finetune(encoder, data, tmp_path / "changed", **brief))
+    told = "the code of frame_encoder tiny has changed since"
+    assert f"warning: {encoder}: {told} it was pretrained; pretrain it again" in capsys.readouterr().err
+    evaluate_run(run, "none", 1, 1)
+    assert f"warning: {run}: {told} this policy was trained" in capsys.readouterr().err
+
+
 def test_a_set_of_one_episode_is_learned_from_without_a_probe(encoder, tmp_path):
     one = write_fake_set(tmp_path / "one" / "walker_walk" / "expert", [20], physics_dim=18)
     run = run_finetune(smoke_finetune(encoder, one, tmp_path / "out", updates=2, batch_size=4, eval_length=2))
     assert run.finished
     assert not (run.path / "probe.json").exists()
+
+
+@pytest.mark.parametrize(
+    ("settings", "told"),
+    [
+        ({"precision": "fp16"}, "--precision is 'fp16': choose one of fp32, bf16"),
+        ({"batch_size": "8"}, "--batch-size is '8': it must be an integer"),
+        ({"learning_rate": "1e-3"}, "--learning-rate is '1e-3': it must be a number"),
+        ({"seed": np.int64(3)}, "--seed is .*3.*: it must be an integer"),
+        ({"shift": True}, "--shift is True: it must be an integer"),
+    ],
+)
+def test_settings_of_another_type_are_one_line(data, encoder, tmp_path, settings, told):
+    for make, words in ((smoke_pretrain, [data]), (smoke_finetune, [encoder, data])):
+        config = make(*words, tmp_path / "out", **settings)
+        with pytest.raises(UserError, match=told):
+            (run_pretrain if make is smoke_pretrain else run_finetune)(config)
+    assert not (tmp_path / "out").exists()
+    assert smoke_pretrain(str(data), str(tmp_path / "out")) == smoke_pretrain(data, tmp_path / "out"), "words are paths"
 
 
 def test_user_slips_are_one_line(data, encoder, tmp_path):

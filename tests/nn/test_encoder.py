@@ -128,6 +128,19 @@ def test_an_encoder_of_a_corruption_whose_file_was_not_run_says_so(tmp_path):
         load_encoder(tmp_path)
 
 
+def test_an_option_that_its_part_has_lost_is_no_default(tmp_path):
+    encoder = Encoder(EncoderConfig(action_dim=6))
+    save_encoder(tmp_path, encoder, replace(CARD, corruption={"corruption": "none", "patch_size": 8}))
+    assert load_encoder(tmp_path)[1].corruption["patch_size"] == 8, "early versions told of what nothing read"
+    save_encoder(tmp_path, encoder, replace(CARD, corruption={"corruption": "patch", "patch_height": 8}))
+    with pytest.raises(UserError, match="corruption patch has no option 'patch_height' by now"):
+        load_encoder(tmp_path)
+    encoder.config = replace(encoder.config, frame_options={"depth": 3})
+    save_encoder(tmp_path, encoder, CARD)
+    with pytest.raises(UserError, match="frame encoder 'drq' has no option 'depth' by now"):
+        load_encoder(tmp_path)
+
+
 def test_weights_of_another_network_say_which_numbers_are_missing(tmp_path):
     save_encoder(tmp_path, make("none", False), CARD)
     save_file({"frame.other": torch.zeros(1)}, tmp_path / "model.safetensors")

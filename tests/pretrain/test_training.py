@@ -6,12 +6,14 @@ import pytest
 import torch
 
 from baselines import CURL
-from pretrain.build import build_on_states, build_target
+from pretrain.build import build_objective, build_on_states, build_target
 from pretrain.config import PretrainConfig
-from pretrain.objectives import METHODS
-from pretrain.train import PretrainTrainer, view_of
+from pretrain.objectives import METHODS, Method
+from pretrain.objectives.masked_inverse import MaskedInverse, MaskedOptions
+from pretrain.train import PretrainTrainer, pretrain, view_of
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.data import View, open_dataset
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn import Encoder, EncoderConfig
 
 
@@ -78,6 +80,35 @@ def test_any_objective_can_be_built_on_states(method):
     assert encoder.dim == (32 if method == "mik+a" else 18)
     states = torch.rand(2, 8, 18, 1, 1)
     assert torch.equal(encoder.frame(states), states[..., 0, 0])
+
+
+class Short(MaskedInverse):
+    def representations(self, window):
+        past, future = super().representations(window)
+        return past[:, 1:], future[:, 1:]
+
+
+class Single(MaskedInverse):
+    def representations(self, window):
+        return super().representations(window)[0]
+
+
+@pytest.mark.parametrize("kind", [Short, Single])
+def test_representations_that_are_no_two_of_every_row_are_refused(tmp_path, monkeypatch, kind):
+    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+    data = write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25])
+    with METHODS.isolated():
+        METHODS.register("mine", Method(kind, options=MaskedOptions))
+        config = PretrainConfig.of("smoke", method="mine", data=data, out=tmp_path / "out")
+        with pytest.raises(UserError, match=rf"{kind.__name__}\.representations must give two tensors \(B, T, D\)"):
+            pretrain(config)
+
+
+def test_an_objective_without_its_encoder_is_refused():
+    with METHODS.isolated():
+        METHODS.register("mine", Method(lambda *given: torch.nn.Linear(1, 1)))
+        with pytest.raises(UserError, match="objective of the method mine has no `encoder`: keep the one that it is"):
+            build_objective(PretrainConfig.of("smoke", method="mine"), 6, None)
 
 
 def test_a_trainer_takes_another_view_of_the_set(trainer: PretrainTrainer):

@@ -176,6 +176,18 @@ def test_files_of_figures_have_plain_names_of_their_own():
     assert not any(".." in name for name in found[1:])
 
 
+def test_code_of_a_pretraining_and_of_its_policy_is_told(tmp_path, capsys):
+    before = {"sources": {"method mine": "mine.py 0", "frame_encoder own": "own.py 0"}}
+    after = {"sources": {"method mine": "mine.py 1", "frame_encoder own": "own.py 1"}}
+    for seed, told in enumerate(({}, after)):
+        run = describe(write_run(tmp_path / f"runs/{seed}", "mine", seed, {10: [1.0]}), {}, "one")
+        write_json(run / "config.json", read_json(run / "config.json") | told)
+        write_json(run / "encoder/config.json", read_json(run / "encoder/config.json") | {"origin": before})
+    main(["report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")])
+    told = "frame_encoder own has 2 states of its code: own.py 0 (mine); own.py 0 then own.py 1 (mine)"
+    assert capsys.readouterr().err == f"warning: {told}\n", "nothing of a method is used after its pretraining"
+
+
 def test_what_was_not_made_of_the_same_is_told(tmp_path, capsys):
     parts = {"plugins": {"method mine": "theirs 1.0"}, "sources": {"method mine": "mine.py 1"}}
     for number, (method, data, told) in enumerate(

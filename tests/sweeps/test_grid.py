@@ -293,6 +293,22 @@ def test_a_method_that_reads_states_is_refused_on_a_task_that_has_none(method):
             check_cell(GridCell({}, cell | {"pretrain": {"method": method}}, {}))
 
 
+def test_a_set_that_is_there_need_not_be_one_that_can_be_collected():
+    with TASKS.isolated():
+        TASKS.register("pictures", GymnasiumTask("MountainCarContinuous-v0"))
+        cell = GridCell({}, {"collect": {"task": "pictures", "quality": "expert"}, "pretrain": {"method": "acro"}}, {})
+        with pytest.raises(UserError, match="mine: pictures has no states for an actor to read"):
+            check_cells([cell], "mine")
+        check_cells([cell], "mine", collects=lambda _: False)
+
+
+@pytest.mark.parametrize("changes", [[], ["pretrain.max-k=3"]])
+def test_a_flags_name_is_no_settings(file, changes):
+    text = '[collect]\ntask = "walker_walk"\nquality = "expert"\n[pretrain]\nmax' + "_-"[not changes] + "k = 1"
+    with pytest.raises(UserError, match=r"pretrain\.max-k: is the flag's name, the setting's is max_k"):
+        load_grid(file(text), changes)
+
+
 def test_the_papers_grids_are_its_figures_over_twelve_methods():
     for name, corruption in (("paper_patch", "patch"), ("paper_patch_zero", "patch+zero_frames")):
         cells = [c for c in load_grid(name).cells() if c.value("corruption") == corruption]

@@ -14,7 +14,7 @@ from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.results import read_results, write_results
 from vd4rl_pomdp.runs import FORMAT
-from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.settings import settings_of
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
 from vd4rl_pomdp.sweeps.stages import collection_of, recorded

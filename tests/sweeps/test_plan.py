@@ -21,7 +21,7 @@ from vd4rl_pomdp.sweeps.estimate import Estimates
 from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.found import FoundRun, FoundRuns, runs_below, runs_kept
 from vd4rl_pomdp.sweeps.grid_file import load_grid
-from vd4rl_pomdp.sweeps.plan import JobPlanner
+from vd4rl_pomdp.sweeps.plan import DATA, JobPlanner
 from vd4rl_pomdp.sweeps.stages import recorded
 from vd4rl_pomdp.tasks import TASKS
 
@@ -68,7 +68,7 @@ def copy(swept, tmp_path, monkeypatch):
 def plan(folder: Path, changes=(), kept=None, data=None, others=(), out=None):
     """Jobs of a folder's grid, in the folder itself unless `out` names another."""
     cells, out = load_grid(str(folder / "grid.toml"), changes).cells(), out or folder
-    return JobPlanner(out, data, kept or FoundRuns([]), FoundRuns(runs_below(out)), others).plan(cells)
+    return JobPlanner(out, data or out / DATA, kept or FoundRuns([]), FoundRuns(runs_below(out)), others).plan(cells)
 
 
 def left(jobs):
@@ -237,7 +237,7 @@ def test_a_kept_row_whose_part_has_changed_counts_and_is_told(copy, tmp_path, mo
     kept = FoundRuns(runs_kept([tmp_path / "rows"]))
     monkeypatch.setattr(module, "of_other_code", lambda record, settings: ["method mine"])
     shutil.copytree(copy / "data", tmp_path / "new" / "data")
-    planner = JobPlanner(tmp_path / "new", None, kept, FoundRuns([]))
+    planner = JobPlanner(tmp_path / "new", tmp_path / "new" / DATA, kept, FoundRuns([]))
     assert left(planner.plan(load_grid(str(copy / "grid.toml")).cells())) == []
     assert planner.changed_since == {"method mine": len(kept.runs) + 1}, "and their set"
 
@@ -246,7 +246,7 @@ def test_policies_on_an_encoder_that_was_made_anew_count_and_are_told(copy):
     cells = load_grid(str(copy / "grid.toml")).cells()
 
     def told():
-        planner = JobPlanner(copy, None, FoundRuns([]), FoundRuns(runs_below(copy)))
+        planner = JobPlanner(copy, copy / DATA, FoundRuns([]), FoundRuns(runs_below(copy)))
         assert left(planner.plan(cells)) == []
         return planner.on_other_encoders
 

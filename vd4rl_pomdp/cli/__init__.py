@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import io
+import multiprocessing
 import os
 import sys
 from collections.abc import Sequence
@@ -26,10 +27,17 @@ COMMANDS |= {
     "sweep": sweeps.COMMANDS,
     **studies.COMMANDS,
 }
+_UNGUARDED = (
+    "error: processes that help import the file that was started, which calls main() then, too: put that call below "
+    'if __name__ == "__main__":'
+)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vd4rl-pomdp`."""
+    if getattr(multiprocessing.current_process(), "_inheriting", False):  # which a worker is while it imports its file
+        print(_UNGUARDED, file=sys.stderr)
+        sys.exit(2)
     words = list(sys.argv[1:] if arguments is None else arguments)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):

@@ -54,9 +54,10 @@ def _evaluate(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.errors import refuse_number
     from vd4rl_pomdp.evaluation import by_part, evaluate_run, evaluations_of
     from vd4rl_pomdp.reference import Reference, summarise
-    from vd4rl_pomdp.runs.episodes import LABELS, append_episodes, begin_episodes
+    from vd4rl_pomdp.runs.episodes import append_episodes, begin_episodes
     from vd4rl_pomdp.runs.files import flatten
     from vd4rl_pomdp.runs.outputs import refuse_inside
+    from vd4rl_pomdp.settings import LABELS
 
     command = parse(EvaluateCommand, words, program)
     refuse_number("parts", command.parts, 1)

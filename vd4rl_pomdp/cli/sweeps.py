@@ -73,7 +73,8 @@ def _run(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
     from vd4rl_pomdp.sweeps.grid import SHARED, narrow
     from vd4rl_pomdp.sweeps.grid_file import load_grid, names
-    from vd4rl_pomdp.sweeps.plan import JobPlanner
+    from vd4rl_pomdp.sweeps.plan import DATA, JobPlanner
+    from vd4rl_pomdp.sweeps.sets import set_of
     from vd4rl_pomdp.sweeps.stages import check_cells
 
     for name in SHARED:
@@ -82,15 +83,16 @@ def _run(words: Arguments, program: str) -> None:
     command = parse_stage(RunCommand, words, program)
     grid = load_grid(command.grid, command.change, command.testing)
     cells = narrow(grid.cells(), command.only)
-    check_cells(cells, command.grid)
     for place in (command.out, command.data or command.out):
         refuse_no_folder(place)
+    sets = command.data or command.out / DATA
+    check_cells(cells, command.grid, lambda cell: not set_of(cell, sets).foreign)
     refuse_kept(command.out)
     here, kept = FoundRuns(runs_below(command.out)), FoundRuns(runs_kept(command.done))
     folder = SweepFolder(command.out)
     own = [str(Path(command.grid).resolve())] * (command.grid not in names())  # another file is another grid
     plan = plan_name(grid.name, [*own, *command.only, *command.change, *["testing"] * command.testing])
-    planner = JobPlanner(command.out, command.data, kept, here, folder.jobs_of_others(plan))
+    planner = JobPlanner(command.out, sets, kept, here, folder.jobs_of_others(plan))
     jobs = planner.plan(cells)
     refuse_unknown_to_jobs(jobs)
     for name, number in planner.of_other_content.items():

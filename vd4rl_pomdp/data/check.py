@@ -42,6 +42,7 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
     is_maze = attributes.get("task") in MAZES
     dataset = open_dataset(path, cache)
     verify_store(dataset.store)
+    _check_actions(dataset)
     returns = dataset.returns.numpy()
     reason = _why_not_replayed(dataset, is_maze)
     replayed = None if reason else _maze_error(dataset, attributes) if is_maze else _replay_error(dataset, replay)
@@ -63,6 +64,19 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
         "dtypes": _dtypes(shard_paths(path)),
         "store_ok": True,
     }
+
+
+def _check_actions(dataset: Dataset) -> None:
+    """Raise UserError for actions that cannot be what this format means by them."""
+    action, reward = dataset.store.array("action"), dataset.store.array("reward")
+    first = dataset.episode_start.numpy()
+    if action[first].any() or reward[first].any():
+        raise UserError(
+            f"{dataset.path}: an episode's first row has an action or a reward, which led to no frame: store each with "
+            "the frame that follows it, and zeros in the first row"
+        )
+    if (most := np.abs(action).max()) > 1:
+        raise UserError(f"{dataset.path}: has actions of up to {most:g}: scale them to [-1, 1], as policies act")
 
 
 def _why_not_replayed(dataset: Dataset, is_maze: bool) -> str:

@@ -77,22 +77,36 @@ class GymnasiumEnv(PixelEnv):
 
     def _begin(self, seed: int) -> None:
         with self._telling("cannot be reset"):
-            self._observation, _ = self.env.reset(seed=seed)
+            given = self.env.reset(seed=seed)
+        self._observation, _ = self._of_interface("reset", given, 2)
 
     def _apply(self, action: np.ndarray) -> tuple[float, bool, float]:
         rescaled, total = self._rescaled(action), 0.0
         for _ in range(self.task.action_repeat):
             with self._telling("cannot make a step"):
-                self._observation, reward, terminated, truncated, _ = self.env.step(rescaled.copy())
-            total += self._finite(float(reward))
+                given = self.env.step(rescaled.copy())
+            self._observation, reward, terminated, truncated, _ = self._of_interface("step", given, 5)
+            total += self._paid(reward)
             if terminated or truncated:
                 return total, True, 0.0 if terminated else 1.0
         return total, False, 1.0
 
-    def _finite(self, reward: float) -> float:
-        if not math.isfinite(reward):
+    def _of_interface(self, method: str, given: Any, length: int) -> Any:
+        if not isinstance(given, tuple) or len(given) != length:
+            found = f"{len(given)} values" if isinstance(given, tuple) else f"a {type(given).__name__}"
+            raise UserError(
+                f"environment {self._name} gives {found} in {method}, where Gymnasium's interface has {length}: wrap it"
+            )
+        return given
+
+    def _paid(self, reward: Any) -> float:
+        try:
+            paid = float(np.asarray(reward).item())
+        except (TypeError, ValueError):
+            paid = math.nan
+        if not math.isfinite(paid):
             raise UserError(f"environment {self._name} pays {reward}, expected a number: mend its rewards, or wrap it")
-        return reward
+        return paid
 
     def _rescaled(self, action: np.ndarray) -> np.ndarray:
         """An (A,) action in [-1, 1] between the bounds of the environment's own, in its shape and dtype."""

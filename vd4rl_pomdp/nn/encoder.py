@@ -5,7 +5,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import asdict, dataclass, field, replace
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
@@ -63,6 +63,8 @@ def build_frame_encoder(config: EncoderConfig) -> FrameEncoder:
     """The frame encoder of a config; raises UserError if it cannot read pictures of that size."""
     told = {"feature_dim": config.feature_dim} | config.frame_options
     options = FRAME_ENCODERS.named(config.frame_encoder).options.fill(told)
+    if unknown := told.keys() - asdict(options).keys():
+        raise UserError(f"frame encoder {config.frame_encoder!r} has no option {min(unknown)!r} by now")
     try:
         return make_frame_encoder(config.frame_encoder, config.channels, config.size, options)
     except RuntimeError as error:

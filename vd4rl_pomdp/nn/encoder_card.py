@@ -45,6 +45,10 @@ class EncoderOrigin:
     """Frames that the pretraining's batches held; None: not recorded."""
     probe: dict[str, float] = field(default_factory=dict)
     """Errors of linear probes, as `vd4rl_pomdp.probes.probe_state` gives them; empty if none was fitted."""
+    plugins: dict[str, str] = field(default_factory=dict)
+    """Where parts come from that are not this package's, as `registry.origins` tells; empty if none was recorded."""
+    sources: dict[str, str] = field(default_factory=dict)
+    """Their files, as `registry.sources` tells, likewise."""
 
 
 @dataclass(frozen=True)
@@ -54,3 +58,15 @@ class EncoderRecord:
     encoder: EncoderConfig
     pretrain: EncoderCard
     origin: EncoderOrigin = EncoderOrigin()
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """Names of the parts that made it, by the registries' `setting`."""
+        card = self.pretrain
+        named = {"method": card.method, "task": card.task, "corruption": card.corruption["corruption"]}
+        return named | {"frame_encoder": self.encoder.frame_encoder}
+
+    @property
+    def code(self) -> dict[str, dict[str, str]]:
+        """What it says of their code, as `registry.code_of` does."""
+        return {"plugins": self.origin.plugins, "sources": self.origin.sources}

@@ -22,7 +22,9 @@ from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.encoder_card import EncoderCard, EncoderOrigin, EncoderRecord
 from vd4rl_pomdp.nn.frame import STATE
 from vd4rl_pomdp.nn.model_card import CARD, model_card
+from vd4rl_pomdp.options import flat, option_names
 from vd4rl_pomdp.reading import build, parse_json, read_bytes, read_tensors
+from vd4rl_pomdp.registry import origins, sources
 from vd4rl_pomdp.runs.files import json_text, write_bytes, write_json
 from vd4rl_pomdp.runs.provenance import git_commit
 
@@ -41,8 +43,10 @@ def save_encoder(folder: Path | str, encoder: Encoder, card: EncoderCard, frames
         frames: how many frames the batches of its pretraining held, if that is known.
     """
     weights = {name: value.cpu().contiguous().clone() for name, value in encoder.state_dict().items()}
-    origin = EncoderOrigin(__version__, git_commit(), frames)
-    _write(Path(folder), save(weights), EncoderRecord(encoder.config, card, origin))
+    record = EncoderRecord(encoder.config, card)
+    parts = record.parts
+    origin = EncoderOrigin(__version__, git_commit(), frames, plugins=origins(parts), sources=sources(parts))
+    _write(Path(folder), save(weights), replace(record, origin=origin))
 
 
 def _write(folder: Path, weights: bytes, record: EncoderRecord) -> None:
@@ -149,8 +153,10 @@ def load_encoder(
 
 
 def _check_corruption(card: EncoderCard) -> None:
-    """Raise KeyError, TypeError or ValueError unless a card names a corruption."""
+    """Raise KeyError, TypeError or ValueError unless a card names a corruption, and options that some part has."""
     config = CorruptionConfig.fill({"corruption": card.corruption["corruption"], **card.corruption})
+    if unknown := card.corruption.keys() - flat(config).keys() - option_names():  # early ones tell of unused ones, too
+        raise TypeError(f"corruption {config.corruption} has no option {min(unknown)!r} by now")
     build(CorruptionConfig, {"corruption": config.corruption, "corruption_mode": config.corruption_mode})
     for stage in config.stages:
         build(type(stage), asdict(stage))

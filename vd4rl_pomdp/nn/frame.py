@@ -55,8 +55,13 @@ class FrameEncoder(nn.Module):
         super().__init__()
         self.convolutions = convolutions
         with torch.no_grad():
-            self.map_shape = tuple(convolutions(torch.zeros(1, channels, size, size)).shape[1:])
-            """(C', H', W') of the feature maps."""
+            maps = convolutions(torch.zeros(1, channels, size, size))
+        if not isinstance(maps, Tensor):
+            raise UserError(
+                f"a frame encoder's module must give feature maps (N, C', H', W'), not a {type(maps).__name__}"
+            )
+        self.map_shape = tuple(maps.shape[1:])
+        """(C', H', W') of the feature maps."""
         flat = math.prod(self.map_shape)
         self.project = nn.Sequential(nn.Linear(flat, feature_dim), nn.LayerNorm(feature_dim), nn.Tanh())
 
@@ -266,6 +271,10 @@ class StateFrame(nn.Module):
 def make_frame_encoder(name: str, channels: int, size: int, options: FrameOptions) -> FrameEncoder:
     """Build a frame encoder by name; an unknown name, or one whose module makes no maps, raises UserError."""
     maps = FRAME_ENCODERS.named(name).build(channels, size, options)
+    if not isinstance(maps, nn.Module):
+        raise UserError(
+            f"frame encoder {name!r} builds a {type(maps).__name__}, not a module: return what makes the maps"
+        )
     encoder = FrameEncoder(maps, channels, size, options.feature_dim)
     if len(encoder.map_shape) != 3:
         raise UserError(

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
+from typing import Any
 
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import LoadedRun, compare
 from vd4rl_pomdp.report.tables import label, setting
-from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.settings import settings_of
 
 _SEEDS = 12
 """Seeds that are named one by one, at most."""
@@ -83,10 +84,21 @@ def _content(run: LoadedRun) -> str:
 
 
 def _code(run: LoadedRun) -> dict[str, str]:
-    """Package and file of each part that is not this project's."""
-    parts = [run.record.get(name, {}) for name in ("plugins", "sources")]
-    names = dict.fromkeys(name for one in parts for name in one)
-    return {name: ", ".join(filter(None, (one.get(name) for one in parts))) for name in names}
+    """Package and file of each part that is not this project's: of a pretraining's, then of a policy's if it is other.
+
+    Of a method those of the pretraining, where they are recorded: nothing of it is used afterwards.
+    """
+    before, own = _parts_of(run.result.origin), _parts_of(run.record)
+    after = {part: told for part, told in own.items() if not (part in before and part.startswith("method "))}
+    told = {part: [one[part] for one in (before, after) if part in one] for part in before | after}
+    return {part: " then ".join(dict.fromkeys(states)) for part, states in told.items()}
+
+
+def _parts_of(record: Mapping[str, Any]) -> dict[str, str]:
+    """Package and file of each part that a record tells of."""
+    told = [record.get(name, {}) for name in ("plugins", "sources")]
+    names = dict.fromkeys(name for one in told for name in one)
+    return {name: ", ".join(filter(None, (one.get(name) for one in told))) for name in names}
 
 
 def facts(runs: list[LoadedRun]) -> list[dict[str, str]]:

@@ -9,8 +9,8 @@ from operator import attrgetter
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import CONDITION, SETTING, LoadedRun, without_options
 from vd4rl_pomdp.report.variants import ENCODER_SEED
-from vd4rl_pomdp.runs.episodes import LABELS
 from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.settings import LABELS
 
 Setting = tuple[str, str, str]
 """Values of SETTING."""
@@ -49,7 +49,7 @@ def never_begun(runs: list[LoadedRun], gaps: Iterable[Row], wanted: Iterable[Row
     Args:
         runs: all of the report.
         gaps: of `find_gaps`.
-        wanted: labels (`runs.episodes.LABELS`) of policies.
+        wanted: labels (`settings.LABELS`) of policies.
     """
     policies = [run.labels for run in runs if run.stage == "finetune"]
     known = {without_options(row, LABELS) for row in (*policies, *gaps)}

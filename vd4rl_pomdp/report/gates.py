@@ -20,7 +20,7 @@ from vd4rl_pomdp.report.load import SETTING, LoadedRun
 from vd4rl_pomdp.report.tables import REFERENCES, grouped
 from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, is_plain, of_corruption, unlike
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.settings import settings_of
 
 STATE_SHARE, ACRO_SHARE = 0.9, 0.7
 """Least shares of the data's mean return, of `state` and of `acro` under `none`."""

@@ -76,7 +76,7 @@ class LoadedRun:
     result: Result
     """Its files."""
     labels: dict[str, Any]
-    """Values of `runs.episodes.LABELS`; the task is empty until the run has opened its data. The corruption is followed
+    """Values of `settings.LABELS`; the task is empty until the run has opened its data. The corruption is followed
     by its options where other runs have others of the same name, "patch, patch_size 48": that is another setting."""
     settings: Settings
     """All settings in which runs of its method may differ, in words."""

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from vd4rl_pomdp.corruptions import corruption_settings
-from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.settings import settings_of
 
 Settings = dict[str, str]
 """Values as words, by the name that is shown beside them."""

@@ -20,13 +20,13 @@ from typing import Any
 from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
-from vd4rl_pomdp.runs.episodes import COLUMNS, LABELS, episodes_until, read_episodes
+from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_csv
 from vd4rl_pomdp.runs.identity import content_hash, identity
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.provenance import CONTINUED
 from vd4rl_pomdp.runs.run import remedy
-from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.settings import LABELS, settings_of
 
 RUNS = "runs.jsonl"
 RECORD, ENCODER = "config", "encoder"
@@ -83,6 +83,11 @@ class Result:
     def encoder(self) -> dict[str, Any]:
         """What its encoder says of its pretraining; empty where there is none yet."""
         return self.files.get(ENCODER, {}).get("pretrain", {})
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        """What its encoder says of the code that made it, and of its probe; empty where there is none yet."""
+        return self.files.get(ENCODER, {}).get("origin", {})
 
     @property
     def card(self) -> dict[str, Any]:

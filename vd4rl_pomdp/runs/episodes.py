@@ -14,9 +14,8 @@ from typing import Any
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.reading import regular
 from vd4rl_pomdp.runs.files import appending, write_csv
+from vd4rl_pomdp.settings import LABELS
 
-LABELS = ("method", "task", "quality", "corruption", "algorithm", "seed")
-"""What names the rows of a run."""
 ADDED = ("evaluated_under", "action_error")
 """Columns that files of earlier versions lack."""
 COLUMNS = (*LABELS, "step", "episode", "episode_seed", "return", "length", "score", *ADDED)

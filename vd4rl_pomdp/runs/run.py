@@ -6,7 +6,6 @@ interrupted or not. One process owns the folder at a time.
 
 from __future__ import annotations
 
-import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import ExitStack
@@ -17,14 +16,14 @@ from typing import Any, Self
 from vd4rl_pomdp.data.format import read_plan
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.options import flat
-from vd4rl_pomdp.registry import code_of, of_other_code
+from vd4rl_pomdp.registry import code_of, warn_of_other_code
 from vd4rl_pomdp.runs import CONFIG_FILE, DIVERGED_FILE, EPISODES_FILE, FORMAT, MACHINE_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, State, fitting, pack, unpack
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_json
 from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.runs.provenance import CONTINUED, command, git_commit, machine, versions
-from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS
+from vd4rl_pomdp.settings import RUNTIME_FIELDS
 
 _CODE = ("versions", "git_commit", "plugins", "sources")
 """What a record tells of the code."""
@@ -123,12 +122,8 @@ class RunFolder:
 
     def _warn_of_other_code(self) -> None:
         kept = {} if self._begins else read_json(self.path / CONFIG_FILE)
-        for part in of_other_code(kept, self._parts):
-            print(
-                f"warning: {self.path}: the code of {part} has changed since this run began, which goes on or counts "
-                "all the same; remove the run to compute it anew",
-                file=sys.stderr,
-            )
+        what = "this run began, which goes on or counts all the same; remove the run to compute it anew"
+        warn_of_other_code(self.path, kept, self._parts, what)
 
     @property
     def _begins(self) -> bool:

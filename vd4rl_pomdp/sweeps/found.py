@@ -12,7 +12,7 @@ from vd4rl_pomdp.results import Result, read_results
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.files import Row, files_below, read_json
 from vd4rl_pomdp.runs.identity import recipe
-from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.settings import settings_of
 from vd4rl_pomdp.sweeps.sets import DataSet
 
 

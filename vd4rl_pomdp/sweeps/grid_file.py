@@ -38,7 +38,7 @@ from typing import Any
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.reading import read_bytes, regular
 from vd4rl_pomdp.runs.interrupt import Terminated
-from vd4rl_pomdp.runs.settings import RUNTIME_FIELDS
+from vd4rl_pomdp.settings import RUNTIME_FIELDS
 from vd4rl_pomdp.sweeps.grid import (
     MAZES,
     PIXELS,
@@ -193,6 +193,8 @@ def _check_settings(section: str, settings: Values, axes: bool = True) -> None:
     for name, value in settings.items():
         if not isinstance(name, str):
             raise UserError(f"{section}: {name!r} is the name of no setting")
+        if "-" in name:
+            raise UserError(f"{section}.{name}: is the flag's name, the setting's is {name.replace('-', '_')}")
         if isinstance(value, list) and axes and name in RUNTIME_FIELDS:
             raise UserError(f"{section}.{name}: changes no result, so that cells of several would be one run; tell one")
         values = value if isinstance(value, list) and axes else [value]

@@ -10,8 +10,8 @@ from vd4rl_pomdp.data.collect import set_quality
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.report.load import Choice, without_options
 from vd4rl_pomdp.results import Result
-from vd4rl_pomdp.runs.episodes import LABELS
 from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.settings import LABELS
 from vd4rl_pomdp.sweeps.found import FoundRun, found_in
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.sets import DataSet, set_of
@@ -37,7 +37,7 @@ class GridMembers(Choice):
         self._asked = f"one of the {len(cells)} cells of {name} that are asked for"
         self._sets: dict[str, list[DataSet]] = defaultdict(list)
         self._policies: set[tuple[Any, ...]] = set()
-        check_cells(cells, name)
+        check_cells(cells, name, collects=lambda _: False)
         for cell in cells:
             if "navigation_train" in cell.chain:
                 raise UserError(f"{name}: its cells are mazes; `vd4rl-pomdp navigation report` reports them")
@@ -55,7 +55,7 @@ class GridMembers(Choice):
         return found
 
     def asks(self, row: Row) -> bool:
-        """Whether a cell asks for a policy of these labels (`runs.episodes.LABELS`), whatever its variant."""
+        """Whether a cell asks for a policy of these labels (`settings.LABELS`), whatever its variant."""
         return without_options(row, LABELS) in self._policies
 
     @property

@@ -16,7 +16,7 @@ from vd4rl_pomdp.nn.encoder_folder import CONFIG, encoder_hash
 from vd4rl_pomdp.options import words_of
 from vd4rl_pomdp.registry import of_other_code
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
-from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.settings import settings_of
 from vd4rl_pomdp.sweeps.found import FoundRun, FoundRuns, run_at
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.naming import run_folder
@@ -81,19 +81,17 @@ class Job:
 class JobPlanner:
     """Makes the jobs of a grid, looking at what is there."""
 
-    def __init__(
-        self, out: Path, data: Path | None, kept: FoundRuns, here: FoundRuns, others: Iterable[Job] = ()
-    ) -> None:
+    def __init__(self, out: Path, data: Path, kept: FoundRuns, here: FoundRuns, others: Iterable[Job] = ()) -> None:
         """Nothing is written.
 
         Args:
             out: the sweep's folder.
-            data: folder of the sets, `out`/data if None.
+            data: folder of the sets.
             kept: runs whose rows are kept, their folders being elsewhere.
             here: runs below `out`.
             others: jobs of other grids in `out`, begun or not.
         """
-        self._out, self._data, self._kept, self._here = out, data or out / DATA, kept, here
+        self._out, self._data, self._kept, self._here = out, data, kept, here
         self._jobs: dict[tuple[str, str, str], Job] = {}
         self._sets: dict[str, DataSet] = {}
         self._taken: set[str] = set()

@@ -16,7 +16,7 @@ from vd4rl_pomdp.options import flat, words_of
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.identity import recipe
-from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.settings import settings_of
 from vd4rl_pomdp.sweeps.fits import check_fit
 from vd4rl_pomdp.sweeps.grid import GridCell, Values
 from vd4rl_pomdp.tasks import TASKS
@@ -45,18 +45,28 @@ def told(cell: GridCell, section: str) -> Values:
     return {name: value for name, value in cell.shared.items() if name in takes} | cell.sections[section]
 
 
-def check_cells(cells: Iterable[GridCell], grid: str) -> None:
-    """`check_cell` for cells of a grid, whose name goes before what is wrong with one."""
+def check_cells(cells: Iterable[GridCell], grid: str, collects: Callable[[GridCell], bool] = lambda _: True) -> None:
+    """`check_cell` for cells of a grid, whose name goes before what is wrong with one.
+
+    Args:
+        cells: the cells.
+        grid: the grid's name.
+        collects: whether a cell's set is one that this package collects, not one that somebody put there.
+    """
     try:
         for cell in cells:
-            check_cell(cell)
+            check_cell(cell, collects(cell))
     except UserError as error:
         raise UserError(f"{grid}: {error}") from error
 
 
-def check_cell(cell: GridCell) -> None:
+def check_cell(cell: GridCell, collects: bool = True) -> None:
     """Raise UserError for settings that a stage would refuse, by themselves or on the set that the cell collects."""
-    check_fit({section: config_of(cell, section) for section in cell.chain})
+    configs = {section: config_of(cell, section) for section in cell.chain}
+    for section in _CHECKS if collects else ():
+        if section in configs:
+            _CHECKS[section](configs[section])
+    check_fit(configs)
     if "finetune" in cell.chain:
         _finetuning(cell)
 
@@ -77,11 +87,15 @@ def _parsed(section: str, words: tuple[str, ...]) -> Any:
 
 
 def _collect(words: list[str], program: str) -> Any:
-    from vd4rl_pomdp.data.collect import CollectConfig, check_config
+    from vd4rl_pomdp.data.collect import CollectConfig
 
-    config = parse(CollectConfig, words, program)
+    return parse(CollectConfig, words, program)
+
+
+def _check_collection(config: Any) -> None:
+    from vd4rl_pomdp.data.collect import check_config
+
     check_config(config)
-    return config
 
 
 def _pretrain(words: list[str], program: str) -> Any:
@@ -100,12 +114,15 @@ def _finetune(words: list[str], program: str) -> Any:
 
 
 def _navigation_collect(words: list[str], program: str) -> Any:
-    from vd4rl_pomdp.navigation.collect import check_config
     from vd4rl_pomdp.navigation.config import PRESETS, MazeCollectConfig
 
-    config = with_presets(MazeCollectConfig, PRESETS, words, program)
+    return with_presets(MazeCollectConfig, PRESETS, words, program)
+
+
+def _check_maze_collection(config: Any) -> None:
+    from vd4rl_pomdp.navigation.collect import check_config
+
     check_config(config)
-    return config
 
 
 def _navigation_train(words: list[str], program: str) -> Any:
@@ -121,6 +138,11 @@ _PARSERS: dict[str, Callable[[list[str], str], Any]] = {
     "navigation_collect": _navigation_collect,
     "navigation_train": _navigation_train,
 }
+_CHECKS: dict[str, Callable[[Any], None]] = {
+    "collect": _check_collection,
+    "navigation_collect": _check_maze_collection,
+}
+"""What refuses a set that cannot be collected, by section."""
 
 
 def collection_of(cell: GridCell) -> Values:

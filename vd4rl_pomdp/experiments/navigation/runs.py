@@ -23,7 +23,7 @@ from vd4rl_pomdp.reading import build
 from vd4rl_pomdp.results import Result, find_results, refuse_loss, write_results
 from vd4rl_pomdp.runs import TRAJECTORY_FILE
 from vd4rl_pomdp.runs.files import write_csv
-from vd4rl_pomdp.runs.settings import settings_of
+from vd4rl_pomdp.settings import settings_of
 
 ROWS, TRAJECTORIES = "rows.csv", "trajectories"
 

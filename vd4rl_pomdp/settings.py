@@ -1,6 +1,6 @@
-"""The settings of a run: its config without seed, folders, device and logging.
+"""The settings of a run, which are its config without seed, folders, device and logging, and its labels.
 
-Runs are seeds of one experiment only if these agree.
+Runs are seeds of one experiment only if their settings agree.
 """
 
 from __future__ import annotations
@@ -26,6 +26,9 @@ RUNTIME_FIELDS = frozenset(
 and are compared by content; `eval_clean` adds rows that change no other."""
 NO_SETTINGS = RUNTIME_FIELDS | {"seed"}
 """Config fields in which the seeds of one experiment may differ."""
+
+LABELS = ("method", "task", "quality", "corruption", "algorithm", "seed")
+"""What names the rows of a run."""
 
 
 def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
