@@ -98,7 +98,7 @@ def _build(config: TrainingConfig, target: ActionTarget | StateScale | None, **s
     method = METHODS.named(config.method)
     encoder = EncoderConfig(**shape, **_memory(config, method))
     objective = method.build(Encoder(encoder), target, config.options, config.seed)
-    if not isinstance(getattr(objective, "encoder", None), Encoder):
+    if isinstance(objective, Objective) and not isinstance(getattr(objective, "encoder", None), Encoder):
         raise UserError(f"the objective of the method {config.method} has no `encoder`: keep the one that it is given")
     return objective
 

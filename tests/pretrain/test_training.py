@@ -15,6 +15,7 @@ from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.data import View, open_dataset
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn import Encoder, EncoderConfig
+from vd4rl_pomdp.objective import Objective
 
 
 @pytest.fixture
@@ -104,9 +105,17 @@ def test_representations_that_are_no_two_of_every_row_are_refused(tmp_path, monk
             pretrain(config)
 
 
+class Blind(Objective):
+    def __init__(self, encoder, target, options, seed):
+        super().__init__()
+
+    def loss(self, window, progress):
+        raise NotImplementedError
+
+
 def test_an_objective_without_its_encoder_is_refused():
     with METHODS.isolated():
-        METHODS.register("mine", Method(lambda *given: torch.nn.Linear(1, 1)))
+        METHODS.register("mine", Method(Blind))
         with pytest.raises(UserError, match="objective of the method mine has no `encoder`: keep the one that it is"):
             build_objective(PretrainConfig.of("smoke", method="mine"), 6, None)
 

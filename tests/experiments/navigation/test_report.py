@@ -21,6 +21,7 @@ from vd4rl_pomdp.navigation.measures import RAW_PREFIX, Measure, refitted_error
 from vd4rl_pomdp.navigation.methods import OBJECTIVES, REFERENCES
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.results import add_results
+from vd4rl_pomdp.runs.files import jsonable
 
 ROOT = Path(__file__).parents[3]
 TRAJECTORY = "three_curtains-mik-K15-seed0.csv"
@@ -38,7 +39,7 @@ def write_run(base: Path, condition: Condition, seed: int, level: float, raw: bo
         "exogenous": condition.exogenous and "photographs",
     }
     given = {name: value for name, value in asked.items() if value}  # not every method knows all of them
-    config = flat(NavigationConfig.of("cpu", seed=seed, **given))
+    config = jsonable(flat(NavigationConfig.of("cpu", seed=seed, **given)))
     command = f"vd4rl-pomdp navigation train --data data/{condition.maze} --method {condition.method} --seed {seed}"
     inputs = {"data": f"set of {condition.maze}"}
     record = {"stage": "navigation", "config": config, "inputs": inputs, "git_commit": "abc", "command": command}

@@ -43,7 +43,7 @@ def pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
 
 
 def methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
-    """Step time and frames/s of every method in the cpu preset, and what doubling K costs MIK+A."""
+    """Step time and frames/s of every method in the cpu preset, and what K and the resolution cost MIK+A."""
     from pretrain.config import PretrainConfig
     from pretrain.objectives import METHODS
 
@@ -57,7 +57,11 @@ def methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
         results[name] = {"step_ms": seconds * 1e3, "frames_per_s": frames}
     narrow, wide = (make_trainer(dataset, config.altered(max_k=k)).update for k in (15, 30))
     once, twice = alternating(repeats, narrow, wide)
-    return results | {"k_30_over_k_15": twice / once}
+    encoders = ("nature", "nature_half")
+    whole, half = alternating(
+        repeats, *(make_trainer(dataset, config.altered(frame_encoder=name)).update for name in encoders)
+    )
+    return results | {"k_30_over_k_15": twice / once, "half_over_whole_resolution": half / whole}
 
 
 def finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
