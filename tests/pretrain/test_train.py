@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from pretrain.objectives import METHODS
-from pretrain.train import check_config
+from pretrain.train import check_config, check_pictures
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_pretrain
@@ -124,9 +124,11 @@ def test_what_does_not_fit_leaves_no_run_behind(data, tmp_path, change, message)
 
 def test_a_patch_that_the_film_of_a_state_cannot_hold_is_refused_first(tmp_path):
     def check(**changes):
-        check_config(smoke_pretrain(tmp_path, tmp_path / "out", corruption="patch", **changes))
+        config = smoke_pretrain(tmp_path, tmp_path / "out", corruption="patch", **changes)
+        check_config(config)
+        check_pictures(config, 96)
 
-    check(method="mik+a", patch_size=85)  # frames may be larger
+    check(method="mik+a", patch_size=85)
     with pytest.raises(UserError, match=r"patch size 85 exceeds the image \(84x84\)"):
         check(method="state", patch_size=85)
     with pytest.raises(UserError, match="--patch-count is 1001; it must be at least 1 and at most 1000"):
