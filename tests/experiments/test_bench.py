@@ -3,6 +3,7 @@ import resource
 import pytest
 import torch
 
+from pretrain.objectives import METHODS
 from vd4rl_pomdp.experiments.bench import data, memory, suite, training
 from vd4rl_pomdp.experiments.bench.suite import GOALS
 from vd4rl_pomdp.runs.files import flatten
@@ -17,6 +18,16 @@ def test_a_set_smaller_than_the_usual_one_can_be_measured(tmp_path, monkeypatch)
     assert opening["rows"] == dataset.num_rows == 8 * data.EPISODE_ROWS
     assert all(value > 0 for value in measured.values())
     assert {name for name in GOALS if name.split(".")[0] in sections} <= set(measured)
+
+
+def test_every_method_that_random_pictures_can_train_is_measured(tmp_path):
+    dataset, _ = data.synthetic_set(tmp_path, 2)
+    measured = training.methods(dataset, tmp_path, 1)
+    ratios = {"k_30_over_k_15", "half_over_whole_resolution"}
+    assert measured.keys() - ratios == {name for name, method in METHODS.items() if method.trained} - {
+        *("supervised", "supervised+a"),
+    }
+    assert all(value > 0 for value in flatten(measured).values())
 
 
 def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
