@@ -272,7 +272,8 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
         raise UserError(f"{run / LABELS_FILE}: has no {missing[0]!r}; {remedy(run)}")
     card = load_encoder(run / "encoder")[1]
     what = "this policy was trained, and it plays by the new; take the earlier code, or train it again"
-    warn_of_other_code(run, _record(run), read_record(run / "encoder").parts, what)
+    record = _record(run)
+    warn_of_other_code(run, record, read_record(run / "encoder").parts, what)
     task = TASKS.named(card.task)
     chosen = own_and_none(CorruptionConfig.fill(card.corruption))
     if corruption is not None:
@@ -280,7 +281,7 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     for one in chosen:
         one.check()
     actor = Reference.read(run).actor_file
-    encoder, policy, length = run / "encoder", run / "policy", _length(run, task)
+    encoder, policy, length = run / "encoder", run / "policy", _length(record, task)
     jobs = [
         EpisodeJob(encoder, policy, task, one, episode, film=False, length=length, actor=actor)
         for one in chosen
@@ -296,9 +297,9 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     return EvaluatedRun(episode_rows(played, labels | {"step": step}), played)
 
 
-def _length(run: Path, task: Task) -> int:
+def _length(record: dict[str, Any], task: Task) -> int:
     """Most decisions in an episode of a run's evaluations; the task's where the run does not tell."""
-    config = _record(run).get("config")
+    config = record.get("config")
     told = config.get("eval_length") if isinstance(config, dict) else None
     return min(told, task.decisions) if isinstance(told, int) else task.decisions
 

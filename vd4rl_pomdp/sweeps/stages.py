@@ -63,9 +63,8 @@ def check_cells(cells: Iterable[GridCell], grid: str, collects: Callable[[GridCe
 def check_cell(cell: GridCell, collects: bool = True) -> None:
     """Raise UserError for settings that a stage would refuse, by themselves or on the set that the cell collects."""
     configs = {section: config_of(cell, section) for section in cell.chain}
-    for section in _CHECKS if collects else ():
-        if section in configs:
-            _CHECKS[section](configs[section])
+    if collects and (check := _CHECKS.get(cell.chain[0])):
+        check(configs[cell.chain[0]])
     check_fit(configs)
     if "finetune" in cell.chain:
         _finetuning(cell)
@@ -92,6 +91,7 @@ def _collect(words: list[str], program: str) -> Any:
     return parse(CollectConfig, words, program)
 
 
+@cache
 def _check_collection(config: Any) -> None:
     from vd4rl_pomdp.data.collect import check_config
 
@@ -119,6 +119,7 @@ def _navigation_collect(words: list[str], program: str) -> Any:
     return with_presets(MazeCollectConfig, PRESETS, words, program)
 
 
+@cache
 def _check_maze_collection(config: Any) -> None:
     from vd4rl_pomdp.navigation.collect import check_config
 
