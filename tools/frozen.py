@@ -1,0 +1,160 @@
+"""Freeze what smoke runs compute, so that a refactor can be held against it, bit by bit, on one machine.
+
+    python tools/frozen.py WORK              # compares with tools/frozen.json; exit code 1 where anything differs
+    python tools/frozen.py WORK --write      # freezes what this code computes
+
+WORK is a folder for sets and runs; sets in it are kept for the next call. Each run is hashed by its losses, weights,
+probes and episodes: names and values, whatever the files are called. Only commands are called, no function of the
+packages, so that the same script runs before and after a move. Bits depend on the processor: freeze and compare on one.
+"""
+
+from __future__ import annotations
+
+import csv
+import hashlib
+import json
+import shutil
+import sys
+from pathlib import Path
+
+from safetensors.numpy import load_file
+
+from vd4rl_pomdp.cli import main
+
+FROZEN = Path(__file__).with_name("frozen.json")
+METHODS = (
+    *("no_history", "ah", "ah+a", "fj", "fj+a", "mik", "mik+a", "acro", "one_step_inverse", "curl", "driml", "homer"),
+    *("random", "supervised", "supervised+a", "bc", "drq_bc", "state"),
+)
+INVERSE = {
+    "literal_future": ["--literal-future"],
+    "future_rows": ["--n", "3"],
+    "bins": ["--action-target", "bins"],
+    "mse": ["--action-target", "mse"],
+    "mse_l2": ["--action-target", "mse_l2"],
+    "self_prediction": ["--self-prediction", "1", "--l2-states", "0.1"],
+    "no_k": ["--no-k-embedding"],
+    "short_memory": ["--m", "2", "--gru-layers", "2"],
+    "no_corruption": ["--corruption", "none"],
+    "patch": ["--corruption", "patch", "--patch-size", "20", "--patch-count", "2"],
+    "zero_frames": ["--corruption", "zero_frames"],
+    "emission": ["--corruption-mode", "emission"],
+    "bf16": ["--precision", "bf16"],
+    "drq": ["--frame-encoder", "drq"],
+    "nature_half": ["--frame-encoder", "nature_half"],
+    "no_shift": ["--shift", "0"],
+}
+"""Options of `mik+a`."""
+PRETRAINED = {
+    **{method: ["--method", method] for method in METHODS},
+    **{f"mik+a {name}": ["--method", "mik+a", *words] for name, words in INVERSE.items()},
+    "fj short": ["--method", "fj", "--m", "2"],
+    "fj+a short": ["--method", "fj+a", "--m", "3"],
+    "acro gru": ["--method", "acro", "--history", "gru"],
+    "acro shared": ["--method", "acro", "--shift-shared"],
+    "random gru": ["--method", "random", "--history", "gru"],
+    "mik seed 1": ["--method", "mik", "--seed", "1"],
+}
+FINETUNED = {
+    **{method: (method, []) for method in METHODS},
+    **{f"mik+a {a}": ("mik+a", ["--algorithm", a]) for a in ("drqv2_bc", "iql", "bc")},
+    "mik+a exact": ("mik+a", ["--views", "0", "--history-window", "4"]),
+    "acro exact": ("acro", ["--views", "0"]),
+    "mik+a two views": ("mik+a", ["--views", "2", "--update-precision", "bf16"]),
+    "mik+a frame": ("mik+a", ["--readout", "frame"]),
+    "mik+a both": ("mik+a", ["--readout", "frame+state"]),
+    "mik+a window": ("mik+a", ["--history-window", "4"]),
+    "mik+a random histories": ("mik+a", ["--random-histories", "0.5"]),
+    "mik+a emission": ("mik+a emission", []),
+    "mik+a patch": ("mik+a patch", []),
+    "mik+a n_step 1": ("mik+a", ["--n-step", "1", "--alpha", "5", "--seed", "2"]),
+}
+MAZES = ("no_history", "ah", "ah+a", "fj", "fj+a", "mik", "mik+a", "random", "supervised", "supervised+a")
+
+
+def call(*words: object) -> None:
+    """Do what the command line does; a refusal ends everything."""
+    main([str(word) for word in words])
+
+
+def losses(run: Path) -> list[object]:
+    """Rows of metrics: step, names and exact values."""
+    return [sorted(json.loads(line).items()) for line in (run / "metrics.jsonl").read_text().splitlines()]
+
+
+def weights(run: Path) -> list[object]:
+    """Every tensor of a run's encoder and policy."""
+    found: list[object] = []
+    for part in ("encoder", "policy"):
+        for path in sorted((run / part).glob("*.safetensors")):
+            tensors = load_file(path)
+            found += [[part, n, str(t.dtype), t.shape, hashlib.sha256(t.tobytes()).hexdigest()] for n, t in sorted(tensors.items())]  # fmt: skip # noqa: E501
+    return found
+
+
+def episodes(run: Path) -> list[object]:
+    """What was played: step, seed, corruption, return and length."""
+    if not (run / "episodes.csv").exists():
+        return []
+    with (run / "episodes.csv").open(newline="") as file:
+        return [[row[n] for n in ("step", "episode_seed", "evaluated_under", "return", "length")] for row in csv.DictReader(file)]  # fmt: skip # noqa: E501
+
+
+def probes(run: Path) -> list[object]:
+    """Probe errors, and all numbers of a run on mazes."""
+    found: list[object] = []
+    if (run / "probe.json").exists():
+        found += sorted(json.loads((run / "probe.json").read_text()).items())
+    if (run / "results.json").exists():
+        rows = json.loads((run / "results.json").read_text())["rows"]
+        found += [[row[name] for name in ("measure", "split", "probe", "rows", "k", "value")] for row in rows]
+    return found
+
+
+def fingerprint(run: Path) -> dict[str, str]:
+    """Short hashes of what a run computed."""
+    parts = {"losses": losses(run), "weights": weights(run), "probes": probes(run), "episodes": episodes(run)}
+    return {name: hashlib.sha256(json.dumps(value).encode()).hexdigest()[:16] for name, value in parts.items() if value}
+
+
+def collect(work: Path) -> None:
+    """The two sets, unless they are there."""
+    if not (work / "walker_walk/expert_noisy").exists():
+        out = work / "walker_walk/expert_noisy"
+        call("data", "collect", "--task", "walker_walk", "--quality", "expert_noisy", "--episodes", 3, "--out", out)
+    if not (work / "maze").exists():
+        words = ["--maze", "three_curtains", "--preset", "smoke", "--trajectories", 12, "--out", work / "maze"]
+        call("navigation", "collect", *words)
+
+
+def runs(work: Path) -> dict[str, dict[str, str]]:
+    """Carry out all runs anew and hash them."""
+    shutil.rmtree(work / "runs", ignore_errors=True)
+    found, data = {}, work / "walker_walk/expert_noisy"
+    common = ["--preset", "smoke", "--data", data, "--device", "cpu"]
+    for name, words in PRETRAINED.items():
+        out = work / "runs/pretrain" / name
+        words = words if "--corruption" in words else ["--corruption", "patch+zero_frames", *words]
+        call("pretrain", *common, *words, "--out", out)
+        found[f"pretrain {name}"] = fingerprint(out)
+    for name, (encoder, words) in FINETUNED.items():
+        out = work / "runs/finetune" / name
+        call("finetune", *common, "--encoder", work / "runs/pretrain" / encoder / "encoder", *words, "--workers", 1, "--out", out)  # fmt: skip # noqa: E501
+        found[f"finetune {name}"] = fingerprint(out)
+    for method in MAZES:
+        out = work / "runs/maze" / method
+        call("navigation", "train", "--preset", "smoke", "--data", work / "maze", "--method", method, "--out", out)
+        found[f"maze {method}"] = fingerprint(out)
+    return found
+
+
+if __name__ == "__main__":
+    place = Path(sys.argv[1])
+    collect(place)
+    now = runs(place)
+    if "--write" in sys.argv:
+        FROZEN.write_text(json.dumps(now, indent=1) + "\n")
+    then = json.loads(FROZEN.read_text())
+    other = [f"{run}: {part}" for run in {**then, **now} for part in {**then.get(run, {}), **now.get(run, {})} if then.get(run, {}).get(part) != now.get(run, {}).get(part)]  # fmt: skip # noqa: E501
+    print("\n".join(other) or f"all {len(now)} runs as frozen")
+    sys.exit(bool(other))
