@@ -16,6 +16,7 @@ from finetune.histories import Histories, HistoryOptions, draw_lengths, read_bot
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.data import Dataset, View
 from vd4rl_pomdp.data.samplers import Sampler
+from vd4rl_pomdp.errors import disk_errors
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.options import Options
@@ -113,9 +114,10 @@ class FeatureFile:
 
     def read(self) -> np.ndarray | None:
         """What was written, None if that is missing or was made of something else."""
-        if not self.exists:
-            return None
-        return np.load(self._path) if read_json(self._origin) == self._description() else None
+        with disk_errors(self._path):
+            if not self.exists:
+                return None
+            return np.load(self._path) if read_json(self._origin) == self._description() else None
 
     def write(self, features: np.ndarray) -> None:
         """Keep the features; what was probed on others goes."""

@@ -376,6 +376,14 @@ def test_what_fails_in_a_push_is_one_sentence_and_leaves_no_half(hub, encoder, m
     assert hub.files(WHERE[ENCODER]) == before
 
 
+@pytest.mark.parametrize("path", ["/repos/create", "/preupload/", "/objects/batch", "/commit/"])
+def test_a_hub_that_falls_silent_in_a_push_is_not_waited_for_for_ever(hub, encoder, monkeypatch, path):
+    monkeypatch.setattr("vd4rl_pomdp.hub.repository._SILENCE_S", 0.2)
+    hub.silent = path
+    with pytest.raises(UserError, match=r"does not answer as the Hub does \(ReadTimeout\); check the network"):
+        push(encoder, ENCODER)
+
+
 def test_a_card_that_the_hub_refuses_is_told(hub, encoder):
     with pytest.raises(UserError, match=r'lab/encoder: the Hub does not take it \(.*"license" must be one of \[mit\]'):
         push(encoder, ENCODER, license="nobody's")

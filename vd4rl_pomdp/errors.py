@@ -7,6 +7,8 @@ of x (memory, disk, rows), `refuse_x` for something named x that cannot be accep
 from __future__ import annotations
 
 import errno
+import os
+import re
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -67,10 +69,13 @@ class DivergedError(FloatingPointError):
 
 
 _PASSING = (
-    *(errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.EMFILE, errno.ENFILE),
-    *(errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH),
+    *(errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOLCK, errno.EBUSY),
+    *(errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENETDOWN, errno.ENETUNREACH),
+    *(errno.ECONNREFUSED, errno.ECONNRESET),
 )
 """What a network file system or a busy machine answers for a while."""
+_OF_CONTENT = (None, errno.EINVAL, errno.ENOENT, errno.ENOTDIR)
+"""What a library's error carries that read what is not there, or followed an offset that a damaged file names."""
 MAX_SEED = 2**31 - 1
 """Largest seed that every random generator in use takes."""
 MOST = 10**9
@@ -153,6 +158,16 @@ def disk_error(path: Path | str | None, error: OSError) -> UserError:
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return UserError(f"{where}may not be used ({reason}); ask its owner for access, or choose another path")
     return UserError(f"{where}cannot be used ({reason}); check the path or choose another")
+
+
+def system_error(path: Path, error: Exception) -> UserError | None:
+    """What the system refused to a library that opened or read a file itself; None if the file's content is at fault.
+
+    HDF5 tells the system's number within its sentence, which is all that there is where h5py makes it a KeyError.
+    """
+    told = re.search(r"\berrno = (\d+)", str(error))
+    number = int(told[1]) if told else getattr(error, "errno", None)
+    return None if number in _OF_CONTENT else disk_error(path, OSError(number, os.strerror(number)))
 
 
 @contextmanager

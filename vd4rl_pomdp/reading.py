@@ -68,6 +68,18 @@ def fits(value: Any, hint: Any) -> bool:
     return isinstance(value, int | float) if hint is float else isinstance(value, get_origin(hint) or hint)
 
 
+def safetensors_metadata(content: bytes) -> dict[str, str]:
+    """What stands in the header of a safetensors file besides its tensors; raises ValueError for no such file.
+
+    The library tells it of files alone that it opens itself, and calls every one missing that it cannot open.
+    """
+    header = parse_json(content[8 : 8 + int.from_bytes(content[:8], "little")])
+    metadata = header.get("__metadata__", {}) if isinstance(header, dict) else None
+    if not isinstance(metadata, dict):
+        raise ValueError("its header is no JSON object")
+    return metadata
+
+
 def read_tensors(path: Path) -> dict[str, Tensor]:
     """Tensors of a safetensors file; a number that is not finite raises UserError.
 

@@ -205,6 +205,16 @@ def test_a_run_that_goes_on_online_is_the_same_run_of_wandb(tmp_path, monkeypatc
     assert all((words["resume"], words["mode"]) == ("allow", "online") for words in asked)
 
 
+def test_whatever_is_asked_of_wandbs_server_has_a_deadline_that_is_told(tmp_path, monkeypatch):
+    asked: list[dict[str, Any]] = []
+    monkeypatch.setattr("wandb.init", lambda **words: asked.append(words) or Faulty("nothing"))
+    open_sinks(run_at(tmp_path, wandb="online"), 0, LABELS, {})
+    (settings,) = (words["settings"] for words in asked)
+    assert 0 < settings.init_timeout <= 60
+    assert 0 < settings.finish_timeout <= 60
+    assert settings.finish_timeout_raises, "else a run whose last rows are lost says nothing"
+
+
 def test_seeds_of_one_experiment_share_a_group_and_other_settings_do_not(tmp_path):
     one, other, wide = (names(run_at(tmp_path, **c), LABELS, {}) for c in ({}, {"seed": 1}, {"max_k": 15}))
     assert one["group"] == other["group"] != wide["group"]

@@ -69,7 +69,7 @@ def _samples() -> Mapping[str, np.ndarray]:
     try:
         return sample_observations()
     except UserError as error:
-        raise UserError(f"{error}; --no-pictures leaves the sample observations out") from error
+        raise type(error)(f"{error}; --no-pictures leaves the sample observations out") from error
 
 
 COMMANDS = {

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import io
 import json
+import os
 import re
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
@@ -23,7 +24,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from vd4rl_pomdp.errors import UserError, disk_error, in_one_line
+from vd4rl_pomdp.errors import UnavailableError, UserError, in_one_line, system_error
 from vd4rl_pomdp.reading import parse_json, regular
 from vd4rl_pomdp.runs.files import read_json, write_bytes
 from vd4rl_pomdp.tasks import FRAME_SIZES
@@ -248,6 +249,20 @@ def read_some_frames(path: Path, rows: np.ndarray) -> np.ndarray:
         return file[FRAMES_KEY][rows]
 
 
+def is_shard(path: Path) -> bool:
+    """Whether a file has a shard's keys; raises UnavailableError if the disk does not tell now.
+
+    It is not locked: what another program writes may be a shard, too.
+    """
+    try:
+        with h5py.File(path, "r", locking=False) as file:
+            return set(file) >= {FRAMES_KEY, "action", "reward", "step_type"}
+    except (OSError, RuntimeError, KeyError) as error:
+        if isinstance(told := system_error(path, error), UnavailableError):
+            raise told from error
+        return False
+
+
 @contextmanager
 def _open(path: Path) -> Iterator[h5py.File]:
     """An open shard; whatever HDF5 cannot read becomes a sentence."""
@@ -256,10 +271,24 @@ def _open(path: Path) -> Iterator[h5py.File]:
             yield file
     except UserError:
         raise
-    except PermissionError as error:
-        raise disk_error(path, error) from error
     except (OSError, RuntimeError, KeyError, ValueError) as error:
-        raise UserError(f"{path}: is truncated, damaged or no HDF5 file ({in_one_line(error)}); {_REPAIR}") from error
+        damaged = UserError(f"{path}: is truncated, damaged or no HDF5 file ({in_one_line(error)}); {_REPAIR}")
+        raise _locked(path, error) or system_error(path, error) or damaged from error
+
+
+def _locked(path: Path, error: Exception) -> UserError | None:
+    """A sentence for a shard that HDF5 does not open for a lock, or for the mark of a program that writes it."""
+    if isinstance(error, OSError) and error.errno and "unable to lock file" in str(error):
+        return UnavailableError(
+            f"{path}: another program writes it, or its disk has no locks ({os.strerror(error.errno).lower()}); close "
+            "that program and start the same command again, or set HDF5_USE_FILE_LOCKING=FALSE to read without locks"
+        )
+    if "already open for write" in str(error):
+        return UnavailableError(
+            f"{path}: another program writes it, or was killed while it did; close that program and start the same "
+            "command again, or remove its mark with `h5clear -s`"
+        )
+    return None
 
 
 def _present(path: Path, file: h5py.File) -> list[str]:
@@ -280,9 +309,14 @@ def _check_keys(path: Path, file: h5py.File) -> None:
     elsewhere = [key for key in wanted if _is_elsewhere(file, key)]
     if elsewhere:
         raise UserError(f"{path}: {elsewhere[0]!r} lies in another file, which is not followed; {_REPAIR}")
-    missing = [key for key in wanted if not _holds_array(file.get(key))]
+    missing = [key for key in wanted if not _holds_array(_stored(file, key))]
     if missing:
         raise UserError(f"{path}: has no {missing[0]!r}, so it is no V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
+
+
+def _stored(file: h5py.File, key: str) -> Any:
+    """What a key names, None if nothing; `file.get` says nothing, too, where the disk fails."""
+    return file[key] if key in file else None  # noqa: SIM401
 
 
 def _holds_array(stored: Any) -> bool:
@@ -294,7 +328,7 @@ def _is_elsewhere(file: h5py.File, key: str) -> bool:
     """Whether a key's values are kept in other files, which could be any file of the machine."""
     if isinstance(file.get(key, getlink=True), h5py.ExternalLink):
         return True
-    stored = file.get(key)
+    stored = _stored(file, key)
     return isinstance(stored, h5py.Dataset) and (stored.external is not None or stored.is_virtual)
 
 

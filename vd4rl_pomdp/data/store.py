@@ -27,7 +27,7 @@ import numpy as np
 
 from vd4rl_pomdp.data.episodes import check_count, join_shards
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows, shard_paths
-from vd4rl_pomdp.errors import DiskFullError, UserError, disk_error
+from vd4rl_pomdp.errors import DiskFullError, UserError, disk_error, disk_errors, system_error
 from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs.identity import content_hash
 from vd4rl_pomdp.runs.progress import ProgressLine
@@ -65,19 +65,24 @@ class Store:
     def frames(self) -> np.ndarray:
         """(N, 3, S, S) uint8, mapped read-only from the file."""
         shape = (self.meta["rows"], 3, self.frame_size, self.frame_size)
-        return np.memmap(self.folder / _FRAMES, np.uint8, "r", shape=shape)
+        with self._reading(_FRAMES):
+            return np.memmap(self.folder / _FRAMES, np.uint8, "r", shape=shape)
 
     def array(self, key: str) -> np.ndarray:
         """Rows of `action` (N, A) float32, `reward` or `discount` (N,) float64, or `step_type` (N,) uint8."""
         return self._load(f"{key}.npy")
 
     def _load(self, name: str, mode: Literal["r"] | None = None) -> np.ndarray:
-        try:
+        with self._reading(name):
             return np.load(self.folder / name, mmap_mode=mode)
-        except PermissionError as error:
-            raise disk_error(self.folder / name, error) from error
+
+    @contextmanager
+    def _reading(self, name: str) -> Iterator[None]:
+        """Turn what numpy raises about a file into one sentence."""
+        try:
+            yield
         except (OSError, ValueError, EOFError) as error:
-            raise self.damaged(name) from error
+            raise system_error(self.folder / name, error) or self.damaged(name) from error
 
     def damaged(self, name: str) -> UserError:
         """A sentence for a file that has changed since it was decoded."""
@@ -134,8 +139,9 @@ def open_store(path: Path, cache: Path | None = None) -> Store:
     Raises:
         UserError: the set is missing, damaged, incomplete or of two frame sizes, or the cache cannot be written.
     """
-    shards = shard_paths(path)
-    folder = (cache or default_cache()) / _key(shards)
+    with disk_errors(path):
+        shards = shard_paths(path)
+        folder = (cache or default_cache()) / _key(shards)
     meta = _read_meta(folder)
     if meta is None:
         with _locked(folder):
@@ -148,7 +154,9 @@ def open_store(path: Path, cache: Path | None = None) -> Store:
 def verify_store(store: Store) -> None:
     """Recompute every checksum; raises UserError naming the file that has changed since it was decoded."""
     for name, file in store.meta["files"].items():
-        if _checksum(store.folder / name) != file["blake2b"]:
+        with disk_errors(store.folder / name):
+            checksum = _checksum(store.folder / name)
+        if checksum != file["blake2b"]:
             raise store.damaged(name)
 
 
@@ -181,7 +189,7 @@ def _locked(folder: Path) -> Iterator[None]:
         try:
             fcntl.flock(file, fcntl.LOCK_EX)
         except OSError as error:
-            raise UserError(
+            raise type(disk_error(folder, error))(
                 f"{folder.parent}: this disk locks no files ({error.strerror}); set VD4RL_POMDP_CACHE to a folder on a "
                 "local one"
             ) from error

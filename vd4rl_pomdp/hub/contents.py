@@ -10,7 +10,7 @@ from pathlib import Path
 from vd4rl_pomdp.data.episodes import join_shards
 from vd4rl_pomdp.data.format import check_frames, is_shard_name, read_rows, shard_files, shard_paths
 from vd4rl_pomdp.data.hub_card import set_card
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UnavailableError, UserError
 from vd4rl_pomdp.hub.repository import ENCODER, SET, Repository
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, WEIGHTS, load_encoder, read_record
 from vd4rl_pomdp.nn.model_card import CARD, model_card
@@ -51,6 +51,8 @@ class Listing:
         try:
             listing = build(cls, read_json(path))
             listing._check(repository)
+        except UnavailableError:
+            raise
         except (UserError, TypeError, ValueError) as error:
             raise UserError(f"{repository}: its {LISTING} is of another version or damaged; ask its owner") from error
         return listing

@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from huggingface_hub import HfApi
+from huggingface_hub import HfApi, get_session
 from huggingface_hub.errors import (
     FileMetadataError,
     GatedRepoError,
@@ -28,8 +28,8 @@ from vd4rl_pomdp.errors import UserError, in_one_line
 
 ENCODER, SET = "an encoder", "a data set"
 """What a repository holds, in the words of `runs.outputs.kept_in`."""
-_TIMEOUT_S = 30.0
-"""How long the Hub's first answer may take."""
+_TIMEOUT_S, _SILENCE_S = 30.0, 60.0
+"""How long the Hub's first answer may take, and how long it may be silent at whatever is asked of it then."""
 
 
 @dataclass(frozen=True)
@@ -70,6 +70,7 @@ def hub_api() -> HfApi:
     check_endpoint(endpoint, "HF_ENDPOINT")
     if not sys.stderr.isatty():
         disable_progress_bars()
+    get_session().timeout = _SILENCE_S  # it has none of its own
     return HfApi(endpoint=endpoint, library_name="vd4rl-pomdp", library_version=__version__)
 
 

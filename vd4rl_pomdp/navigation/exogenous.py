@@ -8,6 +8,7 @@ or binary files, PNG, JPEG.
 from __future__ import annotations
 
 import hashlib
+import io
 from pathlib import Path
 from pickletools import genops
 
@@ -18,8 +19,9 @@ from PIL import Image, ImageDraw
 from torch import Tensor
 
 from vd4rl_pomdp.corruptions.keys import derive_keys, draw_integers
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.mazes import PICTURE_SIZE
+from vd4rl_pomdp.reading import read_bytes
 from vd4rl_pomdp.seeding import stream_seed
 
 TEXTURES, PHOTOGRAPHS = "textures", "photographs"
@@ -61,7 +63,7 @@ def source_fingerprint(source: str) -> str:
         return source
     digest = hashlib.blake2b(digest_size=12)
     for path in _files(Path(source)):
-        digest.update(hashlib.blake2b(path.read_bytes()).digest())
+        digest.update(hashlib.blake2b(read_bytes(path)).digest())
     return digest.hexdigest()
 
 
@@ -144,7 +146,8 @@ _MADE = {TEXTURES: _textures, PHOTOGRAPHS: _photographs}
 
 def _files(folder: Path) -> list[Path]:
     """Files of a folder that hold images, in order."""
-    files = sorted(path for path in folder.rglob("*") if path.is_file())
+    with disk_errors(folder):
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
     shown = (path for path in files if not path.name.startswith("."))  # macOS leaves ._x.png beside x.png
     return [path for path in shown if _is_cifar(path) or path.suffix.lower() in (".png", ".jpg", ".jpeg")]
 
@@ -156,7 +159,9 @@ def _is_cifar(path: Path) -> bool:
 def _read_image(path: Path) -> np.ndarray:
     """(1, H, W, 3) uint8 of one PNG or JPEG file."""
     try:
-        return np.asarray(Image.open(path).convert("RGB"))[None]
+        return np.asarray(Image.open(io.BytesIO(read_bytes(path))).convert("RGB"))[None]
+    except UserError:
+        raise
     except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # Pillow's, by format
         raise UserError(f"{path}: cannot be read as an image ({error}); remove or replace it") from error
 
@@ -168,7 +173,7 @@ def _read_cifar(path: Path) -> np.ndarray:
 
 
 def _binary_records(path: Path) -> np.ndarray:
-    raw = np.fromfile(path, np.uint8)
+    raw = np.frombuffer(read_bytes(path), np.uint8)
     if not raw.size or raw.size % (_CIFAR_BYTES + 1):
         raise UserError(f"{path}: its size is no multiple of {_CIFAR_BYTES + 1} bytes; download CIFAR-10 again")
     records = raw.reshape(-1, _CIFAR_BYTES + 1)
@@ -180,10 +185,12 @@ def _binary_records(path: Path) -> np.ndarray:
 def _python_records(path: Path) -> np.ndarray:
     """The pixels inside a pickled batch, found without running the pickle: its one long run of bytes."""
     try:
-        runs = [a for _, a, _ in genops(path.read_bytes()) if isinstance(a, str | bytes)]
+        runs = [a for _, a, _ in genops(read_bytes(path)) if isinstance(a, str | bytes)]
         longest = max(runs, key=len, default=b"")
         raw = longest.encode("latin-1") if isinstance(longest, str) else longest
-    except (ValueError, OSError) as error:
+    except UserError:
+        raise
+    except ValueError as error:
         raise UserError(f"{path}: is damaged ({error}); download CIFAR-10 again") from error
     if not raw or len(raw) % _CIFAR_BYTES:
         raise UserError(f"{path}: holds no pixels of 32x32 images; download CIFAR-10 again")

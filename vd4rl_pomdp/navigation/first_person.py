@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
-from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_no_folder, refuse_outside
+from vd4rl_pomdp.errors import MAX_SEED, UnavailableError, UserError, refuse_no_folder, refuse_outside
 from vd4rl_pomdp.mazes import ACTION_REPEAT, HARD, MOST_STEPS, MazeSpec, get_maze
 from vd4rl_pomdp.navigation.planner import Planner
 from vd4rl_pomdp.policies.actor import Actor, read_actor
@@ -115,6 +115,8 @@ def _refuse_other(path: Path) -> None:
     if path.exists() or path.is_symlink():
         try:
             read_actor(path)
+        except UnavailableError:
+            raise
         except UserError as error:
             raise UserError(f"{path}: is there already and holds no actor; choose another --out") from error
 

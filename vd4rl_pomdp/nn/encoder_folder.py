@@ -165,7 +165,8 @@ def _check_corruption(card: EncoderCard) -> None:
 
 def read_record(folder: Path) -> EncoderRecord:
     """An encoder folder's config.json; raises UserError if there is none, a damaged one, or a pickle in its place."""
-    pickles = [p.name for p in folder.glob("*") if p.suffix in (".pt", ".pth", ".pkl", ".bin", ".ckpt")]
+    with disk_errors(folder):
+        pickles = [p.name for p in folder.glob("*") if p.suffix in (".pt", ".pth", ".pkl", ".bin", ".ckpt")]
     if pickles and not (folder / WEIGHTS).exists():
         raise UserError(f"{folder}: {pickles[0]} is a pickle, which can run code; only {WEIGHTS} is read")
     try:

@@ -5,14 +5,14 @@ from __future__ import annotations
 from pathlib import Path
 
 import torch
-from safetensors import SafetensorError, safe_open
+from safetensors import SafetensorError
 from safetensors.torch import save
 from torch import Tensor, nn
 from torch.random import fork_rng
 
 from vd4rl_pomdp.errors import UserError, disk_errors, first_line
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp
-from vd4rl_pomdp.reading import read_tensors, regular
+from vd4rl_pomdp.reading import read_bytes, read_tensors, safetensors_metadata
 from vd4rl_pomdp.runs.files import read_json, write_bytes, write_json
 
 _WEIGHTS, _SHAPE = "model.safetensors", "config.json"
@@ -88,10 +88,11 @@ def load_policy(folder: Path | str) -> Policy:
 def policy_step(folder: Path) -> int | None:
     """The training step of a policy folder's weights, None if they do not tell it; UserError as `load_policy`."""
     try:
-        with safe_open(regular(folder / _WEIGHTS), "pt") as file:
-            told = (file.metadata() or {}).get(_STEP)
+        told = safetensors_metadata(read_bytes(folder / _WEIGHTS)).get(_STEP)
         return None if told is None else int(told)
-    except (OSError, SafetensorError, ValueError) as error:
+    except UserError:
+        raise
+    except (FileNotFoundError, ValueError, TypeError) as error:
         raise _no_policy(folder, error) from error
 
 

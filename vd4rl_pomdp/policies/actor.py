@@ -16,12 +16,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from safetensors import SafetensorError, safe_open
-from safetensors.numpy import save
+from safetensors import SafetensorError
+from safetensors.numpy import load, save
 
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.reading import parse_json, read_bytes
+from vd4rl_pomdp.reading import parse_json, read_bytes, safetensors_metadata
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.tasks import TASKS
 
@@ -177,17 +177,15 @@ def read_ladder(path: Path, task: str | None = None) -> Ladder:
 
 def _read(path: Path, task: str | None) -> tuple[dict[str, np.ndarray], dict[str, Any], str]:
     try:
-        sha256 = hashlib.sha256(read_bytes(path)).hexdigest()
-        with safe_open(path, framework="np") as file:
-            card = dict(parse_json((file.metadata() or {}).get("card", "none")))
-            weights = {name: file.get_tensor(name) for name in file.keys()}  # noqa: SIM118
+        content = read_bytes(path)
+        weights, card = load(content), dict(parse_json(safetensors_metadata(content).get("card", "none")))
     except UserError:
         raise
-    except (OSError, SafetensorError, ValueError, TypeError) as error:
+    except (FileNotFoundError, SafetensorError, KeyError, ValueError, TypeError) as error:
         raise UserError(f"{path}: not an actor file ({error}); {_REMEDY}") from error
     if task is not None and card.get("task") != task:
         raise UserError(f"{path}: this actor was trained on {card.get('task')}, not on {task}")
-    return weights, card, sha256
+    return weights, card, hashlib.sha256(content).hexdigest()
 
 
 def _check_weights(path: Path, actor: Actor, task: str | None) -> None:

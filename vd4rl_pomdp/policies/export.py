@@ -7,6 +7,7 @@ all that another machine needs to go on.
 from __future__ import annotations
 
 import csv
+import io
 import json
 import math
 import shutil
@@ -20,7 +21,7 @@ import numpy as np
 from vd4rl_pomdp.errors import UserError, refuse_no_folder
 from vd4rl_pomdp.policies.actor import Actor, Ladder, read_actor, read_ladder
 from vd4rl_pomdp.policies.state_env import StateEnv
-from vd4rl_pomdp.reading import regular
+from vd4rl_pomdp.reading import read_bytes
 from vd4rl_pomdp.runs.files import read_json, write_bytes
 from vd4rl_pomdp.runs.outputs import refuse_foreign, refuse_inside
 from vd4rl_pomdp.tasks import TASKS, Task
@@ -56,11 +57,11 @@ def read_curve(run: Path) -> list[tuple[int, float]]:
     """Learning curve of a run: (decisions, mean return) rows; raises UserError if it is damaged."""
     steps, mean = CURVE_COLUMNS
     try:
-        with regular(run / CURVE).open(newline="", encoding="utf-8") as file:
-            curve = [(int(row[steps]), float(row[mean])) for row in csv.DictReader(file)]
+        text = read_bytes(run / CURVE).decode()
+        curve = [(int(row[steps]), float(row[mean])) for row in csv.DictReader(io.StringIO(text, newline=""))]
     except UserError:
         raise
-    except (KeyError, TypeError, ValueError, csv.Error) as error:
+    except (FileNotFoundError, KeyError, TypeError, ValueError, csv.Error) as error:
         raise UserError(f"{run / CURVE}: is no learning curve ({error}); take another copy of the run") from error
     if not all(math.isfinite(mean) for _, mean in curve):
         raise UserError(f"{run / CURVE}: a return in it is not finite; take another copy of the run")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import io
 import zlib
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field, replace
@@ -12,7 +13,7 @@ from zipfile import BadZipFile
 import numpy as np
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.reading import regular
+from vd4rl_pomdp.reading import read_bytes
 from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.variants import (
@@ -174,7 +175,7 @@ class LoadedRun:
         """Pictures of an evaluation episode, for a run that kept them; raises UserError for a damaged file."""
         path = self.path / FILM_FILE
         try:
-            with np.load(regular(path)) as file:
+            with np.load(io.BytesIO(read_bytes(path))) as file:
                 film = dict(file)
             if [film[name].ndim for name in FILM] != list(FILM.values()):
                 raise ValueError("its arrays have other shapes")

@@ -205,7 +205,7 @@ def _lines(path: Path) -> list[str]:
         lines = read_bytes(path).decode().splitlines()
     except FileNotFoundError as error:
         raise UserError(f"{folder}: holds no {RUNS}, so it is no results folder") from error
-    except ValueError as error:
+    except UnicodeDecodeError as error:
         raise UserError(f"{path}: is no UTF-8 ({error}); take another copy") from error
     if not lines:
         raise UserError(f"{path}: is empty; take another copy, or remove it")

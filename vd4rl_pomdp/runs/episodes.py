@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.reading import regular
+from vd4rl_pomdp.reading import read_bytes, regular
 from vd4rl_pomdp.runs.files import appending, write_csv
 from vd4rl_pomdp.settings import LABELS
 
@@ -70,7 +70,7 @@ def read_episodes(path: Path) -> list[dict[str, Any]]:
     if not regular(path).is_file() or path.stat().st_size == 0:
         return []
     with _whole(path):
-        text = path.read_bytes().decode()
+        text = read_bytes(path).decode()
         if not text.endswith("\n"):
             raise ValueError("the last line has no end")
         return _parse(path, io.StringIO(text, newline=""))
@@ -136,5 +136,5 @@ def episodes_until(path: Path, step: int) -> list[dict[str, Any]]:
     if not path.exists():
         return []
     with _whole(path):
-        whole = regular(path).read_bytes().decode().rpartition("\n")[0]
+        whole = read_bytes(path).decode().rpartition("\n")[0]
         return [row for row in _parse(path, io.StringIO(whole, newline="")) if row["step"] <= step] if whole else []

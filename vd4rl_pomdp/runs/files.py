@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import csv
 import hashlib
+import io
 import json
 import math
 import os
@@ -14,7 +15,7 @@ from pathlib import Path
 from typing import IO, Any
 
 from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.reading import parse_json, read_bytes, regular
+from vd4rl_pomdp.reading import parse_json, read_bytes
 
 Row = dict[str, Any]
 """One row of a table, its values by column."""
@@ -75,13 +76,10 @@ def read_csv(path: Path, columns: Sequence[str], words: Collection[str]) -> list
     if not path.exists():
         return []
     try:
-        with regular(path).open(newline="", encoding="utf-8") as file:
-            reader = csv.DictReader(file)
-            if tuple(reader.fieldnames or ()) != tuple(columns):
-                raise UserError(
-                    f"{path}: has other columns than {', '.join(columns)}; remove it or choose another --out"
-                )
-            rows = list(reader)
+        reader = csv.DictReader(io.StringIO(read_bytes(path).decode(), newline=""))
+        if tuple(reader.fieldnames or ()) != tuple(columns):
+            raise UserError(f"{path}: has other columns than {', '.join(columns)}; remove it or choose another --out")
+        rows = list(reader)
         if not all(math.isfinite(float(row[name])) for row in rows for name in columns if name not in words):
             raise ValueError("a number is not finite")
     except UserError:

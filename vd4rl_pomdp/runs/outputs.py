@@ -8,15 +8,10 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-import h5py
-
-from vd4rl_pomdp.data.format import FRAMES_KEY, PLAN, is_shard_name
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.reading import parse_json
+from vd4rl_pomdp.data.format import PLAN, is_shard, is_shard_name
+from vd4rl_pomdp.errors import UnavailableError, UserError, disk_error
+from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs import CONFIG_FILE
-
-_ROWS = {FRAMES_KEY, "action", "reward", "step_type"}
-"""Keys that tell a shard from other HDF5 files."""
 
 
 def refuse_inside(out: Path) -> None:
@@ -61,8 +56,10 @@ def kept_in(folder: Path) -> str | None:
 
 def _is_run(config: Path) -> bool:
     try:
-        record = parse_json(config.read_bytes())
-    except (OSError, ValueError):
+        record = parse_json(read_bytes(config))
+    except UnavailableError:
+        raise
+    except (FileNotFoundError, ValueError):
         return False
     return isinstance(record, dict) and "stage" in record
 
@@ -71,20 +68,14 @@ def _is_set(folder: Path) -> bool:
     if (folder / PLAN).is_file():
         return True
     shards = (folder / name for name in _names(folder) if is_shard_name(name))
-    return any(path.is_file() and _is_shard(path) for path in shards)
-
-
-def _is_shard(path: Path) -> bool:
-    try:
-        with h5py.File(path, "r") as file:
-            return set(file) >= _ROWS
-    except (OSError, RuntimeError):
-        return False
+    return any(path.is_file() and is_shard(path) for path in shards)
 
 
 def _names(folder: Path) -> list[str]:
-    """Names in a folder, without hidden ones; empty if it cannot be listed, which writing there then reports."""
+    """Names in a folder, without hidden ones; empty if it may not be listed, which writing there then reports."""
     try:
         return [path.name for path in folder.iterdir() if not path.name.startswith(".")]
-    except OSError:
+    except OSError as error:
+        if isinstance(told := disk_error(folder, error), UnavailableError):
+            raise told from error
         return []

@@ -99,7 +99,11 @@ class WandbSink:
             job_type=run.stage,
             config=_whole_config(run, labels, card),
             settings=wandb.Settings(
-                console="off", quiet=True, init_timeout=INIT_TIMEOUT_S, finish_timeout=FINISH_TIMEOUT_S
+                console="off",
+                quiet=True,
+                init_timeout=INIT_TIMEOUT_S,
+                finish_timeout=FINISH_TIMEOUT_S,
+                finish_timeout_raises=True,
             ),
             **names(run, labels, card),
         )

@@ -196,6 +196,8 @@ def _read_plan(path: Path) -> _Plan:
             raise TypeError("it does not tell its jobs and where they were planned")
         jobs = [_job(one) for one in told["jobs"]]
         return _Plan(Path(told["from"]), Path(told["out"]), jobs, dict(told.get("own_file", {})))
+    except UserError:
+        raise
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path}: is damaged ({error}); remove it and start `sweep run` again") from error
 

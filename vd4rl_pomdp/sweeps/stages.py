@@ -57,7 +57,7 @@ def check_cells(cells: Iterable[GridCell], grid: str, collects: Callable[[GridCe
         for cell in cells:
             check_cell(cell, collects(cell))
     except UserError as error:
-        raise UserError(f"{grid}: {error}") from error
+        raise type(error)(f"{grid}: {error}") from error
 
 
 def check_cell(cell: GridCell, collects: bool = True) -> None:

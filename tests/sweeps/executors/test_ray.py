@@ -2,13 +2,17 @@
 
 import os
 import signal
+import socket
+import subprocess
 import sys
+from collections.abc import Iterator
 from dataclasses import replace
+from pathlib import Path
 
 import pytest
 
 from tests.sweeps.executors.waiting import begun, run, until, waiting_job, work_of
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UnavailableError, UserError
 from vd4rl_pomdp.runs.ownership import in_use
 from vd4rl_pomdp.sweeps.driver import Driver
 from vd4rl_pomdp.sweeps.executors import ray as module
@@ -40,6 +44,46 @@ def cluster():
 def options(cluster, monkeypatch) -> RayOptions:
     monkeypatch.setattr(module, "NODES_S", 0.0)
     return RayOptions(address=cluster.address, cpus=1, gpus=0)
+
+
+@pytest.fixture
+def silent() -> Iterator[str]:
+    """An address at which connections are taken and nothing is answered."""
+    with socket.create_server(("127.0.0.1", 0), backlog=64) as server:
+        yield f"127.0.0.1:{server.getsockname()[1]}"
+
+
+@pytest.mark.parametrize("closed", [False, True])
+def test_a_cluster_that_does_not_answer_is_one_line(silent, monkeypatch, closed):
+    ray_is_there.shutdown()
+    monkeypatch.setattr(module, "CONNECT_S", 1.0)
+    address = "127.0.0.1:9" if closed else silent  # the port of a service that nobody runs
+    with pytest.raises(UnavailableError, match=f"no Ray cluster answers at --address {address} within 1 s"):
+        RayExecutor(RayOptions(address=address))
+
+
+def test_a_signal_while_a_cluster_is_waited_for_ends_the_command(silent, tmp_path):
+    words = ["sweep", "run", "quick", "--executor", "ray", "--address", silent, "--out", str(tmp_path / "out")]
+    script = (
+        "from vd4rl_pomdp.cli import main; from vd4rl_pomdp.sweeps.executors import ray; ray.CONNECT_S = 600.0; "
+        f"main({words!r})"
+    )
+    command = subprocess.Popen([sys.executable, "-c", script], stderr=subprocess.PIPE, text=True)
+    asks = Path(f"/proc/{command.pid}/task/{command.pid}/children")
+    try:
+        until(lambda: any(b"ray.init" in _words_of(child) for child in asks.read_text().split()))
+        command.terminate()
+        told = command.communicate(timeout=120)[1]
+    finally:
+        command.kill()
+    assert (command.returncode, told.splitlines()[-1]) == (143, "terminated: the same command does what is left")
+
+
+def _words_of(process: str) -> bytes:
+    try:
+        return Path(f"/proc/{process}/cmdline").read_bytes()
+    except FileNotFoundError:  # it has just ended
+        return b""
 
 
 def test_jobs_share_gpus_and_a_cancelled_one_ends_in_peace(options, tmp_path):

@@ -4,15 +4,17 @@ import errno
 import os
 import signal
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
 
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.errors import OutOfMemoryError, UserError
+from vd4rl_pomdp.errors import OutOfMemoryError, UnavailableError, UserError
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.sweeps.executors import slurm as module
 from vd4rl_pomdp.sweeps.executors import slurm_queue
+from vd4rl_pomdp.sweeps.executors.allocation import Allocation
 from vd4rl_pomdp.sweeps.executors.handover import Handover
 from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor
 from vd4rl_pomdp.sweeps.executors.slurm_queue import SlurmOptions, TaskState, parameters
@@ -267,6 +269,84 @@ def test_a_signal_during_a_submission_waits_until_the_array_is_known(fake, tmp_p
         made.ended()
     assert [task.key for task in made._tasks] == list(fake.queue)
     assert made._live() == ["7_0"], "what stopping takes out of the queue"
+
+
+@pytest.fixture
+def hanging(tmp_path, monkeypatch) -> Path:
+    """Slurm's commands, none of which ever ends; each leaves the number of its process here."""
+    for name in ("squeue", "sbatch", "scancel", "srun"):
+        script = tmp_path / "bin" / name
+        script.parent.mkdir(exist_ok=True)
+        script.write_text(f"#!/bin/sh\necho $$ > {tmp_path}/{name}.pid\nexec sleep 600\n")
+        script.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    monkeypatch.setattr(slurm_queue, "ANSWER_S", 2.0)
+    return tmp_path
+
+
+def test_commands_of_slurm_that_never_end_are_not_waited_for(hanging):
+    pytest.importorskip("submitit")
+    with pytest.raises(UnavailableError, match="Slurm does not answer: see what squeue says"):
+        executor(hanging)
+    with pytest.raises(UnavailableError, match="Slurm does not answer: scancel has not ended after 2 s"):
+        slurm_queue.cancel(["7_0"])
+    alarm = signal.getsignal(signal.SIGALRM)
+    tasks = [Allocation(hanging / "array", number, 1) for number in range(2)]
+    for count in (1, 2):  # which submitit submits in two ways
+        with pytest.raises(UnavailableError, match="Slurm does not answer: sbatch has not ended after 2 s"):
+            slurm_queue.submit(hanging / "array", tasks[:count], SlurmOptions())
+    assert signal.getsignal(signal.SIGALRM) is alarm
+    assert signal.getitimer(signal.ITIMER_REAL) == (0.0, 0.0)
+    for number in hanging.glob("*.pid"):
+        with pytest.raises(ProcessLookupError):  # it was killed
+            os.kill(int(number.read_text()), 0)
+
+
+def test_an_array_that_slurm_may_have_taken_is_submitted_by_another_name(fake, tmp_path, monkeypatch, capsys):
+    submit, names = module.submit, []
+
+    def unanswered(folder, tasks, options):
+        names.append(folder.name)
+        raise UnavailableError("Slurm does not answer: sbatch has not ended")
+
+    monkeypatch.setattr(module, "submit", unanswered)
+    monkeypatch.setattr(module, "AGAIN_S", 0.0)
+    made = executor(tmp_path)
+    made.start(work(tmp_path, "job"))
+    assert made.ended() == []
+    assert "warning: Slurm does not answer: sbatch has not ended; trying again" in capsys.readouterr().err
+    monkeypatch.setattr(module, "submit", submit)
+    made.ended()
+    assert fake.arrays == [[["job"]]], "with its jobs"
+    ((name, _),) = fake.queue
+    assert name not in names
+    assert [path.name for path in (tmp_path / "slurm").iterdir()] == [name], "an array of the old name finds nothing"
+
+
+def test_a_slurm_that_falls_silent_is_told_once_and_stopping_waits_for_it_no_longer(
+    fake, tmp_path, monkeypatch, capsys
+):
+    made = executor(tmp_path)
+    made.start(work(tmp_path, "job"))
+    made.ended()
+    monkeypatch.setattr(module, "read_queue", lambda: None)
+    made.ended()
+    made.ended()
+    assert capsys.readouterr().err.count("warning: Slurm does not answer: see what squeue says") == 1
+
+    def cancel(jobs, *options):
+        raise UnavailableError("Slurm does not answer: scancel has not ended")
+
+    monkeypatch.setattr(module, "cancel", cancel)
+    made.stop()
+    assert "scancel has not ended; see what squeue has of" in capsys.readouterr().err
+
+
+def test_once_a_signal_asks_for_the_end_slurm_has_less_time(hanging, monkeypatch):
+    monkeypatch.setattr(slurm_queue, "LAST_ANSWER_S", 0.5)
+    monkeypatch.setattr(interrupt, "asked", lambda: True)
+    with pytest.raises(UnavailableError, match=r"after 0\.5 s"):
+        slurm_queue.cancel(["7_0"])
 
 
 def test_how_an_arrays_jobs_ended_is_listed_once_a_look(fake, tmp_path, monkeypatch):

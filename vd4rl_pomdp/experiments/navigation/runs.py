@@ -19,7 +19,7 @@ from vd4rl_pomdp.experiments.navigation.grid import Condition
 from vd4rl_pomdp.mazes import MAZES
 from vd4rl_pomdp.navigation.config import PRESETS
 from vd4rl_pomdp.navigation.measures import Measure, measure_of, measure_rows
-from vd4rl_pomdp.reading import build
+from vd4rl_pomdp.reading import build, read_bytes
 from vd4rl_pomdp.results import Result, find_results, refuse_loss, write_results
 from vd4rl_pomdp.runs import TRAJECTORY_FILE
 from vd4rl_pomdp.runs.files import write_csv
@@ -75,12 +75,14 @@ class NavigationRun:
 def read_trajectory(path: Path) -> dict[str, np.ndarray]:
     """Columns of a run's trajectory.csv by name, each (T,) float64; raises UserError for a file that is none."""
     try:
-        rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8"), newline="")))
+        rows = list(csv.DictReader(io.StringIO(read_bytes(path).decode(), newline="")))
         table = {name: np.array([float(row[name]) for row in rows]) for name in rows[0]}
         if missing := [name for name in _DRAWN if name not in table]:
             raise ValueError(f"it has no {', '.join(missing)}")
         return table
-    except (OSError, IndexError, KeyError, TypeError, ValueError) as error:
+    except UserError:
+        raise
+    except (FileNotFoundError, IndexError, KeyError, TypeError, ValueError) as error:
         raise UserError(f"{path}: is no trajectory of a run ({error}); train the run again") from error
 
 

@@ -9,6 +9,8 @@ from __future__ import annotations
 import logging
 import os
 import signal
+import subprocess
+import sys
 import threading
 import time
 from collections.abc import Iterator
@@ -16,7 +18,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from vd4rl_pomdp.errors import OutOfMemoryError, UserError, disk_errors
+from vd4rl_pomdp.errors import OutOfMemoryError, UnavailableError, UserError, disk_errors
 from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.sweeps.executors.local import PATIENCE_S
 from vd4rl_pomdp.sweeps.oom import oom_kills
@@ -25,6 +27,8 @@ from vd4rl_pomdp.sweeps.work import FAILED, INTERRUPTED, KILLED, Ended, Work, en
 NODES_S = 5.0
 """Seconds between two looks at which nodes there are."""
 POLL_S = 0.2
+CONNECT_S = 30.0
+"""Seconds that a cluster has to answer a process that connects."""
 
 
 @dataclass(frozen=True)
@@ -56,6 +60,7 @@ class RayExecutor:
         """Connect to the cluster.
 
         Raises:
+            UnavailableError: the cluster does not answer.
             UserError: Ray is missing, there is no cluster, or none of its nodes has room for a job.
         """
         self._ray = _connected(options.address)
@@ -167,15 +172,33 @@ def _connected(address: str) -> Any:
         import ray
     except ImportError as error:
         raise UserError("--executor ray needs Ray: pip install '.[ray]' in a clone of vd4rl-pomdp") from error
+    if not ray.is_initialized():
+        _require_answer(address)
     try:
         with _own_signals():
             ray.init(address, log_to_driver=False, logging_level=logging.WARNING, ignore_reinit_error=True)
-    except (ConnectionError, ValueError) as error:
+    except (ConnectionError, RuntimeError, ValueError) as error:  # a RuntimeError for a cluster of another version
         raise UserError(
             f"no Ray cluster at {address!r} ({_line(error)}): start one with `ray start --head`, or name another "
             "with --address"
         ) from error
     return ray
+
+
+def _require_answer(address: str) -> None:
+    """Raise UnavailableError if a cluster does not answer in time.
+
+    Another process asks: `ray.init` tries for ten minutes, in C++ code that no signal and no deadline interrupts. Where
+    it fails at once, so does this process's own attempt, which says why.
+    """
+    command = [sys.executable, "-P", "-c", "import sys, ray; ray.init(sys.argv[1])", address]
+    try:
+        subprocess.run(command, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, timeout=CONNECT_S, check=False)
+    except subprocess.TimeoutExpired as error:
+        raise UnavailableError(
+            f"no Ray cluster answers at --address {address} within {CONNECT_S:.0f} s: start one with `ray start "
+            "--head`, or name another with --address"
+        ) from error
 
 
 @contextmanager

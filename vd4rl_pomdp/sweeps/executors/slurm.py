@@ -138,6 +138,8 @@ class SlurmExecutor:
         self._queue: Queue = {}
         """What Slurm told last."""
         self._stopped = False
+        self._answers = True
+        """Whether Slurm did when it was asked last."""
         self._warned: list[str] = []
         self._next_files = self._next_queue = self._next_submission = 0.0
 
@@ -156,7 +158,7 @@ class SlurmExecutor:
         best = max(tasks, key=lambda task: task.free, default=None)
         if best is not None and (best.free >= slots or len(tasks) >= self._options.tasks):
             return best
-        array = self._fresh[0].array if self._fresh else Handover(self._folder / f"{PREFIX}{token_hex(4)}")
+        array = self._fresh[0].array if self._fresh else _new_array(self._folder)
         self._fresh.append(_Task(array, len(self._fresh), self._options.jobs_per_task))
         return self._fresh[-1]
 
@@ -185,7 +187,10 @@ class SlurmExecutor:
         queue = read_queue()
         if queue is not None:
             self._queue = queue
-        return queue is not None
+        elif self._answers:
+            print("warning: Slurm does not answer: see what squeue says; it is asked again", file=sys.stderr)
+        self._answers = queue is not None
+        return self._answers
 
     def _state(self, task: _Task) -> TaskState:
         """What Slurm told last of a task."""
@@ -209,9 +214,9 @@ class SlurmExecutor:
 
         A signal waits until the array is known, which could not be taken out of the queue otherwise.
         """
-        array = self._fresh[0].array.folder
         with interrupt.deferred():
             try:
+                array = self._named_anew() if self._next_submission else self._fresh[0].array.folder
                 submit(array, [Allocation(array, task.number, task.places) for task in self._fresh], self._options)
             except UserError as error:
                 if not (self._accepted or isinstance(error, UnavailableError)):
@@ -219,24 +224,44 @@ class SlurmExecutor:
                 print(f"warning: {error}; trying again in {AGAIN_S:.0f} s", file=sys.stderr)
                 self._next_submission = time.monotonic() + AGAIN_S
                 return
-            self._accepted = True
+            self._accepted, self._next_submission = True, 0.0
             self._tasks, self._fresh = self._tasks + self._fresh, []
+
+    def _named_anew(self) -> Path:
+        """Another name for the array that is not submitted yet: Slurm may have taken it without saying so.
+
+        What Slurm has of the old name then finds no folder, and ends.
+        """
+        old, new = self._fresh[0].array.folder, _new_array(self._folder)
+        with disk_errors(old):
+            if old.is_dir():
+                old.rename(new.folder)
+        for task in self._fresh:
+            task.array = new
+        return new.folder
 
     def stop(self) -> None:
         """Take what waits out of the queue, ask every job to end where nothing is lost, and wait for it."""
         self._fresh, self._stopped = [], True
-        cancel(self._live(), "--state=PENDING")
-        cancel(self._live(), "--signal=TERM")
-        until = time.monotonic() + PATIENCE_S + QUEUE_S
-        while self._live() and time.monotonic() < until:
-            time.sleep(FILES_S)
-        cancel(self._live())
+        try:
+            cancel(self._live(), "--state=PENDING")
+            cancel(self._live(), "--signal=TERM")
+            until = time.monotonic() + PATIENCE_S + QUEUE_S
+            while self._live() and time.monotonic() < until:
+                time.sleep(FILES_S)
+            cancel(self._live())
+        except UnavailableError as error:
+            print(f"warning: {error}; see what squeue has of {self._folder}, and end it by scancel", file=sys.stderr)
         self._next_queue = 0.0
 
     def _live(self) -> list[str]:
         """Slurm's numbers of this sweep's tasks that have not ended, as far as it has told."""
         self._ask()
         return [state.job for state in map(self._state, self._tasks) if state.name not in OVER]
+
+
+def _new_array(folder: Path) -> Handover:
+    return Handover(folder / f"{PREFIX}{token_hex(4)}")
 
 
 def _over(array: Handover) -> set[str]:
@@ -250,7 +275,7 @@ def _known(folder: Path, places: int) -> list[_Task]:
     """Tasks that earlier drivers have in the queue."""
     queue = read_queue()
     if queue is None:
-        raise UserError("Slurm does not answer: see what squeue says")
+        raise UnavailableError("Slurm does not answer: see what squeue says")
     found = []
     for (name, number), state in queue.items():
         array = Handover(folder / name)

@@ -3,13 +3,18 @@
 from __future__ import annotations
 
 import shutil
+import signal
 import subprocess
+import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.errors import UnavailableError, UserError, disk_errors
 from vd4rl_pomdp.options import Limits, Options
+from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.sweeps.executors.allocation import Allocation
 from vd4rl_pomdp.sweeps.executors.local import PATIENCE_S
 
@@ -17,6 +22,8 @@ PREFIX = "vd4rl-pomdp-"
 """What the names of all sweeps' arrays begin with."""
 QUEUE_S = 15.0
 """Seconds between two looks at the queue."""
+ANSWER_S, LAST_ANSWER_S = 30.0, 10.0
+"""Seconds that a command of Slurm's has, and what it has once a signal has asked for the end."""
 REQUEUES = 100
 """How often a task goes on after its time limit before its driver is asked."""
 
@@ -83,18 +90,26 @@ def require_slurm() -> None:
 def read_queue() -> Queue | None:
     """This user's arrays of sweeps in the queue, those that ended of late included; None if Slurm does not answer."""
     command = ["squeue", "--me", "--array", "--states=all", "--noheader", "--format=%j|%K|%T|%i|%r"]
-    answer = subprocess.run(command, capture_output=True, text=True, check=False)
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=_deadline())
+    except subprocess.TimeoutExpired:
+        return None
     if answer.returncode:
         return None
     rows = [line.split("|") for line in answer.stdout.splitlines() if line.startswith(PREFIX)]
     return {(name, int(number) if number.isdigit() else 0): TaskState(*state) for name, number, *state in rows}
 
 
+def _deadline() -> float:
+    return LAST_ANSWER_S if interrupt.asked() else ANSWER_S
+
+
 def submit(folder: Path, tasks: list[Allocation], options: SlurmOptions) -> None:
     """Submit tasks as one array, called as its folder is.
 
     Raises:
-        UnavailableError: its files could not be written, or the machine starts no process now.
+        UnavailableError: its files could not be written, the machine starts no process now, or sbatch does not answer,
+            and Slurm may have taken the array or not.
         UserError: Slurm did not take it.
     """
     import submitit
@@ -102,11 +117,32 @@ def submit(folder: Path, tasks: list[Allocation], options: SlurmOptions) -> None
     executor = submitit.SlurmExecutor(folder, max_num_timeout=REQUEUES)
     executor.update_parameters(job_name=folder.name, **parameters(options))
     try:
-        with disk_errors(folder):
+        with disk_errors(folder), _alarm():
             executor.submit_array(tasks)
     except RuntimeError as error:  # submitit's for a command that failed
+        if isinstance(error.__cause__, UnavailableError):
+            raise error.__cause__ from None
         told = str(error).strip().splitlines()
         raise UserError(f"Slurm took no array ({told[-1] if told else 'it does not say why'})") from error
+
+
+@contextmanager
+def _alarm() -> Iterator[None]:
+    """Raise UnavailableError within the block when sbatch has had its time; submitit, which waits for it, kills it."""
+    if threading.current_thread() is not threading.main_thread():  # which alone gets signals
+        yield
+        return
+
+    def over(*_: object) -> None:
+        raise UnavailableError(f"Slurm does not answer: sbatch has not ended after {ANSWER_S:g} s")
+
+    before = signal.signal(signal.SIGALRM, over)
+    signal.setitimer(signal.ITIMER_REAL, ANSWER_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
 
 
 def parameters(options: SlurmOptions) -> dict[str, Any]:
@@ -129,6 +165,14 @@ def parameters(options: SlurmOptions) -> dict[str, Any]:
 
 
 def cancel(jobs: list[str], *how: str) -> None:
-    """Have scancel, with the options `how`, end tasks by their numbers; none is nothing."""
+    """Have scancel, with the options `how`, end tasks by their numbers; none is nothing.
+
+    Raises:
+        UnavailableError: it does not end in time.
+    """
     if jobs:
-        subprocess.run(["scancel", "--quiet", *how, *jobs], capture_output=True, check=False)
+        try:
+            command = ["scancel", "--quiet", *how, *jobs]
+            subprocess.run(command, capture_output=True, check=False, timeout=_deadline())
+        except subprocess.TimeoutExpired as error:
+            raise UnavailableError(f"Slurm does not answer: scancel has not ended after {error.timeout:g} s") from error

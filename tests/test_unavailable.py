@@ -1,0 +1,202 @@
+"""What cannot be opened for the moment is neither damaged nor to be deleted, whichever library opens it: it passes."""
+
+import errno
+import fcntl
+import os
+import resource
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, nullcontext, suppress
+from pathlib import Path
+from shutil import copyfile
+from types import SimpleNamespace
+
+import h5py
+import numpy as np
+import pytest
+from PIL import Image
+
+from finetune.features import FeatureFile
+from tests.helpers_data import write_fake_set
+from tests.navigation.test_exogenous import python_batch
+from tests.nn.test_encoder import CARD, make
+from vd4rl_pomdp.cli.ends import run_to_end
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows
+from vd4rl_pomdp.data.store import verify_store
+from vd4rl_pomdp.errors import UnavailableError, UserError, system_error
+from vd4rl_pomdp.experiments.navigation.runs import read_trajectory
+from vd4rl_pomdp.hub import LISTING, Repository
+from vd4rl_pomdp.hub.contents import Listing
+from vd4rl_pomdp.navigation.exogenous import _read_cifar, _read_image, load_pool, source_fingerprint
+from vd4rl_pomdp.navigation.first_person import _refuse_other
+from vd4rl_pomdp.nn import load_encoder, save_encoder
+from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
+from vd4rl_pomdp.policies.actor import ASSETS, read_actor, read_ladder
+from vd4rl_pomdp.policies.export import CURVE, read_curve
+from vd4rl_pomdp.report.load import FILM, FILM_FILE, LoadedRun
+from vd4rl_pomdp.results.folder import RUNS, _lines
+from vd4rl_pomdp.runs.checkpoint import Checkpoints
+from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
+from vd4rl_pomdp.runs.files import read_csv
+from vd4rl_pomdp.runs.outputs import kept_in
+from vd4rl_pomdp.sweeps.folder import _read_plan
+
+ADVICE = ("damaged", "truncated", "delete", "download", "collect", "remove", "train", "replace", "another copy")
+"""What may not be said of a whole file."""
+
+
+@contextmanager
+def no_more_files() -> Iterator[None]:
+    """This process has as many open files as it may."""
+    lowest = os.open("/dev/null", os.O_RDONLY)
+    os.close(lowest)
+    before = resource.getrlimit(resource.RLIMIT_NOFILE)
+    resource.setrlimit(resource.RLIMIT_NOFILE, (lowest, before[1]))
+    try:
+        yield
+    finally:
+        resource.setrlimit(resource.RLIMIT_NOFILE, before)
+
+
+@pytest.fixture
+def world(tmp_path) -> dict[str, Callable[[], object]]:
+    """What reads a file of every kind, each of which is whole."""
+    data = write_fake_set(tmp_path / "walker_walk" / "expert", (20, 25))
+    shard, cache = min(data.glob("*.hdf5")), tmp_path / "cache"
+    store = open_dataset(data, cache).store
+    encoder, policy, run = (tmp_path / name for name in ("encoder", "policy", "run"))
+    save_encoder(encoder, make("gru", True), CARD, frames=160)
+    Policy(4, 2, 8).save(policy, step=7)
+    run.mkdir()
+    Checkpoints(run).add(1, {"a": b"1"}, 0.5)
+    actor, ladder = (tmp_path / f"{name}.safetensors" for name in ("actor", "ladder"))
+    copyfile(ASSETS / "walker_walk_expert.safetensors", actor)
+    copyfile(ASSETS / "walker_walk_replay.safetensors", ladder)
+    with (run / FILM_FILE).open("wb") as file:
+        np.savez(file, **{name: np.zeros((1,) * axes) for name, axes in FILM.items()})
+    features = FeatureFile(run, {})
+    features.write(np.zeros(3))
+    (run / "episodes.csv").write_text(",".join(COLUMNS) + "\n")
+    (run / CURVE).write_text("decisions,return_mean\n1,2.0\n")
+    (run / "trajectory.csv").write_text("x,y,estimated_x,estimated_y\n0,0,0,0\n")
+    (run / RUNS).write_text("{}\n")
+    (run / "table.csv").write_text("a\n1\n")
+    (run / LISTING).write_text("{}")
+    (run / "plan.json").write_text('{"from": "/", "out": "/", "jobs": [1]}')
+    (images := tmp_path / "images").mkdir()
+    Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(images / "a.png")
+    (images / "data_batch_1.bin").write_bytes(bytes(3073))
+    (images / "data_batch_1").write_bytes(python_batch(bytes(3072)))
+    return {
+        "rows": lambda: read_rows(shard),
+        "frames": lambda: list(read_frames(shard)),
+        "attributes": lambda: read_attributes(shard),
+        "frame size": lambda: read_frame_size([shard]),
+        "decoded set": lambda: open_dataset(data, cache),
+        "decoded actions": lambda: store.array("action"),
+        "decoded frames": store.frames,
+        "checksums": lambda: verify_store(store),
+        "what a folder keeps": lambda: kept_in(data),
+        "encoder": lambda: load_encoder(encoder),
+        "policy": lambda: load_policy(policy),
+        "step of a policy": lambda: policy_step(policy),
+        "checkpoint": Checkpoints(run).newest,
+        "actor": lambda: read_actor(actor),
+        "ladder": lambda: read_ladder(ladder),
+        "what a policy replaces": lambda: _refuse_other(actor),
+        "film": lambda: LoadedRun.film(SimpleNamespace(path=run)),
+        "features": features.read,
+        "episodes": lambda: read_episodes(run / "episodes.csv"),
+        "episodes of a cut run": lambda: episodes_until(run / "episodes.csv", 1),
+        "curve": lambda: read_curve(run),
+        "trajectory": lambda: read_trajectory(run / "trajectory.csv"),
+        "results": lambda: _lines(run / RUNS),
+        "table": lambda: read_csv(run / "table.csv", ("a",), ()),
+        "images": lambda: load_pool(str(images), 0),
+        "image": lambda: _read_image(images / "a.png"),
+        "CIFAR-10, binary": lambda: _read_cifar(images / "data_batch_1.bin"),
+        "CIFAR-10, Python": lambda: _read_cifar(images / "data_batch_1"),
+        "name of a pool": lambda: source_fingerprint(str(images)),
+        "listing": lambda: Listing.read(run / LISTING, Repository.named("a/b")),
+        "plan of a sweep": lambda: _read_plan(run / "plan.json"),
+    }
+
+
+def test_whoever_may_open_no_more_files_is_told_that_it_passes(world):
+    wrong = {}
+    for name, read in world.items():
+        with suppress(UserError) if name in ("listing", "plan of a sweep") else nullcontext():  # mere JSON
+            read()  # which also imports what it needs
+        try:
+            with no_more_files():
+                read()
+        except UnavailableError as error:
+            said = [word for word in ADVICE if word in str(error)]
+            if said or "too many open files" not in str(error):
+                wrong[name] = str(error)
+        except Exception as error:
+            wrong[name] = repr(error)
+        else:
+            wrong[name] = "read"
+    assert wrong == {}
+
+
+@pytest.fixture
+def shard(tmp_path) -> Path:
+    return min(write_fake_set(tmp_path / "walker_walk" / "expert").glob("*.hdf5"))
+
+
+def test_a_shard_that_another_program_has_locked_passes_and_names_what_reads_it(shard, own_cache):
+    with shard.open("rb") as file:
+        fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
+        with pytest.raises(UnavailableError, match="HDF5_USE_FILE_LOCKING=FALSE"):
+            read_rows(shard)
+        end = run_to_end(["data", "check", str(shard.parent)])
+        assert (end.code, end.cause) == (2, UnavailableError.cause), "what a sweep tries again"
+        assert kept_in(shard.parent) == "a data set"
+    assert run_to_end(["data", "check", str(shard.parent)]).code == 0
+
+
+def test_a_shard_that_is_marked_as_being_written_is_not_called_damaged(tmp_path):
+    with h5py.File(tmp_path / "open.hdf5", "w", libver="latest") as file:
+        file["action"] = np.zeros(3)
+        file.flush()
+        copyfile(tmp_path / "open.hdf5", tmp_path / "copy.hdf5")
+    with pytest.raises(UnavailableError, match="another program writes it, or was killed while it did"):
+        read_rows(tmp_path / "copy.hdf5")
+
+
+@pytest.mark.parametrize("place", ["File", "_hl.group.h5o.open"])
+@pytest.mark.parametrize("number", [errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.ENFILE, errno.EBUSY])
+def test_what_hdf5_says_of_the_system_in_words_passes(shard, monkeypatch, place, number):
+    """h5py raises a KeyError for what fails below an open file, which `get` of its groups takes for no such key."""
+    words = f"Unable to synchronously open object (file read failed: time = now\n, errno = {number}, buf = 0x0)"
+
+    def fail(*_: object, **__: object) -> None:
+        raise KeyError(words) if "h5o" in place else OSError(words)
+
+    monkeypatch.setattr(f"h5py.{place}", fail)
+    with pytest.raises(UnavailableError, match=os.strerror(number).lower()):
+        read_rows(shard)
+
+
+def test_content_and_permissions_are_told_apart_from_what_passes(shard):
+    content = shard.read_bytes()
+    shard.write_bytes(content[: len(content) // 2])
+    with pytest.raises(UserError, match="truncated, damaged") as damaged:
+        read_rows(shard)
+    assert not isinstance(damaged.value, UnavailableError)
+    told = system_error(shard, PermissionError(errno.EACCES, "Permission denied"))
+    assert type(told) is UserError
+    assert "ask its owner" in str(told)
+    for error in (OSError("image file is truncated"), FileNotFoundError(errno.ENOENT, "none"), ValueError("no array")):
+        assert system_error(shard, error) is None
+
+
+def test_a_cache_whose_disk_has_no_locks_now_passes(shard, tmp_path, monkeypatch):
+    def flock(*_: object) -> None:
+        raise OSError(errno.ENOLCK, "No locks available")
+
+    monkeypatch.setattr("vd4rl_pomdp.data.store.fcntl.flock", flock)
+    with pytest.raises(UnavailableError, match="set VD4RL_POMDP_CACHE"):
+        open_dataset(shard.parent, tmp_path / "cache")
