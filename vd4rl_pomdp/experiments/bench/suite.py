@@ -78,6 +78,8 @@ def print_table(results: dict[str, Any]) -> None:
     for name, value in flatten(results).items():
         shown = f"{value:.4g}" if isinstance(value, float) else str(value)
         relation, goal = GOALS.get(name, ("", 0.0))
+        if relation and float(shown) == goal:
+            shown = str(value)  # a goal that is missed is not shown as reached
         reached = value <= goal if relation == "<=" else value >= goal if relation else None
         verdict = {True: "[green]reached[/]", False: "[red]missed[/]", None: ""}[reached]
         table.add_row(name, shown, f"{relation} {goal:g}" if relation else "", verdict)
