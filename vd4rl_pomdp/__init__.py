@@ -1,10 +1,16 @@
 """Which representations survive partial observability in offline visual reinforcement learning."""
 
+import os
 from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.data import open_dataset
+
+# Threads that wait for each other sleep. Else they spin, and where another process is on one of the cores, each of the
+# many short waits in a step of training lasts until the system takes the core from a thread that only spins. OpenMP
+# reads this when torch loads it, so it comes before torch; what the user has set stays.
+os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
 try:
     __version__ = version("vd4rl-pomdp")

@@ -97,6 +97,17 @@ def refuse_number(name: str, value: float, low: float, high: float = MOST) -> No
         raise UserError(f"{flag_of(name)} is {value}; it must be at least {low} and at most {high}")
 
 
+def told_apart(value: float, limit: float, decimals: int) -> tuple[str, str]:
+    """Two numbers as a message shows them: rounded to `decimals`, or to the fewest more that show which is larger."""
+
+    def shown(number: float) -> str:
+        return f"{number:,.{decimals}f}"
+
+    while value != limit and shown(value) == shown(limit):
+        decimals += 1
+    return shown(value), shown(limit)
+
+
 OR_ONES_OWN = ", or run the file that registers it"
 """What else to do about an unknown name of a kind that parts of one's own can be of."""
 

@@ -24,7 +24,7 @@ from vd4rl_pomdp.testing.corruptions import (
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-@pytest.mark.parametrize("name", CORRUPTIONS)
+@pytest.mark.parametrize("name", dict.fromkeys([*CORRUPTIONS, *STAGES]))
 def test_a_corruption_keeps_its_promises(name, check):
     run_check("corruption", check, name)
 

@@ -35,6 +35,7 @@ def test_the_report_holds_every_number(folder, tmp_path):
         "episodes": 3,
         "transitions": 7,
         "incomplete_episodes": 2,  # an episode of a single row has no LAST either
+        "episodes_of_one_row": 1,
         "action_dim": 6,
         "return_mean": pytest.approx(np.mean(returns)),
         "return_min": 0.0,
@@ -83,6 +84,8 @@ def test_differing_dtypes_are_all_listed(tmp_path):
     [
         (0, "action", 0.5, "an episode's first row has an action or a reward, which led to no frame"),
         (0, "reward", 0.5, "an episode's first row has an action or a reward, which led to no frame"),
+        (1, "action", np.nextafter(np.float32(1), np.float32(2)), r"has actions of up to 1\.0000001: scale them"),
+        (1, "discount", np.nextafter(1.0, 2.0), r"'discount' is 1\.0000000000000002 in row 1, not within 0 and 1"),
         (1, "action", -1.5, r"has actions of up to 1.5: scale them to \[-1, 1\]"),
     ],
 )

@@ -145,8 +145,23 @@ def test_every_field_of_every_window_is_aligned(dataset):
 
 def test_an_episode_shorter_than_the_window_is_named(dataset):
     for call in (lambda: dataset.num_windows(6), lambda: dataset.windows([0], 6)):
-        with pytest.raises(UserError, match=r"episode 0 has 5 rows, fewer than the window of 6 \(2 such episodes\)"):
+        with pytest.raises(
+            UserError,
+            match=r"episode 0 has 5 rows, fewer than the window of 6 \(2 such episodes\); choose a window of at most 3",
+        ):
             call()
+
+
+def test_an_episode_of_one_row_is_left_out_of_windows_of_any_length(tmp_path):
+    dataset = open_dataset(write_fake_set(tmp_path / "set", (1, 5, 1, 4, 1)), tmp_path / "cache")
+    assert (dataset.num_windows(2), dataset.num_windows(4)) == (dataset.num_transitions, 3) == (7, 3)
+    starts = dataset.windows([0, 1, 2], 4).key[:, 0]
+    assert starts.tolist() == [row_key(torch.tensor(e), torch.tensor(t)).item() for e, t in [(1, 0), (1, 1), (3, 0)]]
+    with pytest.raises(UserError, match=r"episode 1 has 5 rows, .* \(2 such episodes\); choose a window of at most 4"):
+        dataset.num_windows(6)
+    empty = open_dataset(write_fake_set(tmp_path / "empty", (1, 1)), tmp_path / "cache")
+    with pytest.raises(UserError, match="holds no transition; every episode in it is a single row"):
+        empty.num_windows(2)
 
 
 ARRAYS = [np.array([7]), np.array([7], np.uint64), np.arange(7, 8)[::-1], np.broadcast_to(np.int64(7), (1,))]

@@ -7,7 +7,10 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 
 import pytest
 
+from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.data import download as module
+from vd4rl_pomdp.data import manifest as listed
+from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.download import RemoteFile, download, manifest
 from vd4rl_pomdp.data.format import shard_paths
 from vd4rl_pomdp.errors import UserError
@@ -74,7 +77,8 @@ def mirror(monkeypatch):
     server = ThreadingHTTPServer(("127.0.0.1", 0), Handler)
     mirror.endpoint = f"http://127.0.0.1:{server.server_port}"
     threading.Thread(target=server.serve_forever, args=(0.01,), daemon=True).start()
-    monkeypatch.setattr(module, "manifest", lambda: mirror.manifest)
+    for where in (module, listed):
+        monkeypatch.setattr(where, "manifest", lambda: mirror.manifest)
     monkeypatch.setattr(module, "_FIRST_WAIT_S", 0.001)
     monkeypatch.setattr(module, "_BLOCK", 500)
     monkeypatch.setenv("NO_PROXY", "127.0.0.1")
@@ -292,3 +296,63 @@ def test_what_is_not_published_is_refused(tmp_path, arguments, message):
     with pytest.raises(UserError, match=message):
         download(task, quality, tmp_path, *endpoint)
     assert names(tmp_path) == []
+
+
+def part_of_a_set(mirror, tmp_path, names, folder=EXPERT):
+    """Some of a set's files, of their published sizes and no shards inside."""
+    place = tmp_path / folder
+    place.mkdir(parents=True)
+    for name in names:
+        (place / name).write_bytes(mirror.files.get(f"{folder}/{name}", CONTENT[name]))
+    return place
+
+
+@pytest.mark.parametrize(
+    ("folder", "names", "task", "told"),
+    [
+        (EXPERT, ["0_a_expert.hdf5"], "walker_walk expert", "1_a_expert.hdf5 is missing"),
+        (BOTH, list(CONTENT)[:2], "walker_walk medium_expert", "0_a_medium.hdf5 is missing"),
+        ("mine", ["0_a_expert.hdf5"], "walker_walk expert", "1_a_expert.hdf5 is missing"),
+        ("mine", ["0_a_expert.hdf5", "0_a_medium.hdf5"], "walker_walk medium_expert", "1_a_expert.hdf5 is missing"),
+    ],
+)
+def test_a_part_of_a_published_set_is_told_with_what_gets_the_rest(mirror, tmp_path, folder, names, task, told):
+    place = part_of_a_set(mirror, tmp_path, names, folder)
+    words = "--task {} --quality {}".format(*task.split())
+    out = "DIR" if folder == "mine" else tmp_path
+    with pytest.raises(
+        UserError, match=re.escape(f"{place}: is a part of V-D4RL's {task} ({told}); get the rest")
+    ) as e:
+        open_dataset(place)
+    assert f"`vd4rl-pomdp data download {words} --out {out}`" in str(e.value)
+
+
+def test_a_shard_of_another_size_than_the_others_of_a_published_set_is_told(mirror, tmp_path):
+    place = part_of_a_set(mirror, tmp_path, list(CONTENT)[:2])
+    (place / "1_a_expert.hdf5").write_bytes(b"cut")
+    with pytest.raises(UserError, match=rf"\(1_a_expert.hdf5 has 3 bytes, not {6 * 999}\); get the rest with"):
+        open_dataset(place)
+    download("walker_walk", "expert", tmp_path, mirror.endpoint)
+    with pytest.raises(UserError, match=r"0_a_expert.hdf5: is truncated, damaged or no HDF5 file"):  # as these are
+        open_dataset(place)
+
+
+@pytest.mark.usefixtures("mirror", "own_cache")
+def test_a_set_of_ones_own_is_opened_whatever_its_shards_are_called(tmp_path, capsys):
+    names = ["0_a_expert.hdf5", "1_a_expert.hdf5"]
+    told = {"task": "walker_walk", "set": "expert"}
+    write_fake_set(tmp_path / "a" / EXPERT, (5, 5), cuts=(5,), names=names)
+    write_fake_set(tmp_path / "b" / EXPERT, names=names[:1], attributes=told)
+    write_fake_set(tmp_path / "c" / "mine", names=names[:1])
+    write_fake_set(tmp_path / "d" / EXPERT)
+    write_fake_set(tmp_path / "e" / EXPERT, (5, 5), cuts=(5,), names=[names[0], "0_mine.hdf5"])
+    for folder in (f"a/{EXPERT}", f"b/{EXPERT}", "c/mine", f"d/{EXPERT}", f"e/{EXPERT}"):
+        assert open_dataset(tmp_path / folder).num_episodes == 2
+    assert open_dataset(tmp_path / "c" / "mine" / names[0]).num_episodes == 2
+    assert "warning" not in capsys.readouterr().err
+    place = write_fake_set(tmp_path / EXPERT, names=names[:1])
+    assert open_dataset(place).num_episodes == 2
+    assert (
+        f"warning: {place}: is a part of V-D4RL's walker_walk expert (1_a_expert.hdf5 is missing); get the rest"
+        in capsys.readouterr().err
+    )

@@ -167,7 +167,7 @@ def with_value(index, value):
         ("action", with_value((2, 1), np.nan), r"'action' is not finite as float32 in row 2 \(1 such rows\)"),
         ("reward", with_value(slice(3, 5), np.inf), r"'reward' is not finite as float32 in row 3 \(2 such rows\)"),
         ("discount", with_value(0, np.nan), r"'discount' is not finite as float32 in row 0"),
-        ("discount", with_value(3, 5.0), r"'discount' is 5 in row 3, not within 0 and 1"),
+        ("discount", with_value(3, 5.0), r"'discount' is 5\.0 in row 3, not within 0 and 1"),
         ("discount", with_value(2, -0.5), r"'discount' is -0\.5 in row 2, not within 0 and 1"),
         ("action", lambda v: with_value((2, 1), 1e300)(v.astype(float)), r"'action' is not finite as float32 in row 2"),
         ("reward", with_value(4, -1e300), r"'reward' is not finite as float32 in row 4"),

@@ -206,7 +206,9 @@ def test_a_full_disk_removes_what_was_written(tmp_path, cache, monkeypatch, stag
 
 def test_too_little_space_is_told_before_decoding(tmp_path, cache, monkeypatch):
     monkeypatch.setattr(store_module.shutil, "disk_usage", lambda _: type("usage", (), {"free": 8 * 21168 - 1}))
-    with pytest.raises(UserError, match=r"decoding needs 0\.0 GB, .*VD4RL_POMDP_CACHE"):
+    with pytest.raises(
+        UserError, match=r"decoding needs 0\.000169344 GB, the disk has 0\.000169343 GB; .*VD4RL_POMDP_CACHE"
+    ):
         open_store(write_fake_set(tmp_path / "set", (4, 4)), cache)
     assert visible(cache) == []
 

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 from pretrain.objectives import METHODS
-from vd4rl_pomdp.experiments.bench import data, memory, suite, training
+from vd4rl_pomdp.experiments.bench import data, memory, sharing, suite, training
 from vd4rl_pomdp.experiments.bench.suite import GOALS
 from vd4rl_pomdp.runs.files import flatten
 
@@ -30,6 +30,15 @@ def test_every_method_that_random_pictures_can_train_is_measured(tmp_path):
     assert all(value > 0 for value in flatten(measured).values())
 
 
+def test_two_runs_side_by_side_are_measured_against_one(monkeypatch):
+    measured = {"sharing": sharing.sharing(0.05, rounds=1)}
+    assert all(value > 0 for value in flatten(measured).values())
+    assert {name for name in GOALS if name.startswith("sharing.")} <= set(flatten(measured))
+    speeds = {(1, ""): [100.0], (2, ""): [60.0, 50.0], (1, "ACTIVE"): [125.0]}
+    monkeypatch.setattr(sharing, "_speeds", lambda seconds, count, OMP_WAIT_POLICY="": speeds[count, OMP_WAIT_POLICY])
+    assert sharing.sharing(1) == {"updates_per_s": 100, "of_two_over_alone": 0.5, "passive_over_active": 0.8}
+
+
 def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
     seen = {}
 
@@ -39,7 +48,7 @@ def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
     named = ("sampling", "pretraining", "finetuning", "methods")
     for name in named:
         monkeypatch.setattr(suite, name, section(name))
-    for name in ("memory", "collection", "maze_pictures", "maze_training"):
+    for name in ("memory", "collection", "sharing", "maze_pictures", "maze_training"):
         monkeypatch.setattr(suite, name, lambda *_: {})
     monkeypatch.setattr(suite, "synthetic_set", lambda folder, episodes: data.synthetic_set(folder, 1))
     monkeypatch.setattr(suite, "pick_device", lambda name: torch.device("meta"))

@@ -15,7 +15,7 @@ import pretrain.config
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import UserError, told_apart
 from vd4rl_pomdp.runs import memory
 from vd4rl_pomdp.runs.memory import CPU, bytes_kept, memory_of, require_disk, require_memory, telling_memory
 
@@ -60,8 +60,10 @@ def test_allocations_that_no_machine_grants_are_told():
 
 def test_more_than_the_machine_or_the_disk_has_is_refused(tmp_path):
     require_memory(memory_of(CPU), CPU, Settings(), "window")
-    with pytest.raises(UserError, match=r"--window 4 takes [\d,]+ GB of memory, and there are [\d,]+ GB: lower it"):
-        require_memory(memory_of(CPU) + 1, CPU, Settings(), "window")
+    needed = memory_of(CPU) + 1
+    shown = " GB of memory, and there are ".join(told_apart(needed / 1e9, memory_of(CPU) / 1e9, 0))
+    with pytest.raises(UserError, match=rf"--window 4 takes {shown} GB: lower it"):
+        require_memory(needed, CPU, Settings(), "window")
     require_disk(1, tmp_path / "not" / "there", Settings(), "window")
     with pytest.raises(UserError, match=r"--window 4 takes .* GB on the disk of .*: lower it or free"):
         require_disk(1e18, tmp_path / "not" / "there", Settings(), "window")
@@ -113,3 +115,17 @@ def test_a_finetuning_beyond_the_machine_leaves_no_run(data, tmp_path, name):
     with pytest.raises(UserError, match=rf"--{name.replace('_', '-')} 1000000000.* takes .* GB of memory"):
         run_finetune(config)
     assert not config.out.exists()
+
+
+@pytest.mark.parametrize(
+    ("value", "limit", "decimals", "shown"),
+    [
+        (4.2e9, 1e3, 0, ("4,200,000,000", "1,000")),
+        (4.004, 4.0036, 1, ("4.0040", "4.0036")),
+        (0.796, 0.8, 2, ("0.796", "0.800")),
+        (1e-6, 0.0, 1, ("0.000001", "0.000000")),
+        (2.0, 2.0, 1, ("2.0", "2.0")),
+    ],
+)
+def test_numbers_are_shown_so_that_the_larger_is_seen_to_be(value, limit, decimals, shown):
+    assert told_apart(value, limit, decimals) == shown

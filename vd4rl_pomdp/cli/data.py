@@ -120,7 +120,8 @@ def _check(words: Arguments, program: str) -> None:
     error = result["replay_max_error"]
     if error is not None and error > REPLAY_TOLERANCE:
         raise UserError(
-            f"{command.path}: stored actions do not replay to what is stored (largest difference {error:.3g})"
+            f"{command.path}: stored actions do not replay to what is stored (largest difference {error}, where "
+            f"{REPLAY_TOLERANCE} would be rounding)"
         )
 
 

@@ -28,11 +28,12 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
         replay: what simulates an episode; default `envs.dmc.replay_rewards`.
 
     Returns:
-        JSON values: `rows`, `episodes`, `transitions`, `incomplete_episodes`, `action_dim`, `return_mean`,
-        `return_min` and `return_max` over all episodes, incomplete ones included, `replay_max_error` (largest absolute
-        difference between a stored reward, in a maze a true state, and its replay; None where nothing can be
-        replayed), `replay` (how that was found, or why not), `frame_size`, `task`, `quality`, `shards` (names in
-        order), `dtypes` (key to the stored dtypes), `store_ok` (True: the decoded files have their checksums).
+        JSON values: `rows`, `episodes`, `transitions`, `incomplete_episodes`, `episodes_of_one_row` (on which nothing
+        trains), `action_dim`, `return_mean`, `return_min` and `return_max` over all episodes, incomplete ones included,
+        `replay_max_error` (largest absolute difference between a stored reward, in a maze a true state, and its replay;
+        None where nothing can be replayed), `replay` (how that was found, or why not), `frame_size`, `task`, `quality`,
+        `shards` (names in order), `dtypes` (key to the stored dtypes), `store_ok` (True: the decoded files have their
+        checksums).
 
     Raises:
         UserError: the set or its decoded form is damaged.
@@ -51,6 +52,7 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
         "episodes": dataset.num_episodes,
         "transitions": dataset.num_transitions,
         "incomplete_episodes": dataset.incomplete_episodes,
+        "episodes_of_one_row": int((dataset.episode_end - dataset.episode_start == 1).sum()),
         "action_dim": dataset.action_dim,
         "return_mean": float(returns.mean()),
         "return_min": float(returns.min()),
@@ -76,7 +78,7 @@ def _check_actions(dataset: Dataset) -> None:
             "the frame that follows it, and zeros in the first row"
         )
     if (most := np.abs(action).max()) > 1:
-        raise UserError(f"{dataset.path}: has actions of up to {most:g}: scale them to [-1, 1], as policies act")
+        raise UserError(f"{dataset.path}: has actions of up to {most!s}: scale them to [-1, 1], as policies act")
 
 
 def _why_not_replayed(dataset: Dataset, is_maze: bool) -> str:

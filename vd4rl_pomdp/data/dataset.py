@@ -14,6 +14,8 @@ from torch import Tensor
 
 from vd4rl_pomdp.buffers import FrameBuffers
 from vd4rl_pomdp.data.episodes import episode_returns
+from vd4rl_pomdp.data.format import shard_paths
+from vd4rl_pomdp.data.manifest import check_whole
 from vd4rl_pomdp.data.store import Store, open_store
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.errors import OutOfMemoryError, UserError
@@ -36,9 +38,12 @@ def open_dataset(path: Path | str, cache: Path | str | None = None) -> Dataset:
         cache: where decoded sets are kept; default `$VD4RL_POMDP_CACHE`, else the user's cache folder.
 
     Raises:
-        UserError: the set is missing, empty, damaged, incomplete or of two frame sizes.
+        UserError: the set is missing, empty, damaged, incomplete, a part of a published one, or of two frame sizes.
     """
-    return Dataset(Path(path), open_store(Path(path), Path(cache) if cache else None))
+    path = Path(path)
+    if path.is_dir():
+        check_whole(path, shard_paths(path), task_and_quality(path, []))
+    return Dataset(path, open_store(path, Path(cache) if cache else None))
 
 
 class Dataset:
@@ -299,15 +304,20 @@ class Dataset:
         )
 
     def check_windows(self, length: int) -> None:
-        """Raise UserError unless every episode has a window of `length` rows."""
+        """Raise UserError unless every episode has a window of `length` rows, but for those without a transition.
+
+        An episode of a single row has nothing to train on, whatever the window: `windows` leaves it out.
+        """
         require_positive(length=length)
-        short = torch.nonzero(self.episode_end - self.episode_start < length)
+        self.require_transitions()
+        rows = self.episode_end - self.episode_start
+        short = torch.nonzero((rows < length) & (rows > 1))[:, 0]
         if len(short):
-            episode = int(short[0, 0])
-            rows = int(self.episode_end[episode] - self.episode_start[episode])
+            episode = int(short[0])
             raise UserError(
-                f"{self.path}: episode {episode} has {rows} rows, fewer than the window of {length} "
-                f"({len(short)} such episodes); choose a shorter window"
+                f"{self.path}: episode {episode} has {rows[episode]} rows, fewer than the window of {length} "
+                f"({len(short)} such episodes); choose a window of at most {rows[short].min()}, or take "
+                "them out of the set"
             )
 
     def windows_per_episode(self, length: int) -> Tensor:

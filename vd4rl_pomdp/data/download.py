@@ -7,15 +7,11 @@ for an address where nobody is, and lose up to 10 MB with every connection that 
 
 from __future__ import annotations
 
-import csv
 import os
 import shutil
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
-from dataclasses import dataclass
-from functools import cache
-from importlib.resources import files
 from pathlib import Path
 from urllib.parse import urlsplit
 
@@ -27,6 +23,7 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from urllib3.exceptions import NewConnectionError
 
 from vd4rl_pomdp import __version__
+from vd4rl_pomdp.data.manifest import RemoteFile, manifest
 from vd4rl_pomdp.errors import UserError, disk_error, disk_errors, refuse_unknown
 from vd4rl_pomdp.runs.files import replacing_file, sha256
 from vd4rl_pomdp.runs.outputs import refuse_kept
@@ -40,29 +37,6 @@ _FIRST_WAIT_S = 1.0
 _TIMEOUT_S = (10.0, 60.0)
 _BLOCK = 1 << 16
 """Bytes read at once: what a cut connection loses at most."""
-
-
-@dataclass(frozen=True)
-class RemoteFile:
-    """One published shard."""
-
-    path: str
-    """vd4rl/main/{task}/{quality}/84px/{file}: its place on the mirror."""
-    size: int
-    """Bytes."""
-    sha256: str
-
-    def target(self, destination: Path) -> Path:
-        """Where the file goes: destination/{task}/{quality}/84px/{file}."""
-        return destination.joinpath(*self.path.split("/")[2:])
-
-
-@cache
-def manifest() -> tuple[RemoteFile, ...]:
-    """All published 84-pixel shards."""
-    text = files("vd4rl_pomdp.data").joinpath("manifest.tsv").read_text(encoding="utf-8")
-    rows = csv.DictReader(text.splitlines(), delimiter="\t")
-    return tuple(RemoteFile(row["path"], int(row["bytes"]), row["sha256"]) for row in rows)
 
 
 def default_endpoint() -> str:

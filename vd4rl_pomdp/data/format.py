@@ -353,4 +353,4 @@ def _check_discounts(path: Path, discount: np.ndarray, step_type: np.ndarray) ->
     outside = np.flatnonzero(((discount < 0) | (discount > 1)) & (step_type != StepType.FIRST))
     if len(outside):
         row = outside[0]
-        raise UserError(f"{path}: 'discount' is {discount[row]:g} in row {row}, not within 0 and 1; {_REPAIR}")
+        raise UserError(f"{path}: 'discount' is {discount[row]!s} in row {row}, not within 0 and 1; {_REPAIR}")

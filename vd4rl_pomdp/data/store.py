@@ -27,7 +27,7 @@ import numpy as np
 
 from vd4rl_pomdp.data.episodes import check_count, join_shards
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows, shard_paths
-from vd4rl_pomdp.errors import DiskFullError, UserError, disk_error, disk_errors, system_error
+from vd4rl_pomdp.errors import DiskFullError, UserError, disk_error, disk_errors, system_error, told_apart
 from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs.identity import content_hash
 from vd4rl_pomdp.runs.progress import ProgressLine
@@ -222,8 +222,9 @@ def _decode(path: Path, shards: Sequence[Path], folder: Path) -> dict[str, Any]:
 def _require_space(folder: Path, needed: int) -> None:
     free = shutil.disk_usage(folder).free
     if needed > free:
+        wanted, there = told_apart(needed / 1e9, free / 1e9, 1)
         raise DiskFullError(
-            f"{folder.parent}: decoding needs {needed / 1e9:.1f} GB, the disk has {free / 1e9:.1f} GB; "
+            f"{folder.parent}: decoding needs {wanted} GB, the disk has {there} GB; "
             "free some space or set VD4RL_POMDP_CACHE to a folder on another disk"
         )
 

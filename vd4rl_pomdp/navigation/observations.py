@@ -39,6 +39,11 @@ def open_maze_set(path: Path, cache: Path | None = None) -> tuple[Dataset, MazeS
             "`vd4rl-pomdp navigation collect`"
         )
     check_trajectories(dataset.num_episodes, str(path))
+    if (rows := dataset.episode_end - dataset.episode_start).min() < 2:
+        raise UserError(
+            f"{path}: trajectory {int(rows.argmin())} is a single row, without a step; take it out of the set, or "
+            "collect the set again"
+        )
     return dataset, MAZES[names.pop()]
 
 

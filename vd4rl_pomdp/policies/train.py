@@ -173,7 +173,7 @@ def _check_start(config: PolicyConfig, start: Path) -> None:
             f"{config.decisions}; give more"
         )
     if mean >= config.stop_at:
-        raise UserError(f"{start}: returns {mean:g} already; give a --stop-at above it")
+        raise UserError(f"{start}: returns {mean} already; give a --stop-at above it")
     if config.refill == 0 and config.critic_warmup > 0:
         raise UserError("--refill 0 leaves no decision for --critic-warmup to learn from; give it 0, too")
 

@@ -14,6 +14,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from vd4rl_pomdp.errors import told_apart
 from vd4rl_pomdp.report.gaps import STATE
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import SETTING, LoadedRun
@@ -176,7 +177,9 @@ def _verdict(row: Row, state: list[LoadedRun], acro: list[LoadedRun], differing:
         if row[name] is None:
             unknown.append(_no_share(words, runs))
         elif row[name] < least:
-            missed.append(f"{words} returns {row[name]:.2f} of the data's return, less than {least}")
+            missed.append(
+                f"{words} returns {told_apart(row[name], least, 2)[0]} of the data's return, less than {least}"
+            )
     if differing:
         unknown.append(f"best and random have other {', '.join(differing)}")
     elif row["error"] is None:

@@ -114,7 +114,7 @@ def training(
         means.load_state_dict(state["means"])
 
     run.restore(restore)
-    log = MetricsLog(run.path / METRICS_FILE, learner.step, open_sinks(run, learner.step, labels, card or {}))
+    log = MetricsLog(run.path / METRICS_FILE, learner.step, open_sinks(run, labels, card or {}))
     with closing(log), ProgressLine(title, total, unit, learner.step) as progress, interrupt.deferred():
         try:
             yield Loop(run, learner, means, total, log, progress)

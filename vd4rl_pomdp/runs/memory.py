@@ -12,7 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.errors import DiskFullError, OutOfMemoryError, UserError, flag_of
+from vd4rl_pomdp.errors import DiskFullError, OutOfMemoryError, UserError, flag_of, told_apart
 from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.provenance import machine_memory
 
@@ -40,9 +40,9 @@ def require_memory(needed: float, device: torch.device, config: Any, *names: str
     """Raise UserError, naming the flags that decide, if `needed` bytes exceed all the memory of a device."""
     have = memory_of(device)
     if needed > have:
+        wanted, there = told_apart(needed / 1e9, have / 1e9, 0)
         raise UserError(
-            f"{_named(config, names)} takes {needed / 1e9:,.0f} GB of memory, and there are {have / 1e9:,.0f} GB: "
-            f"{_remedy(names)}"
+            f"{_named(config, names)} takes {wanted} GB of memory, and there are {there} GB: {_remedy(names)}"
         )
 
 
@@ -51,9 +51,10 @@ def require_disk(needed: float, path: Path, config: Any, *names: str) -> None:
     place = next(folder for folder in (path.absolute(), *path.absolute().parents) if folder.exists())
     disk = shutil.disk_usage(place)
     if needed > disk.free and disk.total:  # a file system without room, such as /proc, says itself what may not be
+        wanted, there = told_apart(needed / 1e9, disk.free / 1e9, 1)
         raise DiskFullError(
-            f"{_named(config, names)} takes {needed / 1e9:,.1f} GB on the disk of {path}, and {disk.free / 1e9:,.1f} "
-            f"GB are free: {_remedy(names)} or free some space"
+            f"{_named(config, names)} takes {wanted} GB on the disk of {path}, and {there} GB are free: "
+            f"{_remedy(names)} or free some space"
         )
 
 

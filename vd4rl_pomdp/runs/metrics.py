@@ -63,12 +63,15 @@ class MetricsLog:
     """Appends rows {"step": int, name: number, ...}, which its sinks get, too.
 
     Opening it again at a checkpoint drops the rows after it: those of later steps, and an evaluation of its own step.
+    Sinks that lack some of the others get them again.
     """
 
     def __init__(self, path: Path, step: int, sinks: Sequence[Sink] = ()) -> None:
         self._path, self._sinks = path, sinks
         kept = [row for row in read_metrics(path) if row["step"] < step + (not _is_evaluation(row))]
         write_bytes(path, "".join(json.dumps(row) + "\n" for row in kept).encode())
+        for sink in sinks:
+            sink.resume(step, kept)
 
     def write(self, step: int, metrics: dict[str, float]) -> None:
         """Append one row; a metric that is not a finite number raises FloatingPointError."""

@@ -154,7 +154,7 @@ def steps_lower_the_loss(name: str, **settings: Any) -> None:
     objective = build(name, **settings)
     losses = _train(name, objective, torch.optim.Adam(objective.parameters(), lr=1e-3), [0] * 30)
     first, last = sum(losses[:5]) / 5, sum(losses[-5:]) / 5
-    claim(last < 0.97 * first, f"the mean of the first five is {first:.4f}, of the last five {last:.4f}")
+    claim(last < 0.97 * first, f"the mean of the first five is {first}, of the last five {last}")
 
 
 def _train(name: str, objective: Objective, optimiser: torch.optim.Optimizer, batches: Iterable[int]) -> list[float]:

@@ -279,6 +279,11 @@ def test_sets_that_cannot_be_trained_on_are_named(tmp_path):
     shrunk = write_fake_set(tmp_path / "shrunk", attributes={"task": "no_curtain"})
     with pytest.raises(UserError, match="has frames of 84 pixels, mazes of 100"):
         train(smoke(shrunk, tmp_path / "run"))
+    short = fake_rows([1, 20, 20], action_dim=2, physics_dim=4) | {"observation": np.zeros((41, 3, 100, 100), np.uint8)}
+    (tmp_path / "short").mkdir()
+    write_shard(tmp_path / "short" / "0.hdf5", short, {"task": "no_curtain"})
+    with pytest.raises(UserError, match="trajectory 0 is a single row, without a step; take it out of the set, or"):
+        train(smoke(tmp_path / "short", tmp_path / "run"))
     rows = fake_rows([20, 20], action_dim=2) | {"observation": np.zeros((40, 3, 100, 100), np.uint8)}
     for name, attributes, message in (
         ("none", {}, "names no maze"),

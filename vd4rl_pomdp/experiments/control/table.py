@@ -9,6 +9,7 @@ from itertools import groupby
 
 import numpy as np
 
+from vd4rl_pomdp.errors import told_apart
 from vd4rl_pomdp.experiments.control.config import MEASURED, NO_MEMORY, SETTING, UNTRAINED
 from vd4rl_pomdp.report.gates import FAILED, STANDARD_ERRORS, STATE_SHARE
 from vd4rl_pomdp.report.load import PROBES
@@ -127,7 +128,8 @@ def _gates(rows: list[Row], every: list[Row]) -> Iterator[tuple[str, bool | None
     whole = dict(zip(SETTING, _setting(rows[0]), strict=True)) | {"hidden_share": "0"}
     ceiling = list(_returns([row for row in every if _setting(row) == tuple(whole.values())], NO_MEMORY).values())
     share = float(np.mean(ceiling)) / float(rows[0]["data_return"]) if ceiling else math.nan
-    told = f"{share:.2f} of the data's return (n = {len(ceiling)}), at least {STATE_SHARE}" if ceiling else "-"
+    shown, _ = told_apart(share, STATE_SHARE, 2)
+    told = f"{shown} of the data's return (n = {len(ceiling)}), at least {STATE_SHARE}" if ceiling else "-"
     yield "nothing hidden and no memory", share >= STATE_SHARE if ceiling else None, told
     floor = _floor(rows)
     others = [name for name in _by_return(rows) if name != floor]

@@ -70,8 +70,8 @@ class RayExecutor:
         if not options.jobs and not self.slots:
             self._ray.shutdown()
             raise UserError(
-                f"no node of the Ray cluster has {options.cpus:g} CPUs and {options.gpus:g} GPUs: lower --cpus or "
-                "--gpus, or say with --jobs how many jobs the cluster is to grow for"
+                f"no node of the Ray cluster has {options.cpus:.15g} CPUs and {options.gpus:.15g} GPUs: lower --cpus "
+                "or --gpus, or say with --jobs how many jobs the cluster is to grow for"
             )
         self._task = self._ray.remote(max_retries=0)(attempt)
 

@@ -1,0 +1,50 @@
+"""Threads of torch that wait for each other sleep, unless the user says otherwise; its OpenMP library tells it."""
+
+import os
+import re
+import subprocess
+import sys
+
+import pytest
+
+WORKERS = """
+import os
+from vd4rl_pomdp.runs.workers import run_jobs
+print(*run_jobs(os.getenv, ["OMP_WAIT_POLICY"] * 2, 2))
+"""
+
+
+def run(code: str, **environment: str) -> subprocess.CompletedProcess:
+    unset = {name: value for name, value in os.environ.items() if not re.match("OMP_WAIT_POLICY|GOMP_|KMP_", name)}
+    command = [sys.executable, "-c", code]
+    return subprocess.run(command, env=unset | environment, capture_output=True, text=True, check=True)
+
+
+def spins(code: str, **environment: str) -> set[str]:
+    """How often threads look before they sleep, in every OpenMP library that the code loads."""
+    found = set(re.findall("GOMP_SPINCOUNT = '(.*)'", run(code, OMP_DISPLAY_ENV="VERBOSE", **environment).stderr))
+    if not found:
+        pytest.skip("torch's OpenMP library is another one here")
+    return found
+
+
+@pytest.mark.parametrize(
+    "module",
+    [
+        *("vd4rl_pomdp", "pretrain", "finetune", "baselines"),
+        *("vd4rl_pomdp.cli", "vd4rl_pomdp.__main__", "vd4rl_pomdp.sweeps.worker"),
+    ],
+)
+def test_whatever_is_imported_first_threads_sleep_while_they_wait(module):
+    assert spins(f"import {module}; import torch") == {"0"}
+
+
+def test_workers_wait_as_their_caller_does():
+    assert run(WORKERS).stdout.split() == ["PASSIVE", "PASSIVE"]
+
+
+@pytest.mark.parametrize(
+    ("chosen", "count"), [({"OMP_WAIT_POLICY": "ACTIVE"}, "30000000000"), ({"GOMP_SPINCOUNT": "5000"}, "5000")]
+)
+def test_what_the_user_has_set_is_kept(chosen, count):
+    assert spins("import vd4rl_pomdp; import torch", **chosen) == {count}
