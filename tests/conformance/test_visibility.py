@@ -64,30 +64,14 @@ def test_the_literal_future_leaks_the_target_at_k_1():
     assert all(t in actions for (_, t, k), (_, actions) in seen.items() if k == 1)
 
 
-@pytest.mark.parametrize("told", [{}, {"n": 0}, {"n": 1}, {"gru_layers": 2}], ids=str)
-@pytest.mark.parametrize("method", ["mik", "mik+a"])
-def test_the_future_shows_frames_of_masked_steps_unless_they_are_blanked(method: str, told: dict):
-    """Stacks of three reach back two frames; a pair's first masked frame is that of t+1."""
-    for objective, shown in ((inverse(method, **told), 2), (inverse(method, future_frames="newest", **told), 0)):
-        for found in (dependence, response):
-            for (_, t, k), (frames, _) in found(objective, [ROWS, 4], frames=True).items():
-                masked = set(range(t + 1, t + k))
-                assert frames & masked == set(range(max(t + 1, t + k - shown), t + k))
-                assert frames >= {t - 2, t - 1, t, t + k}, "what is not masked is seen"
-
-
-@pytest.mark.parametrize("kept", [2, 3])
-def test_a_frame_too_many_in_the_futures_first_rows_is_caught(kept: int):
+@pytest.mark.parametrize("row", [0, 1])
+def test_a_frame_too_many_in_the_futures_first_rows_is_caught(row: int):
     """The rows that are seen stay the same: only the count of frames tells."""
     objective = inverse("mik+a", future_frames="newest")
     blanked = objective._blanked
-    objective._blanked = lambda obs: [blanked(obs)[1] if kept == 2 else obs, *blanked(obs)[1:]]
+    objective._blanked = lambda obs: [obs if row == i else blank for i, blank in enumerate(blanked(obs))]
     assert wrong_pairs(objective, [ROWS]) == []
     assert {k for _, _, k in wrong_pairs(objective, [ROWS], frames=True)} == {2, 3, 4}
-    second = inverse("mik+a", future_frames="newest")
-    second._blanked = lambda obs: [blanked(obs)[0], obs]
-    assert wrong_pairs(second, [ROWS]) == []
-    assert wrong_pairs(second, [ROWS], frames=True)
 
 
 def shift_states(objective: InverseObjective, which: tuple[int, ...]) -> None:
