@@ -55,9 +55,8 @@ def wrong_pairs(objective: InverseObjective, lengths: Sequence[int], rows: int =
 def declared(objective: InverseObjective, t: int, k: int, length: int, last_action: bool, frames: bool = False) -> Seen:
     """What `objective` declares visible; `last_action` tells whether the window's last row has an action."""
     rows, actions = objective.visible(t, k, length)
-    return objective.visible_frames(t, k, length) if frames else rows, {
-        a for a in actions if a < length - 1 or last_action
-    }
+    seen = objective.visible_frames(t, k, length) if frames else rows
+    return seen, {a for a in actions if a < length - 1 or last_action}
 
 
 def dependence(
