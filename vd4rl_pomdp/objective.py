@@ -132,6 +132,11 @@ class InverseObjective(Objective):
             Observation rows j (of o_j) and action indices j (of a_j).
         """
 
+    def visible_frames(self, t: int, k: int, rows: int) -> set[int]:
+        """Single frames j (the newest of o_j) that it may depend on: all of the visible rows' stacks; -1 is the one
+        before the window."""
+        return {j - older for j in self.visible(t, k, rows)[0] for older in range(self.encoder.frame_stack)}
+
     def past_visible(self, t: int) -> tuple[set[int], set[int]]:
         """Observation rows and action indices that the encoder's state of row t depends on."""
         shape = self.encoder.config

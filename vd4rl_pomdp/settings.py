@@ -27,10 +27,14 @@ and are compared by content; `eval_clean` adds rows that change no other."""
 NO_SETTINGS = RUNTIME_FIELDS | {"seed"}
 """Config fields in which the seeds of one experiment may differ."""
 
+LATER = {"future_frames": "all"}
+"""Settings that earlier versions did not record, with what they did: having this value is the same as not having it."""
+
 LABELS = ("method", "task", "quality", "corruption", "algorithm", "seed")
 """What names the rows of a run."""
 
 
 def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
     """A stage's config, as JSON keeps it, without NO_SETTINGS: the same for all seeds of an experiment."""
-    return {name: value for name, value in config.items() if name not in NO_SETTINGS}
+    told = {name: value for name, value in config.items() if name not in NO_SETTINGS}
+    return {name: value for name, value in told.items() if name not in LATER or value != LATER[name]}

@@ -11,6 +11,9 @@ Differences and readings:
 - The paper's rows are (o_t, a_{t-1}): the future's first, (o_{t+k}, a_{t+k-1}), hands b the last masked action, which
   for k = 1 is the target. Here b reads (o_j, a_j) for j >= t+k, so that it never sees a_t..a_{t+k-1}.
   `literal_future` restores the literal rows, to measure what they do.
+- An observation is a stack of the frames j-2..j, so that o_{t+k} shows up to two frames of masked steps, in the paper's
+  setting, too. `future_frames` blanks them: b's state of row t+k then reads that row with its newest frame alone, the
+  next one without its oldest.
 - The future of row h is printed as rows min(h+n, H) to H; here it begins at h = t+k, as in the paper's proof.
 - An episode's last row has no action: b reads zeros and a flag there.
 - The future reaches to the window's end, or n rows beyond t+k (the paper's n is not stated for these experiments);
@@ -21,14 +24,15 @@ Differences and readings:
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import ClassVar
+from typing import ClassVar, Literal
 
 import torch
 from torch import Tensor, nn
 
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.sequence import run_gru_backward, run_gru_over_next
+from vd4rl_pomdp.nn.sequence import run_gru_backward, run_gru_over_next, run_gru_over_versions
 from vd4rl_pomdp.objective import InverseObjective, InverseOptions
 from vd4rl_pomdp.options import Limits
 from vd4rl_pomdp.types import Windows
@@ -40,6 +44,10 @@ class MaskedOptions(InverseOptions):
 
     n: int | None = None
     """Rows after t+k that the future encoder reads; None: all to the window's end."""
+
+    future_frames: Literal["all", "newest"] = "all"
+    """Frames of the future's first observations: all, of which up to two are of masked steps, or newest, where those
+    before t+k are blanked."""
 
     limits: ClassVar[Limits] = {"n": 0}
 
@@ -61,6 +69,12 @@ class MaskedInverse(InverseObjective):
         self.use_actions = shape.use_actions
         self.literal_future = isinstance(options, MaskedActionOptions) and options.literal_future
         self.n = options.n
+        self.newest = options.future_frames == "newest"
+        if self.newest and encoder.frame_stack == 1:
+            raise UserError(
+                "--future-frames newest blanks older frames of a stack, and here an observation is one frame: "
+                "leave it out"
+            )
         inputs = shape.feature_dim + (shape.action_dim + 1 if self.use_actions else 0)
         self.backward_gru = nn.GRU(inputs, shape.hidden_dim, shape.gru_layers, batch_first=True)
 
@@ -69,9 +83,19 @@ class MaskedInverse(InverseObjective):
         features = self.encoder.frame(window.obs)
         past = self.encoder.from_features(features, window.prev_action)
         rows = self._future_rows(features, window)
+        if self.newest:
+            blanked = [self._future_rows(self.encoder.frame(obs), window) for obs in self._blanked(window.obs)]
+            span = None if self.n is None else self.n + 1
+            return past, run_gru_over_versions(self.backward_gru, [*blanked, rows], window.length, span)
         if self.n is None:
             return past, run_gru_backward(self.backward_gru, rows, window.length)
         return past, run_gru_over_next(self.backward_gru, rows, window.length, self.n + 1)
+
+    def _blanked(self, obs: Tensor) -> list[Tensor]:
+        """Observations as a future's first row, its second, ...: without the frames of before the first."""
+        stack = self.encoder.frame_stack
+        older = (3 * frames for frames in range(stack - 1, 0, -1))
+        return [torch.cat([torch.zeros_like(obs[:, :, :c]), obs[:, :, c:]], dim=2) for c in older]
 
     def _future_rows(self, features: Tensor, window: Windows) -> Tensor:
         if not self.use_actions:
@@ -90,3 +114,8 @@ class MaskedInverse(InverseObjective):
         if self.use_actions:
             actions |= set(range(t + k - 1, end - 1) if self.literal_future else range(t + k, end))
         return observations, actions
+
+    def visible_frames(self, t: int, k: int, rows: int) -> set[int]:
+        """All of the stacks, or all but those of masked steps: the past's last stack shows what else is blanked."""
+        frames = super().visible_frames(t, k, rows)
+        return frames - set(range(t + 1, t + k)) if self.newest else frames

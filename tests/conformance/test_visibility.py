@@ -29,6 +29,10 @@ OPTIONS = [
     ("acro", {"history": "gru"}),
     ("one_step_inverse", {"history": "gru"}),
     ("mik+a", {"gru_layers": 2}),
+    ("mik", {"future_frames": "newest"}),
+    ("mik+a", {"future_frames": "newest", "gru_layers": 2}),
+    ("mik+a", {"future_frames": "newest", "n": 0, "m": 0}),
+    ("mik+a", {"future_frames": "newest", "n": 3, "literal_future": True}),
 ]
 
 
@@ -58,6 +62,16 @@ def test_mik_a_never_sees_the_masked_actions():
 def test_the_literal_future_leaks_the_target_at_k_1():
     seen = dependence(inverse("mik+a", literal_future=True), [ROWS])
     assert all(t in actions for (_, t, k), (_, actions) in seen.items() if k == 1)
+
+
+@pytest.mark.parametrize("row", [0, 1])
+def test_a_frame_too_many_in_the_futures_first_rows_is_caught(row: int):
+    """The rows that are seen stay the same: only the count of frames tells."""
+    objective = inverse("mik+a", future_frames="newest")
+    blanked = objective._blanked
+    objective._blanked = lambda obs: [obs if row == i else blank for i, blank in enumerate(blanked(obs))]
+    assert wrong_pairs(objective, [ROWS]) == []
+    assert {k for _, _, k in wrong_pairs(objective, [ROWS], frames=True)} == {2, 3, 4}
 
 
 def shift_states(objective: InverseObjective, which: tuple[int, ...]) -> None:

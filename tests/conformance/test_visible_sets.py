@@ -4,6 +4,9 @@ Twice: drawn by hand for single pairs, and as formulas for all pairs of all wind
 depends on is found by changing one input at a time, and by gradients; `visible`, which reads the code's own settings,
 must say the same. Of `mik+a` they are the table's in the reading that this project chose: its later view begins with
 o_{t+k} and the action taken there, not with the one before, which the option `literal` restores.
+
+The table's observations are stacks of three frames here, so each of them shows the two frames before it, those of
+masked steps among them: all pairs are counted in frames, too.
 """
 
 from collections.abc import Callable
@@ -30,6 +33,7 @@ OPTIONS: dict[str, dict] = {
     "n=0": {"n": 0},
     "n=1": {"n": 1},
     "n=9": {"n": 9},
+    "newest": {"future_frames": "newest"},
 }
 WINDOWS = {"inside": INSIDE, "end": END, "short": SHORT}
 DRAWN = """
@@ -111,11 +115,11 @@ def settings(words: tuple[str, ...]) -> dict:
 
 
 @cache
-def seen_by(method: str, words: tuple[str, ...]) -> tuple[InverseObjective, dict, dict]:
+def seen_by(method: str, words: tuple[str, ...], frames: bool = False) -> tuple[InverseObjective, dict, dict]:
     """An objective, and what its predictions change with and have gradients to, pair by pair of every window."""
     largest = {} if method == "one_step_inverse" else {"max_k": ROWS - 1}
     objective = build_inverse(method, **largest, **settings(words)).eval()
-    return objective, response(objective, LENGTHS), dependence(objective, LENGTHS)
+    return objective, response(objective, LENGTHS, frames=frames), dependence(objective, LENGTHS, frames=frames)
 
 
 @pytest.mark.parametrize("line", LINES, ids=" ".join)
@@ -166,6 +170,8 @@ BOUNDED = [
     *((name, ("gru", *m)) for name in ("no_history", "acro", "one_step_inverse") for m in ((), ("m=1",))),
     *((name, (m, n)) for name in ("mik", "mik+a") for m in ("m=0", "m=2") for n in ("n=0", "n=1")),
     *(("mik+a", ("literal", *n)) for n in ((), ("n=0",), ("n=1",), ("m=1", "n=1"))),
+    *((name, ("newest", *more)) for name in ("mik", "mik+a") for more in ((), ("m=0", "n=0"), ("n=1",), ("layers",))),
+    ("mik+a", ("newest", "literal")),
 ]
 
 
@@ -182,18 +188,30 @@ def from_the_paper(method: str, words: tuple[str, ...], t: int, k: int, last: in
     )
 
 
+@pytest.mark.parametrize("frames", [False, True], ids=["rows", "frames"])
 @pytest.mark.parametrize(
     ("method", "words"), BOUNDED, ids=lambda value: value if isinstance(value, str) else ",".join(value)
 )
-def test_every_pair_sees_what_the_papers_table_says(method: str, words: tuple[str, ...]):
-    objective, felt, followed = seen_by(method, words)
+def test_every_pair_sees_what_the_papers_table_says(method: str, words: tuple[str, ...], frames: bool):
+    """Rows; or frames, of which each row shows its own and the two before it: masked ones, too, unless blanked."""
+    objective, felt, followed = seen_by(method, words, frames)
     assert len(felt) == sum(len(objective.pairs(length)) for length in LENGTHS)
     for (window, t, k), seen in felt.items():
         last = LENGTHS[window] - 1
         acts = last if window == INSIDE and "literal" not in words else last - 1
-        table = from_the_paper(method, words, t, k, last, acts)
+        table = rows, actions = from_the_paper(method, words, t, k, last, acts)
+        if frames:
+            masked = set(range(t + 1, t + k)) if "newest" in words else set()
+            table = {frame for row in rows for frame in (row - 2, row - 1, row)} - masked, actions
         assert seen == followed[window, t, k] == table, (window, t, k)
-        assert declared(objective, t, k, LENGTHS[window], last_action=window == INSIDE) == table, (window, t, k)
+        assert declared(objective, t, k, LENGTHS[window], window == INSIDE, frames) == table, (window, t, k)
+
+
+@pytest.mark.parametrize("method", ["mik", "mik+a"])
+def test_the_future_shows_up_to_two_frames_of_masked_steps_unless_they_are_blanked(method: str):
+    for words, most in (((), 2), (("newest",), 0)):
+        for (_, t, k), (frames, _) in seen_by(method, words, frames=True)[1].items():
+            assert len(frames & set(range(t + 1, t + k))) == min(most, k - 1)
 
 
 @pytest.mark.parametrize("method", [name for name in METHODS if predicts_actions(name)])

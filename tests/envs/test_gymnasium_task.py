@@ -3,8 +3,10 @@ from functools import partial
 import gymnasium
 import numpy as np
 import pytest
+from PIL import Image
 
 from vd4rl_pomdp.envs.gym import GymEnv
+from vd4rl_pomdp.envs.gymnasium_task import area_means
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask
@@ -55,6 +57,54 @@ def test_pictures_of_every_layout_become_frames(pixels, shape):
     for t, row in enumerate(rows):
         assert (row.frame.dtype, row.frame.shape) == (np.uint8, (3, 16, 16))
         assert (row.frame == t).all()
+
+
+def exact_means(picture: np.ndarray, size: int) -> np.ndarray:
+    """Means over blocks of a picture in which each pixel stands so often that a block is a new pixel; halves go up."""
+    tall, wide = (np.lcm(old, size) for old in picture.shape[:2])
+    fine = picture.repeat(tall // picture.shape[0], 0).repeat(wide // picture.shape[1], 1)
+    sums = fine.reshape(size, tall // size, size, wide // size, 3).sum((1, 3), dtype=np.int64)
+    number = (tall // size) * (wide // size)
+    return (2 * sums + number) // (2 * number)
+
+
+NOT_WHOLE = [(120, 120), (480, 480), (100, 100), (85, 85), (168, 120), (90, 168), (60, 100), (64, 64)]
+
+
+@pytest.mark.parametrize("shape", NOT_WHOLE, ids=str)
+def test_pixels_of_a_frame_are_means_of_the_areas_that_they_cover(shape):
+    picture = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
+    assert np.array_equal(area_means(picture, 84), exact_means(picture, 84))
+
+
+@pytest.mark.parametrize("shape", [(120, 120), (480, 480)], ids=str)
+def test_a_line_between_black_and_white_is_grey_by_its_place(shape):
+    """By hand: 120 / 84 = 10 / 7, so the third new pixel covers 2 6/7 to 4 2/7."""
+    picture = np.zeros((*shape, 3), np.uint8)
+    picture[:, shape[1] // 40 :] = 255
+    frame = area_means(picture, 84)
+    assert (frame[:, :2] == 0).all()
+    assert (frame[:, 2] == round(255 * (1 - 1 / 10 if shape[1] == 120 else 36 / 40))).all()
+    assert (frame[:, 3:] == 255).all()
+
+
+@pytest.mark.parametrize("shape", [(168, 168), (252, 168), (480, 480), (84, 420)], ids=str)
+def test_whole_ratios_are_as_they_were(shape):
+    size = 96 if shape[0] == 480 else 84
+    picture = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
+    was = Image.fromarray(picture).resize((size, size), Image.Resampling.BOX)
+    assert np.array_equal(area_means(picture, size), np.asarray(was))
+
+
+def test_what_an_environment_draws_is_shrunk_by_areas():
+    class Noise(Counter):
+        def picture(self):
+            return np.random.default_rng(self.steps).integers(0, 256, (90, 120, 3), np.uint8)
+
+    env, rows = play(GymnasiumTask(Noise), 2, size=84)
+    for t, row in enumerate(rows):
+        env.env.steps = t
+        assert np.array_equal(row.frame, exact_means(env.env.picture(), 84).transpose(2, 0, 1))
 
 
 class OneBuffer(Counter):

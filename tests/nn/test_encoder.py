@@ -7,7 +7,7 @@ from safetensors.torch import save_file
 
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn import Encoder, EncoderCard, EncoderConfig, load_encoder, save_encoder, sequence
-from vd4rl_pomdp.nn.sequence import run_gru_backward, run_gru_over_next
+from vd4rl_pomdp.nn.sequence import run_gru_backward, run_gru_over_next, run_gru_over_versions
 from vd4rl_pomdp.types import Windows
 
 CARD = EncoderCard("mik+a", "walker_walk", "expert", {"corruption": "none"}, 0, 10, "smoke")
@@ -101,6 +101,21 @@ def test_the_backward_gru_starts_at_each_windows_last_real_row():
     for b in range(2):
         alone, _ = gru(x[b : b + 1, : length[b]].flip(1))
         torch.testing.assert_close(out[b, : length[b]], alone[0].flip(0))
+
+
+@pytest.mark.parametrize("span", [None, 1, 2, 5, 99])
+@pytest.mark.parametrize("layers", [1, 2])
+@pytest.mark.parametrize("number", [1, 3])
+def test_a_state_reads_its_own_version_of_each_row(number: int, layers: int, span: int | None):
+    torch.manual_seed(0)
+    gru = torch.nn.GRU(3, 4, layers, batch_first=True)
+    versions, length = torch.randn(number, 2, 6, 3), torch.tensor([6, 4])
+    out = run_gru_over_versions(gru, list(versions), length, span)
+    for b in range(2):
+        for j in range(length[b]):
+            read = range(j, min(length[b], j + (span or 99)))
+            rows = torch.stack([versions[min(row - j, number - 1), b, row] for row in read])
+            torch.testing.assert_close(out[b, j], gru(rows.flip(0)[None])[0][0, -1])
 
 
 def test_an_encoder_folder_gives_back_the_same_encoder(tmp_path):

@@ -83,6 +83,22 @@ def test_any_objective_can_be_built_on_states(method):
     assert torch.equal(encoder.frame(states), states[..., 0, 0])
 
 
+def test_frames_before_the_future_are_blanked_in_what_was_shifted_and_corrupted(tmp_path):
+    """Behind patches of 200: what a patch or a shift put into a blanked frame is gone, too."""
+    dataset = open_dataset(write_fake_set(tmp_path / "set", [20, 25]), tmp_path / "cache")
+    config = PretrainConfig.of("smoke", future_frames="newest", corruption="patch", patch_fill=200)
+    objective = build_objective(config, 6, build_target(config, dataset.action.numpy()))
+    trainer, read = PretrainTrainer(objective, dataset, config), []
+    objective.encoder.frame.register_forward_pre_hook(lambda _, inputs: read.append(inputs[0]))
+    trainer.update()
+    whole, *blanked = read
+    assert (whole == 200).flatten(3).any(-1).all(), "a patch in every frame"
+    for obs, older in zip(blanked, (6, 3), strict=True):
+        assert obs.dtype == torch.uint8
+        assert not obs[:, :, :older].any()
+        assert torch.equal(obs[:, :, older:], whole[:, :, older:])
+
+
 class Short(MaskedInverse):
     def representations(self, window):
         past, future = super().representations(window)

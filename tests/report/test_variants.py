@@ -41,6 +41,7 @@ def test_runs_pool_whatever_their_seed_folder_device_and_logging(tmp_path):
         ({"card": {}, "views": 4}, {"card": {}, "views": None}, ["acro, views 4", "acro, views none"]),
         ({"card": {"m": 8}}, {"card": {}}, ["acro, m 8", "acro, m unset"]),
         ({"card": {"history": "method"}}, {"card": {"history": "gru"}}, ["acro", "acro, history gru"]),
+        ({"card": {"m": 8}}, {"card": {"m": 8, "future_frames": "newest"}}, ["acro", "acro, future_frames newest"]),
         (
             {"card": {}, "random_histories": 0.0, "views": 4},
             {"card": {}, "random_histories": 0.5, "views": 8},
@@ -63,6 +64,7 @@ def test_runs_pool_whatever_their_seed_folder_device_and_logging(tmp_path):
         "none",
         "new",
         "plain",
+        "later",
         "two",
         "no card",
         "preset",

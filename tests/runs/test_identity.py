@@ -38,6 +38,16 @@ def test_settings_count(change):
     assert identity(record, CARD) != identity(RECORD, CARD)
 
 
+def test_a_setting_of_a_later_version_counts_where_it_changes_what_all_did_before():
+    def names(value):
+        told = ("config", "future_frames", value), ("settings", "future_frames", value)
+        return recipe(_changed(RECORD, *told[0]), {}), recipe(RECORD, _changed(CARD, *told[1]))
+
+    assert names("all")[0] == recipe(RECORD, {})
+    assert names("newest")[0] != recipe(RECORD, {})
+    assert names("newest")[1] != recipe(RECORD, CARD)
+
+
 @pytest.mark.parametrize("change", [("seed", None, 1), ("settings", "steps", 21)])
 def test_how_the_encoder_was_pretrained_counts(change):
     assert recipe(RECORD, _changed(CARD, *change)) != recipe(RECORD, CARD)

@@ -64,6 +64,19 @@ def test_only_the_same_run_goes_on_wherever_its_data_lies(tmp_path):
     assert {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
 
 
+@dataclass(frozen=True)
+class Later(Config):
+    future_frames: str = "all"
+
+
+def test_a_run_from_before_a_setting_goes_on_with_what_it_did(tmp_path):
+    with begin(tmp_path) as run:
+        run.finish()
+    assert RunFolder(tmp_path, "stage", Later(tmp_path), INPUTS).finished
+    with pytest.raises(UserError, match=r"another config \(future_frames\)"):
+        RunFolder(tmp_path, "stage", Later(tmp_path, future_frames="newest"), INPUTS)
+
+
 @pytest.mark.parametrize("stored", [1, 99])
 def test_a_run_of_another_format_is_refused(tmp_path, stored):
     with begin(tmp_path):

@@ -14,7 +14,15 @@ from matplotlib.figure import Figure
 
 from vd4rl_pomdp.data.dataset import task_and_quality
 from vd4rl_pomdp.data.episodes import episode_returns, join_shards
-from vd4rl_pomdp.data.format import PROVENANCE, check_frames, read_attributes, read_rows, read_some_frames, shard_paths
+from vd4rl_pomdp.data.format import (
+    PROVENANCE,
+    check_frames,
+    read_attributes,
+    read_plan,
+    read_rows,
+    read_some_frames,
+    shard_paths,
+)
 from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.files import read_json
@@ -23,6 +31,8 @@ from vd4rl_pomdp.text import code, markdown, plain, write_text
 from vd4rl_pomdp.types import StepType
 
 FILM_FRAMES = 10
+EARLIER = "an earlier version: area means only if a frame's size divides the picture's height and width"
+"""How the pictures of a set without simulator states were shrunk whose collection.json does not say."""
 LINES = 0.82
 """Height of bars and lines; above is the legend's place."""
 HOW = {
@@ -69,7 +79,7 @@ def write_card(path: Path) -> Path:
     lengths = np.diff([*starts, len(rows["reward"])])
     published = _published(*names)
     film = _film(shards, [len(part["reward"]) for part in parts], starts, lengths, returns)
-    text = _text(path, names, attributes, returns, lengths, published)
+    text = _text(path, names, attributes, returns, lengths, published, "physics" in rows)
     try:
         (path / "card.png").write_bytes(_picture(names, returns, published, film))
         write_text(path / "card.md", text)
@@ -134,6 +144,7 @@ def _text(
     returns: np.ndarray,
     lengths: np.ndarray,
     published: float | None,
+    simulated: bool,
 ) -> str:
     rows = {
         "episodes": len(returns),
@@ -145,7 +156,7 @@ def _text(
         "return, quartiles": ", ".join(f"{q:.1f}" for q in np.quantile(returns, (0.25, 0.5, 0.75))),
         "published return of plain BC on V-D4RL's set": "none" if published is None else f"{published:.0f}",
     }
-    lines = {name: markdown(str(value)) for name, value in rows.items()} | _origin(path, attributes)
+    lines = {name: markdown(str(value)) for name, value in rows.items()} | _origin(path, attributes, simulated)
     table = "\n".join(f"| {name} | {value} |" for name, value in lines.items())
     how = HOW.get(names[1] or "", "") if attributes[0] else "A published set, or one that records no origin."
     return (
@@ -157,8 +168,11 @@ def _span(low: Any, high: Any) -> str:
     return f"{low}" if low == high else f"{low} to {high}"
 
 
-def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, str]:
-    """Seed, actors, rendering, versions and commit, as the shards and provenance.json record them, in Markdown."""
+def _origin(path: Path, attributes: list[dict[str, Any]], simulated: bool) -> dict[str, str]:
+    """Seed, actors, rendering, versions and commit, as the set's files record them, in Markdown.
+
+    `simulated` sets hold simulator states, and their frames are drawn at their own size.
+    """
     if not attributes[0]:
         return {}
     first = attributes[0]
@@ -166,6 +180,8 @@ def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, str]:
     facts = {"seed": first.get("seed"), "render": first.get("render")}
     facts["noise added to actions, standard deviation"] = first.get("action_noise")
     facts |= {f"actor {name}, SHA-256": sha for name, sha in actors.items()}
+    if not simulated:
+        facts["pictures shrunk by"] = read_plan(path).get("downscaling", EARLIER)
     record = path / PROVENANCE
     if record.exists():
         provenance = read_json(record)

@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 
+from vd4rl_pomdp.data.format import DOWNSCALING
 from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.envs.pixels import Render
@@ -34,6 +35,7 @@ from vd4rl_pomdp.tasks import (
     NOISY_QUALITIES,
     SET_QUALITIES,
     TASKS,
+    GymnasiumTask,
     NoisyQuality,
     Quality,
     Task,
@@ -111,7 +113,8 @@ def collect(config: CollectConfig, length: int | None = None) -> list[Path]:
         for path, episodes, collector in plan
     ]
     with owned(config.out):
-        claim_set(config.out, collection(config) | {"actors": _hashes(plan)})
+        made = DOWNSCALING if isinstance(TASKS.named(config.task), GymnasiumTask) else {}
+        claim_set(config.out, collection(config) | {"actors": _hashes(plan)}, made)
         collect_shards(config.out, shards, _roll_out, config.workers, ("collect", "episodes"), config.task)
         from vd4rl_pomdp.data.card import write_card  # draws; the processes that render need it not
 

@@ -14,6 +14,7 @@ import io
 import json
 import os
 import re
+import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,12 +28,14 @@ import numpy as np
 from vd4rl_pomdp.errors import UnavailableError, UserError, in_one_line, system_error
 from vd4rl_pomdp.reading import parse_json, regular
 from vd4rl_pomdp.runs.files import read_json, write_bytes
-from vd4rl_pomdp.tasks import FRAME_SIZES
+from vd4rl_pomdp.tasks import FRAME_SIZES, GymnasiumTask, Task
 from vd4rl_pomdp.types import StepType
 
 SUFFIXES = (".hdf5", ".h5")
 PLAN, PROVENANCE = "collection.json", "provenance.json"
 """What a collection writes before its first shard, and after its last."""
+DOWNSCALING = {"downscaling": "area means"}
+"""What a collection.json says of a Gymnasium task's pictures; earlier ones say nothing."""
 FRAMES_KEY = "observation"
 _ROW_KEYS = {"action": 2, "reward": 1, "discount": 1, "step_type": 1, "physics": 2}
 _OPTIONAL = "physics"
@@ -52,6 +55,16 @@ def is_shard_name(name: str) -> bool:
 def read_plan(folder: Path) -> dict[str, Any]:
     """How a set was collected, as its collection.json has it; empty for sets of other makers."""
     return read_json(folder / PLAN) if (folder / PLAN).is_file() else {}
+
+
+def warn_of_earlier_pictures(place: object, plan: Mapping[str, Any], task: Task) -> None:
+    """Tell on stderr if a set, by its collection.json, has pictures that its task draws otherwise by now."""
+    if plan and isinstance(task, GymnasiumTask) and DOWNSCALING.keys() - plan.keys():
+        print(
+            f"warning: {place}: pictures of its set were shrunk by an earlier version, whose pixels are no means of "
+            "areas unless a frame's size divides the picture's: if it does not, collect it again",
+            file=sys.stderr,
+        )
 
 
 def shard_files(folder: Path) -> list[Path]:

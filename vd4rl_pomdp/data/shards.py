@@ -6,6 +6,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -64,16 +65,26 @@ def collect_shards(
     record.write(workers)
 
 
-def claim_set(out: Path, settings: dict[str, Any]) -> None:
+def claim_set(out: Path, settings: dict[str, Any], made: Mapping[str, Any] = MappingProxyType({})) -> None:
     """Write collection.json, or check that the folder holds the same collection, begun with the same code of its task.
 
     A set that is whole stays one, whatever its task's code has become.
+
+    Args:
+        out: folder of the set.
+        settings: what tells it from others.
+        made: how this version makes it; a set that another began, and that is not whole, is refused.
     """
     path = out / PLAN
     if path.exists():
         stored = read_json(path)
         if others := differing(stored, settings):
             raise UserError(f"{out}: holds a set collected with another {', '.join(others)}; choose another --out")
+        if not (out / PROVENANCE).exists() and (others := differing(stored, made)):
+            raise UserError(
+                f"{out}: was begun by an earlier version with another {others[0]}, and is not whole; choose another "
+                "--out"
+            )
         if not (out / PROVENANCE).exists() and (parts := of_other_code(stored, settings)):
             raise UserError(
                 f"{out}: was begun before the code of {parts[0]} changed, and is not whole; put that back, or choose "
@@ -82,7 +93,7 @@ def claim_set(out: Path, settings: dict[str, Any]) -> None:
         return
     if holds_anything(out):
         raise UserError(f"{out}: is not empty and holds no collected set; choose another --out")
-    write_json(path, settings | {name: told for name, told in code_of(settings).items() if told})
+    write_json(path, settings | dict(made) | {name: told for name, told in code_of(settings).items() if told})
 
 
 def differing(stored: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator
 from contextlib import contextmanager
+from functools import cache
 from typing import Any
 
 import gymnasium
@@ -20,6 +21,28 @@ from vd4rl_pomdp.types import StepType
 NOTHING = np.zeros(0)
 _REFUSALS = (gymnasium.error.Error, ImportError)
 """What an environment raises that cannot do what it is asked, for lack of a package or otherwise."""
+
+
+@cache
+def _overlaps(old: int, new: int) -> np.ndarray:
+    """(new, old) float32: share of each old pixel in each new one, in units that make the sum of a row `old`."""
+    starts, others = np.arange(new)[:, None] * old, np.arange(old) * new
+    return np.maximum(np.minimum(starts + old, others + new) - np.maximum(starts, others), 0).astype(np.float32)
+
+
+def area_means(picture: np.ndarray, size: int) -> np.ndarray:
+    """(H, W, 3) uint8 -> (size, size, 3) uint8, each pixel the mean of the area that it covers, a half rounded up.
+
+    Where both ratios are whole this is Pillow's box filter, which rounds after each axis. At others that filter takes
+    old pixels whole or not at all, and torch's `area` lets areas overlap; so means are computed here, without an error:
+    all sums are integers below 2^24, or 2^53 along the second axis.
+    """
+    height, width, _ = picture.shape
+    if not (height % size or width % size):
+        return np.asarray(Image.fromarray(picture).resize((size, size), Image.Resampling.BOX))
+    lines = _overlaps(height, size) @ picture.reshape(height, -1).astype(np.float32)
+    sums = _overlaps(width, size).astype(np.float64) @ lines.reshape(size, width, 3)
+    return np.floor(sums / (height * width) + 0.5).astype(np.uint8)
 
 
 class GymnasiumEnv(PixelEnv):
@@ -120,8 +143,7 @@ class GymnasiumEnv(PixelEnv):
     def _frame(self, size: int) -> np.ndarray:
         """The present picture as (3, size, size) uint8, each pixel the mean of the area that it covers."""
         picture = self._picture()
-        if picture.shape[:2] != (size, size):
-            picture = np.asarray(Image.fromarray(picture).resize((size, size), Image.Resampling.BOX))
+        picture = picture if picture.shape[:2] == (size, size) else area_means(picture, size)
         return np.array(picture.transpose(2, 0, 1), order="C")  # a copy: the environment may draw into its buffer again
 
     def _picture(self) -> np.ndarray:

@@ -110,6 +110,11 @@ class Encoder(nn.Module):
         """Whether observations are simulator states (B, P, 1, 1) in place of pixels."""
         return self.config.frame_encoder == STATE
 
+    @property
+    def frame_stack(self) -> int:
+        """Frames of an observation; 1 where its channels are not three a frame."""
+        return 1 if self.reads_state or self.config.channels % 3 else self.config.channels // 3
+
     def encode(self, window: Windows) -> Tensor:
         """Representations of every row: (B, T, C, H, W) uint8 -> (B, T, dim); raises UserError for other pictures."""
         self._refuse_other(window.obs)

@@ -2,8 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 
 def run_gru(gru: nn.GRU, x: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -41,6 +44,40 @@ def run_gru_over_next(gru: nn.GRU, x: Tensor, length: Tensor, span: int) -> Tens
     out, _ = run_gru(gru, windows)
     last = (count - 1).reshape(-1, 1)
     return _take_rows(out, last).view(batch, rows, -1)
+
+
+def run_gru_over_versions(gru: nn.GRU, versions: Sequence[Tensor], length: Tensor, span: int | None = None) -> Tensor:
+    """Like `run_gru_backward`, or `run_gru_over_next` if there is a span, with rows that differ by the state they are
+    read for.
+
+    Args:
+        gru: a batch-first, one-directional GRU.
+        versions: V tensors (B, T, I); the state of row j reads row j+i in version i, or V-1 if that is less.
+        length: (B,) int64.
+        span: rows that a state reads; None: all to the window's end.
+
+    Returns:
+        (B, T, H).
+    """
+    last = len(versions) - 1
+    batch, rows, _ = versions[0].shape
+    hidden = next(gru.parameters()).new_zeros(gru.num_layers, batch, gru.hidden_size)
+    states = [hidden] * (rows + last)
+    if span is None:  # from row j+V-1 on all states read the same rows, so one pass over these serves them
+        for j in reversed(range(rows)):
+            states[j] = hidden = torch.where(
+                (j < length)[:, None], run_gru(gru, versions[last][:, j, None], hidden)[1], hidden
+            )
+        own = last
+    else:
+        own = min(span, rows)
+    hidden = torch.stack(states[last:], dim=2).flatten(1, 2)
+    real = torch.arange(rows, device=length.device) < length[:, None]
+    for i in reversed(range(own)):
+        ahead = pad(versions[min(i, last)][:, i:], (0, 0, 0, min(i, rows)))
+        there = pad(real[:, i:], (0, min(i, rows))).flatten()
+        hidden = torch.where(there[:, None], run_gru(gru, ahead.flatten(0, 1)[:, None], hidden)[1], hidden)
+    return hidden[-1].view(batch, rows, -1)
 
 
 def _take_rows(x: Tensor, index: Tensor) -> Tensor:

@@ -10,7 +10,7 @@ from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
 from vd4rl_pomdp.corruptions import corruption_settings
-from vd4rl_pomdp.settings import settings_of
+from vd4rl_pomdp.settings import LATER, settings_of
 
 Settings = dict[str, str]
 """Values as words, by the name that is shown beside them."""
@@ -31,6 +31,7 @@ ENCODER_SEED = "pretraining seed"
 PLAIN = {
     **{"history": "method", "random_histories": "0", "history_window": "0", "readout": "state"},
     **{"pose_noise": "0", "velocity_noise": "0"},
+    **LATER,
 }
 """Values that add nothing to a method: what has them goes by the method's name, and others are its variants."""
 _LABELS = ("method", "task", "quality")
@@ -153,7 +154,7 @@ def _value(settings: Settings, name: str) -> str:
         return settings[name]
     if name in DATA:
         return _NOT_RECORDED
-    return "" if UNKNOWN in settings or name == UNKNOWN else _UNSET
+    return "" if UNKNOWN in settings or name == UNKNOWN else LATER.get(name, _UNSET)
 
 
 def _differs(settings: list[Settings], name: str) -> bool:

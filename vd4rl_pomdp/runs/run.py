@@ -23,7 +23,7 @@ from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_json
 from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.runs.provenance import CONTINUED, command, git_commit, machine, versions
-from vd4rl_pomdp.settings import RUNTIME_FIELDS
+from vd4rl_pomdp.settings import LATER, RUNTIME_FIELDS
 
 _CODE = ("versions", "git_commit", "plugins", "sources")
 """What a record tells of the code."""
@@ -90,7 +90,7 @@ class RunFolder:
             )
         old, inputs = (part if isinstance(part := stored.get(name), dict) else {} for name in ("config", "inputs"))
         keys = set(self.config) - RUNTIME_FIELDS  # an earlier version recorded options that nothing read, too
-        differing = sorted(k for k in keys if old.get(k) != self.config[k])
+        differing = sorted(k for k in keys if (LATER | old).get(k) != self.config[k])
         if stored["stage"] != self.stage or differing:
             what = ", ".join(differing) or f"stage {stored['stage']}"
             raise UserError(f"{self.path}: holds a run with another config ({what}); choose another --out or remove it")

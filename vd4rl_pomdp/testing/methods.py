@@ -21,7 +21,7 @@ ROWS, ACTIONS, STATE, POSE = 6, 2, 5, 3
 _SMALL = {"max_k": 3, "feature_dim": 8, "hidden_dim": 7, "head_dim": 8}
 _SMALLEST = {"max_k": 4, "feature_dim": 6, "hidden_dim": 5, "head_dim": 32}
 """A proof takes a backward pass for every pair; of very few units in the head all may be rectified to zero."""
-_PICTURE, _GRID = (9, 84), (3, 2)
+_PICTURE, _GRID = (9, 84), (9, 2)
 """Channels and size of an observation, and of one that is encoded without convolutions."""
 
 
@@ -260,25 +260,26 @@ def the_action_loss_is_that_of_each_pairs_first_action(name: str, **settings: An
 
 
 def predictions_depend_on_what_is_declared(name: str, **settings: Any) -> None:
-    """The prediction of each pair depends on what `visible` declares, all of it and nothing else."""
+    """The prediction of each pair depends on all that `visible` and `visible_frames` declare, and on nothing else."""
     for training in (False, True):
         claim_visibility(build_inverse(name, **settings).train(training), [ROWS, ROWS, 4], ROWS)
 
 
 def claim_visibility(objective: InverseObjective, lengths: list[int], rows: int) -> None:
     """Raise AssertionError, naming the first pair that is wrong, unless an objective sees what it declares."""
-    wrong = wrong_pairs(objective, lengths, rows)
-    if not wrong:
-        return
-    b, t, k = wrong[0]
-    promised = declared(objective, t, k, lengths[b], last_action=b == 0)
-    found = {
-        "has gradients to": dependence(objective, lengths, rows)[b, t, k],
-        "changes with": response(objective, lengths, rows)[b, t, k],
-        "is declared to see": promised,
-    }
-    told = "; ".join(f"{how} rows {sorted(o)} and actions {sorted(a)}" for how, (o, a) in found.items())
-    raise AssertionError(f"the prediction of a_{t} from rows {t} and {t + k} {told} ({len(wrong)} pairs are wrong)")
+    for frames in (False, True):
+        wrong = wrong_pairs(objective, lengths, rows, frames)
+        if not wrong:
+            continue
+        b, t, k = wrong[0]
+        found = {
+            "has gradients to": dependence(objective, lengths, rows, frames)[b, t, k],
+            "changes with": response(objective, lengths, rows, frames)[b, t, k],
+            "is declared to see": declared(objective, t, k, lengths[b], b == 0, frames),
+        }
+        what = "frames" if frames else "rows"
+        told = "; ".join(f"{how} {what} {sorted(o)} and actions {sorted(a)}" for how, (o, a) in found.items())
+        raise AssertionError(f"the prediction of a_{t} from rows {t} and {t + k} {told} ({len(wrong)} pairs are wrong)")
 
 
 ENCODING: tuple[Check, ...] = (streaming_equals_batch,)

@@ -249,6 +249,10 @@ def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
         ({"frame_encoder": "mixer", "picture": "grey50", "burn_in": 20}, "--burn-in 20 leaves no row"),
         ({"frame_encoder": "vit"}, "unknown frame encoder 'vit'"),
         ({"method": "ah+a", "literal_future": True}, r"--literal-future is not read by the method ah\+a"),
+        (
+            {"future_frames": "newest"},
+            "--future-frames newest blanks older frames of a stack, and here an observation is",
+        ),
         ({"steps": 0}, "--steps is 0"),
         ({"seed": -1}, "--seed is -1"),
         ({"hidden_dim": 0}, "--hidden-dim is 0"),
