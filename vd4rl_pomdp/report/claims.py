@@ -120,7 +120,7 @@ def _row(
     compared = sides(left, right) if claim.right.method else _decisive(left, right)
     if not compared.left:
         return None
-    row = {"claim": claim.text, "kind": claim.kind} | dict(zip(GATED, place, strict=True))
+    row: Row = {"claim": claim.text, "kind": claim.kind} | dict(zip(GATED, place, strict=True))
     row |= _side("left", compared.left) | _side("right", compared.right)
     for prefix in ("", "clean_"):
         above, (low, high) = difference(compared, clean=bool(prefix))

@@ -3,7 +3,8 @@
 The data must suffice for the algorithm where the state is known (`state`) and where nothing is hidden (`acro` under
 `none`), and under the corruption some method must be better than no training (`random`). Where one of these fails,
 differences between returns say more of the data, the algorithm and their budget than of the representations. The three
-are these methods as they are, without what variants add to them, and returns are compared between runs of like settings alone.
+are these methods as they are, without what variants add to them, and returns are compared between runs of like settings
+alone.
 """
 
 from __future__ import annotations
