@@ -2,9 +2,9 @@
 
     OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE python scripts/ladder.py --work DIR [--jobs 1] [--only ...]
 
-Runs `vd4rl-pomdp sweep run results/ladder/grid.toml`, taking finished rows from results/ladder. A fine-tuning writes over
-its policy at each evaluation; every version is copied to DIR/snapshots, since the cloning loss on held-out episodes is
-measured for each rung. Start the same command again after a cut.
+Runs `vd4rl-pomdp sweep run results/ladder/grid.toml`, taking finished rows from results/ladder. A fine-tuning
+overwrites its policy at each evaluation; every version is copied to DIR/snapshots, since the cloning loss on held-out
+episodes is measured for each rung. Re-run the same command to resume.
 """
 
 from __future__ import annotations

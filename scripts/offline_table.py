@@ -8,15 +8,17 @@ from itertools import product
 from pathlib import Path
 
 import numpy as np
-from control_table import probes_of, spread_of, with_seeds
+from control_table import probes_of, spread_of, told, with_seeds
 from scipy.stats import spearmanr
 
-from vd4rl_pomdp.report.gates import FAILED, PASSED, UNKNOWN, gates, returns_of
-from vd4rl_pomdp.report.layout import number
+from vd4rl_pomdp.report.gates import FAILED, PASSED, UNKNOWN, episodes_of, gates, returns_of
+from vd4rl_pomdp.report.layout import number, with_interval
 from vd4rl_pomdp.report.load import PROBES, LoadedRun, load_runs
 from vd4rl_pomdp.report.measures import mean_if_known
-from vd4rl_pomdp.report.stats import mean_and_error
-from vd4rl_pomdp.report.tables import TOLD_STATES
+from vd4rl_pomdp.report.overall import aggregate, improvement
+from vd4rl_pomdp.report.stats import difference_interval
+from vd4rl_pomdp.report.tables import TOLD_STATES, evaluations
+from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
@@ -40,8 +42,18 @@ SETS = {
 """What the README calls a set."""
 CONTROL_ONLY = ("cheetah_run", "medium_noisy")
 """The set that results/offline does not tell of."""
-HIDDEN_FROM, SHOWN_ALL = ("random", "acro", "ah+a", "mik", "mik+a", "supervised+a"), ("acro", "mik+a")
-"""What the README tells of a set: methods under its corruption, and with nothing hidden."""
+MAIN = (UNTRAINED, "acro", "mik", "mik+a")
+"""Methods of which the README's table and the aggregates tell."""
+EXPLORATORY = ("expert_noisy", "medium_noisy")
+"""Qualities that were chosen after looking at first returns."""
+CONTRASTS = {
+    "a memory: `mik` less `acro`": ("mik", "acro"),
+    "past actions: `mik+a` less `mik`": ("mik+a", "mik"),
+    "both: `mik+a` less `acro`": ("mik+a", "acro"),
+}
+"""The paper's claims, as differences of returns."""
+ASIDE = RESULTS / "offline" / "clean_evaluation.csv"
+"""Policies that were played with nothing hidden after their runs had ended."""
 
 
 def main_runs() -> list[LoadedRun]:
@@ -53,17 +65,84 @@ def main_runs() -> list[LoadedRun]:
 
 def readme_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
     """Returns of the main methods, a row for every set and corruption."""
-    yield (
-        "| set (data's return) | `random` | `acro` | `ah+a` | `mik` | `mik+a` | told the states: `supervised+a` |"
-        " trained with nothing hidden: `acro` | trained with nothing hidden: `mik+a` |"
-    )
-    yield "|---|" + "---:|" * len((*HIDDEN_FROM, *SHOWN_ALL))
+    shown = (*(f"`{name}`" for name in MAIN), "`mik+a` less `acro`", "the same, played clean")
+    yield f"| set (data's return) | {' | '.join(shown)} | `acro` trained with nothing hidden |"
+    yield "|---|" + "---:|" * (len(shown) + 1)
     for *place, corruption in measured_sets(runs):
         here = [run for run in runs if _place(run) == tuple(place)]
-        cells = [_told(_of(here, method, corruption)) for method in HIDDEN_FROM]
-        cells += [_told(_of(here, method, CLEAN)) for method in SHOWN_ALL]
+        cells = [_told(_of(here, method, corruption)) for method in MAIN]
+        cells += [_less(here, corruption, "mik+a", "acro", clean) for clean in (False, True)]
         name = f"{SETS[tuple(place)]} ({here[0].reference.data_return:.0f})" + ALONE * (corruption == PATCHES)
-        yield f"| {name} | {' | '.join(cells)} |"
+        name += ", exploratory" * (place[1] in EXPLORATORY)
+        yield f"| {name} | {' | '.join(cells)} | {_told(_of(here, 'acro', CLEAN))} |"
+
+
+def contrast_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """The paper's claims as differences with intervals, on every set, as trained and played with nothing hidden."""
+    yield f"| set | played | {' | '.join(CONTRASTS)} | `mik+a` less the best other |"
+    yield "|---|---|" + "---:|" * (len(CONTRASTS) + 1)
+    for *place, corruption in measured_sets(runs):
+        here = [run for run in runs if _place(run) == tuple(place)]
+        other = _best_other(here, corruption)
+        pairs = (*CONTRASTS.values(), ("mik+a", other))
+        for clean, words in ((False, "as trained"), (True, "with nothing hidden")):
+            cells = [_less(here, corruption, *pair, clean) for pair in pairs]
+            if any(cell != number(None) for cell in cells):
+                cells[-1] += f" (`{other}`)" * (cells[-1] != number(None))
+                yield f"| {table_name(*place, corruption)} | {words} | {' | '.join(cells)} |"
+
+
+def _best_other(runs: Sequence[LoadedRun], corruption: str) -> str:
+    """The method with two seeds or more that returns most, but for `mik+a`, references and those told the states."""
+    here = [run for run in runs if run.labels["corruption"] == corruption]
+    methods = {run.labels["method"] for run in here} - {"mik+a", "state", UNTRAINED, *TOLD_STATES}
+    known = {method: _of(here, method, corruption) for method in methods}
+    return max((m for m in known if len(known[m]) > 1), key=lambda method: returns_of(known[method]).mean())
+
+
+def _less(runs: Sequence[LoadedRun], corruption: str, method: str, other: str, clean: bool) -> str:
+    """Mean return of a method less that of another, and its interval; a dash where one of them was not played so."""
+    one, two = (_episodes(_of(runs, name, corruption), clean) for name in (method, other))
+    if one is None or two is None:
+        return number(None)
+    text = with_interval(one.mean() - two.mean(), *(difference_interval(one, two) or (None, None)), 0)
+    return text if text.startswith("-") else f"+{text}"
+
+
+def _episodes(runs: list[LoadedRun], clean: bool) -> np.ndarray | None:
+    """Returns of runs, (n, episodes); None where a policy was not played with nothing hidden."""
+    if not clean:
+        return episodes_of(runs) if runs else None
+    if runs and all(run.last_clean for run in runs):
+        return episodes_of(runs, clean=True)
+    names = ("task", "quality", "corruption", "method", "seed")
+    rows = read_episodes(ASIDE)
+    found = [[row["return"] for row in rows if all(row[name] == run.labels[name] for name in names)] for run in runs]
+    return np.array(found) if found and all(found) else None
+
+
+def aggregate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """The report's statistics over sets, of the methods that all of them have."""
+    yield "| sets | method | interquartile mean | mean | chance that `mik+a` ends above it |"
+    yield "|---|---|---:|---:|---:|"
+    groups: dict[str, list[LoadedRun]] = {}
+    for run in runs:
+        place, corruption = _place(run), run.labels["corruption"]
+        if place in SETS and corruption in (HIDDEN, PATCHES) and run.labels["method"] in MAIN:
+            kind = "noisy, exploratory" if place[1] in EXPLORATORY else "of the paper's qualities"
+            groups.setdefault(kind + ALONE * (corruption == PATCHES), []).append(run)
+    for kind, mine in groups.items():
+        rows = evaluations(mine)
+        above = {row["other"]: row for row in improvement(rows) if row["method"] == "mik+a"}
+        for row in sorted(aggregate(rows, []), key=lambda row: -row["mean"]):
+            cells = [with_interval(row[name], row[f"{name}_low"], row[f"{name}_high"]) for name in ("iqm", "mean")]
+            chance = above.get(row["method"])
+            cells.append(
+                number(None)
+                if chance is None
+                else with_interval(chance["probability"], chance["low"], chance["high"], 2)
+            )
+            yield f"| {row['tasks']} {kind} | `{row['method']}` | {' | '.join(cells)} |"
 
 
 def measured_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str, str]]:
@@ -84,20 +163,23 @@ def table_name(task: str, quality: str, corruption: str) -> str:
 
 
 def set_lines(runs: Sequence[LoadedRun], task: str, quality: str, corruption: str) -> Iterator[str]:
-    """All methods on one set under a corruption, those that return most first."""
-    yield (
-        "| method | seeds | return (seeds) | episodes | trained with nothing hidden |"
-        " action error: data, loop | probe: pose, velocity |"
-    )
-    yield "|---|---:|---:|---:|---:|---:|---:|"
+    """All methods on one set under a corruption, those that return most first; played clean, where any was."""
     here = [run for run in runs if _place(run) == (task, quality)]
     methods = {run.labels["method"]: _of(here, run.labels["method"], corruption) for run in here}
     shown = [(method, mine) for method, mine in methods.items() if mine]
+    clean = {method: _episodes(mine, clean=True) for method, mine in shown}
+    played = any(returns is not None for returns in clean.values())
+    yield (
+        f"| method | seeds | return (seeds) | episodes |{' played with nothing hidden |' * played}"
+        " trained with nothing hidden | action error: data, loop | probe: pose, velocity |"
+    )
+    yield "|---|" + "---:|" * (6 + played)
     for method, mine in sorted(shown, key=lambda one: -returns_of(one[1]).mean()):
         data, loop = (number(mean_if_known(map(known, mine)), 3) for known in (_path_error, _loop_error))
         probes = probes_of(method, [mean_if_known(run.representation[name] for run in mine) for name in PROBES])
+        cell = number(None) if clean[method] is None else told(clean[method])
         yield (
-            f"| `{method}` | {len(mine)} | {with_seeds(returns_of(mine).tolist())} | {spread_of(mine)} |"
+            f"| `{method}` | {len(mine)} | {with_seeds(mine)} | {spread_of(mine)} |{f' {cell} |' * played}"
             f" {_told(_of(here, method, CLEAN))} | {data}, {loop} | {probes} |"
         )
 
@@ -110,8 +192,12 @@ def gate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
     )
     yield "|---|---:|---:|---:|---:|---:|---|"
     for row in _judged(runs):
-        shares = [number(row[name], 2) for name in ("state_share", "acro_share", "best_share")]
-        above = number(row["above_random"], 0) + ("" if row["error"] is None else f" ± {row['error']:.0f}")
+        shares = [
+            number(row[f"{name}_share"], 2) + f" (n = {row[f'{name}_seeds']})" * (row[f"{name}_seeds"] < 3)
+            for name in ("state", "acro")
+        ]
+        shares.append(number(row["best_share"], 2))
+        above = with_interval(row["above_random"], row["low"], row["high"], 0)
         yield f"| {row['name']} | {row['data_return']:.0f} | {' | '.join(shares)} | {above} | {row['passed']} |"
 
 
@@ -136,7 +222,7 @@ def _judged(runs: Sequence[LoadedRun]) -> Iterator[Row]:
     for row in gates(list(runs)):
         place = row["task"], row["quality"]
         if row["corruption"] in (HIDDEN, PATCHES) and place in SETS:
-            passed = {PASSED: "yes", FAILED: "no", UNKNOWN: "not known"}[row["verdict"].partition(":")[0]]
+            passed = {PASSED: "yes", FAILED: "undecided", UNKNOWN: "not known"}[row["verdict"].partition(":")[0]]
             yield row | {"name": table_name(*place, row["corruption"]), "passed": passed}
 
 
@@ -244,7 +330,7 @@ def _of(runs: Sequence[LoadedRun], method: str, corruption: str) -> list[LoadedR
 
 
 def _told(runs: list[LoadedRun]) -> str:
-    """Mean return and its standard error over seeds, and how many if fewer than three; a dash if there is none."""
+    """Mean return and its interval, and how many seeds if fewer than three; a dash if there is none."""
     if not runs:
         return number(None)
-    return mean_and_error(returns_of(runs).tolist()) + (f" (n = {len(runs)})" if len(runs) < 3 else "")
+    return told(episodes_of(runs)) + (f" (n = {len(runs)})" if len(runs) < 3 else "")

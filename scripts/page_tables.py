@@ -56,6 +56,8 @@ def pages() -> dict[str, Tables]:
         "results/methods/README.md": {"methods": methods_table.table_lines(methods_table.main_runs())},
         "results/offline/README.md": {
             "layers": offline_table.layer_lines(returns),
+            "contrasts": offline_table.contrast_lines(returns),
+            "aggregate": offline_table.aggregate_lines(returns),
             "gates": offline_table.gate_lines(returns),
             "ranks": offline_table.rank_lines(returns),
             **{

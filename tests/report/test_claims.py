@@ -4,12 +4,14 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import scipy.stats
 
 from tests.helpers_report import describe, write_run, write_seeds
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.report.claims import CLAIMS, judge_claims, tally
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.terminal import print_summary
+from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
 
 DATA = 600.0
@@ -35,7 +37,7 @@ def judged(folder: Path) -> dict[str, dict[str, Any]]:
     return {row["claim"]: row for row in judge_claims(load_runs([folder]))}
 
 
-def test_every_claim_is_a_difference_of_means_with_its_error(tmp_path):
+def test_every_claim_is_a_difference_of_means_with_its_interval(tmp_path):
     rows = judged(write(tmp_path, GOOD))
     shown = {claim: (round(row["left_return"]), round(row["right_return"])) for claim, row in rows.items()}
     assert shown == {
@@ -48,7 +50,8 @@ def test_every_claim_is_a_difference_of_means_with_its_error(tmp_path):
         "what is left to the states themselves": (760, 520),
     }
     assert rows[ACTIONS]["difference"] == pytest.approx(200)
-    assert rows[ACTIONS]["error"] == pytest.approx((800 / 2 + 200 / 2) ** 0.5)
+    found = scipy.stats.ttest_ind([500, 540], [310, 330], equal_var=False).confidence_interval(0.95)
+    assert (rows[ACTIONS]["low"], rows[ACTIONS]["high"]) == pytest.approx(tuple(found))
     assert [row["verdict"] for row in rows.values()] == ["holds"] * 4 + ["not refuted", "", ""]
 
 
@@ -72,8 +75,25 @@ def test_every_claim_is_a_difference_of_means_with_its_error(tmp_path):
         ({("acro", "none"): (60,)}, CLEAN, "too few seeds"),
     ],
 )
-def test_what_is_beyond_two_standard_errors_is_told(tmp_path, changes, claim, verdict):
+def test_what_an_interval_leaves_out_is_told(tmp_path, changes, claim, verdict):
     assert judged(write(tmp_path, GOOD | changes))[claim]["verdict"] == verdict
+
+
+def test_a_claim_is_told_of_the_same_policies_played_clean_too(tmp_path):
+    """What is hidden at evaluation is a choice of its own, and a claim may turn with it."""
+    write(tmp_path, GOOD)
+    assert judged(tmp_path)[MEMORY]["clean_difference"] is None, "nobody was played clean"
+    for method, score in (("mik", 10), ("acro", 50)):
+        for seed in (0, 1):
+            run = tmp_path / f"{method}-patch-{seed}-td3_bc"
+            rows = [row for row in read_episodes(run / "episodes.csv") if row["step"] == 10]
+            clean = {"evaluated_under": "none", "score": score + seed, "return": 10 * (score + seed)}
+            append_episodes(run / "episodes.csv", [row | clean for row in rows])
+    row = judged(tmp_path)[MEMORY]
+    assert (row["verdict"], row["difference"]) == ("holds", pytest.approx(110))
+    assert (row["clean_difference"], row["clean_low"] < row["clean_high"] < 0) == (pytest.approx(-400), True)
+    page = write_report([tmp_path], tmp_path / "out").page.read_text()
+    assert "-400 [-430, -370]" in page
 
 
 def test_a_claim_of_which_a_side_was_not_run_has_no_row(tmp_path):
@@ -110,7 +130,7 @@ def test_where_no_runs_have_like_settings_nothing_is_judged_but_said(tmp_path, s
     rows = judged(write(tmp_path, {("mik+a", "patch"): (90, 92)}, **settings))
     for claim in (ACTIONS, FIRST, "what is left to a memory that was told the states"):
         row = rows[claim]
-        assert (row["verdict"], row["difference"], row["error"]) == (f"not judged: other {words}", None, None)
+        assert (row["verdict"], row["difference"], row["low"]) == (f"not judged: other {words}", None, None)
         assert 910 in (round(row["left_return"]), round(row["right_return"])), "both sides are shown"
     assert rows[MEMORY]["verdict"] == "holds"
     states = rows["what is left to the states themselves"]
@@ -142,13 +162,14 @@ def test_a_setting_that_early_runs_do_not_record_is_the_methods_own(tmp_path):
 def test_the_states_count_once_a_seed_whatever_is_hidden(tmp_path):
     row = judged(write(tmp_path, GOOD | {("state", "patch"): (30, 50)}))["what is left to the states themselves"]
     assert (row["left_seeds"], row["left_return"]) == (2, pytest.approx(760)), "those that saw everything"
-    assert row["error"] == pytest.approx((200 / 2 + 800 / 2) ** 0.5)
+    found = scipy.stats.ttest_ind([750, 770], [500, 540], equal_var=False).confidence_interval(0.95)
+    assert (row["low"], row["high"]) == pytest.approx(tuple(found))
 
 
 def test_nothing_is_judged_where_a_gate_is_missed(tmp_path):
     report = write_report([write(tmp_path / "runs", GOOD | {("state", "none"): (9, 9)})], tmp_path / "out")
     verdicts = {row["verdict"] for row in report.claims if row["kind"] != "distance"}
-    assert verdicts == {"not judged: the setting does not discriminate"}
+    assert verdicts == {"not judged: undecided at this budget"}
 
 
 def test_the_page_and_the_terminal_tell_what_becomes_of_the_claims(tmp_path, capsys):
@@ -158,7 +179,7 @@ def test_the_page_and_the_terminal_tell_what_becomes_of_the_claims(tmp_path, cap
     assert "<h2>Claims</h2>" in page
     assert "mik+a: 520 (n = 2)" in page
     assert (tmp_path / "out" / "claims.csv").exists()
-    assert r"400 $\pm$ 14" in (tmp_path / "out" / "claims.tex").read_text()
+    assert "400 [339, 461]" in (tmp_path / "out" / "claims.tex").read_text()
     print_summary(report)
     shown = " ".join(capsys.readouterr().out.split())
     assert f"{FIRST}: holds in 0 of 1 setting; too few seeds in 1" in shown, "mik returns more, with one seed"

@@ -5,6 +5,7 @@ import io
 from pathlib import Path
 
 import pytest
+import scipy.stats
 from rich.console import Console
 
 from tests.helpers_report import describe, write_run
@@ -28,8 +29,10 @@ def test_conditions_are_told_side_by_side_with_what_differs(tmp_path):
     found = compare_results(*two_sets(tmp_path))
     acro, curl, mik = found.rows
     assert (acro["score_a"], acro["score_b"], acro["difference"]) == (20.5, 26.5, 6.0)
-    assert (acro["low"], acro["high"]) == (5.0, 7.0), "the ends of 25 and 27 less 20 and 21, rarely drawn further apart"
-    assert (acro["low_a"], acro["high_a"], acro["seeds_a"], acro["seeds_b"]) == (20.0, 21.0, 2, 2)
+    welch = scipy.stats.ttest_ind([26, 27], [20, 21], equal_var=False).confidence_interval(0.95)
+    assert (acro["low"], acro["high"]) == pytest.approx(tuple(welch))
+    assert (acro["seeds_a"], acro["seeds_b"]) == (2, 2)
+    assert (acro["low_a"], acro["high_a"]) == pytest.approx((14.147, 26.853), abs=0.001), "12.7 standard errors"
     assert acro["settings"] == "views 4 → 1, steps 20 → 60"
     assert (curl["score_a"], curl["score_b"], curl["seeds_b"], curl["difference"]) == (None, 50.0, 1, None)
     assert (mik["score_a"], mik["score_b"], mik["settings"]) == (30.0, None, "")
@@ -81,7 +84,7 @@ def test_no_word_is_broken_at_eighty_columns(tmp_path):
     print_comparison(compare_results(tmp_path / "a", tmp_path / "b"), Console(file=shown, width=80))
     text = shown.getvalue()
     assert text.count("mik+a, random_histories") == 2
-    for words in ("[50.0, 51.0]", "[-1.0, 1.0]", "2 | 2"):
+    for words in ("[44.1, 56.9]", "[-3.0, 3.0]", "2 | 2"):
         assert text.count(words) >= 2, words
 
 
@@ -92,7 +95,7 @@ def test_the_command_prints_and_writes_a_page(tmp_path, capsys):
     assert "only in A" in shown
     assert f"comparison: {tmp_path / 'out' / 'index.html'}" in shown
     page = (tmp_path / "out" / "index.html").read_text()
-    for text in ("<td>acro</td>", ">+6.0<", "[5.0, 7.0]", "2 | 2", "views 4 → 1, steps 20 → 60", "only in B", str(a)):
+    for text in ("<td>acro</td>", ">+6.0<", "[3.0, 9.0]", "2 | 2", "views 4 → 1, steps 20 → 60", "only in B", str(a)):
         assert text in page
     with (tmp_path / "out" / "comparison.csv").open() as file:
         assert [row["method"] for row in csv.DictReader(file)] == ["acro", "curl", "mik+a"]

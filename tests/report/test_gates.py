@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+import scipy.stats
 
 from tests.helpers_report import describe, write_seeds
 from vd4rl_pomdp.report import write_report
@@ -21,6 +22,7 @@ GOOD = {
     ("supervised+a", "patch"): (70, 71),
 }
 """Scores of two seeds of every method under a corruption: a tenth of their returns."""
+ABOVE_RANDOM = tuple(scipy.stats.ttest_ind([500, 540], [100, 140]).confidence_interval(0.95))
 
 
 def grid(folder: Path, scores: dict[tuple[str, str], tuple[float, ...]], **settings: Any) -> Path:
@@ -44,7 +46,8 @@ def test_a_setting_discriminates_if_state_acro_and_the_best_method_hold(tmp_path
     assert row["acro_share"] == pytest.approx(610 / DATA)
     assert row["best_share"] == pytest.approx(520 / DATA), "the best that learned, not the ceiling"
     assert row["above_random"] == pytest.approx(520 - 120)
-    assert row["error"] == pytest.approx((800 / 2 + 800 / 2) ** 0.5)
+    assert (row["low"], row["high"]) == pytest.approx(ABOVE_RANDOM)
+    assert (row["state_seeds"], row["acro_seeds"]) == (2, 2)
 
 
 def test_the_best_method_is_one_whose_seeds_tell_how_sure_it_is(tmp_path):
@@ -57,7 +60,7 @@ def test_references_are_methods_as_they_are_and_not_their_variants(tmp_path):
     grid(tmp_path, {("state", "patch"): (75, 77)}, pose_noise=34)
     row = patch_gate(grid(tmp_path, {("random", "patch"): (49,)}, history="gru"))
     assert row["verdict"] == "not known to discriminate: state was not measured"
-    assert (row["above_random"], row["error"]) == (pytest.approx(520 - 120), pytest.approx((800 / 2 + 800 / 2) ** 0.5))
+    assert (row["above_random"], row["low"]) == pytest.approx((520 - 120, ABOVE_RANDOM[0]))
 
 
 def test_the_best_method_is_held_against_random_that_was_fine_tuned_alike(tmp_path):
@@ -68,7 +71,7 @@ def test_the_best_method_is_held_against_random_that_was_fine_tuned_alike(tmp_pa
         describe(run, updates=500)
     row = patch_gate(tmp_path)
     assert row["verdict"] == "not known to discriminate: best and random have other updates"
-    assert (row["above_random"], row["error"]) == (None, None)
+    assert (row["above_random"], row["low"]) == (None, None)
     for run in tmp_path.glob("acro-patch-*"):
         describe(run, updates=500)
     assert patch_gate(tmp_path)["above_random"] == pytest.approx(210 - 120), "the best of those that are alike"
@@ -108,16 +111,16 @@ def test_data_of_whose_return_there_are_no_shares_are_said(tmp_path, data, words
     [
         (
             {("state", "patch"): (70, 71)},
-            r"does not discriminate: state returns 0.88 of the data's return, less than 0.9",
+            r"undecided at this budget: state returns 0.88 of the data's return, less than 0.9",
         ),
-        ({("acro", "none"): (55, 56)}, r"does not discriminate: acro under none returns 0.69 of the data's return"),
-        ({("random", "patch"): (8, 90)}, r"does not discriminate: best minus random is 30, within 2 standard errors"),
+        ({("acro", "none"): (55, 56)}, r"undecided at this budget: acro under none returns 0.69 of the data's return"),
+        ({("random", "patch"): (8, 90)}, r"undecided at this budget: best minus random is 30 [-"),
         ({("state", "patch"): ()}, r"not known to discriminate: state was not measured"),
         ({("acro", "none"): ()}, r"not known to discriminate: acro under none was not measured"),
         ({("random", "patch"): (10,)}, r"not known to discriminate: best and random need two seeds each"),
         (
             {("random", "patch"): (10,), ("acro", "none"): (1, 1)},
-            r"does not discriminate: acro under none returns 0.01",
+            r"undecided at this budget: acro under none returns 0.01",
         ),
     ],
 )
@@ -126,14 +129,14 @@ def test_a_missed_gate_is_named_and_what_was_not_measured_too(tmp_path, changes,
     assert found.startswith(verdict)
 
 
-def test_methods_of_a_setting_that_does_not_discriminate_are_listed_by_name(tmp_path):
+def test_methods_of_an_undecided_setting_are_listed_by_name(tmp_path):
     runs = grid(tmp_path / "runs", GOOD | {("state", "patch"): (9, 9)})
     report = write_report([runs], tmp_path / "out")
     assert ("walker_walk", "expert", "patch", "td3_bc") in unranked(report.gates)
     names = [row["method"] for row in report.summary if row["corruption"] == "patch"]
     assert names == ["acro", "mik+a", "random", "state", "supervised+a"]
     text = report.page.read_text()
-    assert text.index("does not discriminate: state returns") < text.index("Final scores")
+    assert text.index("undecided at this budget: state returns") < text.index("Final scores")
     ranked = write_report([grid(tmp_path / "good", GOOD)], tmp_path / "other")
     assert next(row["method"] for row in ranked.summary if row["corruption"] == "patch") == "mik+a"
 
@@ -147,11 +150,11 @@ def test_a_gate_that_one_algorithm_misses_says_nothing_of_another(tmp_path, caps
         algorithm: {row["verdict"] for row in report.claims if row["algorithm"] == algorithm}
         for algorithm in ("iql", "td3_bc")
     }
-    assert verdicts == {"iql": {"not judged: the setting does not discriminate", ""}, "td3_bc": {"holds", ""}}
+    assert verdicts == {"iql": {"not judged: undecided at this budget", ""}, "td3_bc": {"holds", ""}}
     assert next(row["method"] for row in report.summary if row["corruption"] == "patch") == "mik+a", "one can rank"
     print_summary(report)
     for shown in (report.page.read_text().replace("</td><td>", ": "), " ".join(capsys.readouterr().out.split())):
-        assert "walker_walk expert, patch, iql: does not discriminate: acro under none" in shown
+        assert "walker_walk expert, patch, iql: undecided at this budget: acro under none" in shown
         assert "walker_walk expert, patch: discriminates" in shown
 
 

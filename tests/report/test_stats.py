@@ -16,6 +16,10 @@ AGREES = 0.002
 """Largest difference from its bootstrap's intervals, of scores between 0 and 1."""
 
 
+def bootstrap(strata, statistic, *how):
+    return stats.bootstrap_intervals(strata, {"": statistic}, *how)[""]
+
+
 def test_iqm_drops_the_outer_quarters():
     assert stats.iqm(np.array([0.0, 1.0, 2.0, 100.0])) == pytest.approx(1.5)
     # five runs: the middle 2.5 are 0.75 of the 2nd, the 3rd, 0.75 of the 4th
@@ -36,7 +40,7 @@ def test_the_bootstrap_covers_as_theory_predicts(count):
     rng = np.random.default_rng(count)
     hits, trials = 0, 2000
     for _ in range(trials):
-        low, high = stats.bootstrap_interval([rng.normal(5, 1, count)], stats.mean, rng, 1000)
+        low, high = bootstrap([rng.normal(5, 1, count)], stats.mean, rng, 1000)
         hits += low <= 5 <= high
     # resampled means spread by sqrt((n - 1) / n) standard errors, and the true mean is t-distributed about the sample's
     reach = scipy.stats.norm.ppf(0.975) * np.sqrt((count - 1) / count)
@@ -48,14 +52,14 @@ def test_the_bootstrap_covers_as_theory_predicts(count):
 def test_the_bootstrap_keeps_tasks_apart():
     rng = np.random.default_rng(0)
     # tasks far apart, no spread within: drawing across tasks would give an interval, drawing within gives none
-    low, high = stats.bootstrap_interval([np.full(4, 0.0), np.full(4, 100.0)], stats.mean, rng, 500)
+    low, high = bootstrap([np.full(4, 0.0), np.full(4, 100.0)], stats.mean, rng, 500)
     assert low == high == 50.0
-    assert stats.bootstrap_interval([np.array([1.0])], stats.mean, rng) is None
+    assert bootstrap([np.array([1.0])], stats.mean, rng) is None
 
 
 def test_the_bootstrap_of_a_mean_is_as_wide_as_its_standard_error():
     scores = np.arange(100) % 2.0  # a standard deviation of a half
-    low, high = stats.bootstrap_interval([scores], stats.mean, np.random.default_rng(0))
+    low, high = bootstrap([scores], stats.mean, np.random.default_rng(0))
     assert (low, high) == pytest.approx((0.5 - 1.96 * 0.05, 0.5 + 1.96 * 0.05), abs=0.006)
 
 
@@ -67,7 +71,7 @@ def test_aggregates_are_those_of_an_independent_implementation(name, statistic):
     chosen["optimality_gap"] = lambda scores: stats.optimality_gap(scores, 1.0)
     value, low, high = RLIABLE["statistics"][name][statistic]
     assert chosen[statistic](np.concatenate(strata)) == pytest.approx(value, abs=1e-9)
-    found = stats.bootstrap_interval(strata, chosen[statistic], np.random.default_rng(0), 100_000)
+    found = bootstrap(strata, chosen[statistic], np.random.default_rng(0), 100_000)
     assert found == pytest.approx((low, high), abs=AGREES)
 
 
@@ -109,19 +113,64 @@ def test_one_seed_gives_no_interval_and_a_seed_of_draws_gives_the_same_one():
     assert stats.improvement_interval(one, many, rng(0)) is None
     assert stats.improvement_interval(many, one, rng(0)) is None
     assert stats.profile_band([*one, *many], thresholds, rng(0)) is None
-    assert stats.difference_interval(one[0], many[0], rng(0)) is None
+    assert stats.mean_interval(np.ones((1, 20))) is None
+    assert stats.difference_interval(np.eye(1, 3), np.eye(3)) is None
     for draw in (
-        lambda seed: stats.bootstrap_interval(many, stats.iqm, rng(seed)),
+        lambda seed: bootstrap(many, stats.iqm, rng(seed)),
         lambda seed: stats.improvement_interval(many, [np.arange(1.0, 6.0)], rng(seed)),
-        lambda seed: stats.difference_interval(many[0], np.arange(1.0, 9.0) ** 2, rng(seed), 50),
         lambda seed: [*map(float, np.concatenate(stats.profile_band(many, np.arange(4.0), rng(seed), 50)))],
     ):
         assert draw(3) == draw(3)
     assert draw(3) != draw(4)
 
 
-def test_a_difference_of_means_is_as_wide_as_its_standard_error():
-    scores, others = np.arange(100) % 2.0, 3 + np.arange(50) % 2.0
-    error = 0.5 * np.sqrt(1 / 100 + 1 / 50)
-    found = stats.difference_interval(scores, others, np.random.default_rng(0))
-    assert found == pytest.approx((-3 - 1.96 * error, -3 + 1.96 * error), abs=0.01)
+def levels(rng, seed_spread, episode_spread, shared=0.0, seeds=3, episodes=20):
+    """(seeds, episodes) scores about 0: a seed, an episode that all seeds share, and what both do not explain."""
+    of_seeds, of_episodes = rng.normal(0, seed_spread, (seeds, 1)), np.broadcast_to(shared, (episodes,))
+    return of_seeds + of_episodes + rng.normal(0, episode_spread, (seeds, episodes))
+
+
+def test_an_interval_of_means_of_single_episodes_is_students_and_welchs():
+    rng = np.random.default_rng(0)
+    one, other = rng.normal(3, 1, 4), rng.normal(0, 5, 7)
+    student = scipy.stats.ttest_1samp(one, 0).confidence_interval(0.95)
+    assert stats.mean_interval(one[:, None]) == pytest.approx(tuple(student))
+    welch = scipy.stats.ttest_ind(one, other, equal_var=False).confidence_interval(0.95)
+    assert stats.difference_interval(one[:, None], other[:, None]) == pytest.approx(tuple(welch))
+
+
+@pytest.mark.parametrize("spreads", [(1.0, 0.0, 0.0), (1.0, 4.5, 1.0), (0.0, 1.0, 0.0), (1.0, 4.5, 9.0)])
+def test_two_levels_cover_what_they_say_wherever_the_spread_comes_from(spreads):
+    *own, shared = spreads
+    rng, trials = np.random.default_rng(1), 1000
+    held = np.zeros(2)
+    for _ in range(trials):
+        starts = rng.normal(0, shared, 20)
+        one, other = (levels(rng, *own, starts) for _ in range(2))
+        for place, found in enumerate((stats.mean_interval(one), stats.difference_interval(one, other))):
+            held[place] += found[0] <= 0 <= found[1]
+    assert (held / trials > 0.93).all(), held / trials
+
+
+def test_seeds_that_happen_to_agree_are_no_surer_than_their_episodes():
+    """Three seeds of one mean each: 0.5 by 20 episodes that either walk or fall."""
+    scores = np.tile(np.arange(20) % 2.0, (3, 1))
+    low, high = stats.mean_interval(scores)
+    reach = scipy.stats.t.ppf(0.975, 19) * scores[0].std(ddof=1) / np.sqrt(20)
+    assert (low, high) == pytest.approx((0.5 - reach, 0.5 + reach))
+    assert stats.mean_interval(np.full((3, 20), 0.5)) is None, "no spread at all tells of none"
+
+
+def test_starts_that_two_methods_share_are_no_part_of_their_difference():
+    rng = np.random.default_rng(2)
+    starts = rng.normal(0, 9, 20)
+    one, other = (levels(rng, 0.1, 0.1, starts) for _ in range(2))
+    low, high = stats.difference_interval(one, other)
+    assert high - low < 1
+    low, high = stats.difference_interval(one, other[:, :19])
+    assert high - low > 4, "of other episodes nothing is known to be shared"
+
+
+def test_seeds_of_unequally_many_episodes_count_by_their_means():
+    assert stats.by_episode([[1.0, 3.0], [5.0, 7.0]]).tolist() == [[1.0, 3.0], [5.0, 7.0]]
+    assert stats.by_episode([[1.0, 3.0], [5.0]]).tolist() == [[2.0], [5.0]]

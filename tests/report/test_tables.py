@@ -4,6 +4,7 @@ from typing import Any
 
 import numpy as np
 import pytest
+import scipy.stats
 
 from vd4rl_pomdp.report import overall, tables
 
@@ -27,7 +28,8 @@ def rows() -> list[dict[str, Any]]:
             "algorithm": "td3_bc",
             "variant": "",
         }
-        | {"seed": seed, "step": step, "score": 99.0 if step == 5 else float(np.mean(scores)), "episodes": len(scores)}
+        | {"seed": seed, "step": step, "scores": scores if step == 10 else (99.0,) * 2}
+        | {"score": 99.0 if step == 5 else float(np.mean(scores))}
         for (method, task), seeds in SCORES.items()
         for seed, scores in seeds.items()
         for step in (5, 10)
@@ -42,7 +44,9 @@ def test_a_summary_is_of_the_last_evaluation_and_names_the_best_beside_it():
     (row,) = of(tables.summary(rows(), []), method="acro", task="walker_walk")
     assert (row["step"], row["score"], row["seeds"], row["episodes"]) == (10, 30.0, 2, 4)
     assert (row["best_step"], row["best_score"], row["few_seeds"]) == (5, 99.0, True)
-    assert (row["low"], row["high"]) == (20.0, 40.0)
+    error, free = (200 / 2 + 50 / 2) ** 0.5, 125**2 / (100**2 + 25**2)  # seeds 20 and 40, episodes 25 and 35
+    reach = scipy.stats.t.ppf(0.975, free) * error
+    assert (row["low"], row["high"]) == pytest.approx((30 - reach, 30 + reach))
 
 
 def test_curves_show_mean_and_range_over_seeds_at_every_evaluation():

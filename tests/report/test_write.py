@@ -31,7 +31,7 @@ def test_a_report_counts_seeds_not_episodes(tmp_path):
     acro = summary[0]
     assert acro["score"] == pytest.approx(30.0)
     assert (acro["seeds"], acro["episodes"], acro["best_step"]) == (2, 4, 5)
-    assert (acro["low"], acro["high"]) == (20.0, 40.0)
+    assert acro["low"] < 20 < 40 < acro["high"], "two seeds, at 20 and 40, tell little"
     assert summary[1]["low"] is None
     with (tmp_path / "out" / "episodes.csv").open() as file:
         assert len(list(csv.DictReader(file))) == 9

@@ -18,9 +18,9 @@ PAPER_QUALITIES = ("expert", "medium_expert")
 _HATCHES = ("", "////", "....", "\\\\\\\\", "xxxx", "----")
 _NAME_WIDTH = 22
 _LEGEND = (
-    "Methods in the order of their names. Bars: mean over seeds at the last evaluation, with 95% interval; dots: "
-    "seeds; open diamonds: mean at the best evaluation, where the last is not the best; a cross with a number: so many "
-    "seeds are missing, unfinished or diverged."
+    "Methods in the order of their names. Bars: mean over seeds at the last evaluation; lines: 95% t intervals over "
+    "seeds and episodes; dots: seeds; open diamonds: mean at the best evaluation, where the last is not the best; a "
+    "cross with a number: so many seeds are missing, unfinished or diverged."
 )
 _PUBLISHED = {"bc": (":", "BC"), "drq_bc": ("--", "DrQ+BC")}
 """Published methods that are drawn as lines: their dashes and their names."""

@@ -14,7 +14,6 @@ from typing import NamedTuple
 from vd4rl_pomdp.report.gates import (
     FAILED,
     GATED,
-    STANDARD_ERRORS,
     Sides,
     as_it_is,
     difference,
@@ -86,12 +85,13 @@ CLAIMS = (
 def judge_claims(runs: list[LoadedRun], unranked: Collection[tuple[str, ...]] = ()) -> list[Row]:
     """One row for every claim and setting of which both sides have finished runs, with its `verdict`.
 
-    `difference` is the left side's mean return less the right one's, `error` its standard error over seeds. Where no
-    runs of both sides have like settings, there are neither, and the verdict says what differs.
+    `difference` is the left side's mean return less the right one's, `low` and `high` its 95% interval, by which it is
+    judged; `clean_` are the same for the policies played with nothing hidden. Where no runs of both sides have like
+    settings, there are none, and the verdict says what differs.
 
     Args:
         runs: of a report.
-        unranked: settings that do not discriminate: there nothing is judged.
+        unranked: settings that are undecided: there nothing is judged.
     """
     finished = [run for run in runs if run.evaluated and not run.end_to_end]
     settings = sorted({place_of(run) for run in finished})
@@ -120,9 +120,11 @@ def _row(
     compared = sides(left, right) if claim.right.method else _decisive(left, right)
     if not compared.left:
         return None
-    above, error = difference(compared)
-    row = {"claim": claim.text, "kind": claim.kind} | dict(zip(GATED, place, strict=True))
-    row |= _side("left", compared.left) | _side("right", compared.right) | {"difference": above, "error": error}
+    row: Row = {"claim": claim.text, "kind": claim.kind} | dict(zip(GATED, place, strict=True))
+    row |= _side("left", compared.left) | _side("right", compared.right)
+    for prefix in ("", "clean_"):
+        above, (low, high) = difference(compared, clean=bool(prefix))
+        row |= {f"{prefix}difference": above, f"{prefix}low": low, f"{prefix}high": high}
     return row | {"verdict": _verdict(row, compared, place in unranked)}
 
 
@@ -134,19 +136,17 @@ def _decisive(left: list[LoadedRun], others: list[LoadedRun]) -> Sides:
     """
     pairs = [pair for seeds in seeds_by_variant(others) if (pair := sides(left, seeds)).left]
     alike = [pair for pair in pairs if not pair.unlike]
-    refuted = [pair for pair in alike if _beyond(*difference(pair)) == FAILS]
-    doubted = [pair for pair in alike if _beyond(*difference(pair)) != HOLDS]
+    refuted = [pair for pair in alike if _beyond(*difference(pair)[1]) == FAILS]
+    doubted = [pair for pair in alike if _beyond(*difference(pair)[1]) != HOLDS]
     decisive = refuted or doubted or alike or pairs
     return max(decisive, key=lambda pair: returns_of(pair.right).mean(), default=Sides([], [], []))
 
 
-def _beyond(above: float | None, error: float | None) -> str:
-    """What a difference of means says of its left side being above."""
-    if above is None or error is None:
+def _beyond(low: float | None, high: float | None) -> str:
+    """What the interval of a difference of means says of its left side being above."""
+    if low is None or high is None:
         return FEW
-    if abs(above) <= STANDARD_ERRORS * error:
-        return OPEN
-    return HOLDS if above > 0 else FAILS
+    return HOLDS if low > 0 else FAILS if high < 0 else OPEN
 
 
 def _at(run: LoadedRun, *place: str) -> bool:
@@ -173,6 +173,6 @@ def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
     if row["kind"] == DISTANCE:
         return ""
     if unranked:
-        return f"not judged: the setting {FAILED}"
-    found = _beyond(row["difference"], row["error"])
+        return f"not judged: {FAILED}"
+    found = _beyond(row["low"], row["high"])
     return NOT_REFUTED if found == OPEN and row["kind"] == "not below" else found

@@ -18,7 +18,7 @@ from vd4rl_pomdp.report.figures import seeds_note
 from vd4rl_pomdp.report.layout import Line, ShownTable, interval, with_interval, write_latex
 from vd4rl_pomdp.report.load import CONDITION, LoadedRun, load_runs
 from vd4rl_pomdp.report.present import by_setting
-from vd4rl_pomdp.report.tables import SCORE, SCORES_NOTE, evaluations, final_scores, grouped, label, mean_and_ends
+from vd4rl_pomdp.report.tables import SCORE, SCORES_NOTE, evaluations, final_episodes, grouped, label, mean_and_ends
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
@@ -116,7 +116,7 @@ def _row(one: list[LoadedRun] | None, other: list[LoadedRun] | None, key: tuple)
     """A condition's row; what a set does not have is None."""
     row: Row = dict(zip(CONDITION, key, strict=True))
     for side, runs in zip("ab", (one, other), strict=True):
-        row |= _score(side, None if runs is None else final_scores(evaluations(runs)))
+        row |= _score(side, None if runs is None else final_episodes(evaluations(runs)))
     found = _difference(one, other) if one and other else (None, None, None)
     row |= dict(zip(("difference", "low", "high"), found, strict=True))
     return row | {"settings": _differing(one, other) if one and other else ""}
@@ -124,9 +124,9 @@ def _row(one: list[LoadedRun] | None, other: list[LoadedRun] | None, key: tuple)
 
 def _difference(one: list[LoadedRun], other: list[LoadedRun]) -> tuple[float, float | None, float | None]:
     """The second's mean score over the first's, with its interval; none where both are the same runs."""
-    first, second = (final_scores(evaluations(runs)) for runs in (one, other))
+    first, second = (final_episodes(evaluations(runs)) for runs in (one, other))
     same = {run.result.id for run in one} == {run.result.id for run in other} and np.array_equal(first, second)
-    ends = None if same else stats.difference_interval(second, first, np.random.default_rng(0))
+    ends = None if same else stats.difference_interval(second, first)
     return float(second.mean() - first.mean()), *(ends or (None, None))
 
 

@@ -2,21 +2,23 @@
 
 The data must suffice for the algorithm where the state is known (`state`) and where nothing is hidden (`acro` under
 `none`), and under the corruption some method must be better than no training (`random`). Where one of these fails,
-differences between returns say more of the data and the algorithm than of the representations. The three are these
-methods as they are, without what variants add to them, and returns are compared between runs of like settings alone.
+differences between returns say more of the data, the algorithm and their budget than of the representations. The three
+are these methods as they are, without what variants add to them, and returns are compared between runs of like settings
+alone.
 """
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
 from vd4rl_pomdp.errors import told_apart
+from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import STATE
 from vd4rl_pomdp.report.grouping import groups
+from vd4rl_pomdp.report.layout import interval
 from vd4rl_pomdp.report.load import SETTING, LoadedRun
 from vd4rl_pomdp.report.tables import REFERENCES, grouped
 from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, is_plain, of_corruption, unlike
@@ -25,9 +27,7 @@ from vd4rl_pomdp.settings import settings_of
 
 STATE_SHARE, ACRO_SHARE = 0.9, 0.7
 """Least shares of the data's mean return, of `state` and of `acro` under `none`."""
-STANDARD_ERRORS = 2.0
-"""Least difference between the best method and `random`, in its standard errors over seeds."""
-PASSED, FAILED, UNKNOWN = "discriminates", "does not discriminate", "not known to discriminate"
+PASSED, FAILED, UNKNOWN = "discriminates", "undecided at this budget", "not known to discriminate"
 GATED = (*SETTING, "algorithm")
 _NOT_PRETRAINED = ("random", STATE)
 """Methods of which no setting of pretraining counts."""
@@ -46,15 +46,16 @@ def gates(runs: list[LoadedRun]) -> list[Row]:
     """One row for every task, quality, corruption and algorithm with frozen encoders' finished runs, and its `verdict`.
 
     `data_return` is a mean over the sets behind its runs; `state_share`, `acro_share` and `best_share`, the best
-    method's, are shares of the return of their own. `above_random` is the best method's mean return less that of
-    `random`, as `sides` finds them, `error` its standard error over seeds. What is not known is None.
+    method's, are shares of the return of their own, `state_seeds` and `acro_seeds` how many runs these rest on.
+    `above_random` is the best method's mean return less that of `random`, as `sides` finds them, `low` and `high` its
+    95% interval. What is not known is None.
     """
     finished = [run for run in runs if run.evaluated and not run.end_to_end]
     return [_gate(key, finished) for key in sorted({place_of(run) for run in finished})]
 
 
 def unranked(table: list[Row], names: Sequence[str] = GATED) -> set[tuple[str, ...]]:
-    """The settings that do not discriminate: values of some columns, where all rows that have them miss a gate."""
+    """The settings that are undecided: values of some columns, where all rows that have them miss a gate."""
     places = grouped(table, names)
     return {place for place, rows in places if all(row["verdict"].startswith(FAILED) for row in rows)}
 
@@ -71,15 +72,16 @@ def _gate(key: tuple[str, ...], runs: list[LoadedRun]) -> Row:
     state, acro = best_of(as_it_is("state", here)), best_of(as_it_is("acro", clean))
     learned = [run for run in here if run.labels["method"] not in REFERENCES]
     compared = sides(learned, as_it_is("random", here))
-    above, error = difference(compared)
+    above, (low, high) = difference(compared)
     data = {value for run in here if (value := run.reference.data_return) is not None}
     row = dict(zip(GATED, key, strict=True)) | {
         "data_return": float(np.mean(sorted(data))) if data else None,
         "state_share": _share(state),
+        "state_seeds": len(state),
         "acro_share": _share(acro),
+        "acro_seeds": len(acro),
         "best_share": _share(compared.left),
-        "above_random": above,
-        "error": error,
+        **{"above_random": above, "low": low, "high": high},
     }
     return row | {"verdict": _verdict(row, state, acro, compared.unlike)}
 
@@ -145,19 +147,22 @@ def returns_of(runs: list[LoadedRun]) -> np.ndarray:
     return np.array([np.mean([row["return"] for row in run.last]) for run in runs])
 
 
-def difference(compared: Sides) -> tuple[float | None, float | None]:
-    """Mean return of the left side less that of the right one, and its standard error over seeds.
+def episodes_of(runs: list[LoadedRun], clean: bool = False) -> np.ndarray:
+    """Returns of the episodes of each run's last evaluation, or of that with nothing hidden, (n, episodes)."""
+    return stats.by_episode([[row["return"] for row in (run.last_clean if clean else run.last)] for run in runs])
 
-    None where a side has no run, or settings differ; no error where a side has a single seed, or where no seed differs
-    from another: that returns are equal to the last digit says nothing of how far the next seed's would be.
+
+def difference(compared: Sides, clean: bool = False) -> tuple[float | None, tuple[float | None, float | None]]:
+    """Mean return of the left side less that of the right one, and its 95% interval over seeds and episodes.
+
+    None where a side has no run, or settings differ, or, with `clean`, where a policy was not played with nothing
+    hidden; no interval where `stats.difference_interval` has none.
     """
-    if not compared.left or compared.unlike:
-        return None, None
-    best, floor = returns_of(compared.left), returns_of(compared.right)
-    above = float(best.mean() - floor.mean())
-    if min(len(best), len(floor)) < 2 or np.ptp(best) == np.ptp(floor) == 0:
-        return above, None
-    return above, math.sqrt(best.var(ddof=1) / len(best) + floor.var(ddof=1) / len(floor))
+    everyone = [*compared.left, *compared.right]
+    if not compared.left or compared.unlike or (clean and not all(run.last_clean for run in everyone)):
+        return None, (None, None)
+    best, floor = (episodes_of(runs, clean) for runs in (compared.left, compared.right))
+    return float(best.mean() - floor.mean()), stats.difference_interval(best, floor) or (None, None)
 
 
 def _share(runs: list[LoadedRun]) -> float | None:
@@ -182,10 +187,10 @@ def _verdict(row: Row, state: list[LoadedRun], acro: list[LoadedRun], differing:
             )
     if differing:
         unknown.append(f"best and random have other {', '.join(differing)}")
-    elif row["error"] is None:
+    elif row["low"] is None:
         unknown.append("best and random need two seeds each that differ")
-    elif row["above_random"] <= STANDARD_ERRORS * row["error"]:
-        missed.append(f"best minus random is {row['above_random']:.0f}, within {STANDARD_ERRORS:g} standard errors")
+    elif row["low"] <= 0:
+        missed.append(f"best minus random is {row['above_random']:.0f} {interval(row['low'], row['high'], 0)}")
     if missed:
         return f"{FAILED}: {'; '.join(missed)}"
     return f"{UNKNOWN}: {'; '.join(dict.fromkeys(unknown))}" if unknown else PASSED

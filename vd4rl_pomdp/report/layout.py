@@ -43,12 +43,12 @@ class ShownTable:
 
 def number(value: float | None, digits: int = 1) -> str:
     """A number, or a dash for one that is not known."""
-    return "–" if value is None else f"{value:.{digits}f}"
+    return "–" if value is None else f"{value:z.{digits}f}"
 
 
 def interval(low: float | None, high: float | None, digits: int = 1) -> str:
     """An interval in brackets, or a dash."""
-    return "–" if low is None or high is None else f"[{low:.{digits}f}, {high:.{digits}f}]"
+    return "–" if low is None or high is None else f"[{low:z.{digits}f}, {high:z.{digits}f}]"
 
 
 def with_interval(value: float | None, low: float | None, high: float | None, digits: int = 1) -> str:

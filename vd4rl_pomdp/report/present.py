@@ -27,14 +27,14 @@ def gates(rows: list[Row]) -> list[ShownTable]:
     lines = []
     for row in rows:
         shares = (number(row[name], 2) for name in ("state_share", "acro_share", "best_share"))
-        above = _with_error(row["above_random"], row["error"])
+        above = with_interval(row["above_random"], row["low"], row["high"], 0)
         lines.append(Line((with_algorithm(row), row["verdict"], number(row["data_return"], 0), *shares, above)))
     return [ShownTable("", columns, lines, words=2)]
 
 
 def claims(rows: list[Row]) -> list[ShownTable]:
     """What becomes of the paper's claims, one table a claim."""
-    columns = ("setting", "verdict", "left", "right", "difference")
+    columns = ("setting", "verdict", "left", "right", "difference", "played clean")
     return [
         ShownTable(claim, columns, list(map(_claim_line, members)), words=4, note=tally(members))
         for (claim,), members in grouped(rows, ("claim",))
@@ -43,12 +43,11 @@ def claims(rows: list[Row]) -> list[ShownTable]:
 
 def _claim_line(row: Row) -> Line:
     sides = (f"{row[side]}: {row[f'{side}_return']:.0f} (n = {row[f'{side}_seeds']})" for side in ("left", "right"))
-    return Line((setting(row), row["verdict"] or "–", *sides, _with_error(row["difference"], row["error"])))
-
-
-def _with_error(difference: float | None, error: float | None) -> str:
-    """A difference of returns and its standard error, as far as they are known."""
-    return number(difference, 0) + ("" if error is None else f" ± {error:.0f}")
+    differences = (
+        with_interval(row[f"{prefix}difference"], row[f"{prefix}low"], row[f"{prefix}high"], 0)
+        for prefix in ("", "clean_")
+    )
+    return Line((setting(row), row["verdict"] or "–", *sides, *differences))
 
 
 def scores(rows: list[Row]) -> list[ShownTable]:

@@ -23,7 +23,7 @@ LOOKS = (
 """The package's methods in the order of their looks, which are the same in every report: the first differ in colour."""
 SCORE = "Score = return / 10 or the task's own divisor"
 """What tables and pages say of their scores."""
-SCORES_NOTE = f"{SCORE}. Mean over seeds, 95% percentile bootstrap intervals."
+SCORES_NOTE = f"{SCORE}. Mean over seeds, 95% t intervals over seeds and episodes."
 """What stands below a table of scores."""
 _MEASURED = (
     *("step", "score", "low", "high", "seeds", "episodes", "few_seeds"),
@@ -52,13 +52,13 @@ def _algorithm(row: Row) -> str:
 
 
 def evaluations(runs: Iterable[LoadedRun]) -> list[Row]:
-    """One row for every evaluation of a run: CONDITION, seed, step, mean `score` and number of its `episodes`."""
+    """One row for every evaluation of a run: CONDITION, seed, step, mean `score`, and the `scores` of its episodes."""
     table = []
     for run in runs:
         named = run.named
         for (step, *_), episodes in grouped(run.rows, ("step",)):
-            score = float(np.mean([row["score"] for row in episodes]))
-            table.append(named | {"step": step, "score": score, "episodes": len(episodes)})
+            scores = [row["score"] for row in episodes]
+            table.append(named | {"step": step, "score": float(np.mean(scores)), "scores": scores})
     return table
 
 
@@ -96,18 +96,17 @@ def _scores(rows: list[Row]) -> Row:
     final = max(curve)
     best = max(curve, key=lambda step: _seeds(curve[step]).mean())
     found: Row = {"step": final, "best_step": best}
-    ends = {step: mean_and_ends(_seeds(curve[step])) for step in {final, best}}
+    ends = {step: mean_and_ends(_by_episode(curve[step])) for step in {final, best}}
     for prefix, step in (("", final), ("best_", best)):
         found |= dict(zip((f"{prefix}score", f"{prefix}low", f"{prefix}high"), ends[step], strict=True))
     count = len(curve[final])
-    found |= {"seeds": count, "episodes": sum(row["episodes"] for row in curve[final])}
+    found |= {"seeds": count, "episodes": sum(len(row["scores"]) for row in curve[final])}
     return {name: (found | {"few_seeds": count < stats.FEW_SEEDS})[name] for name in _MEASURED}
 
 
 def mean_and_ends(scores: np.ndarray) -> tuple[float, float | None, float | None]:
-    """Mean over seeds, and the ends of its interval."""
-    interval = stats.bootstrap_interval([scores], stats.mean, np.random.default_rng(0)) or (None, None)
-    return float(scores.mean()), *interval
+    """Mean of (seeds, episodes) scores, and the ends of its interval."""
+    return float(scores.mean()), *(stats.mean_interval(scores) or (None, None))
 
 
 def curves(rows: list[Row]) -> list[Row]:
@@ -128,6 +127,12 @@ def final_scores(rows: list[Row]) -> np.ndarray:
     """Score of every seed of one condition at its last evaluation, (n,)."""
     curve = _by_step(rows)
     return _seeds(curve[max(curve)])
+
+
+def final_episodes(rows: list[Row]) -> np.ndarray:
+    """The same episode by episode, (n, episodes)."""
+    curve = _by_step(rows)
+    return _by_episode(curve[max(curve)])
 
 
 def table_order(row: Row) -> tuple:
@@ -160,3 +165,8 @@ def _by_step(rows: list[Row]) -> dict[int, list[Row]]:
 def _seeds(rows: list[Row]) -> np.ndarray:
     """Score of every seed at one evaluation."""
     return np.array([row["score"] for row in rows])
+
+
+def _by_episode(rows: list[Row]) -> np.ndarray:
+    """The same episode by episode, (n, episodes)."""
+    return stats.by_episode([row["scores"] for row in rows])

@@ -23,7 +23,7 @@ def print_summary(report: Report, console: Console | None = None) -> None:
     for (claim,), members in grouped(report.claims, ("claim",)):
         if told := tally(members):
             console.print(f"{claim}: {told}", markup=False, highlight=False)
-    console.print(f"{SCORE}; mean over seeds [95% interval]", markup=False, highlight=False)
+    console.print(f"{SCORE}; mean over seeds [95% t interval]", markup=False, highlight=False)
     for place, members in by_setting(report.summary):
         console.print(_table(place, members))
 

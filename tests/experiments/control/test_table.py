@@ -36,7 +36,7 @@ def test_methods_are_ranked_and_answers_given_where_all_gates_are_reached():
     assert "memory pays: mik minus none is +165 ± 15 (n = 2)" in lines
     assert "past actions pay: mik+a minus mik is +205 ± 15 (n = 2)" in lines
     assert [line.split()[0] for line in lines if " to " in line][-3:] == ["mik+a", "mik", "none"]
-    assert not any("does not discriminate" in line for line in lines)
+    assert not any("undecided at this budget" in line for line in lines)
 
 
 def test_a_policy_that_reads_no_memory_answers_nothing_about_it():
@@ -63,7 +63,7 @@ def test_what_the_seeds_do_not_tell_is_said():
 )
 def test_a_setting_that_misses_a_gate_is_not_ranked(groups):
     lines = told(*groups)
-    said = max(i for i, line in enumerate(lines) if line == "does not discriminate: methods are listed by name")
+    said = max(i for i, line in enumerate(lines) if line == "undecided at this budget: methods are listed by name")
     methods = {row["method"] for group in groups for row in group if row["hidden_share"] == "0.5"}
     assert [line.split()[0] for line in lines[said + 2 :] if line][: len(methods)] == sorted(methods)
     assert any(line.startswith("gate, ") and line.endswith("missed") for line in lines)

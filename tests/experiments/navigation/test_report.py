@@ -124,8 +124,8 @@ def test_the_report_shows_means_seeds_and_the_papers_numbers(runs, tmp_path):
     assert float(best["low"]) < 21 < float(best["high"])
     raw = numbers["state_error", "held-out", True, "MIK+A, K=15", "three_curtains"]
     assert (raw["mean"], raw["seeds"], raw["paper"]) == ("31.5", "3", "6.0")
-    assert "| **21.0** [20.0, 22.0] n=3 |" in page
-    assert "**31.5** [30.0, 33.0] n=3 (6.0)" in page
+    assert "| **21.0** [18.5, 23.5] n=3 |" in page
+    assert "**31.5** [27.8, 35.2] n=3 (6.0)" in page
     assert "(-)" not in page
     assert page.count("--seed 1  # ") == 10, "one command for every run of seed 1"
     for name in ("accuracy.png", "accuracy_raw.png", "trajectories.png"):

@@ -11,11 +11,13 @@ import numpy as np
 
 from vd4rl_pomdp.errors import told_apart
 from vd4rl_pomdp.experiments.control.config import MEASURED, NO_MEMORY, SETTING, UNTRAINED
-from vd4rl_pomdp.report.gates import FAILED, STANDARD_ERRORS, STATE_SHARE
+from vd4rl_pomdp.report.gates import FAILED, STATE_SHARE
 from vd4rl_pomdp.report.load import PROBES
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs.files import Row
 
+STANDARD_ERRORS = 2.0
+"""Least difference that tells, in its standard errors over the seeds that both methods have."""
 COLUMNS = ("method", "seeds", "return", "episodes", "good", "error: data", "in loop", "pose", "velocity")
 
 

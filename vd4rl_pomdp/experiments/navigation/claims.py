@@ -179,6 +179,7 @@ def verdict_lines(runs: Sequence[NavigationRun]) -> list[str]:
         "",
         "That ah+a beats the untrained encoder is not to be expected: it tells an action from its record of past ones",
         f"and need not keep the state. In the paper its position error is {recorder}.",
+        *_recorder_lines(runs),
         *_ceiling_lines(mazes, runs),
         "",
     ]
@@ -188,6 +189,22 @@ def _paper_position(maze: str) -> float:
     found = paper_number(Condition(maze, "ah+a"), online_error("position").raw())
     assert found is not None
     return found
+
+
+def _recorder_lines(runs: Sequence[NavigationRun]) -> list[str]:
+    """Whether ah+a has learned to record actions, beside the paper, whose table of action losses says it did."""
+    loss, told = Measure("action_loss", "training", ""), []
+    for maze in PAPER_MAZES:
+        found = _by_seed((Condition(maze, "ah+a"), loss), runs).values()
+        if found:
+            told.append(f"{maze} {sum(found) / len(found):.1f} ({paper_number(Condition(maze, 'ah+a'), loss):.1f})")
+    if not told:
+        return []
+    return [
+        "",
+        f"Its action loss at K = 15 (nats x 100, training averages; in brackets the paper's): {', '.join(told)}.",
+        "Where it is far above the paper's, the recorder is not learned, and its state errors are no replication.",
+    ]
 
 
 def _units_line(pairs: Sequence[tuple[str, Verdict, Verdict]]) -> str:
