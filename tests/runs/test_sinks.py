@@ -183,6 +183,7 @@ def test_a_killed_run_lacks_no_row_once_it_is_resumed(data, tmp_path):
     command = [sys.executable, script, *words]
     unflushed = {"WANDB__TRANSACTION_LOG_FLUSH_INTERVAL": "0"}  # else a slow machine's wandb may have written them
     environment = os.environ | {"PYTHONPATH": os.getcwd()} | unflushed
+    environment.pop("WANDB_SERVICE", None)  # a service of this process would outlive the killed one
     killed = subprocess.run(list(map(str, command)), env=environment, capture_output=True)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert len(read_metrics(out / "metrics.jsonl")) == 40
