@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import csv
-import sys
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -42,7 +41,7 @@ def manifest() -> tuple[RemoteFile, ...]:
 
 
 def check_whole(path: Path, shards: Sequence[Path], named: tuple[str | None, str | None]) -> None:
-    """Raise UserError for a part of a published set; warn where its shards' names alone say that it is one.
+    """Raise UserError for a part of a published set.
 
     A shard of the name and size of a published one is that. Other sets are their makers' business, unless they tell
     nothing of who made them and all their shards are called as those of the published set of their folder are.
@@ -72,11 +71,8 @@ def check_whole(path: Path, shards: Sequence[Path], named: tuple[str | None, str
         return
     more = f" and {len(told) - _TOLD} more" if len(told) > _TOLD else ""
     out = path.parents[2] if path.parts[-3:] == (task, quality, "84px") else "DIR"
-    line = (
+    raise UserError(
         f"{path}: is a part of V-D4RL's {task} {quality} ({', '.join(told[:_TOLD])}{more}); get the rest with "
         f"`vd4rl-pomdp data download --task {task} --quality {quality} --out {out}`, or give the shards other names to "
         "train on them alone"
     )
-    if certain:
-        raise UserError(line)
-    print(f"warning: {line}", file=sys.stderr)
