@@ -1,6 +1,7 @@
 """How images are shifted by whole pixels: an index for a GPU, lines of memory for a CPU.
 
-Gathering by whole pixels gives exactly what DrQ's interpolation gives.
+Whole pixels are gathered. DrQ interpolates at the same places with weights that are 0 and 1 but for float32's rounding:
+of random pixels 59% come out the same to the last bit, the others within 0.004 of 255.
 """
 
 from __future__ import annotations

@@ -6,7 +6,11 @@ import gymnasium
 import numpy as np
 import pytest
 
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.envs import dmc
+from vd4rl_pomdp.envs.corrupted import CorruptedEnv
+from vd4rl_pomdp.envs.gym import GymEnv
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask, Layout
 from vd4rl_pomdp.testing import check_task
@@ -106,6 +110,14 @@ def test_what_the_harness_itself_could_break_is_caught(tasks, monkeypatch):
 
     broken = [
         (GymnasiumEnv, "_rescaled", lambda self, a: a * 5, actions_fill_their_bounds, "becomes .* the bounds are"),
+        (GymnasiumEnv, "_rescaled", lambda self, a: a, actions_fill_their_bounds, "-1.0 becomes .* the bounds are"),
+        (
+            GymnasiumEnv,
+            "_rescaled",
+            lambda self, a: a.astype(np.float64) * 2.5 + 0.5,
+            actions_fill_their_bounds,
+            "are float64, its bounds float32",
+        ),
         (GymnasiumEnv, "_frame", lambda self, s: frame(self, s + 1), frames_have_the_size_asked_for, "of size 84 is"),
         (GymnasiumEnv, "_frame", drawn_into_one_buffer, frames_stay_as_they_were, "row 0 changes in later rows"),
         (
@@ -142,3 +154,38 @@ def test_right_ones_of_both_kinds_pass_and_unknown_names_are_refused(tasks):
     tasks.register("infinite", GymnasiumTask(Infinite))
     with pytest.raises(UserError, match="environment Infinite pays inf"):
         check_task("infinite")
+
+
+class Strict(Square):
+    """Takes what is within its bounds, which are no sums of powers of two, and in their dtype."""
+
+    def __init__(self, render_mode=None):
+        super().__init__(render_mode)
+        self.action_space = gymnasium.spaces.Box(np.array([-0.1, 1.5]), np.array([0.7, 1.86]), dtype=np.float64)
+
+    def step(self, action):
+        assert action.dtype == np.float64
+        assert self.action_space.contains(action), action.tolist()
+        return super().step(action)
+
+
+def test_an_environment_that_takes_nothing_beyond_its_bounds_is_played(tasks):
+    tasks.register("strict", GymnasiumTask(Strict, decisions=5))
+    check_task("strict")
+
+
+@pytest.mark.parametrize("task", ["lqr_2_1", "lqr_6_2"])
+def test_a_task_of_dm_control_without_bounds_is_refused_wherever_it_is_played(tasks, tmp_path, task):
+    tasks.register("unbounded", DMCTask("lqr", task))
+    message = f"dm_control's lqr {task} has actions from -1e[+]10 to 1e[+]10: only bounds within -1e[+]09 and 1e[+]09"
+    for play in (
+        lambda: check_task("unbounded"),
+        lambda: collect(CollectConfig("unbounded", "random", tmp_path / "set", episodes=1, workers=1)),
+        lambda: GymEnv("unbounded"),
+        lambda: CorruptedEnv(tasks["unbounded"], CorruptionConfig.of("none")),
+        lambda: dmc.replay_rewards("unbounded", np.zeros(4), np.zeros((1, 1))),
+    ):
+        with pytest.raises(UserError, match=message) as caught:
+            play()
+        assert "\n" not in str(caught.value)
+    assert not (tmp_path / "set").exists()

@@ -195,6 +195,20 @@ def test_random_shift_equals_padding_and_cropping():
     assert random_shift(obs, key, pad=0) is obs
 
 
+def test_random_shift_is_drqs_interpolation_but_for_its_rounding():
+    """DrQ-v2's own lines, with given shifts: at whole pixels its weights are 0 and 1 up to float32's precision."""
+    obs, key, pad = stacks(32), torch.arange(32), 4
+    padded = torch.nn.functional.pad(obs.float(), (pad,) * 4, mode="replicate")
+    side = 84 + 2 * pad
+    places = torch.linspace(-1 + 1 / side, 1 - 1 / side, side)[:84].repeat(84, 1)[..., None]
+    grid = torch.cat([places, places.transpose(0, 1)], 2).repeat(32, 1, 1, 1)
+    chosen = draw_integers(key, 2 * pad + 1, 2).flip(1).view(32, 1, 1, 2) * (2.0 / side)
+    theirs = torch.nn.functional.grid_sample(padded, grid + chosen, padding_mode="zeros", align_corners=False)
+    difference = (theirs - random_shift(obs, key, pad)).abs()
+    assert difference.max() < 0.004
+    assert 0.5 < (difference == 0).float().mean() < 0.7
+
+
 @pytest.mark.parametrize("shape", [(1, 3, 20, 30), (7, 2, 3, 12, 12), (64, 9, 84, 84), (400, 3, 84, 84)])
 @pytest.mark.parametrize("pad", [1, 4])
 def test_both_ways_to_shift_agree(shape, pad):

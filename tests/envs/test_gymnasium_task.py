@@ -8,6 +8,7 @@ from PIL import Image
 from vd4rl_pomdp.envs.gym import GymEnv
 from vd4rl_pomdp.envs.gymnasium_task import area_means
 from vd4rl_pomdp.envs.make import make_env
+from vd4rl_pomdp.envs.rendering import mujoco
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask
 from vd4rl_pomdp.types import StepType
@@ -201,7 +202,12 @@ def test_an_environment_of_bound_arguments_is_one_too():
     ("arguments", "message"),
     [
         ({"space": gymnasium.spaces.Discrete(3)}, r"has the actions Discrete\(3\)"),
-        ({"high": np.inf}, "only a bounded Box"),
+        (
+            {"space": gymnasium.spaces.Box(-3, 3, (2,), np.int64)},
+            r"has the actions Box\(-3, 3, \(2,\), int64\): only a",
+        ),
+        ({"high": np.inf}, "Counter has actions from -1 to inf: only bounds within -1e[+]09 and 1e[+]09 can be"),
+        ({"low": -1e10}, "Counter has actions from -1e[+]10 to 1: only bounds"),
         ({"shape": (20,)}, r"Counter shows uint8 of shape \(20,\) by its render\(\)"),
         ({"shape": (20, 30, 4)}, r"Counter shows uint8 of shape \(20, 30, 4\)"),
     ],
@@ -245,10 +251,68 @@ def test_the_corrupted_environment_tells_who_ended_an_episode():
             GymEnv(name, frame_size=8)
 
 
-def test_a_task_of_dm_control_that_ends_has_discount_0():
-    env = make_env(DMCTask("lqr", "lqr_2_1"), size=None)
+def test_a_task_of_dm_control_that_ends_has_discount_0(monkeypatch):
+    env = make_env(DMCTask("pendulum", "swingup"), size=None)
     env.reset(0)
-    with env.physics.reset_context():
-        env.physics.set_state(np.zeros(4))
+    monkeypatch.setattr(env.simulator.task, "get_termination", lambda physics: 0.0)
     row = env.step(np.zeros(1))
     assert (row.last, row.discount, row.terminated) == (True, 0.0, True)
+
+
+class Seedless(Counter):
+    def reset(self):
+        return super().reset()
+
+
+class Failing(Counter):
+    def reset(self, *, seed=None, options=None):
+        return len(seed)
+
+
+def test_an_environment_whose_reset_takes_no_seed_is_one_line():
+    env = make_env(GymnasiumTask(Seedless))
+    with pytest.raises(UserError, match=r"Seedless cannot be reset \(.* 'seed'\): an episode .* Gymnasium's") as caught:
+        env.reset(0)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(TypeError, match="has no len"):  # a fault of its own stays what it is
+        make_env(GymnasiumTask(Failing)).reset(0)
+
+
+@pytest.mark.parametrize(
+    ("told", "rate"),
+    [
+        ({"metadata": {"render_fps": 20}}, 10),
+        ({"metadata": {}}, 15),
+        ({"metadata": {"render_fps": 25}, "dt": 0.05}, 10),
+        ({"metadata": {"render_fps": 25}, "control_timestep": lambda self: 0.025}, 20),  # shimmy's, in milliseconds
+        ({"metadata": {"render_fps": 20}, "dt": None}, 10),
+    ],
+)
+def test_a_task_is_as_fast_as_its_time_step_tells_before_its_metadata(told, rate):
+    env = make_env(GymnasiumTask(type("Timed", (Counter,), told), action_repeat=2))
+    assert env.rate == pytest.approx(rate)
+
+
+@pytest.mark.parametrize("told", [0.025, 0, -1, 2000, np.nan, None, "20"])
+def test_a_rate_that_cannot_be_is_one_line(told):
+    env = make_env(GymnasiumTask(type("Timed", (Counter,), {"metadata": {"render_fps": told}})))
+    with pytest.raises(
+        UserError, match=f"Timed has the render_fps {told!r} in its metadata: correct it to the steps a"
+    ):
+        _ = env.rate
+
+
+def test_gymnasiums_cheetah_is_drawn_one_simulator_step_late():
+    """As docs/add_a_task.md says."""
+    env = make_env(GymnasiumTask("HalfCheetah-v5"), size=None)
+    env.reset(0)
+    model, data = env.env.unwrapped.model, env.env.unwrapped.data
+    before = mujoco.MjData(model)
+    before.qpos[:], before.qvel[:], before.ctrl[:] = data.qpos, data.qvel, 1
+    env.step(np.ones(6, np.float32))
+    mujoco.mj_step(model, before, env.env.unwrapped.frame_skip - 1)
+    mujoco.mj_forward(model, before)
+    drawn = data.xpos.copy()
+    np.testing.assert_allclose(drawn, before.xpos, atol=1e-9)
+    mujoco.mj_forward(model, data)
+    assert np.abs(data.xpos - drawn).max() > 1e-3

@@ -161,6 +161,19 @@ def test_the_fast_first_person_picture_is_mujocos_but_for_its_highlights(maze):
         assert (np.abs(ours - theirs) > 20).mean() < 0.02
 
 
+@pytest.mark.parametrize("maze", ["three_curtains", "first_person"])
+def test_every_picture_is_of_the_state_that_is_told_with_it(maze):
+    """MuJoCo leaves the places of bodies as they were when its last step began."""
+    rng = np.random.default_rng(0)
+    fast, exact, again = MazeEnv(maze), MazeEnv(maze, render="exact"), MazeEnv(maze, render="exact")
+    for env in (fast, exact, again):
+        env.reset(seed=0)
+    for action in rng.uniform(-1, 1, (6, 2)):
+        shown, _, _, _, info = exact.step(action)
+        np.testing.assert_array_equal(shown, again.reset(options={"state": info["state"]})[0])
+        np.testing.assert_array_equal(fast.step(action)[-1]["state"], info["state"])
+
+
 def test_curtains_do_not_collide_and_goals_are_not_drawn():
     env = MazeEnv("three_curtains")
     env.reset(seed=0, options={"state": np.array([-1.2, 1.0, 3.0, 0.0])})

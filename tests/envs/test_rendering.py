@@ -1,5 +1,7 @@
 import contextlib
 import gc
+import os
+import re
 import subprocess
 import sys
 
@@ -38,6 +40,88 @@ def test_a_machine_without_opengl_gets_a_sentence(tmp_path):
     line = last_line(f"import sys; sys.path.insert(0, {str(tmp_path)!r})")
     assert "UserError: cannot render with MUJOCO_GL=" in line
     assert "libgl1 " in line
+
+
+PLAY = """
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.tasks import TASKS, GymnasiumTask
+
+TASKS.register("cheetah", GymnasiumTask("HalfCheetah-v5", decisions=2))
+if __name__ == "__main__":
+    main()
+"""
+COMMANDS = {
+    "dm_control": "data collect --task walker_walk --quality random --frame-size 16 --episodes 1 --workers 1",
+    "workers": "data collect --task walker_walk --quality random --frame-size 16 --episodes 2 --workers 2",
+    "gymnasium": "data collect --task cheetah --quality random --frame-size 16 --episodes 1 --workers 1",
+    "maze": "navigation collect --maze no_curtain --preset smoke --workers 1",
+}
+
+
+def collected(folder, command, variables):
+    """What a fresh process with these environment variables says on stderr, and its exit code."""
+    (folder / "play.py").write_text(PLAY)
+    words = [sys.executable, str(folder / "play.py"), *COMMANDS[command].split(), "--out", str(folder / "set")]
+    dropped = ("DISPLAY", "WAYLAND_DISPLAY", "PYOPENGL_PLATFORM")  # the last is set where this process has drawn
+    env = {name: value for name, value in os.environ.items() if name not in dropped} | {"MUJOCO_GL": "egl"} | variables
+    done = subprocess.run(words, capture_output=True, text=True, check=False, env=env)
+    return done.returncode, done.stderr.splitlines()
+
+
+DEVICE, SCREEN = {"MUJOCO_EGL_DEVICE_ID": "0,1"}, {"MUJOCO_GL": "glfw"}
+
+
+@pytest.mark.parametrize(
+    ("command", "variables"), [(name, DEVICE) for name in COMMANDS] + [("dm_control", SCREEN), ("gymnasium", SCREEN)]
+)
+def test_a_variable_that_opengl_cannot_use_is_one_line_for_every_kind_of_task(tmp_path, command, variables):
+    code, lines = collected(tmp_path, command, variables)
+    assert (code, len(lines)) == (2, 1), lines
+    remedy = r"set MUJOCO_GL=egl, .*glfw needs a screen" if variables == SCREEN else "correct or unset MUJOCO_EGL_DEV"
+    ((name, value),) = variables.items()
+    assert re.match(rf"error: cannot render with .*{name}={value} \(.*\): {remedy}", lines[0])
+
+
+@pytest.mark.parametrize(
+    ("name", "value", "told"),
+    [
+        (
+            "MUJOCO_EGL_DEVICE_ID",
+            "",
+            "MUJOCO_EGL_DEVICE_ID='' .*: correct or unset MUJOCO_EGL_DEVICE_ID, which numbers",
+        ),
+        (
+            "MUJOCO_EGL_DEVICE_ID",
+            "99",
+            "MUJOCO_EGL_DEVICE_ID=99 .*: correct or unset MUJOCO_EGL_DEVICE_ID, which numbers",
+        ),
+        ("PYOPENGL_PLATFORM", "glx", "PYOPENGL_PLATFORM=glx .*: correct or unset PYOPENGL_PLATFORM;"),
+        (
+            "PYOPENGL_ERROR_ON_COPY",
+            "1",
+            "PYOPENGL_ERROR_ON_COPY=1 .*: correct or unset PYOPENGL_ERROR_ON_COPY, or set M",
+        ),
+        ("MUJOCO_GL", "EGL", "MUJOCO_GL=EGL .*: set MUJOCO_GL=egl"),
+    ],
+)
+def test_variables_that_any_library_below_reads_are_named(tmp_path, name, value, told):
+    code, lines = collected(tmp_path, "dm_control", {name: value})
+    assert (code, len(lines)) == (2, 1), lines
+    assert re.match(f"error: cannot render with .*{told}", lines[0])
+    assert ("libegl1" in lines[0]) == ("set MUJOCO_GL=egl" in lines[0])
+
+
+@pytest.mark.parametrize(
+    "order", [("HalfCheetah-v5",), ("HalfCheetah-v5", "walker_walk"), ("walker_walk", "HalfCheetah-v5")]
+)
+def test_a_process_that_has_drawn_ends_without_a_word(order):
+    code = (
+        "from vd4rl_pomdp.envs.make import make_env; from vd4rl_pomdp.tasks import TASKS, GymnasiumTask\n"
+        f"envs = [make_env(TASKS.get(name) or GymnasiumTask(name), size=16) for name in {order}]\n"
+        "print(*(env.reset(0).frame.any() for env in envs))"
+    )
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert (done.stdout.split(), done.stderr) == (["True"] * len(order), "")
 
 
 def test_a_machine_without_dm_control_is_told_how_to_install_it():

@@ -3,10 +3,15 @@
 import gymnasium
 import torch
 
-import vd4rl_pomdp.envs  # noqa: F401 (registers the ids)
 from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import TASKS, GymnasiumTask
+
+TASKS.register("half_cheetah", GymnasiumTask("HalfCheetah-v5"))
+
+import vd4rl_pomdp.envs  # noqa: E402, F401 (registers the ids)
 
 TASK, MAZE = "vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0", "vd4rl_pomdp/MazeOneCurtain-v0"
+GYMNASIUM = "vd4rl_pomdp/HalfCheetah-v0"
 
 
 def walk(name: str, start: str) -> None:
@@ -32,9 +37,9 @@ if __name__ == "__main__":
     torch.rand(1000, 1000).exp().sum()  # on two threads, which a forked process does not inherit
     walk(TASK, "fork")
     walk(MAZE, "fork")
+    walk(GYMNASIUM, "fork")
     gymnasium.make(TASK).reset(seed=0)
-    assert refused(TASK)
-    assert refused(MAZE)
-    walk(TASK, "spawn")
-    walk(MAZE, "spawn")
+    for name in (TASK, MAZE, GYMNASIUM):
+        assert refused(name)
+        walk(name, "spawn")
     print("as expected")

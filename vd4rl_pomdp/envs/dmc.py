@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.envs import rendering
-from vd4rl_pomdp.envs.pixels import PixelEnv, Render, TimeStep, between
+from vd4rl_pomdp.envs.pixels import PixelEnv, Render, TimeStep, between, check_bounds
 from vd4rl_pomdp.envs.rendering import mujoco, suite
 from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_SIZE, TASKS, DMCTask, Layout
@@ -209,4 +209,6 @@ def _load(task: DMCTask, random: np.random.RandomState) -> Any:
         tasks = ", ".join(name for domain, name in suite.ALL_TASKS if domain == task.domain)
         choices = tasks or ", ".join(sorted({domain for domain, _ in suite.ALL_TASKS}))
         raise UserError(f"dm_control has no task {task.domain!r}, {task.task!r}: choose one of {choices}")
-    return suite.load(task.domain, task.task, task_kwargs={"random": random, "time_limit": float("inf")})
+    env = suite.load(task.domain, task.task, task_kwargs={"random": random, "time_limit": float("inf")})
+    check_bounds(f"dm_control's {task.domain} {task.task}", env.action_spec().minimum, env.action_spec().maximum)
+    return env

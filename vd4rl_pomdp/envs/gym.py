@@ -43,7 +43,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (self._env.env.action_dim,), np.float32)
         self.render_mode = render_mode
-        self.metadata = {**self.metadata, "render_fps": round(self._env.env.rate)}
+        self.metadata = {**self.metadata, "render_fps": max(1, round(self._env.env.rate))}
         self._corruption_seed: int | None = None
         self._episode = 0
         self._frame = np.zeros((frame_size, frame_size, 3), np.uint8)

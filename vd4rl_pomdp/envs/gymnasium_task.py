@@ -12,13 +12,15 @@ import gymnasium
 import numpy as np
 from PIL import Image
 
-from vd4rl_pomdp.envs.opengl import undisturbed
-from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep, between
+from vd4rl_pomdp.envs.opengl import close_at_exit, gl_errors, refuse_after_fork, undisturbed
+from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep, between, check_bounds
 from vd4rl_pomdp.errors import UserError, in_one_line
 from vd4rl_pomdp.tasks import FRAME_SIZE, GymnasiumTask, Layout
 from vd4rl_pomdp.types import StepType
 
 NOTHING = np.zeros(0)
+MOST_STEPS_A_SECOND = 1000
+_NUMBERS = (int, float, np.number)
 _REFUSALS = (gymnasium.error.Error, ImportError)
 """What an environment raises that cannot do what it is asked, for lack of a package or otherwise."""
 
@@ -64,8 +66,23 @@ class GymnasiumEnv(PixelEnv):
 
     @property
     def rate(self) -> float:
-        """Decisions a second, as the environment's metadata tell; 30 steps a second if they do not."""
-        return self.env.metadata.get("render_fps", 30) / self.task.action_repeat
+        """Decisions a second of simulated time.
+
+        The environment's steps take its `dt` or dm_control's `control_timestep()`, where it has one: `render_fps` is
+        what a film of it is to be played at, and shimmy's is no rate. Else it counts, and is 30 where nothing is told.
+        """
+        for name in ("dt", "control_timestep"):
+            step = getattr(self.env.unwrapped, name, None)
+            step = step() if callable(step) else step
+            if isinstance(step, _NUMBERS) and step > 0:
+                return 1 / float(step) / self.task.action_repeat
+        told = self.env.metadata.get("render_fps", 30)
+        if not (isinstance(told, _NUMBERS) and 1 <= told <= MOST_STEPS_A_SECOND):
+            raise UserError(
+                f"environment {self._name} has the render_fps {told!r} in its metadata: correct it to the steps a "
+                f"second of simulated time, 1 to {MOST_STEPS_A_SECOND}, or give the environment a `dt` in seconds"
+            )
+        return float(told) / self.task.action_repeat
 
     def close(self) -> None:
         """Close the Gymnasium environment."""
@@ -80,9 +97,10 @@ class GymnasiumEnv(PixelEnv):
 
     @contextmanager
     def _telling(self, what: str, refusals: tuple[type[Exception], ...] = _REFUSALS) -> Iterator[None]:
-        """Turn what an environment itself refuses, such as a package that it misses, into a UserError."""
+        """Turn what an environment itself refuses, such as a package or OpenGL that it misses, into a UserError."""
         try:
-            yield
+            with gl_errors():
+                yield
         except refusals as error:
             reason = in_one_line(error)
             raise UserError(
@@ -91,7 +109,8 @@ class GymnasiumEnv(PixelEnv):
             ) from error
 
     def _bounded_box(self, space: gymnasium.Space) -> gymnasium.spaces.Box:
-        if isinstance(space, gymnasium.spaces.Box) and space.is_bounded() and np.issubdtype(space.dtype, np.floating):
+        if isinstance(space, gymnasium.spaces.Box) and np.issubdtype(space.dtype, np.floating):
+            check_bounds(f"environment {self._name}", space.low, space.high)
             return space
         raise UserError(
             f"environment {self._name} has the actions {space}: only a bounded Box of floating point can be a task; "
@@ -99,8 +118,16 @@ class GymnasiumEnv(PixelEnv):
         )
 
     def _begin(self, seed: int) -> None:
-        with self._telling("cannot be reset"):
-            given = self.env.reset(seed=seed)
+        try:
+            with self._telling("cannot be reset"):
+                given = self.env.reset(seed=seed)
+        except TypeError as error:
+            if "'seed'" not in str(error):  # of a TypeError from within
+                raise
+            raise UserError(
+                f"environment {self._name} cannot be reset ({in_one_line(error)}): an episode is its seed's, so give "
+                "it Gymnasium's `reset(self, *, seed=None, options=None)`, or wrap it"
+            ) from error
         self._observation, _ = self._of_interface("reset", given, 2)
 
     def _apply(self, action: np.ndarray) -> tuple[float, bool, float]:
@@ -133,8 +160,8 @@ class GymnasiumEnv(PixelEnv):
 
     def _rescaled(self, action: np.ndarray) -> np.ndarray:
         """An (A,) action in [-1, 1] between the bounds of the environment's own, in its shape and dtype."""
-        low, high = self._space.low.astype(np.float64), self._space.high.astype(np.float64)
-        return between(np.reshape(action, low.shape), low, high).astype(self._space.dtype)
+        low, high = self._space.low, self._space.high
+        return between(np.reshape(action, low.shape), low, high)
 
     def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
         frame = self._frame(self.size) if self.size and self.drawing else None
@@ -164,8 +191,14 @@ class GymnasiumEnv(PixelEnv):
 
     def _rendered(self) -> Any:
         """What `render()` gives, drawn into the environment's own OpenGL context where it is one of MuJoCo's."""
-        viewer = getattr(getattr(self.env.unwrapped, "mujoco_renderer", None), "viewer", None)
+        renderer = getattr(self.env.unwrapped, "mujoco_renderer", None)
+        viewer = getattr(renderer, "viewer", None)  # it exists from the first picture on
+        if renderer is not None:
+            refuse_after_fork()
         with undisturbed(), self._telling("cannot draw its picture"):
-            if viewer is not None:  # it exists from the first picture on
+            if viewer is not None:
                 viewer.make_context_current()
-            return self.env.render()
+            picture = self.env.render()
+        if renderer is not None and viewer is None:
+            close_at_exit(self.env)
+        return picture

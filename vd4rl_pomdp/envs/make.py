@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from functools import cache
 
-from vd4rl_pomdp.envs.pixels import PixelEnv, Render
+from vd4rl_pomdp.envs.pixels import PixelEnv, Render, check_render
 from vd4rl_pomdp.tasks import FRAME_SIZE, DMCTask, GymnasiumTask, Layout, Task
 
 
@@ -20,6 +20,7 @@ def make_env(task: Task, render: Render = "fast", size: int | None = FRAME_SIZE,
     Raises:
         UserError: the environment cannot be built, or is of a kind that the harness cannot play.
     """
+    check_render(render)
     if isinstance(task, GymnasiumTask):
         from vd4rl_pomdp.envs.gymnasium_task import GymnasiumEnv
 

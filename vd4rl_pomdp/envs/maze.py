@@ -10,8 +10,8 @@ import numpy as np
 from vd4rl_pomdp.envs import Info
 from vd4rl_pomdp.envs.maze_model import COLLISION_RADIUS, HEADING, TIMESTEP, build_simulator
 from vd4rl_pomdp.envs.maze_renderers import ExactRenderer, MazeRenderer, make_renderer
-from vd4rl_pomdp.envs.pixels import checked_action
-from vd4rl_pomdp.envs.rendering import Render, check_render, mujoco
+from vd4rl_pomdp.envs.pixels import Render, check_render, checked_action
+from vd4rl_pomdp.envs.rendering import mujoco
 from vd4rl_pomdp.errors import refuse_number
 from vd4rl_pomdp.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, get_maze
 

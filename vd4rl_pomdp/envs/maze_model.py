@@ -12,11 +12,13 @@ import tempfile
 from pathlib import Path
 
 from vd4rl_pomdp.envs.maze_sky import FACE, sky_texture
+from vd4rl_pomdp.envs.opengl import gl_errors
 from vd4rl_pomdp.envs.rendering import mujoco
 from vd4rl_pomdp.mazes import Curtain, MazeSpec, Sky, Style
 
-with contextlib.redirect_stderr(
-    io.StringIO()
+with (
+    gl_errors(),
+    contextlib.redirect_stderr(io.StringIO()),
 ):  # gymnasium-robotics announces changes of environments that are not used here
     import gymnasium_robotics
     from gymnasium_robotics.envs.maze.maps import U_MAZE

@@ -11,15 +11,12 @@ looked up by azimuth, averaged over 2x2 rays.
 
 from __future__ import annotations
 
-import atexit
-import os
-import weakref
-
 import numpy as np
 
 from vd4rl_pomdp.envs.maze_sky import BINS, panorama, sky_texture
-from vd4rl_pomdp.envs.opengl import undisturbed
-from vd4rl_pomdp.envs.rendering import Render, gl_error, mujoco, refuse_after_fork
+from vd4rl_pomdp.envs.opengl import close_at_exit, gl_errors, refuse_after_fork, undisturbed
+from vd4rl_pomdp.envs.pixels import Render
+from vd4rl_pomdp.envs.rendering import mujoco
 from vd4rl_pomdp.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, PICTURE_SIZE, MazeSpec, Style
 
 _FINE = 4
@@ -37,18 +34,17 @@ class ExactRenderer:
 
     def __init__(self, model: mujoco.MjModel) -> None:
         refuse_after_fork()
+        self._model = model
         model.vis.quality.offsamples = 0
         side = model.vis.global_.offwidth = model.vis.global_.offheight = PICTURE_SIZE * _FINE
-        try:
-            with undisturbed():
-                self._renderer = mujoco.Renderer(model, side, side)
-        except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
-            raise gl_error(error) from error
-        _keep_display()
-        atexit.register(_close, weakref.ref(self._renderer))  # before OpenGL itself ends
+        with gl_errors(), undisturbed():
+            self._renderer = mujoco.Renderer(model, side, side)
+        close_at_exit(self._renderer)
 
     def __call__(self, data: mujoco.MjData) -> np.ndarray:
-        """Picture of a state that `mj_forward` has seen."""
+        """Picture of the present state; what a step leaves as places of bodies is where it began."""
+        mujoco.mj_kinematics(self._model, data)  # not mj_forward: it would change what the solver starts the next from
+        mujoco.mj_camlight(self._model, data)
         self._renderer.update_scene(data, camera="view")
         return average(self._rendered(), _FINE)
 
@@ -69,23 +65,6 @@ class ExactRenderer:
     def close(self) -> None:
         """Free the GL context."""
         self._renderer.close()
-
-
-def _keep_display() -> None:
-    """Leave closing the EGL display to the process's end.
-
-    mujoco and dm_control share it; mujoco's exit handler would close it while dm_control still frees its contexts.
-    """
-    if os.environ["MUJOCO_GL"] == "egl":
-        from mujoco.egl import egl_ext
-
-        atexit.unregister(egl_ext.eglTerminate)
-
-
-def _close(renderer: weakref.ref[mujoco.Renderer]) -> None:
-    alive = renderer()
-    if alive is not None:
-        alive.close()
 
 
 def average(fine: np.ndarray, by: int) -> np.ndarray:

@@ -4,19 +4,123 @@ One OpenGL context of a process is current, and what draws does not check that i
 nothing is drawn, and the picture read is an old one. dm_control, mujoco and Gymnasium know their own contexts alone.
 """
 
+import atexit
 import contextlib
 import gc
 import os
+import shlex
 import sys
+import traceback
+import warnings
+import weakref
 from collections.abc import Iterator
+from typing import Any
+
+from vd4rl_pomdp.errors import UserError, first_line
 
 os.environ.setdefault("MUJOCO_GL", "egl" if sys.platform == "linux" else "glfw")  # macOS and Windows know no other
 os.environ.setdefault("LP_NUM_THREADS", "1")  # software rendering scales by processes, not by threads
+warnings.filterwarnings("ignore", module="glfw")  # where there is no screen it warns, and what draws then says so
 
 with contextlib.suppress(ImportError):  # not every PyTorch brings it
     # Triton carries an LLVM of its own. PyTorch's optimisers import it, and the process ends in a segmentation fault
     # if Mesa's software renderer has loaded another LLVM before.
     import triton  # noqa: F401
+
+_LIBRARIES = ("OpenGL.", "glfw.", "mujoco.", "dm_control._render.", "gymnasium.envs.mujoco.mujoco_rendering.")
+"""Modules that load OpenGL or draw with it."""
+_VARIABLES = ("MUJOCO_", "PYOPENGL_", "PYGLFW_", "EGL_", "__EGL_", "LIBGL_", "MESA_", "GALLIUM_")
+"""What the environment variables begin with that these and the drivers below them read."""
+
+
+def gl_error(error: BaseException) -> UserError:
+    """A sentence for a machine on which no OpenGL context can be made, with the variables that decide about it."""
+    backend, said = os.environ["MUJOCO_GL"], first_line(error)
+    others = {name: value for name, value in sorted(os.environ.items()) if name.startswith(_VARIABLES)}
+    del others["MUJOCO_GL"]
+    if others.get("PYOPENGL_PLATFORM") == backend.lower():
+        del others["PYOPENGL_PLATFORM"]  # dm_control and mujoco set it themselves
+    told = ", ".join(f"{name}={shlex.quote(value)}" for name, value in {"MUJOCO_GL": backend, **others}.items())
+    device = "MUJOCO_EGL_DEVICE_ID"
+    at_fault = [name for name in others if name in said or (name == device and isinstance(error, ValueError))]
+    install = "set MUJOCO_GL=glfw"
+    if sys.platform == "linux":
+        install = (
+            "set MUJOCO_GL=egl, for which Debian's libegl1, libgl1 and libgl1-mesa-dri must be installed, or osmesa, "
+            "for which libosmesa6 must be; glfw needs a screen"
+        )
+    remedy = f"correct or unset {' and '.join(at_fault or others)}" if others else install
+    if others and not at_fault:
+        remedy += f", or {install}"
+    if device in at_fault:
+        remedy += ", which numbers one EGL device, from 0"
+    return UserError(
+        f"cannot render with {told} ({said}): {remedy}; what draws nothing, such as control-study, takes "
+        "MUJOCO_GL=disable"
+    )
+
+
+@contextlib.contextmanager
+def gl_errors() -> Iterator[None]:
+    """Turn whatever OpenGL's libraries raise within the block into one line, and let them print nothing beside it."""
+    try:
+        yield
+    except Exception as error:
+        modules = [frame.f_globals.get("__name__", "") for frame, _ in traceback.walk_tb(error.__traceback__)]
+        if not any(f"{name}.".startswith(_LIBRARIES) for name in modules):
+            raise
+        _drop_half_made(error)
+        raise gl_error(error) from error
+
+
+def _drop_half_made(error: BaseException) -> None:
+    """Free now what an error's frames hold: contexts that failed while they were made raise again as they are freed."""
+    hook, sys.unraisablehook = sys.unraisablehook, lambda _: None
+    try:
+        cause: BaseException | None = error
+        while cause is not None:
+            traceback.clear_frames(cause.__traceback__)
+            cause = cause.__context__
+        gc.collect()
+    finally:
+        sys.unraisablehook = hook
+
+
+_rendered_in: set[int] = set()
+"""Process that has rendered; a forked one inherits its parent's."""
+
+
+def refuse_after_fork() -> None:
+    """To be called before rendering: OpenGL waits for ever in a process forked from one that has rendered."""
+    _rendered_in.add(os.getpid())
+    if len(_rendered_in) > 1:
+        raise UserError(
+            "this process was forked from one that has rendered, where OpenGL hangs: start processes by spawn, as in "
+            "gymnasium.make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})"
+        )
+
+
+def keep_display() -> None:
+    """Leave closing the EGL display to the process's end; to be called once dm_control or mujoco has opened it.
+
+    They share it, and the exit handler of either would close it while others still free their contexts.
+    """
+    if os.environ["MUJOCO_GL"] == "egl":
+        from OpenGL import EGL  # type: ignore[import-untyped]
+
+        atexit.unregister(EGL.eglTerminate)
+
+
+def close_at_exit(drawing: Any) -> None:
+    """To be called with what has made a context by mujoco's own means: it is closed before OpenGL itself ends."""
+    keep_display()
+    atexit.register(_close, weakref.ref(drawing))
+
+
+def _close(drawing: weakref.ref[Any]) -> None:
+    alive = drawing()
+    if alive is not None:
+        alive.close()
 
 
 @contextlib.contextmanager

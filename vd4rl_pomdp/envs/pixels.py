@@ -4,16 +4,21 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.errors import MOST, UserError, refuse_unknown
 from vd4rl_pomdp.tasks import Layout, Task
 from vd4rl_pomdp.types import StepType
 
 Render = Literal["fast", "exact"]
 """How dm_control draws: fast, with a smaller shadow map, or exact."""
+
+
+def check_render(render: str) -> None:
+    """Raise UserError for a word that names no rendering."""
+    refuse_unknown("rendering", render, get_args(Render))
 
 
 @dataclass(frozen=True)
@@ -43,9 +48,28 @@ class TimeStep:
         return self.last and self.discount == 0
 
 
+def check_bounds(what: str, low: np.ndarray, high: np.ndarray) -> None:
+    """Raise UserError for bounds of actions, arrays of one shape, that are infinite or so wide that they bound nothing.
+
+    dm_control gives MuJoCo's largest number, 1e10, as the bounds of motors without limits.
+    """
+    least, most = low.astype(np.float64), high.astype(np.float64)  # float16 does not hold 1e9
+    if not ((least >= -MOST) & (least <= most) & (most <= MOST)).all():
+        raise UserError(
+            f"{what} has actions from {np.min(low):g} to {np.max(high):g}: only bounds within -{MOST:g} and {MOST:g} "
+            "can be rescaled to [-1, 1]; take another task, or wrap the environment in one that bounds its actions"
+        )
+
+
 def between(action: np.ndarray, low: np.ndarray, high: np.ndarray) -> np.ndarray:
-    """An action in [-1, 1] between the bounds of an environment's own, in float64; what lies outside is cut off."""
-    return np.clip(action, -1, 1) * ((high - low) / 2) + (high + low) / 2
+    """An action in [-1, 1] between the bounds of an environment's own, in their dtype; what lies outside is cut off.
+
+    -1 and 1 become the bounds themselves, which rounded sums miss: between 1.5 and 1.86, 1 would be 1.8600000000000003.
+    """
+    wide = np.result_type(low, np.float64)
+    lowest, highest, within = low.astype(wide), high.astype(wide), np.clip(action, -1, 1)
+    inner = np.clip(within * ((highest - lowest) / 2) + (highest + lowest) / 2, lowest, highest)
+    return np.where(within == -1, low, np.where(within == 1, high, inner)).astype(low.dtype)
 
 
 def checked_action(action: Any, dimensions: int) -> np.ndarray:
@@ -73,7 +97,7 @@ class PixelEnv(ABC):
         self._length = task.decisions if length is None else length
         if self._length < 1:
             raise UserError(f"an episode of {self._length} decisions is too short; it needs at least 1")
-        self._decisions = 0
+        self._decisions, self._over = 0, True
 
     @property
     @abstractmethod
@@ -93,15 +117,17 @@ class PixelEnv(ABC):
     def reset(self, seed: int) -> TimeStep:
         """Begin the episode of a seed."""
         self._begin(seed)
-        self._decisions = 0
+        self._decisions, self._over = 0, False
         return self._time_step(0.0, 1.0, StepType.FIRST)
 
     def step(self, action: np.ndarray) -> TimeStep:
-        """Apply an (A,) float32 action in [-1, 1] for the action repeat."""
+        """Apply an (A,) float32 action in [-1, 1] for the action repeat; UserError where no episode goes on."""
+        if self._over:
+            raise UserError("no episode has begun, or it is over: call reset() before the next step()")
         reward, ended, discount = self._apply(action)
         self._decisions += 1
-        last = ended or self._decisions == self._length
-        return self._time_step(reward, discount, StepType.LAST if last else StepType.MID)
+        self._over = ended or self._decisions == self._length
+        return self._time_step(reward, discount, StepType.LAST if self._over else StepType.MID)
 
     @abstractmethod
     def close(self) -> None:

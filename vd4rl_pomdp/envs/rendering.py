@@ -8,54 +8,37 @@ This module alone imports mujoco and dm_control, after what must happen before O
 
 from __future__ import annotations
 
-import ctypes
 import hashlib
-import os
-import sys
 from functools import cache
 from pathlib import Path
-from typing import Any, get_args
+from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.envs.opengl import undisturbed
+from vd4rl_pomdp.envs.opengl import gl_errors, keep_display, refuse_after_fork, undisturbed
 from vd4rl_pomdp.envs.pixels import Render
-from vd4rl_pomdp.errors import UserError, first_line, refuse_unknown
+from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.tasks import FRAME_SIZE
 
-
-def gl_error(error: Exception) -> UserError:
-    """A sentence for a machine on which no OpenGL context can be made."""
-    remedy = "set MUJOCO_GL=glfw"
-    if sys.platform == "linux":
-        remedy = (
-            "install Debian's libegl1, libgl1 and libgl1-mesa-dri for MUJOCO_GL=egl, or libosmesa6 for MUJOCO_GL=osmesa"
-        )
-    return UserError(
-        f"cannot render with MUJOCO_GL={os.environ['MUJOCO_GL']} ({first_line(error)}): {remedy}; what draws nothing, "
-        "such as control-study, takes MUJOCO_GL=disable"
-    )
-
-
-try:  # both load the OpenGL library that MUJOCO_GL names, and fail in many ways where it is missing
-    import mujoco
-    from dm_control import suite
-    from dm_control.mujoco import Camera
-except (ImportError, AttributeError, RuntimeError, ctypes.ArgumentError) as _error:
-    if getattr(_error, "name", None) == "dm_control":
+try:
+    with gl_errors():  # both load the OpenGL library that MUJOCO_GL names, and fail in many ways where it is missing
+        import mujoco
+        from dm_control import suite
+        from dm_control.mujoco import Camera
+except ImportError as _error:
+    if _error.name == "dm_control":
         raise UserError("dm-control is not installed: `pip install --no-deps dm-control==1.0.44`") from _error
-    raise gl_error(_error) from _error
+    raise
+keep_display()
 
 __all__ = [
     "FrameCamera",
     "Render",
     "check_mujoco",
     "frames_hash",
-    "gl_error",
     "gl_strings",
     "mujoco",
     "prepare",
-    "refuse_after_fork",
     "suite",
 ]
 
@@ -75,17 +58,11 @@ def check_mujoco(version: str = mujoco.__version__) -> None:
         )
 
 
-def check_render(render: str) -> None:
-    """Raise UserError for a word that names no rendering."""
-    refuse_unknown("rendering", render, get_args(Render))
-
-
 def prepare(physics: Any, render: Render, size: int) -> None:
     """Restore the old sky, set the shadow map's size, and that of the buffer to what `size` x `size` pictures need.
 
     Must be called before the first render of `physics`. The buffer, 640x480 by default, is cleared for every picture.
     """
-    check_render(render)
     model = physics.model
     sky = _sky()
     number = next(i for i in range(model.ntex) if model.tex_type[i] == mujoco.mjtTexture.mjTEXTURE_SKYBOX)
@@ -96,20 +73,6 @@ def prepare(physics: Any, render: Render, size: int) -> None:
     model.vis.global_.offwidth = model.vis.global_.offheight = size
     if render == "fast":
         model.vis.quality.shadowsize = _FAST_SHADOW_SIZE
-
-
-_rendered_in: set[int] = set()
-"""Process that has rendered; a forked one inherits its parent's."""
-
-
-def refuse_after_fork() -> None:
-    """To be called before rendering: OpenGL waits for ever in a process forked from one that has rendered."""
-    _rendered_in.add(os.getpid())
-    if len(_rendered_in) > 1:
-        raise UserError(
-            "this process was forked from one that has rendered, where OpenGL hangs: start processes by spawn, as in "
-            "gymnasium.make_vec(..., vectorization_mode='async', vector_kwargs={'context': 'spawn'})"
-        )
 
 
 class FrameCamera:
@@ -126,11 +89,8 @@ class FrameCamera:
     def frame(self) -> np.ndarray:
         """The present state: (3, size, size) uint8."""
         refuse_after_fork()
-        try:
-            with undisturbed():
-                image = self._drawn()
-        except (ImportError, AttributeError, RuntimeError, mujoco.FatalError) as error:
-            raise gl_error(error) from error
+        with gl_errors(), undisturbed():
+            image = self._drawn()
         return np.array(image.transpose(2, 0, 1), order="C")  # a copy: the camera draws into one buffer
 
     def _drawn(self) -> np.ndarray:

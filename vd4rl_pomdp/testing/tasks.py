@@ -118,12 +118,14 @@ def episodes_end_once(name: str) -> None:
 
 
 def actions_fill_their_bounds(name: str) -> None:
-    """Actions in [-1, 1] reach the environment within its own bounds, its extremes among them."""
-    for action in (-1.0, 0.0, 1.0):
+    """Actions in [-1, 1] reach the environment in its bounds and in their dtype, -1 and 1 as the bounds themselves."""
+    for action in (-1.0, -0.7, 0.0, 0.3, 1.0):
         env = make(name)
         env.reset(0)
         low, high, given = _given(env, np.full(env.action_dim, action, np.float32))
-        claim(((low <= given) & (given <= high)).all(), f"{action} becomes {given}, the bounds are {low} and {high}")
+        least, most = high if action == 1 else low, low if action == -1 else high
+        claim(((least <= given) & (given <= most)).all(), f"{action} becomes {given}, the bounds are {low} and {high}")
+        claim(given.dtype == low.dtype, f"actions are {given.dtype}, its bounds {low.dtype}")
 
 
 def _given(env: PixelEnv, action: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

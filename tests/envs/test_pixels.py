@@ -1,0 +1,62 @@
+"""What all kinds of tasks share: actions between bounds, and when an episode goes on."""
+
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.envs.make import make_env
+from vd4rl_pomdp.envs.pixels import between, check_bounds
+from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble])
+def test_the_extremes_are_the_bounds_in_their_dtype_and_nothing_passes_them(dtype):
+    rng = np.random.default_rng(0)
+    low, high = np.sort(np.round(rng.uniform(-5, 5, (2, 3000)), 2), 0).astype(dtype)
+    ends = [between(end * np.ones(3000, np.float32), low, high) for end in (-1, 1)]
+    for found, bound in zip(ends, (low, high), strict=True):
+        assert found.dtype == dtype
+        np.testing.assert_array_equal(found, bound)
+    for _ in range(20):
+        inner = between(rng.uniform(-1, 1, 3000).astype(np.float32), low, high)
+        almost = between(np.full(3000, np.nextafter(np.float32(1), np.float32(0))), low, high)
+        assert ((low <= inner) & (inner <= high) & (inner <= almost + 1e-2) & (almost <= high)).all()
+
+
+@pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble])
+def test_bounds_that_bound_nothing_are_refused_in_every_dtype(dtype):
+    one = np.ones(2, dtype)
+    check_bounds("it", -one, one)
+    for far in (np.inf, np.nan, *([1e10] if dtype != np.float16 else [])):
+        with pytest.raises(UserError, match=r"it has actions from -1 to .*: only bounds within"):
+            check_bounds("it", -one, np.array([1, far], dtype))
+
+
+def test_bounds_of_one_leave_every_action_as_it_is():
+    actions = np.random.default_rng(0).uniform(-1, 1, 10_000).astype(np.float32)
+    for dtype in (np.float32, np.float64):
+        one = np.ones(10_000, dtype)
+        np.testing.assert_array_equal(between(actions, -one, one), actions.astype(dtype))
+
+
+def test_the_middle_of_the_bounds_and_what_lies_beyond():
+    low, high = np.array([-0.1, 1.5]), np.array([0.7, 1.86])
+    np.testing.assert_allclose(between(np.zeros(2), low, high), [0.3, 1.68])
+    np.testing.assert_array_equal(between(np.array([-1.5, 7.0]), low, high), [-0.1, 1.86])
+
+
+@pytest.mark.parametrize("task", [DMCTask("pendulum", "swingup"), GymnasiumTask("HalfCheetah-v5")])
+def test_a_step_outside_an_episode_is_refused(task):
+    env = make_env(task, size=None, length=1)
+    action = np.zeros(env.action_dim, np.float32)
+    for _ in range(2):
+        with pytest.raises(UserError, match=r"no episode has begun, or it is over: call reset\(\) before the next"):
+            env.step(action)
+        env.reset(0)
+        env.step(action)
+
+
+@pytest.mark.parametrize("task", [TASKS["walker_walk"], GymnasiumTask("HalfCheetah-v5")])
+def test_a_rendering_that_does_not_exist_is_refused_for_every_task(task):
+    with pytest.raises(UserError, match="unknown rendering 'quick': choose one of fast, exact"):
+        make_env(task, "quick")
