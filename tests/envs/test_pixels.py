@@ -28,7 +28,7 @@ def test_bounds_that_bound_nothing_are_refused_in_every_dtype(dtype):
     one = np.ones(2, dtype)
     check_bounds("it", -one, one)
     for far in (np.inf, np.nan, *([1e10] if dtype != np.float16 else [])):
-        with pytest.raises(UserError, match="it has actions from -1 to .*: only bounds within"):
+        with pytest.raises(UserError, match=r"it has actions from -1 to .*: only bounds within"):
             check_bounds("it", -one, np.array([1, far], dtype))
 
 
