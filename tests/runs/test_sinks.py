@@ -182,7 +182,8 @@ def test_a_killed_run_lacks_no_row_once_it_is_resumed(data, tmp_path):
     words += [word for name, value in changes.items() for word in (f"--{name.replace('_', '-')}", value)]
     command = [sys.executable, script, *words]
     unflushed = {"WANDB__TRANSACTION_LOG_FLUSH_INTERVAL": "0"}  # else a slow machine's wandb may have written them
-    environment = os.environ | {"PYTHONPATH": os.getcwd()} | unflushed
+    apart = {name: value for name, value in os.environ.items() if name != "WANDB_SERVICE"}  # a process of its own
+    environment = apart | {"PYTHONPATH": os.getcwd()} | unflushed
     killed = subprocess.run(list(map(str, command)), env=environment, capture_output=True)
     assert killed.returncode == -signal.SIGKILL, killed.stderr
     assert len(read_metrics(out / "metrics.jsonl")) == 40
