@@ -10,7 +10,7 @@ help: ## Show this list
 	@awk -F ':.*## ' '/^[a-z]+:.*## /{printf "  make %-8s %s\n", $$1, $$2}' $(MAKEFILE_LIST)
 
 setup: ## Install what the other commands need (they do it themselves)
-	@bash scripts/setup.sh
+	@bash tools/setup.sh
 
 demo: setup ## Every stage on a small set, ends with a table and a report
 	@$(BIN)/vd4rl-pomdp demo

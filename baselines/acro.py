@@ -17,7 +17,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
-from vd4rl_pomdp.objective import InverseOptions, StateInverse
+from vd4rl_pomdp.nn.objective import InverseOptions, StateInverse
 
 
 @dataclass(frozen=True)

@@ -27,15 +27,15 @@ import copy
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.core.options import Options
+from vd4rl_pomdp.core.types import Windows
+from vd4rl_pomdp.corruptions.augmentation import random_shift
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.contrastive import info_nce, share_found
 from vd4rl_pomdp.nn.draws import Draws
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.heads import move_target
-from vd4rl_pomdp.objective import Objective
-from vd4rl_pomdp.options import Options
-from vd4rl_pomdp.types import Windows
+from vd4rl_pomdp.nn.objective import Objective
 
 MOMENTUM = 0.05
 """Share of the encoder that its momentum copy takes over after every step."""

@@ -28,13 +28,13 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vd4rl_pomdp.core.options import Limits, Options
+from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.draws import Draws
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.heads import mlp
-from vd4rl_pomdp.objective import Objective
-from vd4rl_pomdp.options import Limits, Options
-from vd4rl_pomdp.types import Windows
+from vd4rl_pomdp.nn.objective import Objective
 
 
 class Bottleneck(nn.Module):

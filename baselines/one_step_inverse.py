@@ -12,7 +12,7 @@ Differences:
 
 from __future__ import annotations
 
-from vd4rl_pomdp.objective import StateInverse
+from vd4rl_pomdp.nn.objective import StateInverse
 
 
 class OneStepInverse(StateInverse):

@@ -11,11 +11,11 @@ import tyro
 
 from finetune.algorithms import ALGORITHMS
 from finetune.histories import HistoryOptions
-from vd4rl_pomdp.errors import MAX_SEED, refuse_outside
-from vd4rl_pomdp.options import NO_OPTIONS, Options, StageConfig
+from vd4rl_pomdp.core.errors import MAX_SEED, refuse_outside
+from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
+from vd4rl_pomdp.core.tasks import FRAME_SIZES, MOST_EPISODES
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
-from vd4rl_pomdp.tasks import FRAME_SIZES, MOST_EPISODES
 
 
 @dataclass(frozen=True, kw_only=True)

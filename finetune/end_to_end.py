@@ -22,9 +22,9 @@ from torch import Tensor
 from finetune.algorithms import Algorithm
 from finetune.config import FinetuneConfig
 from finetune.features import FeatureBatch
+from vd4rl_pomdp.core.types import Transitions
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.runs.device import autocast
-from vd4rl_pomdp.types import Transitions
 
 
 class EndToEnd:

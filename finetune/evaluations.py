@@ -12,18 +12,18 @@ import numpy as np
 from finetune.algorithms import Algorithm
 from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd
+from finetune.evaluation import EpisodeJob, episode_rows, evaluate, own_and_none
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import EpisodeJob, episode_rows, evaluate, own_and_none
+from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.nn.encoder_folder import EncoderCard, save_encoder
-from vd4rl_pomdp.reference import Reference
 from vd4rl_pomdp.runs import EPISODES_FILE, FILM_FILE, interrupt
 from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import Row, replacing_file
 from vd4rl_pomdp.runs.loop import Loop
 from vd4rl_pomdp.runs.metrics import EVALUATION
 from vd4rl_pomdp.runs.run import remedy
-from vd4rl_pomdp.tasks import TASKS
 
 POLICY = ("policy/config.json", "policy/model.safetensors")
 """A policy's files, below the folder of its run."""

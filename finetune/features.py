@@ -13,19 +13,19 @@ import torch
 from torch import Tensor
 
 from finetune.histories import Histories, HistoryOptions, draw_lengths, read_both_ends, read_whole
+from vd4rl_pomdp.core.errors import disk_errors
+from vd4rl_pomdp.core.options import Options
+from vd4rl_pomdp.core.reading import regular
+from vd4rl_pomdp.core.types import Batch
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.data import Dataset, View
 from vd4rl_pomdp.data.samplers import Sampler
-from vd4rl_pomdp.errors import disk_errors
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import StateFrame
-from vd4rl_pomdp.options import Options
-from vd4rl_pomdp.reading import regular
 from vd4rl_pomdp.runs import PROBE_FILE
 from vd4rl_pomdp.runs.device import Precision, autocast
 from vd4rl_pomdp.runs.files import read_json, replacing_file, sha256, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
-from vd4rl_pomdp.types import Batch
 
 CHUNK = 128
 """Rows that go through the frame encoder at once."""

@@ -15,11 +15,11 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core.errors import UserError, flag_of
+from vd4rl_pomdp.core.options import Limits, Options
+from vd4rl_pomdp.core.seeding import stream_generator
 from vd4rl_pomdp.data import Dataset
-from vd4rl_pomdp.errors import UserError, flag_of
 from vd4rl_pomdp.nn.encoder import Encoder, Readout
-from vd4rl_pomdp.options import Limits, Options
-from vd4rl_pomdp.seeding import stream_generator
 
 
 @dataclass(frozen=True)

@@ -8,11 +8,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core.tasks import TASKS, DMCTask
 from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.envs.dmc import observed_states
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.policies.actor import Actor
-from vd4rl_pomdp.tasks import TASKS, DMCTask
 
 EPISODES = 20
 """Episodes that the error is measured on, evenly spaced among those of a set that hold a decision."""

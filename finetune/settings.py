@@ -11,10 +11,10 @@ from finetune.algorithms import ReturnOptions
 from finetune.config import FinetuneConfig
 from finetune.features import feature_type
 from finetune.histories import Histories
+from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_number
+from vd4rl_pomdp.core.options import NO_OPTIONS, flat
 from vd4rl_pomdp.data import Dataset
-from vd4rl_pomdp.errors import UserError, flag_of, refuse_number
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.options import NO_OPTIONS, flat
 from vd4rl_pomdp.runs.memory import require_disk, require_memory
 
 

@@ -19,12 +19,16 @@ from finetune.features import STAGE, ExactSampler, FeatureFile, FeatureSampler, 
 from finetune.histories import Histories, HistoryOptions
 from finetune.path import DataPath
 from finetune.settings import as_trained, check_n_step, require_room, return_options
+from vd4rl_pomdp.core.errors import refuse_number, refuse_outside
+from vd4rl_pomdp.core.registry import warn_of_other_code
+from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
+from vd4rl_pomdp.core.tasks import TASKS, UNKNOWN_QUALITY
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.data.format import read_plan, warn_of_earlier_pictures
 from vd4rl_pomdp.data.parity import render_info
+from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.envs.make import layout_of
-from vd4rl_pomdp.errors import refuse_number, refuse_outside
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import (
     FILES_OF_RUN,
@@ -36,10 +40,8 @@ from vd4rl_pomdp.nn.encoder_folder import (
     tell_probe,
 )
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.nn.probes import probe_state
 from vd4rl_pomdp.policies.actor import read_actor
-from vd4rl_pomdp.probes import probe_state
-from vd4rl_pomdp.reference import Reference
-from vd4rl_pomdp.registry import warn_of_other_code
 from vd4rl_pomdp.runs import LABELS_FILE, PRETRAIN_TIMING_FILE, PROBE_FILE, RENDER_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import read_json, write_json
@@ -47,8 +49,6 @@ from vd4rl_pomdp.runs.loop import training
 from vd4rl_pomdp.runs.memory import telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
-from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.tasks import TASKS, UNKNOWN_QUALITY
 
 RESULTS = (*POLICY, *FILES_OF_RUN)
 """What a finished run holds, beside the rows of its evaluations."""

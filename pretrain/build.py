@@ -11,14 +11,14 @@ import numpy as np
 from pretrain.config import MemoryOptions, TrainingConfig
 from pretrain.objectives import METHODS, Method
 from pretrain.objectives.untrained import StateOptions
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import Options, flat
+from vd4rl_pomdp.core.state_scale import StateScale
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.nn.action_target import ActionTarget, make_action_target
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE, encoder_settings
-from vd4rl_pomdp.objective import ActionOptions, Objective
-from vd4rl_pomdp.options import Options, flat
-from vd4rl_pomdp.state_scale import StateScale
-from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
+from vd4rl_pomdp.nn.objective import ActionOptions, Objective
 
 
 def build_target(config: TrainingConfig, actions: np.ndarray) -> ActionTarget | None:

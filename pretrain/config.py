@@ -10,11 +10,11 @@ from typing import Annotated, Any, ClassVar, Literal
 import tyro
 
 from pretrain.objectives import METHODS, Method
+from vd4rl_pomdp.core.errors import MAX_SEED, UserError, flag_of, refuse_outside, refuse_unknown
+from vd4rl_pomdp.core.options import NO_OPTIONS, Limits, Options, StageConfig
 from vd4rl_pomdp.corruptions import NO_CORRUPTION, CorruptionConfig
-from vd4rl_pomdp.errors import MAX_SEED, UserError, flag_of, refuse_outside, refuse_unknown
 from vd4rl_pomdp.nn.encoder import MAX_LAYERS
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS
-from vd4rl_pomdp.options import NO_OPTIONS, Limits, Options, StageConfig
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
 

@@ -10,13 +10,17 @@ import torch
 from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
+from vd4rl_pomdp.core.errors import UserError, refuse_outside
+from vd4rl_pomdp.core.options import flat
+from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
+from vd4rl_pomdp.core.settings import settings_of
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_SIZES, FRAME_STACK, TASKS, UNKNOWN_QUALITY
+from vd4rl_pomdp.core.types import StateWindows, Windows
 from vd4rl_pomdp.corruptions import check_corruption_fits
 from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
 from vd4rl_pomdp.envs.make import layout_of
-from vd4rl_pomdp.errors import UserError, refuse_outside
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, EncoderCard, save_encoder
-from vd4rl_pomdp.objective import Objective, require_loss
-from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.nn.objective import Objective, require_loss
 from vd4rl_pomdp.runs import METRICS_FILE
 from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.loop import training
@@ -24,10 +28,6 @@ from vd4rl_pomdp.runs.memory import bytes_kept, bytes_of_parameters, require_mem
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
-from vd4rl_pomdp.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.settings import settings_of
-from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_SIZES, FRAME_STACK, TASKS, UNKNOWN_QUALITY
-from vd4rl_pomdp.types import StateWindows, Windows
 
 STAGE = "pretrain"
 DECIDE_MEMORY = ("batch_size", "window", "feature_dim", "hidden_dim", "head_dim", "codes", "homer_codes")

@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.types import StepType
 
 
 def fake_frame(episode: int, t: int) -> np.ndarray:

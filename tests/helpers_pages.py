@@ -12,7 +12,7 @@ import pytest
 
 import finetune.algorithms  # noqa: F401 (a kind's registry is made where its parts are)
 import pretrain.objectives  # noqa: F401
-from vd4rl_pomdp.registry import REGISTRIES
+from vd4rl_pomdp.core.registry import REGISTRIES
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = {f"my_{page.stem.split('_', 2)[2]}.py": page for page in sorted(DOCS.glob("add_a*.md"))}

@@ -11,12 +11,12 @@ import torch
 from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
 from pretrain.train import PretrainTrainer
+from vd4rl_pomdp.core.seeding import seed_networks
+from vd4rl_pomdp.core.tasks import FRAME_STACK
+from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.probes import probe_error
-from vd4rl_pomdp.seeding import seed_networks
-from vd4rl_pomdp.tasks import FRAME_STACK
-from vd4rl_pomdp.types import StepType
+from vd4rl_pomdp.nn.probes import probe_error
 
 SIZE, LOW, HIGH, STEP, RADIUS = 32, 8, 24, 6.0, 2.6
 EPISODES, ROWS = 24, 40

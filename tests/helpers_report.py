@@ -8,13 +8,13 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.reference import Reference
+from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.report.tables import label
-from vd4rl_pomdp.results import Result, write_results
 from vd4rl_pomdp.runs.episodes import append_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.identity import identity
+from vd4rl_pomdp.runs.results import Result, write_results
 
 
 def write_run(

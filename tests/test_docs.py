@@ -16,10 +16,10 @@ from tests.helpers_data import write_fake_set
 from tests.helpers_pages import PAGES as EXAMPLES
 from tests.helpers_pages import isolated_registries, load_example
 from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.registry import REGISTRIES
+from vd4rl_pomdp.core.tasks import QUALITIES, TASKS
 from vd4rl_pomdp.corruptions import make_corruption
-from vd4rl_pomdp.mazes import get_maze
-from vd4rl_pomdp.registry import REGISTRIES
-from vd4rl_pomdp.tasks import QUALITIES, TASKS
+from vd4rl_pomdp.envs.mazes import get_maze
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -38,7 +38,7 @@ NOT_RUN = {
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
     "vd4rl-pomdp policy": "trains for hours; tests/policies trains less",
     "vd4rl-pomdp control-study": "trains for minutes; experiments/control trains less",
-    "vd4rl-pomdp navigation": "trains for minutes to days; pretrain/navigation/test_train trains less",
+    "vd4rl-pomdp navigation": "trains for minutes to days; vd4rl_pomdp/studies/navigation/test_train trains less",
     "vd4rl-pomdp report": "the README's is run; tests/report makes all others",
     "vd4rl-pomdp results add": "tests/results adds runs",
     "vd4rl-pomdp pretrain --method": "pretrain/test_train runs every method in its smoke size",

@@ -18,7 +18,7 @@ from tests.helpers_data import write_fake_set
 from tests.helpers_hub import TOKEN, Hub, Repo
 from tests.nn.test_encoder import CARD, make
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.hub import LISTING, Repository, pull, push
 from vd4rl_pomdp.nn import load_encoder, save_encoder
 from vd4rl_pomdp.nn.encoder_folder import encoder_hash

@@ -15,25 +15,25 @@ import torch
 
 import finetune.evaluations
 import finetune.features
-import pretrain.navigation.trainer
 import pretrain.train
+import vd4rl_pomdp.studies.navigation.trainer
 from finetune.algorithms import bc, td3_bc
 from finetune.train import finetune as run_finetune
-from pretrain.navigation.config import NavigationConfig
-from pretrain.navigation.probe import COMPONENTS
-from pretrain.navigation.train import train as run_navigation
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
+from vd4rl_pomdp.core.errors import InUseError, UserError
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.errors import InUseError, UserError
-from vd4rl_pomdp.navigation.measures import RAW_PREFIX
 from vd4rl_pomdp.runs import run as run_module
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.interrupt import Terminated
 from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
 from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.studies.navigation.config import NavigationConfig
+from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX
+from vd4rl_pomdp.studies.navigation.probe import COMPONENTS
+from vd4rl_pomdp.studies.navigation.train import train as run_navigation
 
 FINETUNE = {"updates": 12, "eval_every": 6, "checkpoint_every": 4, "batch_size": 4, "eval_length": 2, "log_every": 3}
 
@@ -86,7 +86,11 @@ def stage(request) -> Stage:
     if request.param == "navigation":
         given = {"steps": 8, "log_every": 4, "checkpoint_every": 4, "precision": "fp32"}
         config = NavigationConfig.of("smoke", data=request.getfixturevalue("maze"), **given)
-        return run_navigation, lambda out: replace(config, out=out), pretrain.navigation.trainer.NavigationTrainer
+        return (
+            run_navigation,
+            lambda out: replace(config, out=out),
+            vd4rl_pomdp.studies.navigation.trainer.NavigationTrainer,
+        )
     data = request.getfixturevalue("data")
     if request.param == "pretrain":
         return run_pretrain, lambda out: smoke_pretrain(data, out, method="no_history"), pretrain.train.PretrainTrainer
@@ -242,8 +246,8 @@ def test_a_run_that_another_process_writes_is_refused_by_every_stage(stage, tmp_
 
 def test_a_set_that_another_process_collects_is_refused(tmp_path):
     from vd4rl_pomdp.data import collect
-    from vd4rl_pomdp.navigation.collect import collect as collect_maze
-    from vd4rl_pomdp.navigation.config import PRESETS
+    from vd4rl_pomdp.studies.navigation.collect import collect as collect_maze
+    from vd4rl_pomdp.studies.navigation.sets import PRESETS
 
     configs = [
         (collect.collect, collect.CollectConfig("walker_walk", "random", tmp_path / "set", workers=1)),

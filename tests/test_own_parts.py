@@ -21,12 +21,12 @@ from tests.helpers_data import write_fake_set
 from tests.helpers_pages import isolated_registries, load_example, write_example
 from vd4rl_pomdp import testing
 from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import Options, flat
+from vd4rl_pomdp.core.registry import REGISTRIES
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.frame import FrameEncoderPart, FrameOptions
-from vd4rl_pomdp.objective import InverseOptions
-from vd4rl_pomdp.options import Options, flat
-from vd4rl_pomdp.registry import REGISTRIES
+from vd4rl_pomdp.nn.objective import InverseOptions
 from vd4rl_pomdp.report import write_report
 
 BY_CALL = "registered by a call"

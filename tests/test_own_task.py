@@ -15,22 +15,22 @@ import pytest
 
 import finetune.config
 import pretrain.config
+from finetune.evaluation import Episode, episode_rows, evaluate_run
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.card import EARLIER
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import read_shard
 from vd4rl_pomdp.envs.make import make_env
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import Episode, episode_rows, evaluate_run
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.policies.config import PolicyConfig, recipes
 from vd4rl_pomdp.policies.train import train_policy
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.runs.episodes import read_episodes
-from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask
 
 PAGE = Path(__file__).parents[1] / "docs" / "add_a_task.md"
 CODE = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)[0]

@@ -23,9 +23,9 @@ from torch import nn
 from finetune.algorithms import BC
 from pretrain.objectives import Method
 from vd4rl_pomdp.nn.frame import FrameEncoderPart, FrameOptions
-from vd4rl_pomdp.objective import InverseOptions, StateInverse
-from vd4rl_pomdp.options import Options
-from vd4rl_pomdp.tasks import GymnasiumTask
+from vd4rl_pomdp.nn.objective import InverseOptions, StateInverse
+from vd4rl_pomdp.core.options import Options
+from vd4rl_pomdp.core.tasks import GymnasiumTask
 
 
 @dataclass(frozen=True)
@@ -181,7 +181,8 @@ def file_hash(place: Path) -> str:
 
 
 def test_another_version_of_a_package_is_other_code_and_so_is_another_file(python, tmp_path):
-    asked = "from vd4rl_pomdp.registry import *; from pretrain.objectives import METHODS; named = {'method': 'sharp'}; "
+    asked = "from vd4rl_pomdp.core.registry import *; from pretrain.objectives import METHODS; "
+    asked += "named = {'method': 'sharp'}; "
     told = python("-c", f"{asked}print({{'plugins': origins(named), 'sources': sources(named)}})")
     assert (
         told

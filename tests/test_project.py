@@ -5,7 +5,7 @@ import re
 import shutil
 import subprocess
 import tomllib
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from graphlib import TopologicalSorter
 from importlib.metadata import requires
 from pathlib import Path
@@ -21,55 +21,20 @@ ROOT = Path(__file__).parents[1]
 PACKAGES = ("vd4rl_pomdp", "pretrain", "finetune", "baselines")
 PACKAGE, OURS = ROOT / "vd4rl_pomdp", "vd4rl_pomdp."
 SOURCES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
+ROOF = ("cli", "sweeps", "studies", "theory", "testing", "bench", "hub")
+"""Rooms of vd4rl_pomdp that may import everything; the stages and the other rooms, the ground, import none of them."""
 MAY_IMPORT = {
-    "vd4rl_pomdp": {"vd4rl_pomdp"},
-    "baselines": {"baselines", "vd4rl_pomdp"},
-    "pretrain": {"pretrain", "baselines", "vd4rl_pomdp"},
-    "finetune": {"finetune", "vd4rl_pomdp"},
+    "baselines": {"baselines"},
+    "pretrain": {"pretrain", "baselines"},
+    "finetune": {"finetune"},
+    "ground": set(),
 }
-MAY_CALL_STAGES = (
-    *("vd4rl_pomdp/cli/", "vd4rl_pomdp/sweeps/", "vd4rl_pomdp/testing/"),
-    *("vd4rl_pomdp/experiments/bench/", "vd4rl_pomdp/experiments/control/"),
-)
-"""Folders whose functions call the stages, and import them there: what is not called is not loaded."""
-MAY_LOOK_UP = {
-    *(("runs.outputs", "data"), ("runs.run", "data"), ("envs.finite", "theory"), ("experiments.demo", "sweeps")),
-    *(("sweeps.stages", "cli"), ("sweeps.worker", "cli")),
-}
-"""Modules that import from a floor above their own, see docs/structure.md."""
-JUDGES = "vd4rl_pomdp.experiments"
-"""What judges runs: the command line alone imports it."""
-JUDGES_MAZES_BY = ("errors", "experiments.navigation", "mazes", "navigation.config")
-JUDGES_MAZES_BY += (
-    "navigation.measures",
-    "navigation.methods",
-    "options",
-    "reading",
-    "report.stats",
-    "results",
-    "runs",
-    "settings",
-    "text",
-)
-"""What the navigation tables are made with: files, names and settings; no data, no environment and no network."""
+"""Of the stages' packages, what a package imports; the ground everybody does."""
 
 
 def everywhere(tree: ast.AST) -> set[str]:
     """Names of the modules that a module imports, whenever it does."""
     return _names(ast.walk(tree))
-
-
-def at_load(tree: ast.AST) -> set[str]:
-    """Names of the modules that are imported with a module: in no function, and not for types alone."""
-    return _names(_outside_functions(tree))
-
-
-def _outside_functions(tree: ast.AST) -> Iterator[ast.AST]:
-    for node in ast.iter_child_nodes(tree):
-        yield node
-        types_alone = isinstance(node, ast.If) and ast.unparse(node.test) == "TYPE_CHECKING"
-        if not types_alone and not isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
-            yield from _outside_functions(node)
 
 
 def _names(nodes: Iterable[ast.AST]) -> set[str]:
@@ -82,30 +47,22 @@ def _names(nodes: Iterable[ast.AST]) -> set[str]:
     return names
 
 
-def importers(of: str) -> list[str]:
-    """Files outside a package, given by its dotted name, that import it."""
-    inside = of.replace(".", "/") + "/"
-    names = {path.relative_to(ROOT).as_posix(): everywhere(ast.parse(path.read_text())) for path in SOURCES}
-    return [
-        file for file in names if not file.startswith(inside) and any(f"{n}.".startswith(f"{of}.") for n in names[file])
-    ]
+def room(module: str) -> str:
+    """The package of a module; of vd4rl_pomdp roof or ground."""
+    package, _, rest = module.partition(".")
+    return package if package != "vd4rl_pomdp" else "roof" if rest.split(".")[0] in ROOF else "ground"
 
 
-def test_layers_import_only_what_is_below_them():
+def test_the_ground_knows_nothing_of_what_stands_on_it():
     wrong = []
     for path in SOURCES:
-        name, tree = path.relative_to(ROOT).as_posix(), ast.parse(path.read_text())
-        imported = at_load(tree) if name.startswith(MAY_CALL_STAGES) else everywhere(tree)
-        packages = {module.split(".")[0] for module in imported} & set(PACKAGES)
-        wrong += [f"{name} imports {other}" for other in sorted(packages - MAY_IMPORT[name.split("/")[0]])]
+        name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
+        others = {
+            room(module) for module in everywhere(ast.parse(path.read_text())) if module.split(".")[0] in PACKAGES
+        }
+        if room(name) != "roof" and not name.endswith("__main__"):
+            wrong += [f"{name} imports {other}" for other in others - MAY_IMPORT[room(name)] - {"ground"}]
     assert wrong == []
-
-
-def test_an_import_counts_unless_it_waits_for_a_call_or_is_for_types():
-    source = "import a\nif b: import c\nif TYPE_CHECKING: import d\nclass E:\n    from f import g\n"
-    tree = ast.parse(source + "    def h(self):\n        import i\n")
-    assert at_load(tree) == {"a", "c", "f.g"}
-    assert everywhere(tree) == {"a", "c", "d", "f.g", "i"}
 
 
 def test_nothing_but_tests_imports_pytest():
@@ -122,38 +79,6 @@ def test_no_modules_import_each_other_in_a_circle():
         imported = {name if name in modules else name.rpartition(".")[0] for name in names}
         graph[module] = imported & modules.keys() - {module}
     TopologicalSorter(graph).prepare()  # names the circle, if there is one
-
-
-def test_modules_import_from_their_floor_and_those_below_it():
-    page = (ROOT / "docs" / "structure.md").read_text().split("from the bottom up:")[1]
-    rows = [re.sub(r"\(.*?\)", "", line) for line in page.splitlines() if line.startswith("| ")][1:]
-    floor = {name: number for number, row in enumerate(rows) for name in re.findall(r"`(\w+)/?`", row)}
-    upwards = set()
-    for path in (path for path in SOURCES if path.is_relative_to(PACKAGE) and not path.match("vd4rl_pomdp/__*__.py")):
-        own = path.relative_to(PACKAGE).with_suffix("").parts
-        others = {name.split(".")[1] for name in everywhere(ast.parse(path.read_text())) if name.startswith(OURS)}
-        upwards |= {(".".join(own), name) for name in others & floor.keys() if floor[name] > floor[own[0]]}
-    assert upwards == MAY_LOOK_UP
-    assert all(f"`{own}`" in page for own, _ in upwards)
-
-
-def test_what_judges_runs_is_imported_by_the_command_line_alone():
-    assert [name for name in importers(JUDGES) if not name.startswith("vd4rl_pomdp/cli/")] == []
-
-
-def test_environments_know_nothing_of_data():
-    assert [name for name in importers("vd4rl_pomdp.data") if name.startswith("vd4rl_pomdp/envs/")] == []
-
-
-def test_the_navigation_tables_are_made_from_files():
-    allowed = tuple(f"vd4rl_pomdp.{name}." for name in JUDGES_MAZES_BY)
-    wrong = []
-    for path in (ROOT / "vd4rl_pomdp" / "experiments" / "navigation").glob("*.py"):
-        ours = {
-            f"{n}." for n in everywhere(ast.parse(path.read_text())) if n.split(".")[0] in (*PACKAGES, "torch", "h5py")
-        }
-        wrong += [f"{path.name} imports {name}" for name in sorted(ours) if not name.startswith(allowed)]
-    assert wrong == []
 
 
 def test_every_module_says_what_it_is():
@@ -236,7 +161,7 @@ def test_every_flag_of_the_table_of_choices_exists():
 
     from finetune.config import FinetuneConfig
     from pretrain.config import PretrainConfig
-    from vd4rl_pomdp.options import option_names
+    from vd4rl_pomdp.core.options import option_names
 
     settings = {f.name for config in (PretrainConfig, FinetuneConfig) for f in fields(config)} | option_names()
     flags = {name.replace("_", "-") for name in settings}
@@ -248,10 +173,10 @@ def test_every_flag_of_the_table_of_choices_exists():
 def test_every_flag_of_the_navigation_page_exists():
     from dataclasses import fields
 
-    from pretrain.navigation.config import NavigationConfig
     from vd4rl_pomdp.cli.sweeps import RunCommand
-    from vd4rl_pomdp.navigation.config import MazeCollectConfig
-    from vd4rl_pomdp.options import option_names
+    from vd4rl_pomdp.core.options import option_names
+    from vd4rl_pomdp.studies.navigation.config import NavigationConfig
+    from vd4rl_pomdp.studies.navigation.sets import MazeCollectConfig
 
     configs = (NavigationConfig, MazeCollectConfig, RunCommand)
     flags = {name.replace("_", "-") for c in configs for name in ({f.name for f in fields(c)} | option_names())}

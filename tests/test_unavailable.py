@@ -17,28 +17,28 @@ from PIL import Image
 
 from finetune.features import FeatureFile
 from tests.helpers_data import write_fake_set
-from tests.navigation.test_exogenous import python_batch
 from tests.nn.test_encoder import CARD, make
+from tests.studies.navigation.test_exogenous import python_batch
 from vd4rl_pomdp.cli.ends import run_to_end
+from vd4rl_pomdp.core.errors import UnavailableError, UserError, system_error
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows
 from vd4rl_pomdp.data.store import verify_store
-from vd4rl_pomdp.errors import UnavailableError, UserError, system_error
-from vd4rl_pomdp.experiments.navigation.runs import read_trajectory
 from vd4rl_pomdp.hub import LISTING, Repository
 from vd4rl_pomdp.hub.contents import Listing
-from vd4rl_pomdp.navigation.exogenous import _read_cifar, _read_image, load_pool, source_fingerprint
-from vd4rl_pomdp.navigation.first_person import _refuse_other
 from vd4rl_pomdp.nn import load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
 from vd4rl_pomdp.policies.actor import ASSETS, read_actor, read_ladder
 from vd4rl_pomdp.policies.export import CURVE, read_curve
 from vd4rl_pomdp.report.load import FILM, FILM_FILE, LoadedRun
-from vd4rl_pomdp.results.folder import RUNS, _lines
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import read_csv
 from vd4rl_pomdp.runs.outputs import kept_in
+from vd4rl_pomdp.runs.results.folder import RUNS, _lines
+from vd4rl_pomdp.studies.navigation.exogenous import _read_cifar, _read_image, load_pool, source_fingerprint
+from vd4rl_pomdp.studies.navigation.first_person import _refuse_other
+from vd4rl_pomdp.studies.navigation.runs import read_trajectory
 from vd4rl_pomdp.sweeps.folder import _read_plan
 
 ADVICE = ("damaged", "truncated", "delete", "download", "collect", "remove", "train", "replace", "another copy")

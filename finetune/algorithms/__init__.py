@@ -7,8 +7,8 @@ from finetune.algorithms.bc import BC
 from finetune.algorithms.drqv2_bc import DrQv2BC
 from finetune.algorithms.iql import IQL, IQLOptions
 from finetune.algorithms.td3_bc import TD3BC, TD3BCOptions
-from vd4rl_pomdp.options import refuse_options
-from vd4rl_pomdp.registry import Registry
+from vd4rl_pomdp.core.options import refuse_options
+from vd4rl_pomdp.core.registry import Registry
 
 __all__ = [
     "ALGORITHMS",

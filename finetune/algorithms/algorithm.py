@@ -12,10 +12,10 @@ from torch import Tensor
 from torch.optim import Optimizer
 
 from finetune.features import FeatureBatch
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import Limits, Options
+from vd4rl_pomdp.nn.objective import is_scalar
 from vd4rl_pomdp.nn.policy import Policy
-from vd4rl_pomdp.objective import is_scalar
-from vd4rl_pomdp.options import Limits, Options
 from vd4rl_pomdp.runs.device import Precision, autocast
 
 

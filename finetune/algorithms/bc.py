@@ -25,8 +25,8 @@ import torch.nn.functional as F
 from finetune.algorithms.algorithm import Loss, NoisyAlgorithm
 from finetune.algorithms.noise import noise_at, with_noise
 from finetune.features import FeatureBatch
+from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.nn.policy import Policy
-from vd4rl_pomdp.options import Options
 
 
 class BC(NoisyAlgorithm):

@@ -33,9 +33,9 @@ from torch import Tensor, nn
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
 from finetune.algorithms.critic import TwinCritic
 from finetune.features import FeatureBatch
+from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp, move_target
 from vd4rl_pomdp.nn.policy import Policy
-from vd4rl_pomdp.options import Limits, Options
 
 MOST_WEIGHT = 100.0
 LOG_STD_RANGE = -5.0, 2.0

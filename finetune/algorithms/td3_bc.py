@@ -22,9 +22,9 @@ from torch import Tensor
 from finetune.algorithms.algorithm import Loss, NoisyAlgorithm, ReturnOptions
 from finetune.algorithms.critic import TwinCritic
 from finetune.features import FeatureBatch
+from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.nn.heads import move_target
 from vd4rl_pomdp.nn.policy import Policy
-from vd4rl_pomdp.options import Limits, Options
 
 TARGET_NOISE, NOISE_CLIP = 0.2, 0.5
 

@@ -12,11 +12,11 @@ from pretrain.objectives.forward_jump import ForwardJump
 from pretrain.objectives.masked_inverse import MaskedActionOptions, MaskedInverse, MaskedOptions
 from pretrain.objectives.supervised import Supervised, SupervisedOptions
 from pretrain.objectives.untrained import StateOptions, Untrained
-from vd4rl_pomdp.augmentation import Sharing
-from vd4rl_pomdp.errors import UserError, refuse_unknown
-from vd4rl_pomdp.objective import ActionOptions, InverseObjective, InverseOptions, Objective
-from vd4rl_pomdp.options import Options, refuse_options
-from vd4rl_pomdp.registry import Registry
+from vd4rl_pomdp.core.errors import UserError, refuse_unknown
+from vd4rl_pomdp.core.options import Options, refuse_options
+from vd4rl_pomdp.core.registry import Registry
+from vd4rl_pomdp.corruptions.augmentation import Sharing
+from vd4rl_pomdp.nn.objective import ActionOptions, InverseObjective, InverseOptions, Objective
 
 
 @dataclass(frozen=True)

@@ -16,7 +16,7 @@ Differences and readings:
 
 from __future__ import annotations
 
-from vd4rl_pomdp.objective import StateInverse
+from vd4rl_pomdp.nn.objective import StateInverse
 
 
 class AllHistory(StateInverse):

@@ -19,7 +19,7 @@ from __future__ import annotations
 
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.objective import ActionOptions, StateInverse
+from vd4rl_pomdp.nn.objective import ActionOptions, StateInverse
 
 
 class ForwardJump(StateInverse):

@@ -29,13 +29,13 @@ from typing import ClassVar, Literal
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import Limits
+from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.objective import InverseObjective, InverseOptions
 from vd4rl_pomdp.nn.sequence import run_gru_backward, run_gru_over_next, run_gru_over_versions
-from vd4rl_pomdp.objective import InverseObjective, InverseOptions
-from vd4rl_pomdp.options import Limits
-from vd4rl_pomdp.types import Windows
 
 
 @dataclass(frozen=True)

@@ -15,13 +15,13 @@ from typing import ClassVar
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import Limits, Options
+from vd4rl_pomdp.core.state_scale import StateScale
+from vd4rl_pomdp.core.types import StateWindows, Windows
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.heads import mlp
-from vd4rl_pomdp.objective import Objective
-from vd4rl_pomdp.options import Limits, Options
-from vd4rl_pomdp.state_scale import StateScale
-from vd4rl_pomdp.types import StateWindows, Windows
+from vd4rl_pomdp.nn.objective import Objective
 
 
 @dataclass(frozen=True)

@@ -13,11 +13,11 @@ from typing import ClassVar
 
 from torch import Tensor
 
+from vd4rl_pomdp.core.options import Limits, Options
+from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.objective import Objective
-from vd4rl_pomdp.options import Limits, Options
-from vd4rl_pomdp.types import Windows
+from vd4rl_pomdp.nn.objective import Objective
 
 
 @dataclass(frozen=True)

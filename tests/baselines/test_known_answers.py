@@ -7,10 +7,10 @@ import pytest
 import torch
 
 from baselines import CURL, DRIML, HOMER, DRIMLOptions, HOMEROptions
+from vd4rl_pomdp.core.options import Options
+from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.contrastive import info_nce, share_found
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
-from vd4rl_pomdp.options import Options
-from vd4rl_pomdp.types import Windows
 
 STATES = 4
 

@@ -4,7 +4,7 @@ import pytest
 
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.cli.parts import summary_of
-from vd4rl_pomdp.registry import REGISTRIES
+from vd4rl_pomdp.core.registry import REGISTRIES
 
 
 def test_every_part_has_a_line_that_says_what_it_is(capsys):

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from finetune.algorithms import ALGORITHMS, BC, TD3BC, Loss
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.testing import check_algorithm, check_corruption
 from vd4rl_pomdp.testing.algorithms import (
     CHECKS,

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 import pytest
 import torch
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.corruptions import CORRUPTIONS, STAGES, Patch
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.options import Options
 from vd4rl_pomdp.testing import check_corruption
 from vd4rl_pomdp.testing.contract import run_check
 from vd4rl_pomdp.testing.corruptions import (

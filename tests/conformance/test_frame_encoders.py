@@ -6,7 +6,7 @@ import pytest
 import torch
 from torch import nn
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, FrameEncoderPart
 from vd4rl_pomdp.testing import check_frame_encoder
 from vd4rl_pomdp.testing.contract import run_check

@@ -6,8 +6,8 @@ import pytest
 import torch
 
 from pretrain.objectives import METHODS, Method
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.objective import InverseObjective, InverseOptions, Objective, StateInverse
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.nn.objective import InverseObjective, InverseOptions, Objective, StateInverse
 from vd4rl_pomdp.testing import check_method
 from vd4rl_pomdp.testing.contract import run_check
 from vd4rl_pomdp.testing.methods import (

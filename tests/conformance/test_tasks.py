@@ -6,13 +6,13 @@ import gymnasium
 import numpy as np
 import pytest
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask, Layout
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.envs import dmc
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
 from vd4rl_pomdp.envs.gym import GymEnv
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask, Layout
 from vd4rl_pomdp.testing import check_task
 from vd4rl_pomdp.testing.contract import run_check
 from vd4rl_pomdp.testing.tasks import (

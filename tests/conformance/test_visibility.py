@@ -10,12 +10,12 @@ import pytest
 import torch
 
 from pretrain.objectives import METHODS
-from vd4rl_pomdp.objective import InverseObjective
+from vd4rl_pomdp.core.types import Windows
+from vd4rl_pomdp.nn.objective import InverseObjective
+from vd4rl_pomdp.nn.visibility import declared, dependence, response, wrong_pairs
 from vd4rl_pomdp.testing.contract import run_check
 from vd4rl_pomdp.testing.methods import ROWS, claim_visibility, predictions_depend_on_what_is_declared, predicts_actions
 from vd4rl_pomdp.testing.methods import build_inverse as inverse
-from vd4rl_pomdp.types import Windows
-from vd4rl_pomdp.visibility import declared, dependence, response, wrong_pairs
 
 INVERSE = [name for name in METHODS if predicts_actions(name)]
 OPTIONS = [

@@ -15,9 +15,9 @@ from functools import cache
 import pytest
 
 from pretrain.objectives import METHODS
-from vd4rl_pomdp.objective import InverseObjective
+from vd4rl_pomdp.nn.objective import InverseObjective
+from vd4rl_pomdp.nn.visibility import declared, dependence, response
 from vd4rl_pomdp.testing.methods import ROWS, build_inverse, predicts_actions
-from vd4rl_pomdp.visibility import declared, dependence, response
 
 INSIDE, END, SHORT = 0, 1, 2
 LENGTHS = [ROWS, ROWS, 4]

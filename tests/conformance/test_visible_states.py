@@ -13,7 +13,7 @@ from pretrain.objectives import METHODS
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.objective import InverseObjective
+from vd4rl_pomdp.nn.objective import InverseObjective
 from vd4rl_pomdp.testing.methods import ROWS, build_inverse
 
 MEMORIES: list[tuple[str, dict]] = [

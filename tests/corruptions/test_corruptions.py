@@ -5,9 +5,8 @@ import pytest
 import torch
 
 from tests.helpers_data import fake_rows
-from vd4rl_pomdp import _shift
-from vd4rl_pomdp._shift import shift_by_index, shift_by_lines
-from vd4rl_pomdp.augmentation import random_shift
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.corruptions import (
     CORRUPTIONS,
     STAGES,
@@ -15,15 +14,16 @@ from vd4rl_pomdp.corruptions import (
     CorruptionConfig,
     KeyStream,
     Patch,
+    _shift,
     derive_keys,
     draw_integers,
     make_corruption,
 )
+from vd4rl_pomdp.corruptions._shift import shift_by_index, shift_by_lines
+from vd4rl_pomdp.corruptions.augmentation import random_shift
 from vd4rl_pomdp.corruptions.corruption import Corruption
 from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.seeding import stream_seed
 
 
 def stacks(n: int = 64) -> torch.Tensor:

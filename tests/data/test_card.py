@@ -7,14 +7,14 @@ from matplotlib.axes import Axes
 from PIL import Image
 
 from tests.helpers_data import fake_reward, fake_rows, write_fake_set
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import QUALITIES, SET_QUALITIES, TASKS
+from vd4rl_pomdp.core.text import markdown
 from vd4rl_pomdp.data import card as module
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.data.published import published_scores
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import QUALITIES, SET_QUALITIES, TASKS
-from vd4rl_pomdp.text import markdown
 
 MADE = {"task": "cheetah_run", "set": "medium_replay", "policy": "medium_replay", "seed": 7, "render": "fast"}
 

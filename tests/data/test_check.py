@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 
 from tests.helpers_data import fake_reward, write_fake_set
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.check import check_dataset
-from vd4rl_pomdp.errors import UserError
 
 
 def true_replay(task, physics, actions):

@@ -7,13 +7,13 @@ import h5py
 import numpy as np
 import pytest
 
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data import collect as module
 from vd4rl_pomdp.data import open_dataset, parity
 from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import read_attributes, read_shard, shard_paths
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.envs.dmc import replay_rewards
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies import Actor, Ladder
 
 LENGTH = 5

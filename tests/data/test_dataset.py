@@ -6,10 +6,10 @@ import pytest
 import torch
 
 from tests.helpers_data import fake_action, fake_reward, fake_rows, frame_identity, write_fake_set
+from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError
+from vd4rl_pomdp.core.types import row_key
 from vd4rl_pomdp.data import TransitionSampler, View, WindowSampler, open_dataset
 from vd4rl_pomdp.data.format import shard_paths, write_shard
-from vd4rl_pomdp.errors import OutOfMemoryError, UserError
-from vd4rl_pomdp.types import row_key
 
 LENGTHS = (5, 3, 260)
 ROWS = [(e, t) for e, length in enumerate(LENGTHS) for t in range(length)]

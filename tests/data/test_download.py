@@ -8,12 +8,12 @@ from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 import pytest
 
 from tests.helpers_data import write_fake_set
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data import download as module
 from vd4rl_pomdp.data import manifest as listed
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.download import RemoteFile, download, manifest
 from vd4rl_pomdp.data.format import shard_paths
-from vd4rl_pomdp.errors import UserError
 
 CONTENT = {"0_a_expert.hdf5": bytes(range(256)) * 40, "1_a_expert.hdf5": b"second" * 999, "0_a_medium.hdf5": b"m" * 500}
 EXPERT = "walker_walk/expert/84px"

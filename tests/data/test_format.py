@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from tests.helpers_data import fake_rows, write_fake_set
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.format import read_attributes, read_dtypes, read_frames, read_shard, shard_paths, write_shard
-from vd4rl_pomdp.errors import UserError
 
 
 @pytest.fixture

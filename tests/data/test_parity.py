@@ -1,11 +1,11 @@
 import numpy as np
 import pytest
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.data import parity
 from vd4rl_pomdp.data.parity import canary_frames, check_parity, compare, render_info
 from vd4rl_pomdp.envs import rendering
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import TASKS
 
 
 @pytest.fixture(scope="module")

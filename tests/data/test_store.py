@@ -11,11 +11,11 @@ import numpy as np
 import pytest
 
 from tests.helpers_data import fake_rows, frame_identity, write_fake_set
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.data import store as store_module
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.data.store import PlayedStore, default_cache, open_store, verify_store
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.files import write_json
 
 fork = multiprocessing.get_context("fork")

@@ -4,11 +4,10 @@ import pytest
 import torch
 
 from tests.helpers_data import fake_action, write_fake_set
-from vd4rl_pomdp import _shift
-from vd4rl_pomdp.corruptions import CorruptionConfig, KeyStream
+from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.types import row_key, unpack_row_key
+from vd4rl_pomdp.corruptions import CorruptionConfig, KeyStream, _shift
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, WindowSampler, open_dataset
-from vd4rl_pomdp.seeding import stream_seed
-from vd4rl_pomdp.types import row_key, unpack_row_key
 
 LENGTHS = (9, 5)
 

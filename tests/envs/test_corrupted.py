@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 import torch
 
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn
-from vd4rl_pomdp.tasks import TASKS
 
 ROWS = 40
 

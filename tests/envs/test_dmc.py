@@ -4,10 +4,10 @@ import sys
 import numpy as np
 import pytest
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import EPISODE_TRANSITIONS, TASKS
+from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.envs.dmc import DMCEnv, observed_states, replay_rewards
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import EPISODE_TRANSITIONS, TASKS
-from vd4rl_pomdp.types import StepType
 
 
 def roll(env, seed, count, action_seed=0):
@@ -93,7 +93,7 @@ def test_an_unknown_task_is_refused():
 
 def test_another_process_renders_the_same_bytes():
     code = (
-        "import sys; from vd4rl_pomdp.envs.make import make_env; from vd4rl_pomdp.tasks import TASKS;"
+        "import sys; from vd4rl_pomdp.envs.make import make_env; from vd4rl_pomdp.core.tasks import TASKS;"
         "env = make_env(TASKS['walker_walk']);"
         "env.reset(9); env.reset(1); sys.stdout.buffer.write(env.step([0.3] * 6).frame.tobytes())"
     )

@@ -7,13 +7,13 @@ import torch
 from gymnasium.error import ResetNeeded
 from gymnasium.utils.env_checker import check_env
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.core.types import row_key
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys, make_corruption
 from vd4rl_pomdp.envs import FINITE_IDS, FINITE_STEPS, GYM_IDS, MAZE_STEPS
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.mazes import MAZES
-from vd4rl_pomdp.tasks import TASKS
-from vd4rl_pomdp.types import row_key
+from vd4rl_pomdp.envs.mazes import MAZES
 
 
 def make(name, **arguments):

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from PIL import Image
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask
+from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.envs.gym import GymEnv
 from vd4rl_pomdp.envs.gymnasium_task import area_means
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.envs.rendering import mujoco
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask
-from vd4rl_pomdp.types import StepType
 
 
 class Counter(gymnasium.Env):

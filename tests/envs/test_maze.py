@@ -8,11 +8,11 @@ import pytest
 from gymnasium.utils.env_checker import check_env
 
 import vd4rl_pomdp.envs
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.envs.maze import MazeEnv
 from vd4rl_pomdp.envs.maze_model import build_simulator
 from vd4rl_pomdp.envs.maze_sky import panorama, sky_texture
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.mazes import HARD, MAZES, get_maze
+from vd4rl_pomdp.envs.mazes import HARD, MAZES, get_maze
 
 CURTAINED = [name for name, spec in MAZES.items() if spec.curtains]
 FIRST_PERSON = [name for name, spec in MAZES.items() if spec.first_person]

@@ -3,10 +3,10 @@
 import numpy as np
 import pytest
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.envs.pixels import between, check_bounds
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask
 
 
 @pytest.mark.parametrize("dtype", [np.float16, np.float32, np.float64, np.longdouble])

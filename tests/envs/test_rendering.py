@@ -8,12 +8,12 @@ import sys
 import numpy as np
 import pytest
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.envs import rendering
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.envs.maze import MazeEnv
 from vd4rl_pomdp.envs.rendering import suite
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import TASKS
 
 
 @pytest.mark.parametrize("version", ["3.1.6", "3.2.7", "3.12.0", "4.0.0"])
@@ -44,7 +44,7 @@ def test_a_machine_without_opengl_gets_a_sentence(tmp_path):
 
 PLAY = """
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.tasks import TASKS, GymnasiumTask
+from vd4rl_pomdp.core.tasks import TASKS, GymnasiumTask
 
 TASKS.register("cheetah", GymnasiumTask("HalfCheetah-v5", decisions=2))
 if __name__ == "__main__":
@@ -116,7 +116,7 @@ def test_variables_that_any_library_below_reads_are_named(tmp_path, name, value,
 )
 def test_a_process_that_has_drawn_ends_without_a_word(order):
     code = (
-        "from vd4rl_pomdp.envs.make import make_env; from vd4rl_pomdp.tasks import TASKS, GymnasiumTask\n"
+        "from vd4rl_pomdp.envs.make import make_env; from vd4rl_pomdp.core.tasks import TASKS, GymnasiumTask\n"
         f"envs = [make_env(TASKS.get(name) or GymnasiumTask(name), size=16) for name in {order}]\n"
         "print(*(env.reset(0).frame.any() for env in envs))"
     )

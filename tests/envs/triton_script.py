@@ -6,8 +6,8 @@ from pathlib import Path
 import gymnasium
 
 import vd4rl_pomdp.envs  # noqa: F401 (registers the ids)
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.runs.workers import run_jobs
-from vd4rl_pomdp.tasks import TASKS
 
 NAMES = ["vd4rl_pomdp/WalkerWalk-v0", "vd4rl_pomdp/MazeOneCurtain-v0"]
 """One for each of two workers: only the first in a process tells anything."""
@@ -36,9 +36,9 @@ def stages() -> None:
 
     encoder = pretrain(PretrainConfig.of("smoke", data=data, out=Path("pretrain"))).path / "encoder"
     from finetune.config import FinetuneConfig
+    from finetune.evaluation import EpisodeJob, evaluate
     from finetune.train import finetune
     from vd4rl_pomdp.corruptions import CorruptionConfig
-    from vd4rl_pomdp.evaluation import EpisodeJob, evaluate
 
     shape = {"eval_episodes": 2, "eval_length": 4, "workers": 1}
     finetune(FinetuneConfig.of("smoke", encoder=encoder, data=data, out=Path("finetune"), **shape))

@@ -3,8 +3,8 @@
 import gymnasium
 import torch
 
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import TASKS, GymnasiumTask
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS, GymnasiumTask
 
 TASKS.register("half_cheetah", GymnasiumTask("HalfCheetah-v5"))
 

@@ -16,7 +16,7 @@ from finetune.algorithms.drqv2_bc import DrQv2BC
 from finetune.algorithms.iql import IQL, IQLOptions, expectile_loss
 from finetune.algorithms.td3_bc import TD3BC
 from finetune.features import FeatureBatch
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn.policy import Policy
 
 DIM, ACTIONS, SIZE = 3, 2, 32

@@ -7,11 +7,11 @@ import torch
 from finetune.features import ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories
 from tests.helpers_data import fake_action, fake_reward, fake_rows, write_fake_set
+from vd4rl_pomdp.core.options import NO_OPTIONS
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, load_encoder
-from vd4rl_pomdp.options import NO_OPTIONS
 
 LENGTHS, VIEWS, N, GAMMA = (6, 4), 3, 2, 0.5
 ROWS = [(e, t) for e, length in enumerate(LENGTHS) for t in range(length)]

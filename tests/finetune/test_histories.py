@@ -12,8 +12,8 @@ from finetune.train import finetune
 from pretrain.train import pretrain
 from tests.finetune.test_features import LENGTHS, ROWS, noise_set
 from tests.helpers_stages import smoke_finetune, smoke_pretrain
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, load_encoder
 
 N = 2

@@ -8,13 +8,13 @@ from finetune.path import DataPath
 from finetune.train import finetune
 from tests.helpers_data import fake_rows
 from tests.helpers_stages import smoke_finetune
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.envs.dmc import observed_states
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.policies import load_actor
-from vd4rl_pomdp.reference import Reference
-from vd4rl_pomdp.tasks import TASKS
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 ROWS = 12

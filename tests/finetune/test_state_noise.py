@@ -7,23 +7,23 @@ import numpy as np
 import pytest
 import torch
 
+from finetune.evaluation import EVALUATION_SEED, Agent, EpisodeJob, evaluate
 from finetune.features import ExactSampler, FeatureFile, FrozenEncoder, encode_views
 from finetune.histories import Histories
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import NO_OPTIONS
+from vd4rl_pomdp.core.state_scale import StateScale
+from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.core.types import row_key
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.corruptions.keys import draw_normals
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.evaluation import EVALUATION_SEED, Agent, EpisodeJob, evaluate
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.policy import Policy
-from vd4rl_pomdp.options import NO_OPTIONS
-from vd4rl_pomdp.state_scale import StateScale
-from vd4rl_pomdp.tasks import TASKS
-from vd4rl_pomdp.types import row_key
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 WALKER = TASKS.named("walker_walk")

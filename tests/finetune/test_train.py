@@ -11,17 +11,17 @@ import numpy as np
 import pytest
 
 from finetune import evaluations, train
+from finetune.evaluation import evaluate_run
 from finetune.features import FrozenEncoder
 from finetune.train import RESULTS
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_finetune, smoke_pretrain
-from vd4rl_pomdp import registry
+from vd4rl_pomdp.core import registry
+from vd4rl_pomdp.core.errors import InUseError, UserError
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
-from vd4rl_pomdp.errors import InUseError, UserError
-from vd4rl_pomdp.evaluation import evaluate_run
 from vd4rl_pomdp.nn import encoder_folder, load_encoder
 from vd4rl_pomdp.runs import memory
 from vd4rl_pomdp.runs.metrics import read_metrics

@@ -12,8 +12,8 @@ from finetune.algorithms.td3_bc import TD3BC
 from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd
 from finetune.features import FeatureBatch
+from vd4rl_pomdp.core.types import Transitions
 from vd4rl_pomdp.nn.policy import Policy
-from vd4rl_pomdp.types import Transitions
 
 DIM, ACTIONS, SIZE, UPDATES, PIXELS = 3, 2, 64, 20, 12
 BEGUN = {"drqv2_bc": 249_990, "bc": 249_990, "td3_bc": 0}

@@ -5,10 +5,10 @@ import pytest
 import torch
 from safetensors.torch import save_file
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn import Encoder, EncoderCard, EncoderConfig, load_encoder, save_encoder, sequence
 from vd4rl_pomdp.nn.sequence import run_gru_backward, run_gru_over_next, run_gru_over_versions
-from vd4rl_pomdp.types import Windows
 
 CARD = EncoderCard("mik+a", "walker_walk", "expert", {"corruption": "none"}, 0, 10, "smoke")
 

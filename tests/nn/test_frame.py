@@ -1,7 +1,7 @@
 import pytest
 import torch
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn.frame import FrameOptions, StateFrame, make_frame_encoder
 
 

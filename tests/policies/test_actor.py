@@ -5,11 +5,11 @@ import numpy as np
 import pytest
 from safetensors.numpy import save_file
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.policies import Actor, Ladder, actor, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.policies.actor import read_ladder
 from vd4rl_pomdp.policies.export import CARD_EPISODES, LADDER_RUNGS, episode_returns
-from vd4rl_pomdp.tasks import TASKS
 
 ACTORS = sorted(p.stem for p in actor.ASSETS.glob("*.json"))
 LADDERS = sorted(p.stem.removesuffix("_replay") for p in actor.ASSETS.glob("*_replay.safetensors"))

@@ -8,9 +8,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.policies import read_actor
-from vd4rl_pomdp.tasks import TASKS
 
 SETTINGS = {
     "mlp": {"critic_norm": True, "n_step": 3, "envs": 2, "updates_per_decision": 0.5},

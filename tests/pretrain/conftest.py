@@ -3,8 +3,8 @@ from pathlib import Path
 
 import pytest
 
-from vd4rl_pomdp.navigation.collect import collect
-from vd4rl_pomdp.navigation.config import PRESETS
+from vd4rl_pomdp.studies.navigation.collect import collect
+from vd4rl_pomdp.studies.navigation.sets import PRESETS
 
 
 @pytest.fixture(scope="session")

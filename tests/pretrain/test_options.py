@@ -5,10 +5,10 @@ import pytest
 from finetune.config import FinetuneConfig
 from finetune.settings import as_trained
 from pretrain.config import PretrainConfig
-from pretrain.navigation.config import NavigationConfig
 from pretrain.objectives import METHODS
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.options import flat, option_names
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import flat, option_names
+from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 
 
 @pytest.mark.parametrize(

@@ -13,17 +13,17 @@ from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import fake_rows, write_fake_set
 from tests.helpers_stages import smoke_pretrain
 from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.core.types import StateWindows, Windows
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn import load_encoder
-from vd4rl_pomdp.probes import probe_state
+from vd4rl_pomdp.nn.probes import probe_state
 from vd4rl_pomdp.runs.metrics import read_metrics
-from vd4rl_pomdp.tasks import TASKS
 from vd4rl_pomdp.testing import check_method
 from vd4rl_pomdp.testing.methods import ROWS, build, windows
-from vd4rl_pomdp.types import StateWindows, Windows
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 LAYOUT = TASKS.named("walker_walk").layout

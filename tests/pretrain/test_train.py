@@ -11,9 +11,9 @@ from pretrain.train import check_config, check_pictures
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_pretrain
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn import load_encoder
-from vd4rl_pomdp.objective import require_loss
+from vd4rl_pomdp.nn.objective import require_loss
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 
@@ -149,7 +149,7 @@ def test_an_encoder_that_its_last_step_ruins_is_marked_and_not_kept(data, tmp_pa
             torch.nn.init.constant_(next(objective.parameters()), math.inf)
 
     ruin.steps = 0
-    monkeypatch.setattr("vd4rl_pomdp.objective.Objective.after_step", ruin)
+    monkeypatch.setattr("vd4rl_pomdp.nn.objective.Objective.after_step", ruin)
     with pytest.raises(FloatingPointError, match="out: weights are not finite after step 2"):
         run_pretrain(config)
     assert json.loads((config.out / "diverged.json").read_text())["step"] == 2

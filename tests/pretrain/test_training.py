@@ -12,10 +12,10 @@ from pretrain.objectives import METHODS, Method
 from pretrain.objectives.masked_inverse import MaskedInverse, MaskedOptions
 from pretrain.train import PretrainTrainer, pretrain, view_of
 from tests.helpers_data import write_fake_set
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data import View, open_dataset
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn import Encoder, EncoderConfig
-from vd4rl_pomdp.objective import Objective
+from vd4rl_pomdp.nn.objective import Objective
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from rich.console import Console
 from tests.helpers_report import describe, write_run
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.report.compare import compare_results, print_comparison
-from vd4rl_pomdp.results import add_results
+from vd4rl_pomdp.runs.results import add_results
 
 
 def two_sets(folder: Path) -> tuple[Path, Path]:

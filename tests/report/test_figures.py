@@ -8,7 +8,7 @@ import pytest
 from matplotlib.axes import Axes
 
 from tests.helpers_report import write_run
-from vd4rl_pomdp.reference import Reference
+from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.report import write, write_report
 from vd4rl_pomdp.report.lines import loss_rows
 from vd4rl_pomdp.report.load import load_runs

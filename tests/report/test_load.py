@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from tests.helpers_report import describe, write_run
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 

@@ -10,7 +10,7 @@ from pathlib import Path
 import pretrain.objectives
 from tests.helpers_report import METHODS, describe, grid, pretraining, write_grid, write_run
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.reference import Reference
+from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.report import figures, films, layout, tables, write, write_report
 from vd4rl_pomdp.report.figures import style
 from vd4rl_pomdp.report.load import LoadedRun

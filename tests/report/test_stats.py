@@ -10,7 +10,7 @@ import scipy.stats
 from vd4rl_pomdp.report import stats
 
 RLIABLE = json.loads((Path(__file__).parent / "rliable.json").read_text())
-"""Scores, and what an independent implementation says of them: scripts/reference_statistics.py."""
+"""Scores, and what an independent implementation says of them: tools/reference_statistics.py."""
 METHODS = {name: [np.array(task) for task in tasks] for name, tasks in RLIABLE["scores"].items()}
 AGREES = 0.002
 """Largest difference from its bootstrap's intervals, of scores between 0 and 1."""

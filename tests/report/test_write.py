@@ -12,12 +12,12 @@ import pytest
 
 from tests.helpers_report import describe, grid, pretraining, write_run
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.reference import Reference
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.report import write, write_report
-from vd4rl_pomdp.results import add_results
 from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import write_json
+from vd4rl_pomdp.runs.results import add_results
 
 ROOT = Path(__file__).parents[2]
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 import torch
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs import checkpoint, files
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, fitting, pack, unpack
 from vd4rl_pomdp.runs.metrics import MetricsLog

@@ -4,7 +4,7 @@ import threading
 
 import pytest
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.episodes import COLUMNS, append_episodes, begin_episodes, drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import appending
 

@@ -2,7 +2,7 @@ import os
 
 import pytest
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.files import appending, read_csv, write_csv
 
 COLUMNS = ("name", "value")

@@ -15,7 +15,7 @@ import pretrain.config
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
-from vd4rl_pomdp.errors import UserError, told_apart
+from vd4rl_pomdp.core.errors import UserError, told_apart
 from vd4rl_pomdp.runs import memory
 from vd4rl_pomdp.runs.memory import CPU, bytes_kept, memory_of, require_disk, require_memory, telling_memory
 

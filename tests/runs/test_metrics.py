@@ -5,7 +5,7 @@ import math
 import pytest
 import torch
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.checkpoint import pack, unpack
 from vd4rl_pomdp.runs.metrics import Means
 

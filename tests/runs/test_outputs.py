@@ -8,7 +8,7 @@ import pytest
 
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.outputs import kept_in, refuse_foreign, refuse_inside, refuse_kept
 
 

@@ -12,7 +12,7 @@ import filelock
 import pytest
 from filelock import SoftFileLease
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs import ownership
 from vd4rl_pomdp.runs.ownership import in_use, owned
 

@@ -12,9 +12,9 @@ import pytest
 
 from tests.helpers_data import write_fake_set
 from tests.runs.test_checkpoint import killed_at
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.format import read_rows
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.encoder_folder import EncoderCard, load_encoder, save_encoder
 from vd4rl_pomdp.policies.actor import Actor, read_actor

@@ -8,7 +8,7 @@ import time
 
 import pytest
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs import workers
 from vd4rl_pomdp.runs.workers import count_workers, run_jobs
 
@@ -31,7 +31,7 @@ def square(job: int) -> int:
 
 
 NOTEBOOK = """
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.workers import run_jobs
 from tests.runs.test_workers import square
 class Job(int):

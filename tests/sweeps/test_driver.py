@@ -115,7 +115,7 @@ def test_a_job_of_another_command_has_not_been_tried(jobs, tmp_path):
 def test_a_job_whose_own_part_was_mended_has_not_been_tried(jobs, tmp_path, monkeypatch):
     of_files = {"sources": {"method mine": "mine.py 1"}}
     monkeypatch.setattr("vd4rl_pomdp.sweeps.driver.sources", lambda settings: of_files["sources"])
-    monkeypatch.setattr("vd4rl_pomdp.registry.sources", lambda settings: of_files["sources"])
+    monkeypatch.setattr("vd4rl_pomdp.core.registry.sources", lambda settings: of_files["sources"])
     carry_out(jobs, tmp_path, {"a": ["refused"]})
     assert "a" not in names(carry_out(jobs, tmp_path)[1])
     of_files["sources"] = {"method mine": "mine.py 2"}

@@ -8,7 +8,7 @@ import pytest
 
 from tests.helpers_sweeps import job
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.errors import DiskFullError, UserError
+from vd4rl_pomdp.core.errors import DiskFullError, UserError
 from vd4rl_pomdp.runs import files
 from vd4rl_pomdp.sweeps import folder as module
 from vd4rl_pomdp.sweeps.folder import SweepFolder, plan_name

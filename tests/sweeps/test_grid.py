@@ -5,13 +5,13 @@ from pathlib import Path
 
 import pytest
 
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.experiments.navigation.grid import condition_of, paper_rows
-from vd4rl_pomdp.mazes import PAPER_MAZES
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS, GymnasiumTask
+from vd4rl_pomdp.envs.mazes import PAPER_MAZES
+from vd4rl_pomdp.studies.navigation.grid import condition_of, paper_rows
 from vd4rl_pomdp.sweeps.grid import GridCell, narrow
 from vd4rl_pomdp.sweeps.grid_file import load_grid, names
 from vd4rl_pomdp.sweeps.stages import check_cell, check_cells
-from vd4rl_pomdp.tasks import TASKS, GymnasiumTask
 
 PAGE = Path(__file__).parents[2] / "docs" / "sweeps.md"
 TOML = """

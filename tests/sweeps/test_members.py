@@ -10,11 +10,11 @@ import pytest
 
 from tests.helpers_report import grid_run
 from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.data.collect import CollectConfig, collection
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.results import read_results, write_results
 from vd4rl_pomdp.runs import FORMAT
-from vd4rl_pomdp.settings import settings_of
+from vd4rl_pomdp.runs.results import read_results, write_results
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
 from vd4rl_pomdp.sweeps.stages import collection_of, recorded

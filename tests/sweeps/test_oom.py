@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from vd4rl_pomdp.errors import OutOfMemoryError
+from vd4rl_pomdp.core.errors import OutOfMemoryError
 from vd4rl_pomdp.sweeps import oom
 from vd4rl_pomdp.sweeps.oom import oom_kills
 from vd4rl_pomdp.sweeps.work import FAILED, KILLED, Work, ended

@@ -11,11 +11,12 @@ from PIL import Image
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.cli.parsing import parse_stage
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import flat
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.data.collect import CollectConfig, collection
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.navigation.exogenous import source_fingerprint
-from vd4rl_pomdp.options import flat
 from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
+from vd4rl_pomdp.studies.navigation.exogenous import source_fingerprint
 from vd4rl_pomdp.sweeps import plan as module
 from vd4rl_pomdp.sweeps.estimate import Estimates
 from vd4rl_pomdp.sweeps.folder import SweepFolder
@@ -23,7 +24,6 @@ from vd4rl_pomdp.sweeps.found import FoundRun, FoundRuns, runs_below, runs_kept
 from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.plan import DATA, JobPlanner
 from vd4rl_pomdp.sweeps.stages import recorded
-from vd4rl_pomdp.tasks import TASKS
 
 ROOT = Path(__file__).parents[2]
 GRID = """
@@ -427,7 +427,7 @@ def test_a_run_that_added_other_images_is_another(tmp_path):
 
 
 def test_a_navigation_run_is_planned_as_it_is_recorded():
-    from pretrain.navigation.config import NavigationConfig
+    from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 
     for cell in load_grid("navigation").cells()[::7]:
         words = ["--preset", "cpu", "--seed", str(cell.seed), "--data", "d", "--out", "o"]

@@ -3,8 +3,8 @@
 import pytest
 
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.results import read_run
 from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.results import read_run
 
 
 @pytest.mark.parametrize(

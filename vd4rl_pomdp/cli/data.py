@@ -10,7 +10,7 @@ import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse, show
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.sweeps.own_file import program_here
 
 REPLAY_TOLERANCE = 1e-6
@@ -70,7 +70,7 @@ def _card(words: Arguments, program: str) -> None:
 
 def _names(table: str) -> list[str]:
     """Names in a table of the module `tasks`, which is imported here because it needs numpy, slow to load."""
-    from vd4rl_pomdp import tasks
+    from vd4rl_pomdp.core import tasks
 
     return list(getattr(tasks, table))
 
@@ -92,7 +92,7 @@ class TableCommand:
 
 
 def _table(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.experiments.datasets import tabulate
+    from vd4rl_pomdp.data.table import tabulate
 
     command = parse(TableCommand, words, program)
     rows = tabulate(command.out, command.tasks, command.qualities, command.timed_episodes, command.workers)

@@ -8,7 +8,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vd4rl_pomdp.cli.dispatch import run_stage
-from vd4rl_pomdp.errors import DIVERGED, DONE, INTERRUPTED, DivergedError, UserError, disk_error, in_one_line
+from vd4rl_pomdp.core.errors import DIVERGED, DONE, INTERRUPTED, DivergedError, UserError, disk_error, in_one_line
 from vd4rl_pomdp.runs import interrupt
 
 

@@ -11,7 +11,7 @@ import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs import NAVIGATION_FILE
 
 if TYPE_CHECKING:
@@ -19,23 +19,23 @@ if TYPE_CHECKING:
 
 
 def _collect(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.navigation.collect import collect
-    from vd4rl_pomdp.navigation.config import PRESETS, MazeCollectConfig
+    from vd4rl_pomdp.studies.navigation.collect import collect
+    from vd4rl_pomdp.studies.navigation.sets import PRESETS, MazeCollectConfig
 
     config = with_presets(MazeCollectConfig, PRESETS, words, program)
     print(f"{len(collect(config))} shards in {config.out}")
 
 
 def _train(words: Arguments, program: str) -> None:
-    from pretrain.navigation.config import NavigationConfig
-    from pretrain.navigation.train import train
+    from vd4rl_pomdp.studies.navigation.config import NavigationConfig
+    from vd4rl_pomdp.studies.navigation.train import train
 
     run = train(parse_stage(NavigationConfig, words, program))
     print(f"results: {run.path / NAVIGATION_FILE}")
 
 
 def _policy(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.navigation.first_person import FirstPersonConfig, train_first_person
+    from vd4rl_pomdp.studies.navigation.first_person import FirstPersonConfig, train_first_person
 
     config = parse(FirstPersonConfig, words, program)
     card = train_first_person(config).card
@@ -55,7 +55,7 @@ class NavigationReportCommand:
 
 
 def _report(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.experiments.navigation.report import write_report
+    from vd4rl_pomdp.studies.navigation.report import write_report
 
     command = parse(NavigationReportCommand, words, program)
     samples = _samples if command.pictures else None
@@ -64,7 +64,7 @@ def _report(words: Arguments, program: str) -> None:
 
 def _samples() -> Mapping[str, np.ndarray]:
     """The sample observations; UserError that names the flag to do without where nothing can be drawn."""
-    from vd4rl_pomdp.navigation.samples import sample_observations
+    from vd4rl_pomdp.studies.navigation.samples import sample_observations
 
     try:
         return sample_observations()

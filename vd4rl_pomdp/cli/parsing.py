@@ -15,8 +15,8 @@ from typing import Any, TypeVar
 import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments
-from vd4rl_pomdp.errors import UserError, flag_of, refuse_unknown
-from vd4rl_pomdp.options import StageConfig, flat, option_names
+from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_unknown
+from vd4rl_pomdp.core.options import StageConfig, flat, option_names
 from vd4rl_pomdp.runs.files import flatten
 from vd4rl_pomdp.runs.interrupt import Terminated
 

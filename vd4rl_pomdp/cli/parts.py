@@ -8,8 +8,8 @@ from typing import Any
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse
-from vd4rl_pomdp.errors import flag_of
-from vd4rl_pomdp.registry import REGISTRIES, Registry
+from vd4rl_pomdp.core.errors import flag_of
+from vd4rl_pomdp.core.registry import REGISTRIES, Registry
 
 
 @dataclass(frozen=True)
@@ -21,7 +21,7 @@ def _list(words: Arguments, program: str) -> None:
     parse(ListCommand, words, program)
     import finetune.algorithms  # noqa: F401 (a kind's registry is made where its parts are)
     import pretrain.objectives  # noqa: F401
-    import vd4rl_pomdp.tasks  # noqa: F401
+    import vd4rl_pomdp.core.tasks  # noqa: F401
 
     for setting, registry in sorted(REGISTRIES.items()):
         print(f"{flag_of(setting)}   (packages offer theirs as entry points of {registry.group})")

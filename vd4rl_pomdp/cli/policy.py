@@ -9,7 +9,7 @@ import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse, with_presets
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 
 
 def _train(words: Arguments, program: str) -> None:

@@ -51,13 +51,13 @@ class EvaluateCommand:
 
 
 def _evaluate(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.errors import refuse_number
-    from vd4rl_pomdp.evaluation import by_part, evaluate_run, evaluations_of
-    from vd4rl_pomdp.reference import Reference, summarise
+    from finetune.evaluation import by_part, evaluate_run, evaluations_of
+    from vd4rl_pomdp.core.errors import refuse_number
+    from vd4rl_pomdp.core.settings import LABELS
+    from vd4rl_pomdp.data.reference import Reference, summarise
     from vd4rl_pomdp.runs.episodes import append_episodes, begin_episodes
     from vd4rl_pomdp.runs.files import flatten
     from vd4rl_pomdp.runs.outputs import refuse_inside
-    from vd4rl_pomdp.settings import LABELS
 
     command = parse(EvaluateCommand, words, program)
     refuse_number("parts", command.parts, 1)
@@ -96,8 +96,8 @@ class DemoCommand:
 
 
 def _demo(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.cli.demo import demo
     from vd4rl_pomdp.cli.sweeps import carry_out
-    from vd4rl_pomdp.experiments.demo import demo
 
     command = parse(DemoCommand, words, program)
     demo(command.out, command.jobs, command.preset, carry_out, run_stage)

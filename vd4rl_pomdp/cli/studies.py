@@ -72,7 +72,7 @@ def _report(words: Arguments, program: str) -> None:
 
 def _choice(command: ReportCommand) -> Choice:
     """What a report is about."""
-    from vd4rl_pomdp.errors import UserError
+    from vd4rl_pomdp.core.errors import UserError
     from vd4rl_pomdp.report.load import ALL
 
     if not command.grid:
@@ -100,7 +100,7 @@ class AddCommand:
 
 
 def _add(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.results import add_results
+    from vd4rl_pomdp.runs.results import add_results
 
     command = parse(AddCommand, words, program)
     added = add_results(command.runs, command.out)
@@ -120,7 +120,7 @@ class TheoryCommand:
 def _theory(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.report.theory import FILE, print_theory, write_theory
     from vd4rl_pomdp.runs.outputs import refuse_foreign
-    from vd4rl_pomdp.theory import theory_study
+    from vd4rl_pomdp.studies.theory import theory_study
 
     command = parse(TheoryCommand, words, program)
     if command.out is not None:
@@ -146,7 +146,7 @@ class BenchCommand:
 
 
 def _bench(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.experiments.bench.suite import bench, print_table
+    from vd4rl_pomdp.bench.suite import bench, print_table
 
     command = parse(BenchCommand, words, program)
     results = bench(command.quick)
@@ -157,9 +157,9 @@ def _bench(words: Arguments, program: str) -> None:
 
 
 def _control_study(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.experiments.control.config import ControlConfig
-    from vd4rl_pomdp.experiments.control.study import control_study
-    from vd4rl_pomdp.experiments.control.table import line_of, summary
+    from vd4rl_pomdp.studies.control.config import ControlConfig
+    from vd4rl_pomdp.studies.control.study import control_study
+    from vd4rl_pomdp.studies.control.table import line_of, summary
 
     config = parse(ControlConfig, words, program)
     rows = control_study(config, lambda row: print(line_of(row), flush=True))

@@ -14,8 +14,8 @@ import tyro
 
 from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, show
-from vd4rl_pomdp.errors import UserError, flag_of, refuse_no_folder
-from vd4rl_pomdp.options import NO_OPTIONS, Options, StageConfig
+from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder
+from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
 from vd4rl_pomdp.sweeps.executors import executor_kind
 from vd4rl_pomdp.sweeps.own_file import program_here, refuse_unknown_to_jobs, refuse_within_a_job
 

@@ -13,12 +13,12 @@ from typing import Any, ClassVar, Literal, Protocol, Self
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core.errors import OR_ONES_OWN, UserError, flag_of, refuse_unknown
+from vd4rl_pomdp.core.options import Limits, Options, flat, refuse_options
+from vd4rl_pomdp.core.registry import Registry
+from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.corruptions.keys import DRAWS, KeyStream, derive_keys, draw_integers, draw_numbered, hash_keys
-from vd4rl_pomdp.errors import OR_ONES_OWN, UserError, flag_of, refuse_unknown
-from vd4rl_pomdp.options import Limits, Options, flat, refuse_options
-from vd4rl_pomdp.registry import Registry
-from vd4rl_pomdp.seeding import stream_seed
-from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 
 Mode = Literal["resample", "emission"]
 _CHANNELS = 3
@@ -110,7 +110,7 @@ STAGES: Registry[type[Options]] = Registry(
     "corruption",
     {"patch": Patch, ZERO_FRAMES: ZeroFrames},
     _is_stage,
-    "a class of vd4rl_pomdp.options.Options with the method of a Stage",
+    "a class of vd4rl_pomdp.core.options.Options with the method of a Stage",
     _refuse_stage,
 )
 """Every stage by name: a dataclass of its options that is a `Stage`. A corruption's name joins its stages with `+`, in

@@ -12,6 +12,10 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from vd4rl_pomdp.core.errors import UserError, disk_error
+from vd4rl_pomdp.core.tasks import SCORE_DIVISOR
+from vd4rl_pomdp.core.text import code, markdown, plain, write_text
+from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.dataset import task_and_quality
 from vd4rl_pomdp.data.episodes import episode_returns, join_shards
 from vd4rl_pomdp.data.format import (
@@ -24,11 +28,7 @@ from vd4rl_pomdp.data.format import (
     shard_paths,
 )
 from vd4rl_pomdp.data.published import published_scores
-from vd4rl_pomdp.errors import UserError, disk_error
 from vd4rl_pomdp.runs.files import read_json
-from vd4rl_pomdp.tasks import SCORE_DIVISOR
-from vd4rl_pomdp.text import code, markdown, plain, write_text
-from vd4rl_pomdp.types import StepType
 
 FILM_FRAMES = 10
 EARLIER = "an earlier version: area means only if a frame's size divides the picture's height and width"

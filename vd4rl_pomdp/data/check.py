@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
+from vd4rl_pomdp.core.errors import UserError, first_line
+from vd4rl_pomdp.core.tasks import TASKS, DMCTask
 from vd4rl_pomdp.data.dataset import Dataset, open_dataset
 from vd4rl_pomdp.data.format import read_attributes, read_dtypes, shard_paths
 from vd4rl_pomdp.data.store import verify_store
-from vd4rl_pomdp.errors import UserError, first_line
-from vd4rl_pomdp.mazes import MAZES
-from vd4rl_pomdp.tasks import TASKS, DMCTask
+from vd4rl_pomdp.envs.mazes import MAZES
 
 ReplayFn = Callable[[str, np.ndarray, np.ndarray], np.ndarray]
 """(task, physics (P,) of an episode's first row, actions (T, A), a_0 first) -> rewards (T,), r_0 first."""

@@ -14,21 +14,9 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.data.format import DOWNSCALING
-from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
-from vd4rl_pomdp.envs.make import layout_of
-from vd4rl_pomdp.envs.pixels import Render
-from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_outside, refuse_unknown
-from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
-from vd4rl_pomdp.runs.files import jsonable
-from vd4rl_pomdp.runs.memory import CPU, require_memory
-from vd4rl_pomdp.runs.outputs import refuse_inside
-from vd4rl_pomdp.runs.ownership import owned
-from vd4rl_pomdp.runs.progress import ProgressLine
-from vd4rl_pomdp.runs.provenance import versions
-from vd4rl_pomdp.runs.workers import run_jobs
-from vd4rl_pomdp.seeding import episode_seed, stream_seed
-from vd4rl_pomdp.tasks import (
+from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_outside, refuse_unknown
+from vd4rl_pomdp.core.seeding import episode_seed, stream_seed
+from vd4rl_pomdp.core.tasks import (
     FRAME_SIZE,
     FRAME_SIZES,
     MOST_EPISODES,
@@ -40,6 +28,18 @@ from vd4rl_pomdp.tasks import (
     Quality,
     Task,
 )
+from vd4rl_pomdp.data.format import DOWNSCALING
+from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
+from vd4rl_pomdp.envs.make import layout_of
+from vd4rl_pomdp.envs.pixels import Render
+from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
+from vd4rl_pomdp.runs.files import jsonable
+from vd4rl_pomdp.runs.memory import CPU, require_memory
+from vd4rl_pomdp.runs.outputs import refuse_inside
+from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.runs.provenance import versions
+from vd4rl_pomdp.runs.workers import run_jobs
 
 Collector = Actor | Ladder | None
 """Who acts in a shard: an actor, a ladder of them, or nobody (random actions)."""

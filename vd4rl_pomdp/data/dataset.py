@@ -12,16 +12,16 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.buffers import FrameBuffers
+from vd4rl_pomdp.core.buffers import FrameBuffers
+from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError
+from vd4rl_pomdp.core.state_scale import StateScale
+from vd4rl_pomdp.core.tasks import FRAME_STACK, SET_QUALITIES, TASKS
+from vd4rl_pomdp.core.types import StepType, Transitions, Windows, row_key, unpack_row_key
 from vd4rl_pomdp.data.episodes import episode_returns
 from vd4rl_pomdp.data.format import shard_paths
 from vd4rl_pomdp.data.manifest import check_whole
 from vd4rl_pomdp.data.store import Store, open_store
 from vd4rl_pomdp.envs.make import layout_of
-from vd4rl_pomdp.errors import OutOfMemoryError, UserError
-from vd4rl_pomdp.state_scale import StateScale
-from vd4rl_pomdp.tasks import FRAME_STACK, SET_QUALITIES, TASKS
-from vd4rl_pomdp.types import StepType, Transitions, Windows, row_key, unpack_row_key
 
 Index = int | Sequence[int] | np.ndarray | Tensor
 Observations = Callable[[Tensor], Tensor]

@@ -23,12 +23,12 @@ from rich.progress import BarColumn, DownloadColumn, Progress, TextColumn, TimeR
 from urllib3.exceptions import NewConnectionError
 
 from vd4rl_pomdp import __version__
+from vd4rl_pomdp.core.errors import UserError, disk_error, disk_errors, refuse_unknown
+from vd4rl_pomdp.core.tasks import QUALITIES
 from vd4rl_pomdp.data.manifest import RemoteFile, manifest
-from vd4rl_pomdp.errors import UserError, disk_error, disk_errors, refuse_unknown
 from vd4rl_pomdp.runs.files import replacing_file, sha256
 from vd4rl_pomdp.runs.outputs import refuse_kept
 from vd4rl_pomdp.runs.ownership import owned
-from vd4rl_pomdp.tasks import QUALITIES
 
 HUB = "https://huggingface.co"
 REPOSITORY = "conglu/vd4rl"

@@ -7,9 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.format import PLAN, read_plan, shard_number
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.types import StepType
 
 
 def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:

@@ -25,11 +25,11 @@ from typing import Any
 import h5py
 import numpy as np
 
-from vd4rl_pomdp.errors import UnavailableError, UserError, in_one_line, system_error
-from vd4rl_pomdp.reading import parse_json, regular
+from vd4rl_pomdp.core.errors import UnavailableError, UserError, in_one_line, system_error
+from vd4rl_pomdp.core.reading import parse_json, regular
+from vd4rl_pomdp.core.tasks import FRAME_SIZES, GymnasiumTask, Task
+from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.runs.files import read_json, write_bytes
-from vd4rl_pomdp.tasks import FRAME_SIZES, GymnasiumTask, Task
-from vd4rl_pomdp.types import StepType
 
 SUFFIXES = (".hdf5", ".h5")
 PLAN, PROVENANCE = "collection.json", "provenance.json"

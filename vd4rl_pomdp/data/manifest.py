@@ -10,8 +10,8 @@ from functools import cache
 from importlib.resources import files
 from pathlib import Path
 
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.format import read_attributes
-from vd4rl_pomdp.errors import UserError
 
 _TOLD = 4
 """How many files a message names."""

@@ -9,13 +9,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS, DMCTask
 from vd4rl_pomdp.data.dataset import open_dataset
 from vd4rl_pomdp.envs.dmc import DMCEnv, start_from
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.envs.rendering import FrameCamera, frames_hash, gl_strings, mujoco
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import TASKS, DMCTask
 
 GOLDEN = Path(__file__).parent / "golden.npz"
 CANARY = "walker_walk"

@@ -7,9 +7,9 @@ from typing import Any
 
 import torch
 
+from vd4rl_pomdp.core.types import Transitions, Windows
 from vd4rl_pomdp.data.dataset import Dataset, require_positive
 from vd4rl_pomdp.data.view import View
-from vd4rl_pomdp.types import Transitions, Windows
 
 
 class Sampler:

@@ -11,9 +11,9 @@ from typing import Any
 
 import numpy as np
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.registry import code_of, of_other_code
 from vd4rl_pomdp.data.format import PLAN, PROVENANCE, write_shard
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.registry import code_of, of_other_code
 from vd4rl_pomdp.runs.files import holds_anything, read_json, write_json
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions

@@ -25,13 +25,13 @@ from typing import Any, Literal
 
 import numpy as np
 
+from vd4rl_pomdp.core.errors import DiskFullError, UserError, disk_error, disk_errors, system_error, told_apart
+from vd4rl_pomdp.core.reading import parse_json, read_bytes
+from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.episodes import check_count, join_shards
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows, shard_paths
-from vd4rl_pomdp.errors import DiskFullError, UserError, disk_error, disk_errors, system_error, told_apart
-from vd4rl_pomdp.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs.identity import content_hash
 from vd4rl_pomdp.runs.progress import ProgressLine
-from vd4rl_pomdp.types import StepType
 
 _VERSION = 2
 _FRAMES = "frames.u8"

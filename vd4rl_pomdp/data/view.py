@@ -7,14 +7,13 @@ from typing import Any, get_args
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp import _shift
-from vd4rl_pomdp.augmentation import Sharing, random_shift
-from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream
+from vd4rl_pomdp.core.errors import refuse_unknown
+from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.tasks import FRAME_STACK
+from vd4rl_pomdp.core.types import Transitions, Windows
+from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, _shift
+from vd4rl_pomdp.corruptions.augmentation import Sharing, random_shift
 from vd4rl_pomdp.data.dataset import Dataset, Index
-from vd4rl_pomdp.errors import refuse_unknown
-from vd4rl_pomdp.seeding import stream_seed
-from vd4rl_pomdp.tasks import FRAME_STACK
-from vd4rl_pomdp.types import Transitions, Windows
 
 
 class View:

@@ -18,8 +18,8 @@ from typing import Any
 import gymnasium
 from gymnasium.envs.registration import WrapperSpec
 
-from vd4rl_pomdp.mazes import MAZES
-from vd4rl_pomdp.tasks import TASKS
+from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.envs.mazes import MAZES
 
 Info = dict[str, Any]
 """Gymnasium's `info`: what an environment tells besides the observation."""

@@ -11,11 +11,11 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK, Task
+from vd4rl_pomdp.core.types import row_key
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys, make_corruption
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.envs.pixels import Render, TimeStep
-from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK, Task
-from vd4rl_pomdp.types import row_key
 
 if hasattr(os, "register_at_fork"):  # a forked process would wait for the threads that it did not inherit
     os.register_at_fork(after_in_child=lambda: torch.set_num_threads(1))

@@ -7,12 +7,12 @@ from typing import Any
 
 import numpy as np
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, TASKS, DMCTask, Layout
+from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.envs import rendering
 from vd4rl_pomdp.envs.pixels import PixelEnv, Render, TimeStep, between, check_bounds
 from vd4rl_pomdp.envs.rendering import mujoco, suite
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import FRAME_SIZE, TASKS, DMCTask, Layout
-from vd4rl_pomdp.types import StepType
 
 
 class DMCEnv(PixelEnv):

@@ -8,12 +8,12 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from vd4rl_pomdp.core.errors import refuse_number
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_SIZES, FRAME_STACK, TASKS
 from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption_fits
 from vd4rl_pomdp.envs import Info
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Observation
 from vd4rl_pomdp.envs.pixels import Render, checked_action
-from vd4rl_pomdp.errors import refuse_number
-from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_SIZES, FRAME_STACK, TASKS
 
 
 class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):

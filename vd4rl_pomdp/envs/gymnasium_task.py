@@ -12,11 +12,11 @@ import gymnasium
 import numpy as np
 from PIL import Image
 
+from vd4rl_pomdp.core.errors import UserError, in_one_line
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, GymnasiumTask, Layout
+from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.envs.opengl import close_at_exit, gl_errors, refuse_after_fork, undisturbed
 from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep, between, check_bounds
-from vd4rl_pomdp.errors import UserError, in_one_line
-from vd4rl_pomdp.tasks import FRAME_SIZE, GymnasiumTask, Layout
-from vd4rl_pomdp.types import StepType
 
 NOTHING = np.zeros(0)
 MOST_STEPS_A_SECOND = 1000

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 from functools import cache
 
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, DMCTask, GymnasiumTask, Layout, Task
 from vd4rl_pomdp.envs.pixels import PixelEnv, Render, check_render
-from vd4rl_pomdp.tasks import FRAME_SIZE, DMCTask, GymnasiumTask, Layout, Task
 
 
 def make_env(task: Task, render: Render = "fast", size: int | None = FRAME_SIZE, length: int | None = None) -> PixelEnv:

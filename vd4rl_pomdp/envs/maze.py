@@ -7,13 +7,13 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from vd4rl_pomdp.core.errors import refuse_number
 from vd4rl_pomdp.envs import Info
 from vd4rl_pomdp.envs.maze_model import COLLISION_RADIUS, HEADING, TIMESTEP, build_simulator
 from vd4rl_pomdp.envs.maze_renderers import ExactRenderer, MazeRenderer, make_renderer
+from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, get_maze
 from vd4rl_pomdp.envs.pixels import Render, check_render, checked_action
 from vd4rl_pomdp.envs.rendering import mujoco
-from vd4rl_pomdp.errors import refuse_number
-from vd4rl_pomdp.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, get_maze
 
 ACCELERATION = 10.0
 """first_person without a `push`: units/s^2 along the heading for an action of 1 (from the top it is 23.9);

@@ -12,9 +12,9 @@ import tempfile
 from pathlib import Path
 
 from vd4rl_pomdp.envs.maze_sky import FACE, sky_texture
+from vd4rl_pomdp.envs.mazes import Curtain, MazeSpec, Sky, Style
 from vd4rl_pomdp.envs.opengl import gl_errors
 from vd4rl_pomdp.envs.rendering import mujoco
-from vd4rl_pomdp.mazes import Curtain, MazeSpec, Sky, Style
 
 with (
     gl_errors(),

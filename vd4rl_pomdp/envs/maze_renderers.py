@@ -14,10 +14,10 @@ from __future__ import annotations
 import numpy as np
 
 from vd4rl_pomdp.envs.maze_sky import BINS, panorama, sky_texture
+from vd4rl_pomdp.envs.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, PICTURE_SIZE, MazeSpec, Style
 from vd4rl_pomdp.envs.opengl import close_at_exit, gl_errors, refuse_after_fork, undisturbed
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.envs.rendering import mujoco
-from vd4rl_pomdp.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, PICTURE_SIZE, MazeSpec, Style
 
 _FINE = 4
 """Rays for each pixel, in each direction."""

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from vd4rl_pomdp.mazes import Sky
+from vd4rl_pomdp.envs.mazes import Sky
 
 FACE = 400
 """Texels along an edge of the cube."""

@@ -16,7 +16,7 @@ import weakref
 from collections.abc import Iterator
 from typing import Any
 
-from vd4rl_pomdp.errors import UserError, first_line
+from vd4rl_pomdp.core.errors import UserError, first_line
 
 os.environ.setdefault("MUJOCO_GL", "egl" if sys.platform == "linux" else "glfw")  # macOS and Windows know no other
 os.environ.setdefault("LP_NUM_THREADS", "1")  # software rendering scales by processes, not by threads

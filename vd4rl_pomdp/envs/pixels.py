@@ -8,9 +8,9 @@ from typing import Any, Literal, get_args
 
 import numpy as np
 
-from vd4rl_pomdp.errors import MOST, UserError, refuse_unknown
-from vd4rl_pomdp.tasks import Layout, Task
-from vd4rl_pomdp.types import StepType
+from vd4rl_pomdp.core.errors import MOST, UserError, refuse_unknown
+from vd4rl_pomdp.core.tasks import Layout, Task
+from vd4rl_pomdp.core.types import StepType
 
 Render = Literal["fast", "exact"]
 """How dm_control draws: fast, with a smaller shadow map, or exact."""

@@ -15,10 +15,10 @@ from typing import Any
 
 import numpy as np
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import FRAME_SIZE
 from vd4rl_pomdp.envs.opengl import gl_errors, keep_display, refuse_after_fork, undisturbed
 from vd4rl_pomdp.envs.pixels import Render
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.tasks import FRAME_SIZE
 
 try:
     with gl_errors():  # both load the OpenGL library that MUJOCO_GL names, and fail in many ways where it is missing

@@ -18,7 +18,7 @@ from huggingface_hub.errors import EntryNotFoundError, LocalEntryNotFoundError
 from huggingface_hub.hf_api import DatasetInfo, ModelInfo
 
 from vd4rl_pomdp import __version__
-from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.hub.contents import LISTING, Listing, accept, checked, is_there
 from vd4rl_pomdp.hub.repository import Repository, hub_answers, hub_api, hub_info, provide
 from vd4rl_pomdp.nn.model_card import CARD, LICENSE

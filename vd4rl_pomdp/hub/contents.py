@@ -7,14 +7,14 @@ import shutil
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
+from vd4rl_pomdp.core.errors import UnavailableError, UserError
+from vd4rl_pomdp.core.reading import build
 from vd4rl_pomdp.data.episodes import join_shards
 from vd4rl_pomdp.data.format import check_frames, is_shard_name, read_rows, shard_files, shard_paths
 from vd4rl_pomdp.data.hub_card import set_card
-from vd4rl_pomdp.errors import UnavailableError, UserError
 from vd4rl_pomdp.hub.repository import ENCODER, SET, Repository
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, WEIGHTS, load_encoder, read_record
 from vd4rl_pomdp.nn.model_card import CARD, model_card
-from vd4rl_pomdp.reading import build
 from vd4rl_pomdp.runs.files import read_json, sha256, write_bytes
 from vd4rl_pomdp.runs.outputs import kept_in
 

@@ -23,8 +23,8 @@ from huggingface_hub.hf_api import DatasetInfo, ModelInfo
 from huggingface_hub.utils import disable_progress_bars, validate_repo_id
 
 from vd4rl_pomdp import __version__
+from vd4rl_pomdp.core.errors import UserError, in_one_line
 from vd4rl_pomdp.data.download import check_endpoint, default_endpoint
-from vd4rl_pomdp.errors import UserError, in_one_line
 
 ENCODER, SET = "an encoder", "a data set"
 """What a repository holds, in the words of `runs.outputs.kept_in`."""

@@ -10,9 +10,9 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
-from vd4rl_pomdp.errors import UserError, refuse_unknown
-from vd4rl_pomdp.options import Limits, Options
-from vd4rl_pomdp.seeding import stream_seed
+from vd4rl_pomdp.core.errors import UserError, refuse_unknown
+from vd4rl_pomdp.core.options import Limits, Options
+from vd4rl_pomdp.core.seeding import stream_seed
 
 
 class ActionTarget(Protocol):

@@ -5,8 +5,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor, nn
 
+from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.corruptions.keys import KeyStream
-from vd4rl_pomdp.seeding import stream_seed
 
 
 class Draws(nn.Module):

@@ -11,11 +11,11 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.errors import UserError, refuse_unknown
+from vd4rl_pomdp.core.errors import UserError, refuse_unknown
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
+from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, STATE, FrameEncoder, StateFrame, make_frame_encoder
 from vd4rl_pomdp.nn.sequence import run_gru
-from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
-from vd4rl_pomdp.types import Windows
 
 MAX_LAYERS = 64
 """Most layers of a GRU."""

@@ -44,7 +44,7 @@ class EncoderOrigin:
     frames: int | None = None
     """Frames that the pretraining's batches held; None: not recorded."""
     probe: dict[str, float] = field(default_factory=dict)
-    """Errors of linear probes, as `vd4rl_pomdp.probes.probe_state` gives them; empty if none was fitted."""
+    """Errors of linear probes, as `vd4rl_pomdp.nn.probes.probe_state` gives them; empty if none was fitted."""
     plugins: dict[str, str] = field(default_factory=dict)
     """Where parts come from that are not this package's, as `registry.origins` tells; empty if none was recorded."""
     sources: dict[str, str] = field(default_factory=dict)

@@ -16,15 +16,15 @@ from safetensors.torch import save
 from torch.random import fork_rng
 
 from vd4rl_pomdp import __version__
+from vd4rl_pomdp.core.errors import UserError, disk_errors, first_line, in_one_line
+from vd4rl_pomdp.core.options import flat, option_names
+from vd4rl_pomdp.core.reading import build, parse_json, read_bytes, read_tensors
+from vd4rl_pomdp.core.registry import origins, sources
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.errors import UserError, disk_errors, first_line, in_one_line
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.encoder_card import EncoderCard, EncoderOrigin, EncoderRecord
 from vd4rl_pomdp.nn.frame import STATE
 from vd4rl_pomdp.nn.model_card import CARD, model_card
-from vd4rl_pomdp.options import flat, option_names
-from vd4rl_pomdp.reading import build, parse_json, read_bytes, read_tensors
-from vd4rl_pomdp.registry import origins, sources
 from vd4rl_pomdp.runs.files import json_text, write_bytes, write_json
 from vd4rl_pomdp.runs.provenance import git_commit
 

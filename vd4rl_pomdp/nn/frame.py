@@ -10,10 +10,10 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import Limits, Options, refuse_options
+from vd4rl_pomdp.core.registry import Registry
 from vd4rl_pomdp.corruptions.keys import draw_normals
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.options import Limits, Options, refuse_options
-from vd4rl_pomdp.registry import Registry
 
 
 @dataclass(frozen=True)

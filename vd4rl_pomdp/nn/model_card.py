@@ -6,8 +6,8 @@ import json
 from collections.abc import Iterator
 from dataclasses import asdict
 
+from vd4rl_pomdp.core.text import code, code_block, one_line
 from vd4rl_pomdp.nn.encoder_card import EncoderRecord
-from vd4rl_pomdp.text import code, code_block, one_line
 
 CARD = "README.md"
 LICENSE = "mit"

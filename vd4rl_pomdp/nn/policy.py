@@ -10,9 +10,9 @@ from safetensors.torch import save
 from torch import Tensor, nn
 from torch.random import fork_rng
 
-from vd4rl_pomdp.errors import UserError, disk_errors, first_line
+from vd4rl_pomdp.core.errors import UserError, disk_errors, first_line
+from vd4rl_pomdp.core.reading import read_bytes, read_tensors, safetensors_metadata
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp
-from vd4rl_pomdp.reading import read_bytes, read_tensors, safetensors_metadata
 from vd4rl_pomdp.runs.files import read_json, write_bytes, write_json
 
 _WEIGHTS, _SHAPE = "model.safetensors", "config.json"

@@ -19,11 +19,11 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.reading import parse_json, read_bytes, safetensors_metadata
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.envs.make import layout_of
-from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.reading import parse_json, read_bytes, safetensors_metadata
 from vd4rl_pomdp.runs.files import write_bytes
-from vd4rl_pomdp.tasks import TASKS
 
 LOG_STD_RANGE = (-20.0, 2.0)
 OBSERVATION_CLIP = 10.0

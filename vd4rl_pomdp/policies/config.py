@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Literal
 
-from vd4rl_pomdp.tasks import TASKS
+from vd4rl_pomdp.core.tasks import TASKS
 
 
 @dataclass(frozen=True)

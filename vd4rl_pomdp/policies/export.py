@@ -18,13 +18,13 @@ from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.errors import UserError, refuse_no_folder
+from vd4rl_pomdp.core.errors import UserError, refuse_no_folder
+from vd4rl_pomdp.core.reading import read_bytes
+from vd4rl_pomdp.core.tasks import TASKS, Task
 from vd4rl_pomdp.policies.actor import Actor, Ladder, read_actor, read_ladder
 from vd4rl_pomdp.policies.state_env import StateEnv
-from vd4rl_pomdp.reading import read_bytes
 from vd4rl_pomdp.runs.files import read_json, write_bytes
 from vd4rl_pomdp.runs.outputs import refuse_foreign, refuse_inside
-from vd4rl_pomdp.tasks import TASKS, Task
 
 CARD_EPISODES = 20
 CARD_SEED = 10_000

@@ -15,16 +15,16 @@ import numpy as np
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.reading import read_bytes
+from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.tasks import Task
 from vd4rl_pomdp.envs.make import layout_of
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.policies.actor import OBSERVATION_CLIP, Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
 from vd4rl_pomdp.policies.state_env import StateEnv
-from vd4rl_pomdp.reading import read_bytes
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, fitting
 from vd4rl_pomdp.runs.files import write_bytes
-from vd4rl_pomdp.seeding import stream_seed
-from vd4rl_pomdp.tasks import Task
 
 if TYPE_CHECKING:
     from sbx import SAC

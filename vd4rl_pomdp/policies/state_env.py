@@ -7,8 +7,8 @@ from typing import Any
 import gymnasium
 import numpy as np
 
+from vd4rl_pomdp.core.tasks import Task
 from vd4rl_pomdp.envs.make import layout_of, make_env
-from vd4rl_pomdp.tasks import Task
 
 
 class StateEnv(gymnasium.Env[np.ndarray, np.ndarray]):

@@ -16,8 +16,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from vd4rl_pomdp.core.errors import MAX_SEED, MOST, UserError, refuse_outside
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.envs.make import layout_of
-from vd4rl_pomdp.errors import MAX_SEED, MOST, UserError, refuse_outside
 from vd4rl_pomdp.policies import learner
 from vd4rl_pomdp.policies.actor import Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
@@ -40,7 +41,6 @@ from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_cs
 from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import Owner, owned
-from vd4rl_pomdp.tasks import TASKS
 
 if TYPE_CHECKING:
     from sbx import SAC

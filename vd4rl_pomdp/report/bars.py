@@ -7,11 +7,11 @@ from typing import Any
 import numpy as np
 from matplotlib.axes import Axes
 
+from vd4rl_pomdp.core.text import plain
 from vd4rl_pomdp.report.figures import COLOURS, Plot, file_name, grid_of, panels, seeds_note
 from vd4rl_pomdp.report.load import SETTING
 from vd4rl_pomdp.report.tables import by_label, grouped, label
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.text import plain
 
 PAPER_QUALITIES = ("expert", "medium_expert")
 """Those of the paper's figures, which come first; its appendix adds medium."""

@@ -11,7 +11,8 @@ from rich.console import Console
 from rich.table import Table as TerminalTable
 from rich.text import Text
 
-from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.text import write_text
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.facts import commits, machines
 from vd4rl_pomdp.report.figures import seeds_note
@@ -22,7 +23,6 @@ from vd4rl_pomdp.report.tables import SCORE, SCORES_NOTE, evaluations, final_epi
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
-from vd4rl_pomdp.text import write_text
 
 FILE = "comparison"
 """Its files' name, which tells a comparison's folder."""

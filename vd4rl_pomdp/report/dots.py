@@ -8,12 +8,12 @@ from typing import Any
 
 from matplotlib.axes import Axes
 
+from vd4rl_pomdp.core.text import plain
 from vd4rl_pomdp.report.figures import COLOURS, Plot, file_name, panels, seeds_note, span, style
 from vd4rl_pomdp.report.load import PROBES, SETTING
 from vd4rl_pomdp.report.measures import ACTION_ERRORS, COSTS
 from vd4rl_pomdp.report.tables import by_label, grouped, label
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.text import plain
 
 _MANY = 300
 """Dots of a figure, above which they are one picture within it, and its words are of the best runs."""

@@ -6,10 +6,10 @@ import json
 from collections.abc import Iterator, Mapping
 from typing import Any
 
+from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import LoadedRun, compare
 from vd4rl_pomdp.report.tables import label, setting
-from vd4rl_pomdp.settings import settings_of
 
 _SEEDS = 12
 """Seeds that are named one by one, at most."""

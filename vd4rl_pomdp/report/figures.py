@@ -17,9 +17,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 
+from vd4rl_pomdp.core.text import plain
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.runs.files import Row, replacing_file, write_csv
-from vd4rl_pomdp.text import plain
 
 mpl.rcParams["svg.hashsalt"] = "vd4rl-pomdp"
 mpl.rcParams["pdf.fonttype"] = 42

@@ -6,11 +6,11 @@ from collections.abc import Iterable, Iterator
 from itertools import groupby
 from operator import attrgetter
 
+from vd4rl_pomdp.core.settings import LABELS
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.load import CONDITION, SETTING, LoadedRun, without_options
 from vd4rl_pomdp.report.variants import ENCODER_SEED
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.settings import LABELS
 
 Setting = tuple[str, str, str]
 """Values of SETTING."""

@@ -14,7 +14,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from vd4rl_pomdp.errors import told_apart
+from vd4rl_pomdp.core.errors import told_apart
+from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import STATE
 from vd4rl_pomdp.report.grouping import groups
@@ -23,7 +24,6 @@ from vd4rl_pomdp.report.load import SETTING, LoadedRun
 from vd4rl_pomdp.report.tables import REFERENCES, grouped
 from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, is_plain, of_corruption, unlike
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.settings import settings_of
 
 STATE_SHARE, ACRO_SHARE = 0.9, 0.7
 """Least shares of the data's mean return, of `state` and of `acro` under `none`."""

@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
+from vd4rl_pomdp.core.text import one_line
 from vd4rl_pomdp.runs.files import write_bytes
-from vd4rl_pomdp.text import one_line
 
 _ESCAPES = {
     **{c: f"\\{c}" for c in "&%$#_{}"},

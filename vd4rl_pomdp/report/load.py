@@ -12,9 +12,9 @@ from zipfile import BadZipFile
 
 import numpy as np
 
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.reading import read_bytes
-from vd4rl_pomdp.reference import Reference
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.reading import read_bytes
+from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.report.grouping import groups
 from vd4rl_pomdp.report.variants import (
     DATA,
@@ -27,9 +27,9 @@ from vd4rl_pomdp.report.variants import (
     read_settings,
     without,
 )
-from vd4rl_pomdp.results import Result, find_results, whole_files
 from vd4rl_pomdp.runs import FILM_FILE, REFERENCE_FILE
 from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.results import Result, find_results, whole_files
 
 SETTING = ("task", "quality", "corruption")
 """Columns of what methods are compared in."""

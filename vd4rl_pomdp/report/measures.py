@@ -6,7 +6,7 @@ from collections.abc import Iterable
 
 import numpy as np
 
-from vd4rl_pomdp.reference import summarise
+from vd4rl_pomdp.data.reference import summarise
 from vd4rl_pomdp.report.gaps import in_words
 from vd4rl_pomdp.report.gates import returns_of
 from vd4rl_pomdp.report.load import CONDITION, IDENTITY, PROBES, LoadedRun

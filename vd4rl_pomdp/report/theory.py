@@ -14,11 +14,11 @@ from rich.console import Console
 from rich.table import Table
 from rich.text import Text
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.text import write_text
 from vd4rl_pomdp.report.figures import COLOURS, to_svg
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.runs.files import Row, files_below, read_json, write_json
-from vd4rl_pomdp.text import write_text
 
 Study = dict[str, Any]
 """What `theory.study.theory_study` returns."""

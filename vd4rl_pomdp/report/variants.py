@@ -9,8 +9,8 @@ from __future__ import annotations
 from collections.abc import Collection, Iterable, Mapping, Sequence
 from typing import Any
 
+from vd4rl_pomdp.core.settings import LATER, settings_of
 from vd4rl_pomdp.corruptions import corruption_settings
-from vd4rl_pomdp.settings import LATER, settings_of
 
 Settings = dict[str, str]
 """Values as words, by the name that is shown beside them."""

@@ -11,8 +11,9 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.text import write_text
 from vd4rl_pomdp.data.published import published_scores
-from vd4rl_pomdp.errors import UserError, disk_errors
 from vd4rl_pomdp.report import bars, dots, lines, measures, overall, present, tables
 from vd4rl_pomdp.report.claims import judge_claims
 from vd4rl_pomdp.report.facts import differing, facts, unfinished, unlike
@@ -25,11 +26,10 @@ from vd4rl_pomdp.report.load import ALL, SETTING, Choice, LoadedRun, load_runs
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.report.theory import load_section
-from vd4rl_pomdp.results import RUNS, refuse_loss, write_results
 from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.ownership import owned
-from vd4rl_pomdp.text import write_text
+from vd4rl_pomdp.runs.results import RUNS, refuse_loss, write_results
 
 _MARK = "summary"
 """The table that is always there: its file tells a report's folder."""

@@ -24,8 +24,8 @@ from safetensors import SafetensorError
 from safetensors.torch import load, save
 from torch import Tensor
 
-from vd4rl_pomdp.errors import UserError, disk_errors, first_line
-from vd4rl_pomdp.reading import parse_json, read_bytes
+from vd4rl_pomdp.core.errors import UserError, disk_errors, first_line
+from vd4rl_pomdp.core.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import synchronise
 from vd4rl_pomdp.runs.memory import ran_out

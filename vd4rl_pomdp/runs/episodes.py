@@ -11,10 +11,10 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.reading import read_bytes, regular
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.reading import read_bytes, regular
+from vd4rl_pomdp.core.settings import LABELS
 from vd4rl_pomdp.runs.files import appending, write_csv
-from vd4rl_pomdp.settings import LABELS
 
 ADDED = ("evaluated_under", "action_error")
 """Columns that files of earlier versions lack."""

@@ -14,8 +14,8 @@ from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
 
-from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.reading import parse_json, read_bytes
+from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.reading import parse_json, read_bytes
 
 Row = dict[str, Any]
 """One row of a table, its values by column."""

@@ -10,7 +10,7 @@ import json
 from collections.abc import Mapping
 from typing import Any
 
-from vd4rl_pomdp.settings import settings_of
+from vd4rl_pomdp.core.settings import settings_of
 
 
 def identity(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:

@@ -12,8 +12,8 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.errors import DiskFullError, OutOfMemoryError, UserError, flag_of, told_apart
-from vd4rl_pomdp.options import flat
+from vd4rl_pomdp.core.errors import DiskFullError, OutOfMemoryError, UserError, flag_of, told_apart
+from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.runs.provenance import machine_memory
 
 _OUT = (

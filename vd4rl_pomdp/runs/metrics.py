@@ -11,8 +11,8 @@ from typing import TYPE_CHECKING, Literal
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.reading import parse_json, read_bytes
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs import METRICS_FILE
 from vd4rl_pomdp.runs.files import appending, write_bytes
 

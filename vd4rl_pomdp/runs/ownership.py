@@ -20,8 +20,8 @@ from typing import Any
 
 from filelock import SoftFileLease, Timeout
 
-from vd4rl_pomdp.errors import InUseError, disk_errors
-from vd4rl_pomdp.reading import parse_json
+from vd4rl_pomdp.core.errors import InUseError, disk_errors
+from vd4rl_pomdp.core.reading import parse_json
 from vd4rl_pomdp.runs.files import synchronise, write_json
 from vd4rl_pomdp.runs.interrupt import handled, hangups
 

@@ -13,17 +13,17 @@ from pathlib import Path
 from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import flat
+from vd4rl_pomdp.core.registry import code_of, warn_of_other_code
+from vd4rl_pomdp.core.settings import LATER, RUNTIME_FIELDS
 from vd4rl_pomdp.data.format import read_plan
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.options import flat
-from vd4rl_pomdp.registry import code_of, warn_of_other_code
 from vd4rl_pomdp.runs import CONFIG_FILE, DIVERGED_FILE, EPISODES_FILE, FORMAT, MACHINE_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, State, fitting, pack, unpack
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_json
 from vd4rl_pomdp.runs.ownership import Owner, owned
 from vd4rl_pomdp.runs.provenance import CONTINUED, command, git_commit, machine, versions
-from vd4rl_pomdp.settings import LATER, RUNTIME_FIELDS
 
 _CODE = ("versions", "git_commit", "plugins", "sources")
 """What a record tells of the code."""

@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, Protocol, TypeVar
 from zlib import crc32
 
-from vd4rl_pomdp.errors import in_one_line
+from vd4rl_pomdp.core.errors import in_one_line
 from vd4rl_pomdp.runs.files import write_bytes
 from vd4rl_pomdp.runs.identity import recipe
 from vd4rl_pomdp.runs.run import RunFolder

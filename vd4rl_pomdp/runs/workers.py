@@ -16,7 +16,7 @@ from multiprocessing.reduction import ForkingPickler
 from pickle import PicklingError, UnpicklingError
 from typing import Any, TypeVar
 
-from vd4rl_pomdp.errors import UserError, WorkerDiedError, first_line
+from vd4rl_pomdp.core.errors import UserError, WorkerDiedError, first_line
 from vd4rl_pomdp.runs.interrupt import blocked
 
 Job = TypeVar("Job")

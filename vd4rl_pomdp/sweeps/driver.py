@@ -14,8 +14,15 @@ from collections.abc import Iterable, Mapping
 from dataclasses import dataclass
 from itertools import takewhile
 
-from vd4rl_pomdp.errors import DiskFullError, InUseError, OutOfMemoryError, UnavailableError, UserError, disk_errors
-from vd4rl_pomdp.registry import of_other_code, sources
+from vd4rl_pomdp.core.errors import (
+    DiskFullError,
+    InUseError,
+    OutOfMemoryError,
+    UnavailableError,
+    UserError,
+    disk_errors,
+)
+from vd4rl_pomdp.core.registry import of_other_code, sources
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.ownership import in_use

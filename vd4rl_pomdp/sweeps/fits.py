@@ -10,10 +10,10 @@ from dataclasses import replace
 from functools import cache
 from typing import Any
 
-from vd4rl_pomdp.errors import UserError, refuse_outside
+from vd4rl_pomdp.core.errors import UserError, refuse_outside
+from vd4rl_pomdp.core.tasks import FRAME_STACK, TASKS, GymnasiumTask
 from vd4rl_pomdp.nn.encoder import EncoderConfig, build_frame_encoder
 from vd4rl_pomdp.nn.frame import encoder_settings
-from vd4rl_pomdp.tasks import FRAME_STACK, TASKS, GymnasiumTask
 
 
 def check_fit(configs: Mapping[str, Any]) -> None:
@@ -36,8 +36,8 @@ def check_fit(configs: Mapping[str, Any]) -> None:
 
 @cache
 def _check_maze(training: Any, maze_set: Any) -> None:
-    from vd4rl_pomdp.navigation.exogenous import check_source
-    from vd4rl_pomdp.navigation.observations import SHAPES, check_trajectories
+    from vd4rl_pomdp.studies.navigation.exogenous import check_source
+    from vd4rl_pomdp.studies.navigation.observations import SHAPES, check_trajectories
 
     if training.exogenous != "none":
         check_source(training.exogenous)

@@ -27,9 +27,9 @@ from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.errors import UserError, disk_errors
-from vd4rl_pomdp.reading import parse_json, read_bytes
-from vd4rl_pomdp.registry import sources
+from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.reading import parse_json, read_bytes
+from vd4rl_pomdp.core.registry import sources
 from vd4rl_pomdp.runs.files import Row, jsonable, write_json
 from vd4rl_pomdp.sweeps.own_file import OwnFile, own_file, parts_by_call, program_of, same_file
 from vd4rl_pomdp.sweeps.plan import Job

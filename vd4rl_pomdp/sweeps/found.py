@@ -7,12 +7,12 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
+from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.nn.encoder_folder import CONFIG
-from vd4rl_pomdp.results import Result, read_results
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.files import Row, files_below, read_json
 from vd4rl_pomdp.runs.identity import recipe
-from vd4rl_pomdp.settings import settings_of
+from vd4rl_pomdp.runs.results import Result, read_results
 from vd4rl_pomdp.sweeps.sets import DataSet
 
 
@@ -74,7 +74,7 @@ class FoundRuns:
 
     def _adds_the_same(self, record: Row) -> bool:
         """Whether the images that a run in a maze added, if it did, are still in their folder."""
-        from vd4rl_pomdp.navigation.exogenous import source_fingerprint
+        from vd4rl_pomdp.studies.navigation.exogenous import source_fingerprint
 
         told, source = record.get("inputs", {}).get("exogenous"), record["config"].get("exogenous")
         if told is not None and source not in self._images:

@@ -8,7 +8,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 
 PIXELS = ("collect", "pretrain", "finetune")
 MAZES = ("navigation_collect", "navigation_train")

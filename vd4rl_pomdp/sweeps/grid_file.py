@@ -35,10 +35,10 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.errors import UserError, disk_error
-from vd4rl_pomdp.reading import read_bytes, regular
+from vd4rl_pomdp.core.errors import UserError, disk_error
+from vd4rl_pomdp.core.reading import read_bytes, regular
+from vd4rl_pomdp.core.settings import RUNTIME_FIELDS
 from vd4rl_pomdp.runs.interrupt import Terminated
-from vd4rl_pomdp.settings import RUNTIME_FIELDS
 from vd4rl_pomdp.sweeps.grid import (
     MAZES,
     PIXELS,
@@ -57,7 +57,7 @@ from vd4rl_pomdp.sweeps.grid import (
     value_of,
 )
 
-GRIDS = Path(__file__).parents[1] / "experiments" / "grids"
+GRIDS = Path(__file__).with_name("grids")
 """The grids that ship with the package."""
 _FOLDERS = {"out", "data", "encoder"}
 """Settings of the stages that a sweep sets."""

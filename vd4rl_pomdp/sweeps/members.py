@@ -6,12 +6,12 @@ from collections import defaultdict
 from pathlib import Path
 from typing import Any
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.settings import LABELS
 from vd4rl_pomdp.data.collect import set_quality
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.report.load import Choice, without_options
-from vd4rl_pomdp.results import Result
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.settings import LABELS
+from vd4rl_pomdp.runs.results import Result
 from vd4rl_pomdp.sweeps.found import FoundRun, found_in
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.sets import DataSet, set_of

@@ -12,8 +12,8 @@ from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.registry import BY_CALL, REGISTRIES, origins
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.registry import BY_CALL, REGISTRIES, origins
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.sweeps.plan import Job

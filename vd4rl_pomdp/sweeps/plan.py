@@ -9,14 +9,14 @@ from itertools import chain, count, pairwise
 from pathlib import Path
 from typing import Any
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import words_of
+from vd4rl_pomdp.core.registry import of_other_code
+from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.data.format import PLAN, PROVENANCE, read_plan
 from vd4rl_pomdp.data.shards import differing
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, encoder_hash
-from vd4rl_pomdp.options import words_of
-from vd4rl_pomdp.registry import of_other_code
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
-from vd4rl_pomdp.settings import settings_of
 from vd4rl_pomdp.sweeps.found import FoundRun, FoundRuns, run_at
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.naming import run_folder

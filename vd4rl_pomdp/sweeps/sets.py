@@ -8,15 +8,15 @@ from functools import cached_property
 from pathlib import Path
 from typing import Any
 
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import FRAME_SIZE
 from vd4rl_pomdp.data.format import PLAN, PROVENANCE, read_frame_size, refuse_partial, shard_files, shard_paths
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.data.store import open_store
-from vd4rl_pomdp.errors import UserError
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.naming import extras
 from vd4rl_pomdp.sweeps.stages import collection_of
-from vd4rl_pomdp.tasks import FRAME_SIZE
 
 _DOWNLOADED = "84px"
 """Folder in which a downloaded set has its shards."""

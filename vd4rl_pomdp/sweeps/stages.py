@@ -11,15 +11,15 @@ from functools import cache
 from typing import Any
 
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
-from vd4rl_pomdp.errors import MAX_SEED, UserError, refuse_number
-from vd4rl_pomdp.options import flat, words_of
+from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_number
+from vd4rl_pomdp.core.options import flat, words_of
+from vd4rl_pomdp.core.settings import settings_of
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.identity import recipe
-from vd4rl_pomdp.settings import settings_of
 from vd4rl_pomdp.sweeps.fits import check_fit
 from vd4rl_pomdp.sweeps.grid import GridCell, Values
-from vd4rl_pomdp.tasks import TASKS
 
 _NOWHERE = "-"
 """Stands for a path while settings are parsed."""
@@ -114,20 +114,20 @@ def _finetune(words: list[str], program: str) -> Any:
 
 
 def _navigation_collect(words: list[str], program: str) -> Any:
-    from vd4rl_pomdp.navigation.config import PRESETS, MazeCollectConfig
+    from vd4rl_pomdp.studies.navigation.sets import PRESETS, MazeCollectConfig
 
     return with_presets(MazeCollectConfig, PRESETS, words, program)
 
 
 @cache
 def _check_maze_collection(config: Any) -> None:
-    from vd4rl_pomdp.navigation.collect import check_config
+    from vd4rl_pomdp.studies.navigation.collect import check_config
 
     check_config(config)
 
 
 def _navigation_train(words: list[str], program: str) -> Any:
-    from pretrain.navigation.config import NavigationConfig
+    from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 
     return parse_stage(NavigationConfig, words, program)
 
@@ -153,7 +153,7 @@ def collection_of(cell: GridCell) -> Values:
         from vd4rl_pomdp.data.collect import collection
 
         return collection(config_of(cell, section))
-    from vd4rl_pomdp.navigation.collect import collection as maze_collection
+    from vd4rl_pomdp.studies.navigation.collect import collection as maze_collection
 
     return maze_collection(config_of(cell, section))
 

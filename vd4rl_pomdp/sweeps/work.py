@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, Protocol
 
-from vd4rl_pomdp.errors import (
+from vd4rl_pomdp.core.errors import (
     DIVERGED,
     DONE,
     INTERRUPTED,

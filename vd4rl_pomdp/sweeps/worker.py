@@ -32,8 +32,8 @@ def main() -> None:
     words = told["words"]
     sys.argv = ["vd4rl-pomdp", *words]  # what a run records as its command
     from vd4rl_pomdp.cli.ends import End, run_to_end
-    from vd4rl_pomdp.errors import UserError
-    from vd4rl_pomdp.registry import changed_since
+    from vd4rl_pomdp.core.errors import UserError
+    from vd4rl_pomdp.core.registry import changed_since
     from vd4rl_pomdp.sweeps.own_file import load
 
     load(told["own_file"])

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.runs.checkpoint import pack, unpack
 from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 
 Check = Callable[..., None]
 """Called with a part's name and its options; the first line of its docstring is the promise that it checks."""

@@ -11,13 +11,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core.options import flat
+from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
+from vd4rl_pomdp.core.types import StepType, row_key
 from vd4rl_pomdp.corruptions import BatchCorruption, Corruption, CorruptionConfig, derive_keys, make_corruption
 from vd4rl_pomdp.corruptions.corruption import ZERO_FRAMES, Mode
-from vd4rl_pomdp.options import flat
-from vd4rl_pomdp.seeding import stream_seed
-from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.testing.contract import Check, claim, run_checks
-from vd4rl_pomdp.types import StepType, row_key
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.data import Dataset
@@ -139,7 +139,7 @@ def a_view_shows_shifted_then_corrupted_stacks(name: str, **options: Any) -> Non
 
 
 def _claim_view(dataset: Dataset, config: CorruptionConfig, shift: int) -> None:
-    from vd4rl_pomdp.augmentation import random_shift
+    from vd4rl_pomdp.corruptions.augmentation import random_shift
     from vd4rl_pomdp.data import View
 
     rows, key = torch.arange(dataset.num_rows).view(2, -1), torch.tensor([5, 6])

@@ -9,10 +9,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import EncoderCard, load_encoder, save_encoder
 from vd4rl_pomdp.nn.frame import FrameEncoder
-from vd4rl_pomdp.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
 
 CHANNELS = 3 * FRAME_STACK

@@ -9,13 +9,13 @@ from typing import Any, cast
 
 import torch
 
+from vd4rl_pomdp.core.state_scale import StateScale
+from vd4rl_pomdp.core.types import StateWindows, Windows, previous
 from vd4rl_pomdp.corruptions import CORRUPTIONS
 from vd4rl_pomdp.nn.action_target import ACTION_TARGETS, CodeOptions, target_options
-from vd4rl_pomdp.objective import InverseObjective, Objective
-from vd4rl_pomdp.state_scale import StateScale
+from vd4rl_pomdp.nn.objective import InverseObjective, Objective
+from vd4rl_pomdp.nn.visibility import declared, dependence, response, wrong_pairs
 from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_check, run_checks, shown
-from vd4rl_pomdp.types import StateWindows, Windows, previous
-from vd4rl_pomdp.visibility import declared, dependence, response, wrong_pairs
 
 ROWS, ACTIONS, STATE, POSE = 6, 2, 5, 3
 _SMALL = {"max_k": 3, "feature_dim": 8, "hidden_dim": 7, "head_dim": 8}

@@ -7,9 +7,9 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from vd4rl_pomdp.tasks import TASKS, DMCTask, GymnasiumTask
+from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask
+from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.testing.contract import Check, claim, run_checks
-from vd4rl_pomdp.types import StepType
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.envs.pixels import PixelEnv, TimeStep
@@ -22,7 +22,7 @@ def check_task(name: str) -> None:
     """Check every promise of a task, by playing a few short episodes of it.
 
     Args:
-        name: of the task in `vd4rl_pomdp.tasks.TASKS`.
+        name: of the task in `vd4rl_pomdp.core.tasks.TASKS`.
 
     Raises:
         AssertionError: a promise is broken; says which one, and by what.

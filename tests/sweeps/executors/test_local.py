@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.sweeps.executors import local
 from vd4rl_pomdp.sweeps.executors.local import LocalExecutor, LocalOptions
 from vd4rl_pomdp.sweeps.work import Work

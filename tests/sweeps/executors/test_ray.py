@@ -12,7 +12,7 @@ from pathlib import Path
 import pytest
 
 from tests.sweeps.executors.waiting import begun, run, until, waiting_job, work_of
-from vd4rl_pomdp.errors import UnavailableError, UserError
+from vd4rl_pomdp.core.errors import UnavailableError, UserError
 from vd4rl_pomdp.runs.ownership import in_use
 from vd4rl_pomdp.sweeps.driver import Driver
 from vd4rl_pomdp.sweeps.executors import ray as module

@@ -11,7 +11,7 @@ import pytest
 
 from tests.sweeps.executors.slurm_cluster import slurm, why_not
 from tests.sweeps.executors.waiting import begun, run, until, waiting_job, work_of
-from vd4rl_pomdp.errors import UserError
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.sweeps.executors import slurm as module
 from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor
 from vd4rl_pomdp.sweeps.executors.slurm_queue import SlurmOptions

@@ -10,7 +10,7 @@ from types import SimpleNamespace
 import pytest
 
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.errors import OutOfMemoryError, UnavailableError, UserError
+from vd4rl_pomdp.core.errors import OutOfMemoryError, UnavailableError, UserError
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.sweeps.executors import slurm as module
 from vd4rl_pomdp.sweeps.executors import slurm_queue

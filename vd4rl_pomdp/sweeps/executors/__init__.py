@@ -7,8 +7,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.errors import refuse_unknown
-from vd4rl_pomdp.options import Options
+from vd4rl_pomdp.core.errors import refuse_unknown
+from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.sweeps.executors.local import LocalExecutor, LocalOptions
 from vd4rl_pomdp.sweeps.executors.ray import RayExecutor, RayOptions
 from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor

@@ -15,7 +15,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any
 
-from vd4rl_pomdp.errors import UnavailableError, UserError, disk_errors
+from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors
 from vd4rl_pomdp.sweeps.executors.handover import Handover
 from vd4rl_pomdp.sweeps.executors.local import LocalExecutor, LocalOptions, visible_gpus
 from vd4rl_pomdp.sweeps.work import INTERRUPTED, KILLED, Ended, Work

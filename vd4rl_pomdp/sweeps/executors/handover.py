@@ -13,7 +13,7 @@ import time
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
-from vd4rl_pomdp.errors import UserError, disk_errors
+from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
 from vd4rl_pomdp.sweeps.work import Ended, Work
 

@@ -10,8 +10,8 @@ from collections import Counter
 from dataclasses import dataclass
 from typing import ClassVar
 
-from vd4rl_pomdp.errors import UserError
-from vd4rl_pomdp.options import Limits, Options
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.sweeps.oom import oom_kills
 from vd4rl_pomdp.sweeps.work import Ended, Work, ended, start_process, wait_or_kill
 

@@ -18,8 +18,8 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
-from vd4rl_pomdp.errors import OutOfMemoryError, UnavailableError, UserError, disk_errors
-from vd4rl_pomdp.options import Limits, Options
+from vd4rl_pomdp.core.errors import OutOfMemoryError, UnavailableError, UserError, disk_errors
+from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.sweeps.executors.local import PATIENCE_S
 from vd4rl_pomdp.sweeps.oom import oom_kills
 from vd4rl_pomdp.sweeps.work import FAILED, INTERRUPTED, KILLED, Ended, Work, ended, start_process, wait_or_kill

@@ -15,7 +15,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from secrets import token_hex
 
-from vd4rl_pomdp.errors import OutOfMemoryError, UnavailableError, UserError, disk_errors
+from vd4rl_pomdp.core.errors import OutOfMemoryError, UnavailableError, UserError, disk_errors
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.sweeps.executors.allocation import IDLE_S, Allocation
 from vd4rl_pomdp.sweeps.executors.handover import Handover

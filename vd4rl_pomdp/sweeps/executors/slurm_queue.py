@@ -12,8 +12,8 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, ClassVar, NamedTuple
 
-from vd4rl_pomdp.errors import UnavailableError, UserError, disk_errors
-from vd4rl_pomdp.options import Limits, Options
+from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors
+from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.sweeps.executors.allocation import Allocation
 from vd4rl_pomdp.sweeps.executors.local import PATIENCE_S

@@ -1,0 +1,318 @@
+"""Evaluate a frozen encoder and a policy in the corrupted environment, episodes in parallel, raw rows as the result."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from functools import cache, lru_cache
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from vd4rl_pomdp.core.errors import UserError, refuse_number
+from vd4rl_pomdp.core.registry import warn_of_other_code
+from vd4rl_pomdp.core.settings import LABELS
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, MOST_EPISODES, TASKS, Task
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data.format import warn_of_earlier_pictures
+from vd4rl_pomdp.data.reference import Reference, action_error
+from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn, Observation
+from vd4rl_pomdp.envs.make import layout_of
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.encoder_folder import encoder_hash, load_encoder, read_record
+from vd4rl_pomdp.nn.frame import StateFrame
+from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
+from vd4rl_pomdp.policies.actor import Actor, read_actor
+from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, LABELS_FILE
+from vd4rl_pomdp.runs.episodes import read_episodes
+from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.run import remedy
+from vd4rl_pomdp.runs.workers import run_jobs
+
+EVALUATION_SEED = 20_000
+"""Evaluation episode i starts from environment seed EVALUATION_SEED + i, for every method and training seed."""
+FILM_EVERY = 4
+"""Rows between two pictures of a film."""
+
+
+class Agent:
+    """Encoder and policy, fed one row at a time; its own past actions are part of the history."""
+
+    def __init__(self, encoder: Encoder, policy: Policy) -> None:
+        self.encoder, self.policy = encoder, policy
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: an episode begins."""
+        self._state = self.encoder.initial_state(1)
+        self._action = torch.zeros(1, self.encoder.config.action_dim)
+
+    @property
+    def picture_size(self) -> int:
+        """Height and width of the pictures it is shown; one that reads states is watched in the benchmark's."""
+        return FRAME_SIZE if self.encoder.reads_state else self.encoder.config.size
+
+    def encoder_input(self, now: Observation, task: Task) -> torch.Tensor:
+        """What the encoder reads: the corrupted stack, or the simulator state for the `state` reference."""
+        if not isinstance(self.encoder.frame, StateFrame):
+            return now.obs
+        state = torch.from_numpy(layout_of(task).visible_state(now.time_step.physics))
+        return self.encoder.frame.observe(state[None], now.key)[0]
+
+    @torch.no_grad()
+    def act(self, obs: torch.Tensor) -> np.ndarray:
+        """Mean action (A,) float32 for a (C, S, S) uint8 observation."""
+        z, self._state = self.encoder.step(obs[None], self._action, self._state)
+        self._action = self.policy(z)
+        return self._action[0].numpy()
+
+    def set_last_action(self, action: np.ndarray) -> None:
+        """Tell that another (A,) action than the last answer was executed."""
+        self._action = torch.from_numpy(action)[None]
+
+
+@dataclass(frozen=True)
+class EpisodeJob:
+    """One evaluation episode."""
+
+    encoder: Path
+    policy: Path
+    task: Task
+    """Itself and not its name: a task of one's own need not be registered where the job is done."""
+    corruption: CorruptionConfig
+    episode: int
+    film: bool
+    length: int | None = None
+    actor: Path | None = None
+    """File of the actor that made the data; None: it is not known."""
+
+
+@dataclass(frozen=True)
+class Episode:
+    """What an evaluation episode gave."""
+
+    evaluated_under: str
+    """Name of the corruption that it was played under."""
+    episode: int
+    rewards: list[float]
+    """One a decision."""
+    film: dict[str, np.ndarray] | None
+    """`clean` (F, 3, S, S) and `corrupted` (F, C, S, S) uint8 pictures, `return` (F,) so far."""
+    action_errors: list[np.floating] = field(default_factory=list)
+    """In closed loop, one a decision: mean squared difference between the policy's action and the mean action of the
+    data's actor at the state it is in; empty: the actor is not known."""
+
+    @property
+    def total(self) -> float:
+        """Its return, added up in order."""
+        return float(np.cumsum(self.rewards)[-1])
+
+    @property
+    def action_error(self) -> float | None:
+        """Mean over its decisions, None if they are unknown."""
+        return float(np.mean(self.action_errors)) if self.action_errors else None
+
+
+def evaluate(jobs: list[EpisodeJob], workers: int) -> list[Episode]:
+    """Run evaluation episodes; their results do not depend on `workers`."""
+    return list(run_jobs(_run_episode, jobs, workers))
+
+
+def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[str, Any]]:
+    """Rows of `episodes.csv`: one an episode, `labels` giving the columns up to `step`: those of the training."""
+    divisor = TASKS.named(labels["task"]).score_divisor
+    return [
+        labels
+        | {
+            "episode": e.episode,
+            "episode_seed": EVALUATION_SEED + e.episode,
+            "return": round(e.total, 4),
+            "length": len(e.rewards),
+            "score": round(e.total / divisor, 4),
+            "evaluated_under": e.evaluated_under,
+            "action_error": None if e.action_error is None else round(e.action_error, 6),
+        }
+        for e in episodes
+    ]
+
+
+def _run_episode(job: EpisodeJob) -> Episode:
+    agent = _agent(job.encoder, job.policy, _content(job.encoder, job.policy))
+    place = (job.task, job.corruption, "fast", job.length, agent.picture_size, _draws(agent, job))
+    return _play(agent, _environment(*place), job)
+
+
+@cache
+def _environment(*place: Any) -> CorruptedEnv:
+    """The process's environment for these arguments: one GL context serves all its episodes."""
+    return CorruptedEnv(*place)
+
+
+@lru_cache(maxsize=1)
+def _agent(encoder: Path, policy: Path, content: tuple[str, str]) -> Agent:
+    """The agent of two folders, read anew when another is asked for or they hold something else."""
+    return Agent(load_encoder(encoder)[0], load_policy(policy))
+
+
+def _content(encoder: Path, policy: Path) -> tuple[str, str]:
+    """Names of what the folders of an agent hold."""
+    try:
+        return encoder_hash(encoder), encoder_hash(policy)  # whose files have the same names
+    except FileNotFoundError:
+        return "", ""  # loading says what is missing
+
+
+def _draws(agent: Agent, job: EpisodeJob) -> Drawn:
+    """A film shows all frames; else no frame is drawn that its agent does not see."""
+    if job.film:
+        return "all"
+    return "nothing" if agent.encoder.reads_state else "seen"
+
+
+def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
+    agent.reset()
+    now = env.reset(EVALUATION_SEED + job.episode, EVALUATION_SEED, job.episode)
+    film = [(now, 0.0)]
+    actor = job.actor and _actor(job.actor)
+    rewards: list[float] = []
+    errors: list[np.floating] = []
+    while not now.time_step.last:
+        action = agent.act(agent.encoder_input(now, job.task))
+        if actor:
+            errors.append(action_error(action, actor.act(now.time_step.state)))
+        now = env.step(action)
+        rewards.append(now.time_step.reward)
+        if job.film and len(rewards) % FILM_EVERY == 0:
+            film.append((now, float(np.cumsum(rewards)[-1])))
+    return Episode(job.corruption.corruption, job.episode, rewards, _film(film) if job.film else None, errors)
+
+
+@cache
+def _actor(path: Path) -> Actor:
+    return read_actor(path)
+
+
+def _film(shots: list[tuple[Observation, float]]) -> dict[str, np.ndarray]:
+    return {
+        "clean": np.stack([shot.clean[-3:].numpy() for shot, _ in shots]),
+        "corrupted": np.stack([shot.obs.numpy() for shot, _ in shots]),
+        "return": np.array([total for _, total in shots]),
+    }
+
+
+def by_part(episodes: list[Episode], parts: int) -> dict[str, dict[str, float | None]]:
+    """Where in time policies lose their way.
+
+    Args:
+        episodes: some that share a task; one that ended early is in the parts that it reached.
+        parts: into how many the longest is cut, at least 1; more than it has decisions are as many as these.
+
+    Returns:
+        By first and last decision ("0-49"): mean `reward` and `action_error` (None: unknown) of a decision.
+    """
+    longest = max(len(episode.rewards) for episode in episodes)
+    parts = min(parts, longest)
+    edges = [longest * part // parts for part in range(parts + 1)]
+    return {
+        f"{first}-{end - 1}": {
+            "reward": _mean(value for episode in episodes for value in episode.rewards[first:end]),
+            "action_error": _mean(value for episode in episodes for value in episode.action_errors[first:end]),
+        }
+        for first, end in pairwise(edges)
+    }
+
+
+def _mean(values: Iterable[Any]) -> float | None:
+    found = list(values)
+    return float(np.mean(found)) if found else None
+
+
+@dataclass(frozen=True)
+class EvaluatedRun:
+    """A policy played again."""
+
+    rows: list[dict[str, Any]]
+    """Of `episodes.csv`; `corruption` is that of training, `step` that of the policy that played."""
+    episodes: list[Episode]
+    """Their episodes, in the same order."""
+
+
+def evaluations_of(run: Path) -> list[dict[str, Any]]:
+    """The rows of a fine-tuning run's own evaluations; UserError for a folder without any."""
+    if rows := read_episodes(run / EPISODES_FILE):
+        return rows
+    raise UserError(f"{run}: holds no evaluated run; name a folder that `vd4rl-pomdp finetune` wrote")
+
+
+def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int) -> EvaluatedRun:
+    """Evaluate a fine-tuning run's policy.
+
+    Args:
+        run: its folder.
+        corruption: name of the corruption to evaluate under, with the run's own options where it reads them; None for
+            the run's own, and for none at all, too.
+        episodes: how many.
+        workers: processes, 0 for every core.
+
+    Returns:
+        `episodes` of them under each corruption, as long as those of the run's own evaluations.
+
+    Raises:
+        UserError: an unknown corruption, no episode, a folder without an evaluated run, or one whose policy changes
+            while it plays.
+    """
+    refuse_number("episodes", episodes, 1, MOST_EPISODES)
+    refuse_number("workers", workers, 0)
+    evaluated = evaluations_of(run)
+    labels = read_json(run / LABELS_FILE)
+    missing = [name for name in LABELS if not isinstance(labels.get(name), str | int)]
+    if missing:
+        raise UserError(f"{run / LABELS_FILE}: has no {missing[0]!r}; {remedy(run)}")
+    card = load_encoder(run / "encoder")[1]
+    what = "this policy was trained, and it plays by the new; take the earlier code, or train it again"
+    record = _record(run)
+    warn_of_other_code(run, record, read_record(run / "encoder").parts, what)
+    task = TASKS.named(card.task)
+    warn_of_earlier_pictures(run, record.get("collection") or {}, task)
+    chosen = own_and_none(CorruptionConfig.fill(card.corruption))
+    if corruption is not None:
+        chosen = [CorruptionConfig.fill(card.corruption | {"corruption": corruption})]
+    for one in chosen:
+        one.check()
+    actor = Reference.read(run).actor_file
+    encoder, policy, length = run / "encoder", run / "policy", _length(record, task)
+    jobs = [
+        EpisodeJob(encoder, policy, task, one, episode, film=False, length=length, actor=actor)
+        for one in chosen
+        for episode in range(episodes)
+    ]
+    content = _content(encoder, policy)
+    step = policy_step(policy)
+    if step is None:  # of an earlier version
+        step = max(row["step"] for row in evaluated)
+    played = evaluate(jobs, workers)
+    if _content(encoder, policy) != content:
+        raise UserError(f"{run}: wrote another policy while this one played; evaluate it when it is done")
+    return EvaluatedRun(episode_rows(played, labels | {"step": step}), played)
+
+
+def _length(record: dict[str, Any], task: Task) -> int:
+    """Most decisions in an episode of a run's evaluations; the task's where the run does not tell."""
+    config = record.get("config")
+    told = config.get("eval_length") if isinstance(config, dict) else None
+    return min(told, task.decisions) if isinstance(told, int) else task.decisions
+
+
+def _record(run: Path) -> dict[str, Any]:
+    """A run's config.json; nothing where an early version kept none."""
+    file = run / CONFIG_FILE
+    return read_json(file) if file.exists() else {}
+
+
+def own_and_none(corruption: CorruptionConfig) -> list[CorruptionConfig]:
+    """The corruptions that a policy trained under one is evaluated under: that one, and none at all."""
+    clean = CorruptionConfig.of("none")
+    return [corruption] if corruption.corruption == clean.corruption else [corruption, clean]

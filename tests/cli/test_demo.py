@@ -1,0 +1,107 @@
+from collections import Counter
+
+import pytest
+from PIL import Image
+
+from tests.studies.navigation.test_report import write_run
+from vd4rl_pomdp.cli import demo as demos
+from vd4rl_pomdp.cli.demo import conclusion, demo, demo_jobs, show_navigation
+from vd4rl_pomdp.runs.episodes import append_episodes
+from vd4rl_pomdp.runs.files import write_json
+from vd4rl_pomdp.studies.navigation.grid import Condition
+
+METHODS = ("mik+a", "acro", "random")
+LABELS = {"task": "walker_walk", "quality": "expert_noisy", "corruption": "patch+zero_frames"}
+LABELS |= {"algorithm": "td3_bc", "seed": 0}
+
+
+def write_returns(jobs):
+    """Rows of two evaluations."""
+    for job, method in zip((job for job in jobs if job.section == "finetune"), METHODS, strict=True):
+        rows = [
+            LABELS
+            | {"method": method, "step": step, "episode": i, "episode_seed": i, "return": value, "length": 500}
+            | {"score": value / 10, "evaluated_under": LABELS["corruption"]}
+            for step, values in ((5, [999.0]), (10, [100.0, 140.0]))
+            for i, value in enumerate(values)
+        ]
+        job.folder.mkdir(parents=True)
+        append_episodes(job.folder / "episodes.csv", rows)
+        write_json(job.folder / "probe.json", {"probe_pose": 39.4, "probe_velocity": 53.6})
+
+
+LEVELS = {"no_history": 80.0, "mik+a": 7.4}
+
+
+def write_navigation(jobs):
+    for job in jobs:
+        if job.section == "navigation_train":
+            method = job.folder.parent.name
+            folder = write_run(job.folder.parents[2], Condition("three_curtains", method), 0, LEVELS[method])
+            job.folder.parent.mkdir(parents=True)
+            folder.rename(job.folder)
+
+
+@pytest.mark.parametrize("preset", ["cpu", "smoke"])
+def test_the_demo_uses_every_stage(tmp_path, preset):
+    words = [job.words for job in demo_jobs(tmp_path, preset)]
+    stages = ["data", *["pretrain", "finetune"] * 3, *["navigation"] * 3]
+    assert [stage[0] for stage in words] == stages
+    assert [stage[1] for stage in words[-3:]] == ["collect", "train", "train"]
+    assert "three_curtains" in words[-3]
+    assert all(stage[stage.index("--preset") + 1] == preset for stage in words if "--preset" in stage)
+
+
+def test_the_demo_is_one_sweep_that_ends_with_report_conclusion_and_film(tmp_path, capsys):
+    carried, commands = [], []
+
+    def carry_out(jobs, folder, kind, options):
+        assert [job.name for job in folder.jobs()] == [job.name for job in jobs], "`sweep status` knows them"
+        carried.append((kind, options.jobs))
+        write_returns(jobs)
+        write_navigation(jobs)
+
+    demo(tmp_path / "demo", 3, "cpu", carry_out, commands.append)
+    assert carried == [("local", 3)]
+    assert [command[0] for command in commands] == ["report"]
+    shown = capsys.readouterr()
+    told = [line.split()[2] for line in shown.err.splitlines() if line.startswith("$ vd4rl-pomdp")]
+    assert Counter(told) == {"data": 1, "pretrain": 3, "finetune": 3, "navigation": 3, "report": 1}
+    assert all(f"  {method} " in shown.out for method in METHODS)
+    assert (tmp_path / "demo/navigation.gif").is_file()
+
+
+def test_without_a_gpu_the_demo_does_a_job_a_core_up_to_four(tmp_path, monkeypatch):
+    at_once = []
+    for cores in (2, 64):
+        monkeypatch.setattr(demos, "visible_gpus", list)
+        monkeypatch.setattr(demos, "count_workers", lambda wanted, cores=cores: wanted or cores)
+        with pytest.raises(RuntimeError, match="far enough"):
+            demo(tmp_path, 0, "cpu", lambda *told: at_once.append(told[3].jobs) or stop(), stop)
+    monkeypatch.setattr(demos, "visible_gpus", lambda: ["0"])
+    with pytest.raises(RuntimeError, match="far enough"):
+        demo(tmp_path, 0, "cpu", lambda *told: at_once.append(told[3].jobs) or stop(), stop)
+    assert at_once == [2, 4, 0]
+
+
+def stop():
+    raise RuntimeError("far enough")
+
+
+def test_the_demo_ends_with_the_last_evaluation_what_is_known_and_how_sure_it_is(tmp_path):
+    jobs = demo_jobs(tmp_path)
+    write_returns(jobs)
+    head, _, _, *lines, caveat, _ = conclusion(jobs)
+    assert LABELS["corruption"] in head
+    assert [" ".join(line.split()) for line in lines] == [f"{method} 39, 54 120 ± 20 (n = 2)" for method in METHODS]
+    assert "One seed each" in caveat
+
+
+def test_the_demo_ends_with_a_film_and_the_errors_behind_the_curtains(tmp_path):
+    jobs = demo_jobs(tmp_path)
+    write_navigation(jobs)
+    lines = list(show_navigation(jobs, tmp_path / "film.gif"))
+    assert [line.split() for line in lines[1:3]] == [["mik+a", "7"], ["no_history", "80"]]
+    assert "film.gif" in lines[-1]
+    with Image.open(tmp_path / "film.gif") as film:
+        assert film.n_frames == 60

@@ -1,0 +1,254 @@
+"""Tasks of one's own: what is found from their models, and what is refused."""
+
+import re
+import subprocess
+import sys
+from dataclasses import replace
+
+import gymnasium
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask, Layout
+from vd4rl_pomdp.data.check import check_dataset
+from vd4rl_pomdp.data.collect import CollectConfig, collect
+from vd4rl_pomdp.envs.dmc import replay_rewards, replays, start_from
+from vd4rl_pomdp.envs.make import layout_of, make_env
+from vd4rl_pomdp.envs.rendering import mujoco, suite
+
+
+def test_tasks_are_named_without_loading_a_simulator():
+    code = "import sys, vd4rl_pomdp.core.tasks; print({'mujoco', 'gymnasium', 'torch'} & set(sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    assert done.stdout.strip() == "set()"
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_the_layouts_of_the_benchmark_are_what_their_models_have(name):
+    task = TASKS[name]
+    assert layout_of(replace(task, layout=None)) == task.layout
+
+
+@pytest.mark.parametrize(
+    ("domain", "task", "layout"),
+    [
+        ("cartpole", "swingup", Layout(1, 5, 2, turning=(1,))),  # its camera stands still and shows where the cart is
+        ("hopper", "hop", Layout(4, 15, 7, travel=(0,), turning=(2,))),
+        ("quadruped", "run", Layout(12, 78, 23, travel=(0, 1), quaternions=(3,))),
+        ("reacher", "easy", Layout(2, 6, 2, turning=(0,))),
+        ("ball_in_cup", "catch", Layout(2, 8, 4)),
+    ],
+)
+def test_what_a_task_does_not_tell_is_found(domain, task, layout):
+    found = layout_of(DMCTask(domain, task))
+    assert found == layout
+    physics = suite.load(domain, task).physics.get_state()
+    width = len(physics) - len(layout.travel) + len(layout.turning) + 2 * len(layout.quaternions)
+    assert found.visible_state(physics[None]).shape == (1, width)
+
+
+def test_where_a_ball_is_shows_beside_the_body_that_a_camera_follows():
+    task = DMCTask("quadruped", "fetch")
+    layout, physics = layout_of(task), suite.load(task.domain, task.task).physics.get_state()[None]
+    assert (layout.travel, layout.beside) == ((0, 1), (23,))
+    both, ball = physics.copy(), physics.copy()
+    for place in (0, 23):
+        both[:, place : place + 2] += (3, -2)
+    ball[:, 23:25] += (3, -2)
+    np.testing.assert_allclose(layout.visible_state(both), layout.visible_state(physics), atol=1e-5)
+    moved = layout.visible_state(ball) - layout.visible_state(physics)
+    assert sorted(moved[np.abs(moved) > 1e-5].round(4).tolist()) == [-2, 3]
+
+
+def test_a_camera_that_follows_a_hand_shows_where_things_are():
+    layout = layout_of(DMCTask("stacker", "stack_2", camera=1))
+    assert (layout.travel, layout.beside) == ((), ())
+
+
+def test_actions_of_a_task_with_other_bounds_reach_all_of_them():
+    env = make_env(DMCTask("quadruped", "walk"), size=None)
+    spec = env.simulator.action_spec()
+    assert (spec.maximum != 1).any()
+    for end, bound in ((-1.0, spec.minimum), (1.0, spec.maximum)):
+        env.reset(0)
+        env.step(np.full(env.action_dim, end, np.float32))
+        np.testing.assert_allclose(env.physics.control(), bound)
+
+
+def _alike(layout: Layout, physics: np.ndarray) -> np.ndarray:
+    """Another simulator state of the same look."""
+    other = physics.copy()
+    other[list(layout.turning)] += [2 * np.pi * (-1) ** i for i in range(len(layout.turning))]
+    for first in layout.quaternions:
+        other[first : first + 4] *= -1
+    return other
+
+
+@pytest.mark.parametrize("name", [*TASKS, "quadruped walk", "acrobot swingup"])
+def test_states_that_look_the_same_are_the_same_vector_and_others_are_not(name):
+    task = TASKS[name] if name in TASKS else DMCTask(*name.split())
+    env, rng = make_env(task, size=48), np.random.default_rng(0)
+    env.reset(1)
+    for _ in range(30):
+        step = env.step(rng.uniform(-1, 1, env.action_dim).astype(np.float32))
+    other = _alike(env.layout, step.physics)
+    assert np.abs(other - step.physics).max() > 0.1
+    start_from(env.simulator, other)
+    drawn = env._time_step(0.0, 1.0, step.step_type)
+    np.testing.assert_array_equal(drawn.frame, step.frame)
+    np.testing.assert_allclose(env.layout.visible_state(other), env.layout.visible_state(step.physics), atol=1e-6)
+    turned = step.physics.copy()
+    column = (*env.layout.turning, *(first + 1 for first in env.layout.quaternions))[0]
+    turned[column] += 0.2
+    assert np.abs(env.layout.visible_state(turned) - env.layout.visible_state(step.physics)).max() > 0.01
+
+
+def test_the_two_columns_of_a_quaternion_are_those_of_its_rotation_matrix():
+    quaternion, matrix = np.random.default_rng(0).normal(size=4), np.zeros(9)
+    quaternion /= np.linalg.norm(quaternion)
+    mujoco.mju_quat2Mat(matrix, quaternion)
+    pose = Layout(1, positions=4, quaternions=(0,)).pose(quaternion)
+    np.testing.assert_allclose(pose, matrix.reshape(3, 3)[:, :2].T.ravel(), atol=1e-12)
+
+
+@pytest.mark.parametrize("task", ["cartpole swingup", "acrobot swingup", "dog walk", "quadruped fetch"])
+def test_rewards_of_any_task_of_dm_control_replay(task):
+    env, rng = make_env(DMCTask(*task.split()), size=None), np.random.default_rng(0)
+    first = env.reset(3)
+    actions = rng.uniform(-1, 1, (8, env.action_dim)).astype(np.float32)
+    rewards = [env.step(action).reward for action in actions]
+    with TASKS.isolated():
+        TASKS.register("mine", env.task)
+        assert replays(env.task)
+        np.testing.assert_array_equal(replay_rewards("mine", first.physics, actions), rewards)
+
+
+@pytest.mark.parametrize("task", ["reacher easy", "finger turn_hard", "swimmer swimmer6"])
+def test_a_task_that_draws_a_target_into_its_model_cannot_be_replayed_and_says_so(task, tmp_path):
+    with TASKS.isolated():
+        TASKS.register("mine", DMCTask(*task.split()))
+        collect(CollectConfig("mine", "random", tmp_path / "set", episodes=1, workers=1, frame_size=16), 2)
+        report = check_dataset(tmp_path / "set", tmp_path / "cache")
+    assert report["replay_max_error"] is None
+    assert report["replay"] == "impossible: mine draws more than the simulator state for each episode"
+
+
+def test_an_unknown_task_of_dm_control_is_one_line():
+    with pytest.raises(UserError, match=r"dm_control has no task 'cartpole', 'swing': choose one of .*swingup"):
+        layout_of(DMCTask("cartpole", "swing"))
+    with pytest.raises(UserError, match=r"choose one of acrobot, .*walker"):
+        layout_of(DMCTask("carpole", "swingup"))
+
+
+def test_what_is_no_task_is_not_registered():
+    with TASKS.isolated():
+        with pytest.raises(
+            UserError, match=r"task 'mine' is a str, not a vd4rl_pomdp\.tasks\.DMCTask or GymnasiumTask"
+        ):
+            TASKS.register("mine", "cartpole")
+        with pytest.raises(UserError, match="a task called 'walker_walk' exists already"):
+            TASKS.register("walker_walk", DMCTask("walker", "walk"))
+    with pytest.raises(UserError, match="unknown task 'mine': choose one of walker_walk, cheetah_run, humanoid_walk"):
+        TASKS.named("mine")
+
+
+@pytest.mark.parametrize("name", ["my/cartpole", "/cartpole", "cartpole/", "", ".", ".."])
+def test_a_task_whose_name_no_file_can_have_is_not_registered(name):
+    with TASKS.isolated(), pytest.raises(UserError, match=f"task '{name}': folders and `--only` are made of names"):
+        TASKS.register(name, DMCTask("cartpole", "swingup"))
+
+
+@pytest.mark.parametrize(
+    ("numbers", "message"),
+    [
+        ({"decisions": 0}, "task 'mine': its decisions is 0: it must be an integer from 1"),
+        ({"decisions": 2**20}, "task 'mine': its decisions is 1048576: it must be an integer from 1 to 1048575"),
+        ({"action_repeat": 0}, "task 'mine': its action_repeat is 0: it must be an integer from 1"),
+        ({"decisions": 20.5}, "task 'mine': its decisions is 20.5: it must be an integer from 1"),
+        ({"score_divisor": 0.0}, "task 'mine': its score_divisor is 0.0: it must be a positive number"),
+        ({"score_divisor": -10.0}, "its score_divisor is -10.0: it must be a positive number"),
+        ({"score_divisor": np.nan}, "its score_divisor is nan: it must be a positive number"),
+    ],
+)
+def test_numbers_that_make_no_task_are_not_registered(numbers, message):
+    for task in (DMCTask("cartpole", "swingup", **numbers), GymnasiumTask("CartPole-v1", **numbers)):
+        with TASKS.isolated(), pytest.raises(UserError, match=message):
+            TASKS.register("mine", task)
+
+
+@pytest.mark.parametrize("camera", [-1, 9])
+def test_a_camera_that_a_model_has_not_is_one_line(camera):
+    message = f"dm_control's walker walk has no camera {camera}: register the task with one of 0 to 1"
+    for layout in (None, TASKS["walker_walk"].layout):
+        with pytest.raises(UserError, match=message):
+            make_env(DMCTask("walker", "walk", camera, layout=layout))
+
+
+def test_a_length_that_is_refused_is_the_tasks_own_where_none_is_told():
+    with pytest.raises(UserError, match="an episode of 0 decisions is too short"):
+        make_env(DMCTask("walker", "walk", decisions=0))
+
+
+class Unpaid(gymnasium.Env):
+    """Pays a number in its first step alone."""
+
+    def __init__(self, paid, render_mode=None):
+        self.paid, self.render_mode, self.steps = paid, render_mode, 0
+        self.observation_space = gymnasium.spaces.Box(0, 255, (1,))
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (2,), np.float32)
+
+    def reset(self, *, seed=None, options=None):
+        return np.zeros(1), {}
+
+    def step(self, action):
+        self.steps += 1
+        return np.zeros(1), 1.0 if self.steps == 1 else self.paid, False, False, {}
+
+    def render(self):
+        return np.zeros((84, 84), np.uint8)
+
+
+@pytest.mark.parametrize("paid", [np.nan, np.inf, -np.inf, None, "much", np.ones(2)])
+def test_a_reward_that_is_no_number_is_refused_in_the_step_that_pays_it(paid):
+    env = make_env(GymnasiumTask(Unpaid, {"paid": paid}))
+    env.reset(0)
+    assert env.step(np.zeros(2, np.float32)).reward == 1
+    with pytest.raises(
+        UserError, match=rf"environment Unpaid pays {re.escape(str(paid))}, expected a number: mend its rewards"
+    ):
+        env.step(np.zeros(2, np.float32))
+
+
+@pytest.mark.parametrize(
+    ("method", "given", "told"),
+    [
+        ("step", (np.zeros(1), 0.0, False, {}), "gives 4 values in step, where Gymnasium's interface has 5: wrap it"),
+        ("reset", np.zeros(1), "gives a ndarray in reset, where Gymnasium's interface has 2: wrap it"),
+    ],
+)
+def test_an_environment_of_another_interface_is_one_line(monkeypatch, method, given, told):
+    monkeypatch.setattr(Unpaid, method, lambda self, *words, **more: given)
+    env = make_env(GymnasiumTask(Unpaid, {"paid": 1.0}))
+    if method == "step":
+        env.reset(0)
+    with pytest.raises(UserError, match=told):
+        env.step(np.zeros(2, np.float32)) if method == "step" else env.reset(0)
+
+
+def test_an_environment_that_does_not_exist_is_one_line():
+    for environment, arguments, reason in (
+        ("NoSuchThing-v0", {}, "NoSuchThing"),
+        ("no_such_module:Thing-v0", {}, "no_such_module"),
+        (gymnasium.Env, {"colour": "red"}, "takes no arguments"),
+    ):
+        with pytest.raises(UserError, match=f"cannot be made .*{reason}") as caught:
+            make_env(GymnasiumTask(environment, arguments))
+        assert "\n" not in str(caught.value)
+
+
+def test_tasks_with_other_arguments_are_other_tasks():
+    one, other = (GymnasiumTask("CartPole-v1", {"sutton_barto_reward": value}) for value in (True, False))
+    assert one != other
+    assert len({one, other}) == 2
+    assert np.all([hash(one), hash(other)])

@@ -1,0 +1,100 @@
+"""What a run is held against is what its set records, and only an actor that ships is known."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from tests.helpers_data import fake_rows, write_fake_set
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.data.reference import Reference, summarise
+from vd4rl_pomdp.policies import load_actor
+from vd4rl_pomdp.policies.actor import ASSETS
+from vd4rl_pomdp.runs import REFERENCE_FILE
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+EXPERT, MEDIUM = (load_actor("walker_walk", quality).sha256 for quality in ("expert", "medium"))
+ACTOR = {"task": "walker_walk", "quality": "expert", "sha256": EXPERT}
+
+
+@pytest.mark.parametrize(
+    ("shards", "known"),
+    [
+        ([{"task": "walker_walk", "actor_sha256": EXPERT}] * 2, ACTOR),
+        ([{"task": "walker_walk", "set": "expert_noisy", "actor_sha256": EXPERT}], ACTOR),
+        ([{"task": "walker_walk", "actor_sha256": MEDIUM}], {"quality": "medium", "sha256": MEDIUM}),
+        ([{"task": "walker_walk", "actor_sha256": sha} for sha in (EXPERT, MEDIUM)], None),
+        ([{"task": "walker_walk", "actor_sha256": EXPERT}, {}], None),
+        ([{"task": "walker_walk", "set": "expert", "actor_sha256": "0" * 64}], None),
+        ([{"task": "cheetah_run", "set": "expert", "actor_sha256": EXPERT}], None),
+        ([{"task": "walker_walk", "set": "random", "actor_sha256": None}], None),
+        ([{}], None),
+        ([{"actor_sha256": EXPERT}], None),
+    ],
+    ids=["expert", "noisy", "medium", "two", "partly", "own", "other task", "random", "published", "no task"],
+)
+def test_a_sets_actor_is_known_if_it_is_one_and_ships(tmp_path, shards, known):
+    (tmp_path / "set").mkdir()
+    for number, attributes in enumerate(shards):
+        write_shard(tmp_path / "set" / f"{number}_fake.hdf5", fake_rows([8, 8]), attributes)
+    dataset = open_dataset(tmp_path / "set")
+    reference = Reference.of(dataset)
+    assert reference.actor == (None if known is None else ACTOR | known)
+    assert (reference.actor_file is None) == (known is None)
+    assert reference.data_return == pytest.approx(np.mean(dataset.returns.tolist()), abs=1e-4)
+    assert reference.path_error is None
+
+
+def test_a_reference_is_kept_in_the_run_and_an_actor_that_ships_no_more_is_unknown(tmp_path):
+    assert Reference.read(tmp_path) == Reference(), "earlier versions kept none"
+    reference = Reference.of(
+        open_dataset(write_fake_set(tmp_path / "set", attributes={"task": "walker_walk", "actor_sha256": EXPERT}))
+    ).with_path_error(0.12345678)
+    reference.write(tmp_path)
+    assert Reference.read(tmp_path) == reference
+    assert reference.path_error == 0.123457
+    assert reference.actor_file == ASSETS / "walker_walk_expert.safetensors"
+    assert Reference(actor=ACTOR | {"sha256": MEDIUM}).actor_file is None
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"data_return": "much"},
+        {"data_return": float("nan")},
+        {"path_error": [1]},
+        {"actor": "expert"},
+        {"actor": {"task": "walker_walk"}},
+        None,
+    ],
+    ids=str,
+)
+def test_a_damaged_reference_is_one_line(tmp_path, change):
+    Reference(1.0, ACTOR, 0.5).write(tmp_path)
+    whole = json.loads((tmp_path / REFERENCE_FILE).read_text())
+    (tmp_path / REFERENCE_FILE).write_text(json.dumps({} if change is None else whole | change))
+    with pytest.raises(UserError, match=r"reference\.json: is damaged") as caught:
+        Reference.read(Path(tmp_path))
+    assert "\n" not in str(caught.value)
+
+
+def test_a_summary_counts_episodes_above_four_fifths_of_the_datas_return():
+    rows = [
+        {"return": total, "score": total / 10, "action_error": error}
+        for total, error in ((90.0, 0.2), (80.0, 0.4), (100.0, None))
+    ]
+    summary = summarise(rows, Reference(data_return=100.0))
+    assert summary == {
+        "score_mean": 9.0,
+        "score_min": 8.0,
+        "score_max": 10.0,
+        "return_mean": 90.0,
+        "share_above_80": 2 / 3,
+        "action_error": pytest.approx(0.3),
+    }
+    assert summarise(rows[2:], Reference())["share_above_80"] is None
+    assert summarise(rows[2:], Reference(data_return=-5.0))["share_above_80"] is None, "80% of what is lost is no aim"
+    assert summarise(rows[2:], Reference())["action_error"] is None

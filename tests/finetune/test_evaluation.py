@@ -1,0 +1,258 @@
+"""An evaluated agent sees, remembers and is paid what an episode gives, on a scripted environment."""
+
+import json
+from dataclasses import replace
+from functools import cache
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from finetune import evaluation
+from finetune.evaluation import EVALUATION_SEED, Episode, EpisodeJob, by_part, episode_rows, evaluate, evaluate_run
+from finetune.train import finetune
+from tests.helpers_stages import smoke_finetune
+from tests.nn.test_encoder import CARD
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.core.types import StepType, Windows
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.envs.corrupted import Observation
+from vd4rl_pomdp.envs.pixels import TimeStep
+from vd4rl_pomdp.nn import Encoder, EncoderConfig, save_encoder
+from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
+from vd4rl_pomdp.policies.actor import ASSETS, load_actor
+from vd4rl_pomdp.runs.episodes import begin_episodes, read_episodes
+from vd4rl_pomdp.runs.files import read_json, write_json
+
+LENGTH, REWARDS = 5, (1.0, 0.5, 0.25, 2.0, 8.0)
+
+
+class ScriptedEnv:
+    """Random pictures by seed, whatever is done; what is clean is white."""
+
+    def __init__(self, *arguments: object) -> None:
+        self.seeds: list[tuple[int, int, int]] = []
+        self.seen: list[list[torch.Tensor]] = []
+        self.done: list[list[np.ndarray]] = []
+
+    def reset(self, environment_seed: int, corruption_seed: int, episode: int) -> Observation:
+        self.seeds.append((environment_seed, corruption_seed, episode))
+        self._random = torch.Generator().manual_seed(environment_seed)
+        self.seen.append([])
+        self.done.append([])
+        return self._show(0.0, StepType.FIRST)
+
+    def step(self, action: np.ndarray) -> Observation:
+        self.done[-1].append(action.copy())
+        t = len(self.done[-1])
+        return self._show(REWARDS[t - 1], StepType.LAST if t == LENGTH else StepType.MID)
+
+    def _show(self, reward: float, step_type: StepType) -> Observation:
+        obs = torch.randint(0, 256, (9, 84, 84), generator=self._random, dtype=torch.uint8)
+        self.seen[-1].append(obs)
+        state = np.full(24, len(self.done[-1]) / 10, np.float32)
+        time_step = TimeStep(None, state, np.zeros(18), reward, 1.0, step_type)
+        key = torch.tensor([len(self.done[-1])])
+        return Observation(obs, torch.full_like(obs, 255), time_step, key)
+
+
+@pytest.fixture
+def world(monkeypatch) -> list[ScriptedEnv]:
+    """Takes the place of the environments; holds those that were made."""
+    made: list[ScriptedEnv] = []
+    monkeypatch.setattr(evaluation, "_environment", cache(lambda *a: (made.append(ScriptedEnv()), made[-1])[1]))
+    return made
+
+
+@pytest.fixture
+def agent(tmp_path) -> tuple[Encoder, Policy]:
+    torch.manual_seed(0)
+    encoder = Encoder(EncoderConfig(6, "nature", 16, "gru", use_actions=True, hidden_dim=8)).eval()
+    policy = Policy(8, 6, 8).eval()
+    with torch.no_grad():
+        policy.net[-1].weight.mul_(5)
+    save_encoder(tmp_path / "encoder", encoder, CARD)
+    policy.save(tmp_path / "policy")
+    return encoder, policy
+
+
+def play(folder: Path, *episodes: int, actor: Path | None = None) -> list[evaluation.Episode]:
+    job = EpisodeJob(
+        folder / "encoder", folder / "policy", TASKS["walker_walk"], CorruptionConfig.of("patch"), 0, film=False
+    )
+    return evaluate([replace(job, episode=episode, actor=actor) for episode in episodes], workers=1)
+
+
+def test_actions_are_the_policys_on_what_was_seen_and_done_in_the_episode(world, agent, tmp_path):
+    """Streamed in evaluation, they are those of the whole window as training would encode it."""
+    play(tmp_path, 0, 1)
+    encoder, policy = agent
+    for seen, done in zip(world[0].seen, world[0].done, strict=True):
+        action = torch.from_numpy(np.stack(done))[None]
+        window = Windows(
+            obs=torch.stack(seen[:LENGTH])[None],
+            prev_action=torch.cat([torch.zeros_like(action[:, :1]), action[:, :-1]], 1),
+            action=action,
+            has_action=torch.ones(1, LENGTH, dtype=torch.bool),
+            length=torch.tensor([LENGTH]),
+            key=torch.zeros(1, LENGTH, dtype=torch.int64),
+        )
+        with torch.no_grad():
+            torch.testing.assert_close(policy(encoder.encode(window)), action, atol=1e-5, rtol=1e-4)
+    assert np.abs(np.diff(world[0].done, axis=1)).max() > 1e-3, "the policy reads something"
+
+
+def test_a_policy_that_was_written_anew_is_the_one_that_plays(world, agent, tmp_path):
+    play(tmp_path, 0)
+    torch.manual_seed(1)
+    Policy(8, 6, 8).save(tmp_path / "policy")
+    play(tmp_path, 0)
+    assert not np.allclose(world[0].done[0], world[0].done[1])
+    (tmp_path / "policy" / "config.json").unlink()
+    with pytest.raises(UserError, match=r"policy.config\.json: cannot be read as JSON"):
+        play(tmp_path, 0)
+
+
+def test_an_episode_does_not_depend_on_those_before_it(world, agent, tmp_path):
+    play(tmp_path, 0, 1)
+    evaluation._environment.cache_clear()
+    play(tmp_path, 1)
+    np.testing.assert_array_equal(world[0].done[1], world[1].done[0])
+
+
+def test_episode_i_has_the_environment_seed_20000_plus_i_and_its_own_corruption(world, agent, tmp_path):
+    play(tmp_path, 0, 3)
+    assert world[0].seeds == [(20_000, 20_000, 0), (20_003, 20_000, 3)]
+    labels = {"method": "x", "task": "walker_walk"}
+    assert [row["episode_seed"] for row in episode_rows(play(tmp_path, 3), labels)] == [EVALUATION_SEED + 3]
+
+
+def test_a_return_is_the_sum_of_all_rewards_and_a_score_a_tenth_of_it(world, agent, tmp_path):
+    (episode,) = play(tmp_path, 0)
+    assert (episode.total, len(episode.rewards)) == (sum(REWARDS), LENGTH)
+    (row,) = episode_rows([episode], {"task": "walker_walk"})
+    assert (row["return"], row["score"], row["length"]) == (11.75, 1.175, LENGTH)
+
+
+def test_the_action_error_is_to_what_the_datas_actor_does_where_the_policy_is(world, agent, tmp_path):
+    (without,) = play(tmp_path, 0)
+    assert without.action_error is None
+    (episode,) = play(tmp_path, 0, actor=ASSETS / "walker_walk_expert.safetensors")
+    expert = load_actor("walker_walk", "expert")
+    shown = [expert.act(np.full(24, t / 10, np.float32)) for t in range(LENGTH)]
+    assert episode.action_error == pytest.approx(np.square(np.array(world[0].done[-1]) - shown).mean())
+    assert np.abs(np.diff(shown, axis=0)).max() > 0.1, "the states tell the rows apart"
+    (row,) = episode_rows([episode], {"task": "walker_walk"})
+    assert (row["evaluated_under"], row["action_error"]) == ("patch", round(episode.action_error, 6))
+
+
+def test_parts_of_episodes_tell_where_reward_and_errors_are():
+    whole = Episode("none", 0, [0.0, 1.0, 2.0, 3.0, 4.0], None, [0.1, 0.2, 0.3, 0.4, 0.5])
+    short = Episode("none", 1, [6.0], None, [0.5])
+    assert by_part([whole, short], 2) == {
+        "0-1": {"reward": pytest.approx(7 / 3), "action_error": pytest.approx(0.8 / 3)},
+        "2-4": {"reward": pytest.approx(3.0), "action_error": pytest.approx(0.4)},
+    }
+    assert list(by_part([whole], 99)) == ["0-0", "1-1", "2-2", "3-3", "4-4"], "no part is empty"
+    assert by_part([Episode("none", 0, [1.0], None)], 1) == {"0-0": {"reward": 1.0, "action_error": None}}
+
+
+def test_a_run_is_evaluated_as_it_was_trained_and_under_none_or_as_one_says(world, encoder, data, tmp_path, capsys):
+    config = smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2)
+    run = finetune(config).path
+    for asked, expected in ((None, ["patch+zero_frames", "none"]), ("patch", ["patch"])):
+        rows = evaluate_run(run, asked, 1, 1).rows
+        assert [row["evaluated_under"] for row in rows] == expected
+        assert {row["corruption"] for row in rows} == {"patch+zero_frames"}, "what it was trained under"
+    rest = ["--parts", "2", "--out", str(tmp_path / "rows.csv")]
+    main(["evaluate", str(run), "--episodes", "1", "--workers", "1", *rest])
+    told = dict(line.split(maxsplit=1) for line in capsys.readouterr().out.splitlines())
+    assert told["data_return"] == f"{open_dataset(data).returns.mean():.6g}"
+    assert (told["path_error"], told["under.none.action_error"]) == ("unknown", "unknown")
+    halves = [float(told[f"under.none.parts.{part}.reward"]) for part in ("0-1", "2-4")]
+    assert halves == pytest.approx([np.mean(REWARDS[:2]), np.mean(REWARDS[2:])], rel=1e-5)
+    written = read_episodes(tmp_path / "rows.csv")
+    for row in written:
+        assert told[f"under.{row['evaluated_under']}.return_mean"] == f"{row['return']:.6g}"
+        assert told[f"under.{row['evaluated_under']}.share_above_80"] == "0"
+    main(["evaluate", str(run), "--episodes", "1", "--workers", "1", "--corruption", "none", "--json"])
+    (only,) = json.loads(capsys.readouterr().out)["under"].items()
+    assert (only[0], only[1]["episodes"]) == ("none", written[1:])
+
+
+def test_another_corruption_is_played_with_the_runs_own_options(world, encoder, data, tmp_path, monkeypatch):
+    """Its patches were played at 16 pixels, whatever the run's size."""
+    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2)).path
+    card = read_json(run / "encoder" / "config.json")
+    card["pretrain"]["corruption"] |= {"patch_size": 40, "corruption_mode": "emission"}
+    write_json(run / "encoder" / "config.json", card)
+    jobs = []
+    monkeypatch.setattr(evaluation, "evaluate", lambda given, workers: jobs.extend(given) or [])
+    evaluate_run(run, "patch", 1, 1)
+    assert [job.corruption for job in jobs] == [CorruptionConfig.of("patch", "emission", patch_size=40)]
+
+
+def test_an_evaluation_names_its_step_and_touches_no_other_file(world, encoder, data, tmp_path):
+    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2))
+    (run.path / "timing.json").unlink()  # an unfinished run has a step, too
+    with pytest.raises(UserError, match="--episodes is 0"):
+        evaluate_run(run.path, None, 0, 1)
+    with pytest.raises(UserError, match="unknown corruption 'fog'"):
+        evaluate_run(run.path, "fog", 1, 1)
+    with pytest.raises(UserError, match="holds no evaluated run"):
+        evaluate_run(encoder.parent, None, 1, 1)
+    with pytest.raises(SystemExit, match="2"):
+        main(["evaluate", str(encoder.parent), "--out", str(tmp_path / "new.csv")])
+    assert not (tmp_path / "new.csv").exists(), "nothing is left where nothing is played"
+    assert [row["step"] for row in evaluate_run(run.path, None, 1, 1).rows] == [2, 2]
+    (run.path / "labels.json").write_text("{}")
+    with pytest.raises(UserError, match=r"labels\.json: has no 'method'"):
+        evaluate_run(run.path, None, 1, 1)
+    thesis = tmp_path / "thesis.csv"
+    thesis.write_text("a,b\n1,2\n")
+    with pytest.raises(UserError, match="has no column 'method'"):
+        begin_episodes(thesis)
+    assert thesis.read_text() == "a,b\n1,2\n"
+
+
+def test_an_evaluation_is_of_the_step_of_the_policy_and_not_of_the_newest_row(world, encoder, data, tmp_path):
+    """A run that was cut in its evaluation has a policy and no row of it yet."""
+    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2)).path
+    assert policy_step(run / "policy") == 2
+    policy = load_policy(run / "policy")
+    policy.save(run / "policy", step=7)
+    assert [row["step"] for row in evaluate_run(run, None, 1, 1).rows] == [7, 7]
+    policy.save(run / "policy")  # as earlier versions did
+    assert [row["step"] for row in evaluate_run(run, None, 1, 1).rows] == [2, 2]
+
+
+@pytest.mark.parametrize("part", ["policy", "encoder"])
+def test_a_policy_that_changes_while_it_plays_is_told(world, encoder, data, tmp_path, monkeypatch, part):
+    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2)).path
+    play_all = evaluation.evaluate
+
+    def train_on(jobs, workers):
+        episodes = play_all(jobs, workers)
+        card = read_json(run / part / "config.json")
+        write_json(run / part / "config.json", card | {"later": 1})
+        return episodes
+
+    monkeypatch.setattr(evaluation, "evaluate", train_on)
+    with pytest.raises(UserError, match="run: wrote another policy while this one played; evaluate it"):
+        evaluate_run(run, None, 1, 1)
+
+
+@pytest.mark.parametrize(("record", "length"), [({"config": {"eval_length": 2}}, 2), ({}, 500), (None, 500)])
+def test_a_run_is_evaluated_again_over_its_own_length(world, encoder, data, tmp_path, monkeypatch, record, length):
+    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=3)).path
+    (run / "config.json").unlink()
+    if record is not None:
+        write_json(run / "config.json", record)
+    jobs = []
+    monkeypatch.setattr(evaluation, "evaluate", lambda given, workers: jobs.extend(given) or [])
+    evaluate_run(run, "patch", 1, 1)
+    assert [job.length for job in jobs] == [length]

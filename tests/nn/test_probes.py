@@ -1,0 +1,69 @@
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.envs.rendering import suite
+from vd4rl_pomdp.nn.probes import probe_error, probe_state
+
+
+@pytest.fixture
+def random() -> np.random.Generator:
+    return np.random.default_rng(0)
+
+
+def test_a_linear_function_of_the_state_is_found_and_noise_is_not(random):
+    episode = np.arange(2000) // 100
+    states = random.normal(size=(2000, 4)) * [1, 2, 0.5, 3] + 5
+    features = states @ random.normal(size=(4, 8)) + 2
+    assert probe_error(features, states, episode) < 1
+    assert probe_error(random.normal(size=(2000, 8)), states, episode) == pytest.approx(80, abs=3)
+    assert probe_error(np.where(episode[:, None] % 5 == 4, 0, features), states, episode) > 60, (
+        "tested on unseen episodes"
+    )
+
+
+def test_constant_states_are_left_out_and_one_episode_is_enough_to_test():
+    states = np.column_stack([np.sin(np.arange(60.0)), np.full(60, 3.0)])
+    assert probe_error(states[:, :1], states, np.arange(60) // 20) < 10
+    assert probe_error(states[:, :1], states, np.arange(60) // 30) < 10
+
+
+def test_pose_and_velocity_are_apart(random):
+    layout = TASKS.named("walker_walk").layout
+    physics = random.normal(size=(1000, 18))
+    episode = np.arange(1000) // 50
+    found = probe_state(layout.velocity(physics), physics, episode, layout)
+    assert found["probe_velocity"] < 1
+    assert found["probe_pose"] > 70
+
+
+@pytest.mark.parametrize("name", TASKS)
+def test_tasks_name_the_columns_of_their_simulators(name: str):
+    task = TASKS[name]
+    physics = suite.load(task.domain, task.task).physics
+    assert task.layout.positions == physics.model.nq
+    joints = [physics.model.id2name(i, "joint") for i in range(physics.model.njnt)]
+    travel = (0, 1) if joints[0] == "root" else (joints.index("rootx"),)
+    assert task.layout.travel == travel
+
+
+def test_knowing_nothing_scores_the_mean_deviation_over_the_standard_deviation(random):
+    episode, nothing = np.arange(20_000) // 100, np.zeros((20_000, 1))
+    for targets, score in (
+        (random.normal(size=20_000), 100 * np.sqrt(2 / np.pi)),
+        (random.laplace(size=20_000), 100 / np.sqrt(2)),
+        (random.choice([-3.0, 5.0], 20_000), 100.0),
+    ):
+        assert probe_error(nothing, targets[:, None], episode) == pytest.approx(score, abs=2)
+
+
+@pytest.mark.parametrize("number", [0, 5])
+def test_one_episode_alone_has_none_to_be_tested_on(random, number):
+    with pytest.raises(UserError, match="one alone is too few"):
+        probe_error(random.normal(size=(20, 3)), random.normal(size=(20, 2)), np.full(20, number))
+
+
+def test_episodes_may_have_any_numbers(random):
+    features, targets, episode = random.normal(size=(40, 3)), random.normal(size=(40, 2)), np.repeat([0, 1], 20)
+    assert probe_error(features, targets, 10 * episode + 10) == probe_error(features, targets, episode)

@@ -1,0 +1,149 @@
+"""Means with intervals or standard errors that the pages tell in sentences are those of committed rows."""
+
+import importlib
+import itertools
+import math
+import re
+from collections import defaultdict
+from collections.abc import Iterable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.report.gates import episodes_of
+from vd4rl_pomdp.report.layout import with_interval
+from vd4rl_pomdp.report.load import load_runs
+from vd4rl_pomdp.report.stats import difference_interval, mean_interval
+from vd4rl_pomdp.studies.navigation.measures import online_error, refitted_error
+from vd4rl_pomdp.studies.navigation.report import write_report
+
+ROOT = Path(__file__).parents[3]
+TOLD = re.compile(r"[-+]?\d+(?:\.\d+)? ± \d+(?:\.\d+)?|[-+]?\d+(?: more| less| above it)? \[-?\d+, -?\d+\]")
+GENERATED = re.compile(r"<!-- table: .* -->\n(?:\|.*\n)*")
+"""Tables that scripts write, which tests/test_scripts.py holds against rows."""
+MAIN = ("control", "offline")
+"""Folders whose rows count as one."""
+ASIDE = ("control/budget", "control/histories", "control/expert")
+REPORTS = sorted(found.parent for found in (ROOT / "results" / "navigation").rglob("tables.csv"))
+MEASURES = (
+    *(online_error(component).raw() for component in ("state", "position", "velocity")),
+    *(refitted_error(component) for component in ("state", "position", "velocity")),
+    *(refitted_error(component).raw() for component in ("state", "position", "velocity")),
+)
+"""Of mazes: the paper's way and units, and the refitted probe's in both units."""
+Estimate = tuple[float, float]
+"""A mean and its standard error."""
+
+
+def estimate(numbers: Iterable[float]) -> Estimate | None:
+    found = np.array(list(numbers))
+    return (found.mean(), found.std(ddof=1) / math.sqrt(len(found))) if len(found) > 1 else None
+
+
+def told(one: Estimate, digits: int) -> str:
+    return f"{one[0]:.{digits}f} ± {one[1]:.{digits}f}"
+
+
+def with_differences(estimates: Iterable[Estimate | None], digits: int) -> Iterator[str]:
+    """Estimates that can be compared, and every difference of two."""
+    known = [one for one in estimates if one]
+    yield from (told(one, digits) for one in known)
+    for one, other in itertools.permutations(known, 2):
+        yield told((one[0] - other[0], math.hypot(one[1], other[1])), digits)
+
+
+def of_returns(folders: Iterable[str]) -> Iterator[str]:
+    """Of methods on one set, whatever was hidden from them, and of the same played clean; of each run over episodes."""
+    groups = defaultdict(lambda: defaultdict(list))
+    for run in load_runs([ROOT / "results" / name for name in folders]):
+        if run.rows and run.finished:
+            kind = run.labels["corruption"], run.labels["algorithm"], run.labels["method"], run.variant
+            groups[run.set_name][kind].append(run)
+            yield told(estimate(row["return"] for row in run.last), 0)
+    for methods in groups.values():
+        everyone = list(methods.values())
+        yield from intervals([episodes_of(mine) for mine in everyone])
+        yield from intervals([episodes_of(mine, True) for mine in everyone if all(run.last_clean for run in mine)])
+
+
+def of_shifts() -> Iterator[str]:
+    """Of `acro` as its authors shift it, which another folder has, beside `acro` as the grids train it."""
+    runs = [run for name in ("control", "control/budget") for run in load_runs([ROOT / "results" / name])]
+    groups = defaultdict(list)
+    for run in runs:
+        if run.set_name == "walker_walk expert_noisy" and run.labels["method"] in ("acro", "acro_shifted"):
+            groups[run.labels["corruption"], run.labels["method"], run.variant].append(run)
+    return intervals([episodes_of(mine) for mine in groups.values()])
+
+
+def intervals(returns: list[np.ndarray]) -> Iterator[str]:
+    """Means with intervals of (seeds, episodes) returns, and every difference of two."""
+    for mine in returns:
+        yield with_interval(mine.mean(), *(mean_interval(mine) or (None, None)), 0)
+    for one, other in itertools.permutations(returns, 2):
+        yield with_interval(one.mean() - other.mean(), *(difference_interval(one, other) or (None, None)), 0)
+
+
+def of_mazes(script: ModuleType) -> Iterator[str]:
+    """Of the pages' measures in every maze; differences only between settings of one method in one maze."""
+    groups = defaultdict(lambda: defaultdict(list))
+    for run in script.main_runs():
+        groups[run.condition.maze, run.condition.method][run.condition].append(run)
+    for conditions, measure in itertools.product(groups.values(), MEASURES):
+        numbers = [script.entry_of(condition, measure, mine).numbers for condition, mine in conditions.items()]
+        for digits in (1, 2):
+            yield from with_differences(map(estimate, numbers), digits)
+
+
+@pytest.fixture(scope="module")
+def known() -> set[str]:
+    places = [MAIN, *((name,) for name in (*MAIN, *ASIDE))]
+    with pytest.MonkeyPatch.context() as patch:
+        patch.syspath_prepend(ROOT / "scripts")
+        script = importlib.import_module("navigation_table")
+    return {word for folders in places for word in of_returns(folders)} | {*of_shifts(), *of_mazes(script)}
+
+
+def unknown(text: str, known: set[str]) -> list[str]:
+    """What is told and in no row; words may stand between a difference and its interval."""
+    return [
+        found for found in TOLD.findall(text) if re.sub(r" (more|less|above it)", "", found).lstrip("+") not in known
+    ]
+
+
+@pytest.mark.parametrize(
+    ("page", "least"),
+    [
+        ("README.md", 4),
+        ("docs/navigation.md", 10),
+        ("docs/methods/acro.md", 6),
+        ("docs/methods/ah.md", 1),
+        ("docs/methods/supervised.md", 2),
+        ("results/offline/README.md", 25),
+        ("results/control/README.md", 25),
+        ("results/gpu/README.md", 4),
+    ],
+)
+def test_what_a_page_tells_is_in_the_rows(page, least, known):
+    text = GENERATED.sub("", (ROOT / page).read_text(encoding="utf-8"))
+    assert len(TOLD.findall(text)) >= least
+    assert unknown(text, known) == []
+
+
+@pytest.mark.parametrize(
+    "text", ["`mik+a` returns 521 [321, 720]", "`mik` less `acro` +180 [106, 253]", "by 5.15 ± 0.11"]
+)
+def test_what_no_row_says_is_found(text, known):
+    assert unknown(text, known) == TOLD.findall(text)
+
+
+@pytest.mark.parametrize("place", REPORTS, ids=lambda place: place.name)
+def test_a_report_on_mazes_is_what_its_rows_and_todays_code_make_of_it(place, tmp_path):
+    """But for the sample observations, which take a renderer."""
+    write_report([place], tmp_path / "again")
+    for name in ("README.md", "rows.csv", "tables.csv"):
+        committed = (place / name).read_text(encoding="utf-8")
+        sample = "![Sample observations](figures/observations.png)\n\n"
+        assert (tmp_path / "again" / name).read_text(encoding="utf-8") == committed.replace(sample, ""), name

@@ -1,0 +1,282 @@
+"""Results folders: they hold what their runs' files hold, and lose nothing."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.helpers_report import describe, grid, pretraining, write_run
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.data.reference import Reference
+from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.runs.episodes import read_episodes
+from vd4rl_pomdp.runs.files import read_json, write_json
+from vd4rl_pomdp.runs.identity import identity
+from vd4rl_pomdp.runs.results import Result, add_results, find_results, folder, read_results, read_run, write_results
+
+COMMITTED = Path(__file__).parents[3] / "results"
+
+
+def whole_run(place: Path, seed: int = 0, score: float = 2.0) -> Path:
+    """A fine-tuning run with every small file."""
+    run = describe(write_run(place, "acro", seed, {5: [1.0], 10: [score]}), {"seed": seed}, data="f00", seed=seed)
+    write_json(run / "machine.json", {"processor": "two cores"})
+    write_json(run / "render.json", {"mujoco": "3.11.0"})
+    write_json(run / "probe.json", {"probe_pose": 12.5, "probe_velocity": None})
+    write_json(run / "pretrain_timing.json", {"seconds": 7.0, "steps": 20})
+    Reference(500.0, None, 0.01).write(run)
+    card = read_json(run / "encoder" / "config.json")
+    write_json(run / "encoder" / "config.json", {"pretrain": card["pretrain"] | {"seed": seed}})
+    return run
+
+
+def content(run: Result) -> tuple:
+    return run.id, run.files, run.step, run.losses, run.rows
+
+
+def test_a_run_comes_back_as_its_files_hold_it(tmp_path):
+    run, before = whole_run(tmp_path / "runs/a"), pretraining(tmp_path / "runs/b")
+    added = add_results([tmp_path / "runs"], tmp_path / "out")
+    assert added.in_words == "2 runs added"
+    (one, other) = read_results(str(tmp_path / "out"))
+    for name in ("config", "labels", "timing", "machine", "render", "probe", "pretrain_timing", "reference"):
+        assert one.files[name] == read_json(run / f"{name}.json"), name
+    assert one.files["encoder"] == read_json(run / "encoder" / "config.json")
+    assert one.rows == read_episodes(run / "episodes.csv")
+    assert one.id == identity(one.record, one.card)
+    assert one.finished
+    assert other.id == identity(read_json(before / "config.json"), {})
+    assert other.losses == [(1, 0.5), (2, 0.25)]
+    assert [content(run) for run in (one, other)] == [content(read_run(path)) for path in (run, before)]
+
+
+def test_a_run_that_went_on_elsewhere_names_every_machine_and_commit(tmp_path):
+    run = whole_run(tmp_path / "run")
+    first = {"processor": "A", "cores": 2, "gpu": None}
+    later = [first | {"git_commit": "two"}, first | {"gpu": "B", "git_commit": "two"}]
+    write_json(run / "machine.json", first | {"continued": later})
+    write_json(run / "config.json", read_json(run / "config.json") | {"git_commit": "one"})
+    told = read_run(run)
+    assert (told.machine, told.commit) == ("A, 2 cores then B", "one then two")
+    for damaged in ("two", [1], 5):
+        write_json(run / "machine.json", first | {"continued": damaged})
+        with pytest.raises(UserError, match="its files are damaged"):
+            read_run(run)
+
+
+def test_runs_are_there_once_and_stay_as_they_are(tmp_path, capsys):
+    run = whole_run(tmp_path / "runs/0")
+    (whole_run(tmp_path / "runs/1", seed=1) / "timing.json").unlink()
+    words = ["results", "add", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
+    main(words)
+    assert capsys.readouterr().out == f"{tmp_path / 'out'}: 1 run added, 1 unfinished and left out\n"
+    before = [content(one) for one in read_results(tmp_path / "out")]
+    shutil.rmtree(run)
+    whole_run(run, score=3.0)
+    write_json(tmp_path / "runs/1/timing.json", {"seconds": 1.0})
+    main(words)
+    assert "1 run added, 1 there already with other rows, which stay" in capsys.readouterr().out
+    assert [content(one) for one in read_results(tmp_path / "out")][:1] == before
+    main(["results", "add", str(tmp_path / "out"), "--out", str(tmp_path / "copy")])
+    main([*words[:3], "--out", str(tmp_path / "copy")])
+    assert (tmp_path / "copy" / "runs.jsonl").read_bytes() == (tmp_path / "out" / "runs.jsonl").read_bytes()
+
+
+def test_a_run_that_lost_its_last_evaluation_is_not_told_of_by_the_one_before(tmp_path):
+    run = whole_run(tmp_path / "run")
+    write_json(run / "timing.json", {"seconds": 1.0, "updates": 10})
+    record = read_json(run / "config.json")
+    write_json(run / "config.json", record | {"config": record["config"] | {"eval_episodes": 1}})
+    assert read_run(run).finished
+    rows = (run / "episodes.csv").read_text().splitlines(keepends=True)
+    (run / "episodes.csv").write_text("".join(rows[:-1]))
+    with pytest.raises(UserError, match=r"has 0 of 1 episodes of the last evaluation; put it back, or remove"):
+        read_run(run)
+
+
+def test_a_diverged_run_is_a_result(tmp_path):
+    run = whole_run(tmp_path / "runs/0")
+    (run / "timing.json").unlink()
+    write_json(run / "diverged.json", {"step": 7, "message": "critic_loss is nan"})
+    assert add_results([run], tmp_path / "out").added == 1
+    (found,) = read_results(tmp_path / "out")
+    assert (found.finished, found.settled, found.diverged["step"]) == (False, True, 7)
+
+
+def test_a_run_that_finished_after_all_takes_the_place_of_the_one_that_diverged(tmp_path):
+    run = whole_run(tmp_path / "runs/0", score=1.5)
+    (run / "timing.json").rename(tmp_path / "timing.json")
+    write_json(run / "diverged.json", {"step": 7, "message": "critic_loss is nan"})
+    for out in ("out", "report"):
+        add_results([run], tmp_path / out)
+    diverged = shutil.copytree(run, tmp_path / "diverged")
+    (run / "diverged.json").unlink()
+    shutil.rmtree(run)
+    whole_run(run)
+    for paths in ([run, tmp_path / "out"], [tmp_path / "out", run]):
+        assert [found.finished for found in find_results(paths)] == [True]
+    write_report([run], tmp_path / "report")
+    assert add_results([run], tmp_path / "out") == (1, 0, 0, 0)
+    for out in ("out", "report"):
+        assert [(found.finished, found.rows[-1]["score"]) for found in read_results(tmp_path / out)] == [(True, 2.0)]
+    assert add_results([diverged], tmp_path / "out") == (0, 0, 1, 0), "and never the other way round"
+
+
+def test_a_report_replaces_no_rows_of_a_settled_run(tmp_path):
+    add_results([whole_run(tmp_path / "runs/0")], tmp_path / "kept")
+    before = (tmp_path / "kept" / "episodes.csv").read_bytes()
+    with pytest.raises(UserError, match=r"kept: holds other rows of 1 runs \(such as \w+\), which would be lost"):
+        write_report([whole_run(tmp_path / "again/0", score=3.0)], tmp_path / "kept")
+    assert (tmp_path / "kept" / "episodes.csv").read_bytes() == before
+    write_report([tmp_path / "runs"], tmp_path / "kept")
+
+
+def test_columns_of_ones_own_are_no_part_of_a_result(tmp_path):
+    run = whole_run(tmp_path / "runs/0")
+    add_results([run], tmp_path / "out")
+    for folder_of_rows in (run, tmp_path / "out"):
+        lines = (folder_of_rows / "episodes.csv").read_text().splitlines()
+        (folder_of_rows / "episodes.csv").write_text("\n".join(f"{line},note" for line in lines) + "\n")
+    assert add_results([run], tmp_path / "out") == (0, 1, 0, 0)
+    write_report([tmp_path / "runs"], tmp_path / "report")
+
+
+def test_a_row_that_was_cut_with_its_run_is_left_out(tmp_path):
+    run = whole_run(tmp_path / "runs/0")
+    whole_run(tmp_path / "runs/1", seed=1)
+    (run / "timing.json").unlink()
+    (run / "episodes.csv").write_text((run / "episodes.csv").read_text()[:-20])
+    assert [row["step"] for row in read_run(run).rows] == [5]
+    assert "unfinished" in write_report([tmp_path / "runs"], tmp_path / "report").page.read_text()
+
+
+def test_results_can_be_read_while_others_are_added(tmp_path, monkeypatch):
+    out = tmp_path / "out"
+    add_results([whole_run(tmp_path / "runs/0")], out)
+    later, read = whole_run(tmp_path / "runs/1", seed=1), folder.read_episodes
+
+    def meanwhile(path):
+        rows = read(path)
+        with monkeypatch.context() as patch:
+            patch.setattr(folder, "read_episodes", read)
+            add_results([later], out)
+        return rows
+
+    with monkeypatch.context() as patch:
+        patch.setattr(folder, "read_episodes", meanwhile)
+        assert len(read_results(out)) == 1
+    assert len(read_results(out)) == 2
+
+
+def test_a_writing_that_is_killed_midway_leaves_what_was_there(tmp_path, monkeypatch):
+    add_results([whole_run(tmp_path / "runs/0")], tmp_path / "out")
+    before = [content(run) for run in read_results(tmp_path / "out")]
+    with monkeypatch.context() as patch:
+        patch.setattr(folder, "replacing_file", lambda path: (_ for _ in ()).throw(KeyboardInterrupt))
+        with pytest.raises(KeyboardInterrupt):
+            add_results([whole_run(tmp_path / "runs/1", seed=1)], tmp_path / "out")
+    assert {row["seed"] for row in read_episodes(tmp_path / "out" / "episodes.csv")} == {0, 1}, "one file was written"
+    assert [content(run) for run in read_results(tmp_path / "out")] == before
+    assert add_results([tmp_path / "runs"], tmp_path / "out") == (1, 1, 0, 0)
+    assert [len(run.rows) for run in read_results(tmp_path / "out")] == [2, 2]
+
+
+def test_an_unfinished_row_gives_way_to_the_finished_run(tmp_path):
+    run = whole_run(tmp_path / "runs/0")
+    (run / "timing.json").rename(tmp_path / "timing.json")
+    write_results(tmp_path / "out", [read_run(run)])
+    assert not read_results(tmp_path / "out")[0].settled
+    (tmp_path / "timing.json").rename(run / "timing.json")
+    assert add_results([run], tmp_path / "out").added == 1
+    assert [one.finished for one in read_results(tmp_path / "out")] == [True]
+
+
+def test_folders_and_results_mix_and_a_run_counts_once(tmp_path):
+    runs = grid(tmp_path)
+    add_results([runs / "acro0", runs / "mik+a1"], tmp_path / "some")
+    assert [run.folder for run in find_results([tmp_path / "some", runs])].count(False) == 0, "folders know more"
+    shutil.rmtree(runs / "acro0")
+    found = find_results([runs, tmp_path / "some"])
+    assert len(found) == len({run.id for run in found}) == 6
+    assert [run.path for run in found if not run.folder] == [tmp_path / "some"]
+
+
+def test_runs_in_linked_folders_count_and_each_once(tmp_path):
+    """As where seeds lie on other disks; a link to a folder above must not be followed for ever."""
+    runs = grid(tmp_path / "disk")
+    (tmp_path / "mixed").mkdir()
+    (tmp_path / "mixed" / "seed0").symlink_to(runs / "acro0")
+    assert len(find_results([tmp_path / "mixed"])) == 1
+    (runs / "above").symlink_to(tmp_path)
+    found = find_results([runs])
+    assert len(found) == 6
+    assert {run.path.parent for run in found} == {runs}, "the real folder is named, not a link to it"
+
+
+def test_a_results_folder_within_another_is_another_experiment(tmp_path):
+    for name, seed in (("outer", 0), ("outer/inner", 1)):
+        run = write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [1.0]})
+        add_results([run], tmp_path / name)
+    shutil.rmtree(tmp_path / "runs")
+    for paths, seeds in ((".",), {0}), (("outer",), {0}), (("outer/inner",), {1}), (("outer", "outer/inner"), {0, 1}):
+        found = find_results([tmp_path / path for path in paths])
+        assert {run.labels["seed"] for run in found} == seeds
+
+
+def test_runs_of_early_versions_are_told_apart_by_their_labels(tmp_path):
+    for method in ("acro", "mik"):
+        write_run(tmp_path / f"runs/{method}", method, 0, {10: [1.0]})
+    assert add_results([tmp_path / "runs"], tmp_path / "out").added == 2
+    assert [run.labels["method"] for run in read_results(tmp_path / "out")] == ["acro", "mik"]
+
+
+BAD = {
+    "runs.jsonl": [
+        (lambda text: "", "is empty"),
+        (lambda text: text[:40], "line 1: its files are damaged"),
+        (lambda text: text + text, "names a run twice"),
+        (lambda text: text.replace('"stage"', '"scene"', 1), "line 1: its files are damaged"),
+        (lambda text: text.replace('"data_return": 500.0', '"data_return": "x"'), "reference"),
+        (lambda text: text.replace('"seconds": 3.0', '"seconds": "x"'), "its files are damaged"),
+    ],
+    "episodes.csv": [
+        (lambda text: "", "has 0 of 2 rows of run"),
+        (lambda text: text.rpartition("\n")[0].rpartition("\n")[0] + "\n", "has 1 of 2 rows of run"),
+        (lambda text: text.replace("id,", "name,", 1), "has no column 'id'"),
+        (lambda text: text[:-20], "a row is not whole"),
+    ],
+}
+
+
+@pytest.mark.parametrize(("name", "change", "words"), [(name, *case) for name, cases in BAD.items() for case in cases])
+def test_a_damaged_results_folder_is_named(tmp_path, name, change, words):
+    add_results([whole_run(tmp_path / "runs/0")], tmp_path / "out")
+    file = tmp_path / "out" / name
+    file.write_text(change(file.read_text()))
+    with pytest.raises(UserError, match=words) as found:
+        write_report([tmp_path / "out"], tmp_path / "report")
+    assert str(tmp_path / "out") in str(found.value)
+    assert not (tmp_path / "report").exists()
+
+
+def test_results_go_into_no_folder_of_another_kind(tmp_path):
+    run = whole_run(tmp_path / "runs/0")
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "mine.txt").touch()
+    for out in (run, run / "results", tmp_path / "notes"):
+        with pytest.raises(UserError, match="choose another --out"):
+            add_results([run], out)
+    with pytest.raises(UserError, match="holds no runs"):
+        read_results(tmp_path / "notes")
+
+
+@pytest.mark.parametrize("place", sorted(COMMITTED.rglob("runs.jsonl")), ids=lambda place: place.parent.name)
+def test_committed_runs_say_what_they_were_made_with(place):
+    for run in read_results(place.parent):
+        assert run.settled
+        assert run.measured or run.losses
+        assert run.labels["task"]
+        assert run.record["command"]
+        assert run.record["git_commit"]
+        assert run.files["machine"]["processor"]

@@ -1,0 +1,140 @@
+import hashlib
+import shutil
+from dataclasses import replace
+from pathlib import Path
+
+import h5py
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.data import open_dataset, shards
+from vd4rl_pomdp.data.check import check_dataset
+from vd4rl_pomdp.envs.maze import MazeEnv
+from vd4rl_pomdp.envs.mazes import MAZES
+from vd4rl_pomdp.studies.navigation.collect import _explore, _Job, _roll_out, collect
+from vd4rl_pomdp.studies.navigation.sets import PRESETS, MazeCollectConfig
+
+
+def small(out: Path, **changes: object) -> MazeCollectConfig:
+    given = {"maze": "three_curtains", "out": out, "trajectories": 4, "trajectory_rows": 30, "workers": 1}
+    return replace(PRESETS["cpu"], **(given | {"trajectories_per_shard": 2} | changes))
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    return {p.name: hashlib.sha256(p.read_bytes()).hexdigest() for p in sorted(folder.glob("*.hdf5"))}
+
+
+@pytest.fixture(scope="module")
+def maze_set(tmp_path_factory) -> Path:
+    out = tmp_path_factory.mktemp("maze") / "set"
+    collect(small(out))
+    return out
+
+
+def test_stored_actions_lead_through_the_stored_states_and_pictures(maze_set, tmp_path):
+    dataset = open_dataset(maze_set, tmp_path)
+    assert (dataset.num_rows, dataset.num_episodes, dataset.task) == (120, 4, "three_curtains")
+    env = MazeEnv("three_curtains", 5)
+    for start, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):
+        frame, _ = env.reset(seed=0, options={"state": dataset.physics[start]})
+        assert not dataset.action[start].any()
+        for row in range(start, end):
+            np.testing.assert_allclose(env.state, dataset.physics[row], atol=1e-9)
+            np.testing.assert_array_equal(frame, dataset.frames[row].numpy())
+            if row + 1 < end:
+                frame, *_ = env.step(dataset.action[row + 1].numpy())
+
+
+def test_a_check_replays_the_states(maze_set, tmp_path):
+    report = check_dataset(maze_set, tmp_path / "cache")
+    assert (report["task"], report["rows"], report["episodes"], report["replay_max_error"]) == (
+        "three_curtains",
+        120,
+        4,
+        0,
+    )
+    damaged = tmp_path / "damaged"
+    shutil.copytree(maze_set, damaged)
+    with h5py.File(damaged / "1_three_curtains.hdf5", "a") as file:
+        file["physics"][20, 2] += 0.5
+    assert check_dataset(damaged, tmp_path / "cache")["replay_max_error"] == pytest.approx(0.5)
+
+
+def test_an_interrupted_collection_ends_in_the_same_files(maze_set, tmp_path, monkeypatch):
+    whole, written = shards.write_shard, []
+
+    def cut(path, rows, attributes):
+        if written:
+            raise KeyboardInterrupt
+        whole(path, rows, attributes)
+        written.append(path)
+
+    monkeypatch.setattr(shards, "write_shard", cut)
+    with pytest.raises(KeyboardInterrupt):
+        collect(small(tmp_path / "set"))
+    assert len(hashes(tmp_path / "set")) == 1
+    monkeypatch.setattr(shards, "write_shard", whole)
+    collect(small(tmp_path / "set", workers=2))
+    assert hashes(tmp_path / "set") == hashes(maze_set)
+
+
+def test_repeat_and_seed_change_the_set(maze_set, tmp_path):
+    found = [hashes(maze_set)]
+    for i, changes in enumerate([{"action_repeat": 2}, {"seed": 1}]):
+        collect(small(tmp_path / str(i), trajectories=2, **changes))
+        found.append(hashes(tmp_path / str(i)))
+    firsts = [files["0_three_curtains.hdf5"] for files in found]
+    assert len(set(firsts)) == 3
+
+
+@pytest.mark.parametrize(
+    ("maze", "changes"), [("hard_no_curtain", {"noise": 1e4}), ("no_curtain", {"random_share": 1})]
+)
+def test_every_trajectory_has_noise_of_its_own(maze, changes, tmp_path, monkeypatch):
+    """Under noise that drowns the planner, or in its place, actions are the noise's signs."""
+    loud = replace(MAZES[maze].style, zero_share=0.0, **changes)
+    monkeypatch.setitem(MAZES, maze, replace(MAZES[maze], style=loud))
+    signs = np.sign([_roll_out(_Job(maze, i, 0, 30, 5))["action"][1:] for i in range(3)])
+    for one, other in ((0, 1), (1, 2), (0, 2)):
+        assert 0.2 < (signs[one] == signs[other]).mean() < 0.8
+
+
+def test_actions_are_the_planners_but_for_a_tenth_zero_and_a_tenth_random_ones():
+    rng, style, wanted = np.random.default_rng(0), MAZES["no_curtain"].style, np.array([3.0, -0.25])
+    actions = np.array([_explore(wanted, style, rng) for _ in range(4000)])
+    assert (actions == 0).all(1).mean() == pytest.approx(0.1, abs=0.015)
+    assert (actions == [1.0, -0.25]).all(1).mean() == pytest.approx(0.8, abs=0.02)
+    noisy = np.array([_explore(np.zeros(2), MAZES["hard_no_curtain"].style, rng) for _ in range(4000)])
+    assert noisy.std(0) == pytest.approx(0.48, abs=0.03)
+    assert not (noisy == 0).all(1).any()
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"maze": "spiral"}, "unknown maze 'spiral'"),
+        ({"trajectory_rows": 1}, "--trajectory-rows is 1"),
+        ({"trajectory_rows": 2**20 + 1}, "--trajectory-rows is 1048577"),
+        ({"action_repeat": 0}, "--action-repeat is 0"),
+        ({"seed": -1}, "--seed is -1"),
+    ],
+)
+def test_wrong_settings_are_named(changes, message, tmp_path):
+    with pytest.raises(UserError, match=message):
+        collect(small(tmp_path / "set", **changes))
+    assert not (tmp_path / "set").exists()
+
+
+def test_another_collection_is_refused(maze_set):
+    with pytest.raises(UserError, match="collected with another seed"):
+        collect(small(maze_set, seed=2))
+
+
+def test_first_person_data_holds_headings_and_moves(tmp_path):
+    collect(small(tmp_path / "set", maze="first_person", trajectories=1, trajectory_rows=120))
+    dataset = open_dataset(tmp_path / "set", tmp_path / "cache")
+    assert dataset.physics.shape == (120, 6)
+    assert np.ptp(dataset.physics[:, 2]) > 1
+    assert np.ptp(dataset.physics[:, :2], axis=0).max() > 1
+    assert len({frame.numpy().tobytes() for frame in dataset.frames}) > 100

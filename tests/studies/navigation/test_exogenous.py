@@ -1,0 +1,141 @@
+import io
+import struct
+from unittest import mock
+
+import numpy as np
+import pytest
+import torch
+from PIL import Image
+
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.studies.navigation import exogenous
+from vd4rl_pomdp.studies.navigation.exogenous import POOL, ExogenousNoise, load_pool
+
+
+@pytest.fixture(scope="module")
+def noise() -> ExogenousNoise:
+    return ExogenousNoise("photographs", 0.5, 0)
+
+
+@pytest.mark.parametrize("name", ["photographs", "textures"])
+def test_a_pool_that_needs_no_files_is_many_different_images_like_natural_ones(name):
+    pool = load_pool(name, 0)
+    assert pool.shape == (POOL, 3, 100, 100)
+    assert len({picture.numpy().tobytes() for picture in pool}) == POOL
+    assert torch.equal(pool, load_pool(name, 0))
+    assert not torch.equal(pool, load_pool(name, 1))
+    neighbours = (pool[..., 1:].float() - pool[..., :-1].float()).abs().mean()
+    strangers = (pool[1:].float() - pool[:-1].float()).abs().mean()
+    assert neighbours < strangers / 3, "pixels of natural images resemble their neighbours"
+
+
+def test_a_row_shows_the_same_image_always_and_rows_differ(noise):
+    pictures = torch.full((200, 3, 100, 100), 50, dtype=torch.uint8)
+    key = torch.arange(200)
+    first = noise(pictures, key)
+    assert torch.equal(first, noise(pictures, key))
+    assert torch.equal(first[7:9], noise(pictures[7:9], key[7:9]))
+    assert len({picture.numpy().tobytes() for picture in first}) > 150
+    assert not torch.equal(first, ExogenousNoise("photographs", 0.5, 1)(pictures, key))
+
+
+def test_noise_is_added_and_clipped(noise):
+    dark, bright = (torch.full((50, 3, 100, 100), v, dtype=torch.uint8) for v in (0, 240))
+    key = torch.arange(50)
+    added = noise(dark, key)
+    expected = (noise(dark, key).int() + 240).clamp(max=255)
+    assert added.max() <= 128
+    assert (noise(bright, key).int() - expected).abs().max() <= 1
+    assert noise.pool.shape[1:] == added.shape[1:]
+
+
+def cifar_binary(folder, count: int = 4) -> np.ndarray:
+    images = np.random.default_rng(0).integers(0, 256, (count, 3072), dtype=np.uint8)
+    records = np.concatenate([np.arange(count, dtype=np.uint8)[:, None], images], 1)
+    (folder / "data_batch_1.bin").write_bytes(records.tobytes())
+    return images
+
+
+def torn_png() -> bytes:
+    """A PNG whose pixels are longer than they say, so that no chunk follows where one should."""
+    whole = io.BytesIO()
+    noise = np.random.default_rng(0).integers(0, 256, (40, 40, 3), dtype=np.uint8)
+    Image.fromarray(noise).save(whole, "PNG")
+    raw = whole.getvalue()
+    place = raw.index(b"IDAT")
+    return raw[: place - 4] + struct.pack(">I", 100) + raw[place:]
+
+
+def python_batch(pixels: bytes) -> bytes:
+    """A protocol-2 pickle of {"data": pixels}, as Python 2 wrote strings."""
+    return b"\x80\x02}q\x01U\x04dataq\x02T" + struct.pack("<i", len(pixels)) + pixels + b"q\x03s."
+
+
+def test_cifar_files_of_both_kinds_give_the_same_images(tmp_path):
+    for name in ("binary", "python"):
+        (tmp_path / name).mkdir()
+    images = cifar_binary(tmp_path / "binary")
+    (tmp_path / "python" / "data_batch_1").write_bytes(python_batch(images.tobytes()))
+    pools = [load_pool(str(tmp_path / name), 0) for name in ("binary", "python")]
+    assert torch.equal(*pools)
+    assert pools[0].shape == (4, 3, 100, 100)
+    planes = images.reshape(4, 3, 32, 32).mean((2, 3))
+    ours = pools[0].float().mean((2, 3)).numpy()
+    assert np.abs(np.sort(planes, 0) - np.sort(ours, 0)).max() < 2
+
+
+def test_a_pickle_is_never_run(tmp_path):
+    """A batch that would write a file, were it unpickled, yields its pixels and nothing else."""
+    pixels = bytes(range(256)) * 12
+    call = b"cos\nsystem\nU" + bytes([len(f"touch {tmp_path}/harm")]) + f"touch {tmp_path}/harm".encode() + b"\x85R0"
+    (tmp_path / "data_batch_1").write_bytes(b"\x80\x02" + call + python_batch(pixels)[2:])
+    assert load_pool(str(tmp_path), 0).shape == (1, 3, 100, 100)
+    assert not (tmp_path / "harm").exists()
+
+
+def test_other_images_are_read_too(tmp_path):
+    Image.fromarray(np.full((40, 60, 3), 99, np.uint8)).save(tmp_path / "a.png")
+    Image.fromarray(np.full((30, 30), 10, np.uint8)).save(tmp_path / "b.JPG", "JPEG")
+    pool = load_pool(str(tmp_path), 0)
+    assert sorted(pool.float().mean((1, 2, 3)).tolist()) == pytest.approx([10, 99], abs=2)
+
+
+def test_of_a_folder_of_many_images_only_those_of_the_pool_are_read(tmp_path, monkeypatch):
+    for level in range(10, 130, 10):
+        Image.fromarray(np.full((20, 30, 3), level, np.uint8)).save(tmp_path / f"{level:03}.png")
+    cifar_binary(tmp_path, count=3)
+    whole = load_pool(str(tmp_path), 0)
+    assert len(whole) == 15
+    monkeypatch.setattr(exogenous, "POOL", 6)
+    with mock.patch.object(exogenous, "_read_image", wraps=exogenous._read_image) as read:
+        assert torch.equal(load_pool(str(tmp_path), 0), whole[:6])
+    assert 1 <= read.call_count <= 6
+
+
+@pytest.mark.parametrize(
+    ("name", "content", "message"),
+    [
+        ("notes.txt", b"no image", "no readable image"),
+        ("data_batch_1.bin", b"\x00" * 3000, "no multiple of 3073"),
+        ("data_batch_1.bin", b"\xff" * 3073, "labels above 9"),
+        ("data_batch_1", python_batch(b"\x00" * 100), "holds no pixels"),
+        ("data_batch_1", b"\xfe\xfe\xfe", "is damaged"),
+        ("a.png", b"not a picture", "cannot be read as an image"),
+        ("a.png", torn_png(), "cannot be read as an image"),
+    ],
+)
+def test_folders_without_usable_images_are_named(tmp_path, name, content, message):
+    (tmp_path / name).write_bytes(content)
+    with pytest.raises(UserError, match=message) as caught:
+        load_pool(str(tmp_path), 0)
+    assert len(str(caught.value).splitlines()) == 1
+
+
+def test_textures_have_the_spectrum_of_natural_images():
+    pool = load_pool("textures", 0)[:200].float().mean(1)
+    power = (torch.fft.fft2(pool - pool.mean((1, 2), keepdim=True)).abs() ** 2).mean(0)
+    frequency = torch.fft.fftfreq(100)[:, None].hypot(torch.fft.fftfreq(100)[None])
+    chosen = (frequency > 0.02) & (frequency < 0.2)
+    x, y = frequency[chosen].log(), power[chosen].log()
+    slope = ((x - x.mean()) * (y - y.mean())).sum() / ((x - x.mean()) ** 2).sum()
+    assert -3.2 < slope < -1.6, "power falls about as the square of the frequency (Field 1987)"

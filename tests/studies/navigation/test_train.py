@@ -1,0 +1,353 @@
+import json
+import re
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.helpers_data import write_fake_set
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.envs.mazes import MAZES
+from vd4rl_pomdp.nn import load_encoder
+from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
+from vd4rl_pomdp.studies.navigation.data import MazeData, open_data
+from vd4rl_pomdp.studies.navigation.methods import METHOD_NAMES, OBJECTIVES
+from vd4rl_pomdp.studies.navigation.observations import open_maze_set
+from vd4rl_pomdp.studies.navigation.probe import ErrorSums, StateProbe, TrueStates, refit
+from vd4rl_pomdp.studies.navigation.train import train
+from vd4rl_pomdp.studies.navigation.trainer import NavigationTrainer, learning_rate, make_objective
+
+
+@pytest.fixture(autouse=True)
+def _cache(tmp_path_factory, monkeypatch):
+    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path_factory.getbasetemp() / "maze-cache"))
+    monkeypatch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
+    torch.set_num_threads(1)
+
+
+def smoke(data: Path, out: Path, **changes: object) -> NavigationConfig:
+    given = {"data": data, "out": out, "steps": 8, "log_every": 2, "checkpoint_every": 4, "precision": "fp32"}
+    return NavigationConfig.of("smoke", **(given | changes))
+
+
+def trainer_of(config: NavigationConfig) -> NavigationTrainer:
+    torch.manual_seed(0)
+    data = open_data(config)
+    return NavigationTrainer(make_objective(data, config), data.on(torch.device("cpu")), config)
+
+
+def results(out: Path) -> dict[tuple, float]:
+    rows = json.loads((out / "results.json").read_text())["rows"]
+    return {(r["measure"], r["split"], r["probe"], r["rows"], r["k"]): r["value"] for r in rows}
+
+
+@pytest.mark.parametrize("method", METHOD_NAMES)
+def test_every_objective_of_the_paper_trains_and_is_measured(maze_set, tmp_path, method):
+    train(smoke(maze_set, tmp_path / "run", method=method))
+    found = results(tmp_path / "run")
+    for component in ("state", "position", "velocity"):
+        assert found[f"{component}_error", "held_out", "refit", "all", 0] > 0
+    assert (("action_loss", "held_out", "", "all", 0) in found) == (method in OBJECTIVES)
+    encoder, card = load_encoder(tmp_path / "run" / "encoder")
+    assert (card.method, card.task) == (method, "three_curtains")
+    assert (encoder.config.channels, encoder.config.size) == (1, 50)
+    assert encoder.config.history == ("none" if method in ("no_history", "supervised_picture") else "gru")
+    lines = (tmp_path / "run" / "trajectory.csv").read_text().splitlines()
+    assert len(lines) == 41
+
+
+def test_the_run_measures_every_k_hidden_steps_and_both_splits(maze_set, tmp_path):
+    train(smoke(maze_set, tmp_path / "run"))
+    found = results(tmp_path / "run")
+    assert {k for measure, *_, k in found if measure == "action_loss"} == {0, 1, 2, 3}
+    assert {(split, probe) for measure, split, probe, *_ in found if measure == "state_error"} == {
+        ("training", "online"),
+        ("training", "refit"),
+        ("held_out", "online"),
+        ("held_out", "refit"),
+    }
+    assert ("position_error", "training", "refit", "hidden", 0) in found
+    averages = [json.loads(line) for line in (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()]
+    expected = np.mean([row["state"] for row in averages])  # average_last covers all eight steps
+    assert found["state_error", "training", "online", "all", 0] == pytest.approx(expected)
+
+
+def test_averages_are_of_the_last_steps_however_often_metrics_are_logged(maze_set, tmp_path):
+    few = {"average_last": 5, "evaluation_windows": 2, "refit_windows": 2}
+    intervals = (1, 2, 3, 100)
+    for every in intervals:
+        train(smoke(maze_set, tmp_path / str(every), log_every=every, **few))
+    found = [results(tmp_path / str(every)) for every in intervals]
+    for measure in (("state_error", "training", "online", "all", 0), ("action_loss", "training", "", "all", 0)):
+        assert [one[measure] for one in found] == pytest.approx([found[0][measure]] * len(found))
+
+
+def test_an_interrupted_run_ends_like_an_uninterrupted_one(maze_set, tmp_path, monkeypatch):
+    whole = train(smoke(maze_set, tmp_path / "whole"))
+    update, calls = NavigationTrainer.update, []
+
+    def cut(self):
+        calls.append(1)
+        if len(calls) == 7:
+            raise KeyboardInterrupt
+        return update(self)
+
+    monkeypatch.setattr(NavigationTrainer, "update", cut)
+    with pytest.raises(KeyboardInterrupt):
+        train(smoke(maze_set, tmp_path / "cut"))
+    monkeypatch.setattr(NavigationTrainer, "update", update)
+    manifest = tmp_path / "cut" / "checkpoints" / "4" / "manifest.json"
+    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"seconds": 1000.0}))
+    train(smoke(maze_set, tmp_path / "cut"))
+    timing = json.loads((tmp_path / "cut" / "timing.json").read_text())
+    assert timing["total_seconds"] >= timing["seconds"] >= 1000
+    for name in ("metrics.jsonl", "trajectory.csv", "encoder/model.safetensors"):
+        assert (whole.path / name).read_bytes() == (tmp_path / "cut" / name).read_bytes(), name
+    assert results(whole.path) == results(tmp_path / "cut")
+    with pytest.raises(UserError, match=r"another config \(seed\)"):
+        train(smoke(maze_set, tmp_path / "cut", seed=1))
+
+
+def test_the_probe_leaves_the_representation_alone(maze_set, tmp_path):
+    trainer = trainer_of(smoke(maze_set, tmp_path / "run"))
+    window = trainer.batch()
+    past, future = trainer.objective.representations(window)
+    loss, _ = trainer.objective.loss_of(past, future, window, 0.0)
+    alone = torch.autograd.grad(loss, list(trainer.objective.parameters()), retain_graph=True)
+    together = torch.autograd.grad(trainer.losses(window)[0], list(trainer.objective.parameters()))
+    for one, other in zip(alone, together, strict=True):
+        torch.testing.assert_close(one, other)
+    trainer.losses(window)[0].backward()
+    assert all(parameter.grad is not None for parameter in trainer.probe.parameters())
+
+
+def test_a_supervised_reference_learns_from_the_states_alone(maze_set, tmp_path):
+    trainer = trainer_of(smoke(maze_set, tmp_path / "run", method="supervised+a"))
+    loss, logs, _ = trainer.losses(trainer.batch())
+    loss.backward()
+    assert set(logs) == {"loss"}
+    assert all(p.grad is not None and p.grad.any() for p in trainer.objective.encoder.parameters())
+    assert trainer.objective.encoder.config.use_actions
+    assert not trainer_of(smoke(maze_set, tmp_path / "run", method="supervised")).objective.encoder.config.use_actions
+
+
+def test_a_single_picture_is_told_apart_from_memory(maze_set, tmp_path):
+    """The estimate of a row depends on its own picture alone, or on those before it, too."""
+    for method, remembers in (("supervised_picture", False), ("supervised", True)):
+        trainer = trainer_of(smoke(maze_set, tmp_path / "run", method=method))
+        window = trainer.batch()
+        before = trainer.losses(window)[2][0]
+        window.obs[:, 2] = 255 - window.obs[:, 2]
+        changed = (trainer.losses(window)[2][0] != before).any(-1).any(0)
+        assert changed[2]
+        assert not changed[:2].any()
+        assert changed[3:].any() == remembers
+
+
+def test_frames_of_a_window_are_encoded_once(maze_set, tmp_path):
+    trainer = trainer_of(smoke(maze_set, tmp_path / "run"))
+    calls = []
+    trainer.objective.encoder.frame.register_forward_hook(lambda m, i, o: calls.append(i[0].shape))
+    trainer.update()
+    assert calls == [(4, 16, 1, 50, 50)]
+
+
+def test_held_out_trajectories_are_never_trained_on(maze_set, tmp_path):
+    data = trainer_of(smoke(maze_set, tmp_path / "run")).data
+    assert data.first_held_out == 11
+    for held_out in (False, True):
+        for number in data.spread(10_000, held_out):
+            episodes = data.windows(number).key >> 20
+            assert ((episodes >= 11) == held_out).all()
+    assert data.total - data.training == 40 - 16 + 1
+
+
+def test_windows_carry_the_states_of_their_rows(maze_set, tmp_path):
+    trainer = trainer_of(smoke(maze_set, tmp_path / "run"))
+    states, data = trainer.data.states, trainer.data
+    window = data.windows(torch.tensor([0, 30, 130]))
+    raw = states.values[data.dataset.rows(window.key)] * states.std + states.mean
+    for b, key in enumerate(window.key[:, 0].tolist()):
+        start = int(data.dataset.episode_start[key >> 20]) + (key & (1 << 20) - 1)
+        np.testing.assert_allclose(raw[b], data.dataset.physics[start : start + 16], atol=1e-4)
+    training = states.values[: int(data.dataset.episode_start[11])]
+    torch.testing.assert_close(training.mean(0), torch.zeros(4), atol=1e-4, rtol=0)
+    torch.testing.assert_close(training.std(0), torch.ones(4), atol=1e-4, rtol=0)
+
+
+def test_errors_leave_out_the_burn_in_and_count_hidden_rows_apart():
+    truth = torch.zeros(1, 5, 4)
+    estimate = torch.tensor([9.0, 9, 1, 1, 4])[None, :, None].expand(1, 5, 4) * torch.tensor([1.0, 1, 2, 2])
+    hidden = torch.tensor([[True, True, False, False, True]])
+    sums = ErrorSums()
+    sums.add(estimate, truth, hidden, burn_in=2)
+    found = sums.percent()
+    assert found["position"] == pytest.approx(200.0)
+    assert found["velocity"] == pytest.approx(400.0)
+    assert found["state"] == pytest.approx(300.0)
+    assert (found["position_hidden"], found["velocity_hidden"]) == (400.0, 800.0)
+    sums = ErrorSums()
+    sums.add(estimate, truth, torch.zeros_like(hidden), burn_in=0)
+    assert "position_hidden" not in sums.percent()
+
+
+def test_raw_errors_are_in_the_simulators_units():
+    errors = ErrorSums()
+    estimate = torch.tensor([0.1, 0.3, 0.2, 0.6]).expand(1, 3, 4)
+    errors.add(estimate, torch.zeros(1, 3, 4), torch.tensor([[False, True, True]]), burn_in=1)
+    found = errors.both(torch.tensor([2.0, 1.0, 3.0, 0.5]))
+    expected = {"position": (20, 25), "velocity": (40, 45), "state": (30, 35)}
+    for name, (percent, raw) in expected.items():
+        for suffix in ("", "_hidden"):
+            assert found[f"{name}{suffix}"] == pytest.approx(percent)
+            assert found[f"raw_{name}{suffix}"] == pytest.approx(raw)
+
+
+def test_a_refitted_probe_reads_what_is_there_and_nothing_else():
+    generator = torch.Generator().manual_seed(0)
+    features = torch.randn(4000, 6, generator=generator)
+    truth = torch.stack([features[:, 0], features[:, 1] * features[:, 2], features[:, 0].sin(), features[:, 5]], 1)
+    truth[:, 3] = torch.randn(4000, generator=generator)  # not in the features
+    probe = refit(features[:3000], truth[:3000], 400, 0)
+    error = (probe(features[3000:]) - truth[3000:]).abs().mean(0)
+    assert (error[:3] < 0.15).all()
+    assert error[3] > 0.7
+    assert isinstance(probe, StateProbe)
+
+
+def test_the_learning_rate_rises_then_falls():
+    config = NavigationConfig.of("cpu", steps=1000, warm_up=100)
+    rates = [learning_rate(config, step) for step in range(1000)]
+    assert rates[0] == pytest.approx(config.learning_rate / 100)
+    assert int(np.argmax(rates)) in (99, 100)
+    assert rates[-1] < 1e-5
+    assert {learning_rate(NavigationConfig.of("paper"), step) for step in (0, 10, 10**5)} == {1e-4}
+    assert learning_rate(NavigationConfig.of("paper", method="supervised"), 0) == pytest.approx(5e-5)
+
+
+def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
+    from vd4rl_pomdp.studies.navigation.exogenous import ExogenousNoise
+
+    noise = ExogenousNoise("photographs", 0.5, 0)
+    for picture, shape in (("grey50", (1, 50, 50)), ("rgb50", (3, 50, 50)), ("rgb100", (3, 100, 100))):
+        config = smoke(maze_set, tmp_path / "run", picture=picture, frame_encoder="nature")
+        clean, noisy = (MazeData(*open_maze_set(maze_set), config, n).on(torch.device("cpu")) for n in (None, noise))
+        number = torch.tensor([0, 40])
+        first, second = clean.windows(number), noisy.windows(number)
+        assert first.obs.shape[-3:] == shape
+        assert (second.obs.float() - first.obs.float()).abs().mean() > 5
+        torch.testing.assert_close(second.obs, noisy.windows(number).obs)
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"method": "mikado"}, "unknown method 'mikado'"),
+        ({"method": "curl"}, "curl predicts no actions: choose one of no_history, ah"),
+        ({"window": 41}, r"episode 0 has 40 rows, fewer than the window of 41"),
+        ({"frame_encoder": "mixer", "picture": "grey50", "burn_in": 20}, "--burn-in 20 leaves no row"),
+        ({"frame_encoder": "vit"}, "unknown frame encoder 'vit'"),
+        ({"method": "ah+a", "literal_future": True}, r"--literal-future is not read by the method ah\+a"),
+        (
+            {"future_frames": "newest"},
+            "--future-frames newest blanks older frames of a stack, and here an observation is",
+        ),
+        ({"steps": 0}, "--steps is 0"),
+        ({"seed": -1}, "--seed is -1"),
+        ({"hidden_dim": 0}, "--hidden-dim is 0"),
+        ({"gru_layers": 0}, "--gru-layers is 0"),
+        ({"feature_dim": 0}, "--feature-dim is 0"),
+        ({"checkpoint_every": 0}, "--checkpoint-every is 0"),
+        ({"learning_rate": float("nan")}, "--learning-rate is nan"),
+        ({"self_prediction": -1.0}, "--self-prediction is -1.0"),
+        ({"max_k": 16}, "--max-k 16 needs windows of more"),
+        ({"exogenous": "nowhere"}, "nowhere: no such folder"),
+        ({"exogenous": "photographs", "exogenous_weight": 2.0}, "--exogenous-weight is 2.0"),
+    ],
+)
+def test_wrong_settings_are_named(maze_set, tmp_path, changes, message):
+    with pytest.raises(UserError, match=message) as caught:
+        train(smoke(maze_set, tmp_path / "run", **changes))
+    assert len(str(caught.value).splitlines()) == 1
+    assert not (tmp_path / "run").exists()
+
+
+def test_sets_that_cannot_be_trained_on_are_named(tmp_path):
+    from tests.helpers_data import fake_rows
+    from vd4rl_pomdp.data.format import write_shard
+
+    other = write_fake_set(tmp_path / "walker_walk" / "expert")
+    with pytest.raises(UserError, match="names no maze"):
+        train(smoke(other, tmp_path / "run"))
+    shrunk = write_fake_set(tmp_path / "shrunk", attributes={"task": "no_curtain"})
+    with pytest.raises(UserError, match="has frames of 84 pixels, mazes of 100"):
+        train(smoke(shrunk, tmp_path / "run"))
+    short = fake_rows([1, 20, 20], action_dim=2, physics_dim=4) | {"observation": np.zeros((41, 3, 100, 100), np.uint8)}
+    (tmp_path / "short").mkdir()
+    write_shard(tmp_path / "short" / "0.hdf5", short, {"task": "no_curtain"})
+    with pytest.raises(UserError, match="trajectory 0 is a single row, without a step; take it out of the set, or"):
+        train(smoke(tmp_path / "short", tmp_path / "run"))
+    rows = fake_rows([20, 20], action_dim=2) | {"observation": np.zeros((40, 3, 100, 100), np.uint8)}
+    for name, attributes, message in (
+        ("none", {}, "names no maze"),
+        ("stateless", {"task": "no_curtain"}, "holds no true states"),
+    ):
+        (tmp_path / name).mkdir()
+        write_shard(tmp_path / name / "0.hdf5", rows, attributes)
+        with pytest.raises(UserError, match=message):
+            train(smoke(tmp_path / name, tmp_path / "run"))
+
+
+def test_true_states_of_first_person_leave_out_the_heading():
+    maze = MAZES["first_person"]
+    assert [*maze.position, *maze.velocity] == [0, 1, 3, 4]
+    assert TrueStates.__dataclass_fields__.keys() >= {"values", "hidden"}
+
+
+def test_the_mixer_refuses_sizes_it_cannot_cut():
+    from vd4rl_pomdp.nn.frame import FrameOptions, make_frame_encoder
+
+    assert make_frame_encoder("mixer", 3, 100, FrameOptions(16))(
+        torch.zeros(2, 3, 100, 100, dtype=torch.uint8)
+    ).shape == (2, 16)
+    with pytest.raises(UserError, match="84 is no multiple"):
+        make_frame_encoder("mixer", 9, 84, FrameOptions(16))
+
+
+def test_the_mixer_has_the_papers_shape():
+    from vd4rl_pomdp.nn.frame import FrameOptions, MixerLayer, make_frame_encoder
+
+    encoder = make_frame_encoder("mixer", 3, 100, FrameOptions())
+    layers = [m for m in encoder.modules() if isinstance(m, MixerLayer)]
+    assert len(layers) == 8
+    assert layers[0].over_patches[0].in_features == 100
+    paper = NavigationConfig.of("paper")
+    assert (paper.memory.gru_layers, paper.memory.hidden_dim, paper.batch_size, paper.window) == (2, 256, 16, 64)
+    assert (paper.steps, paper.average_last, paper.learning_rate) == (200_000, 10_000, 1e-4)
+    assert paper.options.target.codes == 20
+    assert re.fullmatch("mixer", paper.frame_encoder)
+
+
+@pytest.mark.parametrize(("frame_encoder", "picture"), [("mixer", "rgb100"), ("small", "grey50")])
+def test_streaming_and_windows_agree_for_the_mazes_encoders(maze_set, tmp_path, frame_encoder, picture):
+    trainer = trainer_of(smoke(maze_set, tmp_path / "run", frame_encoder=frame_encoder, picture=picture, batch_size=1))
+    window, encoder = trainer.batch(), trainer.objective.encoder.eval()
+    with torch.no_grad():
+        whole, state = encoder.encode(window), encoder.initial_state(1)
+        for t in range(6):
+            z, state = encoder.step(window.obs[:, t], window.prev_action[:, t], state)
+            torch.testing.assert_close(z, whole[:, t], atol=1e-5, rtol=1e-4)
+
+
+def test_the_command_that_a_run_names_has_its_config(maze_set, tmp_path):
+    from vd4rl_pomdp.cli.parsing import parse_stage
+
+    for config in (
+        smoke(maze_set, tmp_path / "a run", method="fj+a", m=3, self_prediction=0.5, k_embedding=False),
+        NavigationConfig.of("cpu", data=maze_set, out=tmp_path, literal_future=True, seed=4, max_k=1),
+        NavigationConfig.of("paper", data=maze_set, out=tmp_path),
+    ):
+        words = command_of(config)
+        assert words[:3] == ["vd4rl-pomdp", "navigation", "train"]
+        assert parse_stage(NavigationConfig, words[3:], "x") == config

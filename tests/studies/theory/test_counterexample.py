@@ -1,0 +1,95 @@
+import warnings
+
+import gymnasium
+import numpy as np
+import pytest
+from gymnasium.utils.env_checker import check_env
+
+import vd4rl_pomdp.envs
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.studies.theory import counterexample as study
+from vd4rl_pomdp.studies.theory.gallery import BLANK, counterexample
+
+K2 = {((1, -1), (0, -1)), ((-1, 1), (0, 1)), ((-1, -1), (2, -1)), ((1, 1), (2, 1))}
+K4 = """
+---- -++- +-+- ++-- 0 -1
+--++ -+-+ +--+ ++++ 0 1
+--+- -+-- +--- +++- 2 -1
+---+ -+++ +-++ ++-+ 2 1
+"""
+"""The appendix's lists of examples from (0, -1) and (0, 1), which are the same for both."""
+
+
+def appendix_k4():
+    for line in K4.strip().splitlines():
+        *plans, x, b = line.split()
+        for plan in plans:
+            yield tuple(1 if sign == "+" else -1 for sign in plan), (int(x), int(b))
+
+
+@pytest.mark.parametrize(("k", "listed"), [(2, K2), (4, set(appendix_k4()))])
+def test_the_appendix_lists(k, listed):
+    assert len(listed) == 2**k
+    examples = study.inverse_examples(counterexample(), k)
+    for start in ((0, -1), (0, 1)):
+        assert {(actions, end) for s, actions, end in examples if s == start} == listed
+
+
+def test_the_counts_of_the_paper_and_what_it_leaves_out():
+    found = study.study(counterexample())
+    assert found["examples"] == 16368
+    assert set(range(4, 11)) <= set(found["uniform_k"])
+    assert found["uniform_k"] == list(range(3, 11)), "k = 3 is uniform, too"
+    assert found["informative_k"] == [1, 2]
+    assert (found["diameter"], found["m_with_actions"], found["period"]) == (3, 3, 2)
+    assert found["by_k"][1] == {"k": 2, "examples": 32, "pairs": 32, "certain": 32, "uniform": 0}
+
+
+def test_the_main_texts_actions_give_other_claims():
+    found = study.study(counterexample((0, 1)))
+    assert found["examples"] == 16368
+    assert found["uniform_k"] == []
+    assert found["diameter"] == 4
+
+
+def make(**arguments):
+    assert vd4rl_pomdp.envs.FINITE_IDS
+    return gymnasium.make("vd4rl_pomdp/ForwardJumpCounterexample-v0", disable_env_checker=True, **arguments)
+
+
+def test_the_environment_passes_gymnasiums_checker():
+    env = make(render_mode="ansi")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error", UserWarning)  # Gymnasium's kind
+        check_env(env.unwrapped)
+
+
+def test_an_action_of_the_world_is_no_place_of_one():
+    env = make()
+    env.reset(seed=0)
+    for wrong in (-1, 2):
+        with pytest.raises(UserError, match=rf"^action {wrong}: give the place of one in \[-1, 1\], 0 to 1$"):
+            env.step(wrong)
+
+
+def test_the_environment_walks_as_the_world_does():
+    env, world = make(max_episode_steps=9), counterexample()
+    rng = np.random.default_rng(0)
+    obs, info = env.reset(seed=3)
+    for step in range(9):
+        shown = world.symbols[int(obs.argmax())]
+        assert obs.sum() == 255
+        assert shown == (info["state"] if info["exogenous"] == 0 else BLANK)
+        action = int(rng.integers(2))
+        before = info
+        obs, reward, terminated, truncated, info = env.step(action)
+        assert info["state"] == world.step[before["state"], world.actions[action]]
+        assert info["exogenous"] == (before["exogenous"] + 1) % 4
+        assert (reward, terminated, truncated) == (0.0, False, step == 8)
+    firsts = {env.reset(seed=s)[1]["state"] for s in range(60)}
+    assert firsts == set(world.states)
+
+
+def test_bad_environments_are_one_line():
+    with pytest.raises(UserError, match="choose one of counterexample"):
+        make(world="maze")

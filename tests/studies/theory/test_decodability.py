@@ -1,0 +1,69 @@
+from dataclasses import replace
+from fractions import Fraction
+
+import pytest
+from hypothesis import given, settings
+
+from tests.studies.theory.random_worlds import worlds
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.studies.theory.decodability import future_memory, past_memory
+from vd4rl_pomdp.studies.theory.gallery import NOISE, biased, counterexample, echo, momentum
+from vd4rl_pomdp.studies.theory.law import joint_law
+from vd4rl_pomdp.studies.theory.world import diameter, uniform, with_noise
+
+HALF = Fraction(1, 2)
+LONGEST = 3
+
+
+def tells(world, seen, row):
+    """Whether what is seen determines s at a row, in every sequence that begins anywhere in the world."""
+    anywhere = replace(world, initial=uniform(world.reachable()))
+    return joint_law(anywhere, [*seen, ("s", row)]).tells(seen, [("s", row)])
+
+
+def past(length, actions):
+    return [("o", j) for j in range(length + 1)] + [("a", j) for j in range(length if actions else 0)]
+
+
+def future(length, actions):
+    return [("o", j) for j in range(length + 1)] + [("a", j) for j in range(length + 1 if actions else 0)]
+
+
+def literal(length):
+    return [("o", j + 1) for j in range(length + 1)] + [("a", j) for j in range(length + 1)]
+
+
+@settings(max_examples=12, deadline=None)
+@given(worlds(most_states=3))
+@pytest.mark.parametrize("actions", [True, False])
+def test_memories_are_those_of_the_joint_law(actions, world):
+    """Enumeration of all sequences up to a length finds the same smallest memory, or none up to that length."""
+    for memory, enough in (
+        (past_memory(world, actions), lambda n: tells(world, past(n, actions), n)),
+        (future_memory(world, actions), lambda n: tells(world, future(n, actions), 0)),
+        (future_memory(world, actions=True, literal=True), lambda n: tells(world, literal(n), 1)),
+    ):
+        smallest = next((n for n in range(LONGEST) if enough(n)), None)
+        assert smallest == (memory if memory is not None and memory < LONGEST else None)
+
+
+def test_long_memories_are_found_and_missing_ones_proven():
+    assert past_memory(counterexample(every=12), actions=True) == 11
+    assert past_memory(counterexample(every=12), actions=False) is None
+
+
+def test_decodability_of_the_gallery():
+    assert [past_memory(w(), actions=True) for w in (counterexample, echo, momentum)] == [3, 1, 1]
+    assert [past_memory(w(), actions=False) for w in (counterexample, echo, momentum)] == [None, 1, 1]
+    assert [future_memory(w(), actions=True) for w in (counterexample, echo, momentum)] == [None, 1, 1]
+    assert [future_memory(w(), actions=False) for w in (counterexample, echo, momentum)] == [None, 1, None]
+    assert future_memory(counterexample(), actions=True, literal=True) == 3
+
+
+def test_noise_and_policies_change_neither_dynamics_nor_decodability():
+    noisy = with_noise(biased(momentum()), "noise", NOISE)
+    assert (past_memory(noisy, True), future_memory(noisy, True)) == (1, 1)
+    assert diameter(noisy) == diameter(momentum()) == 4
+    assert len(noisy.symbols) == 2 * len(momentum().symbols)
+    with pytest.raises(UserError, match="noise"):
+        with_noise(momentum(), "noise", {0: {0: HALF}})

@@ -1,0 +1,107 @@
+from itertools import combinations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+
+from tests.studies.theory.random_worlds import worlds
+from vd4rl_pomdp.studies.theory.classifiers import Memory
+from vd4rl_pomdp.studies.theory.gallery import NOISE, biased, counterexample, echo, momentum
+from vd4rl_pomdp.studies.theory.partition import (
+    discards_noise,
+    forced_shares,
+    relation,
+    state_classes,
+    state_relation,
+)
+from vd4rl_pomdp.studies.theory.views import VIEWS
+from vd4rl_pomdp.studies.theory.world import with_noise
+
+MEMORY = Memory(3, 3)
+
+
+def classes(world, method, max_k):
+    found = relation(world, VIEWS[method], MEMORY, range(1, max_k + 1))
+    return state_classes(found, found.coarsest())
+
+
+@settings(max_examples=20, deadline=None)
+@given(worlds(most_states=3))
+@pytest.mark.parametrize("method", ["fj", "fj+a", "mik+a"])
+def test_a_coarsest_partition_factors_and_cannot_be_coarsened(method, world):
+    found = relation(world, VIEWS[method], Memory(1, 1), (1, 2))
+    blocks = found.coarsest()
+    assert len(blocks) == len(found.histories)
+    assert found.factors(blocks)
+    for one, other in combinations(sorted(set(blocks.tolist())), 2):
+        assert not found.factors(np.where(blocks == other, one, blocks))
+
+
+@settings(max_examples=15, deadline=None)
+@given(worlds(most_states=3))
+@pytest.mark.parametrize("method", ["fj+a", "mik+a"])
+def test_conflicts_are_the_pairs_that_no_partition_can_merge(method, world):
+    found = relation(world, VIEWS[method], Memory(1, 1), (1, 2))
+    conflicts, apart = found.conflicts(), np.arange(len(found.histories))
+    for one, other in list(combinations(apart, 2))[:60]:
+        merged = found.factors(np.where(apart == other, one, apart))
+        assert merged is not bool(conflicts[one, other])
+
+
+def test_forward_jumps_merge_what_mik_a_must_separate():
+    """Up to k = D = m = 3, FJ and FJ+A let s^A go; MIK+A has to tell s^A = x from x+2."""
+    world = counterexample()
+    assert classes(world, "fj", 3) == [0] * 8
+    assert classes(world, "fj+a", 3) == [0, 1] * 4
+    assert classes(world, "mik+a literal", 3) == [0, 0, 0, 0, 1, 1, 1, 1]
+    opposite = {frozenset(((x, b), (x + 2, c))) for x in (0, 1) for b in (-1, 1) for c in (-1, 1)}
+    shares = {
+        name: forced_shares(relation(world, VIEWS[name], MEMORY, (1, 2, 3)))
+        for name in ("fj+a", "mik+a", "mik+a literal")
+    }
+    assert {pair for pair, share in shares["mik+a literal"].items() if share == 1} == opposite
+    assert {pair for pair, share in shares["mik+a"].items() if share > 0} == opposite
+    assert max(shares["fj+a"].values()) < 1
+
+
+def test_beyond_m_forward_jumps_separate_these_states_again():
+    """At k = m+1 the later window begins at t+1, so FJ+A with k <= 5 cannot merge opposite states either."""
+    world = counterexample()
+    shares = forced_shares(relation(world, VIEWS["fj+a"], MEMORY, range(1, 6)))
+    assert shares[frozenset(((0, 1), (2, 1)))] == 1
+    assert classes(world, "fj+a", 5) == [0, 1, 0, 1, 2, 3, 2, 3]
+
+
+def test_no_inverse_model_separates_parities_of_the_counterexample():
+    found = state_relation(counterexample(), range(1, 11))
+    blocks, conflicts = found.coarsest(), found.conflicts()
+    here, beside, opposite = (found.histories[state,] for state in ((0, 1), (1, 1), (2, 1)))
+    assert len(set(blocks)) == 4
+    assert blocks[here] == blocks[beside]
+    assert not conflicts[here, beside]
+    assert conflicts[here, opposite]
+
+
+def test_one_encoder_on_true_states_recovers_aperiodic_worlds():
+    for world, diameter in ((echo(), 4), (momentum(), 4)):
+        blocks = state_relation(world, range(1, diameter + 1)).coarsest()
+        assert len(set(blocks)) == len(world.states)
+
+
+def test_the_past_encoder_alone_may_merge_states_that_act_alike():
+    """echo: (0, 1) and (2, 0) have the same successors; f can merge them under a policy that treats them alike."""
+    world, ks = echo(), range(1, 5)
+    even = forced_shares(relation(world, VIEWS["mik+a"], Memory(1, 1), ks))
+    assert {pair for pair, share in even.items() if share == 0} == {
+        frozenset(((x, b), ((x + 2) % 4, 1 - b))) for x in range(4) for b in (0, 1)
+    }
+    partial = forced_shares(relation(biased(world), VIEWS["mik+a"], Memory(1, 1), ks))
+    assert set(partial.values()) == {1}
+
+
+def test_which_objectives_can_drop_the_exogenous_part():
+    ks = (1, 2)
+    for name in ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a"):
+        assert discards_noise(relation(with_noise(momentum(), "noise", NOISE), VIEWS[name], Memory(1, 1), ks))
+    assert not discards_noise(relation(counterexample(), VIEWS["fj"], MEMORY, ks))
+    assert discards_noise(relation(counterexample(), VIEWS["fj+a"], MEMORY, ks))

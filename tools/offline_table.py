@@ -1,0 +1,336 @@
+"""The tables of returns in README.md and results/offline/README.md, made from rows of results/control and offline."""
+
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from control_table import probes_of, spread_of, told, with_seeds
+from scipy.stats import spearmanr
+
+from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.report.gates import FAILED, PASSED, UNKNOWN, episodes_of, gates, returns_of
+from vd4rl_pomdp.report.layout import number, with_interval
+from vd4rl_pomdp.report.load import PROBES, LoadedRun, load_runs
+from vd4rl_pomdp.report.measures import mean_if_known
+from vd4rl_pomdp.report.overall import aggregate, improvement
+from vd4rl_pomdp.report.stats import difference_interval
+from vd4rl_pomdp.report.tables import TOLD_STATES, evaluations
+from vd4rl_pomdp.runs.episodes import read_episodes
+from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.sweeps.grid_file import load_grid
+from vd4rl_pomdp.sweeps.members import GridMembers
+
+RESULTS = Path(__file__).parents[1] / "results"
+GRIDS = ("offline", "control")
+HIDDEN, PATCHES, CLEAN = "patch+zero_frames", "patch", "none"
+ALONE = ", patches alone"
+"""What is added to the name of a set where no frames were zeroed."""
+UNTRAINED = "random"
+SETS = {
+    ("walker_walk", "expert_noisy"): "walker_walk, noisy expert",
+    ("walker_walk", "expert"): "walker_walk, expert",
+    ("walker_walk", "medium_expert"): "walker_walk, medium_expert",
+    ("cheetah_run", "medium_noisy"): "cheetah_run, noisy medium",
+    ("cheetah_run", "expert_noisy"): "cheetah_run, noisy expert",
+    ("cheetah_run", "expert"): "cheetah_run, expert",
+    ("cheetah_run", "medium_expert"): "cheetah_run, medium_expert",
+}
+"""What the README calls a set."""
+CONTROL_ONLY = ("cheetah_run", "medium_noisy")
+"""The set that results/offline does not tell of."""
+MAIN = (UNTRAINED, "acro", "mik", "mik+a")
+"""Methods of which the README's table and the aggregates tell."""
+EXPLORATORY = ("expert_noisy", "medium_noisy")
+"""Qualities that were chosen after looking at first returns."""
+CONTRASTS = {
+    "a memory: `mik` less `acro`": ("mik", "acro"),
+    "past actions: `mik+a` less `mik`": ("mik+a", "mik"),
+    "both: `mik+a` less `acro`": ("mik+a", "acro"),
+}
+"""The paper's claims, as differences of returns."""
+ASIDE = RESULTS / "offline" / "clean_evaluation.csv"
+"""Policies that were played with nothing hidden after their runs had ended."""
+
+
+def main_runs() -> list[LoadedRun]:
+    """Finished TD3+BC of the two grids, without variants."""
+    cells = [cell for name in GRIDS for cell in load_grid(name).cells()]
+    found = load_runs([RESULTS / name for name in GRIDS], choice=GridMembers(" and ".join(GRIDS), cells))
+    return [run for run in found if run.rows and run.finished and not run.variant]
+
+
+def readme_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """Returns of the main methods, a row for every set and corruption."""
+    shown = (*(f"`{name}`" for name in MAIN), "`mik+a` less `acro`", "the same, played clean")
+    yield f"| set (data's return) | {' | '.join(shown)} | `acro` trained with nothing hidden |"
+    yield "|---|" + "---:|" * (len(shown) + 1)
+    for *place, corruption in measured_sets(runs):
+        here = [run for run in runs if _place(run) == tuple(place)]
+        cells = [_told(_of(here, method, corruption)) for method in MAIN]
+        cells += [_less(here, corruption, "mik+a", "acro", clean) for clean in (False, True)]
+        name = f"{SETS[tuple(place)]} ({here[0].reference.data_return:.0f})" + ALONE * (corruption == PATCHES)
+        name += ", exploratory" * (place[1] in EXPLORATORY)
+        yield f"| {name} | {' | '.join(cells)} | {_told(_of(here, 'acro', CLEAN))} |"
+
+
+def contrast_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """The paper's claims as differences with intervals, on every set, as trained and played with nothing hidden."""
+    yield f"| set | played | {' | '.join(CONTRASTS)} | `mik+a` less the best other |"
+    yield "|---|---|" + "---:|" * (len(CONTRASTS) + 1)
+    for *place, corruption in measured_sets(runs):
+        here = [run for run in runs if _place(run) == tuple(place)]
+        other = _best_other(here, corruption)
+        pairs = (*CONTRASTS.values(), ("mik+a", other))
+        for clean, words in ((False, "as trained"), (True, "with nothing hidden")):
+            cells = [_less(here, corruption, *pair, clean) for pair in pairs]
+            if any(cell != number(None) for cell in cells):
+                cells[-1] += f" (`{other}`)" * (cells[-1] != number(None))
+                yield f"| {table_name(*place, corruption)} | {words} | {' | '.join(cells)} |"
+
+
+def _best_other(runs: Sequence[LoadedRun], corruption: str) -> str:
+    """The method with two seeds or more that returns most, but for `mik+a`, references and those told the states."""
+    here = [run for run in runs if run.labels["corruption"] == corruption]
+    methods = {run.labels["method"] for run in here} - {"mik+a", "state", UNTRAINED, *TOLD_STATES}
+    known = {method: _of(here, method, corruption) for method in methods}
+    return max((m for m in known if len(known[m]) > 1), key=lambda method: returns_of(known[method]).mean())
+
+
+def _less(runs: Sequence[LoadedRun], corruption: str, method: str, other: str, clean: bool) -> str:
+    """Mean return of a method less that of another, and its interval; a dash where one of them was not played so."""
+    one, two = (_episodes(_of(runs, name, corruption), clean) for name in (method, other))
+    if one is None or two is None:
+        return number(None)
+    text = with_interval(one.mean() - two.mean(), *(difference_interval(one, two) or (None, None)), 0)
+    return text if text.startswith("-") else f"+{text}"
+
+
+def _episodes(runs: list[LoadedRun], clean: bool) -> np.ndarray | None:
+    """Returns of runs, (n, episodes); None where a policy was not played with nothing hidden."""
+    if not clean:
+        return episodes_of(runs) if runs else None
+    if runs and all(run.last_clean for run in runs):
+        return episodes_of(runs, clean=True)
+    names = ("task", "quality", "corruption", "method", "seed")
+    rows = read_episodes(ASIDE)
+    found = [[row["return"] for row in rows if all(row[name] == run.labels[name] for name in names)] for run in runs]
+    return np.array(found) if found and all(found) else None
+
+
+def aggregate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """The report's statistics over sets, of the methods that all of them have."""
+    yield "| sets | method | interquartile mean | mean | chance that `mik+a` ends above it |"
+    yield "|---|---|---:|---:|---:|"
+    groups: dict[str, list[LoadedRun]] = {}
+    for run in runs:
+        place, corruption = _place(run), run.labels["corruption"]
+        if place in SETS and corruption in (HIDDEN, PATCHES) and run.labels["method"] in MAIN:
+            kind = "noisy, exploratory" if place[1] in EXPLORATORY else "of the paper's qualities"
+            groups.setdefault(kind + ALONE * (corruption == PATCHES), []).append(run)
+    for kind, mine in groups.items():
+        rows = evaluations(mine)
+        above = {row["other"]: row for row in improvement(rows) if row["method"] == "mik+a"}
+        for row in sorted(aggregate(rows, []), key=lambda row: -row["mean"]):
+            cells = [with_interval(row[name], row[f"{name}_low"], row[f"{name}_high"]) for name in ("iqm", "mean")]
+            chance = above.get(row["method"])
+            cells.append(
+                number(None)
+                if chance is None
+                else with_interval(chance["probability"], chance["low"], chance["high"], 2)
+            )
+            yield f"| {row['tasks']} {kind} | `{row['method']}` | {' | '.join(cells)} |"
+
+
+def measured_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str, str]]:
+    """Task, quality and corruption of which the pages tell and of which anything is there."""
+    measured = {(*_place(run), run.labels["corruption"]) for run in runs}
+    asked = ((*place, corruption) for corruption, place in product((HIDDEN, PATCHES), SETS))
+    return (one for one in asked if one in measured)
+
+
+def page_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str, str]]:
+    """Those of which results/offline/README.md has a table."""
+    return (one for one in measured_sets(runs) if one[:2] != CONTROL_ONLY)
+
+
+def table_name(task: str, quality: str, corruption: str) -> str:
+    """What the table of a set is called."""
+    return f"{task}, {quality}" + ALONE * (corruption == PATCHES)
+
+
+def set_lines(runs: Sequence[LoadedRun], task: str, quality: str, corruption: str) -> Iterator[str]:
+    """All methods on one set under a corruption, those that return most first; played clean, where any was."""
+    here = [run for run in runs if _place(run) == (task, quality)]
+    methods = {run.labels["method"]: _of(here, run.labels["method"], corruption) for run in here}
+    shown = [(method, mine) for method, mine in methods.items() if mine]
+    clean = {method: _episodes(mine, clean=True) for method, mine in shown}
+    played = any(returns is not None for returns in clean.values())
+    yield (
+        f"| method | seeds | return (seeds) | episodes |{' played with nothing hidden |' * played}"
+        " trained with nothing hidden | action error: data, loop | probe: pose, velocity |"
+    )
+    yield "|---|" + "---:|" * (6 + played)
+    for method, mine in sorted(shown, key=lambda one: -returns_of(one[1]).mean()):
+        data, loop = (number(mean_if_known(map(known, mine)), 3) for known in (_path_error, _loop_error))
+        probes = probes_of(method, [mean_if_known(run.representation[name] for run in mine) for name in PROBES])
+        cell = number(None) if clean[method] is None else told(clean[method])
+        yield (
+            f"| `{method}` | {len(mine)} | {with_seeds(mine)} | {spread_of(mine)} |{f' {cell} |' * played}"
+            f" {_told(_of(here, method, CLEAN))} | {data}, {loop} | {probes} |"
+        )
+
+
+def gate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """What has to hold on a set before methods are ranked on it."""
+    yield (
+        "| set | data's return | `state`, of it | `acro` with nothing hidden, of it | best of it | best less `random` |"
+        " passed |"
+    )
+    yield "|---|---:|---:|---:|---:|---:|---|"
+    for row in _judged(runs):
+        shares = [
+            number(row[f"{name}_share"], 2) + f" (n = {row[f'{name}_seeds']})" * (row[f"{name}_seeds"] < 3)
+            for name in ("state", "acro")
+        ]
+        shares.append(number(row["best_share"], 2))
+        above = with_interval(row["above_random"], row["low"], row["high"], 0)
+        yield f"| {row['name']} | {row['data_return']:.0f} | {' | '.join(shares)} | {above} | {row['passed']} |"
+
+
+def rank_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """How well what is known of a policy orders the returns on a set, with and without untrained encoders."""
+    yield "| set | passed | runs | " + " | ".join(GOING_WITH) + " |"
+    yield "|---|---|---:|" + "---:|" * len(GOING_WITH)
+    for row in _judged(runs):
+        place = row["task"], row["quality"]
+        probed = _probed(
+            [run for run in runs if (*_place(run), run.labels["corruption"]) == (*place, row["corruption"])]
+        )
+        trained = [run for run in probed if run.labels["method"] != UNTRAINED]
+        cells = (
+            f"{_rank_correlation(probed, known)}, {_rank_correlation(trained, known)}" for known in GOING_WITH.values()
+        )
+        yield f"| {row['name']} | {row['passed']} | {len(probed)}, {len(trained)} | {' | '.join(cells)} |"
+
+
+def _judged(runs: Sequence[LoadedRun]) -> Iterator[Row]:
+    """Gates of the sets that pages tell of, by their `name`s there, and whether they are `passed`."""
+    for row in gates(list(runs)):
+        place = row["task"], row["quality"]
+        if row["corruption"] in (HIDDEN, PATCHES) and place in SETS:
+            passed = {PASSED: "yes", FAILED: "undecided", UNKNOWN: "not known"}[row["verdict"].partition(":")[0]]
+            yield row | {"name": table_name(*place, row["corruption"]), "passed": passed}
+
+
+def _rank_correlation(runs: list[LoadedRun], known: Callable[[LoadedRun], float | None]) -> str:
+    """Spearman's, of an error and the return over runs: -1 where the one that errs less always returns more.
+
+    A dash for a single run, which has no order, and where a run does not know its error.
+    """
+    errors = [known(run) for run in runs]
+    if len(runs) < 2 or None in errors:
+        return number(None)
+    return f"{spearmanr(errors, returns_of(runs)).statistic:.2f}"
+
+
+def _probe_error(probe: str) -> Callable[[LoadedRun], float | None]:
+    return lambda run: run.representation[probe]
+
+
+def _path_error(run: LoadedRun) -> float | None:
+    return run.reference.path_error
+
+
+def _loop_error(run: LoadedRun) -> float | None:
+    return mean_if_known(row["action_error"] for row in run.last)
+
+
+GOING_WITH: dict[str, Callable[[LoadedRun], float | None]] = {
+    "probe of the pose": _probe_error(PROBES[0]),
+    "probe of the velocity": _probe_error(PROBES[1]),
+    "actions on the data": _path_error,
+    "actions in closed loop": _loop_error,
+}
+"""Errors that returns may go with."""
+
+
+def _probed(runs: Sequence[LoadedRun]) -> list[LoadedRun]:
+    """Those with a probe that is held out: not of methods that were told the states."""
+    known = (run for run in runs if run.representation[PROBES[0]] is not None)
+    return [run for run in known if run.labels["method"] not in TOLD_STATES]
+
+
+def layer_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """How many cells of each layer of the grid are measured, by task."""
+    grid = GridMembers(GRIDS[0], load_grid(GRIDS[0]).cells())
+    asked = Counter((row["task"], _layer(row)) for row in grid.wanted)
+    found = Counter((run.labels["task"], _layer(run.labels)) for run in runs if grid.asks(run.labels))
+    tasks = [task for task in TASKS if any(task == one for one, _ in asked)]
+    yield f"| layer | {' | '.join(tasks)} |"
+    yield "|---|" + "---:|" * len(tasks)
+    for layer, words in LAYERS.items():
+        places = [(task, layer) for task in tasks]
+        counts = (f"{found[place]} of {asked[place]}" if place in asked else "–" for place in places)
+        yield f"| ({layer}) {words} | {' | '.join(counts)} |"
+
+
+LAYERS = {
+    "a": "sets that leave the expert's path, patches and zeroed frames",
+    "b": "the paper's qualities, patches and zeroed frames, and their references",
+    "c": "the paper's qualities, patches alone",
+    "d": "the other methods, patches and zeroed frames",
+    "e": "a third task, patches and zeroed frames, and its references",
+    "f": "`medium` and `medium_replay`, five seeds",
+}
+"""Of the grid `offline`, in their order."""
+_MAIN_METHODS = ("mik+a", "mik", "ah+a", "acro", UNTRAINED, "supervised+a", "state")
+
+
+def _layer(labels: Row) -> str:
+    if labels["quality"] in ("medium", "medium_replay"):
+        return "f"
+    if labels["task"] == "humanoid_walk":
+        return "e"
+    if labels["method"] not in _MAIN_METHODS:
+        return "d"
+    if labels["corruption"] == PATCHES:
+        return "c"
+    return "a" if labels["quality"] == "expert_noisy" else "b"
+
+
+def cost_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+    """Minutes of both stages by task and method under corruption: the median cell, the fastest and the slowest."""
+    yield "| task | method | cells | pretraining, minutes | fine-tuning, minutes |"
+    yield "|---|---|---:|---:|---:|"
+    for task in sorted({run.labels["task"] for run in runs}):
+        here = [run for run in runs if (run.labels["task"], run.labels["corruption"]) == (task, HIDDEN)]
+        for method in sorted({run.labels["method"] for run in here}):
+            mine = [run for run in here if run.labels["method"] == method]
+            stages = [run.representation["pretrain_seconds"] for run in mine], [run.seconds for run in mine]
+            yield f"| {task} | `{method}` | {len(mine)} | {_minutes(stages[0])} | {_minutes(stages[1])} |"
+
+
+def _minutes(seconds: Sequence[float]) -> str:
+    least, middle, most = np.quantile(seconds, (0, 0.5, 1)) / 60
+    return f"{middle:.1f} ({least:.1f} to {most:.1f})" if len(seconds) > 1 else f"{middle:.1f}"
+
+
+def _place(run: LoadedRun) -> tuple[str, str]:
+    return run.labels["task"], run.labels["quality"]
+
+
+def _of(runs: Sequence[LoadedRun], method: str, corruption: str) -> list[LoadedRun]:
+    """Runs of a method under a corruption, by seed."""
+    mine = [run for run in runs if (run.labels["method"], run.labels["corruption"]) == (method, corruption)]
+    return sorted(mine, key=lambda run: run.labels["seed"])
+
+
+def _told(runs: list[LoadedRun]) -> str:
+    """Mean return and its interval, and how many seeds if fewer than three; a dash if there is none."""
+    if not runs:
+        return number(None)
+    return told(episodes_of(runs)) + (f" (n = {len(runs)})" if len(runs) < 3 else "")

@@ -1,0 +1,102 @@
+"""Write the tables of README.md, docs and results that are made from committed rows into their pages.
+
+    python tools/page_tables.py
+
+A table lies under a line `<!-- table: NAME -->` of its page, up to the next line that is none of it. A test holds the
+pages against what this writes.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
+
+import control_table
+import methods_table
+import navigation_table
+import offline_table
+from script import run_script
+
+from vd4rl_pomdp.core.errors import UserError
+
+ROOT = Path(__file__).parents[1]
+MARK = "<!-- table: {} -->"
+"""The line above a table."""
+Tables = dict[str, Iterable[str]]
+"""Lines of tables, by their names."""
+
+
+@dataclass(frozen=True)
+class Config:
+    """Write the tables that are made from committed rows into their pages; there is nothing to choose."""
+
+
+def pages() -> dict[str, Tables]:
+    """Tables of each page, which is told by its path in the repository."""
+    returns, mazes = offline_table.main_runs(), navigation_table.main_runs()
+    return {
+        "README.md": {
+            "returns": offline_table.readme_lines(returns),
+            "mazes": navigation_table.state_lines(mazes, (15, 1)),
+        },
+        "docs/navigation.md": {
+            **{maze: navigation_table.maze_lines(mazes, maze) for maze in navigation_table.measured(mazes)},
+            "hard": navigation_table.hard_lines(mazes),
+            "K = 1": navigation_table.state_lines(mazes, (1,)),
+            **{words: navigation_table.added_lines(mazes, added) for added, words in navigation_table.ADDED.items()},
+            "first rung": navigation_table.first_rung_lines(navigation_table.first_rung_runs()),
+            "pictures": navigation_table.picture_lines(navigation_table.picture_runs(), mazes),
+            "first person": navigation_table.first_person_lines(navigation_table.first_person_runs()),
+        },
+        "results/control/README.md": {
+            "control": control_table.table_lines(control_table.RESULTS),
+            "costs": control_table.cost_lines(control_table.RESULTS / "cell_cost.csv"),
+        },
+        "results/methods/README.md": {"methods": methods_table.table_lines(methods_table.main_runs())},
+        "results/offline/README.md": {
+            "layers": offline_table.layer_lines(returns),
+            "contrasts": offline_table.contrast_lines(returns),
+            "aggregate": offline_table.aggregate_lines(returns),
+            "gates": offline_table.gate_lines(returns),
+            "ranks": offline_table.rank_lines(returns),
+            **{
+                offline_table.table_name(*place): offline_table.set_lines(returns, *place)
+                for place in offline_table.page_sets(returns)
+            },
+            "minutes": offline_table.cost_lines(returns),
+        },
+    }
+
+
+def with_tables(text: str, tables: Tables, page: str) -> str:
+    """A page's text with its tables under their marks.
+
+    Raises:
+        UserError: If a table has no mark on the page, or several.
+    """
+    lines = text.split("\n")
+    for name, table in tables.items():
+        mark = MARK.format(name)
+        if lines.count(mark) != 1:
+            raise UserError(
+                f"{page}: one line `{mark}` is wanted, above where that table belongs; {lines.count(mark)} found"
+            )
+        start = end = lines.index(mark) + 1
+        while end < len(lines) and lines[end].startswith("|"):
+            end += 1
+        lines[start:end] = table
+    return "\n".join(lines)
+
+
+def main(config: Config) -> None:
+    """Write all pages, or none if a mark is missing."""
+    written = {
+        page: with_tables((ROOT / page).read_text(encoding="utf-8"), tables, page) for page, tables in pages().items()
+    }
+    for page, text in written.items():
+        (ROOT / page).write_text(text, encoding="utf-8")
+
+
+if __name__ == "__main__":
+    run_script(main, Config)

@@ -1,0 +1,70 @@
+#!/usr/bin/env bash
+# Set up what `make demo` and `make test` need: a virtual environment with the package, and software rendering.
+# A second run finds its stamp and does nothing. PYTHON=python3.12 chooses the interpreter: an environment of another
+# version is made anew. Without it an environment keeps its own.
+set -euo pipefail
+cd "$(dirname "$0")/.."
+
+VENV=.venv
+if [ -z "${PYTHON:-}" ]; then
+    PYTHON=python3
+    [ ! -x "$VENV/bin/python" ] || PYTHON="$VENV/bin/python"
+fi
+STAMP="$VENV/.installed"
+export MUJOCO_GL="${MUJOCO_GL:-egl}"
+RENDER_PACKAGES=(libegl1 libgl1 libgl1-mesa-dri)
+if [ "$MUJOCO_GL" = osmesa ]; then
+    RENDER_PACKAGES=(libosmesa6)
+fi
+
+say() { printf '%s\n' "$*" >&2; }
+
+# Install Debian packages as root or with passwordless sudo; otherwise name them in one line and stop.
+install_debian() {
+    local as_root=""
+    if [ "$(id -u)" -ne 0 ]; then
+        if ! sudo -n true 2>/dev/null; then
+            say "setup: please install $* (for example: sudo apt-get install $*), then run the same command again"
+            exit 2
+        fi
+        as_root="sudo -n"
+    fi
+    say "setup: installing $*"
+    $as_root apt-get update -qq >/dev/null
+    $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq "$@" >/dev/null
+}
+
+version() { "$1" -V 2>/dev/null || true; }
+
+wanted="$(cat pyproject.toml constraints.txt tools/setup.sh | sha256sum | cut -d' ' -f1) $(version "$PYTHON")"
+if [ -f "$STAMP" ] && [ "$(cat "$STAMP")" = "$wanted" ]; then
+    exit 0
+fi
+
+if ! command -v "$PYTHON" >/dev/null; then
+    install_debian python3 python3-venv
+fi
+if ! "$PYTHON" -c 'import sys; sys.exit(not (3, 11) <= sys.version_info < (3, 14))'; then
+    say "setup: $PYTHON is $("$PYTHON" -V), one of 3.11 to 3.13 is needed; name it with PYTHON=python3.12"
+    exit 2
+fi
+if [ "$(version "$VENV/bin/python")" != "$(version "$PYTHON")" ]; then
+    "$PYTHON" -c 'import ensurepip, venv' 2>/dev/null || install_debian python3-venv
+    "$PYTHON" -m venv --clear "$VENV"
+fi
+say "setup: installing Python packages (a few minutes the first time)"
+pip_install() { "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt "$@"; }
+pip_install -e ".[dev,policy,tracking]"
+pip_install --no-deps dm-control # which Python 3.13 gets no other way; elsewhere it is there already
+
+can_render() {
+    "$VENV/bin/python" tools/can_render.py >/dev/null 2>&1
+}
+if ! can_render; then
+    install_debian "${RENDER_PACKAGES[@]}"
+    if ! can_render; then
+        say "setup: rendering still fails with MUJOCO_GL=$MUJOCO_GL; try MUJOCO_GL=osmesa"
+        exit 2
+    fi
+fi
+printf '%s' "$wanted" >"$STAMP"

@@ -1,0 +1,120 @@
+"""The demo: the grids `quick` and `quick_navigation` as one sweep, a report and a film.
+
+It shows that all works, not which method is best.
+"""
+
+from __future__ import annotations
+
+import shlex
+import sys
+import time
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+from vd4rl_pomdp.core.errors import refuse_no_folder, refuse_unknown
+from vd4rl_pomdp.core.options import Options
+from vd4rl_pomdp.envs.mazes import get_maze
+from vd4rl_pomdp.report.measures import PROBES
+from vd4rl_pomdp.report.stats import mean_and_error
+from vd4rl_pomdp.runs import EPISODES_FILE, PROBE_FILE
+from vd4rl_pomdp.runs.episodes import read_episodes
+from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.outputs import refuse_kept
+from vd4rl_pomdp.runs.workers import count_workers
+from vd4rl_pomdp.studies.navigation.film import write_film
+from vd4rl_pomdp.studies.navigation.measures import refitted_error
+from vd4rl_pomdp.studies.navigation.runs import find_navigation, load_runs
+from vd4rl_pomdp.sweeps.executors.local import LocalOptions, visible_gpus
+from vd4rl_pomdp.sweeps.folder import SweepFolder
+from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below
+from vd4rl_pomdp.sweeps.grid_file import load_grid
+from vd4rl_pomdp.sweeps.plan import Job, JobPlanner
+
+GRIDS = {"runs": "quick", "navigation": "quick_navigation"}
+"""What is carried out, by the folder that it goes to."""
+FILM = "navigation.gif"
+PRESETS = {"cpu": False, "smoke": True}
+"""Whether a preset is the grid's testing subset."""
+MOST_AT_ONCE = 4
+"""More jobs at a time than this would end no sooner."""
+
+
+def demo_jobs(out: Path, preset: str = "cpu") -> list[Job]:
+    """The jobs of the demo, in order; UserError for an unknown preset."""
+    refuse_unknown("preset", preset, PRESETS)
+    jobs = []
+    for folder, grid in GRIDS.items():
+        runs, cells = out / folder, load_grid(grid, testing=PRESETS[preset]).cells()
+        jobs += JobPlanner(runs, out / "data", FoundRuns([]), FoundRuns(runs_below(runs))).plan(cells)
+    return jobs
+
+
+def demo(
+    out: Path,
+    at_once: int,
+    preset: str,
+    carry_out: Callable[[list[Job], SweepFolder, str, Options], None],
+    run: Callable[[list[str]], None],
+) -> None:
+    """Run every command of the demo, after printing them so that they can be run by hand.
+
+    Args:
+        out: folder of data, runs and report.
+        at_once: jobs at a time, 0 for what the machine takes.
+        preset: how long the stages take, one of PRESETS.
+        carry_out: what runs jobs on an executor of a kind with options.
+        run: what carries out one command line.
+
+    Raises:
+        UserError: an unknown preset, a number of jobs that cannot be, or a folder that is something else.
+    """
+    started = time.monotonic()
+    options = LocalOptions(jobs=at_once or _jobs_at_once())
+    options.check()
+    refuse_no_folder(out)
+    refuse_kept(out)
+    jobs, folder = demo_jobs(out, preset), SweepFolder(out)
+    report = ("report", str(out / "runs"), "--out", str(out / "report"))
+    for words in (*(job.words for job in jobs if not job.finished), report):
+        print(f"$ vd4rl-pomdp {shlex.join(words)}", file=sys.stderr)
+    print(f"Where this stands: vd4rl-pomdp sweep status {out}; what it prints: {folder.path / 'logs'}", file=sys.stderr)
+    folder.keep_plan("demo", jobs)
+    carry_out(jobs, folder, "local", options)
+    run(list(report))
+    print("\n".join([*conclusion(jobs), *show_navigation(jobs, out / FILM)]))
+    print(f"demo finished in {(time.monotonic() - started) / 60:.1f} minutes")
+
+
+def _jobs_at_once() -> int:
+    """One a core, or 0, which the executor takes for one a GPU."""
+    return 0 if visible_gpus() else min(count_workers(0), MOST_AT_ONCE)
+
+
+def conclusion(jobs: list[Job]) -> Iterator[str]:
+    """What the demo's methods know and return, and how sure it is: lines of text."""
+    policies = [(dict(job.settings), job.folder) for job in jobs if job.section == "finetune"]
+    corruption = policies[0][0]["corruption"]
+    yield f"Under {corruption}, what is not known of pose and velocity (error of a"
+    yield "linear probe in % of a standard deviation; 60 to 80 knows nothing), and the"
+    yield "return (mean ± standard error over episodes):"
+    for settings, folder in policies:
+        rows = read_episodes(folder / EPISODES_FILE)
+        last = max(row["step"] for row in rows)
+        returns = [row["return"] for row in rows if row["step"] == last]
+        probe = read_json(folder / PROBE_FILE)
+        known = ", ".join(f"{probe[name]:.0f}" for name in PROBES)
+        yield f"  {settings['method']:<8}{known:<10}{mean_and_error(returns)} (n = {len(returns)})"
+    yield "One seed each: with another, what is known hardly changes, and returns may end"
+    yield "elsewhere. What three seeds say of 100 episodes is in results/control."
+
+
+def show_navigation(jobs: list[Job], film: Path) -> Iterator[str]:
+    """Write the film, and say how far each method misses the mass while a curtain hides it: lines of text."""
+    runs = load_runs(find_navigation([job.folder for job in jobs if job.section == "navigation_train"]))
+    trajectories = {run.condition.method: run.trajectory for run in runs if run.trajectory is not None}
+    write_film(trajectories, get_maze(runs[0].condition.maze), film)
+    yield "Held-out position error behind curtains, % of a standard deviation (one seed):"
+    for run in runs:
+        error = run.values.get(refitted_error("position", rows="hidden"))
+        yield f"  {run.condition.method:<12}{'no hidden step' if error is None else f'{error:.0f}'}"
+    yield f"The mass, and where each takes it to be: {film}"

@@ -1,0 +1,1 @@
+"""Ground of the house: the time axis, errors, named random streams, parts and their options."""

@@ -1,0 +1,188 @@
+"""Tasks by name: the benchmark's three with V-D4RL's conventions, those added by a call, and those of other packages.
+
+A task is dm_control's (`DMCTask`) or any Gymnasium environment with pixels (`GymnasiumTask`). What a task's name means,
+its parameters included, is fixed where it is registered: no flag changes it.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+from typing import Any, Literal, get_args
+
+import numpy as np
+
+from vd4rl_pomdp.core.errors import MOST, MOST_ROWS, UserError, refuse_unknown
+from vd4rl_pomdp.core.registry import Registry
+
+FRAME_SIZE = 84
+"""Height and width of the benchmark's frames."""
+FRAME_SIZES = (16, 480)
+"""Smallest and largest frames that can be collected."""
+FRAME_STACK = 3
+ACTION_REPEAT = 2
+EPISODE_TRANSITIONS = 500
+"""Decisions an episode of the benchmark: 1000 simulator steps at action repeat 2; an episode has one row more."""
+MOST_EPISODES = 10**6
+"""Most episodes that any command makes or plays at once."""
+SCORE_DIVISOR = 10.0
+"""V-D4RL's normalised score is return / 10."""
+Quality = Literal["random", "medium_replay", "medium", "medium_expert", "expert"]
+QUALITIES: tuple[Quality, ...] = get_args(Quality)
+"""V-D4RL's."""
+NoisyQuality = Literal["medium_noisy", "medium_expert_noisy", "expert_noisy"]
+NOISY_QUALITIES: tuple[NoisyQuality, ...] = get_args(NoisyQuality)
+"""This package's own: where actions are not decided by the state, an inverse model can tell them from what they did."""
+SET_QUALITIES = (*QUALITIES, *NOISY_QUALITIES)
+"""All that `data collect` makes."""
+UNKNOWN_QUALITY = "unknown"
+"""What stands for a quality that neither a set's files nor its folders tell."""
+
+
+@dataclass(frozen=True)
+class Layout:
+    """Widths of what the rows of a task hold."""
+
+    action_dim: int
+    state_dim: int = 0
+    """Width of dm_control's observations, flattened and concatenated in their own order; 0: the task has no states."""
+    positions: int = 0
+    """Generalised positions: the first columns of the simulator state, velocities the others."""
+    travel: tuple[int, ...] = ()
+    """Positions along the ground, which a tracking camera does not show."""
+    turning: tuple[int, ...] = ()
+    """Positions that are angles without limits: a full turn more looks the same."""
+    quaternions: tuple[int, ...] = ()
+    """First of the four positions of every unit quaternion: one of the other sign looks the same."""
+    beside: tuple[int, ...] = ()
+    """First of the two positions along the ground of other bodies, which are seen from where the travelling one is."""
+
+    def pose(self, physics: np.ndarray) -> np.ndarray:
+        """What (..., P) simulator states look like, in coordinates without winding: equal for equal looks.
+
+        Limited positions, sine and cosine of turning angles, then two columns of every quaternion's rotation matrix
+        (Zhou et al. 2019, arXiv 1812.07035); of places on the ground, where others are beside the travelling body.
+        """
+        positions, turning = physics[..., : self.positions].copy(), physics[..., list(self.turning)]
+        for first in self.beside:
+            positions[..., first : first + 2] -= positions[..., list(self.travel)]
+        rotations = [_two_columns(positions[..., first : first + 4]) for first in self.quaternions]
+        replaced = [column for first in self.quaternions for column in range(first, first + 4)]
+        plain = np.delete(positions, [*self.travel, *self.turning, *replaced], axis=-1)
+        return np.concatenate([plain, np.sin(turning), np.cos(turning), *rotations], axis=-1)
+
+    def velocity(self, physics: np.ndarray) -> np.ndarray:
+        """Velocities of (..., P) simulator states."""
+        return physics[..., self.positions :]
+
+    def visible_state(self, physics: np.ndarray) -> np.ndarray:
+        """(..., P') float32: pose and velocity."""
+        return np.concatenate([self.pose(physics), self.velocity(physics)], axis=-1).astype(np.float32)
+
+
+def _two_columns(quaternion: np.ndarray) -> np.ndarray:
+    """First two columns (..., 6) of the rotation matrices of (..., 4) unit quaternions, real part first."""
+    w, x, y, z = np.moveaxis(quaternion, -1, 0)
+    first = [1 - 2 * (y * y + z * z), 2 * (x * y + w * z), 2 * (x * z - w * y)]
+    second = [2 * (x * y - w * z), 1 - 2 * (x * x + z * z), 2 * (y * z + w * x)]
+    return np.stack([*first, *second], axis=-1)
+
+
+@dataclass(frozen=True, kw_only=True)
+class Task:
+    """What the harness needs of any task."""
+
+    action_repeat: int
+    """Steps for which an action is applied, and their rewards summed."""
+    decisions: int = EPISODE_TRANSITIONS
+    """Decisions after which an episode is cut off, unless it ends before."""
+    score_divisor: float = SCORE_DIVISOR
+    """A score is a return divided by this."""
+    action_noise: float | None = None
+    """Standard deviation of the noise in the noisy sets; None: it has none."""
+    layout: Layout | None = None
+    """Widths of its rows, if they are to be known without building the environment; None: found from it (see
+    `envs.make.layout_of`)."""
+
+    @property
+    def summary(self) -> str:
+        """One line that says what it is."""
+        return f"each action {self.action_repeat} times, {self.decisions} decisions an episode"
+
+
+@dataclass(frozen=True)
+class DMCTask(Task):
+    """A task of dm_control's suite; its simulator states are stored, and its rewards replay from them."""
+
+    domain: str
+    task: str
+    camera: int = 0
+    """Number of the camera that shows it."""
+    action_repeat: int = field(default=ACTION_REPEAT, kw_only=True)
+    """Simulator steps for which an action is applied, and their rewards summed."""
+
+    @property
+    def summary(self) -> str:
+        """One line that says what it is."""
+        return f"dm_control's {self.domain} {self.task}, camera {self.camera}, {super().summary}"
+
+
+@dataclass(frozen=True)
+class GymnasiumTask(Task):
+    """A Gymnasium environment with pixels and bounded Box actions, which are rescaled to [-1, 1]; it has no states."""
+
+    environment: str | Callable[..., Any]
+    """Id of the environment, or what makes it: a class or a function of a module."""
+    arguments: Mapping[str, Any] = field(default_factory=dict, hash=False)
+    """Keyword arguments of the environment."""
+    pixels: Literal["render", "observation"] = "render"
+    """Where the picture comes from: `render()` under render_mode "rgb_array", or the observation itself."""
+    action_repeat: int = field(default=1, kw_only=True)
+    """Steps for which an action is applied, and their rewards summed; an episode that ends ends it, too."""
+
+    @property
+    def name(self) -> str:
+        """The environment's: its id, or that of what makes it."""
+        if isinstance(self.environment, str):
+            return self.environment
+        return getattr(self.environment, "__name__", repr(self.environment))
+
+    @property
+    def summary(self) -> str:
+        """One line that says what it is."""
+        return f"Gymnasium's {self.name}, {super().summary}"
+
+
+def _refuse(name: str, task: Task) -> None:
+    """Raise UserError for numbers and words that make no task."""
+    for what, most in (("decisions", MOST_ROWS - 1), ("action_repeat", MOST)):
+        number = getattr(task, what)
+        if not isinstance(number, int) or not 1 <= number <= most:
+            raise UserError(f"its {what} is {number!r}: it must be an integer from 1 to {most}")
+    if not (isinstance(task.score_divisor, int | float) and 0 < task.score_divisor < math.inf):
+        raise UserError(f"its score_divisor is {task.score_divisor!r}: it must be a positive number")
+    noise = 0.0 if task.action_noise is None else task.action_noise
+    if not (isinstance(noise, int | float) and 0 <= noise < math.inf):
+        raise UserError(f"its action_noise is {noise!r}: it must be a number that is not negative, or None")
+    if isinstance(task, DMCTask) and not isinstance(task.camera, int):
+        raise UserError(f"its camera is {task.camera!r}: it must be the camera's number")
+    if isinstance(task, GymnasiumTask):
+        refuse_unknown("pixels", task.pixels, ("render", "observation"))
+
+
+TASKS: Registry[Task] = Registry(
+    "task",
+    {
+        "walker_walk": DMCTask("walker", "walk", layout=Layout(6, 24, 9, travel=(1,), turning=(2,)), action_noise=0.5),
+        "cheetah_run": DMCTask("cheetah", "run", layout=Layout(6, 17, 9, travel=(0,), turning=(2,)), action_noise=0.4),
+        "humanoid_walk": DMCTask(
+            "humanoid", "walk", layout=Layout(21, 67, 28, travel=(0, 1), quaternions=(3,)), action_noise=0.3
+        ),
+    },
+    lambda part: isinstance(part, DMCTask | GymnasiumTask),
+    "a vd4rl_pomdp.core.tasks.DMCTask or GymnasiumTask",
+    _refuse,
+)
+"""All tasks. Packages offer theirs in the group of entry points `vd4rl_pomdp.tasks`. The noise of the benchmark's is of
+0.2, 0.3, 0.4 and 0.5 the largest that leaves the expert more than half of its mean return."""

@@ -1,1 +1,0 @@
-"""Experiments as data: lists of stage commands and what to measure."""

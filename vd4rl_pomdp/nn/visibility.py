@@ -1,0 +1,155 @@
+"""Visibility proofs: what an inverse model's predictions depend on, against what it declares.
+
+A prediction that sees the action it is asked for, or less than it claims, gives numbers that mean something else than
+its name. Two proofs show both, in float64 on small windows: gradients of every logit with respect to every observation
+and action, and the logits that differ when one of these takes another value. The second also finds what gradients do
+not pass: detached copies, rounded and compared values.
+
+An observation is a stack of frames, so rows that are not seen can show in the stacks of rows that are: each proof can
+also be asked for single frames, through the stacking.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+
+import torch
+from torch import Tensor
+
+from vd4rl_pomdp.core.types import Windows, previous
+from vd4rl_pomdp.nn.objective import InverseObjective
+
+Seen = tuple[set[int], set[int]]
+"""Observation rows j (of o_j), or single frames j (the newest of o_j), and action indices j (of a_j)."""
+Pair = tuple[int, int, int]
+"""(window, t, k)."""
+
+
+def wrong_pairs(objective: InverseObjective, lengths: Sequence[int], rows: int = 6, frames: bool = False) -> list[Pair]:
+    """Pairs whose prediction depends on other rows or actions than `objective.visible` declares.
+
+    A pair holds if the prediction has a gradient to all that is declared, changes with all of it, and neither has a
+    gradient to anything else nor changes with it.
+
+    Args:
+        objective: a small one (few features, few units, but some 30 in the head: of very few, all may be rectified to
+            zero at a pair); the proof takes a backward pass for every pair. It is changed to float64.
+        lengths: real rows of each window of the batch; the first ends inside its episode, the others at an end.
+        rows: rows T of the windows, padding included.
+        frames: compare single frames with `objective.visible_frames`, in place of rows.
+
+    Returns:
+        (window, t, k) of every pair that is wrong; empty if all hold.
+
+    Raises:
+        ValueError: a window's predictions depend on another window of the batch, or differ from call to call.
+    """
+    felt = response(objective, lengths, rows, frames)
+    return [
+        (b, t, k)
+        for (b, t, k), seen in dependence(objective, lengths, rows, frames).items()
+        if not seen == felt[b, t, k] == declared(objective, t, k, lengths[b], b == 0, frames)
+    ]
+
+
+def declared(objective: InverseObjective, t: int, k: int, length: int, last_action: bool, frames: bool = False) -> Seen:
+    """What `objective` declares visible; `last_action` tells whether the window's last row has an action."""
+    rows, actions = objective.visible(t, k, length)
+    seen = objective.visible_frames(t, k, length) if frames else rows
+    return seen, {a for a in actions if a < length - 1 or last_action}
+
+
+def dependence(
+    objective: InverseObjective, lengths: Sequence[int], rows: int = 6, frames: bool = False
+) -> dict[Pair, Seen]:
+    """(window, t, k) -> what the prediction has a gradient to, for all real pairs; see `wrong_pairs`."""
+    objective = objective.double()
+    inputs = obs, actions = [x.requires_grad_() for x in _inputs(objective, lengths, rows, frames, seed=0)]
+    logits = objective.action_logits(_window(obs, actions, lengths))
+    weights = torch.randn(logits.shape[-1], generator=torch.Generator().manual_seed(1), dtype=torch.float64)
+    found = {}
+    for p, (b, t, k) in _real_pairs(objective, lengths, rows):
+        value = (logits[b, p] * weights).sum()
+        grads = torch.autograd.grad(value, inputs, retain_graph=True, allow_unused=True)
+        places, used = (_rows_with_gradient(grad, b) for grad in grads)
+        found[b, t, k] = ({place - (obs.shape[1] - rows) for place in places}, used)
+    return found
+
+
+@torch.no_grad()
+def response(
+    objective: InverseObjective, lengths: Sequence[int], rows: int = 6, frames: bool = False
+) -> dict[Pair, Seen]:
+    """(window, t, k) -> what the prediction changes with, for all real pairs; see `wrong_pairs`."""
+    objective = objective.double()
+    (obs, actions), (new_obs, new_actions) = (_inputs(objective, lengths, rows, frames, seed) for seed in (0, 2))
+    plain = objective.action_logits(_window(obs, actions, lengths))
+
+    def changed(obs: Tensor, actions: Tensor) -> Tensor:
+        return (objective.action_logits(_window(obs, actions, lengths)) != plain).any(-1)
+
+    if changed(obs, actions).any():
+        raise ValueError("predictions differ from call to call: put the objective into eval mode")
+    for b in range(len(lengths)):
+        touched = changed(_exchange(obs, new_obs, 0, b), _exchange(actions, new_actions, 0, b))
+        if touched[torch.arange(len(lengths)) != b].any():
+            raise ValueError("a prediction depends on another window of its batch")
+    found: dict[Pair, Seen] = {pair: (set(), set()) for _, pair in _real_pairs(objective, lengths, rows)}
+    before = obs.shape[1] - rows
+    for place in range(obs.shape[1]):
+        touched = changed(_exchange(obs, new_obs, 1, place), actions)
+        for p, pair in _real_pairs(objective, lengths, rows):
+            if touched[pair[0], p]:
+                found[pair][0].add(place - before)
+    for row in range(rows):
+        touched = changed(obs, _exchange(actions, new_actions, 1, row))
+        for p, pair in _real_pairs(objective, lengths, rows):
+            if touched[pair[0], p]:
+                found[pair][1].add(row)
+    return found
+
+
+def _real_pairs(objective: InverseObjective, lengths: Sequence[int], rows: int) -> Iterator[tuple[int, Pair]]:
+    """Place among the logits and (window, t, k) of every pair that lies within its window's real rows."""
+    for p, (t, k) in enumerate(objective.pairs(rows).tolist()):
+        yield from ((p, (b, t, k)) for b, length in enumerate(lengths) if t + k < length)
+
+
+def _rows_with_gradient(grad: Tensor | None, window: int) -> set[int]:
+    if grad is None:
+        return set()
+    touched = grad.flatten(2).abs().amax(2) > 0
+    if touched[torch.arange(len(touched)) != window].any():
+        raise ValueError("a prediction depends on another window of its batch")
+    return set(torch.nonzero(touched[window])[:, 0].tolist())
+
+
+def _exchange(values: Tensor, others: Tensor, axis: int, place: int) -> Tensor:
+    """Copy of `values` whose slice at one place of an axis is that of `others`."""
+    return values.index_copy(axis, torch.tensor([place]), others.narrow(axis, place, 1))
+
+
+def _inputs(
+    objective: InverseObjective, lengths: Sequence[int], rows: int, frames: bool, seed: int
+) -> tuple[Tensor, Tensor]:
+    """Random observations and actions a_0..a_{T-1} (B, T, A), padding included, float64.
+
+    Observations are (B, T, C, H, W), or (B, S-1+T, C/S, H, W) single frames, those before the window first.
+    """
+    shape = objective.encoder.config
+    stack = objective.encoder.frame_stack if frames else 1
+    g = torch.Generator().manual_seed(seed)
+    size = (len(lengths), stack - 1 + rows, shape.channels // stack, shape.size, shape.size)
+    obs = torch.rand(size, generator=g, dtype=torch.float64) * 255
+    return obs, torch.rand(len(lengths), rows, shape.action_dim, generator=g, dtype=torch.float64) - 0.5
+
+
+def _window(obs: Tensor, actions: Tensor, lengths: Sequence[int]) -> Windows:
+    """Windows of `_inputs`; the first ends inside its episode, the others at an end."""
+    rows, length = actions.shape[1], torch.tensor(lengths)
+    obs = torch.cat([obs[:, first : first + rows] for first in range(obs.shape[1] - rows + 1)], dim=2)
+    has_action = torch.arange(rows) < length[:, None] - 1
+    has_action[0] = torch.arange(rows) < length[0]
+    action = actions * has_action[..., None]
+    key = torch.zeros(obs.shape[:2], dtype=torch.int64)
+    return Windows(obs, previous(action), action, has_action, length, key)

@@ -1,0 +1,164 @@
+"""Collect a maze's data: shards in V-D4RL's format with frames of 100x100 and the true state of every row.
+
+Trajectory i depends on (seed, i) alone, whatever the number of workers. Within a trajectory nothing is reset; goals
+are uniform in the free space and move when they are reached. Shards are written whole, so the same command goes on
+after an interruption and ends in the same files.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import asdict, dataclass
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from vd4rl_pomdp.core.errors import MAX_SEED, MOST_ROWS, refuse_outside
+from vd4rl_pomdp.core.seeding import episode_seed
+from vd4rl_pomdp.core.tasks import MOST_EPISODES
+from vd4rl_pomdp.core.types import StepType
+from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
+from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, Style, check_maze, get_maze
+from vd4rl_pomdp.runs.files import jsonable
+from vd4rl_pomdp.runs.memory import CPU, require_memory
+from vd4rl_pomdp.runs.outputs import refuse_inside
+from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.provenance import versions
+from vd4rl_pomdp.studies.navigation.sets import MazeCollectConfig
+
+if TYPE_CHECKING:
+    from vd4rl_pomdp.envs.maze import MazeEnv
+
+_RUNTIME_FIELDS = ("out", "workers", "preset")
+
+
+@dataclass(frozen=True)
+class _Job:
+    """One trajectory to roll out."""
+
+    maze: str
+    trajectory: int
+    seed: int
+    rows: int
+    action_repeat: int
+
+
+def collect(config: MazeCollectConfig) -> list[Path]:
+    """Collect the set, or what is missing of it; returns its shards."""
+    check_config(config)
+    refuse_inside(config.out)
+    shards = [
+        Shard(path, [_job(config, i) for i in trajectories], _attributes(config))
+        for path, trajectories in _plan(config)
+    ]
+    with owned(config.out):
+        claim_set(config.out, collection(config))
+        title = f"collect {config.maze}", "trajectories"
+        collect_shards(config.out, shards, _roll_out, config.workers, title, config.maze)
+    return [shard.path for shard in shards]
+
+
+def collection(config: MazeCollectConfig) -> dict[str, Any]:
+    """What tells a set from others: the settings in its collection.json."""
+    return {name: value for name, value in jsonable(asdict(config)).items() if name not in _RUNTIME_FIELDS}
+
+
+def drive(maze: str, rows: int) -> Columns:
+    """Rows of the first trajectory of seed 0, by key, without writing anything."""
+    check_maze(maze)
+    return _roll_out(_Job(maze, 0, 0, rows, ACTION_REPEAT))
+
+
+def check_config(config: MazeCollectConfig) -> None:
+    """Raise UserError for settings that make no set."""
+    check_maze(config.maze)
+    refuse_outside(
+        config, trajectories=(1, MOST_EPISODES), trajectory_rows=(2, MOST_ROWS), action_repeat=(1, MOST_STEPS),
+        seed=(0, MAX_SEED), trajectories_per_shard=1, workers=0,
+    )  # fmt: skip
+    rows = config.trajectory_rows * min(config.trajectories, config.trajectories_per_shard)
+    require_memory(rows * 3 * PICTURE_SIZE**2, CPU, config, "trajectory_rows", "trajectories_per_shard")
+
+
+def _plan(config: MazeCollectConfig) -> Iterator[tuple[Path, range]]:
+    """Shards to write: file and trajectory numbers."""
+    for number, start in enumerate(range(0, config.trajectories, config.trajectories_per_shard)):
+        stop = min(start + config.trajectories_per_shard, config.trajectories)
+        yield config.out / f"{number}_{config.maze}.hdf5", range(start, stop)
+
+
+def _job(config: MazeCollectConfig, trajectory: int) -> _Job:
+    return _Job(config.maze, trajectory, config.seed, config.trajectory_rows, config.action_repeat)
+
+
+def _roll_out(job: _Job) -> Columns:
+    """Rows of one trajectory, by key."""
+    env = _environment(job.maze, job.action_repeat)
+    rng = np.random.default_rng([job.seed, job.trajectory])
+    act = _controller(env, rng)
+    frame, info = env.reset(seed=episode_seed(job.seed, job.trajectory))
+    rows: list[tuple[Any, ...]] = [(frame, np.zeros(2, np.float32), 0.0, info["state"])]
+    while len(rows) < job.rows:
+        action = _explore(act(info["state"], info["goal"]), env.maze_spec.style, rng)
+        frame, reward, _, _, info = env.step(action)
+        rows.append((frame, action, reward, info["state"]))
+    frames, actions, rewards, states = zip(*rows, strict=True)
+    step_type = np.full(len(rows), StepType.MID)
+    step_type[0], step_type[-1] = StepType.FIRST, StepType.LAST
+    return {
+        "observation": np.stack(frames),
+        "action": np.stack(actions),
+        "reward": np.array(rewards),
+        "discount": np.ones(len(rows)),
+        "step_type": step_type,
+        "physics": np.stack(states),
+    }
+
+
+def _explore(action: np.ndarray, style: Style, rng: np.random.Generator) -> np.ndarray:
+    """The action (2,) float32 that is executed in place of a controller's."""
+    if style.noise:
+        action = action + rng.normal(0, style.noise, 2)
+    if style.zero_share + style.random_share > 0:
+        kind = rng.random()
+        if kind < style.zero_share:
+            action = np.zeros(2)
+        elif kind < style.zero_share + style.random_share:
+            action = rng.uniform(-1, 1, 2)
+    return np.clip(action, -1, 1).astype(np.float32)
+
+
+def _controller(env: MazeEnv, rng: np.random.Generator) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """What drives: the action for a state and a goal."""
+    from vd4rl_pomdp.studies.navigation.first_person import FirstPersonController
+    from vd4rl_pomdp.studies.navigation.planner import Planner, WaypointPlanner
+
+    if env.maze_spec.first_person:
+        return FirstPersonController(env).act
+    return (WaypointPlanner(env, rng) if env.maze_spec.style.goals_are_cells else Planner(env)).act
+
+
+@cache
+def _environment(maze: str, action_repeat: int) -> MazeEnv:
+    """The process's environment for these arguments: one GL context serves all its trajectories."""
+    from vd4rl_pomdp.envs.maze import MazeEnv
+
+    return MazeEnv(maze, action_repeat)
+
+
+def _attributes(config: MazeCollectConfig) -> dict[str, Any]:
+    maze = get_maze(config.maze)
+    style = maze.style
+    packages = ("mujoco", "gymnasium-robotics", "vd4rl-pomdp")
+    return {
+        "task": config.maze,
+        "policy": maze.driver,
+        "seed": config.seed,
+        "action_repeat": config.action_repeat,
+        "noise": style.noise,
+        "zero_share": style.zero_share,
+        "random_share": style.random_share,
+        "versions": {k: v for k, v in versions().items() if k in packages},
+    }

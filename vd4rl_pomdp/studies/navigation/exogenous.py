@@ -1,0 +1,204 @@
+"""Exogenous noise: an image from a pool is added to each observation, and has nothing to do with the agent.
+
+A row's key chooses its image, so that a row always shows the same one, as in a real environment. The pool consists of
+generated textures, of crops of the two photographs that scikit-learn ships, or of a folder's images: CIFAR-10's python
+or binary files, PNG, JPEG.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import io
+from pathlib import Path
+from pickletools import genops
+
+import numpy as np
+import torch
+import torch.nn.functional as F
+from PIL import Image, ImageDraw
+from torch import Tensor
+
+from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.reading import read_bytes
+from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.corruptions.keys import derive_keys, draw_integers
+from vd4rl_pomdp.envs.mazes import PICTURE_SIZE
+
+TEXTURES, PHOTOGRAPHS = "textures", "photographs"
+"""Names of the pools that need no files."""
+POOL = 1024
+"""Images in a pool at most."""
+_CIFAR_SIDE, _CIFAR_CLASSES = 32, 10
+_CIFAR_BYTES = 3 * _CIFAR_SIDE**2
+_CROPS = (120, 400)
+"""Least and greatest side of a photograph's crop, in its pixels."""
+_DISCS, _RADII, _CONTRAST = 300, (4.0, 60.0), 60.0
+"""Discs of a texture, their least and greatest radius in pixels, and the standard deviation of their colours."""
+
+
+class ExogenousNoise:
+    """Adds `weight` times an image of the pool to each picture and clips."""
+
+    def __init__(self, source: str, weight: float, seed: int) -> None:
+        self._source, self._weight = source, weight
+        self._seed = stream_seed(seed, "exogenous", "choice")
+        self.pool = load_pool(source, seed)
+        """(P, 3, 100, 100) uint8."""
+
+    def fingerprint(self) -> str:
+        """`source_fingerprint` of the pool's."""
+        return source_fingerprint(self._source)
+
+    def __call__(self, pictures: Tensor, key: Tensor) -> Tensor:
+        """Noisy copies of (N, 3, 100, 100) uint8 pictures, drawn by (N,) int64 row keys."""
+        self.pool = self.pool.to(pictures.device)
+        chosen = draw_integers(derive_keys(self._seed, key), len(self.pool), 1)[:, 0]
+        added = self.pool[chosen].float().mul_(self._weight)
+        return added.add_(pictures).round_().clamp_(max=255).to(torch.uint8)
+
+
+def source_fingerprint(source: str) -> str:
+    """Hash of the files of a pool; for one that needs none, only its name."""
+    if source in _MADE:
+        return source
+    digest = hashlib.blake2b(digest_size=12)
+    for path in _files(Path(source)):
+        digest.update(hashlib.blake2b(read_bytes(path)).digest())
+    return digest.hexdigest()
+
+
+def check_source(source: str) -> None:
+    """Raise UserError for what is neither the name of a pool nor a folder with files of images."""
+    if source in _MADE:
+        return
+    if not Path(source).is_dir():
+        raise UserError(f"{source}: no such folder; name one with images or use --exogenous {TEXTURES}")
+    if not _files(Path(source)):
+        raise UserError(
+            f"{source}: no readable image; name a folder with CIFAR-10's data_batch files (python or binary), with PNG "
+            f"or JPEG files, or use --exogenous {TEXTURES}"
+        )
+
+
+def load_pool(source: str, seed: int) -> Tensor:
+    """Images to add: (P, 3, 100, 100) uint8; raises UserError if there is none."""
+    check_source(source)
+    rng = np.random.default_rng(stream_seed(seed, "exogenous", "images"))
+    if source in _MADE:
+        return _MADE[source](rng)
+    return _drawn(_files(Path(source)), rng)
+
+
+def _drawn(files: list[Path], rng: np.random.Generator) -> Tensor:
+    """Images drawn from files, at most POOL; of PNG and JPEG files only those are decoded, however many there are."""
+    batches = {path: _read_cifar(path) for path in files if _is_cifar(path)}
+    ends = np.cumsum([len(batches[path]) if path in batches else 1 for path in files])
+    drawn = rng.permutation(ends[-1])[:POOL]
+    number = np.searchsorted(ends, drawn, side="right")
+    pool = torch.empty((len(drawn), 3, PICTURE_SIZE, PICTURE_SIZE), dtype=torch.uint8)
+    for file in np.unique(number):
+        mine = np.flatnonzero(number == file)
+        images = batches[files[file]] if files[file] in batches else _read_image(files[file])
+        pool[mine] = _to_size(images[drawn[mine] - ends[file]])  # counted from the file's end
+    return pool
+
+
+def _textures(rng: np.random.Generator) -> Tensor:
+    """Pictures of discs."""
+    return _to_size(np.stack([_dead_leaves(rng) for _ in range(POOL)]))
+
+
+def _dead_leaves(rng: np.random.Generator) -> np.ndarray:
+    """(100, 100, 3) uint8: discs that cover each other, radii with density r^-3, colours around the image's own.
+
+    Edges and scales are those of natural images (Lee, Mumford, Huang 2001, "Occlusion models for natural images").
+    """
+    own = rng.uniform(0, 255) + rng.normal(0, _CONTRAST / 2, 3)
+    image = Image.new("RGB", (PICTURE_SIZE, PICTURE_SIZE), tuple(own.clip(0, 255).astype(int).tolist()))
+    draw = ImageDraw.Draw(image)
+    centres = rng.uniform(0, PICTURE_SIZE, (_DISCS, 2))
+    least, greatest = _RADII
+    radii = least / np.sqrt(1 - rng.random(_DISCS) * (1 - (least / greatest) ** 2))
+    colours = rng.normal(own, _CONTRAST, (_DISCS, 3)).clip(0, 255).astype(int)
+    for (x, y), r, colour in zip(centres.tolist(), radii.tolist(), colours.tolist(), strict=True):
+        draw.ellipse((x - r, y - r, x + r, y + r), fill=tuple(colour))
+    return np.asarray(image)
+
+
+def _photographs(rng: np.random.Generator) -> Tensor:
+    """Random square crops, mirrored half of the time."""
+    from sklearn.datasets import load_sample_images
+
+    photographs = load_sample_images().images
+    crops = []
+    for number in range(POOL):
+        photograph = photographs[number % len(photographs)]
+        side = int(rng.integers(*_CROPS))
+        top, left = (int(rng.integers(length - side + 1)) for length in photograph.shape[:2])
+        crop = photograph[top : top + side, left : left + side]
+        crops.append(_to_size(np.ascontiguousarray(crop[:, ::-1] if rng.random() < 0.5 else crop)[None]))
+    return torch.cat(crops)
+
+
+_MADE = {TEXTURES: _textures, PHOTOGRAPHS: _photographs}
+"""Pools that need no files: what makes them, by name."""
+
+
+def _files(folder: Path) -> list[Path]:
+    """Files of a folder that hold images, in order."""
+    with disk_errors(folder):
+        files = sorted(path for path in folder.rglob("*") if path.is_file())
+    shown = (path for path in files if not path.name.startswith("."))  # macOS leaves ._x.png beside x.png
+    return [path for path in shown if _is_cifar(path) or path.suffix.lower() in (".png", ".jpg", ".jpeg")]
+
+
+def _is_cifar(path: Path) -> bool:
+    return path.name.startswith(("data_batch", "test_batch"))
+
+
+def _read_image(path: Path) -> np.ndarray:
+    """(1, H, W, 3) uint8 of one PNG or JPEG file."""
+    try:
+        return np.asarray(Image.open(io.BytesIO(read_bytes(path))).convert("RGB"))[None]
+    except UserError:
+        raise
+    except (OSError, SyntaxError, ValueError, Image.DecompressionBombError) as error:  # Pillow's, by format
+        raise UserError(f"{path}: cannot be read as an image ({error}); remove or replace it") from error
+
+
+def _read_cifar(path: Path) -> np.ndarray:
+    """(N, 32, 32, 3) uint8 of one CIFAR-10 file, POOL of them at most."""
+    data = _binary_records(path) if path.suffix == ".bin" else _python_records(path)
+    return data.reshape(-1, 3, _CIFAR_SIDE, _CIFAR_SIDE)[:POOL].transpose(0, 2, 3, 1)
+
+
+def _binary_records(path: Path) -> np.ndarray:
+    raw = np.frombuffer(read_bytes(path), np.uint8)
+    if not raw.size or raw.size % (_CIFAR_BYTES + 1):
+        raise UserError(f"{path}: its size is no multiple of {_CIFAR_BYTES + 1} bytes; download CIFAR-10 again")
+    records = raw.reshape(-1, _CIFAR_BYTES + 1)
+    if records[:, 0].max() >= _CIFAR_CLASSES:
+        raise UserError(f"{path}: holds labels above 9, so it is no CIFAR-10 file; download CIFAR-10 again")
+    return records[:, 1:]
+
+
+def _python_records(path: Path) -> np.ndarray:
+    """The pixels inside a pickled batch, found without running the pickle: its one long run of bytes."""
+    try:
+        runs = [a for _, a, _ in genops(read_bytes(path)) if isinstance(a, str | bytes)]
+        longest = max(runs, key=len, default=b"")
+        raw = longest.encode("latin-1") if isinstance(longest, str) else longest
+    except UserError:
+        raise
+    except ValueError as error:
+        raise UserError(f"{path}: is damaged ({error}); download CIFAR-10 again") from error
+    if not raw or len(raw) % _CIFAR_BYTES:
+        raise UserError(f"{path}: holds no pixels of 32x32 images; download CIFAR-10 again")
+    return np.frombuffer(raw, np.uint8)
+
+
+def _to_size(images: np.ndarray) -> Tensor:
+    """(N, H, W, 3) uint8 -> (N, 3, 100, 100) uint8."""
+    planes = torch.from_numpy(np.array(images)).permute(0, 3, 1, 2).float()
+    resized = F.interpolate(planes, (PICTURE_SIZE, PICTURE_SIZE), mode="bilinear", antialias=True)
+    return resized.round_().clamp_(0, 255).to(torch.uint8)

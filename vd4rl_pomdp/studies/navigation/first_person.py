@@ -1,0 +1,202 @@
+"""The actor that collects first-person data: PPO (stable-baselines3) on states, exported as a small file and shipped.
+
+Its inputs are the next waypoint and its velocity, both relative to its heading. The reward is the distance by which
+it comes nearer to the goal, and 1 for reaching it. PPO's Gaussian is applied before a tanh, as in an actor's file
+(see `policies.actor`).
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from importlib.metadata import version
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import gymnasium
+import numpy as np
+
+from vd4rl_pomdp.core.errors import MAX_SEED, UnavailableError, UserError, refuse_no_folder, refuse_outside
+from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, HARD, MOST_STEPS, MazeSpec, get_maze
+from vd4rl_pomdp.policies.actor import Actor, read_actor
+from vd4rl_pomdp.runs.outputs import refuse_inside
+from vd4rl_pomdp.runs.progress import ProgressLine
+from vd4rl_pomdp.studies.navigation.planner import Planner
+
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
+
+    from vd4rl_pomdp.envs.maze import MazeEnv
+
+_ASSETS = Path(__file__).parent / "assets"
+FEATURES = 4
+_EPISODE = 200
+_LARGEST = 4.0
+"""Bound of PPO's actions before the tanh."""
+_PARALLEL = 8
+
+
+@dataclass(frozen=True)
+class FirstPersonConfig:
+    """Settings of `vd4rl-pomdp navigation policy`."""
+
+    out: Path
+    """File of the actor."""
+    maze: str = "first_person"
+    """first_person, or hard_first_person."""
+    decisions: int = 200_000
+    """Environment decisions, at the least: PPO makes whole rounds of 2,048."""
+    action_repeat: int = ACTION_REPEAT
+    """Simulator steps of 0.01 s for one action."""
+    seed: int = 0
+    """Seed of the networks and the episodes."""
+
+
+def shipped_actor(maze: MazeSpec) -> Actor:
+    """What drives through a first-person maze: one actor for each kind of kinematics."""
+    return read_actor(_ASSETS / f"{'hard_' if maze.style is HARD else ''}first_person.safetensors")
+
+
+def features(state: np.ndarray, waypoint: np.ndarray) -> np.ndarray:
+    """The actor's inputs for a (6,) state: (4,) float32, waypoint and velocity in the frame of its heading."""
+    ahead = np.array([np.cos(state[2]), np.sin(state[2])])
+    left = np.array([-ahead[1], ahead[0]])
+    way = waypoint - state[:2]
+    return np.array([way @ ahead, way @ left, state[3:5] @ ahead, state[3:5] @ left], np.float32)
+
+
+class FirstPersonController:
+    """Drives to the environment's goal by the mean action of an actor, the shipped one by default."""
+
+    def __init__(self, env: MazeEnv, actor: Actor | None = None) -> None:
+        self._planner = Planner(env)
+        self._actor = actor or shipped_actor(env.maze_spec)
+
+    def act(self, state: np.ndarray, goal: np.ndarray) -> np.ndarray:
+        """Action (2,) for a (6,) state and a (2,) goal."""
+        return self._actor.act(features(state, self._planner.waypoint(state[:2], goal)))
+
+
+class FirstPersonEnv(gymnasium.Env[np.ndarray, np.ndarray]):
+    """The first-person maze as a task on states, for PPO."""
+
+    def __init__(self, maze: str, action_repeat: int) -> None:
+        from vd4rl_pomdp.envs.maze import MazeEnv
+
+        self._env = MazeEnv(maze, action_repeat, pixels=False)
+        self._planner = Planner(self._env)
+        self.observation_space = gymnasium.spaces.Box(-np.inf, np.inf, (FEATURES,), np.float32)
+        self.action_space = gymnasium.spaces.Box(-_LARGEST, _LARGEST, (2,), np.float32)
+        self._steps = 0
+
+    def reset(
+        self, *, seed: int | None = None, options: dict[str, Any] | None = None
+    ) -> tuple[np.ndarray, dict[str, Any]]:
+        """Another start and goal."""
+        super().reset(seed=seed)
+        self._env.reset(seed=seed)
+        self._steps = 0
+        return self._features(), {}
+
+    def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, dict[str, Any]]:
+        """Apply tanh(action); the reward is the distance covered towards the goal, and 1 for reaching it."""
+        goal = self._env.goal
+        before = self._planner.distance(self._env.state[:2], goal)
+        _, reached, *_ = self._env.step(np.tanh(action))
+        covered = before - self._planner.distance(self._env.state[:2], goal)
+        self._steps += 1
+        return self._features(), covered + reached, False, self._steps == _EPISODE, {}
+
+    def _features(self) -> np.ndarray:
+        return features(self._env.state, self._planner.waypoint(self._env.state[:2], self._env.goal))
+
+
+def _refuse_other(path: Path) -> None:
+    """Raise UserError for a file to write that exists and holds anything but an earlier actor."""
+    if path.exists() or path.is_symlink():
+        try:
+            read_actor(path)
+        except UnavailableError:
+            raise
+        except UserError as error:
+            raise UserError(f"{path}: is there already and holds no actor; choose another --out") from error
+
+
+def train_first_person(config: FirstPersonConfig) -> Actor:
+    """Train and write the actor; its card holds the number of goals that it reaches in 20 episodes."""
+    if not get_maze(config.maze).first_person:
+        raise UserError(f"--maze is {config.maze}, which a planner drives through; choose first_person")
+    refuse_outside(config, decisions=1, action_repeat=(1, MOST_STEPS), seed=(0, MAX_SEED))
+    refuse_no_folder(config.out.parent)
+    refuse_inside(config.out)
+    _refuse_other(config.out)
+    try:
+        from stable_baselines3 import PPO
+        from stable_baselines3.common.callbacks import BaseCallback
+        from stable_baselines3.common.logger import Logger
+        from stable_baselines3.common.vec_env import DummyVecEnv
+        from torch import nn
+    except ImportError as error:
+        raise UserError(
+            f"training a policy needs stable-baselines3 ({error}): `pip install '.[policy]'` in the package's folder"
+        ) from None
+
+    class Report(BaseCallback):
+        """Moves the progress line."""
+
+        def _on_step(self) -> bool:
+            progress.advance(_PARALLEL)
+            return True
+
+    environments = DummyVecEnv([lambda: FirstPersonEnv(config.maze, config.action_repeat) for _ in range(_PARALLEL)])
+    model = PPO(
+        "MlpPolicy",
+        environments,
+        n_steps=256,
+        batch_size=512,
+        gamma=0.98,
+        ent_coef=1e-3,
+        seed=config.seed,
+        device="cpu",
+        policy_kwargs={"net_arch": [64, 64], "activation_fn": nn.ReLU},
+    )
+    model.set_logger(Logger(None, []))  # its own would leave an empty folder among the temporary files
+    with ProgressLine(f"PPO {config.maze}", config.decisions, "decisions") as progress:
+        model.learn(config.decisions, callback=Report())
+    actor = _export(model, config)
+    actor.card["goals_in_20_episodes"] = goals_reached(actor, config.maze, config.action_repeat, 20)
+    actor.save(config.out)
+    return actor
+
+
+def goals_reached(actor: Actor, maze: str, action_repeat: int, episodes: int) -> int:
+    """Goals that the mean action reaches in episodes of 200 decisions from fixed seeds."""
+    from vd4rl_pomdp.envs.maze import MazeEnv
+
+    env = MazeEnv(maze, action_repeat, pixels=False)
+    controller, reached = FirstPersonController(env, actor), 0
+    for episode in range(episodes):
+        _, info = env.reset(seed=10_000 + episode)
+        for _ in range(_EPISODE):
+            _, reward, _, _, info = env.step(controller.act(info["state"], info["goal"]))
+            reached += int(reward)
+    return reached
+
+
+def _export(model: PPO, config: FirstPersonConfig) -> Actor:
+    """PPO's actor as plain matrices; its standard deviation does not depend on the state."""
+    policy: Any = model.policy
+    layers = [module for module in policy.mlp_extractor.policy_net if hasattr(module, "weight")]
+    weights = {f"hidden.{i}": layer for i, layer in enumerate(layers)} | {"mean": policy.action_net}
+    arrays = {f"{name}.weight": layer.weight.detach().numpy().T.copy() for name, layer in weights.items()}
+    arrays |= {f"{name}.bias": layer.bias.detach().numpy().copy() for name, layer in weights.items()}
+    log_std = policy.log_std.detach().numpy().copy()
+    arrays |= {"log_std.weight": np.zeros((layers[-1].out_features, len(log_std)), np.float32), "log_std.bias": log_std}
+    card = {
+        "task": config.maze,
+        "algorithm": "PPO",
+        "decisions": model.num_timesteps,
+        "action_repeat": config.action_repeat,
+        "seed": config.seed,
+        "stable_baselines3": version("stable-baselines3"),
+    }
+    return Actor(arrays, card)

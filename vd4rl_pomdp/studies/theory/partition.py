@@ -1,0 +1,291 @@
+"""What an objective needs of its representation: the coarsest partitions of histories that determine its predictions.
+
+At its optimum an objective knows F_k(x, y) = P(a_t | x, y) for every history x and later view y that occur together. A
+representation phi is enough if F_k is a function of phi(x) and phi(y) (of phi(x) and y, where the later view is one of
+the future and has an encoder of its own). Every refinement of such a phi is enough, too, so:
+
+- two histories *must differ* if putting just these two together contradicts F: no optimal representation merges them;
+- a partition is *coarsest* if no two of its blocks can be put together. F is silent about pairs that never occur
+  together, so there may be several; they are found by first fit, from more than one order, and the smallest is shown.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from fractions import Fraction
+from functools import cached_property
+from itertools import combinations
+
+import numpy as np
+
+from vd4rl_pomdp.studies.theory.classifiers import Memory, first_row
+from vd4rl_pomdp.studies.theory.law import Law, Prediction, Variable, joint_law, number_rows
+from vd4rl_pomdp.studies.theory.views import ObjectiveView
+from vd4rl_pomdp.studies.theory.world import World
+
+History = tuple
+"""Values of what a representation is computed from, oldest first."""
+
+
+class Relation:
+    """F: the prediction for each pair of histories at each k. Histories and predictions are numbered."""
+
+    def __init__(self, world: World, shared: bool) -> None:
+        self.world = world
+        self.shared = shared
+        """Whether one representation serves both ends."""
+        self.histories: dict[History, int] = {}
+        self.acted: dict[int, tuple] = {}
+        """History -> the actions it shows, oldest first."""
+        self._laters: dict[tuple, int] = self.histories if shared else {}
+        self._contents: dict[tuple, int] = {}
+        self._predictions: dict[Prediction, int] = {}
+        self._entries: list[np.ndarray] = []
+        self._facts: dict[str, list[np.ndarray]] = {"s": [], "xi": [], "content": []}
+
+    def add(self, law: Law, start: Iterable[Variable], end: Iterable[Variable], t: int, k: int) -> None:
+        """Record F_k from a law of both views and a_t."""
+        seen = law.given({*start, *end}, ("a", t))
+        kinds, distinct = seen.kinds
+        values = np.array([self._predictions.setdefault(p, len(self._predictions)) for p in distinct])[kinds]
+        past, later = (_numbers(*side, law)[seen.first] for side in ((self.histories, start), (self._laters, end)))
+        self._entries.append(np.stack([np.full_like(past, k), past, later, values]))
+
+    def add_facts(self, law: Law, past: Iterable[Variable], content: Iterable[Variable], row: int) -> None:
+        """Record the states, exogenous states and contents that histories which end at a row may have.
+
+        Args:
+            law: of `past`, `content` and the s and xi of `row`.
+            past: what histories consist of.
+            content: their agent-centric content: the states of the rows they show, and the actions they show.
+            row: their last row.
+        """
+        history = _numbers(self.histories, past, law)
+        told = {kind: law.column((kind, row)) for kind in ("s", "xi")}
+        told["content"] = _numbers(self._contents, content, law)
+        for kind, values in told.items():
+            self._facts[kind].append(np.unique(np.stack([history, values], axis=1), axis=0))
+        numbers, first = np.unique(history, return_index=True)
+        acted = law.values([v for v in past if v[0] == "a"], first)
+        self.acted.update(zip(numbers.tolist(), acted, strict=True))
+
+    @cached_property
+    def entries(self) -> np.ndarray:
+        """(4, E): k, history, other side and prediction of every pair that occurs."""
+        return np.concatenate(self._entries, axis=1)
+
+    @cached_property
+    def states(self) -> np.ndarray:
+        """(H, S) bool: agent-centric states that a history may end in; one, if it decodes."""
+        return self._incidence("s", len(self.world.states))
+
+    @cached_property
+    def noises(self) -> np.ndarray:
+        """(H, X) bool: exogenous states that a history may end in."""
+        return self._incidence("xi", len(self.world.exogenous))
+
+    @cached_property
+    def contents(self) -> np.ndarray:
+        """(P, 2): each history with each agent-centric content that it may have."""
+        return np.concatenate(self._facts["content"])
+
+    def _incidence(self, kind: str, width: int) -> np.ndarray:
+        table = np.zeros((len(self.histories), width), bool)
+        table[tuple(np.concatenate(self._facts[kind]).T)] = True
+        return table
+
+    def conflicts(self) -> np.ndarray:
+        """(H, H) bool: pairs of histories that every representation that is enough keeps apart."""
+        k, past, later, value = self.entries
+        found = np.zeros((len(self.histories),) * 2, bool)
+        _mark_differing(found, past, number_rows([k, later])[0], value)
+        if self.shared:
+            _mark_differing(found, later, number_rows([k, past])[0], value)
+            for each in np.unique(k):
+                found |= self._contradict_as_one(self.entries[1:, k == each])
+        return found | found.T
+
+    def _contradict_as_one(self, entries: np.ndarray) -> np.ndarray:
+        """(H, H): pairs of histories that, put together, would need several predictions for one pair at this k."""
+        past, later, value = entries
+        table = np.full((len(self.histories),) * 2, -1, np.int32)
+        table[past, later] = value
+        loop = table.diagonal()
+        low, high = np.full_like(table, len(self._predictions)), table
+        for other in (table, table.T, loop[:, None], loop):
+            low, high = np.where(other < 0, low, np.minimum(low, other)), np.maximum(high, other)
+        return low < high
+
+    def factors(self, codes: np.ndarray) -> bool:
+        """Whether F is a function of the codes of both sides; codes (H,) integers."""
+        k, past, later, value = self.entries
+        key, first = number_rows([k, codes[past], codes[later] if self.shared else later])
+        return bool((value == value[first][key]).all())
+
+    def coarsest(self) -> np.ndarray:
+        """(H,) integers: a coarsest partition, the smallest of those that the orders lead to."""
+        names = np.fromiter(self.world.states, object, len(self.world.states))
+        ends = [repr(sorted(names[row], key=repr)) for row in self.states]
+        recent = [repr(self.acted[h][::-1]) for h in range(len(ends))]
+        found = [self._first_fit(groups, ends) for groups in (recent, ends)]
+        return min(found, key=lambda blocks: len(set(blocks)))
+
+    def _first_fit(self, groups: Sequence[str], ends: Sequence[str]) -> np.ndarray:
+        """Blocks by first fit: at first within groups (of equal states, or of equal actions), then across them."""
+        texts = [repr(history) for history in self.histories]
+        order = sorted(range(len(texts)), key=lambda h: (groups[h], ends[h], texts[h]))
+        blocks = _Blocks(self._tables(), self.shared)
+        heads = blocks.join(order, lambda a, b: groups[a] == groups[b])
+        blocks.join(heads, lambda a, b: True)
+        return np.unique([blocks.find(h) for h in range(len(texts))], return_inverse=True)[1]
+
+    def _tables(self) -> np.ndarray:
+        """(K, H, L): the prediction for every k, history and other side, -1 where they never occur together."""
+        k, past, later, value = self.entries
+        place = np.unique(k, return_inverse=True)[1]
+        tables = np.full((int(place.max()) + 1, len(self.histories), len(self._laters)), -1)
+        tables[place, past, later] = value
+        return tables
+
+
+class _Blocks:
+    """Blocks of histories, each named by its first member, with the tables of F between blocks."""
+
+    def __init__(self, tables: np.ndarray, shared: bool) -> None:
+        self.tables, self.shared = tables, shared
+        self.parent = list(range(tables.shape[1]))
+
+    def find(self, name: int) -> int:
+        """The block of a history."""
+        while self.parent[name] != name:
+            name = self.parent[name]
+        return name
+
+    def join(self, order: Iterable[int], allowed: Callable[[int, int], bool]) -> list[int]:
+        """Put every block, in order, into the first earlier one that is allowed and fits; returns what is left."""
+        heads: list[int] = []
+        for name in order:
+            head = next((h for h in heads if allowed(h, name) and self.fit(h, name)), None)
+            if head is None:
+                heads.append(name)
+            else:
+                self._merge(head, name)
+        return heads
+
+    def fit(self, one: int, other: int) -> bool:
+        """Whether two blocks put together contradict nothing."""
+        both = [one, other]
+        if _differ(self.tables[:, both], axis=1):
+            return False
+        if not self.shared:
+            return True
+        between = self.tables[:, both][:, :, both].reshape(len(self.tables), 4)
+        return not (_differ(self.tables[:, :, both], axis=2) or _differ(between, axis=1))
+
+    def _merge(self, head: int, name: int) -> None:
+        """Give a block the entries of another, which are equal where both have one."""
+        self.parent[name] = head
+        for side in (self.tables, self.tables.swapaxes(1, 2)) if self.shared else (self.tables,):
+            side[:, head] = np.maximum(side[:, head], side[:, name])
+            side[:, name] = -1
+
+
+def _differ(values: np.ndarray, axis: int) -> bool:
+    """Whether known values (those that are not -1) differ anywhere along an axis."""
+    low = np.where(values < 0, values.max(initial=0), values).min(axis)
+    return bool((low < values.max(axis)).any())
+
+
+def _numbers(known: dict[tuple, int], group: Iterable[Variable], law: Law) -> np.ndarray:
+    """(N,) numbers of the joint values of a group; values that are not known yet get the next ones."""
+    ids, first = law.numbered(group)
+    return np.array([known.setdefault(name, len(known)) for name in law.values(group, first)])[ids]
+
+
+def _mark_differing(found: np.ndarray, mine: np.ndarray, key: np.ndarray, value: np.ndarray) -> None:
+    """Mark each two of (E,) entries that have one key and two values."""
+    order = np.argsort(key, kind="stable")
+    mine, key, value = mine[order], key[order], value[order]
+    for gap in range(1, int(np.bincount(key).max())):
+        differ = (key[gap:] == key[:-gap]) & (value[gap:] != value[:-gap])
+        found[mine[gap:][differ], mine[:-gap][differ]] = True
+
+
+def relation(world: World, view: ObjectiveView, memory: Memory, ks: Iterable[int]) -> Relation:
+    """F of one objective on a world, for some k.
+
+    Where the past is a window, one t with a whole window stands for all. Where it is the whole history, every pair
+    within the rows m..m+K is taken, because one late history must serve all earlier t.
+    """
+    ks, first = list(ks), first_row(view, memory)
+    found, histories = Relation(world, shared=not view.masked), {}
+    for t in range(first, first + (max(ks) if view.past == "all" else 1)):
+        for k in (k for k in ks if view.past != "all" or t + k <= first + max(ks)):
+            rows = t + k + memory.n + 1
+            start, end = view.start(t, memory.m), view.end(t, k, memory.m, memory.n, rows)
+            found.add(joint_law(world, start | end | {("a", t)}), start, end, t, k)
+            histories[t] = start
+            if found.shared:
+                histories[t + k] = end
+    for row, seen in histories.items():
+        content = {("s", j) if kind == "o" else (kind, j) for kind, j in seen}
+        found.add_facts(joint_law(world, seen | content | {("s", row), ("xi", row)}), seen, content, row)
+    return found
+
+
+def state_relation(world: World, ks: Iterable[int]) -> Relation:
+    """F_k(s, s') = P(a_t | s_t = s, s_{t+k} = s') with one encoder for both ends: multi-step inverse on true states."""
+    found = Relation(world, shared=True)
+    for k in ks:
+        start, end = [("s", 0)], [("s", k)]
+        found.add(joint_law(world, [*start, *end, ("a", 0)]), start, end, 0, k)
+    found.add_facts(joint_law(world, [("s", 0), ("xi", 0)]), [("s", 0)], [("s", 0)], 0)
+    return found
+
+
+def forced_shares(found: Relation) -> dict[frozenset, Fraction]:
+    """For every pair of states, the share of pairs of their histories that every optimal representation separates.
+
+    Only histories that may have the same exogenous state are paired: others can be told apart by what the future shows
+    of the exogenous state.
+    """
+    ends, noises = found.states.astype(float), found.noises.astype(float)  # whole numbers, far below 2^53: exact
+    eligible = noises @ noises.T > 0
+    possible, forced = (ends.T @ pairs.astype(float) @ ends for pairs in (eligible, found.conflicts() & eligible))
+    names = found.world.states
+    return {
+        frozenset((names[i], names[j])): Fraction(int(forced[i, j]), max(1, int(possible[i, j])))
+        for i, j in combinations(range(len(names)), 2)
+    }
+
+
+def discards_noise(found: Relation) -> bool:
+    """Whether F depends on the agent-centric content of histories alone, so that what differs in noise can be one."""
+    return found.factors(_linked(found.contents))
+
+
+def state_classes(found: Relation, blocks: np.ndarray) -> list[int]:
+    """Class of each state: states that a partition of histories cannot tell apart share one.
+
+    They share a block at an equal exogenous state, directly or through others.
+    """
+    history, noise = np.nonzero(found.noises)
+    table = np.zeros((found.states.shape[1], int(blocks.max()) + 1, found.noises.shape[1]), bool)
+    for state, ends in enumerate(found.states.T):
+        there = ends[history]
+        table[state, blocks[history[there]], noise[there]] = True
+    return _linked(np.argwhere(table.reshape(len(table), -1))).tolist()
+
+
+def _linked(pairs: np.ndarray) -> np.ndarray:
+    """Classes of the left numbers of (P, 2) pairs: those that share a right number, directly or through others."""
+    left, right = pairs.T
+    label = np.arange(int(left.max()) + 1)
+    while True:
+        lowest = np.full(int(right.max()) + 1, len(label))
+        np.minimum.at(lowest, right, label[left])
+        linked = label.copy()
+        np.minimum.at(linked, left, lowest[right])
+        if (linked == label).all():
+            return np.unique(label, return_inverse=True)[1]
+        label = linked

@@ -1,0 +1,74 @@
+"""Which variables each inverse objective of the paper's Table 1 sees when it predicts a_t for the pair (t, t+k).
+
+The learned objectives declare the same in `InverseObjective.visible`, and a test compares the two. Here a view has two
+parts, one for each of the two representations that the prediction is made from.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+from vd4rl_pomdp.studies.theory.law import Variable
+
+
+@dataclass(frozen=True)
+class ObjectiveView:
+    """The observations and actions of a sequence that one objective sees."""
+
+    name: str
+    past: Literal["none", "all", "window"]
+    """Rows before t that are seen (and before t+k, if the later representation is one of the past): none, all, or m."""
+    actions: bool = False
+    """Whether actions are seen."""
+    masked: bool = False
+    """Whether the later representation is one of the future from t+k on, by an encoder of its own."""
+    literal: bool = False
+    """Whether a window's first row, too, comes with the action before it, as the paper's formulas read."""
+
+    def start(self, t: int, m: int) -> frozenset[Variable]:
+        """What the representation of row t is computed from."""
+        return self._before(t, m)
+
+    def end(self, t: int, k: int, m: int, n: int, rows: int) -> frozenset[Variable]:
+        """What the representation of row t+k is computed from, in a window of `rows` rows.
+
+        A future of n rows beyond t+k holds n+1 actions, as `MaskedInverse` reads it.
+        """
+        if not self.masked:
+            return self._before(t + k, m)
+        last = min(rows, t + k + n + 1)
+        shift = 1 if self.literal else 0
+        actions = range(t + k - shift, last - shift) if self.actions else ()
+        return _variables(range(t + k, last), actions)
+
+    def visible(self, t: int, k: int, m: int, n: int, rows: int) -> frozenset[Variable]:
+        """Everything a prediction may depend on."""
+        return self.start(t, m) | self.end(t, k, m, n, rows)
+
+    def _before(self, row: int, m: int) -> frozenset[Variable]:
+        first = {"none": row, "all": 0, "window": max(0, row - m)}[self.past]
+        earlier = first - 1 if self.literal and not self.masked else first
+        return _variables(range(first, row + 1), range(max(0, earlier), row) if self.actions else ())
+
+
+def _variables(rows: range, actions: range | tuple) -> frozenset[Variable]:
+    return frozenset([("o", j) for j in rows] + [("a", j) for j in actions])
+
+
+VIEWS = {
+    view.name: view
+    for view in (
+        ObjectiveView("no_history", "none"),
+        ObjectiveView("ah", "all"),
+        ObjectiveView("ah+a", "all", actions=True),
+        ObjectiveView("fj", "window"),
+        ObjectiveView("fj+a", "window", actions=True),
+        ObjectiveView("fj+a literal", "window", actions=True, literal=True),
+        ObjectiveView("mik", "window", masked=True),
+        ObjectiveView("mik+a", "window", actions=True, masked=True),
+        ObjectiveView("mik+a literal", "window", actions=True, masked=True, literal=True),
+    )
+}
+"""Every view by the name of its method. Literal are rows (o_t, a_{t-1}), as the paper defines them: those of the future
+in `mik+a literal`, those of the past in `fj+a literal`."""

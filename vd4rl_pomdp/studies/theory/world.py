@@ -1,0 +1,241 @@
+"""A small language for finite agent-centric FM-POMDPs (Wu et al., arXiv 2404.14552, section 2), in exact arithmetic.
+
+A world has agent-centric states s with deterministic dynamics, an exogenous chain xi that no action touches, an
+emission of the pair, and a policy that reads s alone:
+
+    row      0                1                2
+    pair     (s_0, xi_0) ---> (s_1, xi_1) ---> (s_2, xi_2)       s_{t+1} = step(s_t, a_t),  xi_{t+1} ~ drift(xi_t)
+    seen     o_0              o_1              o_2               o_t ~ emit(s_t, xi_t)
+    action          a_0              a_1              a_2        a_t ~ policy(s_t)
+
+Probabilities are fractions; `law` turns a world into exact joint laws of sequences.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Hashable, Iterable, Mapping
+from dataclasses import dataclass, replace
+from fractions import Fraction
+from math import gcd
+from typing import Any
+
+from vd4rl_pomdp.core.errors import UserError
+
+AgentState = Hashable
+Exogenous = Hashable
+Action = Hashable
+Symbol = Hashable
+JointState = tuple[AgentState, Exogenous]
+Distribution = dict[Any, Fraction]
+"""Probabilities by outcome; they sum to 1."""
+
+
+@dataclass(frozen=True, eq=False)
+class World:
+    """A checked finite world; build it with `finite_world`. Two worlds are equal if they are the same object."""
+
+    name: str
+    states: tuple[AgentState, ...]
+    exogenous: tuple[Exogenous, ...]
+    actions: tuple[Action, ...]
+    initial: dict[JointState, Fraction]
+    """Law of the pair at row 0 of a sequence."""
+    step: dict[tuple[AgentState, Action], AgentState]
+    drift: dict[Exogenous, Distribution]
+    emission: dict[JointState, Distribution]
+    policy: dict[AgentState, Distribution]
+
+    @property
+    def symbols(self) -> tuple[Symbol, ...]:
+        """Every observation that can be emitted, in a fixed order."""
+        return tuple(dict.fromkeys(o for row in self.emission.values() for o in row))
+
+    def reachable(self) -> set[JointState]:
+        """Pairs that some sequence visits."""
+        return _closure(self.initial, self._successors)
+
+    def _successors(self, pair: JointState) -> Iterable[JointState]:
+        state, noise = pair
+        return ((self.step[state, a], other) for a in self.policy[state] for other in self.drift[noise])
+
+
+def finite_world(
+    name: str,
+    states: Iterable[AgentState],
+    exogenous: Iterable[Exogenous],
+    actions: Iterable[Action],
+    step: Callable[[Any, Any], AgentState],
+    drift: Callable[[Any], Mapping[Exogenous, Any]],
+    emit: Callable[[Any, Any], Mapping[Symbol, Any]],
+    policy: Callable[[Any, Any], Mapping[Action, Any]] | None = None,
+    initial: Mapping[JointState, Any] | None = None,
+) -> World:
+    """Tabulate and check a world; raises UserError if it is not a world as the module describes.
+
+    Args:
+        name: how messages and tables call it.
+        states: agent-centric states.
+        exogenous: exogenous states.
+        actions: actions.
+        step: next agent-centric state of (s, a).
+        drift: law of the next exogenous state.
+        emit: law of the observation of (s, xi).
+        policy: law of the action at (s, xi), which must not depend on xi; uniform by default.
+        initial: law of the first pair; uniform by default.
+    """
+    states, exogenous, actions = tuple(states), tuple(exogenous), tuple(actions)
+    if not (states and exogenous and actions):
+        raise UserError(f"world {name!r}: needs at least one state, one exogenous state and one action")
+    pairs = [(s, xi) for s in states for xi in exogenous]
+    initial = uniform(pairs) if initial is None else initial
+    choose = policy or (lambda s, xi: uniform(actions))
+    world = World(
+        name,
+        states,
+        exogenous,
+        actions,
+        _law(name, "initial", initial, pairs),
+        _successors(name, states, actions, step),
+        {xi: _law(name, f"drift({xi})", drift(xi), exogenous) for xi in exogenous},
+        {(s, xi): _law(name, f"emit({s}, {xi})", emit(s, xi), None) for s, xi in pairs},
+        {s: _agent_centric(name, s, exogenous, actions, choose) for s in states},
+    )
+    _all_reached(world)
+    return world
+
+
+def uniform(items: Iterable[Any]) -> Distribution:
+    """The uniform law on some items."""
+    items = tuple(items)
+    return {item: Fraction(1, len(items)) for item in items}
+
+
+def with_policy(world: World, name: str, policy: Callable[[Any], Mapping[Action, Any]]) -> World:
+    """The same world under another agent-centric policy."""
+    table = {s: _law(world.name, f"policy({s})", policy(s), world.actions) for s in world.states}
+    changed = replace(world, name=f"{world.name}, {name}", policy=table)
+    _all_reached(changed)
+    return changed
+
+
+def with_noise(world: World, name: str, noise: Mapping[Exogenous, Distribution]) -> World:
+    """The world with a second exogenous chain (a table of its transitions) that is shown beside every observation."""
+    noise = {xi: _law(world.name, f"noise({xi})", row, noise) for xi, row in noise.items()}
+    share = Fraction(1, len(noise))
+    return replace(
+        world,
+        name=f"{world.name}, {name}",
+        exogenous=tuple((xi, e) for xi in world.exogenous for e in noise),
+        initial={(s, (xi, e)): p * share for (s, xi), p in world.initial.items() for e in noise},
+        drift={(xi, e): _product(row, noise[e]) for xi, row in world.drift.items() for e in noise},
+        emission={
+            (s, (xi, e)): _product(row, {e: Fraction(1)}) for (s, xi), row in world.emission.items() for e in noise
+        },
+    )
+
+
+def _product(one: Distribution, other: Distribution) -> Distribution:
+    return {(a, b): p * q for a, p in one.items() for b, q in other.items()}
+
+
+def _law(name: str, where: str, row: Mapping[Any, Any], allowed: Iterable[Any] | None) -> Distribution:
+    """A row of probabilities as fractions, without zeros."""
+    law = {key: _fraction(name, where, value) for key, value in row.items()}
+    if any(p < 0 for p in law.values()):
+        raise UserError(f"world {name!r}: {where} has a negative probability: every entry must be 0 or more")
+    if sum(law.values()) != 1:
+        raise UserError(f"world {name!r}: {where} sums to {sum(law.values())}, not to 1: correct that row")
+    for key in law:
+        if allowed is not None:
+            _check_declared(name, where, key, allowed)
+    return {key: p for key, p in law.items() if p}
+
+
+def _fraction(name: str, where: str, value: Any) -> Fraction:
+    try:
+        if isinstance(value, int | Fraction | str):
+            return Fraction(value)
+    except (ValueError, ZeroDivisionError):
+        pass
+    raise UserError(
+        f"world {name!r}: {where} holds {value!r}: write probabilities as Fraction, int or '1/3', not float"
+    )
+
+
+def _successors(
+    name: str, states: tuple, actions: tuple, step: Callable[[AgentState, Action], AgentState]
+) -> dict[tuple[AgentState, Action], AgentState]:
+    """The state after every state and action."""
+    after = {(s, a): step(s, a) for s in states for a in actions}
+    for (s, a), state in after.items():
+        _check_declared(name, f"step({s}, {a})", state, states)
+    return after
+
+
+def _check_declared(name: str, where: str, value: Any, allowed: Iterable[Any]) -> None:
+    """Raise UserError unless a value is among those that a world declares."""
+    if value not in set(allowed):
+        raise UserError(f"world {name!r}: {where} gives {value!r}, which is not declared: add it or correct the entry")
+
+
+def _agent_centric(
+    name: str, state: AgentState, exogenous: tuple, actions: tuple, policy: Callable[[Any, Any], Mapping[Action, Any]]
+) -> Distribution:
+    """The policy's row at one state, checked to be the same whatever the exogenous part."""
+    rows = [_law(name, f"policy({state}, {xi})", policy(state, xi), actions) for xi in exogenous]
+    for xi, row in zip(exogenous, rows, strict=True):
+        if row != rows[0]:
+            raise UserError(
+                f"world {name!r}: the policy reads the exogenous part (at state {state} it differs between "
+                f"{exogenous[0]} and {xi}): make it depend on the agent-centric state alone"
+            )
+    return rows[0]
+
+
+def _all_reached(world: World) -> None:
+    reached = world.reachable()
+    for kind, names, found in (
+        ("state", world.states, {s for s, _ in reached}),
+        ("exogenous state", world.exogenous, {xi for _, xi in reached}),
+    ):
+        lost = [name for name in names if name not in found]
+        if lost:
+            raise UserError(
+                f"world {world.name!r}: {kind} {lost[0]} is unreachable: drop it, or lead to it from the initial law"
+            )
+
+
+def _closure(start: Iterable[Any], successors: Callable[[Any], Iterable[Any]]) -> set[Any]:
+    found, todo = set(start), list(start)
+    while todo:
+        for item in successors(todo.pop()):
+            if item not in found:
+                found.add(item)
+                todo.append(item)
+    return found
+
+
+def distances(world: World, start: AgentState) -> dict[AgentState, int]:
+    """Fewest actions from a state to every state that can be reached from it."""
+    found, level = {start: 0}, [start]
+    while level:
+        depth = found[level[0]] + 1
+        after = [world.step[s, a] for s in level for a in world.actions]
+        level = list(dict.fromkeys(s for s in after if s not in found))
+        found |= dict.fromkeys(level, depth)
+    return found
+
+
+def diameter(world: World) -> int | None:
+    """Longest shortest path between two states; None if some state cannot be reached from another."""
+    tables = [distances(world, s) for s in world.states]
+    if any(len(table) < len(world.states) for table in tables):
+        return None
+    return max(max(table.values()) for table in tables)
+
+
+def period(world: World) -> int:
+    """Greatest common divisor of the lengths of all cycles through the first state: 1 if it is aperiodic."""
+    depth = distances(world, world.states[0])
+    back = [depth[s] + 1 - depth[world.step[s, a]] for s in depth for a in world.actions]
+    return gcd(*back)
