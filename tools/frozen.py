@@ -28,6 +28,7 @@ METHODS = (
 )
 INVERSE = {
     "literal_future": ["--literal-future"],
+    "future_frames": ["--future-frames", "newest"],
     "future_rows": ["--n", "3"],
     "bins": ["--action-target", "bins"],
     "mse": ["--action-target", "mse"],
