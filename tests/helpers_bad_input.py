@@ -8,18 +8,18 @@ from pathlib import Path
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
 
-SET, MAZE, ENCODER, RUN = "walker_walk/expert", "no_curtain", "runs/pretrained/encoder", "runs/finetuned"
-SMOKE = ["--preset", "smoke"]
+SET, ENCODER, RUN = "walker_walk/expert", "runs/pretrained/encoder", "runs/finetuned"
+PRETRAIN = ["--preset", "smoke", "--steps", "2"]
+FINETUNE = ["--preset", "smoke", "--updates", "2", "--eval-length", "2", "--workers", "1"]
 
 
 def build_world(folder: Path) -> None:
-    """Two sets, runs of three stages of which one was cut, rows of results, and things that are no input of anybody."""
+    """A set, runs of both stages, one of which was cut, rows of results, and things that are no input of anybody."""
     write_fake_set(folder / SET, [20, 25, 30], physics_dim=18)
     with contextlib.chdir(folder):
         for words in (
-            ["pretrain", "--data", SET, "--out", "runs/pretrained", *SMOKE],
-            ["finetune", "--encoder", ENCODER, "--data", SET, "--out", RUN, *SMOKE, "--workers", "1"],
-            ["navigation", "collect", "--maze", MAZE, "--out", MAZE, *SMOKE, "--workers", "1"],
+            ["pretrain", "--data", SET, "--out", "runs/pretrained", *PRETRAIN],
+            ["finetune", "--encoder", ENCODER, "--data", SET, "--out", RUN, *FINETUNE],
             ["results", "add", "runs", "--out", "results"],
         ):
             code, told = end_of(words)

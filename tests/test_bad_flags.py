@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.helpers_bad_input import ENCODER, MAZE, RUN, SET, SMOKE, build_world, end_of, snapshot
+from tests.helpers_bad_input import ENCODER, FINETUNE, PRETRAIN, RUN, SET, build_world, end_of, snapshot
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import flag_of
 from vd4rl_pomdp.core.options import options_in
@@ -24,16 +24,15 @@ VALID = {
     "data parity": [SET],
     "data collect": ["--task", "walker_walk", "--quality", "random", "--episodes", "1", *OUT],
     "policy train": ["--task", "walker_walk", "--decisions", "10", *OUT],
-    "pretrain": ["--data", SET, "--corruption", "patch+zero_frames", *OUT, *SMOKE],
-    "pretrain --method homer": ["--data", SET, *OUT, *SMOKE],
-    "finetune": ["--encoder", ENCODER, "--data", SET, "--workers", "1", *OUT, *SMOKE],
-    "finetune --algorithm iql": ["--encoder", ENCODER, "--data", SET, "--workers", "1", *OUT, *SMOKE],
+    "pretrain": ["--data", SET, "--corruption", "patch+zero_frames", *OUT, *PRETRAIN],
+    "pretrain --method homer": ["--data", SET, *OUT, *PRETRAIN],
+    "finetune": ["--encoder", ENCODER, "--data", SET, "--workers", "1", *OUT, *PRETRAIN],
+    "finetune --algorithm iql": ["--encoder", ENCODER, "--data", SET, *OUT, *FINETUNE],
     "evaluate": [RUN, "--episodes", "1", "--workers", "1"],
     "report": ["runs", *OUT],
     "report compare": ["runs", "results", *OUT],
     "results add": ["runs", *OUT],
-    "navigation collect": ["--maze", "no_curtain", *OUT, *SMOKE],
-    "navigation train": ["--data", MAZE, *OUT, *SMOKE],
+    "navigation collect": ["--maze", "no_curtain", "--preset", "smoke", *OUT],
     "sweep run": ["quick", "--testing", "--dry-run", *OUT],
     "theory": OUT,
     "control-study": ["--methods", "none", "--episodes", "2", "--decisions", "32", "--updates", "1", *OUT],
@@ -74,8 +73,8 @@ class _FoundError(Exception):
 def flags_of(command: str) -> dict[str, type]:
     """Type of one value of every flag of a command."""
 
-    def stop(config, **given):
-        raise _FoundError(config, given.get("default"))
+    def stop(kind, **given):
+        raise _FoundError(kind, given.get("default"))
 
     with mock.patch("tyro.cli", stop), pytest.raises(_FoundError) as found:
         main([*command.split(), *VALID[command]])

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tests.helpers_bad_input import ENCODER, MAZE, RUN, SET, SMOKE, build_world, end_of
+from tests.helpers_bad_input import ENCODER, FINETUNE, PRETRAIN, RUN, SET, build_world, end_of
 
 OUT = ["--out", "new"]
 READERS = [
@@ -18,9 +18,8 @@ READERS = [
     (["report", "compare", "runs", "results", *OUT], "results/*"),
     (["results", "add", "runs", "--out", "results"], "results/*"),
     (["evaluate", RUN, "--episodes", "1", "--workers", "1"], f"{RUN}/**/*.*"),
-    (["finetune", "--encoder", ENCODER, "--data", SET, *OUT, *SMOKE, "--workers", "1"], f"{ENCODER}/*"),
-    (["pretrain", "--data", SET, "--out", "cut/pretrained", *SMOKE], "cut/pretrained/**/*.*"),
-    (["navigation", "train", "--data", MAZE, *OUT, *SMOKE], f"{MAZE}/*"),
+    (["finetune", "--encoder", ENCODER, "--data", SET, *OUT, *FINETUNE], f"{ENCODER}/*"),
+    (["pretrain", "--data", SET, "--out", "cut/pretrained", *PRETRAIN], "cut/pretrained/**/*.*"),
 ]
 """Command lines, and the files that they read."""
 
