@@ -294,15 +294,6 @@ def test_rows_tell_every_attempt(jobs, tmp_path):
     ]
 
 
-def test_a_row_that_a_full_disk_cut_is_left_out(tmp_path):
-    history = SweepFolder(tmp_path)
-    history.add({"job": "a", "cause": "killed", "step": 0})
-    with (tmp_path / "sweep" / "attempts.jsonl").open("a") as file:
-        file.write('{"job": "a", "cau\n')
-    history.add({"job": "a", "cause": "killed", "step": 0})
-    assert len(history.attempts()["a"]) == 2
-
-
 def test_a_cause_counts_in_a_row_only():
     rows = [{"cause": cause, "step": 0, "slots": 1} for cause in ["killed"] * 4 + ["interrupted"] + ["killed"] * 4]
     assert given_up(rows) == ""

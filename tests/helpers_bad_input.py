@@ -1,0 +1,50 @@
+"""A folder of small valid files, what a command does in it, and what it changes."""
+
+import contextlib
+import io
+import shutil
+from pathlib import Path
+
+from tests.helpers_data import write_fake_set
+from vd4rl_pomdp.cli import main
+
+SET, ENCODER, RUN = "walker_walk/expert", "runs/pretrained/encoder", "runs/finetuned"
+PRETRAIN = ["--preset", "smoke", "--steps", "2"]
+FINETUNE = ["--preset", "smoke", "--updates", "2", "--eval-length", "2", "--workers", "1"]
+
+
+def build_world(folder: Path) -> None:
+    """A set, runs of both stages, one of which was cut, rows of results, and things that are no input of anybody."""
+    write_fake_set(folder / SET, [20, 25, 30], physics_dim=18)
+    with contextlib.chdir(folder):
+        for words in (
+            ["pretrain", "--data", SET, "--out", "runs/pretrained", *PRETRAIN],
+            ["finetune", "--encoder", ENCODER, "--data", SET, "--out", RUN, *FINETUNE],
+            ["results", "add", "runs", "--out", "results"],
+        ):
+            code, told = end_of(words)
+            assert code == 0, told
+        shutil.copytree("runs/pretrained", "cut/pretrained")
+        Path("cut/pretrained/timing.json").unlink()
+        shutil.rmtree("cut/pretrained/encoder")
+        Path("file").write_text("not ours\n")
+        for name in ("empty", "foreign"):
+            Path(name).mkdir()
+        Path("foreign/notes.txt").write_text("not ours\n")
+        Path("loop").symlink_to("loop")
+
+
+def end_of(words: list[str]) -> tuple[int, str]:
+    """Exit code and stderr of a command line; a traceback is raised here as what it is."""
+    told = io.StringIO()
+    with contextlib.redirect_stdout(io.StringIO()), contextlib.redirect_stderr(told):
+        try:
+            main(words)
+        except SystemExit as end:
+            return int(end.code or 0), told.getvalue()
+    return 0, told.getvalue()
+
+
+def snapshot(folder: Path) -> dict[Path, tuple[int, int]]:
+    """Size and time of every name below a folder."""
+    return {path: ((s := path.lstat()).st_size, s.st_mtime_ns) for path in folder.rglob("*")}

@@ -1,0 +1,109 @@
+"""Wrong values of flags: every command ends in one line and exit code 2, and writes nothing."""
+
+import contextlib
+import os
+from dataclasses import fields
+from functools import cache
+from pathlib import Path
+from typing import get_args, get_type_hints
+from unittest import mock
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.helpers_bad_input import ENCODER, FINETUNE, PRETRAIN, RUN, SET, build_world, end_of, snapshot
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.errors import flag_of
+from vd4rl_pomdp.core.options import options_in
+
+OUT = ["--out", "new"]
+VALID = {
+    "data card": [SET],
+    "data check": [SET],
+    "data parity": [SET],
+    "data collect": ["--task", "walker_walk", "--quality", "random", "--episodes", "1", *OUT],
+    "policy train": ["--task", "walker_walk", "--decisions", "10", *OUT],
+    "pretrain": ["--data", SET, "--corruption", "patch+zero_frames", *OUT, *PRETRAIN],
+    "pretrain --method homer": ["--data", SET, *OUT, *PRETRAIN],
+    "finetune": ["--encoder", ENCODER, "--data", SET, "--workers", "1", *OUT, *PRETRAIN],
+    "finetune --algorithm iql": ["--encoder", ENCODER, "--data", SET, *OUT, *FINETUNE],
+    "evaluate": [RUN, "--episodes", "1", "--workers", "1"],
+    "report": ["runs", *OUT],
+    "report compare": ["runs", "results", *OUT],
+    "results add": ["runs", *OUT],
+    "navigation collect": ["--maze", "no_curtain", "--preset", "smoke", *OUT],
+    "sweep run": ["quick", "--testing", "--dry-run", *OUT],
+    "theory": OUT,
+    "control-study": ["--methods", "none", "--episodes", "2", "--decisions", "32", "--updates", "1", *OUT],
+}
+"""Words after each command that are right; each test makes one flag's value wrong."""
+NO_FILE = ["nowhere", "file/below", "file", "empty", "foreign", "loop", "/dev/null", "n" * 300, os.fsdecode(b"a\xff")]
+WRONG = {
+    bool: ["maybe"],
+    int: ["", "many", "1.5", "nan", "-7", str(10**30)],
+    float: ["", "much", "nan", "inf", "-7"],
+    str: ["@@", "ζ", os.fsdecode(b"a\xff"), "a\nb"],
+    Path: ["", *NO_FILE],
+}
+RIGHT = {
+    *((command, flag, "-7") for command in VALID for flag in ("target_entropy", "stop_at")),
+    *((command, "out", "empty") for command in VALID),
+    *((command, "out", "nowhere") for command in VALID),
+    *(("sweep run", flag, word) for flag in ("out", "data") for word in ("nowhere", "empty", "foreign")),
+}
+"""What is no bad input: an entropy and a return may be negative, an output folder new or empty."""
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("world")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VD4RL_POMDP_CACHE", str(tmp_path_factory.mktemp("cache")))
+        build_world(folder)
+        with contextlib.chdir(folder):
+            yield folder
+
+
+class _FoundError(Exception):
+    """Carries a command's config class and defaults out of its parsing."""
+
+
+@cache
+def flags_of(command: str) -> dict[str, type]:
+    """Type of one value of every flag of a command."""
+
+    def stop(kind, **given):
+        raise _FoundError(kind, given.get("default"))
+
+    with mock.patch("tyro.cli", stop), pytest.raises(_FoundError) as found:
+        main([*command.split(), *VALID[command]])
+    return _flags(*found.value.args)
+
+
+def _flags(config: type, default: object) -> dict[str, type]:
+    found, hints = {}, get_type_hints(config)
+    for field in fields(config):
+        nested = options_in(getattr(default, field.name, None))
+        if nested is not None:
+            for options in nested:
+                found |= _flags(type(options), options)
+        elif "Positional" not in str(field.type):
+            kinds = [part for part in (hints[field.name], *get_args(hints[field.name])) if part in WRONG]
+            found[field.name] = kinds[0] if kinds else str
+    return found
+
+
+@settings(max_examples=150, deadline=None, derandomize=True)
+@given(data=st.data())
+def test_a_wrong_value_ends_in_one_line_and_exit_code_2_and_nothing_is_written(world, data):
+    command = data.draw(st.sampled_from(list(VALID)))
+    flag, kind = data.draw(st.sampled_from(list(flags_of(command).items())))
+    value = data.draw(st.sampled_from([v for v in WRONG[kind] if (command, flag, v) not in RIGHT]))
+    words = [*command.split(), *VALID[command]]
+    if flag_of(flag) in words:
+        del words[words.index(flag_of(flag)) :][:2]
+    before = snapshot(world)
+    code, told = end_of([*words, flag_of(flag), value])
+    assert (code, told.count("\n"), told[:7]) == (2, 1, "error: "), told
+    assert snapshot(world) == before

@@ -1,0 +1,64 @@
+"""Damaged files: the command that reads one works all the same, or ends in one line and exit code 2."""
+
+import contextlib
+import shutil
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tests.helpers_bad_input import ENCODER, FINETUNE, PRETRAIN, RUN, SET, build_world, end_of
+
+OUT = ["--out", "new"]
+READERS = [
+    (["data", "check", SET], f"{SET}/*"),
+    (["data", "card", SET], f"{SET}/*"),
+    (["report", "runs", *OUT], f"{RUN}/*.*"),
+    (["report", "runs", *OUT], "runs/pretrained/*.*"),
+    (["report", "compare", "runs", "results", *OUT], "results/*"),
+    (["results", "add", "runs", "--out", "results"], "results/*"),
+    (["evaluate", RUN, "--episodes", "1", "--workers", "1"], f"{RUN}/**/*.*"),
+    (["finetune", "--encoder", ENCODER, "--data", SET, *OUT, *FINETUNE], f"{ENCODER}/*"),
+    (["pretrain", "--data", SET, "--out", "cut/pretrained", *PRETRAIN], "cut/pretrained/**/*.*"),
+]
+"""Command lines, and the files that they read."""
+
+
+@pytest.fixture(scope="module")
+def world(tmp_path_factory):
+    folder = tmp_path_factory.mktemp("world")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VD4RL_POMDP_CACHE", str(tmp_path_factory.mktemp("cache")))
+        build_world(folder)
+        yield folder
+
+
+def _truncated(draw, whole: bytes) -> bytes:
+    return whole[: draw(st.integers(0, max(len(whole) - 1, 0)))]
+
+
+def _flipped(draw, whole: bytes) -> bytes:
+    place, bit = draw(st.integers(0, max(len(whole) - 1, 0))), draw(st.integers(0, 7))
+    return whole[:place] + bytes(byte ^ 1 << bit for byte in whole[place : place + 1]) + whole[place + 1 :]
+
+
+def _replaced(draw, whole: bytes) -> bytes:
+    place, garbage = draw(st.integers(0, len(whole))), draw(st.binary(min_size=1, max_size=64))
+    return whole[:place] + garbage + whole[place + len(garbage) :]
+
+
+@settings(max_examples=60, deadline=None, derandomize=True)
+@given(data=st.data())
+def test_a_damaged_file_is_read_or_refused_in_one_line(world, tmp_path_factory, data):
+    words, pattern = data.draw(st.sampled_from(READERS))
+    name = data.draw(st.sampled_from(sorted(p.relative_to(world) for p in world.glob(pattern) if p.is_file())))
+    damaged = data.draw(st.sampled_from([_truncated, _flipped, _replaced]))(data.draw, (world / name).read_bytes())
+    folder = tmp_path_factory.mktemp("case")
+    shutil.copytree(world, folder, symlinks=True, dirs_exist_ok=True)
+    (folder / name).write_bytes(damaged)
+    with contextlib.chdir(folder):
+        code, told = end_of(words)
+    shutil.rmtree(folder)
+    if code:
+        assert code == 2, told
+        assert [line[:7] for line in told.splitlines() if not line.startswith("warning: ")] == ["error: "], told
