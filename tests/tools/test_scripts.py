@@ -135,8 +135,8 @@ def test_what_a_cell_saves_leaves_its_return_as_it_is(tmp_path, monkeypatch):
 
 def test_another_python_makes_the_environment_anew(tmp_path):
     """With interpreters that only say their version, note what they make, and agree to all else."""
-    (tmp_path / "scripts").mkdir()
-    shutil.copy(SCRIPTS / "setup.sh", tmp_path / "scripts")
+    (tmp_path / "tools").mkdir()
+    shutil.copy(SCRIPTS / "setup.sh", tmp_path / "tools")
     for name in ("pyproject.toml", "constraints.txt"):
         (tmp_path / name).touch()
     for number in (11, 12):
