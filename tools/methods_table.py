@@ -5,8 +5,6 @@ from __future__ import annotations
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-from control_table import probes_of, spread_of
-
 from vd4rl_pomdp.report.gates import returns_of
 from vd4rl_pomdp.report.layout import number
 from vd4rl_pomdp.report.load import PROBES, LoadedRun, load_runs
@@ -35,7 +33,7 @@ def table_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
     cells = {(run.labels["method"], run.labels["corruption"]): run for run in runs}
     ranks = {method: _rank(cells, method) for method, _ in cells}
     for method in sorted(ranks, key=ranks.__getitem__, reverse=True):
-        yield f"| `{method}` | {' | '.join(_told(method, cells.get((method, hidden))) for hidden in HIDDEN)} |"
+        yield f"| `{method}` | {' | '.join(_told(cells.get((method, hidden))) for hidden in HIDDEN)} |"
 
 
 def _rank(cells: dict[tuple[str, str], LoadedRun], method: str) -> tuple[float, ...]:
@@ -44,9 +42,10 @@ def _rank(cells: dict[tuple[str, str], LoadedRun], method: str) -> tuple[float, 
     return tuple(returns_of([run]).item() if run else -1.0 for run in mine)
 
 
-def _told(method: str, run: LoadedRun | None) -> str:
+def _told(run: LoadedRun | None) -> str:
     """Return, lowest and highest episode, and probe errors; dashes if there is no run."""
     if run is None:
         return f"{number(None)} | {number(None)}"
-    probes = probes_of(method, [run.representation[name] for name in PROBES])
-    return f"{returns_of([run]).item():.0f} ({spread_of([run])}) | {probes}"
+    probes = ", ".join(number(run.representation[name], 1) for name in PROBES)
+    episodes = [row["return"] for row in run.last]
+    return f"{returns_of([run]).item():.0f} ({min(episodes):.0f} to {max(episodes):.0f}) | {probes}"

@@ -1,4 +1,4 @@
-"""The tables of README.md and docs/navigation.md about the paper's own mazes, made from rows of results/navigation."""
+"""The tables of the pages in results/navigation, made from its rows."""
 
 from __future__ import annotations
 
@@ -43,8 +43,6 @@ a percentage is a mean over both coordinates, so the raw error lies between its 
 STARS, COMPASS = "first_person", "compass_first_person"
 PICTURES = {"rgb50": "colour, 50x50", "rgb100": "colour, 100x100"}
 """Pictures other than the preset's, as the pages call them."""
-ADDED = {"self_prediction": "self-prediction", "exogenous": "textures"}
-"""What is added to a training or its pictures, as the pages call it."""
 _ORDER = ("mik+a", "fj+a", "ah", "mik", "fj", "ah+a", "no_history")
 _HEAD = (
     "| | seeds | " + " | ".join(f"`{name}`" for name in _ORDER) + " |",
@@ -98,12 +96,12 @@ def state_lines(runs: list[NavigationRun], ks: Sequence[int]) -> Iterator[str]:
             yield from _state_lines(runs, f"K = {k}", Condition(maze, "", k))
 
 
-def added_lines(runs: list[NavigationRun], added: str) -> Iterator[str]:
-    """State errors at K = 15 with what a field of `Condition` adds (one of `ADDED`), and without it."""
+def texture_lines(runs: list[NavigationRun]) -> Iterator[str]:
+    """State errors at K = 15 with textures in the pictures, and without them."""
     yield from _HEAD
     for maze in measured(runs):
-        if with_it := list(_state_lines(runs, ADDED[added], Condition(maze, "", **{added: True}))):
-            yield from (*with_it, *_state_lines(runs, "without", Condition(maze, "")))
+        if with_them := list(_state_lines(runs, "textures", Condition(maze, "", exogenous=True))):
+            yield from (*with_them, *_state_lines(runs, "without", Condition(maze, "")))
 
 
 def _state_lines(runs: list[NavigationRun], words: str, cell: Condition) -> Iterator[str]:

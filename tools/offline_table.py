@@ -1,23 +1,20 @@
-"""The tables of returns in README.md and results/offline/README.md, made from rows of results/control and offline."""
+"""The tables of results/offline/README.md and results/control/README.md, made from the rows of both folders."""
 
 from __future__ import annotations
 
-from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from itertools import product
 from pathlib import Path
 
 import numpy as np
-from control_table import probes_of, spread_of, told, with_seeds
 from scipy.stats import spearmanr
 
-from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.report.gates import FAILED, PASSED, UNKNOWN, episodes_of, gates, returns_of
 from vd4rl_pomdp.report.layout import number, with_interval
 from vd4rl_pomdp.report.load import PROBES, LoadedRun, load_runs
 from vd4rl_pomdp.report.measures import mean_if_known
 from vd4rl_pomdp.report.overall import aggregate, improvement
-from vd4rl_pomdp.report.stats import difference_interval
+from vd4rl_pomdp.report.stats import difference_interval, mean_interval
 from vd4rl_pomdp.report.tables import TOLD_STATES, evaluations
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import Row
@@ -39,11 +36,9 @@ SETS = {
     ("cheetah_run", "expert"): "cheetah_run, expert",
     ("cheetah_run", "medium_expert"): "cheetah_run, medium_expert",
 }
-"""What the README calls a set."""
-CONTROL_ONLY = ("cheetah_run", "medium_noisy")
-"""The set that results/offline does not tell of."""
+"""What the table of returns calls a set."""
 MAIN = (UNTRAINED, "acro", "mik", "mik+a")
-"""Methods of which the README's table and the aggregates tell."""
+"""Methods of the table of returns and of the aggregates."""
 EXPLORATORY = ("expert_noisy", "medium_noisy")
 """Qualities that were chosen after looking at first returns."""
 CONTRASTS = {
@@ -63,7 +58,7 @@ def main_runs() -> list[LoadedRun]:
     return [run for run in found if run.rows and run.finished and not run.variant]
 
 
-def readme_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+def return_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
     """Returns of the main methods, a row for every set and corruption."""
     shown = (*(f"`{name}`" for name in MAIN), "`mik+a` less `acro`", "the same, played clean")
     yield f"| set (data's return) | {' | '.join(shown)} | `acro` trained with nothing hidden |"
@@ -152,36 +147,9 @@ def measured_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str, str]]:
     return (one for one in asked if one in measured)
 
 
-def page_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str, str]]:
-    """Those of which results/offline/README.md has a table."""
-    return (one for one in measured_sets(runs) if one[:2] != CONTROL_ONLY)
-
-
 def table_name(task: str, quality: str, corruption: str) -> str:
     """What the table of a set is called."""
     return f"{task}, {quality}" + ALONE * (corruption == PATCHES)
-
-
-def set_lines(runs: Sequence[LoadedRun], task: str, quality: str, corruption: str) -> Iterator[str]:
-    """All methods on one set under a corruption, those that return most first; played clean, where any was."""
-    here = [run for run in runs if _place(run) == (task, quality)]
-    methods = {run.labels["method"]: _of(here, run.labels["method"], corruption) for run in here}
-    shown = [(method, mine) for method, mine in methods.items() if mine]
-    clean = {method: _episodes(mine, clean=True) for method, mine in shown}
-    played = any(returns is not None for returns in clean.values())
-    yield (
-        f"| method | seeds | return (seeds) | episodes |{' played with nothing hidden |' * played}"
-        " trained with nothing hidden | action error: data, loop | probe: pose, velocity |"
-    )
-    yield "|---|" + "---:|" * (6 + played)
-    for method, mine in sorted(shown, key=lambda one: -returns_of(one[1]).mean()):
-        data, loop = (number(mean_if_known(map(known, mine)), 3) for known in (_path_error, _loop_error))
-        probes = probes_of(method, [mean_if_known(run.representation[name] for run in mine) for name in PROBES])
-        cell = number(None) if clean[method] is None else told(clean[method])
-        yield (
-            f"| `{method}` | {len(mine)} | {with_seeds(mine)} | {spread_of(mine)} |{f' {cell} |' * played}"
-            f" {_told(_of(here, method, CLEAN))} | {data}, {loop} | {probes} |"
-        )
 
 
 def gate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
@@ -264,61 +232,6 @@ def _probed(runs: Sequence[LoadedRun]) -> list[LoadedRun]:
     return [run for run in known if run.labels["method"] not in TOLD_STATES]
 
 
-def layer_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
-    """How many cells of each layer of the grid are measured, by task."""
-    grid = GridMembers(GRIDS[0], load_grid(GRIDS[0]).cells())
-    asked = Counter((row["task"], _layer(row)) for row in grid.wanted)
-    found = Counter((run.labels["task"], _layer(run.labels)) for run in runs if grid.asks(run.labels))
-    tasks = [task for task in TASKS if any(task == one for one, _ in asked)]
-    yield f"| layer | {' | '.join(tasks)} |"
-    yield "|---|" + "---:|" * len(tasks)
-    for layer, words in LAYERS.items():
-        places = [(task, layer) for task in tasks]
-        counts = (f"{found[place]} of {asked[place]}" if place in asked else "–" for place in places)
-        yield f"| ({layer}) {words} | {' | '.join(counts)} |"
-
-
-LAYERS = {
-    "a": "sets that leave the expert's path, patches and zeroed frames",
-    "b": "the paper's qualities, patches and zeroed frames, and their references",
-    "c": "the paper's qualities, patches alone",
-    "d": "the other methods, patches and zeroed frames",
-    "e": "a third task, patches and zeroed frames, and its references",
-    "f": "`medium` and `medium_replay`, five seeds",
-}
-"""Of the grid `offline`, in their order."""
-_MAIN_METHODS = ("mik+a", "mik", "ah+a", "acro", UNTRAINED, "supervised+a", "state")
-
-
-def _layer(labels: Row) -> str:
-    if labels["quality"] in ("medium", "medium_replay"):
-        return "f"
-    if labels["task"] == "humanoid_walk":
-        return "e"
-    if labels["method"] not in _MAIN_METHODS:
-        return "d"
-    if labels["corruption"] == PATCHES:
-        return "c"
-    return "a" if labels["quality"] == "expert_noisy" else "b"
-
-
-def cost_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
-    """Minutes of both stages by task and method under corruption: the median cell, the fastest and the slowest."""
-    yield "| task | method | cells | pretraining, minutes | fine-tuning, minutes |"
-    yield "|---|---|---:|---:|---:|"
-    for task in sorted({run.labels["task"] for run in runs}):
-        here = [run for run in runs if (run.labels["task"], run.labels["corruption"]) == (task, HIDDEN)]
-        for method in sorted({run.labels["method"] for run in here}):
-            mine = [run for run in here if run.labels["method"] == method]
-            stages = [run.representation["pretrain_seconds"] for run in mine], [run.seconds for run in mine]
-            yield f"| {task} | `{method}` | {len(mine)} | {_minutes(stages[0])} | {_minutes(stages[1])} |"
-
-
-def _minutes(seconds: Sequence[float]) -> str:
-    least, middle, most = np.quantile(seconds, (0, 0.5, 1)) / 60
-    return f"{middle:.1f} ({least:.1f} to {most:.1f})" if len(seconds) > 1 else f"{middle:.1f}"
-
-
 def _place(run: LoadedRun) -> tuple[str, str]:
     return run.labels["task"], run.labels["quality"]
 
@@ -333,4 +246,6 @@ def _told(runs: list[LoadedRun]) -> str:
     """Mean return and its interval, and how many seeds if fewer than three; a dash if there is none."""
     if not runs:
         return number(None)
-    return told(episodes_of(runs)) + (f" (n = {len(runs)})" if len(runs) < 3 else "")
+    returns = episodes_of(runs)
+    text = with_interval(returns.mean(), *(mean_interval(returns) or (None, None)), 0)
+    return text + (f" (n = {len(runs)})" if len(runs) < 3 else "")

@@ -1,4 +1,4 @@
-"""Write the tables of README.md, docs and results that are made from committed rows into their pages.
+"""Write the tables of results that are made from committed rows into their pages.
 
     python tools/page_tables.py
 
@@ -12,7 +12,6 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
-import control_table
 import methods_table
 import navigation_table
 import offline_table
@@ -36,35 +35,30 @@ def pages() -> dict[str, Tables]:
     """Tables of each page, which is told by its path in the repository."""
     returns, mazes = offline_table.main_runs(), navigation_table.main_runs()
     return {
-        "README.md": {
-            "returns": offline_table.readme_lines(returns),
-            "mazes": navigation_table.state_lines(mazes, (15, 1)),
-        },
-        "docs/navigation.md": {
-            **{maze: navigation_table.maze_lines(mazes, maze) for maze in navigation_table.measured(mazes)},
-            "hard": navigation_table.hard_lines(mazes),
-            "K = 1": navigation_table.state_lines(mazes, (1,)),
-            **{words: navigation_table.added_lines(mazes, added) for added, words in navigation_table.ADDED.items()},
-            "first rung": navigation_table.first_rung_lines(navigation_table.first_rung_runs()),
-            "pictures": navigation_table.picture_lines(navigation_table.picture_runs(), mazes),
-            "first person": navigation_table.first_person_lines(navigation_table.first_person_runs()),
-        },
         "results/control/README.md": {
-            "control": control_table.table_lines(control_table.RESULTS),
-            "costs": control_table.cost_lines(control_table.RESULTS / "cell_cost.csv"),
-        },
-        "results/methods/README.md": {"methods": methods_table.table_lines(methods_table.main_runs())},
-        "results/offline/README.md": {
-            "layers": offline_table.layer_lines(returns),
-            "contrasts": offline_table.contrast_lines(returns),
-            "aggregate": offline_table.aggregate_lines(returns),
             "gates": offline_table.gate_lines(returns),
             "ranks": offline_table.rank_lines(returns),
-            **{
-                offline_table.table_name(*place): offline_table.set_lines(returns, *place)
-                for place in offline_table.page_sets(returns)
-            },
-            "minutes": offline_table.cost_lines(returns),
+        },
+        "results/methods/README.md": {"methods": methods_table.table_lines(methods_table.main_runs())},
+        "results/navigation/README.md": {
+            "mazes": navigation_table.state_lines(mazes, (15, 1)),
+            "three_curtains": navigation_table.maze_lines(mazes, "three_curtains"),
+            "textures": navigation_table.texture_lines(mazes),
+        },
+        "results/navigation/longer/README.md": {"hard": navigation_table.hard_lines(mazes)},
+        "results/navigation/first_person/README.md": {
+            "first person": navigation_table.first_person_lines(navigation_table.first_person_runs())
+        },
+        "results/navigation/first_person/pictures/README.md": {
+            "pictures": navigation_table.picture_lines(navigation_table.picture_runs(), mazes),
+        },
+        "results/navigation/first_person/small/README.md": {
+            "first rung": navigation_table.first_rung_lines(navigation_table.first_rung_runs()),
+        },
+        "results/offline/README.md": {
+            "returns": offline_table.return_lines(returns),
+            "contrasts": offline_table.contrast_lines(returns),
+            "aggregate": offline_table.aggregate_lines(returns),
         },
     }
 

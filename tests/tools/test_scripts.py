@@ -173,10 +173,3 @@ def test_a_table_takes_the_place_of_the_one_under_its_mark(monkeypatch):
     assert written == "a\n\n<!-- table: one -->\n| 1 |\n\n| not it |\n<!-- table: other -->\n| 2 |\nend"
     with pytest.raises(UserError, match=r"^page.md: one line `<!-- table: new -->` is wanted, .* belongs; 0 found$"):
         script.with_tables(page, {"new": ["| 3 |"]}, "page.md")
-
-
-def test_a_set_of_several_actors_has_no_action_errors(monkeypatch):
-    monkeypatch.syspath_prepend(SCRIPTS)
-    script = importlib.import_module("control_table")
-    lines = script.table_lines(script.RESULTS.parent / "offline")
-    assert {line.split(" | ")[6] for line in lines if "medium_expert |" in line} == {"–, –"}

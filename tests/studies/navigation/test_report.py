@@ -202,7 +202,7 @@ def test_what_was_not_trained_alike_is_said(tmp_path):
     untrained = write_run(tmp_path / "runs", Condition("no_curtain", "random"), 0, 1.0)
     (untrained / "timing.json").write_text(json.dumps({"steps": 0, "seconds": 1.0}))
     write_report([tmp_path / "runs"], tmp_path / "out")
-    assert "Not alike" not in (tmp_path / "out" / "README.md").read_text(), "self-prediction and no training are told"
+    assert "Not alike" not in (tmp_path / "out" / "report.md").read_text(), "self-prediction and no training are told"
     (longer / "timing.json").write_text(json.dumps({"steps": 9000, "seconds": 300.0}))
     for run in (*alike, untrained):
         tell_set(run, 1000)

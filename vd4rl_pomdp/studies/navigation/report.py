@@ -1,6 +1,6 @@
 """The navigation report: the paper's tables from raw rows, each number beside the paper's, and what they say.
 
-OUT/README.md     tables, verdicts, figures, and the command of every condition
+OUT/report.md     tables, verdicts, figures, and the command of every condition
 OUT/runs.jsonl, episodes.csv, trajectories/     a results folder; `navigation report OUT` makes everything again from it
 OUT/rows.csv      every number of every run
 OUT/tables.csv    every number: mean, interval, seeds, the paper's number
@@ -68,7 +68,7 @@ def _write(
         pictures.append("observations.png")
     tables = make_tables(runs)
     write_tables(tables, out / "tables.csv")
-    page = out / "README.md"
+    page = out / "report.md"
     write_text(page, "\n".join(_page(runs, unfinished, tables, pictures)) + "\n")
     return page
 
