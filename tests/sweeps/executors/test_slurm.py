@@ -1,4 +1,4 @@
-"""A sweep on a real Slurm of one node: tasks share the jobs, are asked for again, and outlive a driver that is killed."""
+"""A sweep on a real Slurm of one node: tasks share the jobs, are replaced, and outlive a driver that is killed."""
 
 import os
 import signal
