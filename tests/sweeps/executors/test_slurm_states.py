@@ -101,7 +101,7 @@ def test_tasks_are_known_by_the_name_of_their_folder(commands, capsys):
     text = "".join(script.read_text() for script in (folder / "slurm").glob("*.sh"))
     name = made._own[1].partition("=")[2]
     assert f"--job-name={name}\n" in text
-    assert "--array=0-2%100\n" in text
+    assert "--array=0-2%3\n" in text
     assert cluster(folder / "other")._own != cluster(folder)._own == made._own
 
 
