@@ -24,7 +24,6 @@ def row(cause, seconds=100.0, ago=60.0):
     return {
         "cause": cause,
         "step": 0,
-        "slots": 1,
         "line": f"its {cause}",
         "ended": time.time() - ago,
         "seconds": seconds,
@@ -58,16 +57,6 @@ def test_what_needs_a_failed_job_is_blocked_and_is_no_time_left(jobs, tmp_path):
     finish(tmp_path / "running")
     finish(tmp_path / "other")
     assert status([*jobs, *after], attempts(), Estimates([])).seconds_left == 0.0
-
-
-@pytest.mark.parametrize(
-    ("slots", "state"),
-    [({"slots": 1, "largest": 2}, "waiting"), ({"slots": 2, "largest": 2}, "failed"), ({}, "failed")],
-)
-def test_out_of_memory_waits_as_long_as_there_are_more_slots(jobs, slots, state):
-    found = status(jobs, {"waiting": [row("out of memory") | slots]}, Estimates([]))
-    assert found.states["waiting"] == state
-    assert list(found.failures) == ["waiting"] * (state == "failed")
 
 
 def test_an_attempt_at_another_command_says_nothing_of_a_job(jobs):

@@ -2,11 +2,8 @@
 
 import signal
 
-import pytest
-
 from tests.sweeps.executors.waiting import until
-from vd4rl_pomdp.sweeps import work as work_module
-from vd4rl_pomdp.sweeps.work import INTERRUPTED, KILLED, Ended, Work, code_of, ended, start_process
+from vd4rl_pomdp.sweeps.work import INTERRUPTED, KILLED, Ended, Work, ended, start_process
 
 GRID = """
 import time
@@ -31,14 +28,6 @@ def test_a_job_imports_these_packages_whatever_the_working_directory_holds(tmp_p
     work = Work("job", ("pretrain", "--method", "nothing"), tmp_path / "log")
     assert ended(work, start_process(work, {}).wait(120)).cause == "refused"
     assert "unknown method 'nothing'" in work.log.read_text()
-
-
-@pytest.mark.parametrize("code", [-signal.SIGKILL, code_of(KILLED)])
-def test_a_job_whose_worker_was_killed_for_want_of_memory_is_short_of_it(tmp_path, monkeypatch, code):
-    monkeypatch.setattr(work_module, "oom_kills", lambda: 3)
-    work = Work("job", (), tmp_path / "log")
-    assert ended(work, code, 2).cause == "out of memory"
-    assert ended(work, code, 3).cause == "killed"
 
 
 def test_what_an_earlier_attempt_printed_is_not_told_of_the_next(tmp_path):

@@ -16,8 +16,9 @@ from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
-from vd4rl_pomdp.sweeps.executors import executor_kind
-from vd4rl_pomdp.sweeps.own_file import program_here, refuse_unknown_to_jobs, refuse_within_a_job
+from vd4rl_pomdp.sweeps.executors import CLUSTERS, executor_options
+from vd4rl_pomdp.sweeps.executors.local import LocalExecutor, LocalOptions
+from vd4rl_pomdp.sweeps.own_file import program_here, refuse_unknown_to_jobs, refuse_while_loading
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.sweeps.folder import SweepFolder
@@ -39,7 +40,7 @@ class _ExecutorConfig(StageConfig):
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
         """Options of the executor."""
-        return {"options": executor_kind(values["executor"]).options.fill(values)}
+        return {"options": executor_options(values["executor"]).fill(values)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -110,7 +111,7 @@ def _run(words: Arguments, program: str) -> None:
         _print_plan(jobs, [*here.runs, *kept.runs])
         return
     folder.keep_plan(plan, jobs)
-    _carry_out(jobs, command, folder)
+    _carry_out(jobs, command, folder, plan)
 
 
 def _print_plan(jobs: list[Job], past: list[Any]) -> None:
@@ -133,18 +134,30 @@ def _print_plan(jobs: list[Job], past: list[Any]) -> None:
     print(f"# {len(jobs)} jobs, {len(jobs) - left} done, {left} to do: {told}")
 
 
-def _carry_out(jobs: list[Job], command: _ExecutorConfig, folder: SweepFolder) -> None:
-    carry_out(jobs, folder, command.executor, command.options)
+def _carry_out(jobs: list[Job], command: _ExecutorConfig, folder: SweepFolder, plan: str | None = None) -> None:
+    carry_out(jobs, folder, command.executor, command.options, plan)
     print(f"all {len(jobs)} jobs are finished")
 
 
-def carry_out(jobs: list[Job], folder: SweepFolder, kind: str, options: Options) -> None:
-    """Run jobs to their end on an executor of a kind; SystemExit 1 if some are not finished."""
+def carry_out(jobs: list[Job], folder: SweepFolder, kind: str, options: Any, plan: str | None = None) -> None:
+    """Run jobs to their end on an executor of a kind; SystemExit 1 if some are not finished.
+
+    Args:
+        jobs: each after those it needs.
+        folder: the sweep's.
+        kind: name of the executor.
+        options: its options.
+        plan: name of the plan that the jobs are of; None: of several.
+    """
+    from vd4rl_pomdp.sweeps.cluster import watch
     from vd4rl_pomdp.sweeps.driver import Driver
 
-    refuse_within_a_job()
-    executor = executor_kind(kind).build(options, folder.of_executor(kind))
-    if not Driver(jobs, executor, folder).run():
+    refuse_while_loading()
+    if kind in CLUSTERS:
+        finished = watch(jobs, CLUSTERS[kind](options, folder.of_executor(kind)), folder, plan)
+    else:
+        finished = Driver(jobs, LocalExecutor(options), folder).run()
+    if not finished:
         failures = _status(folder, jobs).failures
         for name, row in failures.items():
             print(f"{row['cause']}: {name}: {row['line']}", file=sys.stderr)
@@ -207,6 +220,38 @@ def _retry(words: Arguments, program: str) -> None:
 
 
 @dataclass(frozen=True)
+class JoinCommand:
+    """Help with a sweep on this machine: take jobs that nobody has, and end when there is none to take.
+
+    What a task of Slurm or Ray does; on any other cluster, start it as often as you like.
+    """
+
+    out: tyro.conf.Positional[Path]
+    """Folder of the sweep."""
+    plan: str = ""
+    """Jobs of this plan alone; default: all that lie in OUT/sweep/plans."""
+    jobs: int = 0
+    """Jobs at a time on this machine; 0: as many as its GPUs take, or one without a GPU."""
+    jobs_per_gpu: int = 1
+    """Jobs at a time on each GPU."""
+    threads: int = 0
+    """CPU threads of a job; 0: its share of the machine's cores."""
+
+
+def _join(words: Arguments, program: str) -> None:
+    from vd4rl_pomdp.sweeps.driver import Driver
+    from vd4rl_pomdp.sweeps.folder import SweepFolder
+
+    refuse_while_loading()
+    command = parse(JoinCommand, words, program)
+    options = LocalOptions(command.jobs, command.jobs_per_gpu, command.threads)
+    options.check()
+    folder = SweepFolder(command.out)
+    finished = Driver(folder.own_jobs(command.plan), LocalExecutor(options), folder, helps=True).run()
+    print("all is finished" if finished else "there is nothing to take now; `sweep status` tells what is left")
+
+
+@dataclass(frozen=True)
 class GridsCommand:
     """List the grids that ship with the package."""
 
@@ -224,5 +269,6 @@ COMMANDS = {
     "run": Command("carry out a grid, or go on with it", _run),
     "status": Command("counts, rate, time left and failures of a sweep", _show_status),
     "retry": Command("take up failures again", _retry),
+    "join": Command("help with a sweep on this machine", _join),
     "list": Command("the grids that ship", _list),
 }

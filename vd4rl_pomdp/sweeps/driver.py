@@ -7,14 +7,17 @@ next one goes on with whatever is left.
 from __future__ import annotations
 
 import os
+import random
 import socket
 import sys
 import time
 from collections.abc import Iterable, Mapping
-from dataclasses import dataclass
+from contextlib import suppress
 from itertools import takewhile
 
 from vd4rl_pomdp.core.errors import (
+    DONE,
+    INTERRUPTED,
     DiskFullError,
     InUseError,
     OutOfMemoryError,
@@ -29,34 +32,23 @@ from vd4rl_pomdp.runs.ownership import in_use
 from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.progress import progress_of
-from vd4rl_pomdp.sweeps.work import DIVERGED, DONE, FAILED, INTERRUPTED, KILLED, Ended, Executor
+from vd4rl_pomdp.sweeps.work import FAILED, KILLED, Ended, Executor
 
 POLL_S = 0.1
-
-
-@dataclass(frozen=True)
-class Retry:
-    """What is done about a cause."""
-
-    times: int
-    """How often a job is tried again without having got further or having been ended from outside."""
-    wait_s: float = 0.0
-    """Before that."""
-
-
-_ALWAYS = 10**6
-RETRIES = {
-    KILLED: Retry(4),
-    DiskFullError.cause: Retry(20, 30.0),
-    UnavailableError.cause: Retry(20, 30.0),
-    InUseError.cause: Retry(_ALWAYS, 10.0),
-    INTERRUPTED: Retry(_ALWAYS),
-    OutOfMemoryError.cause: Retry(1),
-    FAILED: Retry(1),
-    UserError.cause: Retry(0),
-    DIVERGED: Retry(0),
-}
-"""By cause. Out of memory is tried again with twice the slots; where a job had them all already, it is not."""
+TRIES = 5
+"""Attempts at a job that end alike without a new checkpoint, before it has failed."""
+PAUSE_S = 60.0
+"""Before another attempt, whoever made the last."""
+IN_USE_S = 10.0
+"""Until a job that another driver has is looked at again."""
+IDLE_S = 90.0
+"""A helping driver that finds nothing to start for so long ends."""
+SPREAD = 64
+"""Helping drivers choose among so many jobs by chance: all would otherwise start the same one."""
+PASSING = (KILLED, OutOfMemoryError.cause, DiskFullError.cause, UnavailableError.cause)
+"""Causes that another attempt may not meet. A refusal, a defect or a divergence would only come again."""
+_SHORT_OF_MEMORY = (OutOfMemoryError.cause, KILLED)
+"""The kernel kills a process when memory runs out, and does not say so."""
 
 
 def attempts_at(job: Job, attempts: dict[str, list[Row]]) -> list[Row]:
@@ -74,13 +66,11 @@ def given_up(rows: list[Row]) -> str:
 
     What was done once, and is there no more, is done again.
     """
-    if not rows or rows[-1]["cause"] == DONE:
+    if not rows or rows[-1]["cause"] in (DONE, INTERRUPTED):
         return ""
-    last = rows[-1]
-    here = takewhile(lambda row: row["step"] == last["step"] and row["cause"] != INTERRUPTED, reversed(rows))
-    alike = sum(row["cause"] == last["cause"] for row in here)
-    hopeless = last["cause"] == OutOfMemoryError.cause and last["slots"] >= last.get("largest", 1)
-    return last["cause"] if hopeless or alike > RETRIES.get(last["cause"], Retry(0)).times else ""
+    cause, step = rows[-1]["cause"], rows[-1]["step"]
+    here = takewhile(lambda row: row["step"] == step and row["cause"] != INTERRUPTED, reversed(rows))
+    return "" if cause in PASSING and len(list(here)) < TRIES else cause
 
 
 def lost_among(jobs: Iterable[Job], rows: Mapping[str, list[Row]]) -> set[str]:
@@ -111,23 +101,32 @@ def _finished_anew(job: Job) -> bool:
 class Driver:
     """One process's part in a sweep."""
 
-    def __init__(self, jobs: Iterable[Job], executor: Executor, folder: SweepFolder) -> None:
-        """See the module."""
+    def __init__(self, jobs: Iterable[Job], executor: Executor, folder: SweepFolder, helps: bool = False) -> None:
+        """See the module.
+
+        Args:
+            jobs: those of the sweep, each after those it needs.
+            executor: what runs them.
+            folder: the sweep's.
+            helps: whether it is one of several on a cluster, which ends when there is nothing to start for IDLE_S.
+        """
         self._jobs = {job.name: job for job in jobs}
-        self._executor, self._folder = executor, folder
-        attempts = folder.attempts()
-        self._rows = {name: attempts_at(job, attempts) for name, job in self._jobs.items()}
+        self._executor, self._folder, self._helps = executor, folder, helps
         self._left = {job.name: job for job in self._jobs.values() if not job.finished}
-        self._running: dict[str, tuple[float, int, int]] = {}
-        """When each began, its slots, and the most it could have had."""
+        self._running: dict[str, float] = {}
+        """When each began."""
         self._not_before: dict[str, float] = {}
-        self._lost = lost_among(self._left.values(), self._rows)
-        """What is left and will stay so."""
+        """When to look again at what others have."""
+        self._busy = time.monotonic()
+        """When something last ran."""
+        self._read = 0
+        self._learn(folder.attempts())
 
     def run(self) -> bool:
         """Work until nothing is left that can be done; whether all is finished."""
         try:
-            while len(self._left) > len(self._lost):
+            while len(self._left) > len(self._lost) and not self._idle():
+                self._look()
                 self._start()
                 time.sleep(POLL_S)
                 self._collect()
@@ -138,27 +137,45 @@ class Driver:
             raise
         return all(map(_is_finished, self._left.values()))  # others may have finished what was given up here
 
+    def _idle(self) -> bool:
+        if self._running:
+            self._busy = time.monotonic()
+        return self._helps and time.monotonic() - self._busy > IDLE_S
+
+    def _look(self) -> None:
+        """Learn of all attempts, other drivers' too: what is given up is so for everybody."""
+        with suppress(UnavailableError):  # the next time, then
+            if (size := self._folder.attempts_size()) != self._read:
+                self._learn(self._folder.attempts())
+                self._read = size
+
+    def _learn(self, attempts: dict[str, list[Row]]) -> None:
+        self._rows = {name: attempts_at(job, attempts) for name, job in self._jobs.items()}
+        self._lost = lost_among(self._left.values(), self._rows)
+
     def _start(self) -> None:
         """Start every job that can be."""
-        for job in filter(self._ready, list(self._left.values())):
+        ready = [job for job in self._left.values() if self._ready(job)]
+        if self._helps:
+            ready = random.sample(ready[:SPREAD], min(SPREAD, len(ready)))
+        for job in ready:
             if not self._executor.fits(1):
                 break
             if self._executor.fits(self._slots(job)) and not self._elsewhere(job):
                 self._begin(job)
 
     def _begin(self, job: Job) -> None:
-        self._count(job)
+        self._running[job.name] = time.monotonic()
         try:
             with disk_errors(job.folder):
                 self._executor.start(self._folder.work(job, self._slots(job)))
         except UserError as error:
             self._end(Ended(job.name, error.cause, str(error)))
 
-    def _count(self, job: Job) -> None:
-        self._running[job.name] = (time.monotonic(), self._slots(job), self._executor.largest)
-
     def _ready(self, job: Job) -> bool:
         free = job.name not in self._running and time.monotonic() >= self._not_before.get(job.name, 0)
+        last = (self._rows[job.name] or [{"cause": DONE}])[-1]
+        free = free and not (last["cause"] in PASSING and time.time() < last.get("ended", 0) + PAUSE_S)
         return free and job.name not in self._lost and not any(name in self._left for name in job.needs)
 
     def _elsewhere(self, job: Job) -> bool:
@@ -168,37 +185,38 @@ class Driver:
                 if job.finished:
                     del self._left[job.name]
                     return True
-                cause = InUseError.cause if in_use(job.folder) else ""
-        except UnavailableError as error:
-            cause = error.cause
+                if not in_use(job.folder):
+                    return False
+        except UnavailableError:
+            pass
         except UserError as error:
-            self._count(job)
+            self._running[job.name] = time.monotonic()
             self._end(Ended(job.name, error.cause, str(error)))
             return True
-        if cause:
-            self._not_before[job.name] = time.monotonic() + RETRIES[cause].wait_s
-        return bool(cause)
+        self._not_before[job.name] = time.monotonic() + IN_USE_S
+        return True
 
     def _slots(self, job: Job) -> int:
-        """One, or twice as many as when the memory last did not suffice."""
-        short = [row["slots"] for row in self._rows[job.name] if row["cause"] == OutOfMemoryError.cause]
-        return min(2 * max(short), self._executor.largest) if short else 1
+        """One, and twice as many after every attempt that the memory may not have sufficed for."""
+        short = sum(row["cause"] in _SHORT_OF_MEMORY for row in self._rows[job.name])
+        return min(2**short, self._executor.largest)
 
     def _collect(self) -> None:
         for ended in self._executor.ended():
             self._end(ended)
 
     def _end(self, ended: Ended) -> None:
-        began, slots, largest = self._running.pop(ended.name)
-        seconds = time.monotonic() - began
+        seconds = time.monotonic() - self._running.pop(ended.name)
+        if ended.cause == InUseError.cause:  # another driver was faster: no attempt at the job
+            self._not_before[ended.name] = time.monotonic() + IN_USE_S
+            return
         ended, finished, step = self._outcome(ended)
-        self._note(ended, {"seconds": round(seconds, 1), "slots": slots, "largest": largest, "step": step})
+        self._note(ended, {"seconds": round(seconds, 1), "step": step})
         if finished:
             del self._left[ended.name]
         else:
-            self._not_before[ended.name] = time.monotonic() + RETRIES[ended.cause].wait_s
             self._lost = lost_among(self._left.values(), self._rows)
-        self._say(ended, seconds)
+        say(ended.name, ended.cause, seconds, ended.line, len(self._jobs) - len(self._left), len(self._jobs))
 
     def _outcome(self, ended: Ended) -> tuple[Ended, bool, int]:
         """How an attempt ended, whether its job is finished, and how far it is, as far as the disk tells now."""
@@ -224,8 +242,8 @@ class Driver:
         except UnavailableError as error:
             print(f"warning: {error}", file=sys.stderr)
 
-    def _say(self, ended: Ended, seconds: float) -> None:
-        done = len(self._jobs) - len(self._left)
-        line = f"[{done}/{len(self._jobs)}] {ended.cause:<13} {seconds:6.0f} s  {ended.name}"
-        line += f": {ended.line}" if ended.line else ""
-        print(line, file=sys.stderr, flush=True)
+
+def say(name: str, cause: str, seconds: float, told: str, done: int, of: int) -> None:
+    """Print how an attempt at a job ended."""
+    line = f"[{done}/{of}] {cause:<13} {seconds:6.0f} s  {name}" + (f": {told}" if told else "")
+    print(line, file=sys.stderr, flush=True)

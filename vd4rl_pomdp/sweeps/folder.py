@@ -4,11 +4,10 @@
                                  of its jobs, if one does), and the jobs of a grid: name, stage, folder, command, needs;
                                  GRID~*.json those of a grid of one's own, of a part of one, or of one with other
                                  settings
-    OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, step, slots, largest
-                                 (the most slots it could have had), host, words (of its command), sources (files of its
-                                 parts that are one's own)
+    OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, step, host, words (of
+                                 its command), sources (files of its parts that are one's own)
     OUT/sweep/logs/JOB.log
-    OUT/sweep/slurm/             what the Slurm executor keeps
+    OUT/sweep/slurm/, ray/       what the tasks of a cluster print
 
 Rows are appended whole, so that several drivers may share a folder. Whether a job is finished is never read here: its
 own folder says it.
@@ -23,6 +22,7 @@ import os
 import shlex
 import sys
 from collections.abc import Iterable
+from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -74,15 +74,18 @@ class SweepFolder:
         jobs = [replace(job, folder=plan.place(job.folder, self.out)) for plan in plans for job in plan.jobs]
         return list({job.name: job for job in jobs}.values())
 
-    def own_jobs(self) -> list[Job]:
+    def own_jobs(self, name: str = "") -> list[Job]:
         """The jobs of the plans that this process can carry out: of the program itself, or its own file's.
 
         Those of other files are told of in a warning each.
 
+        Args:
+            name: of the plan; empty: all of them.
+
         Raises:
             UserError: there is none, or the commands of one name other folders here than where it was made.
         """
-        plans, here = self._plans(), own_file()
+        plans, here = self._plans(name), own_file()
         own = [plan for plan in plans if not plan.own_file or same_file(plan.own_file, here)]
         others = dict.fromkeys(program_of(plan.own_file) for plan in plans if plan not in own)
         told = [f"`{program} sweep retry {shlex.quote(str(self.out))}`" for program in others]
@@ -106,8 +109,8 @@ class SweepFolder:
                     f"anew by `sweep run GRID --out {self.out}`"
                 )
 
-    def _plans(self) -> list[_Plan]:
-        if not (paths := self._plan_files()):
+    def _plans(self, name: str = "") -> list[_Plan]:
+        if not (paths := [path for path in self._plan_files() if name in ("", path.stem)]):
             raise UserError(f"{self.out}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one")
         return [_read_plan(path) for path in paths]
 
@@ -137,6 +140,12 @@ class SweepFolder:
                     raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
             finally:
                 os.close(handle)
+
+    def attempts_size(self) -> int:
+        """Bytes of the attempts' file: another number, further attempts."""
+        with suppress(OSError):
+            return self._attempts.stat().st_size
+        return 0
 
     def forget(self, job: str) -> None:
         """Have the job taken up as if it had never been tried."""

@@ -22,7 +22,12 @@ OwnFile = dict[str, str]
 """A main module by `multiprocessing`'s name for how it is found: a path, or a module's name; empty for none."""
 _PROGRAM = "vd4rl-pomdp"
 _PATH, _NAME = "init_main_from_path", "init_main_from_name"
-_WORKER = "vd4rl_pomdp.sweeps.worker"
+
+
+class _Loading:
+    """Whether a job's process is at importing its file."""
+
+    now = False
 
 
 def own_file() -> OwnFile:
@@ -40,7 +45,11 @@ def load(file: OwnFile) -> None:
         sys.path.insert(0, str(Path(file[_PATH]).parent))
     elif _NAME in file:  # which `python -m` found from there
         sys.path.insert(0, os.getcwd())
-    multiprocessing.spawn.prepare(dict(file))
+    _Loading.now = True
+    try:
+        multiprocessing.spawn.prepare(dict(file))
+    finally:
+        _Loading.now = False
     if file:
         sys.argv[0] = str(sys.modules["__main__"].__file__)
 
@@ -79,7 +88,7 @@ def parts_by_call(jobs: Iterable[Job]) -> Iterator[str]:
         yield from (part for part, origin in origins(dict(job.settings)).items() if origin == BY_CALL)
 
 
-def refuse_within_a_job() -> None:
-    """Raise UserError where the file starts the sweep anew when a job imports it."""
-    if getattr(sys.modules["__main__"].__spec__, "name", "") == _WORKER:
+def refuse_while_loading() -> None:
+    """Raise UserError where the file starts the sweep anew when a job's process imports it."""
+    if _Loading.now:
         raise UserError('a job cannot start a sweep: put the call that did below `if __name__ == "__main__":`')

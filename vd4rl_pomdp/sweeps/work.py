@@ -1,14 +1,16 @@
-"""A job as an executor gets it, and how its process says how it ended: by its exit code."""
+"""A job as an executor gets it, a task as a cluster does, and how a process says how it ended: by its exit code."""
 
 from __future__ import annotations
 
 import json
 import os
-import signal
+import socket
 import subprocess
 import sys
+import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Protocol
 
@@ -22,11 +24,14 @@ from vd4rl_pomdp.core.errors import (
     UnavailableError,
     UserError,
     WorkerDiedError,
+    disk_errors,
 )
-from vd4rl_pomdp.sweeps.oom import oom_kills
 
 FAILED = "failed"
 KILLED = WorkerDiedError.cause
+PATIENCE_S = 120.0
+"""Seconds that a job has to end in after SIGTERM: it finishes a step and writes a checkpoint."""
+POLL_S = 0.5
 _FIRST = 64
 _BEGINS = b"-- an attempt begins --\n"
 """What stands in a log before what an attempt prints."""
@@ -82,6 +87,59 @@ class Executor(Protocol):
         """Ask every job to end where nothing is lost, and wait for it."""
 
 
+class Cluster(Protocol):
+    """Where tasks run. They see the folders of runs and sets at the same paths."""
+
+    folder: Path
+    """For what tasks print."""
+    tasks: int
+    """The most at a time."""
+    jobs_per_task: int
+    """Jobs of a task at a time."""
+    threads: int
+    """CPU threads of a job; 0: its share of the task's cores."""
+
+    def live(self) -> int:
+        """How many tasks of this sweep wait or run; UnavailableError if the cluster does not answer."""
+
+    def submit(self, task: Task, number: int) -> None:
+        """Ask for tasks; UnavailableError if it may succeed later, UserError if it was refused."""
+
+    def stop(self) -> None:
+        """Take waiting tasks back, ask running ones to end where nothing is lost, and wait for them."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a task does: `sweep join` in a process of its own, which ends when the task is asked to."""
+
+    work: Work
+    cwd: str
+    """In which relative paths begin."""
+
+    def run(self, asked: list[int]) -> Ended:
+        """Wait for the process, and end it in peace once a signal is in `asked`, or at a KeyboardInterrupt.
+
+        Raises:
+            UserError: this machine does not have the folder, or the log's disk takes nothing now.
+        """
+        here = socket.gethostname()
+        try:
+            os.chdir(self.cwd)
+        except OSError as error:
+            raise UserError(f"{self.cwd}: not on node {here}; use a disk that all nodes share") from error
+        work = replace(self.work, log=self.work.log / f"{here}-{os.getpid()}.log")
+        with disk_errors(work.log):
+            process = start_process(work, {})
+        with suppress(KeyboardInterrupt):  # as which Ray's cancellation arrives
+            while process.poll() is None and not asked:
+                time.sleep(POLL_S)
+        if process.poll() is None:
+            process.terminate()
+            wait_or_kill(process, PATIENCE_S + 10 * POLL_S)
+        return ended(work, process.returncode)
+
+
 def start_process(work: Work, environment: Mapping[str, str], cores: Sequence[int] = ()) -> subprocess.Popen:
     """Start the process that does a job and appends to its log.
 
@@ -125,20 +183,16 @@ def code_of(cause: str) -> int:
     return 0 if cause == DONE else _FIRST + CAUSES.index(cause)
 
 
-def ended(work: Work, code: int, oom_kills_before: int | None = None) -> Ended:
+def ended(work: Work, code: int) -> Ended:
     """How a job's process ended.
 
     Args:
         work: the job.
         code: its exit code, negative for a signal, as `subprocess` has it.
-        oom_kills_before: `oom_kills()` when it began; None: not known.
     """
     if code == 0:
         return Ended(work.name, DONE, "")
     told = CAUSES[code - _FIRST] if _FIRST <= code < _FIRST + len(CAUSES) else None
-    killed = code == -signal.SIGKILL or told == KILLED  # the job itself, or a worker of it
-    if killed and oom_kills_before is not None and oom_kills() > oom_kills_before:
-        return Ended(work.name, OutOfMemoryError.cause, "the kernel killed it for want of memory")
     return Ended(work.name, told or (KILLED if code < 0 else FAILED), last_line(work.log))
 
 

@@ -11,14 +11,12 @@ from pathlib import Path
 
 import pytest
 
-from tests.sweeps.executors.waiting import begun, run, until, waiting_job, work_of
+from tests.sweeps.executors.waiting import begun, driver, until, waiting_job
 from vd4rl_pomdp.core.errors import UnavailableError, UserError
 from vd4rl_pomdp.runs.ownership import in_use
-from vd4rl_pomdp.sweeps.driver import Driver
 from vd4rl_pomdp.sweeps.executors import ray as module
-from vd4rl_pomdp.sweeps.executors.ray import RayExecutor, RayOptions
-from vd4rl_pomdp.sweeps.folder import SweepFolder
-from vd4rl_pomdp.sweeps.work import DONE, INTERRUPTED, KILLED, Ended, Work
+from vd4rl_pomdp.sweeps.executors.ray import RayCluster, RayOptions
+from vd4rl_pomdp.sweeps.work import Task, Work
 
 ray_is_there = pytest.importorskip("ray")
 NODE = {"num_cpus": 2, "object_store_memory": 80 * 2**20, "include_dashboard": False}
@@ -41,8 +39,7 @@ def cluster():
 
 
 @pytest.fixture
-def options(cluster, monkeypatch) -> RayOptions:
-    monkeypatch.setattr(module, "NODES_S", 0.0)
+def options(cluster) -> RayOptions:
     return RayOptions(address=cluster.address, cpus=1, gpus=0)
 
 
@@ -59,7 +56,7 @@ def test_a_cluster_that_does_not_answer_is_one_line(silent, monkeypatch, closed)
     monkeypatch.setattr(module, "CONNECT_S", 1.0)
     address = "127.0.0.1:9" if closed else silent  # the port of a service that nobody runs
     with pytest.raises(UnavailableError, match=f"no Ray cluster answers at --address {address} within 1 s"):
-        RayExecutor(RayOptions(address=address))
+        RayCluster(RayOptions(address=address), Path())
 
 
 def test_a_signal_while_a_cluster_is_waited_for_ends_the_command(silent, tmp_path):
@@ -86,75 +83,49 @@ def _words_of(process: str) -> bytes:
         return b""
 
 
-def test_jobs_share_gpus_and_a_cancelled_one_ends_in_peace(options, tmp_path):
+def test_tasks_fill_the_nodes_and_a_gpu_may_be_shared(options):
     before = signal.getsignal(signal.SIGTERM)
-    assert (RayExecutor(options).slots, RayExecutor(options).largest) == (4, 2)
-    assert RayExecutor(replace(options, jobs=1)).largest == 1, "no job may wait for more than there will ever be"
+    assert RayCluster(options, Path()).tasks == 4
+    assert RayCluster(replace(options, cpus=0.5, gpus=0.25), Path()).tasks == 4
+    assert RayCluster(replace(options, gpus=2, jobs=3), Path()).tasks == 3
     assert signal.getsignal(signal.SIGTERM) is before
-    executor = RayExecutor(replace(options, cpus=0.5, gpus=0.25))
-    assert (executor.slots, executor.largest) == (4, 4)
-    small, large, waiting = (waiting_job(tmp_path, name) for name in ("small", "large", "waiting"))
-    executor.start(work_of(small))
-    executor.start(work_of(large, 3))
-    assert not executor.fits(1)
-    until(lambda: begun(small) and begun(large))  # before the third, which Ray might else place ahead of the large one
-    executor.start(work_of(waiting))  # which Ray keeps until there is room
-    (seen,) = begun(small)
-    assert (seen["CUDA_VISIBLE_DEVICES"], seen["OMP_NUM_THREADS"], seen["cwd"]) == ("0", "1", os.getcwd())
-    (small.folder / "go").touch()
-    assert [(ended.name, ended.cause) for ended in run(executor, 1)] == [("small", DONE)]
-    until(lambda: begun(waiting))
-    executor.stop()
-    assert {(ended.name, ended.cause) for ended in run(executor, 2)} == {
-        ("large", INTERRUPTED),
-        ("waiting", INTERRUPTED),
-    }
-    assert "terminated" in work_of(large).log.read_text()
-
-
-def test_a_job_that_cannot_be_found_is_refused_and_a_task_that_fails_has_failed(options, tmp_path, monkeypatch):
-    executor = RayExecutor(options)
-    executor.start(Work("none", ("pretrain", "--method", "none"), tmp_path / "none.log"))
-    (ended,) = run(executor, 1)
-    assert (ended.cause, "unknown method 'none'" in ended.line) == ("refused", True)
-    monkeypatch.setattr(os, "getcwd", lambda: "/nowhere")
-    executor.start(Work("lost", ("list",), tmp_path / "lost.log"))
-    (ended,) = run(executor, 1)
-    assert (ended.cause, "use a disk that all nodes share" in ended.line) == ("refused", True)
-
-
-def test_a_cluster_without_room_for_a_job_is_refused(options):
     with pytest.raises(UserError, match="no node of the Ray cluster has 1 CPUs and 2 GPUs"):
-        RayExecutor(replace(options, gpus=2))
-    assert RayExecutor(replace(options, gpus=2, jobs=3)).slots == 3
+        RayCluster(replace(options, gpus=2), Path())
     with pytest.raises(UserError, match="whole number"):
         RayOptions(gpus=1.5).check()
+
+
+def test_a_node_without_the_folder_is_told(options, tmp_path, capsys):
+    made = RayCluster(options, tmp_path)
+    made.submit(Task(Work("join", ("list",), tmp_path), "/nowhere"), 1)
+    until(lambda: not made.live())
+    assert "use a disk that all nodes share" in capsys.readouterr().err
 
 
 def test_without_ray_one_is_told_what_to_install(monkeypatch):
     monkeypatch.setitem(sys.modules, "ray", None)
     with pytest.raises(UserError, match=r"needs Ray: pip install '\.\[ray\]' in a clone"):
-        RayExecutor(RayOptions())
+        RayCluster(RayOptions(), Path())
 
 
-def test_all_is_finished_although_a_node_dies(cluster, options, tmp_path):
+def test_all_is_finished_although_a_node_dies_and_a_driver_that_is_stopped_ends_its_jobs(cluster, tmp_path):
     """The last test, since the node does not come back."""
     jobs = [waiting_job(tmp_path, f"job{number}") for number in range(4)]
-    executor = RayExecutor(options)
-    ended, nodes, history = executor.ended, list(cluster.worker_nodes), SweepFolder(tmp_path)
-
-    def interfere() -> list[Ended]:
-        """Kill a node while all jobs run, and let them end once it is known which of them that killed."""
-        if nodes and all(begun(job) for job in jobs):
-            cluster.remove_node(nodes.pop(), allow_graceful=False)
-        killed = history.attempts()
-        if killed and not any(in_use(tmp_path / name) for name in killed):
-            (tmp_path / "go").touch()
-        return ended()
-
-    executor.ended = interfere
-    assert Driver(jobs, executor, history).run()
-    assert nodes == []
-    causes = {name: [row["cause"] for row in rows] for name, rows in history.attempts().items()}
-    assert sorted(told[0] for told in causes.values()) == [DONE, DONE, KILLED, KILLED]
-    assert {told[-1] for told in causes.values()} == {DONE}  # "in use" between, where the killed were slow to go
+    command = driver("ray", tmp_path, 4, address=cluster.address, cpus=1, gpus=0)
+    process = subprocess.Popen(command, env=os.environ)
+    try:
+        until(lambda: all(begun(job) for job in jobs))
+        (seen,) = begun(jobs[0])
+        assert (seen["OMP_NUM_THREADS"], seen["cwd"]) == ("1", os.getcwd())
+        process.terminate()
+        assert process.wait(200) != 0
+        assert not any(in_use(job.folder) for job in jobs)
+        process = subprocess.Popen(command, env=os.environ)
+        until(lambda: all(len(begun(job)) == 2 for job in jobs))
+        cluster.remove_node(next(iter(cluster.worker_nodes)), allow_graceful=False)
+        (jobs[0].folder / "go").touch()
+        until(lambda: jobs[0].finished)
+        (tmp_path / "go").touch()
+        assert process.wait(200) == 0
+    finally:
+        process.kill()

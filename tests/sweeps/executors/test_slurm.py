@@ -1,27 +1,18 @@
-"""Jobs on a real Slurm of one node: arrays, allocations that are used again, requeue, and drivers that are killed."""
+"""A sweep on a real Slurm of one node: tasks share the jobs, are replaced, and outlive a driver that is killed."""
 
 import os
 import signal
 import subprocess
-import sys
-import time
-from dataclasses import replace
 
 import pytest
 
 from tests.sweeps.executors.slurm_cluster import slurm, why_not
-from tests.sweeps.executors.waiting import begun, run, until, waiting_job, work_of
-from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.sweeps.executors import slurm as module
-from vd4rl_pomdp.sweeps.executors.slurm import SlurmExecutor
-from vd4rl_pomdp.sweeps.executors.slurm_queue import SlurmOptions
+from tests.sweeps.executors.waiting import begun, driver, until, waiting_job
 from vd4rl_pomdp.sweeps.folder import SweepFolder
-from vd4rl_pomdp.sweeps.work import DONE, INTERRUPTED, KILLED
+from vd4rl_pomdp.sweeps.work import INTERRUPTED
 
 pytestmark = pytest.mark.skipif(bool(why_not()), reason=why_not())
-SETTLED_S = 5.0
-"""Time for Slurm to hear how an interrupted task's script ended: told of it after the new start, it fails the task."""
-OPTIONS = SlurmOptions(time=30, gpus=0, cpus=2, tasks=4)
+OPTIONS = {"time": 30, "gpus": 0, "cpus": 2, "tasks": 4}
 
 
 @pytest.fixture(scope="module")
@@ -35,15 +26,19 @@ def out(cluster, tmp_path, monkeypatch):
     """Folder of a sweep, on a machine with the cluster."""
     monkeypatch.setenv("SLURM_CONF", str(cluster))
     monkeypatch.setenv("PYTHONPATH", os.getcwd())
-    for name, seconds in {"QUEUE_S": 0.5, "IDLE_S": 4.0}.items():
-        monkeypatch.setattr(module, name, seconds)
     yield tmp_path / "out"
     subprocess.run(["scancel", "--me"], check=True)
     until(lambda: not queue())
 
 
-def make(out, **changes) -> SlurmExecutor:
-    return SlurmExecutor(replace(OPTIONS, **changes), out / "sweep" / "slurm")
+@pytest.fixture
+def start(out, request):
+    def started(number: int, **changes: object) -> subprocess.Popen:
+        process = subprocess.Popen(driver("slurm", out, number, **OPTIONS | changes), stderr=subprocess.PIPE, text=True)
+        request.addfinalizer(process.kill)
+        return process
+
+    return started
 
 
 def queue() -> list[str]:
@@ -54,94 +49,54 @@ def queue() -> list[str]:
     return told.stdout.split()
 
 
-def test_what_starts_together_is_one_array_of_tasks_with_several_jobs_each_and_free_places_are_used_again(out):
-    jobs = [waiting_job(out, f"job{number}") for number in range(4)]
-    executor = make(out, jobs_per_task=2)
-    for job in jobs[:3]:
-        executor.start(work_of(job))
-    assert executor.slots == 8
-    run(executor, 0)
-    assert sorted(name.partition("_")[2] for name in queue()) == ["0", "1"]
-    until(lambda: all(begun(job) for job in jobs[:3]))  # at the same time: none of them may end yet
-    executor.start(work_of(jobs[3]))
-    until(lambda: begun(jobs[3]))
+def causes(out) -> dict[str, list[str]]:
+    return {name: [row["cause"] for row in rows] for name, rows in SweepFolder(out).attempts().items()}
+
+
+def test_tasks_share_the_jobs_of_a_sweep_and_a_cancelled_one_is_replaced(out, start):
+    jobs = [waiting_job(out, f"job{number}") for number in range(3)]
+    process = start(3, jobs_per_task=2)
+    until(lambda: all(begun(job) for job in jobs))
     assert len(queue()) == 2
+    subprocess.run(["scancel", queue()[0]], check=True)
+    until(lambda: sum(len(begun(job)) for job in jobs) > 3)
     (out / "go").touch()
-    found = run(executor, 4)
-    assert {ended.name: ended.cause for ended in found} == {job.name: DONE for job in jobs}
-    executor.stop()
-    assert queue() == []
+    process.communicate(timeout=200)
+    assert process.returncode == 0, "all is finished"
+    until(lambda: not queue())
 
 
-@pytest.mark.parametrize("how", ["scontrol requeue", "scancel --signal=USR2"])
-def test_a_task_that_slurm_interrupts_starts_again_with_its_jobs(out, how):
-    """The second is what Slurm sends before the time limit."""
-    job, executor = waiting_job(out, "job"), make(out)
-    executor.start(work_of(job))
-    run(executor, 0)
+def test_a_task_before_its_time_limit_and_a_driver_that_is_stopped_end_in_peace(out, start):
+    (job,) = jobs = [waiting_job(out, "job0")]
+    process = start(1)
     until(lambda: begun(job))
-    subprocess.run([*how.split(), *queue()], check=True)
-    update = ["scontrol", "update", "StartTime=now", f"JobId={queue()[0]}"]  # Slurm has it wait else
-    settled = time.monotonic() + SETTLED_S
-
-    def hurry(found):
-        if time.monotonic() > settled:
-            subprocess.run(update, capture_output=True, check=False)
-        if len(begun(job)) == 2:
-            (out / "go").touch()
-
-    assert [ended.cause for ended in run(executor, 1, hurry)] == [DONE]
-    assert len(begun(job)) == 2
-    assert "terminated" in work_of(job).log.read_text()
-
-
-def test_what_is_stopped_ends_in_peace_and_what_is_cancelled_was_killed(out):
-    running, waiting, cancelled = (waiting_job(out, name) for name in ("running", "waiting", "cancelled"))
-    executor = make(out, cpus=8)
-    executor.start(work_of(cancelled))
-    run(executor, 0)
-    until(lambda: begun(cancelled))
-    subprocess.run(["scancel", *queue()], check=True)
-    (ended,) = run(executor, 1)
-    assert (ended.cause, "CANCELLED" in ended.line) == (KILLED, True)
-    executor.start(work_of(running))
-    run(executor, 0)
-    until(lambda: begun(running))
-    executor.start(work_of(waiting))
-    run(executor, 0)
-    executor.stop()
+    subprocess.run(["scancel", "--signal=USR2", *queue()], check=True)  # what Slurm sends before the limit
+    until(lambda: len(begun(job)) == 2)
+    process.terminate()
+    process.communicate(timeout=200)
     assert queue() == []
-    assert {ended.name: ended.cause for ended in run(executor, 2)} == {"running": INTERRUPTED, "waiting": INTERRUPTED}
-    assert not begun(waiting)
+    assert causes(out) == {job.name: [INTERRUPTED, INTERRUPTED] for job in jobs}
 
 
-def test_a_new_driver_waits_for_what_a_killed_one_has_running_and_in_the_queue(out, request):
-    def start_driver():
-        driver = subprocess.Popen([sys.executable, "-m", "tests.sweeps.executors.waiting", str(out), "2"])
-        request.addfinalizer(driver.kill)
-        return driver
-
-    driver = start_driver()
-    until(lambda: len(queue()) == 2)  # of which the machine takes one at a time
-    until(lambda: begun(waiting_job(out, "job0")))
-    os.kill(driver.pid, signal.SIGKILL)
-    driver.wait()
-    driver = start_driver()
-    until(lambda: (out / "sweep" / "slurm").is_dir())
+def test_a_new_driver_finds_the_tasks_of_a_killed_one(out, start):
+    jobs = [waiting_job(out, f"job{number}") for number in range(2)]
+    process = start(2, cpus=8)  # of which the machine takes one task at a time
+    until(lambda: any(begun(job) for job in jobs))
+    until(lambda: len(queue()) == 2)
+    os.kill(process.pid, signal.SIGKILL)
+    process.wait()
+    before, process = queue(), start(2, cpus=8)
     (out / "go").touch()
-    assert driver.wait(150) == 0
-    assert [len(begun(waiting_job(out, name))) for name in ("job0", "job1")] == [1, 1]
-    assert len(list((out / "sweep" / "slurm").iterdir())) == 1
-    assert {row["cause"] for rows in SweepFolder(out).attempts().values() for row in rows} == {DONE}
+    process.communicate(timeout=200)
+    assert process.returncode == 0
+    assert set(queue()) <= set(before)
+    assert [len(begun(job)) for job in jobs] == [1, 1]
 
 
-def test_an_array_that_slurm_refuses_is_one_line_and_a_later_one_is_tried_again(out, capsys):
-    executor = make(out, partition="none")
-    executor.start(work_of(waiting_job(out, "job")))
-    with pytest.raises(UserError, match=r"Slurm took no array .*partition"):
-        executor.ended()
-    executor._accepted = True
-    assert executor.ended() == []
-    assert "trying again in 60 s" in capsys.readouterr().err
-    executor.stop()
+def test_an_array_that_slurm_refuses_is_one_line(out, start):
+    process = start(1, partition="none")
+    told = process.communicate(timeout=200)[1]
+    assert process.returncode == 1
+    assert "UserError: Slurm took no array" in told.splitlines()[-1]
+    assert "partition" in told.splitlines()[-1]
     assert queue() == []

@@ -1,6 +1,6 @@
 """Jobs that take as long as a test wants: real commands that read a grid in Python, which waits for a file.
 
-`python -m tests.sweeps.executors.waiting OUT N` is a driver on Slurm of N such jobs.
+`python -m tests.sweeps.executors.waiting KIND OUT N '{"options": ...}'` is a driver of N such jobs on a cluster.
 """
 
 import json
@@ -10,10 +10,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.sweeps.driver import Driver
+from vd4rl_pomdp.sweeps import cluster as module
+from vd4rl_pomdp.sweeps.executors import CLUSTERS, EXECUTORS
 from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.plan import Job
-from vd4rl_pomdp.sweeps.work import Ended, Executor, Work
 
 GRID = """
 import json, os, time
@@ -29,7 +29,7 @@ with owned(here):
     (here / "provenance.json").write_text("{}")
 GRID = {"collect": {"task": "walker_walk", "quality": "expert"}}
 """
-PATIENCE_S = 150.0
+PATIENCE_S = 200.0
 
 
 def waiting_job(out: Path, name: str) -> Job:
@@ -40,10 +40,6 @@ def waiting_job(out: Path, name: str) -> Job:
         (folder / "grid.py").write_text(GRID)
     words = ("sweep", "run", str(folder / "grid.py"), "--out", str(folder / "runs"), "--dry-run")
     return Job(name, "collect", folder, words)
-
-
-def work_of(job: Job, slots: int = 1) -> Work:
-    return SweepFolder(job.folder.parent).work(job, slots)
 
 
 def begun(job: Job) -> list[Row]:
@@ -60,29 +56,22 @@ def until(holds: Callable[[], object]) -> None:
         time.sleep(0.05)
 
 
-def run(
-    executor: Executor, number: int, meanwhile: Callable[[list[Ended]], object] = lambda found: None
-) -> list[Ended]:
-    """Wait until so many jobs have ended; how."""
-    found: list[Ended] = []
-
-    def enough() -> bool:
-        found.extend(executor.ended())
-        meanwhile(found)
-        return len(found) >= number
-
-    until(enough)
-    return found
+def driver(kind: str, out: Path, number: int, **options: object) -> list[str]:
+    """The command of a driver of so many waiting jobs."""
+    return [sys.executable, "-m", "tests.sweeps.executors.waiting", kind, str(out), str(number), json.dumps(options)]
 
 
 def main() -> None:
-    from vd4rl_pomdp.sweeps.executors import slurm
+    from vd4rl_pomdp.runs import interrupt
 
-    out, number = Path(sys.argv[1]), int(sys.argv[2])
-    slurm.QUEUE_S, slurm.IDLE_S = 1.0, 4.0
-    options = slurm.SlurmOptions(time=30, gpus=0, cpus=8)
-    jobs = [waiting_job(out, f"job{index}") for index in range(number)]
-    sys.exit(not Driver(jobs, slurm.SlurmExecutor(options, out / "sweep" / "slurm"), SweepFolder(out)).run())
+    kind, out, options = sys.argv[1], Path(sys.argv[2]), json.loads(sys.argv[4])
+    module.LOOK_S = 1.0
+    jobs = [waiting_job(out, f"job{index}") for index in range(int(sys.argv[3]))]
+    folder = SweepFolder(out)
+    folder.keep_plan("waiting", jobs)
+    with interrupt.handled():
+        made = CLUSTERS[kind](EXECUTORS[kind](**options), folder.of_executor(kind))
+        sys.exit(not module.watch(jobs, made, folder, "waiting"))
 
 
 if __name__ == "__main__":

@@ -12,11 +12,7 @@ from typing import ClassVar
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import Limits, Options
-from vd4rl_pomdp.sweeps.oom import oom_kills
-from vd4rl_pomdp.sweeps.work import Ended, Work, ended, start_process, wait_or_kill
-
-PATIENCE_S = 120.0
-"""Seconds that a job has to end in after SIGTERM: it finishes a step and writes a checkpoint."""
+from vd4rl_pomdp.sweeps.work import PATIENCE_S, Ended, Work, ended, start_process, wait_or_kill
 
 
 @dataclass(frozen=True)
@@ -27,8 +23,10 @@ class LocalOptions(Options):
     """Jobs at a time on this machine; 0: as many as its GPUs take, or one without a GPU."""
     jobs_per_gpu: int = 1
     """Jobs at a time on each GPU."""
+    threads: int = 0
+    """CPU threads of a job; 0: its share of the machine's cores."""
 
-    limits: ClassVar[Limits] = {"jobs": (0, 1024), "jobs_per_gpu": (1, 64)}
+    limits: ClassVar[Limits] = {"jobs": (0, 1024), "jobs_per_gpu": (1, 64), "threads": (0, 4096)}
 
 
 @dataclass(frozen=True)
@@ -45,8 +43,6 @@ class _Running:
     work: Work
     places: list[Place]
     process: subprocess.Popen
-    oom_kills: int
-    """When it began."""
 
 
 class LocalExecutor:
@@ -54,7 +50,7 @@ class LocalExecutor:
 
     def __init__(self, options: LocalOptions) -> None:
         """See the class."""
-        self._free = _places(options)
+        self._free, self._threads = _places(options), options.threads
         self.slots = len(self._free)
         self.largest = max(Counter(place.gpu for place in self._free).values())
         self._running: list[_Running] = []
@@ -75,13 +71,13 @@ class LocalExecutor:
         """Begin a job that fits."""
         chosen = self._choose(work.slots)
         cores = sorted({core for place in chosen for core in place.cores})
-        environment = {"OMP_NUM_THREADS": str(max(1, len(cores)))}
+        environment = {"OMP_NUM_THREADS": str(self._threads or max(1, len(cores)))}
         if chosen[0].gpu is not None:
             environment["CUDA_VISIBLE_DEVICES"] = chosen[0].gpu
-        before, process = oom_kills(), start_process(work, environment, cores)
+        process = start_process(work, environment, cores)
         for place in chosen:
             self._free.remove(place)
-        self._running.append(_Running(work, chosen, process, before))
+        self._running.append(_Running(work, chosen, process))
 
     def ended(self) -> list[Ended]:
         """What has ended since the last call."""
@@ -89,7 +85,7 @@ class LocalExecutor:
         for job in over:
             self._running.remove(job)
             self._free += job.places
-        return [ended(job.work, job.process.returncode, job.oom_kills) for job in over]
+        return [ended(job.work, job.process.returncode) for job in over]
 
     def stop(self) -> None:
         """Ask every job to end where nothing is lost, and wait for it."""

@@ -1,32 +1,25 @@
-"""Jobs as tasks of a Ray cluster that is there already: each task starts the process of a job on its node.
+"""Tasks of a sweep on a Ray cluster that is there already.
 
-Ray chooses nodes and GPUs; whether an attempt is followed by another one is the driver's business, so that Ray itself
-tries nothing again. A task ends with its driver, and the process of its job with the task.
+Ray chooses nodes and GPUs, and ends a task with the driver that asked for it. It tries nothing again itself.
 """
 
 from __future__ import annotations
 
 import logging
-import os
 import signal
 import subprocess
 import sys
 import threading
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, ClassVar
 
-from vd4rl_pomdp.core.errors import OutOfMemoryError, UnavailableError, UserError, disk_errors
+from vd4rl_pomdp.core.errors import UnavailableError, UserError
 from vd4rl_pomdp.core.options import Limits, Options
-from vd4rl_pomdp.sweeps.executors.local import PATIENCE_S
-from vd4rl_pomdp.sweeps.oom import oom_kills
-from vd4rl_pomdp.sweeps.work import FAILED, INTERRUPTED, KILLED, Ended, Work, ended, start_process, wait_or_kill
+from vd4rl_pomdp.sweeps.work import PATIENCE_S, Ended, Task
 
-NODES_S = 5.0
-"""Seconds between two looks at which nodes there are."""
-POLL_S = 0.2
 CONNECT_S = 30.0
 """Seconds that a cluster has to answer a process that connects."""
 
@@ -53,121 +46,75 @@ class RayOptions(Options):
             raise UserError(f"--gpus is {self.gpus}; above 1 it must be a whole number")
 
 
-class RayExecutor:
-    """Tasks of a cluster."""
+class RayCluster:
+    """A sweep's tasks on a Ray cluster, each with one job at a time."""
 
-    def __init__(self, options: RayOptions) -> None:
+    jobs_per_task = 1
+
+    def __init__(self, options: RayOptions, folder: Path) -> None:
         """Connect to the cluster.
 
         Raises:
             UnavailableError: the cluster does not answer.
             UserError: Ray is missing, there is no cluster, or none of its nodes has room for a job.
         """
-        self._ray = _connected(options.address)
-        self._options = options
-        self._running: dict[Any, Work] = {}
-        self._until, self._rooms = 0.0, [0]
-        if not options.jobs and not self.slots:
+        self._ray, self._options, self.folder = _connected(options.address), options, folder
+        self.threads = max(1, int(options.cpus))
+        self._running: list[Any] = []
+        if not self.tasks:
             self._ray.shutdown()
             raise UserError(
                 f"no node of the Ray cluster has {options.cpus:.15g} CPUs and {options.gpus:.15g} GPUs: lower --cpus "
                 "or --gpus, or say with --jobs how many jobs the cluster is to grow for"
             )
-        self._task = self._ray.remote(max_retries=0)(attempt)
 
     @property
-    def slots(self) -> int:
-        """Jobs at a time."""
-        return self._options.jobs or sum(self._room())
+    def tasks(self) -> int:
+        """What was asked for, or what the nodes take that are there now."""
+        wanted = {"CPU": self._options.cpus, "GPU": self._options.gpus}
+        nodes = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
+        rooms = (min(int(one.get(name, 0) / share) for name, share in wanted.items() if share) for one in nodes)
+        return self._options.jobs or sum(rooms)
 
-    @property
-    def largest(self) -> int:
-        """The most slots that share a memory: a GPU's, or a node's."""
-        shared = int(1 / self._options.gpus) if self._options.gpus else max(self._room())
-        return max(1, min(self.slots, shared))
+    def live(self) -> int:
+        """How many tasks wait or run. One that failed says why."""
+        over, self._running = (
+            self._ray.wait(self._running, num_returns=len(self._running), timeout=0) if (self._running) else ([], [])
+        )
+        for task in over:
+            try:
+                self._ray.get(task)
+            except self._ray.exceptions.RayError as error:
+                print(f"warning: a task ended ({_line(getattr(error, 'cause', None) or error)})", file=sys.stderr)
+        return len(self._running)
 
-    def fits(self, slots: int) -> bool:
-        """Whether so many slots wait for a job."""
-        return sum(work.slots for work in self._running.values()) + slots <= self.slots
-
-    def start(self, work: Work) -> None:
-        """Begin a job that fits; Ray finds the node."""
-        options, slots = self._options, work.slots
-        task = self._task.options(num_cpus=slots * options.cpus, num_gpus=slots * options.gpus, name=work.name)
-        self._running[task.remote(work, max(1, int(slots * options.cpus)), os.getcwd())] = work
-
-    def ended(self) -> list[Ended]:
-        """What has ended since the last call."""
-        if not self._running:
-            return []
-        over, _ = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=0)
-        return [self._end(task, self._running.pop(task)) for task in over]
-
-    def _end(self, task: Any, work: Work) -> Ended:
-        errors = self._ray.exceptions
-        try:
-            return self._ray.get(task)
-        except errors.TaskCancelledError:
-            return Ended(work.name, INTERRUPTED, "ended before its process was")
-        except errors.OutOfMemoryError as error:
-            return Ended(work.name, OutOfMemoryError.cause, _line(error))
-        except errors.RayTaskError as error:
-            cause = error.cause
-            return Ended(work.name, getattr(cause, "cause", FAILED), _line(cause))
-        except errors.RayError as error:  # a node or a process of Ray's is gone
-            return Ended(work.name, KILLED, _line(error))
+    def submit(self, task: Task, number: int) -> None:
+        """Start tasks; Ray finds their nodes."""
+        run = self._ray.remote(max_retries=0)(_run)
+        run = run.options(num_cpus=self._options.cpus, num_gpus=self._options.gpus, name=str(self.folder))
+        self._running += [run.remote(task) for _ in range(number)]
 
     def stop(self) -> None:
-        """Ask every job to end where nothing is lost, and wait for it."""
+        """Cancel what waits, ask every task to end where nothing is lost, and wait for it."""
         for task in self._running:
             self._ray.cancel(task)
         if self._running:
-            _, left = self._ray.wait(list(self._running), num_returns=len(self._running), timeout=PATIENCE_S + 10)
+            _, left = self._ray.wait(self._running, num_returns=len(self._running), timeout=PATIENCE_S + 10)
             for task in left:
                 self._ray.cancel(task, force=True)
 
-    def _room(self) -> list[int]:
-        """How many jobs every node takes."""
-        if time.monotonic() > self._until:
-            alive = [node["Resources"] for node in self._ray.nodes() if node["Alive"]]
-            self._rooms = [self._room_of(resources) for resources in alive] or [0]
-            self._until = time.monotonic() + NODES_S
-        return self._rooms
 
-    def _room_of(self, resources: dict[str, float]) -> int:
-        wanted = {"CPU": self._options.cpus, "GPU": self._options.gpus}
-        return min(int(resources.get(name, 0) / amount) for name, amount in wanted.items() if amount)
-
-
-def attempt(work: Work, threads: int, folder: str) -> Ended:
-    """What a task does on its node: start the process of a job, and end it if the task is cancelled.
-
-    Args:
-        work: the job.
-        threads: how many it may use.
-        folder: the driver's, in which relative paths begin.
-
-    Raises:
-        UserError: this node does not have the folder, or the log's disk takes nothing now.
-    """
-    try:
-        os.chdir(folder)
-    except OSError as error:
-        raise UserError(f"{folder}: not on node {os.uname().nodename}; use a disk that all nodes share") from error
-    before = oom_kills()
-    with disk_errors(work.log):
-        process = start_process(work, {"OMP_NUM_THREADS": str(threads)})
-    try:
-        while process.poll() is None:
-            time.sleep(POLL_S)
-    except KeyboardInterrupt:  # as which a cancellation arrives
-        process.terminate()
-        wait_or_kill(process, PATIENCE_S)
-    return ended(work, process.returncode, before)
+def _run(task: Task) -> Ended:
+    return task.run([])
 
 
 def _connected(address: str) -> Any:
-    """Ray, connected to a cluster."""
+    """Ray, connected to a cluster.
+
+    Raises:
+        UnavailableError: it does not answer.
+        UserError: Ray is missing, or there is no cluster.
+    """
     try:
         import ray
     except ImportError as error:

@@ -1,284 +1,203 @@
-"""Jobs as tasks of Slurm arrays, submitted by submitit: each task is an allocation in which several jobs run at a time.
-
-An array is known by its job name, which is also the name of its folder. The folder is written before the array is
-submitted, and the queue says whether the array is there; so a driver that is started anew finds what an earlier one has
-submitted, also what still waits in the queue, and waits for it instead of submitting it twice.
-"""
+"""Tasks of a sweep as arrays of Slurm, submitted by submitit; the queue knows them by a name that the folder gives."""
 
 from __future__ import annotations
 
+import hashlib
+import shutil
+import signal
+import subprocess
 import sys
+import threading
 import time
 from collections.abc import Iterator
-from contextlib import suppress
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
-from secrets import token_hex
+from typing import Any, ClassVar
 
-from vd4rl_pomdp.core.errors import OutOfMemoryError, UnavailableError, UserError, disk_errors
+from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors
+from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.runs import interrupt
-from vd4rl_pomdp.sweeps.executors.allocation import IDLE_S, Allocation
-from vd4rl_pomdp.sweeps.executors.handover import Handover
-from vd4rl_pomdp.sweeps.executors.local import PATIENCE_S
-from vd4rl_pomdp.sweeps.executors.slurm_queue import (
-    PREFIX,
-    QUEUE_S,
-    Queue,
-    SlurmOptions,
-    TaskState,
-    cancel,
-    read_queue,
-    require_slurm,
-    submit,
-)
-from vd4rl_pomdp.sweeps.work import FAILED, INTERRUPTED, KILLED, Ended, Work, last_line
+from vd4rl_pomdp.sweeps.work import PATIENCE_S, Task
 
-FILES_S = 1.0
-"""Seconds between two looks at the files that tell how jobs ended; the queue is asked less often."""
-AGAIN_S = 60.0
-"""Seconds until an array is submitted again that Slurm did not take."""
-_GONE = "gone"
-"""TaskState of a task that the queue does not know."""
+ANSWER_S, LAST_ANSWER_S = 30.0, 10.0
+"""Seconds that a command of Slurm's has, and what it has once a signal has asked for the end."""
+SPARE_S = 15.0
+"""Seconds that the end of a task takes beside that of its jobs."""
+POLL_S = 1.0
 _USUAL = ("None", "Priority", "Resources", "BeginTime", "Cleaning", "JobArrayTaskLimit")
 """What a task waits for that comes by itself."""
-OVER = {
-    **dict.fromkeys(("BOOT_FAIL", "CANCELLED", "DEADLINE", "NODE_FAIL", "PREEMPTED", "TIMEOUT", _GONE), KILLED),
-    **{"COMPLETED": INTERRUPTED, "FAILED": FAILED, "OUT_OF_MEMORY": OutOfMemoryError.cause},
-}
-"""Slurm's states of a task that has ended, and why the jobs in it did that have not told themselves. A task that ends
-in peace with jobs left was asked to."""
-_UNKNOWN = TaskState(_GONE, "unknown")
 
 
-@dataclass(eq=False)
-class _Task:
-    """A task of an array, as far as this driver knows."""
+@dataclass(frozen=True)
+class SlurmOptions(Options):
+    """Options of the Slurm executor; an array task is one allocation of sbatch."""
 
-    array: Handover
-    number: int
-    places: int
-    left: dict[str, Work] = field(default_factory=dict)
-    """Attempts that have not ended."""
-    mine: dict[str, str] = field(default_factory=dict)
-    """Those of them that this driver waits for: attempts by job."""
-    busy: float = field(default_factory=time.monotonic)
-    """When it last had something to do."""
+    partition: str | None = None
+    """Partition of the tasks; default: the cluster's."""
+    account: str | None = None
+    """Account that pays."""
+    qos: str | None = None
+    """Quality of service."""
+    constraint: str | None = None
+    """Features that the nodes must have: "a100|h100"."""
+    time: int = 240
+    """Time limit of a task, minutes; jobs that it cuts resume in another task."""
+    gpus: int = 1
+    """GPUs of a task."""
+    cpus: int = 8
+    """CPU cores of a task."""
+    memory: float | None = None
+    """Memory of a task, GB; default: the cluster's."""
+    jobs_per_task: int = 1
+    """Jobs at a time in a task, which share its GPUs, cores and memory."""
+    tasks: int = 100
+    """Tasks in the queue or running at a time."""
+    sbatch: list[str] = field(default_factory=list)
+    """Further parameters of sbatch: reservation=mine exclusive."""
 
-    @property
-    def key(self) -> tuple[str, int]:
-        return self.array.folder.name, self.number
-
-    @property
-    def slots(self) -> int:
-        """What this driver's jobs take of it."""
-        return sum(self.left[attempt].slots for attempt in self.mine.values())
-
-    @property
-    def free(self) -> int:
-        """Places without a job; none where the task may be about to end for want of jobs."""
-        if not self.left and time.monotonic() - self.busy > IDLE_S / 2:
-            return 0
-        return self.places - sum(work.slots for work in self.left.values())
-
-    def add(self, work: Work) -> None:
-        attempt = self.array.add(self.number, work)
-        self.left[attempt], self.mine[work.name], self.busy = work, attempt, time.monotonic()
-
-    def take_over(self, work: Work) -> bool:
-        """Wait for an attempt at the same that another driver has handed over; whether there is one."""
-        alike = (name for name, other in self.left.items() if (other.name, other.words) == (work.name, work.words))
-        if found := next(alike, None):
-            self.mine[work.name] = found
-        return found is not None
-
-    def told(self, over: set[str]) -> Iterator[Ended]:
-        """Of the attempts that are over, what has ended since the last call.
-
-        Where the disk does not tell now, the next one does.
-        """
-        with suppress(UnavailableError), disk_errors(self.array.folder):
-            for attempt in over & self.left.keys():
-                ended, name = self.array.end_of(attempt), self.left[attempt].name
-                del self.left[attempt]
-                self.busy = time.monotonic()
-                if self.mine.get(name) == attempt:
-                    del self.mine[name]
-                    yield ended
-
-    def untold(self, state: TaskState, stopped: bool) -> list[Ended]:
-        """How its jobs ended when it has ended itself; what this driver has `stopped` was not killed."""
-        line = last_line(self.array.folder / f"{state.job}_0_log.out") if state.name == "FAILED" else ""
-        line = line or f"Slurm says {state.name} of task {state.job}"
-        cause = INTERRUPTED if stopped and OVER[state.name] == KILLED else OVER[state.name]
-        return [Ended(name, cause, line) for name in self.mine]
+    limits: ClassVar[Limits] = {
+        **{"time": (5, 60 * 24 * 365), "gpus": (0, 64), "cpus": (1, 4096), "memory": (0.01, 10**6)},
+        **{"jobs_per_task": (1, 1024), "tasks": (1, 1000)},
+    }
 
 
-class SlurmExecutor:
-    """Arrays of allocations."""
+@dataclass(frozen=True)
+class Allocation:
+    """What submitit runs in an array task."""
+
+    task: Task
+
+    def __call__(self) -> None:
+        """Do the task; SIGTERM, and the signal that Slurm sends before the time limit, end it in peace."""
+        asked: list[int] = []
+        for number in (signal.SIGTERM, signal.SIGUSR2):
+            signal.signal(number, lambda number, frame: asked.append(number))
+        print(self.task.run(asked))
+
+
+class SlurmCluster:
+    """A sweep's tasks in Slurm's queue."""
+
+    threads = 0
 
     def __init__(self, options: SlurmOptions, folder: Path) -> None:
-        """Finds what earlier drivers of the same sweep have in the queue.
+        """Asks Slurm for nothing yet.
 
         Args:
-            options: what to ask Slurm for.
-            folder: for the arrays, on a disk that all nodes share.
+            options: what a task gets.
+            folder: for what submitit and the tasks write, on a disk that all nodes share.
 
         Raises:
-            UserError: submitit or Slurm's commands are missing, or Slurm does not answer.
+            UserError: submitit or Slurm's commands are missing.
         """
-        require_slurm()
-        self._options, self._folder = options, folder
-        self.largest = -(-options.jobs_per_task // max(1, options.gpus))
-        self.slots = options.tasks * options.jobs_per_task
-        self._tasks = _known(folder, options.jobs_per_task)
-        self._fresh: list[_Task] = []
-        """Tasks of the array that is not submitted yet."""
-        self._accepted = False
-        """Whether Slurm has taken an array of these options."""
-        self._queue: Queue = {}
-        """What Slurm told last."""
-        self._stopped = False
-        self._answers = True
-        """Whether Slurm did when it was asked last."""
-        self._warned: list[str] = []
-        self._next_files = self._next_queue = self._next_submission = 0.0
+        _require_slurm()
+        self._options, self.folder = options, folder
+        self.tasks, self.jobs_per_task = options.tasks, options.jobs_per_task
+        digest = hashlib.blake2b(str(folder.resolve()).encode(), digest_size=4).hexdigest()
+        self._own = ("--me", f"--name=vd4rl-pomdp-{digest}")
+        self._reasons: set[str] = set()
 
-    def fits(self, slots: int) -> bool:
-        """Whether so many slots wait for a job."""
-        return sum(task.slots for task in self._tasks + self._fresh) + slots <= self.slots
+    def live(self) -> int:
+        """How many tasks of this sweep wait or run; UnavailableError if Slurm does not answer."""
+        told = _ask("squeue", *self._own, "--array", "--noheader", "--format=%T|%r")
+        rows = [line.partition("|") for line in told.splitlines() if line.strip()]
+        for state, _, reason in rows:
+            if state == "PENDING" and reason not in (*_USUAL, *self._reasons):
+                self._reasons.add(reason)
+                print(f"warning: Slurm keeps tasks waiting: {reason}", file=sys.stderr)
+        return len(rows)
 
-    def start(self, work: Work) -> None:
-        """Begin a job: wait for an earlier driver's attempt, use a free place, or have a new task submitted."""
-        if not any(task.take_over(work) for task in self._tasks):
-            self._place(work.slots).add(work)
-
-    def _place(self, slots: int) -> _Task:
-        """A task with so many free places, a new one, or where there are enough of them the least busy one."""
-        tasks = self._tasks + self._fresh
-        best = max(tasks, key=lambda task: task.free, default=None)
-        if best is not None and (best.free >= slots or len(tasks) >= self._options.tasks):
-            return best
-        array = self._fresh[0].array if self._fresh else _new_array(self._folder)
-        self._fresh.append(_Task(array, len(self._fresh), self._options.jobs_per_task))
-        return self._fresh[-1]
-
-    def ended(self) -> list[Ended]:
-        """What has ended since the last call. All that was started since then becomes one array.
+    def submit(self, task: Task, number: int) -> None:
+        """Submit one array.
 
         Raises:
-            UserError: Slurm refuses the first array.
+            UnavailableError: its files could not be written, or sbatch does not answer, and Slurm may have taken the
+                array or not.
+            UserError: Slurm did not take it.
         """
-        now = time.monotonic()
-        if self._fresh and now >= self._next_submission:
-            self._submit()
-        answered = False
-        if now >= self._next_queue:
-            self._next_queue, answered = now + QUEUE_S, self._ask()
-            self._warn()
-        if not answered and now < self._next_files:
-            return []
-        self._next_files = now + FILES_S
-        over = {array: _over(array) for array in {task.array for task in self._tasks}}
-        found = [ended for task in self._tasks for ended in task.told(over[task.array])]  # after the queue: all of them
-        return found + self._gone() if answered else found
+        import submitit
 
-    def _ask(self) -> bool:
-        """Read the queue; whether Slurm answers, and if it does not, what it told last stays."""
-        queue = read_queue()
-        if queue is not None:
-            self._queue = queue
-        elif self._answers:
-            print("warning: Slurm does not answer: see what squeue says; it is asked again", file=sys.stderr)
-        self._answers = queue is not None
-        return self._answers
-
-    def _state(self, task: _Task) -> TaskState:
-        """What Slurm told last of a task."""
-        return self._queue.get(task.key, _UNKNOWN)
-
-    def _warn(self) -> None:
-        """Say, once each, what tasks wait for that may never come."""
-        for state in map(self._state, self._tasks):
-            if state.name == "PENDING" and state.reason not in (*_USUAL, *self._warned):
-                self._warned.append(state.reason)
-                print(f"warning: Slurm keeps task {state.job} waiting: {state.reason}", file=sys.stderr)
-
-    def _gone(self) -> list[Ended]:
-        """Jobs in tasks that have ended without telling of them."""
-        over = [task for task in self._tasks if self._state(task).name in OVER]
-        self._tasks = [task for task in self._tasks if task not in over]
-        return [ended for task in over for ended in task.untold(self._state(task), self._stopped)]
-
-    def _submit(self) -> None:
-        """Submit what was gathered; a failure is waited out where Slurm took such an array before, or the disk is full.
-
-        A signal waits until the array is known, which could not be taken out of the queue otherwise.
-        """
-        with interrupt.deferred():
-            try:
-                array = self._named_anew() if self._next_submission else self._fresh[0].array.folder
-                submit(array, [Allocation(array, task.number, task.places) for task in self._fresh], self._options)
-            except UserError as error:
-                if not (self._accepted or isinstance(error, UnavailableError)):
-                    raise
-                print(f"warning: {error}; trying again in {AGAIN_S:.0f} s", file=sys.stderr)
-                self._next_submission = time.monotonic() + AGAIN_S
-                return
-            self._accepted, self._next_submission = True, 0.0
-            self._tasks, self._fresh = self._tasks + self._fresh, []
-
-    def _named_anew(self) -> Path:
-        """Another name for the array that is not submitted yet: Slurm may have taken it without saying so.
-
-        What Slurm has of the old name then finds no folder, and ends.
-        """
-        old, new = self._fresh[0].array.folder, _new_array(self._folder)
-        with disk_errors(old):
-            if old.is_dir():
-                old.rename(new.folder)
-        for task in self._fresh:
-            task.array = new
-        return new.folder
+        executor = submitit.AutoExecutor(self.folder, cluster="slurm")
+        executor.update_parameters(name=self._own[1].partition("=")[2], **parameters(self._options))
+        try:
+            with disk_errors(self.folder), _alarm():
+                executor.submit_array([Allocation(task)] * number)
+        except RuntimeError as error:  # submitit's for a command that failed
+            if isinstance(error.__cause__, UnavailableError):
+                raise error.__cause__ from None
+            told = str(error).strip().splitlines()
+            raise UserError(f"Slurm took no array ({told[-1] if told else 'it does not say why'})") from error
 
     def stop(self) -> None:
-        """Take what waits out of the queue, ask every job to end where nothing is lost, and wait for it."""
-        self._fresh, self._stopped = [], True
+        """Take what waits out of the queue, ask every task to end where nothing is lost, and wait for it."""
         try:
-            cancel(self._live(), "--state=PENDING")
-            cancel(self._live(), "--signal=TERM")
-            until = time.monotonic() + PATIENCE_S + QUEUE_S
-            while self._live() and time.monotonic() < until:
-                time.sleep(FILES_S)
-            cancel(self._live())
+            _ask("scancel", "--quiet", *self._own, "--state=PENDING")
+            _ask("scancel", "--quiet", *self._own, "--signal=TERM")
+            until = time.monotonic() + PATIENCE_S + SPARE_S
+            while self.live() and time.monotonic() < until:
+                time.sleep(POLL_S)
+            _ask("scancel", "--quiet", *self._own)
         except UnavailableError as error:
-            print(f"warning: {error}; see what squeue has of {self._folder}, and end it by scancel", file=sys.stderr)
-        self._next_queue = 0.0
-
-    def _live(self) -> list[str]:
-        """Slurm's numbers of this sweep's tasks that have not ended, as far as it has told."""
-        self._ask()
-        return [state.job for state in map(self._state, self._tasks) if state.name not in OVER]
+            print(f"warning: {error}; tasks may be left: scancel {' '.join(self._own)}", file=sys.stderr)
 
 
-def _new_array(folder: Path) -> Handover:
-    return Handover(folder / f"{PREFIX}{token_hex(4)}")
+def _require_slurm() -> None:
+    """Raise UserError unless submitit and Slurm's commands are here."""
+    try:
+        import submitit  # noqa: F401
+    except ImportError as error:
+        raise UserError("--executor slurm needs submitit: pip install '.[slurm]' in a clone of vd4rl-pomdp") from error
+    for name in ("sbatch", "squeue", "scancel", "srun"):
+        if shutil.which(name) is None:
+            raise UserError(f"--executor slurm finds no {name} here: start the sweep where Slurm's commands are")
 
 
-def _over(array: Handover) -> set[str]:
-    """Attempts of an array that have ended, as far as the disk tells now."""
-    with suppress(UnavailableError), disk_errors(array.folder):
-        return array.ended()
-    return set()
+def parameters(options: SlurmOptions) -> dict[str, Any]:
+    """What submitit is told of a task."""
+    names = ("partition", "account", "qos", "constraint", "time")
+    found = {name: getattr(options, name) for name in names if getattr(options, name) is not None}
+    if options.gpus:
+        found["gpus_per_node"] = options.gpus
+    if options.memory is not None:
+        found["mem"] = f"{options.memory * 1024:.0f}M"
+    further = [parameter.removeprefix("--").partition("=") for parameter in options.sbatch]
+    found |= {
+        "cpus_per_task": options.cpus,
+        "srun_args": [f"--cpus-per-task={options.cpus}"],  # which some versions do not take from sbatch
+        "array_parallelism": options.tasks,
+        "signal_delay_s": round(PATIENCE_S + SPARE_S),
+        "additional_parameters": {"requeue": True} | {name: value or True for name, _, value in further},
+    }
+    return {f"slurm_{name}": value for name, value in found.items()} | {"stderr_to_stdout": True}
 
 
-def _known(folder: Path, places: int) -> list[_Task]:
-    """Tasks that earlier drivers have in the queue."""
-    queue = read_queue()
-    if queue is None:
-        raise UnavailableError("Slurm does not answer: see what squeue says")
-    found = []
-    for (name, number), state in queue.items():
-        array = Handover(folder / name)
-        if state.name not in OVER and array.folder.is_dir():
-            found.append(_Task(array, number, places, array.left(number)))
-    return found
+def _ask(*command: str) -> str:
+    """What a command of Slurm's prints; UnavailableError if it does not end in time, or fails."""
+    seconds = LAST_ANSWER_S if interrupt.asked() else ANSWER_S
+    try:
+        answer = subprocess.run(command, capture_output=True, text=True, check=False, timeout=seconds)
+    except subprocess.TimeoutExpired as error:
+        raise UnavailableError(f"Slurm does not answer: {command[0]} has not ended after {seconds:g} s") from error
+    if answer.returncode and command[0] == "squeue":  # scancel fails where there is nothing to cancel
+        raise UnavailableError(f"Slurm does not answer: see what squeue says ({answer.stderr.strip()})")
+    return answer.stdout
+
+
+@contextmanager
+def _alarm() -> Iterator[None]:
+    """Raise UnavailableError within the block when sbatch has had its time; submitit, which waits for it, kills it."""
+    if threading.current_thread() is not threading.main_thread():  # which alone gets signals
+        yield
+        return
+
+    def over(*_: object) -> None:
+        raise UnavailableError(f"Slurm does not answer: sbatch has not ended after {ANSWER_S:g} s")
+
+    before = signal.signal(signal.SIGALRM, over)
+    signal.setitimer(signal.ITIMER_REAL, ANSWER_S)
+    try:
+        yield
+    finally:
+        signal.setitimer(signal.ITIMER_REAL, 0)
+        signal.signal(signal.SIGALRM, before)
