@@ -1,4 +1,4 @@
-"""Write the tables of README.md, docs and results that are made from committed rows into their pages.
+"""Write the tables of results that are made from committed rows into their pages.
 
     python tools/page_tables.py
 
@@ -14,7 +14,6 @@ from pathlib import Path
 
 import control_table
 import methods_table
-import navigation_table
 import offline_table
 from script import run_script
 
@@ -34,21 +33,8 @@ class Config:
 
 def pages() -> dict[str, Tables]:
     """Tables of each page, which is told by its path in the repository."""
-    returns, mazes = offline_table.main_runs(), navigation_table.main_runs()
+    returns = offline_table.main_runs()
     return {
-        "README.md": {
-            "returns": offline_table.readme_lines(returns),
-            "mazes": navigation_table.state_lines(mazes, (15, 1)),
-        },
-        "docs/navigation.md": {
-            **{maze: navigation_table.maze_lines(mazes, maze) for maze in navigation_table.measured(mazes)},
-            "hard": navigation_table.hard_lines(mazes),
-            "K = 1": navigation_table.state_lines(mazes, (1,)),
-            **{words: navigation_table.added_lines(mazes, added) for added, words in navigation_table.ADDED.items()},
-            "first rung": navigation_table.first_rung_lines(navigation_table.first_rung_runs()),
-            "pictures": navigation_table.picture_lines(navigation_table.picture_runs(), mazes),
-            "first person": navigation_table.first_person_lines(navigation_table.first_person_runs()),
-        },
         "results/control/README.md": {
             "control": control_table.table_lines(control_table.RESULTS),
             "costs": control_table.cost_lines(control_table.RESULTS / "cell_cost.csv"),
