@@ -1,6 +1,6 @@
 """Draw docs/hero.png: what an agent sees under each corruption, and what policies return under both.
 
-    python tools/hero.py --data data/walker_walk/expert_noisy
+python tools/hero.py --data data/walker_walk/expert_noisy
 """
 
 from __future__ import annotations
