@@ -20,7 +20,7 @@ from vd4rl_pomdp.report.gates import episodes_of
 from vd4rl_pomdp.report.stats import mean_interval
 
 matplotlib.use("Agg")
-import matplotlib.pyplot as plt  # noqa: E402 (the backend is chosen first)
+import matplotlib.pyplot as plt
 
 SEEN = {"clean": "none", "16x16 patches": "patch", "two frames zeroed": "zero_frames"}
 """What is above each stack, and its corruption."""
