@@ -28,7 +28,7 @@ class FinetuneConfig(StageConfig):
     data: Path = Path()
     """Folder of the data set."""
     out: Path = Path()
-    """Run folder; the same command continues a run that was cut."""
+    """Run folder; re-run the same command to resume."""
     algorithm: str = "td3_bc"
     """Algorithm, `vd4rl-pomdp list` shows all; the references bc and drq_bc bring their own."""
     seed: int = 0

@@ -40,7 +40,7 @@ class TrainingConfig(StageConfig):
     data: Path = Path()
     """Folder of the data set."""
     out: Path = Path()
-    """Run folder; the same command continues a run that was cut."""
+    """Run folder; re-run the same command to resume."""
     method: str = "mik+a"
     """Objective to train; `vd4rl-pomdp list` shows all."""
     seed: int = 0

@@ -2,6 +2,8 @@
 
 import re
 import shlex
+import subprocess
+import sys
 import tomllib
 from pathlib import Path
 
@@ -17,9 +19,11 @@ from tests.helpers_pages import PAGES as EXAMPLES
 from tests.helpers_pages import isolated_registries, load_example
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.registry import REGISTRIES
-from vd4rl_pomdp.core.tasks import QUALITIES, TASKS
+from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
 from vd4rl_pomdp.corruptions import make_corruption
 from vd4rl_pomdp.envs.mazes import get_maze
+from vd4rl_pomdp.sweeps.grid_file import load_grid
+from vd4rl_pomdp.sweeps.stages import check_cell
 
 ROOT = Path(__file__).parents[1]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
@@ -127,7 +131,7 @@ CHECKS = {
     "tasks": TASKS.named,
     "maze": get_maze,
     "mazes": get_maze,
-    "quality": QUALITIES.index,
+    "quality": SET_QUALITIES.index,
 }
 
 
@@ -144,10 +148,11 @@ def check_names(config: object) -> None:
 
 @pytest.fixture
 def study(tmp_path, monkeypatch) -> Path:
-    """A folder in which the pages' paths exist: a set, and the encoder that was pretrained on it."""
+    """A folder in which the pages' paths exist: sets, and with `encoder` what was pretrained on one of them."""
     monkeypatch.chdir(tmp_path)
     monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
-    write_fake_set(tmp_path / "data" / "walker_walk" / "expert", [40, 40, 40])
+    for quality in ("expert", "expert_noisy"):
+        write_fake_set(tmp_path / "data" / "walker_walk" / quality, [40, 40, 40])
     return tmp_path
 
 
@@ -159,7 +164,7 @@ def encoder(study) -> None:
 
 def small(words: list[str]) -> list[str]:
     """The same command in the smallest size."""
-    return [{"cpu": "smoke", "paper": "smoke"}.get(word, word) for word in words]
+    return [{"cpu": "smoke", "paper": "smoke", "20000": "20", "20": "1"}.get(word, word) for word in words]
 
 
 def test_the_readmes_commands_run_one_after_the_other(study, capsys):
@@ -202,8 +207,54 @@ def check_results(page: str, names: dict) -> None:
 
 
 def test_toml_blocks_are_read_and_name_what_exists():
-    pages = [page for page in PAGES if page.name != "sweeps.md"]  # whose grid tests/sweeps reads
+    pages = [page for page in PAGES if page.name not in ("README.md", "sweeps.md")]  # whose blocks are grids
     found = [tomllib.loads(code)["project"]["entry-points"] for page in pages for code in blocks(page, "toml")]
     assert sorted(group for groups in found for group in groups) == sorted(
         registry.group for registry in REGISTRIES.values()
     )
+
+
+def test_the_readmes_grid_has_five_seeds_of_four_methods(tmp_path):
+    (block,) = blocks(ROOT / "README.md", "toml")
+    (tmp_path / "grid.toml").write_text(block)
+    cells = load_grid(str(tmp_path / "grid.toml")).cells()
+    assert len(cells) == 5 * 4
+    for cell in cells:
+        check_cell(cell)
+
+
+def test_the_readme_is_short():
+    assert len((ROOT / "README.md").read_text().split()) <= 950
+
+
+LINK = re.compile(r"\]\(([^)\s]+)\)")
+TEXTS = [*PAGES, ROOT / "CHANGELOG.md"]
+
+
+def anchors(page: Path) -> set[str]:
+    """What GitHub and the site call a page's headings."""
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    headings = re.findall(r"^#+ (.*)$", text, re.MULTILINE)
+    return {re.sub(r"[^\w\- ]", "", heading.lower()).replace(" ", "-") for heading in headings}
+
+
+@pytest.mark.parametrize("page", TEXTS, ids=lambda page: page.relative_to(ROOT).as_posix())
+def test_every_link_within_the_repository_leads_somewhere(page):
+    text = re.sub(r"^```.*?^```", "", page.read_text(), flags=re.DOTALL | re.MULTILINE)
+    targets = [target for target in LINK.findall(text) if not target.startswith(("http:", "https:"))]
+    broken = []
+    for target in targets:
+        path, _, anchor = target.partition("#")
+        file = (page.parent / path).resolve() if path else page
+        if file.is_dir() and anchor:
+            file = file / "README.md"
+        if not file.exists() or (anchor and anchor not in anchors(file)):
+            broken.append(target)
+    assert broken == []
+
+
+def test_the_site_is_built_without_a_warning(tmp_path):
+    pytest.importorskip("mkdocs", reason="mkdocs is not installed")
+    command = [sys.executable, "-m", "mkdocs", "build", "--strict", "--quiet", "--site-dir", str(tmp_path / "site")]
+    built = subprocess.run(command, cwd=ROOT, capture_output=True, text=True)
+    assert built.returncode == 0, built.stdout + built.stderr

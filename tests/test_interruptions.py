@@ -214,7 +214,7 @@ def test_a_full_disk_is_one_sentence_and_the_same_command_goes_on(stage, whole, 
     run, config, _ = stage
     with monkeypatch.context() as patch:
         fill_disk(patch, name, number)
-        with pytest.raises(UserError, match="the disk is full: free some space and start the same command again"):
+        with pytest.raises(UserError, match="the disk is full: free some space and re-run the same command"):
             run(config(tmp_path / "cut"))
     run(config(tmp_path / "cut"))
     assert contents(tmp_path / "cut") == whole

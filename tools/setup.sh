@@ -24,7 +24,7 @@ install_debian() {
     local as_root=""
     if [ "$(id -u)" -ne 0 ]; then
         if ! sudo -n true 2>/dev/null; then
-            say "setup: please install $* (for example: sudo apt-get install $*), then run the same command again"
+            say "setup: please install $* (for example: sudo apt-get install $*), then re-run the same command"
             exit 2
         fi
         as_root="sudo -n"

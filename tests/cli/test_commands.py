@@ -123,7 +123,7 @@ def test_a_signal_while_words_are_read_is_no_slip(monkeypatch):
 
     monkeypatch.setattr("tyro.cli", end)
     ended = ends.run_to_end(["data", "check", "x"])
-    assert (ended.code, ended.line) == (143, "terminated: the same command does what is left")
+    assert (ended.code, ended.line) == (143, "terminated: re-run the same command to resume")
 
 
 @pytest.mark.parametrize(("stage", "flag"), [("pretrain", "--precision"), ("finetune", "--update-precision")])

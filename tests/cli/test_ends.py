@@ -27,7 +27,7 @@ def test_a_signal_that_an_import_hides_is_one_all_the_same(monkeypatch, number):
     during(monkeypatch, half_imported)
     end = run_to_end(["pretrain"])
     assert (end.code, end.cause) == (128 + number, "interrupted")
-    assert end.line == "ended by a signal: the same command does what is left"
+    assert end.line == "ended by a signal: re-run the same command to resume"
 
 
 def test_a_defect_without_a_signal_is_raised(monkeypatch):

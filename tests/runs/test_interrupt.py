@@ -81,7 +81,7 @@ def test_a_training_run_keeps_its_running_step_and_goes_on_from_there(tmp_path, 
     program = start(tmp_path, SLOW_STEPS, *words)
     assert program.stdout.readline() == "in step 3\n"
     program.send_signal(number)
-    kept = f"{word}: {tmp_path / 'run'} keeps step 3, and the same command goes on from there"
+    kept = f"{word}: {tmp_path / 'run'} keeps step 3; re-run the same command to resume"
     assert said(program) == [kept]
     assert program.returncode == code
     assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["3"]
@@ -93,7 +93,7 @@ def test_workers_end_with_the_first_signal(tmp_path, number, code, word):
     program = start(tmp_path, SLOW_JOBS)
     workers = [int(program.stdout.readline()) for _ in range(2)]
     os.killpg(program.pid, number)  # as a terminal's Ctrl-C and a cluster's scancel do
-    assert said(program) == [f"{word}: the same command does what is left"]
+    assert said(program) == [f"{word}: re-run the same command to resume"]
     assert program.returncode == code
     assert not any(map(_alive, workers))
 
@@ -107,7 +107,7 @@ def test_a_signal_while_workers_start_is_the_callers_business(tmp_path):
     while len(pids := children.read_text().split()) < 3:  # two workers, and the tracker of their resources
         time.sleep(0.01)
     os.killpg(program.pid, signal.SIGINT)
-    assert said(program) == ["interrupted: the same command does what is left"]
+    assert said(program) == ["interrupted: re-run the same command to resume"]
     assert program.returncode == 130
     while any(_alive(int(pid)) for pid in pids):  # the tracker ends when it finds its caller gone
         time.sleep(0.01)

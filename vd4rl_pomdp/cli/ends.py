@@ -69,7 +69,7 @@ def _nobody_reads() -> bool:
 
 def _ended(how: str, kept: str) -> str:
     """One line for a signal's end; what was `kept` is where a training loop stood."""
-    where = f"{kept}, and the same command goes on from there" if kept else "the same command does what is left"
+    where = f"{kept}; re-run the same command to resume" if kept else "re-run the same command to resume"
     return f"{how}: {where}"
 
 

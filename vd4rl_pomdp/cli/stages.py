@@ -88,7 +88,7 @@ class DemoCommand:
     """Every stage, in minutes: three methods on a small walker_walk set, two in a maze; a table, a report, a film."""
 
     out: Path = Path("runs/demo")
-    """Folder of the demo's data and runs; the same command continues where it was cut."""
+    """Folder of the demo's data and runs; re-run the same command to resume."""
     jobs: int = 0
     """Commands at a time; 0: as many as the GPUs take, or one a core, up to 4."""
     preset: str = "cpu"

@@ -174,6 +174,6 @@ COMMANDS: dict[str, Command | Mapping[str, Command]] = {
     ),
     "results": {"add": Command("append finished runs to a results folder", _add)},
     "theory": Command("the paper's claims on finite worlds, by enumeration", _theory),
-    "control-study": Command("does memory pay? told on simulator states, in minutes", _control_study),
+    "control-study": Command("does memory pay? in minutes, on simulator states", _control_study),
     "bench": Command("speed and memory on this machine", _bench),
 }

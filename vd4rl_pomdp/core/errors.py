@@ -160,12 +160,12 @@ def disk_error(path: Path | str | None, error: OSError) -> UserError:
     """A sentence for a file or folder that could not be read or written; None where the system does not name it."""
     where = f"{path}: " if path is not None else ""
     if error.errno in (errno.ENOSPC, errno.EDQUOT):
-        return DiskFullError(f"{where}the disk is full: free some space and start the same command again")
+        return DiskFullError(f"{where}the disk is full: free some space and re-run the same command")
     reason = (error.strerror or str(error)).lower()
     if error.errno == errno.ENOMEM:
         return OutOfMemoryError(f"{where}{reason}: end other programs, or run fewer jobs at a time")
     if error.errno in _PASSING:
-        return UnavailableError(f"{where}cannot be used now ({reason}); start the same command again")
+        return UnavailableError(f"{where}cannot be used now ({reason}); re-run the same command")
     if error.errno in (errno.EACCES, errno.EPERM, errno.EROFS):
         return UserError(f"{where}may not be used ({reason}); ask its owner for access, or choose another path")
     return UserError(f"{where}cannot be used ({reason}); check the path or choose another")

@@ -1,7 +1,7 @@
 """Collect a set in V-D4RL's format, with simulator states and a data card, from the actors that ship with the package.
 
-Episode i depends on (seed, i) alone, whatever the number of workers. Shards are written whole, so the same command goes
-on after an interruption and ends in the same files.
+Episode i depends on (seed, i) alone, whatever the number of workers. Shards are written whole: re-running the same
+command resumes an interrupted collection and ends in the same files.
 """
 
 from __future__ import annotations

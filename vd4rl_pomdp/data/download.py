@@ -204,14 +204,16 @@ def _fetch(file: RemoteFile, target: Path, url: str, bar: Progress) -> None:
         if failures >= _ATTEMPTS:
             reason = problem or "it sent nothing"
             raise UserError(
-                f"{url}: cannot be fetched ({reason}); check the network or choose another --endpoint and start the "
-                "same command again: it goes on where it stopped"
+                f"{url}: cannot be fetched ({reason}); check the network or choose another --endpoint, and re-run "
+                "the same command to resume"
             )
         time.sleep(_FIRST_WAIT_S * 2 ** (failures - 1))
     bar.remove_task(row)
     if _size(part) != file.size or sha256(part) != file.sha256:
         part.unlink()
-        raise UserError(f"{url}: has a wrong SHA-256 and was removed; start again or choose another --endpoint")
+        raise UserError(
+            f"{url}: has a wrong SHA-256 and was removed; re-run the same command or choose another --endpoint"
+        )
     part.replace(target)
 
 

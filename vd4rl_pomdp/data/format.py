@@ -294,7 +294,7 @@ def _locked(path: Path, error: Exception) -> UserError | None:
     if isinstance(error, OSError) and error.errno and "unable to lock file" in str(error):
         return UnavailableError(
             f"{path}: another program writes it, or its disk has no locks ({os.strerror(error.errno).lower()}); close "
-            "that program and start the same command again, or set HDF5_USE_FILE_LOCKING=FALSE to read without locks"
+            "that program and re-run the same command, or set HDF5_USE_FILE_LOCKING=FALSE to read without locks"
         )
     if "already open for write" in str(error):
         return UnavailableError(

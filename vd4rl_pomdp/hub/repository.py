@@ -118,7 +118,7 @@ def hub_answers(repository: Repository, revision: str) -> Iterator[None]:
     except (HTTPError, LocalEntryNotFoundError, FileMetadataError) as error:
         raise UserError(
             f"{repository}: {default_endpoint()} does not answer as the Hub does ({type(error).__name__}); check the "
-            "network and HF_ENDPOINT, and start the same command again: it goes on where it stopped"
+            "network and HF_ENDPOINT, and re-run the same command to resume"
         ) from error
     except (RuntimeError, ValueError) as error:  # of an upload's parts, and of a card that the Hub refuses
         raise UserError(f"{repository}: {_refusal(error)}") from error

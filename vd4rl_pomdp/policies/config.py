@@ -16,7 +16,7 @@ class PolicyConfig:
     task: str
     """walker_walk, cheetah_run or humanoid_walk, or a task of dm_control that was added."""
     out: Path
-    """Run folder; the same command continues a run that was cut."""
+    """Run folder; re-run the same command to resume."""
     decisions: int = 300_000
     """Environment decisions in all."""
     seed: int = 0

@@ -156,9 +156,7 @@ class RunFolder:
         told = read_json(path)
         parts = told.pop(CONTINUED, [])
         if not isinstance(parts, list):
-            raise UserError(
-                f"{path}: is damaged ({CONTINUED!r} is no list); remove it and start the same command again"
-            )
+            raise UserError(f"{path}: is damaged ({CONTINUED!r} is no list); remove it and re-run the same command")
         part, begun = now | self._code_now(), told | self.code
         if part != (begun | parts[-1] if parts else begun):
             write_json(path, told | {CONTINUED: [*parts, part]})

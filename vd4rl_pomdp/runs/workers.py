@@ -113,7 +113,7 @@ class _Crew:
             why = "perhaps for want of memory: use fewer --workers" if killed else "as what it printed tells: mend that"
             raise WorkerDiedError(
                 f"a worker process ended before its job (exit code {process.exitcode}), {why} "
-                "and start the same command again"
+                "and re-run the same command"
             ) from None
 
     def end(self) -> None:

@@ -73,7 +73,7 @@ def test_a_signal_while_a_cluster_is_waited_for_ends_the_command(silent, tmp_pat
         told = command.communicate(timeout=120)[1]
     finally:
         command.kill()
-    assert (command.returncode, told.splitlines()[-1]) == (143, "terminated: the same command does what is left")
+    assert (command.returncode, told.splitlines()[-1]) == (143, "terminated: re-run the same command to resume")
 
 
 def _words_of(process: str) -> bytes:

@@ -1,8 +1,8 @@
 """Collect a maze's data: shards in V-D4RL's format with frames of 100x100 and the true state of every row.
 
 Trajectory i depends on (seed, i) alone, whatever the number of workers. Within a trajectory nothing is reset; goals
-are uniform in the free space and move when they are reached. Shards are written whole, so the same command goes on
-after an interruption and ends in the same files.
+are uniform in the free space and move when they are reached. Shards are written whole: re-running the same command
+resumes an interrupted collection and ends in the same files.
 """
 
 from __future__ import annotations
