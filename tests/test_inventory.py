@@ -1,4 +1,4 @@
-"""What users had before the packages were laid out anew: each kept, renamed or dropped with a reason, in inventory.tsv."""
+"""What users had before the packages were laid out anew, kept, renamed or dropped with a reason: inventory.tsv."""
 
 import contextlib
 import csv
@@ -11,8 +11,8 @@ from pathlib import Path
 import gymnasium
 import pytest
 
-import finetune.algorithms
-import pretrain.objectives
+import finetune.algorithms  # noqa: F401 (registers its kind of part)
+import pretrain.objectives  # noqa: F401
 import vd4rl_pomdp.envs
 import vd4rl_pomdp.nn.frame  # noqa: F401 (registers its kind of part)
 from finetune.config import FinetuneConfig

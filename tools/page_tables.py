@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 import methods_table
+import navigation_table
 import offline_table
 from script import run_script
 
@@ -32,7 +33,7 @@ class Config:
 
 def pages() -> dict[str, Tables]:
     """Tables of each page, which is told by its path in the repository."""
-    returns = offline_table.main_runs()
+    returns, mazes = offline_table.main_runs(), navigation_table.main_runs()
     return {
         "results/control/README.md": {
             "gates": offline_table.gate_lines(returns),
