@@ -45,6 +45,7 @@ def pretrain(config: PretrainConfig) -> RunFolder:
 def _pretrain(config: PretrainConfig) -> RunFolder:
     method = METHODS.named(config.method)
     dataset = open_dataset(config.data)
+    dataset.require_transitions()
     check_pictures(config, dataset.frame_size)
     task = _task_of(dataset, config)
     seed_networks(config.seed, STAGE)

@@ -122,6 +122,15 @@ def test_what_does_not_fit_leaves_no_run_behind(data, tmp_path, change, message)
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.parametrize("method", ["mik+a", "curl", "random"])
+def test_a_set_without_a_transition_is_refused_whatever_the_method(tmp_path, method):
+    """Advice such as fewer codes or a shorter window leads nowhere there."""
+    data = write_fake_set(tmp_path / "walker_walk" / "expert", (1, 1, 1), complete_last=False)
+    with pytest.raises(UserError, match="a single row: take another set"):
+        run_pretrain(smoke_pretrain(data, tmp_path / "out", method=method))
+    assert not (tmp_path / "out").exists()
+
+
 def test_a_patch_that_the_film_of_a_state_cannot_hold_is_refused_first(tmp_path):
     def check(**changes):
         config = smoke_pretrain(tmp_path, tmp_path / "out", corruption="patch", **changes)

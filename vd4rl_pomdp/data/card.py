@@ -27,6 +27,7 @@ from vd4rl_pomdp.data.format import (
     read_some_frames,
     shard_paths,
 )
+from vd4rl_pomdp.data.manifest import check_whole
 from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.runs.files import read_json
 
@@ -64,11 +65,12 @@ def write_card(path: Path) -> Path:
         The card's file.
 
     Raises:
-        UserError: this is no folder, the set is damaged, or the folder cannot be written.
+        UserError: this is no folder, the set is damaged or a part of a published one, or the folder cannot be written.
     """
     if path.is_file():
         raise UserError(f"{path}: is one file; a card describes a whole set: name its folder")
     shards = shard_paths(path)
+    check_whole(path, shards, task_and_quality(path, []))
     check_frames(shards)
     parts = [read_rows(shard) for shard in shards]
     rows = join_shards(path, shards, parts)

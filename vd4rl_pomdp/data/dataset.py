@@ -112,7 +112,7 @@ class Dataset:
     def require_transitions(self) -> None:
         """Raise UserError if the set holds none."""
         if not self.num_transitions:
-            raise UserError(f"{self.path}: holds no transition; every episode in it is a single row")
+            raise UserError(f"{self.path}: holds no transition; every episode in it is a single row: take another set")
 
     @property
     def action_dim(self) -> int:

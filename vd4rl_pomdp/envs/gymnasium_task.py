@@ -109,7 +109,7 @@ class GymnasiumEnv(PixelEnv):
             ) from error
 
     def _bounded_box(self, space: gymnasium.Space) -> gymnasium.spaces.Box:
-        if isinstance(space, gymnasium.spaces.Box) and np.issubdtype(space.dtype, np.floating):
+        if isinstance(space, gymnasium.spaces.Box) and np.issubdtype(space.dtype, np.floating) and space.low.size:
             check_bounds(f"environment {self._name}", space.low, space.high)
             return space
         raise UserError(
@@ -181,7 +181,7 @@ class GymnasiumEnv(PixelEnv):
             picture = picture.transpose(1, 2, 0)
         if picture.ndim == 2:
             picture = picture[..., None]
-        if picture.ndim != 3 or picture.shape[-1] not in (1, 3) or picture.dtype != np.uint8:
+        if picture.ndim != 3 or picture.shape[-1] not in (1, 3) or picture.dtype != np.uint8 or not picture.size:
             got = f"{picture.dtype} of shape {picture.shape}" if isinstance(shown, np.ndarray) else type(shown).__name__
             raise UserError(
                 f"environment {self._name} shows {got} by its {'render()' if self._renders else 'observation'}, "
