@@ -94,7 +94,7 @@ def _flags(config: type, default: object) -> dict[str, type]:
     return found
 
 
-@settings(max_examples=150, deadline=None, derandomize=True)
+@settings(max_examples=200, deadline=None, derandomize=True)
 @given(data=st.data())
 def test_a_wrong_value_ends_in_one_line_and_exit_code_2_and_nothing_is_written(world, data):
     command = data.draw(st.sampled_from(list(VALID)))
