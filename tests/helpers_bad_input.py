@@ -46,5 +46,8 @@ def end_of(words: list[str]) -> tuple[int, str]:
 
 
 def snapshot(folder: Path) -> dict[Path, tuple[int, int]]:
-    """Size and time of every name below a folder."""
-    return {path: ((s := path.lstat()).st_size, s.st_mtime_ns) for path in folder.rglob("*")}
+    """Every name below a folder, with size and time of what is no folder: a lock may have come and gone in one."""
+    return {
+        path: (0, 0) if path.is_dir() else ((stat := path.lstat()).st_size, stat.st_mtime_ns)
+        for path in folder.rglob("*")
+    }
