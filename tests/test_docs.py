@@ -41,10 +41,10 @@ NOT_RUN = {
     "vd4rl-pomdp hub": "needs a Hub; test_hub has one of its own",
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
     "vd4rl-pomdp policy": "trains for hours; tests/policies trains less",
-    "vd4rl-pomdp control-study": "trains for minutes; experiments/control trains less",
+    "vd4rl-pomdp control-study": "trains for minutes; studies/control trains less",
     "vd4rl-pomdp navigation": "trains for minutes to days; vd4rl_pomdp/studies/navigation/test_train trains less",
     "vd4rl-pomdp report": "the README's is run; tests/report makes all others",
-    "vd4rl-pomdp results add": "tests/results adds runs",
+    "vd4rl-pomdp results add": "tests/runs/results adds runs",
     "vd4rl-pomdp pretrain --method": "pretrain/test_train runs every method in its smoke size",
     "vd4rl-pomdp finetune --encoder RUN": "as above",
     "vd4rl-pomdp sweep": "trains for minutes; tests/sweeps trains less",
@@ -228,7 +228,7 @@ def test_the_readme_is_short():
 
 
 LINK = re.compile(r"\]\(([^)\s]+)\)")
-TEXTS = [*(page for page in PAGES if page.name != "mutants.md"), ROOT / "CHANGELOG.md"]
+TEXTS = [*PAGES, *sorted((ROOT / "results").rglob("*.md")), ROOT / "CHANGELOG.md"]
 
 
 def anchors(page: Path) -> set[str]:

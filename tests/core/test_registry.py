@@ -56,7 +56,7 @@ def test_what_a_block_registers_is_forgotten_after_it(registry):
 
 
 def test_what_packages_offer_outlives_a_block_that_met_it_first(registry, monkeypatch):
-    offer(monkeypatch, theirs="tests.test_registry:THEIRS")
+    offer(monkeypatch, theirs="tests.core.test_registry:THEIRS")
     with registry.isolated():
         assert "theirs" in registry
     assert "theirs" in registry
@@ -112,20 +112,20 @@ def test_a_part_that_cannot_work_is_refused_however_it_comes(registry, monkeypat
         registry.register("a", "yours")
     with pytest.raises(UserError, match=told):
         Registry("frame encoder", {"b": "mine", "a": "yours"}, lambda part: True, "anything", no_yours)
-    monkeypatch.setattr("tests.test_registry.THEIRS", "yours")
-    offer(monkeypatch, a="tests.test_registry:THEIRS")
+    monkeypatch.setattr("tests.core.test_registry.THEIRS", "yours")
+    offer(monkeypatch, a="tests.core.test_registry:THEIRS")
     assert "a" not in registry
     assert told in capsys.readouterr().err
 
 
 def test_an_entry_point_offers_a_part(registry, monkeypatch):
-    offer(monkeypatch, theirs="tests.test_registry:THEIRS")
+    offer(monkeypatch, theirs="tests.core.test_registry:THEIRS")
     assert registry.named("theirs") == "theirs"
     assert len(registry) == len(list(registry)) == 3, "loaded once"
 
 
 def test_what_is_known_at_import_loads_no_package(registry, monkeypatch):
-    offer(monkeypatch, theirs="tests.test_registry:THEIRS")
+    offer(monkeypatch, theirs="tests.core.test_registry:THEIRS")
     assert list(registry.registered()) == ["own", "own+a"]
     assert "theirs" in registry
     assert list(registry.registered()) == ["own", "own+a", "theirs"]
@@ -135,7 +135,7 @@ def test_a_package_and_its_version_are_the_origin_of_what_it_offers(registry, mo
     from importlib.metadata import entry_points
 
     script = next(e for e in entry_points(group="console_scripts") if e.dist.name == "pytest")
-    offered = EntryPoint("theirs", "tests.test_registry:THEIRS", registry.group)._for(script.dist)
+    offered = EntryPoint("theirs", "tests.core.test_registry:THEIRS", registry.group)._for(script.dist)
     monkeypatch.setattr(vd4rl_pomdp.core.registry, "entry_points", lambda group: [offered])
     assert registry.origin("theirs") == f"pytest {pytest.__version__}"
     assert registry.origin("own") == ""
@@ -145,12 +145,12 @@ def test_a_package_and_its_version_are_the_origin_of_what_it_offers(registry, mo
     ("value", "reason"),
     [
         ("no_such_package:METHOD", "no_such_package:METHOD: ModuleNotFoundError"),
-        ("tests.test_registry:NOWHERE", "AttributeError"),
-        ("tests.test_registry:PAGE", "is a int, not a string"),
+        ("tests.core.test_registry:NOWHERE", "AttributeError"),
+        ("tests.core.test_registry:PAGE", "is a int, not a string"),
     ],
 )
 def test_a_part_that_cannot_be_loaded_is_named_once_and_left_out(registry, monkeypatch, capsys, value, reason):
-    offer(monkeypatch, broken=value, theirs="tests.test_registry:THEIRS")
+    offer(monkeypatch, broken=value, theirs="tests.core.test_registry:THEIRS")
     assert registry.named("own") == "ours"
     assert registry.named("theirs") == "theirs"
     (line,) = capsys.readouterr().err.splitlines()
@@ -162,7 +162,7 @@ def test_a_part_that_cannot_be_loaded_is_named_once_and_left_out(registry, monke
 
 
 def test_settings_name_their_parts_and_where_these_come_from(registry, monkeypatch):
-    offer(monkeypatch, theirs="tests.test_registry:THEIRS")
+    offer(monkeypatch, theirs="tests.core.test_registry:THEIRS")
     registry.register("mine", "my own")
     by_call, offered = "registered by a call", "an installed package"
     assert origins({"frame_encoder": "own", "steps": 3}) == {}
@@ -175,7 +175,7 @@ def test_settings_name_their_parts_and_where_these_come_from(registry, monkeypat
 
 
 def test_a_package_that_offers_a_taken_name_disables_no_other_part(registry, monkeypatch, capsys):
-    offer(monkeypatch, own="tests.test_registry:THEIRS")
+    offer(monkeypatch, own="tests.core.test_registry:THEIRS")
     assert registry.named("own") == "ours"
     assert "a frame encoder called 'own' exists already" in capsys.readouterr().err
 

@@ -144,7 +144,7 @@ def test_an_unknown_task_of_dm_control_is_one_line():
 def test_what_is_no_task_is_not_registered():
     with TASKS.isolated():
         with pytest.raises(
-            UserError, match=r"task 'mine' is a str, not a vd4rl_pomdp\.tasks\.DMCTask or GymnasiumTask"
+            UserError, match=r"task 'mine' is a str, not a vd4rl_pomdp\.core\.tasks\.DMCTask or GymnasiumTask"
         ):
             TASKS.register("mine", "cartpole")
         with pytest.raises(UserError, match="a task called 'walker_walk' exists already"):

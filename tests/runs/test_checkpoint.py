@@ -170,7 +170,7 @@ def full_disk(monkeypatch, left: int) -> None:
 def test_a_full_disk_is_one_sentence_and_takes_nothing(two, tmp_path, monkeypatch, left):
     with monkeypatch.context() as patch:
         full_disk(patch, left)
-        with pytest.raises(UserError, match=r"checkpoints/3: the disk is full: free some space and start the same"):
+        with pytest.raises(UserError, match=r"checkpoints/3: the disk is full: free some space and re-run the same"):
             two.add(3, at(3), 0.0)
     assert names(tmp_path) == ["1", "2"]
     assert two.newest().files == at(2)

@@ -125,7 +125,7 @@ def _refuse_twins(folder: Path, shards: Sequence[Path]) -> None:
 def refuse_partial(folder: Path) -> None:
     """Raise UserError if a set's download began in a folder and did not end."""
     if partial := next(folder.glob("[!.]*.part"), None):
-        raise UserError(f"{partial}: the set's download is not finished; start the same `data download` command again")
+        raise UserError(f"{partial}: the set's download is not finished; re-run the same `data download` command")
 
 
 def shard_number(path: Path) -> tuple[str, int | None]:
@@ -298,8 +298,8 @@ def _locked(path: Path, error: Exception) -> UserError | None:
         )
     if "already open for write" in str(error):
         return UnavailableError(
-            f"{path}: another program writes it, or was killed while it did; close that program and start the same "
-            "command again, or remove its mark with `h5clear -s`"
+            f"{path}: another program writes it, or was killed while it did; close that program and re-run the same "
+            "command, or remove its mark with `h5clear -s`"
         )
     return None
 

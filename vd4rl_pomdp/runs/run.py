@@ -32,7 +32,7 @@ _CODE = ("versions", "git_commit", "plugins", "sources")
 def remedy(folder: Path) -> str:
     """What to do about a result of a finished run that is lost or damaged."""
     return (
-        f"put it back, or remove {folder / TIMING_FILE} and start the run's command again: it goes on from the last "
+        f"put it back, or remove {folder / TIMING_FILE} and re-run its command: it resumes from the last "
         "checkpoint and writes it anew"
     )
 
