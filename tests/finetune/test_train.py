@@ -323,7 +323,7 @@ def test_a_finished_run_that_lost_a_result_says_so_and_writes_it_anew(finished, 
     else:
         (run / name).unlink()
     before = contents(run)
-    with pytest.raises(UserError, match=r"or remove .*timing\.json and start the run's command again"):
+    with pytest.raises(UserError, match=r"or remove .*timing\.json and re-run its command"):
         run_finetune(config)
     assert contents(run) == before
     (run / "timing.json").unlink()

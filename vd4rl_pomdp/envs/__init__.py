@@ -41,7 +41,7 @@ MAZE_STEPS, FINITE_STEPS = 500, 16
 def _register(name: str, entry_point: str, arguments: dict[str, Any], steps: int) -> None:
     gymnasium.register(
         name,
-        entry_point=f"vd4rl_pomdp.envs.{entry_point}",
+        entry_point=f"vd4rl_pomdp.{entry_point}",
         kwargs=arguments,
         max_episode_steps=steps,
         additional_wrappers=(WrapperSpec("ResetAfterEnd", "vd4rl_pomdp.envs.ended:ResetAfterEnd", {}),),
@@ -49,8 +49,8 @@ def _register(name: str, entry_point: str, arguments: dict[str, Any], steps: int
 
 
 for _id, _arguments in GYM_IDS.items():
-    _register(_id, "gym:GymEnv", _arguments, TASKS.registered()[_arguments["task"]].decisions)
+    _register(_id, "envs.gym:GymEnv", _arguments, TASKS.registered()[_arguments["task"]].decisions)
 for _id, _world in FINITE_IDS.items():
-    _register(_id, "finite:FiniteEnv", {"world": _world}, FINITE_STEPS)
+    _register(_id, "studies.theory.env:FiniteEnv", {"world": _world}, FINITE_STEPS)
 for _maze in MAZES.values():
-    _register(_maze.gym_id, "maze:MazeEnv", {"maze": _maze.name}, MAZE_STEPS)
+    _register(_maze.gym_id, "envs.maze:MazeEnv", {"maze": _maze.name}, MAZE_STEPS)
