@@ -125,7 +125,9 @@ def be_killed(job: int) -> None:
 
 
 def test_a_worker_that_was_killed_may_have_lacked_memory(capfd):
-    with pytest.raises(UserError, match=r"\(exit code -9\), perhaps for want of memory: use fewer --workers and re-run"):
+    with pytest.raises(
+        UserError, match=r"\(exit code -9\), perhaps for want of memory: use fewer --workers and re-run"
+    ):
         list(run_jobs(be_killed, [0, 1], 2))
 
 

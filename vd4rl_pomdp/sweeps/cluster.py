@@ -101,8 +101,8 @@ class _Front:
                 done = len(self._jobs) - len(self._left)
                 say(name, row["cause"], row["seconds"], row["line"], done, len(self._jobs))
             self._said[name] = len(rows)
-        rows = {job.name: attempts_at(job, attempts) for job in self._jobs}
-        lost, left = lost_among(self._left, rows), {job.name for job in self._left}
+        since = {job.name: attempts_at(job, attempts) for job in self._jobs}
+        lost, left = lost_among(self._left, since), {job.name for job in self._left}
         ready = [job for job in self._left if job.name not in lost and left.isdisjoint(job.needs)]
         running = sum(in_use(job.folder) for job in ready)
         return len(ready) - running, running

@@ -92,12 +92,14 @@ class Cluster(Protocol):
 
     folder: Path
     """For what tasks print."""
-    tasks: int
-    """The most at a time."""
     jobs_per_task: int
     """Jobs of a task at a time."""
     threads: int
     """CPU threads of a job; 0: its share of the task's cores."""
+
+    @property
+    def tasks(self) -> int:
+        """The most at a time."""
 
     def live(self) -> int:
         """How many tasks of this sweep wait or run; UnavailableError if the cluster does not answer."""
