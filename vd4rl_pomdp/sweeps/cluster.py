@@ -19,7 +19,7 @@ from vd4rl_pomdp.sweeps.driver import attempts_at, lost_among, say
 from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.own_file import own_file
 from vd4rl_pomdp.sweeps.plan import Job
-from vd4rl_pomdp.sweeps.work import Cluster, Task, Work, last_line
+from vd4rl_pomdp.sweeps.work import Cluster, ClusterTask, Work, last_line
 
 LOOK_S = 15.0
 """Seconds between two looks at the cluster."""
@@ -45,7 +45,7 @@ def watch(jobs: Iterable[Job], cluster: Cluster, folder: SweepFolder, plan: str 
     words = ["sweep", "join", str(folder.out), "--jobs", str(cluster.jobs_per_task)]
     words += ["--jobs-per-gpu", str(cluster.jobs_per_task), "--threads", str(cluster.threads)]
     words += [] if plan is None else ["--plan", plan]
-    task = Task(Work("join", tuple(words), folder.path / "logs" / "tasks", 1, own_file(), told), os.getcwd())
+    task = ClusterTask(Work("join", tuple(words), folder.path / "logs" / "tasks", 1, own_file(), told), os.getcwd())
     front = _Front(jobs, cluster, folder, task)
     try:
         while front.look():
@@ -62,7 +62,7 @@ def watch(jobs: Iterable[Job], cluster: Cluster, folder: SweepFolder, plan: str 
 class _Front:
     """What is known of a sweep's jobs and tasks."""
 
-    def __init__(self, jobs: list[Job], cluster: Cluster, folder: SweepFolder, task: Task) -> None:
+    def __init__(self, jobs: list[Job], cluster: Cluster, folder: SweepFolder, task: ClusterTask) -> None:
         self._jobs, self._cluster, self._folder, self._task = jobs, cluster, folder, task
         self._left = [job for job in jobs if not job.finished]
         self._said = {name: len(rows) for name, rows in folder.attempts().items()}

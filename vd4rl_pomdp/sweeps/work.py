@@ -104,7 +104,7 @@ class Cluster(Protocol):
     def live(self) -> int:
         """How many tasks of this sweep wait or run; UnavailableError if the cluster does not answer."""
 
-    def submit(self, task: Task, number: int) -> None:
+    def submit(self, task: ClusterTask, number: int) -> None:
         """Ask for tasks; UnavailableError if it may succeed later, UserError if it was refused."""
 
     def stop(self) -> None:
@@ -112,7 +112,7 @@ class Cluster(Protocol):
 
 
 @dataclass(frozen=True)
-class Task:
+class ClusterTask:
     """What a task does: `sweep join` in a process of its own, which ends when the task is asked to."""
 
     work: Work

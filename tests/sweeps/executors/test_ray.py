@@ -16,7 +16,7 @@ from vd4rl_pomdp.core.errors import UnavailableError, UserError
 from vd4rl_pomdp.runs.ownership import in_use
 from vd4rl_pomdp.sweeps.executors import ray as module
 from vd4rl_pomdp.sweeps.executors.ray import RayCluster, RayOptions
-from vd4rl_pomdp.sweeps.work import Task, Work
+from vd4rl_pomdp.sweeps.work import ClusterTask, Work
 
 ray_is_there = pytest.importorskip("ray")
 NODE = {"num_cpus": 2, "object_store_memory": 80 * 2**20, "include_dashboard": False}
@@ -97,7 +97,7 @@ def test_tasks_fill_the_nodes_and_a_gpu_may_be_shared(options):
 
 def test_a_node_without_the_folder_is_told(options, tmp_path, capsys):
     made = RayCluster(options, tmp_path)
-    made.submit(Task(Work("join", ("list",), tmp_path), "/nowhere"), 1)
+    made.submit(ClusterTask(Work("join", ("list",), tmp_path), "/nowhere"), 1)
     until(lambda: not made.live())
     assert "use a disk that all nodes share" in capsys.readouterr().err
 

@@ -12,7 +12,7 @@ from vd4rl_pomdp.core.errors import UnavailableError, UserError
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.sweeps.executors import slurm as module
 from vd4rl_pomdp.sweeps.executors.slurm import SlurmCluster, SlurmOptions, parameters
-from vd4rl_pomdp.sweeps.work import Task, Work
+from vd4rl_pomdp.sweeps.work import ClusterTask, Work
 
 GRID = 'preset = "smoke"\n[collect]\ntask = "walker_walk"\nquality = "expert"\n'
 SCRIPTS = {
@@ -21,7 +21,7 @@ SCRIPTS = {
     "scancel": ":",
     "srun": ":",
 }
-TASK = Task(Work("join", ("list",), Path("log")), "/")
+TASK = ClusterTask(Work("join", ("list",), Path("log")), "/")
 
 
 @pytest.fixture

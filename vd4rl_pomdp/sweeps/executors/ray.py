@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 
 from vd4rl_pomdp.core.errors import UnavailableError, UserError
 from vd4rl_pomdp.core.options import Limits, Options
-from vd4rl_pomdp.sweeps.work import PATIENCE_S, Ended, Task
+from vd4rl_pomdp.sweeps.work import PATIENCE_S, ClusterTask, Ended
 
 CONNECT_S = 30.0
 """Seconds that a cluster has to answer a process that connects."""
@@ -88,7 +88,7 @@ class RayCluster:
                 print(f"warning: a task ended ({_line(getattr(error, 'cause', None) or error)})", file=sys.stderr)
         return len(self._running)
 
-    def submit(self, task: Task, number: int) -> None:
+    def submit(self, task: ClusterTask, number: int) -> None:
         """Start tasks; Ray finds their nodes."""
         run = self._ray.remote(max_retries=0)(_run)
         run = run.options(num_cpus=self._options.cpus, num_gpus=self._options.gpus, name=str(self.folder))
@@ -104,7 +104,7 @@ class RayCluster:
                 self._ray.cancel(task, force=True)
 
 
-def _run(task: Task) -> Ended:
+def _run(task: ClusterTask) -> Ended:
     return task.run([])
 
 

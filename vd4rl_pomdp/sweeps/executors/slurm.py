@@ -18,7 +18,7 @@ from typing import Any, ClassVar
 from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.runs import interrupt
-from vd4rl_pomdp.sweeps.work import PATIENCE_S, Task
+from vd4rl_pomdp.sweeps.work import PATIENCE_S, ClusterTask
 
 ANSWER_S, LAST_ANSWER_S = 30.0, 10.0
 """Seconds that a command of Slurm's has, and what it has once a signal has asked for the end."""
@@ -66,7 +66,7 @@ class SlurmOptions(Options):
 class Allocation:
     """What submitit runs in an array task."""
 
-    task: Task
+    task: ClusterTask
 
     def __call__(self) -> None:
         """Do the task; SIGTERM, and the signal that Slurm sends before the time limit, end it in peace."""
@@ -108,7 +108,7 @@ class SlurmCluster:
                 print(f"warning: Slurm keeps tasks waiting: {reason}", file=sys.stderr)
         return len(rows)
 
-    def submit(self, task: Task, number: int) -> None:
+    def submit(self, task: ClusterTask, number: int) -> None:
         """Submit one array.
 
         Raises:
