@@ -9,7 +9,7 @@ tmp=$(mktemp -d)
 trap 'rm -rf "$tmp"' EXIT
 python3 -m venv "$tmp/venv"
 "$tmp/venv/bin/pip" install --quiet "minari[hdf5,create]==0.5.4" \
-    gymnasium==1.4.0 numpy==2.4.6 h5py==3.16.0
+    gymnasium==1.4.0 numpy==2.4.6 h5py==3.16.0 pillow==13.0.0
 "$tmp/venv/bin/python" - "$tmp" << 'PY'
 import os
 import sys

@@ -25,12 +25,12 @@ def losses(**options):
     with torch.autocast("cpu", torch.bfloat16, **options):
         for _ in range(3):
             loss = (layer(x) - y).square().mean()
-            found.append(round(float(loss), 4))
+            found.append(round(loss.item(), 4))
             optimiser.zero_grad()
             loss.backward()
             optimiser.step()
     with torch.autocast("cpu", torch.bfloat16):
-        found.append(round(float((layer(x) - y).square().mean()), 4))
+        found.append(round((layer(x) - y).square().mean().item(), 4))
     return found
 
 

@@ -40,14 +40,14 @@ print("torch", torch.__version__)
 
 
 def milliseconds(policy):
-    end = subprocess.run(
+    done = subprocess.run(
         [sys.executable, "-c", train],
         env={**os.environ, "OMP_NUM_THREADS": "2", "OMP_WAIT_POLICY": policy} if policy else without,
         capture_output=True,
         text=True,
         check=True,
     )
-    return float(end.stdout)
+    return float(done.stdout)
 
 
 without = {name: value for name, value in os.environ.items() if not name.startswith("OMP_")}

@@ -1,10 +1,12 @@
 #!/usr/bin/env bash
-# One would guess: of one seed, the first n values of `torch.randn(n + 1)` are `torch.randn(n)`, as in numpy.
-# What happens: on the CPU torch fills 16 values at a time (Box-Muller in pairs eight apart) and draws the last 16 anew
-# when the count is no multiple; below 16 it uses another order. So changing a size changes values at the front; `rand`
-# is steady.
-# For this field: noise for 20 episodes and for 21, or for a batch cut in two, are unrelated, and "same seed"
-# comparisons of batch sizes or shards are none. Draw per episode from a generator of its own, or from numpy.
+# One would guess: of one seed, the first n values of `torch.randn(n + 1)` are `torch.randn(n)`, and two draws of 8 are
+# one of 16, as in numpy.
+# What happens: on the CPU fewer than 16 values are drawn in another order than 16 and more, and a count that is no
+# multiple of 16 has its last 16 values drawn anew. So 15 and 16 values have nothing in common, three draws of 6 and
+# one of 18 neither; only multiples of 16 can be cut. `torch.rand` is steady.
+# For this field: six joints' noise for one environment and the noise of three environments at once are unrelated for
+# the same seed, so acting one by one and in a batch cannot be compared. Draw for each episode from a generator of its
+# own, or from numpy.
 set -eu
 tmp=$(mktemp -d)
 trap 'rm -rf "$tmp"' EXIT
@@ -29,10 +31,13 @@ draws = {
 same = {name: {n: kept(draw, n) for n in (8, 15, 16, 20)} for name, draw in draws.items()}
 for name, counts in same.items():
     print(f"{name}: of n values, kept when n + 1 are drawn:", counts)
-generator = torch.Generator().manual_seed(0)
-halves = torch.cat([torch.randn(8, generator=generator), torch.randn(8, generator=generator)])
-print("randn, two times 8 against 16:", int((halves == draws["torch.randn"](16)).sum()), "of 16 the same")
+cut = {}
+for count, size in ((2, 8), (3, 6), (2, 16)):
+    generator = torch.Generator().manual_seed(0)
+    parts = torch.cat([torch.randn(size, generator=generator) for _ in range(count)])
+    cut[count, size] = int((parts == draws["torch.randn"](count * size)).sum())
+    print(f"torch.randn, {count} draws of {size} against one of {count * size}: {cut[count, size]} values the same")
 assert same["torch.randn"][15] == 0 and same["torch.randn"][16] < 3 and same["torch.randn"][20] < 20
 assert all(count == n for name in ("torch.rand", "numpy standard_normal") for n, count in same[name].items())
-assert (halves != draws["torch.randn"](16)).all()
+assert cut == {(2, 8): 0, (3, 6): 0, (2, 16): 32}, "draws are cut otherwise"
 PY
