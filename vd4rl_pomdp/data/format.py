@@ -25,7 +25,7 @@ from typing import Any
 import h5py
 import numpy as np
 
-from vd4rl_pomdp.core.errors import UnavailableError, UserError, in_one_line, system_error
+from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors, in_one_line, system_error
 from vd4rl_pomdp.core.reading import parse_json, regular
 from vd4rl_pomdp.core.tasks import FRAME_SIZES, GymnasiumTask, Task
 from vd4rl_pomdp.core.types import StepType
@@ -69,7 +69,8 @@ def warn_of_earlier_pictures(place: object, plan: Mapping[str, Any], task: Task)
 
 def shard_files(folder: Path) -> list[Path]:
     """Files of a folder that are called shards, in no order; none without a folder. `shard_paths` checks them."""
-    return [path for path in folder.iterdir() if is_shard_name(path.name)] if folder.is_dir() else []
+    with disk_errors(folder):
+        return [path for path in folder.iterdir() if is_shard_name(path.name)] if folder.is_dir() else []
 
 
 def shard_paths(folder: Path) -> list[Path]:
@@ -91,7 +92,8 @@ def shard_paths(folder: Path) -> list[Path]:
         raise UserError(f"{folder}: the set's collection is not finished; start the command that collects it again")
     shards = shard_files(folder)
     if not shards:
-        first = min((path for path in folder.rglob("*") if is_shard_name(path.name)), default=None)
+        with disk_errors(folder):
+            first = min((path for path in folder.rglob("*") if is_shard_name(path.name)), default=None)
         hint = f"name a folder of shards such as {first.parent}" if first else "collect or download a set there"
         raise UserError(f"{folder}: holds no .hdf5 shards; {hint}")
     _refuse_twins(folder, shards)
@@ -124,7 +126,9 @@ def _refuse_twins(folder: Path, shards: Sequence[Path]) -> None:
 
 def refuse_partial(folder: Path) -> None:
     """Raise UserError if a set's download began in a folder and did not end."""
-    if partial := next(folder.glob("[!.]*.part"), None):
+    with disk_errors(folder):
+        partial = next(folder.glob("[!.]*.part"), None)
+    if partial:
         raise UserError(f"{partial}: the set's download is not finished; re-run the same `data download` command")
 
 

@@ -7,10 +7,10 @@ from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
-from importlib.resources import files
 from pathlib import Path
 
-from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.reading import read_bytes
 from vd4rl_pomdp.data.format import read_attributes
 
 _TOLD = 4
@@ -35,7 +35,7 @@ class RemoteFile:
 @cache
 def manifest() -> tuple[RemoteFile, ...]:
     """All published 84-pixel shards."""
-    text = files("vd4rl_pomdp.data").joinpath("manifest.tsv").read_text(encoding="utf-8")
+    text = read_bytes(Path(__file__).with_name("manifest.tsv")).decode()
     rows = csv.DictReader(text.splitlines(), delimiter="\t")
     return tuple(RemoteFile(row["path"], int(row["bytes"]), row["sha256"]) for row in rows)
 
@@ -51,7 +51,8 @@ def check_whole(path: Path, shards: Sequence[Path], named: tuple[str | None, str
         shards: its shards.
         named: the task and quality that its folders tell.
     """
-    sizes = {shard.name: shard.stat().st_size if shard.exists() else -1 for shard in shards}
+    with disk_errors(path):
+        sizes = {shard.name: shard.stat().st_size if shard.exists() else -1 for shard in shards}
     published: dict[tuple[str | None, str | None], dict[str, int]] = defaultdict(dict)
     for file in manifest():
         *_, of_task, of_quality, _, name = file.path.split("/")
