@@ -45,7 +45,7 @@ def test_every_claim_is_a_difference_of_means_with_its_interval(tmp_path):
         "a memory pays: mik above acro": (320, 210),
         "past actions pay: mik+a above mik": (520, 320),
         "mik+a is above every other method": (520, 320),
-        "a memory costs nothing where nothing is hidden: mik+a not below acro": (590, 610),
+        "with nothing hidden, mik+a is not below acro": (590, 610),
         "what is left to a memory that was told the states": (705, 520),
         "what is left to the states themselves": (760, 520),
     }

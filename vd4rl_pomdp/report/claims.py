@@ -64,7 +64,7 @@ CLAIMS = (
     ReturnClaim("past actions pay: mik+a above mik", Contender("mik+a"), Contender("mik")),
     ReturnClaim("mik+a is above every other method", Contender("mik+a"), Contender()),
     ReturnClaim(
-        "a memory costs nothing where nothing is hidden: mik+a not below acro",
+        "with nothing hidden, mik+a is not below acro",
         Contender("mik+a"),
         Contender("acro"),
         hidden=False,
