@@ -16,7 +16,6 @@ from vd4rl_pomdp.core.errors import UserError, disk_error
 from vd4rl_pomdp.core.tasks import SCORE_DIVISOR
 from vd4rl_pomdp.core.text import code, markdown, plain, write_text
 from vd4rl_pomdp.core.types import StepType
-from vd4rl_pomdp.data.dataset import task_and_quality
 from vd4rl_pomdp.data.episodes import episode_returns, join_shards
 from vd4rl_pomdp.data.format import (
     PROVENANCE,
@@ -27,7 +26,7 @@ from vd4rl_pomdp.data.format import (
     read_some_frames,
     shard_paths,
 )
-from vd4rl_pomdp.data.manifest import check_whole
+from vd4rl_pomdp.data.manifest import check_whole, task_and_quality
 from vd4rl_pomdp.data.published import published_scores
 from vd4rl_pomdp.runs.files import read_json
 
@@ -70,7 +69,7 @@ def write_card(path: Path) -> Path:
     if path.is_file():
         raise UserError(f"{path}: is one file; a card describes a whole set: name its folder")
     shards = shard_paths(path)
-    check_whole(path, shards, task_and_quality(path, []))
+    check_whole(path, shards)
     check_frames(shards)
     parts = [read_rows(shard) for shard in shards]
     rows = join_shards(path, shards, parts)

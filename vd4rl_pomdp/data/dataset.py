@@ -2,11 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import torch
@@ -15,11 +13,11 @@ from torch import Tensor
 from vd4rl_pomdp.core.buffers import FrameBuffers
 from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError
 from vd4rl_pomdp.core.state_scale import StateScale
-from vd4rl_pomdp.core.tasks import FRAME_STACK, SET_QUALITIES, TASKS
+from vd4rl_pomdp.core.tasks import FRAME_STACK, TASKS
 from vd4rl_pomdp.core.types import StepType, Transitions, Windows, row_key, unpack_row_key
 from vd4rl_pomdp.data.episodes import episode_returns
 from vd4rl_pomdp.data.format import shard_paths
-from vd4rl_pomdp.data.manifest import check_whole
+from vd4rl_pomdp.data.manifest import check_whole, task_and_quality
 from vd4rl_pomdp.data.store import Store, open_store
 from vd4rl_pomdp.envs.make import layout_of
 
@@ -42,7 +40,7 @@ def open_dataset(path: Path | str, cache: Path | str | None = None) -> Dataset:
     """
     path = Path(path)
     if path.is_dir():
-        check_whole(path, shard_paths(path), task_and_quality(path, []))
+        check_whole(path, shard_paths(path))
     return Dataset(path, open_store(path, Path(cache) if cache else None))
 
 
@@ -357,17 +355,3 @@ def _read_only_tensor(array: np.ndarray) -> Tensor:
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # meant: see `Dataset.frames`
         return torch.from_numpy(array)
-
-
-def task_and_quality(path: Path, attributes: list[dict[str, Any]]) -> tuple[str | None, str | None]:
-    """Task and quality of a set: as the attributes of all its shards say, else as its folders are named."""
-    return _name(path, attributes, "task", tuple(TASKS)), _name(path, attributes, "set", SET_QUALITIES)
-
-
-def _name(path: Path, attributes: list[dict[str, Any]], attribute: str, choices: tuple[str, ...]) -> str | None:
-    stored = {str(one[attribute]) for one in attributes if one.get(attribute)}
-    if len(stored) > 1:
-        raise UserError(f"{path}: its shards come from {' and '.join(sorted(stored))}; keep one set in a folder")
-    folders = *path.resolve().parts, *Path(os.path.abspath(path)).parts  # a link's name comes before its target's
-    named = (part for part in reversed(folders) if part in choices)
-    return stored.pop() if stored else next(named, None)

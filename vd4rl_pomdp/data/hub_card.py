@@ -7,8 +7,8 @@ from pathlib import Path
 
 from vd4rl_pomdp.core.reading import read_bytes
 from vd4rl_pomdp.core.text import code, code_block, one_line
-from vd4rl_pomdp.data.dataset import task_and_quality
 from vd4rl_pomdp.data.format import read_attributes, shard_paths
+from vd4rl_pomdp.data.manifest import task_and_quality
 
 TAGS = ("reinforcement-learning", "offline-reinforcement-learning", "vd4rl-pomdp")
 

@@ -3,14 +3,17 @@
 from __future__ import annotations
 
 import csv
+import os
 from collections import defaultdict
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cache
 from pathlib import Path
+from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.reading import read_bytes
+from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
 from vd4rl_pomdp.data.format import read_attributes
 
 _TOLD = 4
@@ -40,7 +43,7 @@ def manifest() -> tuple[RemoteFile, ...]:
     return tuple(RemoteFile(row["path"], int(row["bytes"]), row["sha256"]) for row in rows)
 
 
-def check_whole(path: Path, shards: Sequence[Path], named: tuple[str | None, str | None]) -> None:
+def check_whole(path: Path, shards: Sequence[Path]) -> None:
     """Raise UserError for a part of a published set.
 
     A shard of the name and size of a published one is that. Other sets are their makers' business, unless they tell
@@ -49,7 +52,6 @@ def check_whole(path: Path, shards: Sequence[Path], named: tuple[str | None, str
     Args:
         path: the folder.
         shards: its shards.
-        named: the task and quality that its folders tell.
     """
     with disk_errors(path):
         sizes = {shard.name: shard.stat().st_size if shard.exists() else -1 for shard in shards}
@@ -59,7 +61,7 @@ def check_whole(path: Path, shards: Sequence[Path], named: tuple[str | None, str
         published[of_task, of_quality][name] = file.size
     alike = [key for key, wanted in published.items() if sizes.keys() <= wanted.keys()]
     certain = [key for key in alike if sizes.items() & published[key].items()]
-    key: tuple[str | None, str | None] = named
+    key = named = task_and_quality(path, [])
     if certain and named not in certain:
         key = min(certain, key=lambda key: len(published[key]))  # the shards of expert are in medium_expert, too
     elif key not in alike or (not certain and read_attributes(shards[0])):
@@ -77,3 +79,17 @@ def check_whole(path: Path, shards: Sequence[Path], named: tuple[str | None, str
         f"`vd4rl-pomdp data download --task {task} --quality {quality} --out {out}`, or give the shards other names to "
         "train on them alone"
     )
+
+
+def task_and_quality(path: Path, attributes: list[dict[str, Any]]) -> tuple[str | None, str | None]:
+    """Task and quality of a set: as the attributes of all its shards say, else as its folders are named."""
+    return _name(path, attributes, "task", tuple(TASKS)), _name(path, attributes, "set", SET_QUALITIES)
+
+
+def _name(path: Path, attributes: list[dict[str, Any]], attribute: str, choices: tuple[str, ...]) -> str | None:
+    stored = {str(one[attribute]) for one in attributes if one.get(attribute)}
+    if len(stored) > 1:
+        raise UserError(f"{path}: its shards come from {' and '.join(sorted(stored))}; keep one set in a folder")
+    folders = *path.resolve().parts, *Path(os.path.abspath(path)).parts  # a link's name comes before its target's
+    named = (part for part in reversed(folders) if part in choices)
+    return stored.pop() if stored else next(named, None)

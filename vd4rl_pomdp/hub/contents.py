@@ -9,7 +9,6 @@ from pathlib import Path
 
 from vd4rl_pomdp.core.errors import UnavailableError, UserError
 from vd4rl_pomdp.core.reading import build
-from vd4rl_pomdp.data.dataset import task_and_quality
 from vd4rl_pomdp.data.episodes import join_shards
 from vd4rl_pomdp.data.format import check_frames, is_shard_name, read_rows, shard_files, shard_paths
 from vd4rl_pomdp.data.hub_card import set_card
@@ -99,7 +98,7 @@ def _check(folder: Path, kind: str) -> None:
         load_encoder(folder)
     else:
         shards = shard_paths(folder)
-        check_whole(folder, shards, task_and_quality(folder, []))
+        check_whole(folder, shards)
         check_frames(shards)
         join_shards(folder, shards, [read_rows(shard) for shard in shards])
 
