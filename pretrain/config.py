@@ -66,8 +66,8 @@ class TrainingConfig(StageConfig):
     learning_rate: float = 3e-4
     """Adam's learning rate."""
     frame_encoder: str = "drq"
-    """Frame encoder: drq, nature (a fraction of its cost), nature_half (half the resolution), small, mixer, or state (no
-    pixels: the simulator's state)."""
+    """Frame encoder: drq, nature (a fraction of its cost), nature_half (half the resolution), small or mixer; or
+    state, the simulator's, in place of pixels."""
     precision: Precision = "fp32"
     """fp32, or bf16 autocast."""
     device: str = "auto"

@@ -17,9 +17,10 @@ from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK, TASKS, UNKNOWN_QUALITY
 from vd4rl_pomdp.core.types import StateWindows
 from vd4rl_pomdp.corruptions import check_corruption_fits
-from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
+from vd4rl_pomdp.data import Dataset, StateView, View, WindowSampler, open_dataset
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, EncoderCard, save_encoder
+from vd4rl_pomdp.nn.frame import STATE, StateFrame
 from vd4rl_pomdp.nn.objective import Objective
 from vd4rl_pomdp.runs import METRICS_FILE
 from vd4rl_pomdp.runs.device import pick_device
@@ -40,7 +41,7 @@ def pretrain(config: PretrainConfig) -> RunFolder:
     with RunFolder(config.out, STAGE, config, {"data": dataset.fingerprint}, FILES_OF_RUN) as run:
         if not run.finished:
             dataset.to(next(objective.parameters()).device)
-            trainer = Trainer(objective, make_batches(dataset, config), config)
+            trainer = Trainer(objective, make_batches(dataset, config, objective), config)
             labels = {name: run.config[name] for name in ("method", "task", "corruption")}
             labels["quality"] = dataset.quality or UNKNOWN_QUALITY
             trainer.run(run, config.steps if method.trained else 0, f"pretrain {config.method}", labels)
@@ -60,14 +61,20 @@ def make_objective(dataset: Dataset, config: PretrainConfig) -> Objective:
     check_corruption_fits(config.corruption, FRAME_SIZE if method.reads_state else dataset.frame_size)
     seed_networks(config.seed, STAGE)
     target = build_target(config, dataset.action_after(dataset.transition_rows).numpy())
-    states = dataset.state_scale() if method.reads_state or method.regresses_state else None
+    told = method.reads_state or method.regresses_state or config.frame_encoder == STATE
+    states = dataset.state_scale() if told else None
     return build_objective(config, dataset.action_dim, target, states, (3 * FRAME_STACK, dataset.frame_size))
 
 
-def make_batches(dataset: Dataset, config: PretrainConfig) -> Batches:
+def make_batches(dataset: Dataset, config: PretrainConfig, objective: Objective) -> Batches:
     """Windows of a set as the method is to see them, from the run's own random stream."""
     method, batches = METHODS.named(config.method), stream_generator(config.seed, STAGE, "batches")
-    given = view_of(dataset, config), config.batch_size, config.window, batches
+    frame = objective.encoder.frame
+    if isinstance(frame, StateFrame):
+        view: View = StateView(dataset, frame.observe, config.corruption, config.seed, STAGE)
+    else:
+        view = view_of(dataset, config)
+    given = view, config.batch_size, config.window, batches
     return StateWindowSampler(*given) if method.regresses_state else WindowSampler(*given)
 
 

@@ -120,8 +120,8 @@ def maze_training() -> dict[str, float]:
     from vd4rl_pomdp.studies.navigation.config import NavigationConfig
     from vd4rl_pomdp.studies.navigation.data import MazeData
     from vd4rl_pomdp.studies.navigation.observations import open_maze_set
-    from vd4rl_pomdp.studies.navigation.sets import PRESETS as SETS
     from vd4rl_pomdp.studies.navigation.probed import make_trainer
+    from vd4rl_pomdp.studies.navigation.sets import PRESETS as SETS
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

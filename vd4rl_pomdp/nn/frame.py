@@ -270,18 +270,18 @@ class StateFrame(nn.Module):
         """Observations of states.
 
         Args:
-            state: (N, P) float32.
-            key: (N,) int64, what noise and hidden coordinates are drawn from; equal keys give equal ones.
+            state: (..., P) float32.
+            key: (...,) int64, what noise and hidden coordinates are drawn from; equal keys give equal ones.
 
         Returns:
-            (N, P, 1, 1) float32.
+            (..., P, 1, 1) float32.
         """
         if len(self.noise):
-            state = (state + draw_normals(key, state.shape[1]) * self.noise).float()
+            state = (state + draw_normals(key, state.shape[-1]) * self.noise).float()
         if len(self.std):
             state = ((state - self.mean) / torch.where(self.std > 0, self.std, 1)).float()
         if self.hidden_share:
-            hidden = draw_integers(derive_keys(1, key), DRAWS, state.shape[1]) < self.hidden_share * DRAWS
+            hidden = draw_integers(derive_keys(1, key), DRAWS, state.shape[-1]) < self.hidden_share * DRAWS
             state = state.masked_fill(hidden, 0.0)
         return state[..., None, None]
 
