@@ -51,6 +51,7 @@ def _check_maze(training: Any, maze_set: Any) -> None:
 def _check_pretraining(config: Any, size: int, rows: int) -> None:
     from pretrain.objectives import METHODS
 
+    refuse_outside(config, shift=(0, size - 1))
     check_corruption_fits(config.corruption, size)
     _check_window(config.window, rows)
     if not METHODS.named(config.method).reads_state and config.frame_encoder != STATE:
