@@ -2,11 +2,12 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from typing import Any
 
 import numpy as np
 
-from pretrain.config import HiddenOptions, MemoryOptions, TrainingConfig
+from pretrain.config import HiddenOptions, TrainingConfig, history_of
 from pretrain.objectives import METHODS
 from pretrain.objectives.untrained import StateOptions
 from vd4rl_pomdp.core.options import flat
@@ -15,6 +16,7 @@ from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.nn.action_target import ActionTarget, make_action_target
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE, encoder_settings
+from vd4rl_pomdp.nn.memory import MemoryOptions
 from vd4rl_pomdp.nn.objective import ActionOptions, Objective
 
 
@@ -56,13 +58,15 @@ def build_objective(
         shape = {"frame_encoder": config.frame_encoder, "channels": channels, "size": size}
         shape |= encoder_settings(config.frame)
     if isinstance(config.memory, MemoryOptions):
-        past = method.past if config.memory.m is None else config.memory.m
+        told = asdict(config.memory)
+        hidden, m = told.pop("hidden_dim"), told.pop("m")
+        past = method.past if m is None else m
         memory = {
-            "history": "gru",
+            "history": history_of(config.method, method, getattr(config, "history", "method")),
             "use_actions": method.use_actions,
-            "hidden_dim": config.memory.hidden_dim,
-            "gru_layers": config.memory.gru_layers,
+            "hidden_dim": hidden,
             "history_window": 0 if past is None else past + 1,
+            "memory_options": told,
         }
     encoder = Encoder(EncoderConfig(action_dim, **shape, **memory))
     return method.build(encoder, states if method.regresses_state else target, config.options, config.seed)
