@@ -13,20 +13,17 @@ import numpy as np
 import pytest
 import torch
 
-import finetune.evaluations
-import finetune.features
-import pretrain.train
-import vd4rl_pomdp.studies.navigation.trainer
+import finetune.train
 from finetune.algorithms import bc, td3_bc
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
+from pretrain.trainer import Trainer
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import InUseError, UserError
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.runs import run as run_module
 from vd4rl_pomdp.runs.episodes import read_episodes
-from vd4rl_pomdp.runs.files import read_json, write_json
+from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
 from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
 from vd4rl_pomdp.runs.ownership import owned
@@ -89,11 +86,11 @@ def stage(request) -> Stage:
         return (
             run_navigation,
             lambda out: replace(config, out=out),
-            vd4rl_pomdp.studies.navigation.trainer.NavigationTrainer,
+            Trainer,
         )
     data = request.getfixturevalue("data")
     if request.param == "pretrain":
-        return run_pretrain, lambda out: smoke_pretrain(data, out, method="no_history"), pretrain.train.PretrainTrainer
+        return run_pretrain, lambda out: smoke_pretrain(data, out, method="no_history"), Trainer
     encoder, changes = request.getfixturevalue("encoder"), FINETUNE | {"algorithm": "bc"}
     return run_finetune, lambda out: smoke_finetune(encoder, data, out, **changes), bc.BC
 
@@ -312,41 +309,6 @@ def test_record_and_card_name_the_inputs(encoder, data, tmp_path):
     assert set(inputs) == {"data", "encoder"}
 
 
-def test_features_of_other_inputs_or_damaged_ones_are_made_anew(encoder, data, tmp_path, monkeypatch):
-    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **FINETUNE))
-    config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
-    with monkeypatch.context() as patch:
-        fill_disk(patch, "state.safetensors", 1)
-        with pytest.raises(UserError):
-            run_finetune(config)
-    features, origin = config.out / "features.npy", config.out / "features.json"
-    assert read_json(origin).keys() == {"data", "encoder", "sha256", "versions", "git_commit", "plugins", "sources"}
-    features.write_bytes(features.read_bytes()[:-100] + bytes(100))
-    run_finetune(config)
-    assert contents(config.out) == contents(whole.path)
-    assert not features.exists()
-    assert not origin.exists()
-
-
-@pytest.mark.parametrize("changed", [False, True])
-def test_features_that_other_code_made_are_made_anew_and_probed_anew(encoder, data, tmp_path, monkeypatch, changed):
-    config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
-    encode, encoded = finetune.features._encode_all, []
-    monkeypatch.setattr(finetune.features, "_encode_all", lambda *words: (encoded.append(words), encode(*words))[1])
-    with monkeypatch.context() as patch:
-        fill_disk(patch, "state.safetensors", 1)
-        with pytest.raises(UserError):
-            run_finetune(config)
-    write_json(config.out / "probe.json", {"probe_pose": 1.0, "probe_velocity": 2.0})
-    if changed:
-        monkeypatch.setattr(
-            run_module, "code_of", lambda parts: {"plugins": {}, "sources": {"corruption mine": "mine.py 2"}}
-        )
-    run_finetune(config)
-    assert len(encoded) == 1 + changed
-    assert (config.out / "probe.json").exists() != changed, "this set has no states to probe anew"
-
-
 @pytest.mark.parametrize(("evaluation", "rows_written"), [(1, 0), (1, 1), (2, 0), (2, 2)])
 def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
     encoder, data, tmp_path, monkeypatch, evaluation, rows_written
@@ -355,7 +317,7 @@ def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
     changes = FINETUNE | {"eval_episodes": 2}
     whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes))
     config = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
-    append, evaluations = finetune.evaluations.append_episodes, []
+    append, evaluations = finetune.train.append_episodes, []
 
     def cut(path: Path, rows: list[dict[str, Any]]) -> None:
         evaluations.append(rows)
@@ -366,7 +328,7 @@ def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(finetune.evaluations, "append_episodes", cut)
+        patch.setattr(finetune.train, "append_episodes", cut)
         with pytest.raises(KeyboardInterrupt):
             run_finetune(config)
     monkeypatch.setattr(td3_bc.TD3BC, "update", _fail if evaluation == 2 else td3_bc.TD3BC.update)
@@ -405,7 +367,7 @@ def test_an_old_format_is_refused_before_anything_is_written(data, tmp_path):
 def test_a_run_that_was_taken_over_adds_no_row_and_no_mark(data, tmp_path, monkeypatch, diverges):
     """Between two checkpoints: its successor writes there by now, and rows of both would be one too many."""
     config = smoke_pretrain(data, tmp_path / "out", steps=20, log_every=5, checkpoint_every=20)
-    update = pretrain.train.PretrainTrainer.update
+    update = Trainer.update
 
     def taken_over(trainer):
         if trainer.step == 7:
@@ -414,7 +376,7 @@ def test_a_run_that_was_taken_over_adds_no_row_and_no_mark(data, tmp_path, monke
                 raise FloatingPointError("its loss is not finite")
         return update(trainer)
 
-    monkeypatch.setattr(pretrain.train.PretrainTrainer, "update", taken_over)
+    monkeypatch.setattr(Trainer, "update", taken_over)
     with pytest.raises(InUseError, match="was taken over by process 1 on elsewhere"):
         run_pretrain(config)
     assert [row["step"] for row in read_metrics(config.out / "metrics.jsonl")] == [5]

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from finetune.features import FeatureFile
 from tests.helpers_data import write_fake_set
 from tests.nn.test_encoder import CARD, make
 from tests.studies.navigation.test_exogenous import python_batch
@@ -74,8 +73,6 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
     copyfile(ASSETS / "walker_walk_replay.safetensors", ladder)
     with (run / FILM_FILE).open("wb") as file:
         np.savez(file, **{name: np.zeros((1,) * axes) for name, axes in FILM.items()})
-    features = FeatureFile(run, {})
-    features.write(np.zeros(3))
     (run / "episodes.csv").write_text(",".join(COLUMNS) + "\n")
     (run / CURVE).write_text("decisions,return_mean\n1,2.0\n")
     (run / "trajectory.csv").write_text("x,y,estimated_x,estimated_y\n0,0,0,0\n")
@@ -105,7 +102,6 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
         "ladder": lambda: read_ladder(ladder),
         "what a policy replaces": lambda: _refuse_other(actor),
         "film": lambda: LoadedRun.film(SimpleNamespace(path=run)),
-        "features": features.read,
         "episodes": lambda: read_episodes(run / "episodes.csv"),
         "episodes of a cut run": lambda: episodes_until(run / "episodes.csv", 1),
         "curve": lambda: read_curve(run),

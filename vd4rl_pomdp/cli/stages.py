@@ -51,7 +51,7 @@ class EvaluateCommand:
 
 
 def _evaluate(words: Arguments, program: str) -> None:
-    from finetune.evaluation import by_part, evaluate_run, evaluations_of
+    from finetune.evaluation import by_part, evaluate_run
     from vd4rl_pomdp.core.errors import refuse_number
     from vd4rl_pomdp.core.settings import LABELS
     from vd4rl_pomdp.data.reference import Reference, summarise
@@ -63,10 +63,8 @@ def _evaluate(words: Arguments, program: str) -> None:
     refuse_number("parts", command.parts, 1)
     if command.out is not None:
         refuse_inside(command.out)
-        evaluations_of(command.run)
         begin_episodes(command.out)  # before any episode is played
-    played = evaluate_run(command.run, command.corruption, command.episodes, command.workers)
-    rows = played.rows
+    rows, episodes = evaluate_run(command.run, command.corruption, command.episodes, command.workers)
     if command.out is not None:
         append_episodes(command.out, rows)
     reference = Reference.read(command.run)
@@ -77,7 +75,7 @@ def _evaluate(words: Arguments, program: str) -> None:
         mine = [row for row in rows if row["evaluated_under"] == name]
         under[name] = summarise(mine, reference) | {"episodes": mine if command.json else len(mine)}
         if command.parts > 1:
-            under[name]["parts"] = by_part([e for e in played.episodes if e.evaluated_under == name], command.parts)
+            under[name]["parts"] = by_part([e for e in episodes if e.evaluated_under == name], command.parts)
     result = labels | known | {"under": under}
     told = {name: "unknown" if value is None else value for name, value in flatten(result).items()}
     show(result if command.json else told, command.json)

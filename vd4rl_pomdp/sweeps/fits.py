@@ -68,10 +68,7 @@ def _check_states(method: str, task: str) -> None:
 
 @cache
 def _check_finetuning(config: Any, size: int, rows: int) -> None:
-    from finetune.settings import check_n_step
-
     refuse_outside(config, shift=(0, size - 1))
-    check_n_step(config, rows - 1)
 
 
 def _check_window(window: int, rows: int) -> None:
