@@ -36,8 +36,8 @@ from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import read_csv
 from vd4rl_pomdp.runs.outputs import kept_in
 from vd4rl_pomdp.runs.results.folder import RUNS, _lines
+from vd4rl_pomdp.studies.navigation.drivers import _refuse_other
 from vd4rl_pomdp.studies.navigation.exogenous import _read_cifar, _read_image, load_pool, source_fingerprint
-from vd4rl_pomdp.studies.navigation.first_person import _refuse_other
 from vd4rl_pomdp.studies.navigation.runs import read_trajectory
 from vd4rl_pomdp.sweeps.folder import _read_plan
 

@@ -11,8 +11,7 @@ from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 from vd4rl_pomdp.report.layout import number
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs.results import read_results
-from vd4rl_pomdp.studies.navigation.grid import Condition
-from vd4rl_pomdp.studies.navigation.measures import Measure, online_error, refitted_error
+from vd4rl_pomdp.studies.navigation.measures import Condition, Measure, online_error, refitted_error
 from vd4rl_pomdp.studies.navigation.methods import METHOD_NAMES, OBJECTIVES, UNTRAINED
 from vd4rl_pomdp.studies.navigation.runs import NavigationRun, load_runs
 from vd4rl_pomdp.studies.navigation.tables import Entry, entry_of

@@ -19,8 +19,7 @@ if TYPE_CHECKING:
 
 
 def _collect(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.studies.navigation.collect import collect
-    from vd4rl_pomdp.studies.navigation.sets import PRESETS, MazeCollectConfig
+    from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig, collect
 
     config = with_presets(MazeCollectConfig, PRESETS, words, program)
     print(f"{len(collect(config))} shards in {config.out}")
@@ -35,7 +34,7 @@ def _train(words: Arguments, program: str) -> None:
 
 
 def _policy(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.studies.navigation.first_person import FirstPersonConfig, train_first_person
+    from vd4rl_pomdp.studies.navigation.drivers import FirstPersonConfig, train_first_person
 
     config = parse(FirstPersonConfig, words, program)
     card = train_first_person(config).card
@@ -64,7 +63,7 @@ def _report(words: Arguments, program: str) -> None:
 
 def _samples() -> Mapping[str, np.ndarray]:
     """The sample observations; UserError that names the flag to do without where nothing can be drawn."""
-    from vd4rl_pomdp.studies.navigation.samples import sample_observations
+    from vd4rl_pomdp.studies.navigation.collect import sample_observations
 
     try:
         return sample_observations()

@@ -6,7 +6,7 @@ import pytest
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.envs.mazes import MAZES
 from vd4rl_pomdp.policies.actor import read_actor
-from vd4rl_pomdp.studies.navigation.first_person import (
+from vd4rl_pomdp.studies.navigation.drivers import (
     FirstPersonConfig,
     goals_reached,
     shipped_actor,

@@ -1,6 +1,6 @@
 import torch
 
-from vd4rl_pomdp.studies.navigation.observations import to_grey50, to_rgb50
+from vd4rl_pomdp.studies.navigation.data import to_grey50, to_rgb50
 
 
 def test_grey_quarters_are_area_averages_of_the_luminance():

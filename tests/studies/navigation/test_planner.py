@@ -1,7 +1,7 @@
 import numpy as np
 
 from vd4rl_pomdp.envs.maze import CELL_OFFSET, MazeEnv
-from vd4rl_pomdp.studies.navigation.planner import Planner, WaypointPlanner
+from vd4rl_pomdp.studies.navigation.drivers import Planner, WaypointPlanner
 
 
 def test_the_planner_reaches_goals_everywhere():

@@ -17,8 +17,14 @@ from vd4rl_pomdp.runs.results import add_results
 from vd4rl_pomdp.studies.navigation import figures
 from vd4rl_pomdp.studies.navigation.claims import claims, judge, paper_number, verdict_lines
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-from vd4rl_pomdp.studies.navigation.grid import Condition, condition_of, paper_rows
-from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX, Measure, refitted_error
+from vd4rl_pomdp.studies.navigation.measures import (
+    RAW_PREFIX,
+    Condition,
+    Measure,
+    condition_of,
+    paper_rows,
+    refitted_error,
+)
 from vd4rl_pomdp.studies.navigation.methods import OBJECTIVES, REFERENCES
 from vd4rl_pomdp.studies.navigation.report import write_report
 from vd4rl_pomdp.studies.navigation.runs import NavigationRun, find_navigation, load_runs, read_trajectory

@@ -1,5 +1,5 @@
 from vd4rl_pomdp.envs.mazes import MAZES
-from vd4rl_pomdp.studies.navigation.samples import SAMPLES, sample_observations
+from vd4rl_pomdp.studies.navigation.collect import SAMPLES, sample_observations
 
 
 def test_sample_observations_are_of_different_moments_and_mazes():

@@ -11,9 +11,8 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.envs.mazes import MAZES
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
-from vd4rl_pomdp.studies.navigation.data import MazeData, open_data
+from vd4rl_pomdp.studies.navigation.data import MazeData, open_data, open_maze_set
 from vd4rl_pomdp.studies.navigation.methods import METHOD_NAMES, OBJECTIVES
-from vd4rl_pomdp.studies.navigation.observations import open_maze_set
 from vd4rl_pomdp.studies.navigation.probe import ErrorSums, StateProbe, TrueStates, refit
 from vd4rl_pomdp.studies.navigation.train import train
 from vd4rl_pomdp.studies.navigation.trainer import NavigationTrainer, learning_rate, make_objective
