@@ -226,7 +226,7 @@ def test_the_learning_rate_rises_then_falls():
 
 
 def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
-    from vd4rl_pomdp.studies.navigation.exogenous import ExogenousNoise
+    from vd4rl_pomdp.studies.navigation.pictures import ExogenousNoise
 
     noise = ExogenousNoise("photographs", 0.5, 0)
     for picture, shape in (("grey50", (1, 50, 50)), ("rgb50", (3, 50, 50)), ("rgb100", (3, 100, 100))):

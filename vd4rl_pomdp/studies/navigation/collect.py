@@ -27,8 +27,7 @@ from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.provenance import versions
-from vd4rl_pomdp.studies.navigation.data import to_grey50
-from vd4rl_pomdp.studies.navigation.exogenous import TEXTURES, ExogenousNoise
+from vd4rl_pomdp.studies.navigation.pictures import TEXTURES, ExogenousNoise, to_grey50
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.envs.maze import MazeEnv

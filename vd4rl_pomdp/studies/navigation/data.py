@@ -6,27 +6,18 @@ Exogenous noise may be added to the pictures; the small presets see a quarter of
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
 
 import torch
 from torch import Tensor
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.envs.mazes import MAZES, PICTURE_SIZE, MazeSpec
-from vd4rl_pomdp.studies.navigation.exogenous import ExogenousNoise
+from vd4rl_pomdp.studies.navigation.config import NavigationConfig, NoiseOptions
+from vd4rl_pomdp.studies.navigation.pictures import SHAPES, ExogenousNoise, Picture, to_grey50, to_rgb50
 from vd4rl_pomdp.studies.navigation.probe import TrueStates
 
-if TYPE_CHECKING:
-    from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-
-Picture = Literal["rgb100", "rgb50", "grey50"]
-_HALF = PICTURE_SIZE // 2
-SHAPES: dict[Picture, tuple[int, int]] = {"rgb100": (3, PICTURE_SIZE), "rgb50": (3, _HALF), "grey50": (1, _HALF)}
-"""Channels and size of an observation."""
-_LUMA = (0.299, 0.587, 0.114)
 _BLOCK = 1000
 HELD_OUT = 10
 """One in this many trajectories, the last ones, is never trained on."""
@@ -37,18 +28,13 @@ def open_maze_set(path: Path, cache: Path | None = None) -> tuple[Dataset, MazeS
     dataset = open_dataset(path, cache)
     attributes = dataset.store.meta["attributes"]
     names = {stored.get("task") for stored in attributes}
-    if len(names) != 1 or not names <= set(MAZES):
-        raise UserError(f"{path}: names no maze; collect a set with `vd4rl-pomdp navigation collect`")
-    if dataset.frame_size != PICTURE_SIZE:
-        raise UserError(
-            f"{path}: has frames of {dataset.frame_size} pixels, mazes of {PICTURE_SIZE}; collect a set with "
-            "`vd4rl-pomdp navigation collect`"
-        )
-    if dataset.physics is None:
-        raise UserError(
-            f"{path}: holds no true states ('physics'), which the probe needs; collect a set with "
-            "`vd4rl-pomdp navigation collect`"
-        )
+    for wrong, what in (
+        (len(names) != 1 or not names <= set(MAZES), "names no maze"),
+        (dataset.frame_size != PICTURE_SIZE, f"has frames of {dataset.frame_size} pixels, mazes of {PICTURE_SIZE}"),
+        (dataset.physics is None, "holds no true states ('physics'), which the probe needs"),
+    ):
+        if wrong:
+            raise UserError(f"{path}: {what}; collect a set with `vd4rl-pomdp navigation collect`")
     check_trajectories(dataset.num_episodes, str(path))
     if (rows := dataset.episode_end - dataset.episode_start).min() < 2:
         raise UserError(
@@ -62,23 +48,6 @@ def check_trajectories(number: int, where: str) -> None:
     """Raise UserError for a set of so few trajectories that none can be held out."""
     if number < 2:
         raise UserError(f"{where}: a single trajectory leaves none to be held out; collect more --trajectories")
-
-
-def to_grey50(pictures: Tensor) -> Tensor:
-    """Area averages of the luminance: (N, 3, 100, 100) uint8 -> (N, 1, 50, 50) uint8."""
-    weights = torch.tensor(_LUMA, device=pictures.device) / 4
-    return torch.einsum("nchw,c->nhw", _sums(pictures).float(), weights).round_().to(torch.uint8)[:, None]
-
-
-def to_rgb50(pictures: Tensor) -> Tensor:
-    """Area averages: (N, 3, 100, 100) uint8 -> (N, 3, 50, 50) uint8."""
-    return ((_sums(pictures) + 2) // 4).to(torch.uint8)
-
-
-def _sums(pictures: Tensor) -> Tensor:
-    """Sums over 2x2 pixels, int16."""
-    corners = [pictures[..., row::2, column::2].short() for row in (0, 1) for column in (0, 1)]
-    return corners[0] + corners[1] + corners[2] + corners[3]
 
 
 class MazeView(View):
@@ -110,8 +79,8 @@ class MazeView(View):
 def open_data(config: NavigationConfig) -> MazeData:
     """The set that a config names, with its exogenous noise, on the CPU."""
     noise = None
-    if config.exogenous != "none":
-        noise = ExogenousNoise(config.exogenous, flat(config)["exogenous_weight"], config.seed)
+    if isinstance(config.noise, NoiseOptions):
+        noise = ExogenousNoise(config.exogenous, config.noise.exogenous_weight, config.seed)
     return MazeData(*open_maze_set(config.data), config, noise)
 
 

@@ -16,8 +16,9 @@ from vd4rl_pomdp.runs.device import autocast
 from vd4rl_pomdp.runs.loop import training
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-from vd4rl_pomdp.studies.navigation.data import SHAPES, MazeData
+from vd4rl_pomdp.studies.navigation.data import MazeData
 from vd4rl_pomdp.studies.navigation.methods import SUPERVISED
+from vd4rl_pomdp.studies.navigation.pictures import SHAPES
 from vd4rl_pomdp.studies.navigation.probe import ErrorSums, StateProbe
 
 _SUPERVISED_RATE = 0.5
