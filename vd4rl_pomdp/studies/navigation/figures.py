@@ -81,7 +81,7 @@ def accuracy_bars(frame: pd.DataFrame, measure: Measure, path: Path) -> bool:
     handles: list[Any] = [Rectangle((0, 0), 1, 1, color=colour) for *_, colour in _VARIANTS.values()]
     marks = {"a seed": _SEED, **({"the paper": _MARK} if measure.is_raw else {}), "no run": _NO_RUN}
     handles += [Line2D([], [], **style) for style in marks.values()]
-    legend = {"loc": "outside upper center", "ncols": 3 if columns == 1 else 6, "frameon": False}
+    legend: dict[str, Any] = {"loc": "outside upper center", "ncols": 3 if columns == 1 else 6, "frameon": False}
     figure.legend(handles, [*_VARIANTS, *marks], **legend)
     figure.savefig(path, dpi=130, metadata={"Software": None})
     return True

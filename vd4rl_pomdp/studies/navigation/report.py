@@ -152,10 +152,10 @@ def _unlike(runs: list[NavigationRun]) -> list[str]:
         for name in settings:
             is_without = np.array([not getattr(run.condition, name, True) for run in mine])  # such as self_prediction
             values = settings[name][~is_without].dropna().str[: 8 if name == "set" else None]
-            usual, *others = [*values.value_counts().index, ""]
-            where = [f"{one} in {', '.join(values.index[values == one].unique())}" for one in others if one]
+            found = list(values.value_counts().index)
+            where = [f"{one} in {', '.join(values.index[values == one].unique())}" for one in found[1:]]
             if where:
-                lines.append(f"Not alike in {code(maze)}: {name} is {usual}, but {'; '.join(where)}.  ")
+                lines.append(f"Not alike in {code(maze)}: {name} is {found[0]}, but {'; '.join(where)}.  ")
     return [*lines, ""] if lines else []
 
 

@@ -69,16 +69,17 @@ def make_tables(frame: pd.DataFrame) -> pd.DataFrame:
         number; and whether it is `missing`, see `is_missing`.
         Rows of a table for which neither a run nor the paper has a number are left out, and tables that no run has.
     """
-    lines = [(*where, *condition, *measure, condition) for *where, condition, measure in _layout(frame)]
-    cells = pd.DataFrame(lines, columns=["table", "view", "row", *KEYS, "condition"])
-    cells["paper"] = [paper_number(line[-1], Measure(*line[-6:-1])) for line in lines]
+    lines = list(_layout(frame))
+    places = [(*line[:3], *line[3], *line[4]) for line in lines]
+    cells = pd.DataFrame(places, columns=["table", "view", "row", *KEYS])
+    trained = conditions_of(frame)
+    cells["paper"] = [paper_number(condition, measure) for _, _, _, condition, measure in lines]
+    cells["missing"] = [is_missing(condition, trained) for _, _, _, condition, _ in lines]
     groups = frame.groupby(KEYS)["value"].agg(numbers=np.array).reset_index()
     cells = cells.merge(groups, how="left", on=KEYS)
     cells["numbers"] = [found if isinstance(found, np.ndarray) else np.empty(0) for found in cells["numbers"]]
     cells["seeds"] = cells["numbers"].map(len)
     cells["of_seeds"] = cells["maze"].map(frame.groupby("maze")["seed"].nunique())
-    trained = conditions_of(frame)
-    cells["missing"] = [is_missing(condition, trained) for condition in cells.pop("condition")]
     cells["mean"] = [found.mean() if len(found) else None for found in cells["numbers"]]
     ends = [mean_interval(found[:, None]) if len(found) else None for found in cells["numbers"]]
     cells[["low", "high"]] = [end or (None, None) for end in ends]
