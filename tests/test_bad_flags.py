@@ -22,7 +22,6 @@ VALID = {
     "data check": [SET],
     "data parity": [SET],
     "data collect": ["--task", "walker_walk", "--quality", "random", "--episodes", "1", *OUT],
-    "policy train": ["--task", "walker_walk", "--decisions", "10", *OUT],
     "pretrain": ["--data", SET, "--corruption", "patch+zero_frames", *OUT, *PRETRAIN],
     "pretrain --method homer": ["--data", SET, *OUT, *PRETRAIN],
     "finetune": ["--encoder", ENCODER, "--data", SET, "--workers", "1", *OUT, *PRETRAIN],
@@ -46,12 +45,11 @@ WRONG = {
     Path: ["", *NO_FILE],
 }
 RIGHT = {
-    *((command, flag, "-7") for command in VALID for flag in ("target_entropy", "stop_at")),
     *((command, "out", "empty") for command in VALID),
     *((command, "out", "nowhere") for command in VALID),
     *(("sweep run", flag, word) for flag in ("out", "data") for word in ("nowhere", "empty", "foreign")),
 }
-"""What is no bad input: an entropy and a return may be negative, an output folder new or empty."""
+"""What is no bad input: an output folder may be new or empty."""
 
 
 @pytest.fixture(scope="module")

@@ -12,7 +12,7 @@ if os.name != "posix":
     print("error: vd4rl-pomdp runs on Linux and macOS; on Windows use its subsystem for Linux (WSL)", file=sys.stderr)
     sys.exit(2)
 
-from vd4rl_pomdp.cli import data, hub, navigation, parts, policy, stages, studies, sweeps
+from vd4rl_pomdp.cli import data, hub, navigation, parts, stages, studies, sweeps
 from vd4rl_pomdp.cli.dispatch import COMMANDS
 from vd4rl_pomdp.cli.ends import run_to_end
 
@@ -21,7 +21,6 @@ COMMANDS |= {
     "list": parts.LIST,
     "data": data.COMMANDS,
     "hub": hub.COMMANDS,
-    "policy": policy.COMMANDS,
     **stages.COMMANDS,
     "navigation": navigation.COMMANDS,
     "sweep": sweeps.COMMANDS,
