@@ -1,5 +1,6 @@
 """Code blocks of the README and of docs/: Python is executed, commands are parsed, and run where that takes seconds."""
 
+import functools
 import re
 import shlex
 import subprocess
@@ -140,9 +141,10 @@ def check_names(config: object) -> None:
     """Names that a command looks up after parsing must exist."""
     if type(config).__name__ in ("NavigationConfig", "ControlConfig"):  # their methods are others, too
         return
+    told = config.keywords if isinstance(config, functools.partial) else vars(config)
     for field, check in CHECKS.items():
-        value = getattr(config, field, None)
-        for name in value if isinstance(value, list) else [value]:
+        value = told.get(field)
+        for name in value if isinstance(value, list | tuple) else [value]:
             if name:
                 check(name)
 

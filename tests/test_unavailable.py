@@ -19,7 +19,7 @@ from finetune.features import FeatureFile
 from tests.helpers_data import write_fake_set
 from tests.nn.test_encoder import CARD, make
 from tests.studies.navigation.test_exogenous import python_batch
-from vd4rl_pomdp.cli.ends import run_to_end
+from vd4rl_pomdp.cli import run_to_end
 from vd4rl_pomdp.core.errors import UnavailableError, UserError, system_error
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows

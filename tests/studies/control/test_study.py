@@ -3,7 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from vd4rl_pomdp.cli.ends import run_to_end
+from vd4rl_pomdp.cli import run_to_end
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.studies.control import study as module
