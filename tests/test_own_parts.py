@@ -169,7 +169,7 @@ def test_a_method_that_predicts_actions_has_their_options(registries):
         ("method", "seed", "PretrainConfig"),
         ("method", "patch_size", "Patch"),
         ("corruption", "corruption_mode", "CorruptionConfig"),
-        ("frame_encoder", "hidden_dim", "MemoryOptions"),
+        ("frame_encoder", "hidden_dim", "GRUOptions"),
         ("algorithm", "readout", "HistoryOptions"),
     ],
 )

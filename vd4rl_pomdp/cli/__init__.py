@@ -17,7 +17,7 @@ from vd4rl_pomdp.runs import interrupt
 PROGRAM = "vd4rl-pomdp"
 COMMANDS = {
     "demo": ("stages.demo", "every stage on a small set, in minutes"),
-    "list": ("stages.list_parts", "methods, corruptions, algorithms, frame encoders and tasks, one line each"),
+    "list": ("stages.list_parts", "all parts that have a name: methods, corruptions, algorithms and the like"),
     "data collect": ("data.collect", "render a set in V-D4RL's format from the shipped actors"),
     "data download": ("data.download", "fetch a published V-D4RL set"),
     "data card": ("data.card", "describe a set: returns, origin, film strip"),

@@ -102,7 +102,7 @@ def demo(out: Path = Path("runs/demo"), jobs: int = 0, preset: str = "cpu") -> N
 
 @command
 def list_parts() -> None:
-    """List methods, corruptions, algorithms, frame encoders and tasks, one line each."""
+    """List methods, corruptions, algorithms, frame encoders, memories and tasks, one line each."""
     import finetune.algorithms  # noqa: F401 (a kind's registry is made where its parts are)
     import pretrain.objectives  # noqa: F401
     import vd4rl_pomdp.core.tasks  # noqa: F401
