@@ -14,7 +14,6 @@ from vd4rl_pomdp.cli import COMMANDS, main, run_to_end, stages
 from vd4rl_pomdp.cli.parsing import show
 from vd4rl_pomdp.core.registry import REGISTRIES
 
-STUDY = ["--methods", "none", "--episodes", "2", "--decisions", "32", "--updates", "1", "--eval-episodes", "1"]
 SWEEP = ["sweep", "run", "quick", "--out", "y", "--dry-run"]
 PRETRAIN = ["pretrain", "--data", "x", "--out", "y"]
 SLIPS = [
@@ -45,8 +44,6 @@ SLIPS = [
     ([*SWEEP, "--change", "pretrain.method=acor"], "'acor': choose one of"),
     ([*SWEEP, "--executor", "cloud"], "unknown executor 'cloud': choose one of local"),
     (["sweep", "status", "file"], "file: holds no sweep"),
-    (["control-study", "--out", "file/below", *STUDY], "file/below"),
-    (["control-study", "--out", "x", "--methods", "acro"], "unknown method of this study 'acro': choose one of none,"),
 ]
 
 

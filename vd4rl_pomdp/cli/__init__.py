@@ -42,7 +42,6 @@ COMMANDS = {
     "report compare": ("studies.compare", "two result sets side by side"),
     "results add": ("studies.add", "append finished runs to a results folder"),
     "theory": ("studies.theory", "the paper's claims on finite worlds, by enumeration"),
-    "control-study": ("studies.control_study", "does memory pay? in minutes, on simulator states"),
     "bench": ("studies.bench", "speed and memory on this machine"),
 }
 """Function, within this package, and summary of every command. A function takes the words behind its name, and what

@@ -1,4 +1,4 @@
-"""Commands that measure or summarise: report, results, theory, control-study, bench, navigation."""
+"""Commands that measure or summarise: report, results, theory, bench, navigation."""
 
 from __future__ import annotations
 
@@ -130,17 +130,6 @@ def bench(json: bool = False, quick: bool = False) -> None:
         show(results, as_json=True)
     else:
         print_table(results)
-
-
-def control_study(words: list[str], program: str) -> None:
-    """Train and evaluate on simulator states."""
-    from vd4rl_pomdp.studies.control.config import ControlConfig
-    from vd4rl_pomdp.studies.control.study import control_study
-    from vd4rl_pomdp.studies.control.table import line_of, summary
-
-    config = parse(ControlConfig, words, program)
-    rows = control_study(config, lambda row: print(line_of(row), flush=True))
-    print(*summary(rows), sep="\n")
 
 
 def navigation_collect(words: list[str], program: str) -> None:

@@ -100,10 +100,9 @@ def _check_collection(config: Any) -> None:
 
 def _pretrain(words: list[str], program: str) -> Any:
     from pretrain.config import PretrainConfig
-    from pretrain.train import check_config
 
     config = parse_stage(PretrainConfig, words, program)
-    check_config(config)
+    config.check()
     return config
 
 
