@@ -21,7 +21,7 @@ from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
 from vd4rl_pomdp.studies.navigation.data import open_data
 from vd4rl_pomdp.studies.navigation.measure import measure, write_trajectory
-from vd4rl_pomdp.studies.navigation.methods import UNTRAINED
+from vd4rl_pomdp.studies.navigation.measures import UNTRAINED
 from vd4rl_pomdp.studies.navigation.probed import STAGE, ProbedObjective, make_trainer
 
 RESULTS = (NAVIGATION_FILE, TRAJECTORY_FILE, *FILES_OF_RUN)
