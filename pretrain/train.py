@@ -18,31 +18,24 @@ from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_SIZES, FRAME_STACK, TASKS, 
 from vd4rl_pomdp.core.types import StateWindows, Windows
 from vd4rl_pomdp.corruptions import check_corruption_fits
 from vd4rl_pomdp.data import Dataset, View, WindowSampler, open_dataset
+from vd4rl_pomdp.data.format import read_plan
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, EncoderCard, save_encoder
 from vd4rl_pomdp.nn.objective import Objective, require_loss
 from vd4rl_pomdp.runs import METRICS_FILE
 from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.loop import training
-from vd4rl_pomdp.runs.memory import bytes_kept, bytes_of_parameters, require_memory, telling_memory
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 
 STAGE = "pretrain"
-DECIDE_MEMORY = ("batch_size", "window", "feature_dim", "hidden_dim", "head_dim", "codes", "homer_codes")
-"""Settings that the memory of a training hangs on."""
 
 
 def pretrain(config: PretrainConfig) -> RunFolder:
     """Run the stage, or go on with it, and write `out/encoder`; returns the run's folder."""
     check_config(config)
     refuse_inside(config.out)
-    with telling_memory(config, *DECIDE_MEMORY):
-        return _pretrain(config)
-
-
-def _pretrain(config: PretrainConfig) -> RunFolder:
     method = METHODS.named(config.method)
     dataset = open_dataset(config.data)
     dataset.require_transitions()
@@ -51,10 +44,8 @@ def _pretrain(config: PretrainConfig) -> RunFolder:
     seed_networks(config.seed, STAGE)
     objective = _build(dataset, config)
     device = pick_device(config.device)
-    if method.trained:
-        require_batch(objective, device, config)
-    inputs = {"data": dataset.fingerprint}
-    with RunFolder(config.out, STAGE, replace(config, task=task), inputs, FILES_OF_RUN) as run:
+    inputs, collection = {"data": dataset.fingerprint}, read_plan(config.data)
+    with RunFolder(config.out, STAGE, replace(config, task=task), inputs, FILES_OF_RUN, collection=collection) as run:
         if not run.finished:
             trainer = PretrainTrainer(objective.to(device), dataset.to(device), config)
             trainer.run(run, config.steps if method.trained else 0)
@@ -104,11 +95,10 @@ class PretrainTrainer:
     def run(self, run: RunFolder, steps: int) -> None:
         """Train up to `steps`, from the newest checkpoint if there is one."""
         with training(run, self, f"pretrain {self.config.method}", steps, labels=self._labels(run)) as loop:
-            while self.step < steps:
+            for _ in loop:
                 loop.add(self.update())
                 if loop.due(self.config.log_every):
                     loop.log("loss")
-                loop.step_done(save=loop.due(self.config.checkpoint_every))
             loop.require_finite(self.objective)
 
     def _labels(self, run: RunFolder) -> dict[str, str]:
@@ -147,22 +137,6 @@ def check_pictures(config: PretrainConfig, size: int) -> None:
     refuse_outside(config, shift=(0, size - 1))
     films = METHODS.named(config.method).reads_state  # pictures are for its film alone, of the benchmark's size
     check_corruption_fits(config.corruption, min(size, FRAME_SIZE) if films else size)
-
-
-def require_batch(objective: Objective, device: torch.device, config: Any) -> None:
-    """Refuse a batch whose frames alone, once encoded, exceed the memory of a device.
-
-    Args:
-        objective: what will be trained.
-        device: where.
-        config: a stage's settings, `DECIDE_MEMORY` among them.
-    """
-    shape = objective.encoder.config
-    stack = torch.zeros(1, shape.channels, shape.size, shape.size, dtype=torch.uint8)
-    rows = config.batch_size * config.window
-    with autocast(stack.device, config.precision):
-        needed = rows * (stack.nbytes + bytes_kept(objective.encoder.frame, stack)) + bytes_of_parameters(objective)
-    require_memory(needed, device, config, *DECIDE_MEMORY)
 
 
 def _build(dataset: Dataset, config: PretrainConfig) -> Objective:

@@ -215,7 +215,7 @@ def test_a_damaged_run_is_one_sentence(configure, tmp_path, monkeypatch):
     config = configure(tmp_path / "run", decisions=40)
     train_policy(config)
     assert decisions_made(tmp_path / "run") == 40
-    (tmp_path / "run" / "checkpoints" / "40" / "replay.safetensors").write_bytes(b"cut")
+    (tmp_path / "run" / "checkpoints" / "40.pt").write_bytes(b"cut")
     with pytest.raises(UserError, match="checkpoint is damaged"):
         train_policy(config)
     kept = tmp_path / "kept"

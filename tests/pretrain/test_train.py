@@ -11,7 +11,8 @@ from pretrain.train import check_config, check_pictures
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_pretrain
-from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.cli.ends import run_to_end
+from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.objective import require_loss
 
@@ -145,8 +146,11 @@ def test_a_patch_that_the_film_of_a_state_cannot_hold_is_refused_first(tmp_path)
 
 
 def test_weights_that_no_memory_holds_are_told_as_such(data, tmp_path):
-    with pytest.raises(UserError, match=r"out of memory with .*--feature-dim 1000000000"):
-        run_pretrain(smoke_pretrain(data, tmp_path / "out", feature_dim=10**9))
+    end = run_to_end(
+        f"pretrain --preset smoke --data {data} --out {tmp_path / 'out'} --method acro --feature-dim 1000000000".split()
+    )
+    assert (end.code, end.cause) == (2, OutOfMemoryError.cause)
+    assert end.line.startswith("error: out of memory")
 
 
 def test_an_encoder_that_its_last_step_ruins_is_marked_and_not_kept(data, tmp_path, monkeypatch):

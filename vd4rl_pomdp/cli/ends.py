@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import re
 import select
 import signal
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vd4rl_pomdp.cli.dispatch import run_stage
-from vd4rl_pomdp.core.errors import DIVERGED, DONE, INTERRUPTED, DivergedError, UserError, disk_error, in_one_line
+from vd4rl_pomdp.core.errors import (
+    DIVERGED,
+    DONE,
+    INTERRUPTED,
+    DivergedError,
+    OutOfMemoryError,
+    UserError,
+    disk_error,
+    in_one_line,
+)
 from vd4rl_pomdp.runs import interrupt
+
+_NO_MEMORY = re.compile("out of memory|allocate memory|Storage size calculation overflowed|ALLOC_FAILED")
+"""What torch says, of a CPU and of a GPU's libraries."""
 
 
 @dataclass(frozen=True)
@@ -52,7 +65,10 @@ def run_to_end(words: Sequence[str], second: signal.Handlers = signal.SIG_DFL) -
     except OSError as error:
         told = disk_error(error.filename, error)
         return End(2, told.cause, f"error: {told}")
-    except Exception:
+    except Exception as error:
+        if isinstance(error, MemoryError) or _NO_MEMORY.search(str(error)):
+            told = f"error: out of memory ({in_one_line(error)[:200]}); lower --batch-size, or what else sets the size"
+            return End(2, OutOfMemoryError.cause, told)
         if (number := interrupt.arrived()) is None:
             raise
         return End(128 + number, INTERRUPTED, _ended("ended by a signal", ""))  # raised in an import, which hid it

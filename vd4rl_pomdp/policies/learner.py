@@ -6,12 +6,12 @@ the observation statistics alone, small enough for a repository, and is what ano
 
 from __future__ import annotations
 
-import json
 from importlib.metadata import version
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 from safetensors import SafetensorError
 from safetensors.numpy import load, save
 
@@ -23,14 +23,13 @@ from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.policies.actor import OBSERVATION_CLIP, Actor
 from vd4rl_pomdp.policies.config import PolicyConfig
 from vd4rl_pomdp.policies.state_env import StateEnv
-from vd4rl_pomdp.runs.checkpoint import Checkpoints, fitting
+from vd4rl_pomdp.runs.checkpoint import Checkpoints
 from vd4rl_pomdp.runs.files import write_bytes
 
 if TYPE_CHECKING:
     from sbx import SAC
 
 REPLAY_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
-_MODEL, _REPLAY, _COUNTERS = "model.safetensors", "replay.safetensors", "counters.json"
 STATISTICS = ("mean", "var", "count")
 DECISIONS_A_ROUND = 4
 """Decisions between two rounds of updates, or one for each environment if those are more."""
@@ -166,24 +165,25 @@ def save_checkpoint(model: SAC, run: Path) -> None:
     stop = buffer.buffer_size if buffer.full else buffer.pos
     replay = {k: np.ascontiguousarray(getattr(buffer, k)[:stop]) for k in REPLAY_ARRAYS}
     counters = {"decisions": model.num_timesteps, "updates": model._n_updates, "position": buffer.pos}
-    files = {_MODEL: save(arrays), _REPLAY: save(replay), _COUNTERS: json.dumps(counters).encode()}
-    Checkpoints(run).add(model.num_timesteps, files, 0.0)
+    state = {"model": _tensors(arrays), "replay": _tensors(replay), "counters": counters}
+    Checkpoints(run).add(model.num_timesteps, state, 0.0)
+
+
+def _tensors(arrays: dict[str, np.ndarray]) -> dict[str, torch.Tensor]:
+    return {name: torch.from_numpy(array) for name, array in arrays.items()}
 
 
 def restore_checkpoint(model: SAC, run: Path) -> int:
     """Load the newest whole checkpoint; returns the decisions made so far, 0 without one. New episodes begin there."""
-    checkpoint = Checkpoints(run).newest()
-    if checkpoint is None:
-        return 0
-    with fitting(checkpoint):
-        _restore(model, checkpoint.files)
-    return int(model.num_timesteps)
+    found = Checkpoints(run).restore(lambda state: _restore(model, state))
+    return 0 if found is None else int(model.num_timesteps)
 
 
-def _restore(model: SAC, files: dict[str, bytes]) -> None:
+def _restore(model: SAC, state: dict[str, Any]) -> None:
     import jax
 
-    counters, stored, replay = json.loads(files[_COUNTERS]), load(files[_MODEL]), load(files[_REPLAY])
+    counters = state["counters"]
+    stored, replay = ({name: tensor.numpy() for name, tensor in state[part].items()} for part in ("model", "replay"))
     model.set_random_seed(_seed_from(model.seed or 0, counters["decisions"]))
     policy = model.policy
     leaves, structure = _flatten(_states(model))

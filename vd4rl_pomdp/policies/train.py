@@ -38,9 +38,8 @@ from vd4rl_pomdp.policies.export import (
 from vd4rl_pomdp.runs import FORMAT, interrupt
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_csv, write_json
-from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
-from vd4rl_pomdp.runs.ownership import Owner, owned
+from vd4rl_pomdp.runs.ownership import owned
 
 if TYPE_CHECKING:
     from sbx import SAC
@@ -65,16 +64,16 @@ def train_policy(config: PolicyConfig, on_progress: Callable[[int, float], None]
     task = TASKS.named(config.task)
     refuse_inside(config.out)
     _check(config)
-    with owned(config.out) as owner:
+    with owned(config.out):
         _check_folder(config)  # another process may have begun it since
         model = learner.build(config, task)
         if not (config.out / SETTINGS).exists():
             write_json(config.out / SETTINGS, _settings(config))
-        _learn(model, config, owner, on_progress)
+        _learn(model, config, on_progress)
         return export_run(config.out, config.out)
 
 
-def _learn(model: SAC, config: PolicyConfig, owner: Owner, on_progress: Callable[[int, float], None] | None) -> None:
+def _learn(model: SAC, config: PolicyConfig, on_progress: Callable[[int, float], None] | None) -> None:
     """Train to the end, from the newest checkpoint if there is one."""
     done = learner.restore_checkpoint(model, config.out)
     _forget_newer(config.out, done)
@@ -85,7 +84,6 @@ def _learn(model: SAC, config: PolicyConfig, owner: Owner, on_progress: Callable
         with interrupt.deferred():
             mean = _learn_and_evaluate(model, config, done)
             done = int(model.num_timesteps)
-            owner.check()
             learner.save_checkpoint(model, config.out)
             interrupt.check(f"{config.out} keeps {done} decisions")
         if on_progress is not None:
@@ -114,7 +112,7 @@ def decisions_made(run: Path) -> int:
 def _check(config: PolicyConfig) -> None:
     """Raise UserError for settings out of range, or that need too much memory, and for a folder of another run."""
     task = TASKS.named(config.task)
-    if not (state_dim := layout_of(task).state_dim):
+    if not layout_of(task).state_dim:
         raise UserError(f"{config.task} has no states for an actor to read: choose a task of dm_control")
     refuse_outside(
         config, seed=(0, MAX_SEED), decisions=1, learning_rate=0, hidden=1, n_step=(1, task.decisions),
@@ -124,9 +122,6 @@ def _check(config: PolicyConfig) -> None:
     )  # fmt: skip
     if config.temperature == 0:
         raise UserError("--temperature is 0; it must be above: it is where a learnt one starts")
-    # of float32 numbers, as the weights are
-    require_memory(8 * state_dim * config.replay_size, CPU, config, "replay_size")
-    require_memory(4 * (15 * config.hidden**2 + config.batch_size * config.hidden), CPU, config, "hidden", "batch_size")
     _check_folder(config)
 
 

@@ -31,10 +31,10 @@ class Learner(Protocol):
 class Loop:
     """The steps that are left of a training; made by `training`.
 
-        for step in loop:
-            loop.add(learner.update())  # which adds one to `learner.step`
-            if loop.due(config.log_every):
-                loop.log("loss")
+    for step in loop:
+        loop.add(learner.update())  # which adds one to `learner.step`
+        if loop.due(config.log_every):
+            loop.log("loss")
     """
 
     def __init__(

@@ -34,13 +34,13 @@ def owned(folder: Path) -> Iterator[None]:
             lock.acquire(timeout=_WAIT_S, poll_interval=_WAIT_S / 10)
         except Timeout:
             owner = (folder / LOCK).read_text(encoding="utf-8") or "another process"
-            raise InUseError(
-                f"{folder}: is in use by {owner}; wait until it ends, or choose another folder"
-            ) from None
+            raise InUseError(f"{folder}: is in use by {owner}; wait until it ends, or choose another folder") from None
     try:
         since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
         with disk_errors(folder):
-            (folder / LOCK).write_text(f"process {os.getpid()} on {socket.gethostname()} since {since}", "utf-8")
+            (folder / LOCK).write_text(
+                f"process {os.getpid()} on {socket.gethostname()} since {since}", encoding="utf-8"
+            )
         with handled():
             yield
     finally:

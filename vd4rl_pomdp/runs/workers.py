@@ -10,9 +10,10 @@ import threading
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
+from contextlib import contextmanager
 from multiprocessing.reduction import ForkingPickler
 from pickle import PicklingError
-from typing import TypeVar
+from typing import Any, TypeVar
 
 from vd4rl_pomdp.core.errors import UserError, WorkerDiedError, first_line
 from vd4rl_pomdp.runs.interrupt import SIGNALS
@@ -36,28 +37,39 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
         return
     _refuse_unsendable(jobs[0])
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)
-    # Ctrl-C, which a terminal sends to all processes, is the caller's business: workers inherit this mask.
-    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS) if hasattr(signal, "pthread_sigmask") else None
+    processes: dict[int, Any] = {}
     try:
-        results = pool.map(function, jobs)
-        processes = dict(pool._processes)
-    finally:
-        if before is not None:
-            signal.pthread_sigmask(signal.SIG_SETMASK, before)
-    try:
+        with _blocked_signals():
+            results = pool.map(function, jobs)
+            processes = dict(pool._processes)
         yield from results
     except BrokenProcessPool as error:
         if error.__cause__ is not None:  # a result that cannot be read here
             raise
-        codes = [process.exitcode for process in processes.values() if process.exitcode]
         raise WorkerDiedError(
-            f"a worker process ended before its job (exit code {', '.join(map(str, codes))}): it was killed, perhaps "
-            "for want of memory, or printed why; use fewer --workers and re-run the same command"
+            "a worker process ended before its job: if it printed nothing, it was killed, perhaps for want of memory: "
+            "use fewer --workers and re-run the same command"
         ) from None
     finally:
         for process in processes.values():  # they hold nothing that could be lost, and `shutdown` waits for their jobs
             process.kill()
         pool.shutdown(cancel_futures=True)
+
+
+@contextmanager
+def _blocked_signals() -> Iterator[None]:
+    """Processes that are started in the block inherit the mask: Ctrl-C, which a terminal sends to all, is not for them.
+
+    Nor is the SIGTERM that a cluster sends to a whole group.
+    """
+    if not hasattr(signal, "pthread_sigmask"):
+        yield
+        return
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, SIGNALS)
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
 
 
 def count_workers(workers: int) -> int:

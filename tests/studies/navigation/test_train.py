@@ -97,8 +97,8 @@ def test_an_interrupted_run_ends_like_an_uninterrupted_one(maze_set, tmp_path, m
     with pytest.raises(KeyboardInterrupt):
         train(smoke(maze_set, tmp_path / "cut"))
     monkeypatch.setattr(NavigationTrainer, "update", update)
-    manifest = tmp_path / "cut" / "checkpoints" / "4" / "manifest.json"
-    manifest.write_text(json.dumps(json.loads(manifest.read_text()) | {"seconds": 1000.0}))
+    checkpoint = tmp_path / "cut" / "checkpoints" / "4.pt"
+    torch.save(torch.load(checkpoint, weights_only=True) | {"seconds": 1000.0}, checkpoint)
     train(smoke(maze_set, tmp_path / "cut"))
     timing = json.loads((tmp_path / "cut" / "timing.json").read_text())
     assert timing["total_seconds"] >= timing["seconds"] >= 1000

@@ -13,7 +13,6 @@ from vd4rl_pomdp.data.collect import MAX_NOISE
 from vd4rl_pomdp.nn.encoder import Readout
 from vd4rl_pomdp.nn.objective import ActionOptions
 from vd4rl_pomdp.policies.actor import load_actor
-from vd4rl_pomdp.runs.memory import CPU, require_memory
 
 NO_MEMORY, UNTRAINED = "none", "random"
 """What is seen of the states itself, and a GRU over it that is not trained: the floors."""
@@ -70,7 +69,6 @@ class ControlConfig:
         for task in self.tasks:
             load_actor(task, "expert")
             refuse_number("decisions", self._decisions(task), _window(), TASKS.named(task).decisions)
-            require_memory(_FEATURE_BYTES * self.episodes * self._decisions(task), CPU, self, "episodes")
         for method in self.methods:
             refuse_unknown("method of this study", method, fitting_methods())
 

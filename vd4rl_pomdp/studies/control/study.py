@@ -8,7 +8,7 @@ from pathlib import Path
 
 from vd4rl_pomdp.runs.files import Row, read_csv, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_foreign
-from vd4rl_pomdp.runs.ownership import Owner, owned
+from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.studies.control.config import LABELS, RUN_COLUMNS, WORDS, ControlConfig
 from vd4rl_pomdp.studies.control.measures import EPISODE_COLUMNS, measured
 
@@ -30,15 +30,15 @@ def control_study(config: ControlConfig, on_run: Callable[[Row], None]) -> list[
     """
     config.check()
     refuse_foreign(config.out, "control study", RUNS)
-    with owned(config.out) as owner:
+    with owned(config.out):
         runs, episodes = _read(config.out)
-        _write(owner, config.out, runs, episodes)
+        _write(config.out, runs, episodes)
         for run in config.runs():
             row = next((row for row in runs if _labels(row) == tuple(run.labels.values())), None)
             if row is None:
                 row, played = measured(run)
                 runs, episodes = [*runs, row], [*episodes, *played]
-                _write(owner, config.out, runs, episodes)
+                _write(config.out, runs, episodes)
             on_run(row)
         return _read(config.out)[0]
 
@@ -52,9 +52,8 @@ def _read(out: Path) -> tuple[list[Row], list[Row]]:
     return whole, [row for row in episodes if _labels(row) in names]
 
 
-def _write(owner: Owner, out: Path, runs: list[Row], episodes: list[Row]) -> None:
+def _write(out: Path, runs: list[Row], episodes: list[Row]) -> None:
     """Episodes first: what has no row among the runs counts as not run."""
-    owner.check()
     write_csv(out / EPISODES, EPISODE_COLUMNS, episodes)
     write_csv(out / RUNS, RUN_COLUMNS, runs)
 

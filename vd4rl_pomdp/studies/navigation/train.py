@@ -8,16 +8,15 @@ from __future__ import annotations
 
 import shlex
 
-from pretrain.train import DECIDE_MEMORY, require_batch
 from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.seeding import seed_networks
 from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data.format import read_plan
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, EncoderCard, save_encoder
 from vd4rl_pomdp.runs import METRICS_FILE, NAVIGATION_FILE, TRAJECTORY_FILE
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import write_json
-from vd4rl_pomdp.runs.memory import telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
@@ -34,17 +33,11 @@ def train(config: NavigationConfig) -> RunFolder:
     """Run the stage, or go on with it; returns the run's folder."""
     config.check()
     refuse_inside(config.out)
-    with telling_memory(config, *DECIDE_MEMORY):
-        return _train(config)
-
-
-def _train(config: NavigationConfig) -> RunFolder:
     data = open_data(config)
     seed_networks(config.seed, STAGE)
     objective = make_objective(data, config)
     device = pick_device(config.device)
-    require_batch(objective, device, config)
-    with RunFolder(config.out, STAGE, config, data.inputs, RESULTS) as run:
+    with RunFolder(config.out, STAGE, config, data.inputs, RESULTS, collection=read_plan(config.data)) as run:
         if not run.finished:
             trainer = NavigationTrainer(objective.to(device), data.on(device), config)
             trainer.run(run, 0 if config.method == UNTRAINED else config.steps)

@@ -85,14 +85,13 @@ class NavigationTrainer:
         """Train up to `steps`, from the newest checkpoint if there is one."""
         labels = {"method": self.config.method, "task": self.data.maze.name}
         with training(run, self, f"{self.data.maze.name} {self.config.method}", steps, labels=labels) as loop:
-            while self.step < steps:
+            for step in loop:
                 logs, states = self.update()
                 loop.add(logs)
                 self.errors.add(*states, self.config.burn_in)
-                if loop.due(self.config.log_every) or self.step == steps - self.config.average_last:
+                if loop.due(self.config.log_every) or step == steps - self.config.average_last:
                     loop.log("loss", "state", **self.errors.both(self.data.states.std))
                     self.errors = ErrorSums()
-                loop.step_done(save=loop.due(self.config.checkpoint_every))
             loop.require_finite(self.objective)
 
     def state(self) -> dict[str, Any]:
