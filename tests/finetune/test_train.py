@@ -319,28 +319,6 @@ def test_a_finished_run_without_its_earlier_evaluations_cannot_get_them_back(fin
         run_finetune(replace(finished[1], out=run))
 
 
-def test_a_run_that_an_earlier_version_began_goes_on_and_is_evaluated_clean_at_the_end(
-    encoder, data, tmp_path, monkeypatch
-):
-    """It knew neither the setting nor the columns, and kept no reference."""
-    changes = {"eval_every": 10, "checkpoint_every": 10, "updates": 20, "batch_size": 4, "eval_length": 2}
-    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes)).path
-    config = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
-    with monkeypatch.context() as patch:
-        cut_at(patch, 2)
-        with pytest.raises(CutError):
-            run_finetune(config)
-    record = json.loads((config.out / "config.json").read_text())
-    del record["config"]["eval_clean"]
-    (config.out / "config.json").write_text(json.dumps(record))
-    (config.out / "reference.json").unlink()
-    rows = (config.out / "episodes.csv").read_text().splitlines()
-    (config.out / "episodes.csv").write_text("".join(row.rsplit(",", 2)[0] + "\n" for row in rows))
-    run_finetune(config)
-    ours, theirs = contents(config.out), contents(whole)
-    assert {name for name in theirs if ours[name] != theirs[name]} == {"config.json"}
-
-
 def test_the_clean_evaluation_can_be_left_out(encoder, data, tmp_path):
     changes = {"updates": 2, "batch_size": 4, "eval_length": 2, "eval_clean": False}
     run = run_finetune(smoke_finetune(encoder, data, tmp_path / "out", **changes))
