@@ -14,11 +14,10 @@ import torch
 
 import finetune.evaluations
 import finetune.features
-import pretrain.train
-import vd4rl_pomdp.studies.navigation.trainer
 from finetune.algorithms import bc, td3_bc
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
+from pretrain.trainer import Trainer
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
@@ -85,14 +84,10 @@ def stage(request) -> Stage:
     if request.param == "navigation":
         given = {"steps": 8, "log_every": 4, "checkpoint_every": 4, "precision": "fp32"}
         config = NavigationConfig.of("smoke", data=request.getfixturevalue("maze"), **given)
-        return (
-            run_navigation,
-            lambda out: replace(config, out=out),
-            vd4rl_pomdp.studies.navigation.trainer.NavigationTrainer,
-        )
+        return run_navigation, lambda out: replace(config, out=out), Trainer
     data = request.getfixturevalue("data")
     if request.param == "pretrain":
-        return run_pretrain, lambda out: smoke_pretrain(data, out, method="no_history"), pretrain.train.PretrainTrainer
+        return run_pretrain, lambda out: smoke_pretrain(data, out, method="no_history"), Trainer
     encoder, changes = request.getfixturevalue("encoder"), FINETUNE | {"algorithm": "bc"}
     return run_finetune, lambda out: smoke_finetune(encoder, data, out, **changes), bc.BC
 

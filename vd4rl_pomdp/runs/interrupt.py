@@ -83,11 +83,6 @@ def deferred(value: bool = True) -> Iterator[None]:
     check()
 
 
-def arrived() -> int | None:
-    """The signal that has arrived since signals were last begun to be answered, if one has."""
-    return _Signals.arrived
-
-
 def asked() -> bool:
     """Whether a signal has arrived and waits for an answer."""
     return _Signals.handled and _Signals.arrived is not None
