@@ -235,8 +235,8 @@ def test_a_run_that_another_process_writes_is_refused_by_every_stage(stage, tmp_
 
 def test_a_set_that_another_process_collects_is_refused(tmp_path):
     from vd4rl_pomdp.data import collect
+    from vd4rl_pomdp.studies.navigation.collect import PRESETS
     from vd4rl_pomdp.studies.navigation.collect import collect as collect_maze
-    from vd4rl_pomdp.studies.navigation.sets import PRESETS
 
     configs = [
         (collect.collect, collect.CollectConfig("walker_walk", "random", tmp_path / "set", workers=1)),

@@ -18,7 +18,7 @@ from PIL import Image
 from finetune.features import FeatureFile
 from tests.helpers_data import write_fake_set
 from tests.nn.test_encoder import CARD, make
-from tests.studies.navigation.test_exogenous import python_batch
+from tests.studies.navigation.test_pictures import python_batch
 from vd4rl_pomdp.cli import run_to_end
 from vd4rl_pomdp.core.errors import UnavailableError, UserError, system_error
 from vd4rl_pomdp.data import open_dataset
@@ -35,8 +35,8 @@ from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import read_csv
 from vd4rl_pomdp.runs.outputs import kept_in
 from vd4rl_pomdp.runs.results.folder import RUNS, _lines
-from vd4rl_pomdp.studies.navigation.exogenous import _read_cifar, _read_image, load_pool, source_fingerprint
-from vd4rl_pomdp.studies.navigation.first_person import _refuse_other
+from vd4rl_pomdp.studies.navigation.drivers import _refuse_other
+from vd4rl_pomdp.studies.navigation.pictures import _read_cifar, _read_image, load_pool, source_fingerprint
 from vd4rl_pomdp.studies.navigation.runs import read_trajectory
 from vd4rl_pomdp.sweeps.folder import _read_plan
 
