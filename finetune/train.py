@@ -25,6 +25,7 @@ from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.core.tasks import TASKS, UNKNOWN_QUALITY
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
+from vd4rl_pomdp.data.format import read_plan
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.envs.make import layout_of
@@ -84,7 +85,7 @@ def finetune(config: FinetuneConfig) -> RunFolder:
     card = replace(card, quality=dataset.quality or untold)  # the policy's set names its rows
     inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
     before = read_record(config.encoder)
-    with RunFolder(config.out, STAGE, config, inputs, RESULTS, before.parts) as run:
+    with RunFolder(config.out, STAGE, config, inputs, RESULTS, before.parts, read_plan(config.data)) as run:
         if not run.finished:
             warn_of_other_code(config.encoder, before.code, before.parts, "it was pretrained; pretrain it again")
             write_json(run.path / LABELS_FILE, labels_of(config, card))
@@ -185,14 +186,13 @@ class FinetuneTrainer:
             drop_episodes_after(run.path / EPISODES_FILE, self.step)  # of a checkpoint that is gone
             if self.step and loop.due(config.eval_every):
                 self.evaluate(run, loop)
-            while self.step < config.updates:
+            for step in loop:
                 loop.add(self.algorithm.update(self.sampler.sample()))  # type: ignore[arg-type]
-                self.step += 1
+                self.step = step
                 if loop.due(config.log_every):
                     loop.log()
-                evaluates = loop.due(config.eval_every)
-                loop.step_done(save=evaluates or self.step % config.checkpoint_every == 0)
-                if evaluates:
+                if loop.due(config.eval_every):
+                    loop.save()
                     self.evaluate(run, loop)
         if self.path:
             self.reference.with_path_error(self.path.action_error(self.algorithm.policy)).write(run.path)
@@ -210,7 +210,7 @@ class FinetuneTrainer:
         """
         own = CorruptionConfig.fill(self.card.corruption)
         under = own_and_none(own) if self.config.eval_clean and self.step == self.config.updates else [own]
-        with interrupt.at_once():
+        with interrupt.deferred(False):
             loop.require_finite(self.algorithm.policy)
             self.algorithm.policy.save(run.path / "policy", self.step)
             if isinstance(self.algorithm, EndToEnd):
@@ -234,7 +234,6 @@ class FinetuneTrainer:
         episodes = evaluate(
             jobs_of(run.path, task, under, config.eval_episodes, config.eval_length, film=True), config.workers
         )
-        loop.require_owner()  # whoever took the run over meanwhile has rows of its own
         rows = episode_rows(episodes, labels_of(config, self.card) | {"step": self.step})
         if episodes[0].film is not None:
             with replacing_file(run.path / FILM_FILE) as fresh, fresh.open("wb") as file:

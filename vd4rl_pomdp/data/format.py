@@ -14,7 +14,6 @@ import io
 import json
 import os
 import re
-import sys
 from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -27,7 +26,7 @@ import numpy as np
 
 from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors, in_one_line, system_error
 from vd4rl_pomdp.core.reading import parse_json, regular
-from vd4rl_pomdp.core.tasks import FRAME_SIZES, GymnasiumTask, Task
+from vd4rl_pomdp.core.tasks import FRAME_SIZES
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.runs.files import read_json, write_bytes
 
@@ -55,16 +54,6 @@ def is_shard_name(name: str) -> bool:
 def read_plan(folder: Path) -> dict[str, Any]:
     """How a set was collected, as its collection.json has it; empty for sets of other makers."""
     return read_json(folder / PLAN) if (folder / PLAN).is_file() else {}
-
-
-def warn_of_earlier_pictures(place: object, plan: Mapping[str, Any], task: Task) -> None:
-    """Tell on stderr if a set, by its collection.json, has pictures that its task draws otherwise by now."""
-    if plan and isinstance(task, GymnasiumTask) and DOWNSCALING.keys() - plan.keys():
-        print(
-            f"warning: {place}: pictures of its set were shrunk by an earlier version, whose pixels are no means of "
-            "areas unless a frame's size divides the picture's: if it does not, collect it again",
-            file=sys.stderr,
-        )
 
 
 def shard_files(folder: Path) -> list[Path]:
