@@ -130,22 +130,16 @@ def test_actions_are_rescaled_and_pictures_shrunk(tasks):
     assert (row.state.size, row.physics.size) == (0, 0)
 
 
-def test_sets_say_how_their_pictures_were_shrunk_and_those_of_before_that_they_do_not(tasks, tmp_path, capsys):
+def test_sets_say_how_their_pictures_were_shrunk_and_those_of_before_that_they_do_not(tasks, tmp_path):
     data, row = tmp_path / "centre" / "random", "| pictures shrunk by | {} |"
     config = CollectConfig("centre", "random", data, episodes=2, workers=1, frame_size=50)
     collect(config, 8)
     plan = json.loads((data / "collection.json").read_text())
     assert plan.pop("downscaling") == "area means"
     assert row.format("area means") in (data / "card.md").read_text()
-    stages(data, tmp_path / "now")
-    assert "shrunk" not in capsys.readouterr().err
     (data / "collection.json").write_text(json.dumps(plan))
     collect(config, 8)  # which is whole, and stays
     assert row.format(EARLIER) in (data / "card.md").read_text()
-    run = stages(data, tmp_path / "before")
-    assert f"warning: {data}: pictures of its set were shrunk by an earlier version" in capsys.readouterr().err
-    evaluate_run(run, "none", 1, 1)
-    assert f"warning: {run}: pictures of its set were shrunk by an earlier version" in capsys.readouterr().err
     (data / "provenance.json").unlink()
     with pytest.raises(UserError, match="was begun by an earlier version with another downscaling, and is not whole"):
         collect(config, 8)
@@ -215,8 +209,6 @@ def test_an_evaluation_is_never_longer_than_the_task(tasks, tmp_path):
     config = finetune.config.FinetuneConfig.of("smoke", encoder=encoder / "encoder", data=data, workers=1)
     run = run_finetune(replace(config, out=tmp_path / "run", eval_length=500))
     assert {row["length"] for row in read_episodes(run.path / "episodes.csv")} == {9}
-    with pytest.raises(UserError, match="--eval-length is 501; it must be at least 1 and at most 500"):
-        run_finetune(replace(config, out=tmp_path / "other", eval_length=501))
 
 
 @pytest.mark.parametrize(("told", "length"), [(500, 510), (499, 499)])

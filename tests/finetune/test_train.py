@@ -99,8 +99,6 @@ def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_th
         ({"gamma": 1.5}, "--gamma is 1.5; it must be at least 0 and at most 1"),
         ({"n_step": 0}, "--n-step is 0"),
         ({"learning_rate": float("nan")}, "--learning-rate is nan"),
-        ({"precision": "fp16"}, "--precision is 'fp16': choose one of fp32, bf16"),
-        ({"batch_size": "8"}, "--batch-size is '8': it must be an integer"),
         ({"device": "cuda:99"}, "no such GPU"),
     ],
 )
