@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from shutil import copyfile
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -30,12 +29,13 @@ from vd4rl_pomdp.nn import load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
 from vd4rl_pomdp.policies.actor import ASSETS, read_actor, read_ladder
 from vd4rl_pomdp.policies.export import CURVE, read_curve
-from vd4rl_pomdp.report.load import FILM, FILM_FILE, LoadedRun
+from vd4rl_pomdp.report.films import FILM, read_film
+from vd4rl_pomdp.runs import FILM_FILE
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import read_csv
 from vd4rl_pomdp.runs.outputs import kept_in
-from vd4rl_pomdp.runs.results.folder import RUNS, _lines
+from vd4rl_pomdp.runs.results import RUNS, read_lines
 from vd4rl_pomdp.studies.navigation.exogenous import _read_cifar, _read_image, load_pool, source_fingerprint
 from vd4rl_pomdp.studies.navigation.first_person import _refuse_other
 from vd4rl_pomdp.studies.navigation.runs import read_trajectory
@@ -104,13 +104,13 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
         "actor": lambda: read_actor(actor),
         "ladder": lambda: read_ladder(ladder),
         "what a policy replaces": lambda: _refuse_other(actor),
-        "film": lambda: LoadedRun.film(SimpleNamespace(path=run)),
+        "film": lambda: read_film(run / FILM_FILE),
         "features": features.read,
         "episodes": lambda: read_episodes(run / "episodes.csv"),
         "episodes of a cut run": lambda: episodes_until(run / "episodes.csv", 1),
         "curve": lambda: read_curve(run),
         "trajectory": lambda: read_trajectory(run / "trajectory.csv"),
-        "results": lambda: _lines(run / RUNS),
+        "results": lambda: read_lines(run / RUNS),
         "table": lambda: read_csv(run / "table.csv", ("a",), ()),
         "images": lambda: load_pool(str(images), 0),
         "image": lambda: _read_image(images / "a.png"),

@@ -8,8 +8,7 @@ from itertools import pairwise
 from pathlib import Path
 
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
-from vd4rl_pomdp.report.layout import number
-from vd4rl_pomdp.report.stats import mean_and_error
+from vd4rl_pomdp.report.stats import mean_and_error, number
 from vd4rl_pomdp.runs.results import read_results
 from vd4rl_pomdp.studies.navigation.grid import Condition
 from vd4rl_pomdp.studies.navigation.measures import Measure, online_error, refitted_error
