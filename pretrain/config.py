@@ -5,32 +5,30 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 import tyro
 
 from pretrain.objectives import METHODS, Method
-from vd4rl_pomdp.core.errors import MAX_SEED, UserError, flag_of, refuse_outside, refuse_unknown
+from vd4rl_pomdp.core.errors import MAX_SEED, OR_ONES_OWN, UserError, refuse_outside, refuse_unknown
 from vd4rl_pomdp.core.options import NO_OPTIONS, Limits, Options, StageConfig
+from vd4rl_pomdp.core.tasks import FRAME_SIZES
 from vd4rl_pomdp.corruptions import NO_CORRUPTION, CorruptionConfig
-from vd4rl_pomdp.nn.encoder import MAX_LAYERS
-from vd4rl_pomdp.nn.frame import FRAME_ENCODERS
+from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, STATE
+from vd4rl_pomdp.nn.memory import MEMORIES
+from vd4rl_pomdp.nn.objective import ActionOptions
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
 
 
 @dataclass(frozen=True)
-class MemoryOptions(Options):
-    """Options of encoders with a memory."""
+class HiddenOptions(Options):
+    """Options of `--frame-encoder state`, which reads the simulator's standardised states in place of pixels."""
 
-    hidden_dim: int = 256
-    """Units of each GRU layer."""
-    gru_layers: int = 1
-    """Layers of the GRU."""
-    m: int | None = None
-    """Rows before t that a state is computed from; None: what the method has (fj and fj+a 8, the others all)."""
+    hidden_share: float = 0.0
+    """Share of a state's coordinates that are hidden, drawn anew in every row."""
 
-    limits: ClassVar[Limits] = {"hidden_dim": 1, "gru_layers": (1, MAX_LAYERS), "m": 0}
+    limits: ClassVar[Limits] = {"hidden_share": (0, 1)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -54,7 +52,8 @@ class TrainingConfig(StageConfig):
     learning_rate: float = 3e-4
     """Adam's learning rate."""
     frame_encoder: str = "drq"
-    """Frame encoder: drq, nature (a fraction of its cost), nature_half (half the resolution), small or mixer."""
+    """Frame encoder: drq, nature (a fraction of its cost), nature_half (half the resolution), small or mixer; or
+    state, the simulator's, in place of pixels."""
     precision: Precision = "fp32"
     """fp32, or bf16 autocast."""
     device: str = "auto"
@@ -94,8 +93,8 @@ class PretrainConfig(TrainingConfig):
     """The set's task, where neither its shards nor its folder's name tell."""
     shift: int = 4
     """Random shift in pixels; whether observations or windows share one is the method's choice."""
-    history: Literal["method", "gru"] = "method"
-    """Memory of the encoder: what the method has, or a GRU over the past also for methods that have none."""
+    history: str = "method"
+    """Memory of the encoder: method for the method's own (mostly gru, or none), or a memory's name, such as gru."""
     corruption: CorruptionConfig = NO_CORRUPTION
     """What makes the observations partial."""
 
@@ -123,33 +122,40 @@ class PretrainConfig(TrainingConfig):
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
         """Options of method, memory, frame encoder and corruption."""
         method = METHODS.named(values["method"])
-        recurrent = history_of(values["method"], method, values["history"]) == "gru"
         return {
             "options": method.options.fill(values),
-            "memory": (MemoryOptions if recurrent else Options).fill(values),
-            "frame": frame_options(method, values),
+            "memory": memory_options(history_of(values["method"], method, values["history"]), values),
+            "frame": HiddenOptions.fill(values) if values["frame_encoder"] == STATE else frame_options(method, values),
             "corruption": CorruptionConfig.fill(values),
         }
 
     def check(self) -> None:
         """Refuse settings that cannot work, before anything is read or written."""
         super().check()
-        usual, method = self.defaults(self.preset), METHODS.named(self.method)
-        for name in ("frame_encoder", "shift") if method.reads_state else ():
-            if getattr(self, name) != usual[name]:
-                raise UserError(f"{flag_of(name)} is not read by the method {self.method}: leave it out")
-        if method.shift == "own" and self.shift != usual["shift"]:
-            raise UserError(f"--shift is not read by the method {self.method}, which shifts by itself: leave it out")
+        method = METHODS.named(self.method)
+        refuse_outside(self, shift=(0, FRAME_SIZES[1] - 1))
+        if self.batch_size < method.least_batch:
+            told = f"{self.method} tells windows apart: give it {method.least_batch}"
+            raise UserError(f"--batch-size is {self.batch_size}; {told}")
+        if self.frame_encoder == STATE and not (isinstance(self.options, ActionOptions) or self.method == "random"):
+            raise UserError(f"--frame-encoder state is for random and methods that predict actions, not {self.method}")
 
 
 def history_of(name: str, method: Method, history: str) -> str:
-    """Memory of a method's encoder, gru or none; one that it cannot have raises UserError."""
-    refuse_unknown("--history", history, ("method", "gru"))
+    """Name of the memory of a method's encoder, or none; one that it cannot have raises UserError."""
     if history == "method":
         return method.history
     if method.end_to_end or method.reads_state:
         raise UserError(f"{name} has no memory: --history {history} is for pretrained methods")
+    if history not in MEMORIES.broken:
+        refuse_unknown("--history", history, ("method", *MEMORIES), OR_ONES_OWN)
     return history
+
+
+def memory_options(history: str, values: Mapping[str, Any]) -> Options:
+    """Options of the memory called `history`; none for `none`."""
+    kind = Options if history == "none" else MEMORIES.named(history).options
+    return kind.fill(values)
 
 
 def frame_options(method: Method, values: Mapping[str, Any]) -> Options:

@@ -100,10 +100,9 @@ def _check_collection(config: Any) -> None:
 
 def _pretrain(words: list[str], program: str) -> Any:
     from pretrain.config import PretrainConfig
-    from pretrain.train import check_config
 
     config = parse_stage(PretrainConfig, words, program)
-    check_config(config)
+    config.check()
     return config
 
 
@@ -114,7 +113,7 @@ def _finetune(words: list[str], program: str) -> Any:
 
 
 def _navigation_collect(words: list[str], program: str) -> Any:
-    from vd4rl_pomdp.studies.navigation.sets import PRESETS, MazeCollectConfig
+    from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig
 
     return with_presets(MazeCollectConfig, PRESETS, words, program)
 
@@ -183,7 +182,7 @@ def _finetuning(cell: GridCell) -> Any:
 
     before = config_of(cell, "pretrain")
     method = METHODS.named(before.method)
-    remembers = history_of(before.method, method, before.history) == "gru"
+    remembers = history_of(before.method, method, before.history) != "none"
     task = TASKS.get(cell.value("task"))  # none in a cell that will be refused, for it has no set
     decisions = task.decisions if task else 0
     return as_trained(config_of(cell, "finetune"), before.method, method.end_to_end, remembers, decisions)
