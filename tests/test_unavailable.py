@@ -67,7 +67,7 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
     save_encoder(encoder, make("gru", True), CARD, frames=160)
     Policy(4, 2, 8).save(policy, step=7)
     run.mkdir()
-    Checkpoints(run).add(1, {"a": b"1"}, 0.5)
+    Checkpoints(run).add(1, {"a": 1}, 0.5)
     actor, ladder = (tmp_path / f"{name}.safetensors" for name in ("actor", "ladder"))
     copyfile(ASSETS / "walker_walk_expert.safetensors", actor)
     copyfile(ASSETS / "walker_walk_replay.safetensors", ladder)
@@ -98,7 +98,7 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
         "encoder": lambda: load_encoder(encoder),
         "policy": lambda: load_policy(policy),
         "step of a policy": lambda: policy_step(policy),
-        "checkpoint": Checkpoints(run).newest,
+        "checkpoint": lambda: Checkpoints(run).restore(lambda state: None),
         "actor": lambda: read_actor(actor),
         "ladder": lambda: read_ladder(ladder),
         "what a policy replaces": lambda: _refuse_other(actor),
