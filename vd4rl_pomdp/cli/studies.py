@@ -134,8 +134,7 @@ def bench(json: bool = False, quick: bool = False) -> None:
 
 def navigation_collect(words: list[str], program: str) -> None:
     """Collect a maze's data."""
-    from vd4rl_pomdp.studies.navigation.collect import collect
-    from vd4rl_pomdp.studies.navigation.sets import PRESETS, MazeCollectConfig
+    from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig, collect
 
     config = with_presets(MazeCollectConfig, PRESETS, words, program)
     print(f"{len(collect(config))} shards in {config.out}")
@@ -152,7 +151,7 @@ def navigation_train(words: list[str], program: str) -> None:
 
 def navigation_policy(words: list[str], program: str) -> None:
     """Train the policy that walks the first-person maze."""
-    from vd4rl_pomdp.studies.navigation.first_person import FirstPersonConfig, train_first_person
+    from vd4rl_pomdp.studies.navigation.drivers import FirstPersonConfig, train_first_person
 
     config = parse(FirstPersonConfig, words, program)
     card = train_first_person(config).card
@@ -170,7 +169,7 @@ def navigation_report(
         out: Folder of the report.
         pictures: Also draw sample observations, which needs OpenGL.
     """
+    from vd4rl_pomdp.studies.navigation.collect import sample_observations
     from vd4rl_pomdp.studies.navigation.report import write_report
-    from vd4rl_pomdp.studies.navigation.samples import sample_observations
 
     print(f"report: {write_report(_named(runs), out, sample_observations if pictures else None)}")

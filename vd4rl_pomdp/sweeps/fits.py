@@ -37,8 +37,8 @@ def check_fit(configs: Mapping[str, Any]) -> None:
 
 @cache
 def _check_maze(training: Any, maze_set: Any) -> None:
-    from vd4rl_pomdp.studies.navigation.exogenous import check_source
-    from vd4rl_pomdp.studies.navigation.observations import SHAPES, check_trajectories
+    from vd4rl_pomdp.studies.navigation.data import check_trajectories
+    from vd4rl_pomdp.studies.navigation.pictures import SHAPES, check_source
 
     if training.exogenous != "none":
         check_source(training.exogenous)

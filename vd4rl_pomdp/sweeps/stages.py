@@ -113,7 +113,7 @@ def _finetune(words: list[str], program: str) -> Any:
 
 
 def _navigation_collect(words: list[str], program: str) -> Any:
-    from vd4rl_pomdp.studies.navigation.sets import PRESETS, MazeCollectConfig
+    from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig
 
     return with_presets(MazeCollectConfig, PRESETS, words, program)
 
