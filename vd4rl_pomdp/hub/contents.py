@@ -9,10 +9,9 @@ from pathlib import Path
 
 from vd4rl_pomdp.core.errors import UnavailableError, UserError
 from vd4rl_pomdp.core.reading import build
-from vd4rl_pomdp.data.episodes import join_shards
-from vd4rl_pomdp.data.format import check_frames, is_shard_name, read_rows, shard_files, shard_paths
-from vd4rl_pomdp.data.hub_card import set_card
-from vd4rl_pomdp.data.manifest import check_whole
+from vd4rl_pomdp.data.card import set_card
+from vd4rl_pomdp.data.folder import is_shard_name, join_shards, shard_files, shard_paths
+from vd4rl_pomdp.data.format import read_frame_size, read_rows
 from vd4rl_pomdp.hub.repository import ENCODER, SET, Repository
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, WEIGHTS, load_encoder, read_record
 from vd4rl_pomdp.nn.model_card import CARD, model_card
@@ -98,8 +97,7 @@ def _check(folder: Path, kind: str) -> None:
         load_encoder(folder)
     else:
         shards = shard_paths(folder)
-        check_whole(folder, shards)
-        check_frames(shards)
+        read_frame_size(shards)
         join_shards(folder, shards, [read_rows(shard) for shard in shards])
 
 

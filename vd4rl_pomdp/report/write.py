@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.text import write_text
-from vd4rl_pomdp.data.published import published_scores
+from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import bars, dots, lines, measures, overall, present, tables
 from vd4rl_pomdp.report.claims import judge_claims
 from vd4rl_pomdp.report.facts import differing, facts, unfinished, unlike

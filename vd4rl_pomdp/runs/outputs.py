@@ -10,7 +10,8 @@ from pathlib import Path
 
 from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_error
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
-from vd4rl_pomdp.data.format import PLAN, is_shard, is_shard_name
+from vd4rl_pomdp.data.folder import PLAN, is_shard_name
+from vd4rl_pomdp.data.format import is_shard
 from vd4rl_pomdp.runs import CONFIG_FILE
 
 

@@ -17,7 +17,7 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.registry import code_of, warn_of_other_code
 from vd4rl_pomdp.core.settings import LATER, RUNTIME_FIELDS
-from vd4rl_pomdp.data.format import read_plan
+from vd4rl_pomdp.data.folder import read_plan
 from vd4rl_pomdp.runs import CONFIG_FILE, DIVERGED_FILE, EPISODES_FILE, FORMAT, MACHINE_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, State, fitting, pack, unpack
 from vd4rl_pomdp.runs.episodes import read_episodes

@@ -19,12 +19,11 @@ from vd4rl_pomdp.core.errors import MAX_SEED, MOST_ROWS, refuse_outside
 from vd4rl_pomdp.core.seeding import episode_seed
 from vd4rl_pomdp.core.tasks import MOST_EPISODES
 from vd4rl_pomdp.core.types import StepType
-from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
+from vd4rl_pomdp.data.shards import Columns, Shard, collect_set
 from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, Style, check_maze, get_maze
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
-from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.provenance import versions
 from vd4rl_pomdp.studies.navigation.sets import MazeCollectConfig
 
@@ -53,10 +52,8 @@ def collect(config: MazeCollectConfig) -> list[Path]:
         Shard(path, [_job(config, i) for i in trajectories], _attributes(config))
         for path, trajectories in _plan(config)
     ]
-    with owned(config.out):
-        claim_set(config.out, collection(config))
-        title = f"collect {config.maze}", "trajectories"
-        collect_shards(config.out, shards, _roll_out, config.workers, title, config.maze)
+    title = f"collect {config.maze}", "trajectories"
+    collect_set(config.out, collection(config), shards, _roll_out, config.workers, title, config.maze)
     return [shard.path for shard in shards]
 
 
