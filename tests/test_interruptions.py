@@ -12,11 +12,11 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+import vd4rl_pomdp.studies.navigation.trainer
 
 import finetune.evaluations
 import finetune.features
 import pretrain.train
-import vd4rl_pomdp.studies.navigation.trainer
 from finetune.algorithms import bc, td3_bc
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
@@ -246,8 +246,8 @@ def test_a_run_that_another_process_writes_is_refused_by_every_stage(stage, tmp_
 
 def test_a_set_that_another_process_collects_is_refused(tmp_path):
     from vd4rl_pomdp.data import collect
+    from vd4rl_pomdp.studies.navigation.collect import PRESETS
     from vd4rl_pomdp.studies.navigation.collect import collect as collect_maze
-    from vd4rl_pomdp.studies.navigation.sets import PRESETS
 
     configs = [
         (collect.collect, collect.CollectConfig("walker_walk", "random", tmp_path / "set", workers=1)),

@@ -175,8 +175,8 @@ def test_every_flag_of_the_navigation_page_exists():
 
     from vd4rl_pomdp.cli.sweeps import RunCommand
     from vd4rl_pomdp.core.options import option_names
+    from vd4rl_pomdp.studies.navigation.collect import MazeCollectConfig
     from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-    from vd4rl_pomdp.studies.navigation.sets import MazeCollectConfig
 
     configs = (NavigationConfig, MazeCollectConfig, RunCommand)
     flags = {name.replace("_", "-") for c in configs for name in ({f.name for f in fields(c)} | option_names())}

@@ -18,8 +18,8 @@ from PIL import Image
 from finetune.features import FeatureFile
 from tests.helpers_data import write_fake_set
 from tests.nn.test_encoder import CARD, make
-from tests.studies.navigation.test_exogenous import python_batch
-from vd4rl_pomdp.cli.ends import run_to_end
+from tests.studies.navigation.test_pictures import python_batch
+from vd4rl_pomdp.cli import run_to_end
 from vd4rl_pomdp.core.errors import UnavailableError, UserError, system_error
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows
@@ -29,15 +29,14 @@ from vd4rl_pomdp.hub.contents import Listing
 from vd4rl_pomdp.nn import load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
 from vd4rl_pomdp.policies.actor import ASSETS, read_actor, read_ladder
-from vd4rl_pomdp.policies.export import CURVE, read_curve
 from vd4rl_pomdp.report.load import FILM, FILM_FILE, LoadedRun
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import read_csv
 from vd4rl_pomdp.runs.outputs import kept_in
 from vd4rl_pomdp.runs.results.folder import RUNS, _lines
-from vd4rl_pomdp.studies.navigation.exogenous import _read_cifar, _read_image, load_pool, source_fingerprint
-from vd4rl_pomdp.studies.navigation.first_person import _refuse_other
+from vd4rl_pomdp.studies.navigation.drivers import _refuse_other
+from vd4rl_pomdp.studies.navigation.pictures import _read_cifar, _read_image, load_pool, source_fingerprint
 from vd4rl_pomdp.studies.navigation.runs import read_trajectory
 from vd4rl_pomdp.sweeps.folder import _read_plan
 
@@ -77,7 +76,6 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
     features = FeatureFile(run, {})
     features.write(np.zeros(3))
     (run / "episodes.csv").write_text(",".join(COLUMNS) + "\n")
-    (run / CURVE).write_text("decisions,return_mean\n1,2.0\n")
     (run / "trajectory.csv").write_text("x,y,estimated_x,estimated_y\n0,0,0,0\n")
     (run / RUNS).write_text("{}\n")
     (run / "table.csv").write_text("a\n1\n")
@@ -108,7 +106,6 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
         "features": features.read,
         "episodes": lambda: read_episodes(run / "episodes.csv"),
         "episodes of a cut run": lambda: episodes_until(run / "episodes.csv", 1),
-        "curve": lambda: read_curve(run),
         "trajectory": lambda: read_trajectory(run / "trajectory.csv"),
         "results": lambda: _lines(run / RUNS),
         "table": lambda: read_csv(run / "table.csv", ("a",), ()),

@@ -15,6 +15,7 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from export_actor import StateEnv
 from script import run_script
 
 from finetune.evaluation import EVALUATION_SEED
@@ -23,7 +24,6 @@ from vd4rl_pomdp.core.state_scale import StateScale
 from vd4rl_pomdp.core.tasks import MOST_EPISODES, TASKS
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.policies.actor import Actor, load_actor
-from vd4rl_pomdp.policies.state_env import StateEnv
 from vd4rl_pomdp.runs.files import write_csv
 from vd4rl_pomdp.runs.outputs import refuse_inside
 

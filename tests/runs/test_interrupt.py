@@ -15,40 +15,38 @@ from vd4rl_pomdp.runs import interrupt
 
 SLOW_STEPS = """
 import sys, time
-from pretrain.train import PretrainTrainer
+from pretrain.trainer import Trainer
 from vd4rl_pomdp.cli import main
-update = PretrainTrainer.update
+update = Trainer.update
 def slow(self):
     logs = update(self)
     if self.step == 3:
         print("in step 3", flush=True)
     time.sleep(0.2)
     return logs
-PretrainTrainer.update = slow
+Trainer.update = slow
 if __name__ == "__main__":
     main(sys.argv[1:])
 """
 SLOW_JOBS = """
 import sys
 from tests.runs.test_workers import tell_and_sleep
-from vd4rl_pomdp.cli import COMMANDS, main
-from vd4rl_pomdp.cli.dispatch import Command
+from vd4rl_pomdp.cli import main, stages
 from vd4rl_pomdp.runs.workers import run_jobs
-COMMANDS["jobs"] = Command("", lambda words, program: list(run_jobs(tell_and_sleep, [0, 1], 2)))
+stages.list_parts = lambda words, program: list(run_jobs(tell_and_sleep, [0, 1], 2))
 if __name__ == "__main__":
-    main(["jobs"])
+    main(["list"])
 """
 HANGING = """
 import sys, time
-from vd4rl_pomdp.cli import COMMANDS, main
-from vd4rl_pomdp.cli.dispatch import Command
+from vd4rl_pomdp.cli import main, stages
 from vd4rl_pomdp.runs import interrupt
 def hang(words, program):
     with interrupt.deferred():
         print("hanging", flush=True)
         time.sleep(60)
-COMMANDS["hang"] = Command("", hang)
-main(["hang"])
+stages.list_parts = hang
+main(["list"])
 """
 ENDS = [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
 

@@ -8,7 +8,7 @@ import pytest
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS, GymnasiumTask
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
-from vd4rl_pomdp.studies.navigation.grid import condition_of, paper_rows
+from vd4rl_pomdp.studies.navigation.measures import condition_of, paper_rows
 from vd4rl_pomdp.sweeps.grid import GridCell, narrow
 from vd4rl_pomdp.sweeps.grid_file import load_grid, names
 from vd4rl_pomdp.sweeps.stages import check_cell, check_cells

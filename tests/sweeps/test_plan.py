@@ -16,7 +16,7 @@ from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
-from vd4rl_pomdp.studies.navigation.exogenous import source_fingerprint
+from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
 from vd4rl_pomdp.sweeps import plan as module
 from vd4rl_pomdp.sweeps.estimate import Estimates
 from vd4rl_pomdp.sweeps.folder import SweepFolder

@@ -21,7 +21,7 @@ from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.outputs import refuse_kept
 from vd4rl_pomdp.runs.workers import count_workers
-from vd4rl_pomdp.studies.navigation.film import write_film
+from vd4rl_pomdp.studies.navigation.figures import write_film
 from vd4rl_pomdp.studies.navigation.measures import refitted_error
 from vd4rl_pomdp.studies.navigation.runs import find_navigation, load_runs
 from vd4rl_pomdp.sweeps.executors.local import LocalOptions, visible_gpus

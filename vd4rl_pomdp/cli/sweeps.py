@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from vd4rl_pomdp.cli.dispatch import Arguments, Command
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
@@ -68,7 +67,8 @@ class RunCommand(_ExecutorConfig):
     """Print every job, what is finished, what is shared, and an estimate of time; run nothing."""
 
 
-def _run(words: Arguments, program: str) -> None:
+def run(words: list[str], program: str) -> None:
+    """Carry out a grid, or resume it."""
     from vd4rl_pomdp.runs.outputs import refuse_kept
     from vd4rl_pomdp.sweeps.folder import SweepFolder, plan_name
     from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
@@ -186,7 +186,8 @@ class StatusCommand:
     """Print one JSON object."""
 
 
-def _show_status(words: Arguments, program: str) -> None:
+def show_status(words: list[str], program: str) -> None:
+    """Show where a sweep stands."""
     from vd4rl_pomdp.sweeps.folder import SweepFolder
     from vd4rl_pomdp.sweeps.status import lines
 
@@ -208,7 +209,8 @@ class RetryCommand(_ExecutorConfig):
     """Folder of the sweep."""
 
 
-def _retry(words: Arguments, program: str) -> None:
+def retry(words: list[str], program: str) -> None:
+    """Run failures again."""
     from vd4rl_pomdp.sweeps.folder import SweepFolder
 
     command = parse_stage(RetryCommand, words, program)
@@ -238,7 +240,8 @@ class JoinCommand:
     """CPU threads of a job; 0: its share of the machine's cores."""
 
 
-def _join(words: Arguments, program: str) -> None:
+def join(words: list[str], program: str) -> None:
+    """Help with a sweep."""
     from vd4rl_pomdp.sweeps.driver import Driver
     from vd4rl_pomdp.sweeps.folder import SweepFolder
 
@@ -256,19 +259,11 @@ class GridsCommand:
     """List the grids that ship with the package."""
 
 
-def _list(words: Arguments, program: str) -> None:
+def list_grids(words: list[str], program: str) -> None:
+    """List the grids that ship."""
     from vd4rl_pomdp.sweeps.grid_file import load_grid, names
 
     parse(GridsCommand, words, program)
     for name in names():
         grid = load_grid(name)
         print(f"{name:<18} {len(grid.cells()):>5} cells  {grid.title}")
-
-
-COMMANDS = {
-    "run": Command("carry out a grid, or go on with it", _run),
-    "status": Command("counts, rate, time left and failures of a sweep", _show_status),
-    "retry": Command("take up failures again", _retry),
-    "join": Command("help with a sweep on this machine", _join),
-    "list": Command("the grids that ship", _list),
-}

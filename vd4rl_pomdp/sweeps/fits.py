@@ -12,8 +12,9 @@ from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError, refuse_outside
 from vd4rl_pomdp.core.tasks import FRAME_STACK, TASKS, GymnasiumTask
+from vd4rl_pomdp.corruptions import check_corruption_fits
 from vd4rl_pomdp.nn.encoder import EncoderConfig, build_frame_encoder
-from vd4rl_pomdp.nn.frame import encoder_settings
+from vd4rl_pomdp.nn.frame import STATE, encoder_settings
 
 
 def check_fit(configs: Mapping[str, Any]) -> None:
@@ -36,8 +37,8 @@ def check_fit(configs: Mapping[str, Any]) -> None:
 
 @cache
 def _check_maze(training: Any, maze_set: Any) -> None:
-    from vd4rl_pomdp.studies.navigation.exogenous import check_source
-    from vd4rl_pomdp.studies.navigation.observations import SHAPES, check_trajectories
+    from vd4rl_pomdp.studies.navigation.data import check_trajectories
+    from vd4rl_pomdp.studies.navigation.pictures import SHAPES, check_source
 
     if training.exogenous != "none":
         check_source(training.exogenous)
@@ -49,11 +50,11 @@ def _check_maze(training: Any, maze_set: Any) -> None:
 @cache
 def _check_pretraining(config: Any, size: int, rows: int) -> None:
     from pretrain.objectives import METHODS
-    from pretrain.train import check_pictures
 
-    check_pictures(config, size)
+    refuse_outside(config, shift=(0, size - 1))
+    check_corruption_fits(config.corruption, size)
     _check_window(config.window, rows)
-    if not METHODS.named(config.method).reads_state:
+    if not METHODS.named(config.method).reads_state and config.frame_encoder != STATE:
         _check_frames(config, 3 * FRAME_STACK, size)
 
 

@@ -74,7 +74,7 @@ class FoundRuns:
 
     def _adds_the_same(self, record: Row) -> bool:
         """Whether the images that a run in a maze added, if it did, are still in their folder."""
-        from vd4rl_pomdp.studies.navigation.exogenous import source_fingerprint
+        from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
 
         told, source = record.get("inputs", {}).get("exogenous"), record["config"].get("exogenous")
         if told is not None and source not in self._images:

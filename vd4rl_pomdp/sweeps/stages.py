@@ -100,10 +100,9 @@ def _check_collection(config: Any) -> None:
 
 def _pretrain(words: list[str], program: str) -> Any:
     from pretrain.config import PretrainConfig
-    from pretrain.train import check_config
 
     config = parse_stage(PretrainConfig, words, program)
-    check_config(config)
+    config.check()
     return config
 
 
@@ -114,7 +113,7 @@ def _finetune(words: list[str], program: str) -> Any:
 
 
 def _navigation_collect(words: list[str], program: str) -> Any:
-    from vd4rl_pomdp.studies.navigation.sets import PRESETS, MazeCollectConfig
+    from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig
 
     return with_presets(MazeCollectConfig, PRESETS, words, program)
 

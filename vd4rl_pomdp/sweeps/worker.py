@@ -31,7 +31,7 @@ def main() -> None:
     signal.signal(signal.SIGTERM, _end_interrupted)  # importing what follows takes a while
     words = told["words"]
     sys.argv = ["vd4rl-pomdp", *words]  # what a run records as its command
-    from vd4rl_pomdp.cli.ends import End, run_to_end
+    from vd4rl_pomdp.cli import End, run_to_end
     from vd4rl_pomdp.core.errors import UserError
     from vd4rl_pomdp.core.registry import changed_since
     from vd4rl_pomdp.sweeps.own_file import load

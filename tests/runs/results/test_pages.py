@@ -88,13 +88,14 @@ def intervals(returns: list[np.ndarray]) -> Iterator[str]:
 
 def of_mazes(script: ModuleType) -> Iterator[str]:
     """Of the pages' measures in every maze; differences only between settings of one method in one maze."""
-    groups = defaultdict(lambda: defaultdict(list))
+    numbers = script.numbers_in()
+    conditions = defaultdict(set)
     for run in script.main_runs():
-        groups[run.condition.maze, run.condition.method][run.condition].append(run)
-    for conditions, measure in itertools.product(groups.values(), MEASURES):
-        numbers = [script.entry_of(condition, measure, mine).numbers for condition, mine in conditions.items()]
+        conditions[run.condition.maze, run.condition.method].add(run.condition)
+    for mine, measure in itertools.product(conditions.values(), MEASURES):
+        found = [script.values(numbers, condition, measure) for condition in sorted(mine)]
         for digits in (1, 2):
-            yield from with_differences(map(estimate, numbers), digits)
+            yield from with_differences(map(estimate, found), digits)
 
 
 @pytest.fixture(scope="module")
