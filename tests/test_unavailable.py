@@ -8,7 +8,6 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
 from pathlib import Path
 from shutil import copyfile
-from types import SimpleNamespace
 
 import h5py
 import numpy as np
@@ -29,12 +28,13 @@ from vd4rl_pomdp.hub.contents import Listing
 from vd4rl_pomdp.nn import load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
 from vd4rl_pomdp.policies.actor import ASSETS, read_actor, read_ladder
-from vd4rl_pomdp.report.load import FILM, FILM_FILE, LoadedRun
+from vd4rl_pomdp.report.films import FILM, read_film
+from vd4rl_pomdp.runs import FILM_FILE
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import read_csv
 from vd4rl_pomdp.runs.outputs import kept_in
-from vd4rl_pomdp.runs.results.folder import RUNS, _lines
+from vd4rl_pomdp.runs.results import RUNS, read_lines
 from vd4rl_pomdp.studies.navigation.drivers import _refuse_other
 from vd4rl_pomdp.studies.navigation.pictures import _read_cifar, _read_image, load_pool, source_fingerprint
 from vd4rl_pomdp.studies.navigation.runs import read_trajectory
@@ -67,7 +67,7 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
     save_encoder(encoder, make("gru", True), CARD, frames=160)
     Policy(4, 2, 8).save(policy, step=7)
     run.mkdir()
-    Checkpoints(run).add(1, {"a": b"1"}, 0.5)
+    Checkpoints(run).add(1, {"a": 1}, 0.5)
     actor, ladder = (tmp_path / f"{name}.safetensors" for name in ("actor", "ladder"))
     copyfile(ASSETS / "walker_walk_expert.safetensors", actor)
     copyfile(ASSETS / "walker_walk_replay.safetensors", ladder)
@@ -98,16 +98,16 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
         "encoder": lambda: load_encoder(encoder),
         "policy": lambda: load_policy(policy),
         "step of a policy": lambda: policy_step(policy),
-        "checkpoint": Checkpoints(run).newest,
+        "checkpoint": lambda: Checkpoints(run).restore(lambda state: None),
         "actor": lambda: read_actor(actor),
         "ladder": lambda: read_ladder(ladder),
         "what a policy replaces": lambda: _refuse_other(actor),
-        "film": lambda: LoadedRun.film(SimpleNamespace(path=run)),
+        "film": lambda: read_film(run / FILM_FILE),
         "features": features.read,
         "episodes": lambda: read_episodes(run / "episodes.csv"),
         "episodes of a cut run": lambda: episodes_until(run / "episodes.csv", 1),
         "trajectory": lambda: read_trajectory(run / "trajectory.csv"),
-        "results": lambda: _lines(run / RUNS),
+        "results": lambda: read_lines(run / RUNS),
         "table": lambda: read_csv(run / "table.csv", ("a",), ()),
         "images": lambda: load_pool(str(images), 0),
         "image": lambda: _read_image(images / "a.png"),

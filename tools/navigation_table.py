@@ -12,8 +12,15 @@ from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs.results import read_results
 from vd4rl_pomdp.studies.navigation.claims import Numbers
-from vd4rl_pomdp.studies.navigation.measures import Condition, Measure, online_error, paper_number, refitted_error
-from vd4rl_pomdp.studies.navigation.methods import OBJECTIVES, UNTRAINED
+from vd4rl_pomdp.studies.navigation.measures import (
+    OBJECTIVES,
+    UNTRAINED,
+    Condition,
+    Measure,
+    online_error,
+    paper_number,
+    refitted_error,
+)
 from vd4rl_pomdp.studies.navigation.runs import NavigationRun, frame_of, load_runs, numbers_of
 
 RESULTS = Path(__file__).parents[1] / "results" / "navigation"

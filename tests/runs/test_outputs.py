@@ -40,7 +40,7 @@ def test_what_owns_a_folder_is_known_by_its_files(kept, tmp_path):
     assert {name: kept_in(folder) for name, folder in kept.items()} == {name: name.strip() for name in kept}
     others = {
         "reports": {"summary.csv": "", "index.html": ""},
-        "package": {"config.json": "[1]", "a.hdf5": "no shard"},
+        "package": {"config.json": "[1]"},
         "broken": {"config.json": "{"},
     }
     for name, files in others.items():

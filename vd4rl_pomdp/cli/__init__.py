@@ -5,13 +5,14 @@ from __future__ import annotations
 import importlib
 import io
 import multiprocessing
+import re
 import signal
 import sys
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vd4rl_pomdp import __version__
-from vd4rl_pomdp.core.errors import DIVERGED, DONE, INTERRUPTED, UserError, disk_error, in_one_line
+from vd4rl_pomdp.core.errors import DIVERGED, DONE, INTERRUPTED, OutOfMemoryError, UserError, disk_error, in_one_line
 from vd4rl_pomdp.runs import interrupt
 
 PROGRAM = "vd4rl-pomdp"
@@ -58,6 +59,10 @@ class End:
     """done, diverged, interrupted, or the `cause` of a UserError."""
     line: str = ""
     """What the user is told, empty if nothing is."""
+
+
+_NO_MEMORY = re.compile("out of memory|allocate memory|Storage size calculation overflowed|ALLOC_FAILED")
+"""What torch says, of a CPU and of a GPU's libraries."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
@@ -107,6 +112,11 @@ def run_to_end(words: Sequence[str], second: signal.Handlers = signal.SIG_DFL) -
         return End(143, INTERRUPTED, _resume("terminated", error.reason))
     except BrokenPipeError:  # what read the output is gone, as `head` goes
         return End(141, INTERRUPTED)
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not _NO_MEMORY.search(str(error)):
+            raise
+        line = f"error: out of memory ({in_one_line(error)[:200]}); lower --batch-size, or what else sets the size"
+        return End(2, OutOfMemoryError.cause, line)
     except OSError as error:
         told = disk_error(error.filename, error)
         return End(2, told.cause, f"error: {told}")

@@ -19,7 +19,9 @@ from vd4rl_pomdp.studies.navigation import figures
 from vd4rl_pomdp.studies.navigation.claims import claims, judge, verdict_lines
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.studies.navigation.measures import (
+    OBJECTIVES,
     RAW_PREFIX,
+    REFERENCES,
     Condition,
     Measure,
     condition_of,
@@ -27,7 +29,6 @@ from vd4rl_pomdp.studies.navigation.measures import (
     paper_rows,
     refitted_error,
 )
-from vd4rl_pomdp.studies.navigation.methods import OBJECTIVES, REFERENCES
 from vd4rl_pomdp.studies.navigation.report import write_report
 from vd4rl_pomdp.studies.navigation.runs import (
     NavigationRun,

@@ -15,6 +15,7 @@ import pandas as pd
 
 from vd4rl_pomdp.envs.mazes import MAZES
 from vd4rl_pomdp.studies.navigation.measures import (
+    UNTRAINED,
     Condition,
     Measure,
     held_out_loss,
@@ -22,7 +23,6 @@ from vd4rl_pomdp.studies.navigation.measures import (
     paper_number,
     refitted_error,
 )
-from vd4rl_pomdp.studies.navigation.methods import UNTRAINED
 from vd4rl_pomdp.studies.navigation.runs import numbers_of
 
 RECURRENT = ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a")

@@ -21,9 +21,8 @@ from vd4rl_pomdp.core.seeding import episode_seed
 from vd4rl_pomdp.core.tasks import MOST_EPISODES
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.shards import Columns, Shard, collect_set
-from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MAZES, MOST_STEPS, PICTURE_SIZE, Style, check_maze, get_maze
+from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MAZES, MOST_STEPS, Style, check_maze, get_maze
 from vd4rl_pomdp.runs.files import jsonable
-from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.provenance import versions
 from vd4rl_pomdp.studies.navigation.pictures import TEXTURES, ExogenousNoise, to_grey50
@@ -96,8 +95,6 @@ def check_config(config: MazeCollectConfig) -> None:
         config, trajectories=(1, MOST_EPISODES), trajectory_rows=(2, MOST_ROWS), action_repeat=(1, MOST_STEPS),
         seed=(0, MAX_SEED), trajectories_per_shard=1, workers=0,
     )  # fmt: skip
-    rows = config.trajectory_rows * min(config.trajectories, config.trajectories_per_shard)
-    require_memory(rows * 3 * PICTURE_SIZE**2, CPU, config, "trajectory_rows", "trajectories_per_shard")
 
 
 def _plan(config: MazeCollectConfig) -> Iterator[tuple[Path, range]]:

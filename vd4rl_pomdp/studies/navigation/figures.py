@@ -14,8 +14,15 @@ from matplotlib.patches import Rectangle
 from PIL import Image, ImageDraw
 
 from vd4rl_pomdp.envs.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
-from vd4rl_pomdp.studies.navigation.measures import Condition, Measure, condition_of, paper_number, paper_rows
-from vd4rl_pomdp.studies.navigation.methods import OBJECTIVES, REFERENCES
+from vd4rl_pomdp.studies.navigation.measures import (
+    OBJECTIVES,
+    REFERENCES,
+    Condition,
+    Measure,
+    condition_of,
+    paper_number,
+    paper_rows,
+)
 from vd4rl_pomdp.studies.navigation.runs import NavigationRun, numbers_of, read_trajectory
 from vd4rl_pomdp.studies.navigation.tables import conditions_of, is_missing
 

@@ -1,4 +1,4 @@
-"""What is measured, and of what: conditions, measures, and the paper's numbers for them.
+"""What is measured, and of what: methods, conditions, measures, and the paper's numbers for them.
 
 A number of a run is named by its `Condition`, its seed and its `Measure`; the fields of both are columns of every table
 of runs.
@@ -18,6 +18,15 @@ PAPER = Path(__file__).parent / "paper.csv"
 """The paper's numbers: one line a table row, one column a maze."""
 RAW_PREFIX = "raw_"
 """Before an error's name: it is in the simulator's units x 100, which the paper's numbers seem to be."""
+
+OBJECTIVES = ("no_history", "ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
+UNTRAINED = "random"
+WITH_MEMORY = ("supervised", "supervised+a")
+SUPERVISED = ("supervised_picture", *WITH_MEMORY)
+REFERENCES = (UNTRAINED, *SUPERVISED)
+"""What a table is read against: mik+a's network untrained; no_history's, ah's and ah+a's trained on the true states."""
+METHOD_NAMES = (*OBJECTIVES, *REFERENCES)
+"""The paper's objectives, the floor and the ceilings."""
 
 
 class Condition(NamedTuple):

@@ -17,7 +17,7 @@ from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.objective import InverseObjective, Objective
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.studies.navigation.data import MazeData
-from vd4rl_pomdp.studies.navigation.methods import SUPERVISED
+from vd4rl_pomdp.studies.navigation.measures import SUPERVISED
 from vd4rl_pomdp.studies.navigation.pictures import SHAPES
 from vd4rl_pomdp.studies.navigation.probe import ErrorSums, StateProbe
 

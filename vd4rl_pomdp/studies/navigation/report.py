@@ -23,8 +23,7 @@ from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.results import RUNS, Result
 from vd4rl_pomdp.studies.navigation import figures
 from vd4rl_pomdp.studies.navigation.claims import verdict_lines
-from vd4rl_pomdp.studies.navigation.measures import refitted_error
-from vd4rl_pomdp.studies.navigation.methods import UNTRAINED
+from vd4rl_pomdp.studies.navigation.measures import UNTRAINED, refitted_error
 from vd4rl_pomdp.studies.navigation.runs import NavigationRun, find_navigation, frame_of, load_runs, save_runs
 from vd4rl_pomdp.studies.navigation.tables import make_tables, table_sections, write_tables
 

@@ -22,8 +22,7 @@ from vd4rl_pomdp.runs import TRAJECTORY_FILE
 from vd4rl_pomdp.runs.files import write_csv
 from vd4rl_pomdp.runs.results import Result, find_results, refuse_loss, write_results
 from vd4rl_pomdp.studies.navigation.collect import PRESETS
-from vd4rl_pomdp.studies.navigation.measures import Condition, Measure, measure_of
-from vd4rl_pomdp.studies.navigation.methods import UNTRAINED
+from vd4rl_pomdp.studies.navigation.measures import UNTRAINED, Condition, Measure, measure_of
 
 ROWS, TRAJECTORIES = "rows.csv", "trajectories"
 KEYS = [*Condition._fields, *Measure._fields]

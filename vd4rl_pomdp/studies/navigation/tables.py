@@ -16,7 +16,10 @@ from vd4rl_pomdp.envs.mazes import MAZES, PAPER_MAZES
 from vd4rl_pomdp.report.stats import mean_interval
 from vd4rl_pomdp.runs.files import write_csv
 from vd4rl_pomdp.studies.navigation.measures import (
+    METHOD_NAMES,
+    OBJECTIVES,
     RAW_PREFIX,
+    REFERENCES,
     Condition,
     Measure,
     condition_of,
@@ -25,7 +28,6 @@ from vd4rl_pomdp.studies.navigation.measures import (
     paper_rows,
     refitted_error,
 )
-from vd4rl_pomdp.studies.navigation.methods import METHOD_NAMES, OBJECTIVES, REFERENCES
 from vd4rl_pomdp.studies.navigation.runs import KEYS
 
 _REFITTED = "held-out trajectories, probe refitted on frozen states"
