@@ -149,20 +149,6 @@ def read_some_frames(path: Path, rows: np.ndarray) -> np.ndarray:
         return file[FRAMES_KEY][rows]
 
 
-def is_shard(path: Path) -> bool:
-    """Whether a file has a shard's keys; raises UnavailableError if the disk does not tell now.
-
-    It is not locked: what another program writes may be a shard, too.
-    """
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            return set(file) >= {FRAMES_KEY, "action", "reward", "step_type"}
-    except (OSError, RuntimeError, KeyError) as error:
-        if isinstance(told := system_error(path, error), UnavailableError):
-            raise told from error
-        return False
-
-
 @contextmanager
 def _open(path: Path) -> Iterator[h5py.File]:
     """An open shard; whatever HDF5 cannot read becomes a sentence."""
