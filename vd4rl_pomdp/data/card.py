@@ -1,4 +1,4 @@
-"""A set's data card: `card.md` and `card.png` beside its shards, all from what the set itself records; on the Hub, too.
+"""A set's data card: `card.md` and `card.png` beside its shards, all from what the set itself records.
 
 V-D4RL's files are not needed to make one; its published figures are those in `published`.
 """
@@ -6,16 +6,14 @@ V-D4RL's files are not needed to make one; its published figures are those in `p
 from __future__ import annotations
 
 import io
-import json
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from vd4rl_pomdp.core.errors import UserError, disk_error
-from vd4rl_pomdp.core.reading import read_bytes
 from vd4rl_pomdp.core.tasks import SCORE_DIVISOR
-from vd4rl_pomdp.core.text import code, code_block, markdown, one_line, plain, write_text
+from vd4rl_pomdp.core.text import code, markdown, plain, write_text
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.folder import (
     PROVENANCE,
@@ -29,7 +27,6 @@ from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_rows,
 from vd4rl_pomdp.runs.files import read_json
 
 FILM_FRAMES = 10
-TAGS = ("reinforcement-learning", "offline-reinforcement-learning", "vd4rl-pomdp")
 LINES = 0.82
 """Height of bars and lines; above is the legend's place."""
 HOW = {
@@ -188,21 +185,3 @@ def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, str]:
         facts["command"] = provenance.get("command")
     shown = {markdown(name): str(value) for name, value in facts.items() if value not in (None, "")}
     return {name: code(value) if name == "command" else markdown(value) for name, value in shown.items()}
-
-
-def set_card(folder: Path, repository: str, license: str) -> str:
-    """Text of a set's README.md on the Hugging Face Hub: its data card, or what its files tell if it has none.
-
-    Args:
-        folder: a set's folder.
-        repository: OWNER/NAME on the Hub.
-        license: the licence that its owner gives it, as the Hub spells it.
-    """
-    names = task_and_quality(folder, [read_attributes(shard) for shard in shard_paths(folder)])
-    tags = [*TAGS, *(one_line(name) for name in names if name)]
-    card = folder / "card.md"
-    title = ", ".join(code(name or "unknown") for name in names)
-    body = read_bytes(card).decode(errors="replace") if card.is_file() else f"# {title}\n"
-    use = code_block([f"vd4rl-pomdp hub pull datasets/{repository} FOLDER"], "bash")
-    front = ["---", f"license: {json.dumps(license)}", f"tags: {json.dumps(tags)}", "---", ""]
-    return "\n".join([*front, body.rstrip(), "", "## Use it", "", *use, ""])
