@@ -25,7 +25,7 @@ from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.core.tasks import TASKS, UNKNOWN_QUALITY
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
-from vd4rl_pomdp.data.format import read_plan
+from vd4rl_pomdp.data.folder import read_plan
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.envs.make import layout_of

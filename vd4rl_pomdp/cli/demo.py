@@ -14,7 +14,7 @@ from pathlib import Path
 from vd4rl_pomdp.core.errors import refuse_no_folder, refuse_unknown
 from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.envs.mazes import get_maze
-from vd4rl_pomdp.report.measures import PROBES
+from vd4rl_pomdp.report.load import PROBES
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs import EPISODES_FILE, PROBE_FILE
 from vd4rl_pomdp.runs.episodes import read_episodes

@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 from vd4rl_pomdp.report.gates import episodes_of
-from vd4rl_pomdp.report.layout import with_interval
 from vd4rl_pomdp.report.load import load_runs
-from vd4rl_pomdp.report.stats import difference_interval, mean_interval
+from vd4rl_pomdp.report.stats import difference_interval, mean_interval, with_interval
 from vd4rl_pomdp.studies.navigation.measures import online_error, refitted_error
 from vd4rl_pomdp.studies.navigation.report import write_report
 
@@ -59,7 +58,7 @@ def of_returns(folders: Iterable[str]) -> Iterator[str]:
     groups = defaultdict(lambda: defaultdict(list))
     for run in load_runs([ROOT / "results" / name for name in folders]):
         if run.rows and run.finished:
-            kind = run.labels["corruption"], run.labels["algorithm"], run.labels["method"], run.variant
+            kind = run.labels["corruption"], run.labels["algorithm"], run.method, run.variant
             groups[run.set_name][kind].append(run)
             yield told(estimate(row["return"] for row in run.last), 0)
     for methods in groups.values():
@@ -73,8 +72,8 @@ def of_shifts() -> Iterator[str]:
     runs = [run for name in ("control", "control/budget") for run in load_runs([ROOT / "results" / name])]
     groups = defaultdict(list)
     for run in runs:
-        if run.set_name == "walker_walk expert_noisy" and run.labels["method"] in ("acro", "acro_shifted"):
-            groups[run.labels["corruption"], run.labels["method"], run.variant].append(run)
+        if run.set_name == "walker_walk expert_noisy" and run.method in ("acro", "acro_shifted"):
+            groups[run.labels["corruption"], run.method, run.variant].append(run)
     return intervals([episodes_of(mine) for mine in groups.values()])
 
 
