@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import pydoc
 import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
@@ -23,8 +24,6 @@ from vd4rl_pomdp.core.errors import UnavailableError, UserError, system_error
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows
 from vd4rl_pomdp.data.store import verify_store
-from vd4rl_pomdp.hub import LISTING, Repository
-from vd4rl_pomdp.hub.contents import Listing
 from vd4rl_pomdp.nn import load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
 from vd4rl_pomdp.policies.actor import ASSETS, read_actor, read_ladder
@@ -79,7 +78,6 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
     (run / "trajectory.csv").write_text("x,y,estimated_x,estimated_y\n0,0,0,0\n")
     (run / RUNS).write_text("{}\n")
     (run / "table.csv").write_text("a\n1\n")
-    (run / LISTING).write_text("{}")
     (run / "plan.json").write_text('{"from": "/", "out": "/", "jobs": [1]}')
     (images := tmp_path / "images").mkdir()
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(images / "a.png")
@@ -114,7 +112,6 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
         "CIFAR-10, binary": lambda: _read_cifar(images / "data_batch_1.bin"),
         "CIFAR-10, Python": lambda: _read_cifar(images / "data_batch_1"),
         "name of a pool": lambda: source_fingerprint(str(images)),
-        "listing": lambda: Listing.read(run / LISTING, Repository.named("a/b")),
         "plan of a sweep": lambda: _read_plan(run / "plan.json"),
     }
 
@@ -135,6 +132,29 @@ def test_whoever_may_open_no_more_files_is_told_that_it_passes(world):
             wrong[name] = repr(error)
         else:
             wrong[name] = "read"
+    assert wrong == {}
+
+
+def test_what_someone_else_may_read_alone_is_neither_called_damaged_nor_to_be_made_again(world, tmp_path, monkeypatch):
+    def refusing(open_file):
+        def refuse(path, *arguments, **options):
+            if not isinstance(path, int) and Path(os.fspath(path)).is_relative_to(tmp_path):
+                raise PermissionError(errno.EACCES, "Permission denied")
+            return open_file(path, *arguments, **options)
+
+        return refuse
+
+    for place in ("io.open", "builtins.open", "h5py.File", "safetensors.safe_open"):
+        monkeypatch.setattr(place, refusing(pydoc.locate(place)))
+    wrong = {}
+    for name in world.keys() - {"listing", "what a policy replaces"}:  # which are not whole, or need not be
+        try:
+            world[name]()
+        except UserError as error:
+            if "may not be used (permission denied); ask its owner for access" not in str(error):
+                wrong[name] = str(error)
+        except Exception as error:
+            wrong[name] = repr(error)
     assert wrong == {}
 
 

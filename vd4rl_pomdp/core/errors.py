@@ -59,15 +59,6 @@ class WorkerDiedError(UserError):
     cause = "killed"
 
 
-class DivergedError(FloatingPointError):
-    """A number of training is no longer finite, in a command without --learning-rate and --precision."""
-
-    def __init__(self, message: str, remedy: str) -> None:
-        super().__init__(message)
-        self.remedy = remedy
-        """What its user can do, in words that end a sentence."""
-
-
 _PASSING = (
     *(errno.EIO, errno.ESTALE, errno.ETIMEDOUT, errno.EAGAIN, errno.EMFILE, errno.ENFILE, errno.ENOLCK, errno.EBUSY),
     *(errno.ENOTCONN, errno.EHOSTDOWN, errno.EHOSTUNREACH, errno.ENETDOWN, errno.ENETUNREACH),

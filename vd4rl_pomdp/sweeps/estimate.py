@@ -6,7 +6,7 @@ from collections.abc import Iterable, Mapping
 from statistics import median
 from typing import Any
 
-from vd4rl_pomdp.data.format import PROVENANCE
+from vd4rl_pomdp.data.folder import PROVENANCE
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.sweeps.found import FoundRun
 from vd4rl_pomdp.sweeps.plan import Job, cost_of

@@ -13,7 +13,7 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import words_of
 from vd4rl_pomdp.core.registry import of_other_code
 from vd4rl_pomdp.core.settings import settings_of
-from vd4rl_pomdp.data.format import PLAN, PROVENANCE, read_plan
+from vd4rl_pomdp.data.folder import PLAN, PROVENANCE, read_plan
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, encoder_hash
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from vd4rl_pomdp.data.format import shard_files
+from vd4rl_pomdp.data.folder import shard_files
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 from vd4rl_pomdp.sweeps.plan import Job
 from vd4rl_pomdp.sweeps.stages import STAGES

@@ -10,7 +10,8 @@ from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import FRAME_SIZE
-from vd4rl_pomdp.data.format import PLAN, PROVENANCE, read_frame_size, refuse_partial, shard_files, shard_paths
+from vd4rl_pomdp.data.folder import PLAN, PROVENANCE, shard_files, shard_paths
+from vd4rl_pomdp.data.format import read_frame_size
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.data.store import open_store
 from vd4rl_pomdp.runs.files import read_json
@@ -55,18 +56,17 @@ class DataSet:
 
     def check(self) -> None:
         """Raise UserError if its folder holds a set that was collected otherwise, or not downloaded to its end."""
-        refuse_partial(self.folder)
         if self.foreign:
-            self._check_frames()
+            self._check_frames(shard_paths(self.folder))
         stored = read_json(self.folder / PLAN) if (self.folder / PLAN).exists() else self.wanted
         if others := differing(stored, self.wanted):
             has, asked = (_told(others[0], values.get(others[0])) for values in (stored, self.wanted))
             raise UserError(f"{self.folder}: holds a set of {has}, the grid says {asked}; choose another --data")
 
-    def _check_frames(self) -> None:
+    def _check_frames(self, shards: list[Path]) -> None:
         """Raise UserError if a set that nothing here collected has frames of another size: its files tell no more."""
         asked = self.wanted.get("frame_size") or FRAME_SIZE
-        if self.section == "collect" and (size := read_frame_size(shard_paths(self.folder))) != asked:
+        if self.section == "collect" and (size := read_frame_size(shards)) != asked:
             raise UserError(
                 f"{self.folder}: holds frames of {size}x{size} pixels, the grid says {asked}; choose another --data"
             )
