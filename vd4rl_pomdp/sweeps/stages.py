@@ -1,28 +1,22 @@
-"""What a sweep knows of each stage: its command, its settings, and how the settings of a run are recorded.
-
-Settings are parsed once for all seeds and folders, by the stage's own command line.
-"""
+"""What a sweep knows of each stage: its command, its settings, and how the settings of a run are recorded."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
-from dataclasses import replace
+from collections.abc import Iterable
+from dataclasses import fields, replace
 from functools import cache
+from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
-from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_number
-from vd4rl_pomdp.core.options import flat, words_of
+from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_number, refuse_unknown
+from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.identity import recipe
-from vd4rl_pomdp.sweeps.fits import check_fit
 from vd4rl_pomdp.sweeps.grid import GridCell, Values
 
-_NOWHERE = "-"
-"""Stands for a path while settings are parsed."""
 COMMANDS = {
     "collect": ("data", "collect"),
     "pretrain": ("pretrain",),
@@ -33,8 +27,6 @@ COMMANDS = {
 """Words of every section's command."""
 STAGES = {"pretrain": "pretrain", "finetune": "finetune", "navigation_train": "navigation"}
 """What a training's record calls its stage, by section."""
-_READS = {"collect": (), "pretrain": ("data",), "finetune": ("data", "encoder"), "navigation_train": ("data",)}
-"""Folders that a stage is given, beside the one it writes."""
 _TAKES = {"collect": (), "navigation_collect": ("preset",)}
 """What a stage takes of the shared settings, where that is not all of them."""
 
@@ -45,29 +37,18 @@ def told(cell: GridCell, section: str) -> Values:
     return {name: value for name, value in cell.shared.items() if name in takes} | cell.sections[section]
 
 
-def check_cells(cells: Iterable[GridCell], grid: str, collects: Callable[[GridCell], bool] = lambda _: True) -> None:
-    """`check_cell` for cells of a grid, whose name goes before what is wrong with one.
+def check_cells(cells: Iterable[GridCell], grid: str) -> None:
+    """Raise UserError, which begins with the grid's name, for settings that a stage does not have or take.
 
-    Args:
-        cells: the cells.
-        grid: the grid's name.
-        collects: whether a cell's set is one that this package collects, not one that somebody put there.
+    Whether they fit the set, the machine and one another the stage itself says: its job then fails by itself.
     """
     try:
         for cell in cells:
-            check_cell(cell, collects(cell))
+            for section in cell.chain[1:]:
+                recorded(cell, section)
+            config_of(cell, cell.chain[0])
     except UserError as error:
         raise type(error)(f"{grid}: {error}") from error
-
-
-def check_cell(cell: GridCell, collects: bool = True) -> None:
-    """Raise UserError for settings that a stage would refuse, by themselves or on the set that the cell collects."""
-    configs = {section: config_of(cell, section) for section in cell.chain}
-    if collects and (check := _CHECKS.get(cell.chain[0])):
-        check(configs[cell.chain[0]])
-    check_fit(configs)
-    if "finetune" in cell.chain:
-        _finetuning(cell)
 
 
 def config_of(cell: GridCell, section: str) -> Any:
@@ -75,75 +56,57 @@ def config_of(cell: GridCell, section: str) -> Any:
     settings = told(cell, section)
     seed = settings.pop("seed", 0)
     refuse_number("seed", seed, 0, MAX_SEED)
-    return replace(_parsed(section, tuple(words_of(settings))), seed=seed)
+    try:
+        return replace(_made(section, tuple(settings.items())), seed=seed)
+    except UserError as error:
+        raise type(error)(f"{section}: {error}") from error
 
 
 @cache
-def _parsed(section: str, words: tuple[str, ...]) -> Any:
-    command = " ".join(COMMANDS[section])
-    places = words_of(dict.fromkeys((*_READS.get(section, ()), "out"), _NOWHERE))
-    return _PARSERS[section]([*words, *places], f"vd4rl-pomdp {command}")
+def _made(section: str, items: tuple[tuple[str, Any], ...]) -> Any:
+    """The settings of a section, once for all seeds."""
+    settings, kind = dict(items), _config_class(section)
+    if section == "collect":
+        return _collection(kind, settings, {"task": None, "quality": None, "out": Path()})
+    if section == "navigation_collect":
+        from vd4rl_pomdp.studies.navigation.sets import PRESETS
 
-
-def _collect(words: list[str], program: str) -> Any:
-    from vd4rl_pomdp.data.collect import CollectConfig
-
-    return parse(CollectConfig, words, program)
-
-
-@cache
-def _check_collection(config: Any) -> None:
-    from vd4rl_pomdp.data.collect import check_config
-
-    check_config(config)
-
-
-def _pretrain(words: list[str], program: str) -> Any:
-    from pretrain.config import PretrainConfig
-    from pretrain.train import check_config
-
-    config = parse_stage(PretrainConfig, words, program)
-    check_config(config)
+        preset = settings.get("preset", "paper")
+        refuse_unknown("preset", preset, PRESETS)
+        return _collection(kind, settings, vars(PRESETS[preset]) | {"maze": None})
+    config = kind.of(**settings)
+    config.check()
     return config
 
 
-def _finetune(words: list[str], program: str) -> Any:
-    from finetune.config import FinetuneConfig
+def _config_class(section: str) -> Any:
+    """The class of a section's settings, imported when it is needed."""
+    if section == "collect":
+        from vd4rl_pomdp.data.collect import CollectConfig
 
-    return parse_stage(FinetuneConfig, words, program)
+        return CollectConfig
+    if section == "pretrain":
+        from pretrain.config import PretrainConfig
 
+        return PretrainConfig
+    if section == "finetune":
+        from finetune.config import FinetuneConfig
 
-def _navigation_collect(words: list[str], program: str) -> Any:
-    from vd4rl_pomdp.studies.navigation.sets import PRESETS, MazeCollectConfig
+        return FinetuneConfig
+    from vd4rl_pomdp.studies.navigation import config, sets
 
-    return with_presets(MazeCollectConfig, PRESETS, words, program)
-
-
-@cache
-def _check_maze_collection(config: Any) -> None:
-    from vd4rl_pomdp.studies.navigation.collect import check_config
-
-    check_config(config)
-
-
-def _navigation_train(words: list[str], program: str) -> Any:
-    from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-
-    return parse_stage(NavigationConfig, words, program)
+    return sets.MazeCollectConfig if section == "navigation_collect" else config.NavigationConfig
 
 
-_PARSERS: dict[str, Callable[[list[str], str], Any]] = {
-    "collect": _collect,
-    "pretrain": _pretrain,
-    "finetune": _finetune,
-    "navigation_collect": _navigation_collect,
-    "navigation_train": _navigation_train,
-}
-_CHECKS: dict[str, Callable[[Any], None]] = {
-    "collect": _check_collection,
-    "navigation_collect": _check_maze_collection,
-}
-"""What refuses a set that cannot be collected, by section."""
+def _collection(kind: Any, settings: Values, defaults: Values) -> Any:
+    """A collection's settings, of which a grid has to tell those whose default is None."""
+    for name in settings:
+        refuse_unknown("setting", name, (field.name for field in fields(kind)))
+    values = defaults | settings
+    for name in defaults:
+        if values[name] is None:
+            raise UserError(f"names no {name}: give it one")
+    return kind(**values)
 
 
 def collection_of(cell: GridCell) -> Values:
@@ -169,13 +132,15 @@ def recipe_of(cell: GridCell, section: str) -> str:
 
 def recorded(cell: GridCell, section: str) -> Values:
     """The config that a training records, folders aside."""
-    config = _finetuning(cell) if section == "finetune" else config_of(cell, section)
+    config = config_of(cell, section)
     if section == "pretrain":  # its set tells it the task
         config = replace(config, task=cell.value("task") or config.task)
+    if section == "finetune":
+        config = _as_trained(cell, config)
     return jsonable(flat(config))
 
 
-def _finetuning(cell: GridCell) -> Any:
+def _as_trained(cell: GridCell, config: Any) -> Any:
     """The config that a fine-tuning trains with: what its encoder's method cannot read is no part of it."""
     from finetune.settings import as_trained
     from pretrain.config import history_of
@@ -184,6 +149,5 @@ def _finetuning(cell: GridCell) -> Any:
     before = config_of(cell, "pretrain")
     method = METHODS.named(before.method)
     remembers = history_of(before.method, method, before.history) == "gru"
-    task = TASKS.get(cell.value("task"))  # none in a cell that will be refused, for it has no set
-    decisions = task.decisions if task else 0
-    return as_trained(config_of(cell, "finetune"), before.method, method.end_to_end, remembers, decisions)
+    decisions = TASKS.named(cell.value("task")).decisions
+    return as_trained(config, before.method, method.end_to_end, remembers, decisions)
