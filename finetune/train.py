@@ -11,7 +11,6 @@ from typing import Any
 import torch
 
 from finetune.algorithms import ALGORITHMS, Algorithm
-from finetune.algorithms.algorithm import require_policy
 from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd
 from finetune.evaluations import POLICY, Evaluations, labels
@@ -125,7 +124,6 @@ def _trainer(
         policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(batches)]))
     noise = stream_generator(config.seed, STAGE, "noise")
     algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
-    require_policy(algorithm)
     algorithm.precision = config.update_precision
     reference = Reference.of(dataset)
     actor = reference.actor_file

@@ -14,7 +14,7 @@ from pretrain.train import PretrainTrainer
 from vd4rl_pomdp.core.seeding import seed_networks
 from vd4rl_pomdp.core.tasks import FRAME_STACK
 from vd4rl_pomdp.core.types import StepType
-from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.nn.probes import probe_error
 
@@ -74,5 +74,5 @@ def trainer_on(dataset: Dataset, method: str, **settings: Any) -> PretrainTraine
 def position_error(trainer: PretrainTrainer) -> float:
     """Error of a linear probe on the ball's position in unshifted pictures of held-out episodes, % of its deviation."""
     dataset = trainer.dataset
-    features = trainer.objective.encoder.frame(dataset.stacks(torch.arange(dataset.num_rows)))
+    features = trainer.objective.encoder.frame(View(dataset).stacks(torch.arange(dataset.num_rows)))
     return probe_error(features.numpy(), dataset.physics, dataset.episode.numpy())

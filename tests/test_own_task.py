@@ -20,7 +20,7 @@ from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask
-from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data import View, open_dataset
 from vd4rl_pomdp.data.card import EARLIER
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
@@ -117,7 +117,7 @@ def test_an_end_of_the_task_itself_is_stored_in_the_row_that_the_action_led_into
     assert "physics" not in rows
     assert (rows["reward"][last][ended] > 0.8).all(), "in the middle the reward is largest"
     dataset = open_dataset(tmp_path / "set")
-    assert dataset.transitions([int(lengths[0]) - 2]).discount.item() == (0.0 if ended[0] else 1.0)
+    assert View(dataset).transitions([int(lengths[0]) - 2]).discount.item() == (0.0 if ended[0] else 1.0)
 
 
 def test_actions_are_rescaled_and_pictures_shrunk(tasks):

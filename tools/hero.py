@@ -15,7 +15,7 @@ import torch
 from script import run_script
 
 from vd4rl_pomdp.corruptions import BatchCorruption
-from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.report.gates import episodes_of
 from vd4rl_pomdp.report.stats import mean_interval
 
@@ -43,7 +43,7 @@ class Config:
 
 def stack_seen(data: Dataset, row: int, corruption: str) -> np.ndarray:
     """An observation's three frames, oldest first, side by side: (84, 264, 3) uint8 with white between them."""
-    obs = data.transitions([row], n_step=1, frame_stack=3).obs.clone()
+    obs = View(data).transitions([row]).obs.clone()
     frames = BatchCorruption(corruption, seed=3)(obs, torch.tensor([row])).view(3, 3, 84, 84).numpy()
     picture = np.full((84, 264, 3), 255, np.uint8)
     for place, frame in enumerate(frames.transpose(0, 2, 3, 1)):

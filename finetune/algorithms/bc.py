@@ -16,20 +16,21 @@ Differences:
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from typing import Any
 
 import torch
 import torch.nn.functional as F
+from torch import Tensor
+from torch.optim import Optimizer
 
-from finetune.algorithms.algorithm import Loss, NoisyAlgorithm
+from finetune.algorithms.algorithm import Algorithm, Loss
 from finetune.algorithms.noise import noise_at, with_noise
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.nn.policy import Policy
 
 
-class BC(NoisyAlgorithm):
+class BC(Algorithm):
     """See the module."""
 
     summary = "behaviour cloning, which uses no reward"
@@ -37,15 +38,20 @@ class BC(NoisyAlgorithm):
     def __init__(
         self, policy: Policy, options: Options, learning_rate: float, updates: int, generator: torch.Generator
     ) -> None:
-        self.policy, self.planned, self.generator = policy, updates, generator
+        super().__init__(policy, options, learning_rate, updates, generator)
         self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=learning_rate, fused=True)
 
-    def losses(self, batch: FeatureBatch) -> Iterator[Loss]:
-        """See the module."""
+    def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
+        """One step along the one loss."""
+        logs = self.minimise(self.cloning_loss, batch, self.optimiser, *encoder)
+        self.updates += 1
+        return logs
+
+    def cloning_loss(self, batch: FeatureBatch) -> Loss:
+        """Mean of (a~ - a)^2."""
         chosen = with_noise(self.policy(batch.z), noise_at(self.updates, self.planned), self.generator)
         loss = F.mse_loss(chosen, batch.action)
-        yield Loss(loss, self.optimiser, {"bc_loss": loss.detach()})
-        self.updates += 1
+        return Loss(loss, {"bc_loss": loss.detach()})
 
     def parts(self) -> dict[str, Any]:
         """The policy and its optimiser."""

@@ -22,13 +22,14 @@ from __future__ import annotations
 
 import copy
 import math
-from collections.abc import Iterator
 from dataclasses import dataclass
+from functools import partial
 from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
+from torch.optim import Optimizer
 
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
 from finetune.algorithms.critic import TwinCritic
@@ -36,6 +37,7 @@ from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp, move_target
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.runs.device import autocast
 
 MOST_WEIGHT = 100.0
 LOG_STD_RANGE = -5.0, 2.0
@@ -76,7 +78,7 @@ class IQL(Algorithm):
     def __init__(
         self, policy: Policy, options: IQLOptions, learning_rate: float, updates: int, generator: torch.Generator
     ) -> None:
-        self.policy, self.settings, self.learning_rate, self.planned = policy, options, learning_rate, updates
+        super().__init__(policy, options, learning_rate, updates, generator)
         dim, action_dim, hidden = (policy.shape[name] for name in ("dim", "action_dim", "hidden"))
         device = policy.standardise.mean.device
         self.critic = TwinCritic(dim, action_dim, hidden).to(device)
@@ -87,42 +89,45 @@ class IQL(Algorithm):
         self.policy_optimiser = torch.optim.Adam(actor, lr=learning_rate, fused=True)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=learning_rate, fused=True)
         self.value_optimiser = torch.optim.Adam(self.value.parameters(), lr=learning_rate, fused=True)
-        self.updates = 0
 
-    def losses(self, batch: FeatureBatch) -> Iterator[Loss]:
-        """The critics', the value's and the actor's."""
-        z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
-        yield self._critic_loss(z, batch, next_z)
+    def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
+        """A step of the critics and their targets, then of the value, then of the actor."""
+        logs = self.minimise(self.critic_loss, batch, self.critic_optimiser, *encoder)
         move_target(self.target_critic, self.critic, self.tau)
-        z = z.detach()
-        with torch.no_grad():
-            q = torch.minimum(*self.target_critic(z, batch.action))
-        yield self._value_loss(z, q)
-        yield self._policy_loss(z, batch.action, q)
+        with torch.no_grad(), autocast(batch.z.device, self.precision):  # once, because two losses read it
+            q = torch.minimum(*self.target_critic(self.policy.standardise(batch.z), batch.action))
+        logs |= self.minimise(partial(self.value_loss, q=q), batch, self.value_optimiser)
+        for group in self.policy_optimiser.param_groups:
+            group["lr"] = self.policy_learning_rate
+        logs |= self.minimise(partial(self.actor_loss, q=q), batch, self.policy_optimiser)
         self.updates += 1
+        return logs
 
-    def _critic_loss(self, z: Tensor, batch: FeatureBatch, next_z: Tensor) -> Loss:
+    def critic_loss(self, batch: FeatureBatch) -> Loss:
+        """Squared error of both critics, to the same target y."""
+        z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
             target = batch.reward + self.settings.gamma * batch.discount * self.value(next_z)[:, 0]
         first, second = self.critic(z, batch.action)
         loss = F.mse_loss(first, target) + F.mse_loss(second, target)
-        return Loss(loss, self.critic_optimiser, {"critic_loss": loss.detach(), "q": first.detach().mean()})
+        return Loss(loss, {"critic_loss": loss.detach(), "q": first.detach().mean()})
 
-    def _value_loss(self, z: Tensor, q: Tensor) -> Loss:
-        value = self.value(z)[:, 0]
+    def value_loss(self, batch: FeatureBatch, q: Tensor) -> Loss:
+        """Expectile loss of V to the (B,) smaller target value of the actions taken."""
+        value = self.value(self.policy.standardise(batch.z.detach()))[:, 0]
         loss = expectile_loss(q - value, self.settings.expectile)
-        return Loss(loss, self.value_optimiser, {"value_loss": loss.detach(), "v": value.detach().mean()})
+        return Loss(loss, {"value_loss": loss.detach(), "v": value.detach().mean()})
 
-    def _policy_loss(self, z: Tensor, action: Tensor, q: Tensor) -> Loss:
-        for group in self.policy_optimiser.param_groups:
-            group["lr"] = self.policy_learning_rate
+    def actor_loss(self, batch: FeatureBatch, q: Tensor) -> Loss:
+        """Minus the likelihood of the actions taken, each weighted by its advantage."""
+        z, action = self.policy.standardise(batch.z.detach()), batch.action
         with torch.no_grad():
             advantage = q - self.value(z)[:, 0]
             weight = (self.settings.temperature * advantage).exp().clamp(max=MOST_WEIGHT)
         chosen = self.policy.from_standardised(z)
         loss = -(weight * self.gaussian(chosen, action)).mean()
         logs = {"actor_loss": loss.detach(), "advantage": advantage.mean(), "weight": weight.mean()}
-        return Loss(loss, self.policy_optimiser, logs | {"bc_loss": F.mse_loss(chosen.detach(), action)})
+        return Loss(loss, logs | {"bc_loss": F.mse_loss(chosen.detach(), action)})
 
     @property
     def policy_learning_rate(self) -> float:
@@ -142,15 +147,6 @@ class IQL(Algorithm):
             "critic_optimiser": self.critic_optimiser,
             "value_optimiser": self.value_optimiser,
         }
-
-    def state_dict(self) -> dict[str, Any]:
-        """Everything needed to go on."""
-        return super().state_dict() | {"updates": self.updates}
-
-    def load_state_dict(self, state: dict[str, Any]) -> None:
-        """Continue from `state_dict`."""
-        super().load_state_dict(state)
-        self.updates = state["updates"]
 
 
 def expectile_loss(error: Tensor, expectile: float) -> Tensor:

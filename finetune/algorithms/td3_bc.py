@@ -11,15 +11,15 @@ Differences: states are frozen representations, standardised like the authors' s
 from __future__ import annotations
 
 import copy
-from collections.abc import Iterator
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
 from torch import Tensor
+from torch.optim import Optimizer
 
-from finetune.algorithms.algorithm import Loss, NoisyAlgorithm, ReturnOptions
+from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
 from finetune.algorithms.critic import TwinCritic
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
@@ -39,7 +39,7 @@ class TD3BCOptions(ReturnOptions):
     limits: ClassVar[Limits] = {"alpha": 0}
 
 
-class TD3BC(NoisyAlgorithm):
+class TD3BC(Algorithm):
     """See the module."""
 
     options: type[Options] = TD3BCOptions
@@ -50,7 +50,7 @@ class TD3BC(NoisyAlgorithm):
     def __init__(
         self, policy: Policy, options: TD3BCOptions, learning_rate: float, updates: int, generator: torch.Generator
     ) -> None:
-        self.policy, self.settings, self.planned, self.generator = policy, options, updates, generator
+        super().__init__(policy, options, learning_rate, updates, generator)
         shape = policy.shape
         device = policy.standardise.mean.device
         self.critic = TwinCritic(shape["dim"], shape["action_dim"], shape["hidden"]).to(device)
@@ -58,22 +58,34 @@ class TD3BC(NoisyAlgorithm):
         self.policy_optimiser = torch.optim.Adam(policy.net.parameters(), lr=learning_rate, fused=True)
         self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=learning_rate, fused=True)
 
-    def losses(self, batch: FeatureBatch) -> Iterator[Loss]:
-        """The critics', and every other time the actor's."""
-        z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
-        yield self._critic_loss(z, batch, next_z)
+    def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
+        """A step of the critics, and in every `policy_delay`-th update one of the actor and of the targets."""
+        logs = self.minimise(self.critic_loss, batch, self.critic_optimiser, *encoder)
         if (self.updates + 1) % self.policy_delay == 0:
-            yield self._policy_loss(z.detach(), batch.action)
-            self._move_targets()
-        self.updates += 1
+            logs |= self.minimise(self.actor_loss, batch, self.policy_optimiser)
+            self.move_targets()
+        self.updates += 1  # last, because DrQ-v2's noise of both losses is that of the updates made before
+        return logs
 
-    def _critic_loss(self, z: Tensor, batch: FeatureBatch, next_z: Tensor) -> Loss:
+    def critic_loss(self, batch: FeatureBatch) -> Loss:
+        """Squared error of both critics, to the same target y."""
+        z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
             value = torch.minimum(*self.target_critic(next_z, self._next_action(next_z)))
             target = batch.reward + self.settings.gamma * batch.discount * value
         first, second = self.critic(z, batch.action)
         loss = F.mse_loss(first, target) + F.mse_loss(second, target)
-        return Loss(loss, self.critic_optimiser, {"critic_loss": loss.detach(), "q": first.detach().mean()})
+        return Loss(loss, {"critic_loss": loss.detach(), "q": first.detach().mean()})
+
+    def actor_loss(self, batch: FeatureBatch) -> Loss:
+        """Cloning less the value, in units of the value's own size."""
+        z = self.policy.standardise(batch.z.detach())  # the critics' loss alone trains an encoder
+        chosen = self._policy_action(z)
+        value = self._policy_value(z, chosen)
+        weight = self.settings.alpha / value.abs().mean().detach()
+        cloning = F.mse_loss(chosen, batch.action)
+        loss = cloning - weight * value.mean()
+        return Loss(loss, {"actor_loss": loss.detach(), "bc_loss": cloning.detach()})
 
     def _next_action(self, next_z: Tensor) -> Tensor:
         """Action of the target policy, smoothed by clipped noise."""
@@ -89,15 +101,8 @@ class TD3BC(NoisyAlgorithm):
         """The action that the actor's loss is about."""
         return self.policy.from_standardised(z)
 
-    def _policy_loss(self, z: Tensor, action: Tensor) -> Loss:
-        chosen = self._policy_action(z)
-        value = self._policy_value(z, chosen)
-        weight = self.settings.alpha / value.abs().mean().detach()
-        cloning = F.mse_loss(chosen, action)
-        loss = cloning - weight * value.mean()
-        return Loss(loss, self.policy_optimiser, {"actor_loss": loss.detach(), "bc_loss": cloning.detach()})
-
-    def _move_targets(self) -> None:
+    def move_targets(self) -> None:
+        """Move the target networks by the share tau of the way."""
         move_target(self.target_critic, self.critic, self.tau)
         move_target(self.target_policy.net, self.policy.net, self.tau)
 

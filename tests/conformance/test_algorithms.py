@@ -1,5 +1,7 @@
 """Every algorithm of the registry keeps the contract of algorithms, and what breaks it is caught."""
 
+import copy
+
 import numpy as np
 import pytest
 import torch
@@ -16,7 +18,6 @@ from vd4rl_pomdp.testing.algorithms import (
     losses_are_finite_scalars,
     targets_creep_and_nothing_else_moves_by_itself,
     the_first_loss_alone_reaches_the_representations,
-    updates_draw_from_the_generator_alone,
 )
 from vd4rl_pomdp.testing.contract import run_check
 
@@ -40,26 +41,33 @@ def test_checks_leave_the_callers_generators_alone():
 
 
 class Idle(BC):
-    def losses(self, batch):
-        yield from ()
+    def update(self, batch, *encoder):
+        return {"bc_loss": torch.zeros(())}
 
 
 class Silent(BC):
-    def losses(self, batch):
-        for loss in super().losses(batch):
-            yield loss._replace(logs={})
+    def cloning_loss(self, batch):
+        return super().cloning_loss(batch)._replace(logs={})
 
 
 class Attached(BC):
-    def losses(self, batch):
-        for loss in super().losses(batch):
-            yield loss._replace(logs={"bc_loss": loss.value})
+    def cloning_loss(self, batch):
+        value = super().cloning_loss(batch).value
+        return Loss(value, {"bc_loss": value})
+
+
+class Numbering(BC):
+    """Its log stands in the column that numbers the rows."""
+
+    def cloning_loss(self, batch):
+        value = super().cloning_loss(batch).value
+        return Loss(value, {"step": value.detach()})
 
 
 class Overwriting(TD3BC):
-    def losses(self, batch):
-        for loss in super().losses(batch):
-            yield loss._replace(logs={"loss": loss.value.detach()})
+    def actor_loss(self, batch):
+        value = super().actor_loss(batch).value
+        return Loss(value, {"critic_loss": value.detach()})
 
 
 class Unlisted(BC):
@@ -70,9 +78,9 @@ class Unlisted(BC):
         self.scale = torch.nn.Parameter(torch.ones(()))
         self.optimiser.add_param_group({"params": [self.scale], "lr": 1e-3})
 
-    def losses(self, batch):
-        for loss in super().losses(batch):
-            yield loss._replace(value=loss.value * self.scale)
+    def cloning_loss(self, batch):
+        value, logs = super().cloning_loss(batch)
+        return Loss(value * self.scale, logs)
 
 
 class Unreached(BC):
@@ -93,30 +101,39 @@ class Half(BC):
         self.optimiser = torch.optim.Adam(policy.net[-1].parameters(), lr=learning_rate)
 
 
+class Other(BC):
+    def __init__(self, policy, *arguments):
+        super().__init__(copy.deepcopy(policy), *arguments)
+
+
 class Blind(BC):
-    def losses(self, batch):
-        return super().losses(batch.replace(z=batch.z.detach()))
+    def cloning_loss(self, batch):
+        return super().cloning_loss(batch.replace(z=batch.z.detach()))
 
 
-class Twice(BC):
+class Frozen(BC):
+    def update(self, batch, *encoder):
+        return super().update(batch)
+
+
+class Twice(TD3BC):
     """Its second loss reaches the representations, too."""
 
-    def losses(self, batch):
-        yield from super().losses(batch)
-        loss = self.policy(batch.z).square().mean()
-        yield Loss(loss, self.optimiser, {"size": loss.detach()})
+    def actor_loss(self, batch):
+        value, logs = super().actor_loss(batch)
+        return Loss(value + self.policy(batch.z).square().mean(), logs)
 
 
 class Jumping(TD3BC):
     """Its targets move by another share than tau."""
 
-    def _move_targets(self):
-        super()._move_targets()
-        super()._move_targets()
+    def move_targets(self):
+        super().move_targets()
+        super().move_targets()
 
 
 class Still(TD3BC):
-    def _move_targets(self):
+    def move_targets(self):
         pass
 
 
@@ -127,16 +144,9 @@ class Forgetful(TD3BC):
         super().load_state_dict(state | {"updates": 0})
 
 
-class Unkept(BC):
-    """Its state holds a number that is not Python's, such as a best loss so far."""
-
-    def state_dict(self):
-        return super().state_dict() | {"best": np.float32(0.5)}
-
-
 class Drawing(BC):
-    def losses(self, batch):
-        return super().losses(batch.replace(z=batch.z + torch.randn(batch.z.shape)))
+    def cloning_loss(self, batch):
+        return super().cloning_loss(batch.replace(z=batch.z + torch.randn(batch.z.shape)))
 
 
 class Unbounded(BC):
@@ -146,26 +156,28 @@ class Unbounded(BC):
 
 
 class Writing(BC):
-    def losses(self, batch):
+    def cloning_loss(self, batch):
         batch.reward.mul_(2)
-        yield from super().losses(batch)
+        return super().cloning_loss(batch)
 
 
 MUTANTS = [
-    (Idle, losses_are_finite_scalars, "Idle.losses yields no loss"),
+    (Idle, losses_are_finite_scalars, "an update minimises no loss"),
     (Silent, losses_are_finite_scalars, "update 0 logs nothing"),
     (Attached, losses_are_finite_scalars, "bc_loss is logged with its graph"),
-    (Overwriting, losses_are_finite_scalars, "two losses log under one name: loss, loss"),
+    (Numbering, losses_are_finite_scalars, "a log is called `step`"),
+    (Overwriting, losses_are_finite_scalars, "its losses log critic_loss, critic_loss, q, the update"),
     (Unlisted, a_loss_moves_what_its_optimiser_steps, r"parts\(\) names"),
     (Unreached, a_loss_moves_what_its_optimiser_steps, r"no gradient to parameters of the shapes \[\(2, 2\), \(2,\)\]"),
     (Half, a_loss_moves_what_its_optimiser_steps, "stood still, or should have: /policy/net.0"),
+    (Other, a_loss_moves_what_its_optimiser_steps, "`policy` is not the one that it was given"),
     (Blind, the_first_loss_alone_reaches_the_representations, "the first loss has none"),
+    (Frozen, the_first_loss_alone_reaches_the_representations, "the encoder's optimiser takes no step"),
     (Twice, the_first_loss_alone_reaches_the_representations, "a later one has"),
     (Jumping, targets_creep_and_nothing_else_moves_by_itself, "did not move by tau"),
     (Still, targets_creep_and_nothing_else_moves_by_itself, "of the targets target_critic, target_policy moved none"),
     (Forgetful, an_algorithm_that_goes_on_elsewhere_takes_the_same_steps, "update 3 logs"),
-    (Unkept, an_algorithm_that_goes_on_elsewhere_takes_the_same_steps, "cannot keep best, which is a float32"),
-    (Drawing, updates_draw_from_the_generator_alone, "after other seeds of torch, update 0 logs"),
+    (Drawing, an_algorithm_that_goes_on_elsewhere_takes_the_same_steps, "update 3 logs"),
     (Unbounded, actions_lie_within_their_bounds, "one has the size"),
     (Writing, a_batch_is_left_as_it_was, "it changed reward"),
 ]
@@ -182,8 +194,6 @@ def test_an_algorithm_that_breaks_a_promise_is_told_which_and_how(algorithms, ki
     algorithms.register("mine", kind)
     with pytest.raises(AssertionError, match=f"algorithm 'mine' breaks a promise(.|\n)*{reason}"):
         run_check("algorithm", check, "mine")
-    with pytest.raises(AssertionError, match="algorithm 'mine' breaks a promise"):
-        check_algorithm("mine")
 
 
 def test_options_reach_the_algorithm_and_unknown_names_are_refused():

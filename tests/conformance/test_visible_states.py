@@ -11,7 +11,7 @@ from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
 from tests.helpers_data import write_fake_set
-from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.objective import InverseObjective
 from vd4rl_pomdp.testing.methods import ROWS, build_inverse
@@ -141,7 +141,7 @@ def test_predictions_depend_on_their_own_episodes_stored_rows_alone(dataset: Dat
     starts = [(e, first) for e, rows in enumerate(EPISODES) for first in range(rows - SPAN + 1)]
 
     def logits() -> torch.Tensor:
-        return objective.action_logits(dataset.windows(list(range(len(starts))), SPAN, stack))
+        return objective.action_logits(View(dataset, frame_stack=stack).windows(list(range(len(starts))), SPAN))
 
     by_frame = changed_rows(dataset, "frames", dataset.frames, logits)
     by_action = changed_rows(dataset, "action", dataset.action, logits)

@@ -252,7 +252,7 @@ def test_observing_rows_equals_shifting_then_corrupting_their_stacks(dataset, na
     for pad in (0, 4):
         apart, together = BatchCorruption(config, 1, "a"), View(dataset, config, pad, 1, "a")
         for _ in range(2):
-            expected = apart(random_shift(dataset.stacks(rows), key, pad).clone(), dataset.keys(rows))
+            expected = apart(random_shift(View(dataset).stacks(rows), key, pad).clone(), dataset.keys(rows))
             assert torch.equal(together.observe(rows, key), expected)
 
 

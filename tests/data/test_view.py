@@ -80,12 +80,6 @@ def test_observations_of_a_window_can_be_shifted_each_by_itself(dataset, monkeyp
     assert not torch.equal(view.observe(rows), seen), "the next ones are others"
 
 
-def test_the_plain_view_is_the_set_itself(dataset):
-    index = torch.arange(dataset.num_transitions)
-    plain, seen = dataset.transitions(index, 3), View(dataset).transitions(index, 3)
-    assert all(torch.equal(plain[name], seen[name]) for name in plain)
-
-
 def test_actions_before_and_after_a_row(dataset):
     rows = dataset.transition_rows
     assert rows.tolist() == [*range(8), *range(9, 13)]
@@ -102,7 +96,7 @@ def test_actions_before_and_after_a_row(dataset):
 def test_row_keys_unpack_and_padding_is_not_real(dataset):
     episode, t = torch.tensor([0, 3, 70_000]), torch.tensor([0, 500, 1_000_000])
     assert [x.tolist() for x in unpack_row_key(row_key(episode, t))] == [episode.tolist(), t.tolist()]
-    window = dataset.windows([0, 1], 4).replace(length=torch.tensor([4, 2]))
+    window = View(dataset).windows([0, 1], 4).replace(length=torch.tensor([4, 2]))
     assert window.real.tolist() == [[True] * 4, [True, True, False, False]]
 
 

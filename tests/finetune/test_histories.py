@@ -14,6 +14,7 @@ from tests.finetune.test_features import LENGTHS, ROWS, noise_set
 from tests.helpers_stages import smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import View
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, load_encoder
 
 N = 2
@@ -33,7 +34,7 @@ def ends_of(frozen: FrozenEncoder, first: int, row: int, last: int) -> tuple[tor
     """Both ends of a transition, from a stream that begins at row `first` and knows no earlier action."""
     state, action, read = frozen.encoder.initial_state(1), torch.zeros(1, 6), []
     for now in range(first, last + 1):
-        z, state = frozen.encoder.step(frozen.dataset.stacks(torch.tensor([now])), action, state)
+        z, state = frozen.encoder.step(View(frozen.dataset).stacks(torch.tensor([now])), action, state)
         read.append(z[0])
         action = frozen.dataset.action[now + 1 : now + 2]
     return read[row - first], read[last - first]

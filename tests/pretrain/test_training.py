@@ -141,4 +141,4 @@ def test_a_trainer_takes_another_view_of_the_set(trainer: PretrainTrainer):
     window = PretrainTrainer(trainer.objective, trainer.dataset, trainer.config, view).batch()
     assert trainer.config.shift > 0
     rows = trainer.dataset.episode_start[window.key >> 20] + (window.key & 0xFFFFF)
-    assert torch.equal(window.obs, trainer.dataset.stacks(rows)), "neither shifted nor corrupted"
+    assert torch.equal(window.obs, View(trainer.dataset).stacks(rows)), "neither shifted nor corrupted"

@@ -21,10 +21,6 @@ class FrameBuffers:
         """Each block with the view that its borrower holds, gone when the last tensor on it is gone."""
         self._lock = threading.Lock()
 
-    def __reduce__(self) -> tuple[type[FrameBuffers], tuple[()]]:
-        """A copy, or one that is read in another process, lends blocks of its own."""
-        return FrameBuffers, ()
-
     def take(self, shape: tuple[int, ...] | torch.Size) -> Tensor:
         """Uninitialised uint8 tensor of a shape that shares memory with no other living tensor."""
         shape = tuple(shape)
@@ -40,3 +36,7 @@ class FrameBuffers:
             elif idle:
                 self._blocks[idle[0]] = block, weakref.ref(view)
         return torch.from_numpy(view)
+
+
+BUFFERS = FrameBuffers()
+"""The process's only lender."""

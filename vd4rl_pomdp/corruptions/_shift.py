@@ -12,11 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.core.buffers import FrameBuffers
 from vd4rl_pomdp.corruptions import draw_integers
-
-BUFFERS = FrameBuffers()
-"""Memory of the batches that are made here."""
 
 
 def draw_offset(key: Tensor, pad: int) -> Tensor:

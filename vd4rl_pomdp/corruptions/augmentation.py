@@ -7,6 +7,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core.buffers import BUFFERS
 from vd4rl_pomdp.corruptions import _shift
 
 Sharing = Literal["window", "observation"]
@@ -29,7 +30,7 @@ def random_shift(obs: Tensor, key: Tensor, pad: int = 4) -> Tensor:
     offset = _shift.draw_offset(key, pad)
     if not _shift.by_lines(obs, pad):
         return _shift.shift_by_index(obs, offset)
-    out = _shift.BUFFERS.take(obs.shape)
+    out = BUFFERS.take(obs.shape)
     images, shifted = (x.view(len(obs), -1, *obs.shape[-2:]) for x in (obs, out))
     _shift.shift_by_lines(images, torch.arange(len(obs)), offset, shifted)
     return out

@@ -1,20 +1,19 @@
-"""A data set in memory: rows, episodes, and vectorised gathering of transitions and windows."""
+"""A data set in memory: rows, episodes, and the arithmetic of their indices; `View` makes pixels of them."""
 
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.core.buffers import FrameBuffers
 from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError
 from vd4rl_pomdp.core.state_scale import StateScale
-from vd4rl_pomdp.core.tasks import FRAME_STACK, TASKS
-from vd4rl_pomdp.core.types import StepType, Transitions, Windows, row_key, unpack_row_key
+from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.core.types import StepType, row_key, unpack_row_key
 from vd4rl_pomdp.data.episodes import episode_returns
 from vd4rl_pomdp.data.format import shard_paths
 from vd4rl_pomdp.data.manifest import check_whole, task_and_quality
@@ -22,8 +21,6 @@ from vd4rl_pomdp.data.store import Store, open_store
 from vd4rl_pomdp.envs.make import layout_of
 
 Index = int | Sequence[int] | np.ndarray | Tensor
-Observations = Callable[[Tensor], Tensor]
-"""Observations (..., C, H, W) uint8 of (...,) int64 rows."""
 
 
 def open_dataset(path: Path | str, cache: Path | str | None = None) -> Dataset:
@@ -53,7 +50,6 @@ class Dataset:
     def __init__(self, path: Path, store: Store) -> None:
         self.path = path
         self.store = store
-        self._buffers = FrameBuffers()
         self._windows: dict[int, int] = {}
         """How many there are of each length that was asked for: to count anew would mean to wait for a GPU."""
         self.fingerprint = store.fingerprint
@@ -84,6 +80,8 @@ class Dataset:
         """(N,) int64: episode of every row."""
         self.t = torch.arange(len(step_type)) - self.episode_start[self.episode]
         """(N,) int64: row within its episode."""
+        self.transition_rows = torch.nonzero(self.t[1:] > 0)[:, 0]
+        """(M,) int64: rows that have a successor in their episode, in order."""
         self.returns = torch.from_numpy(episode_returns(reward, starts))
         """(E,) float64: undiscounted return of every episode."""
 
@@ -171,11 +169,6 @@ class Dataset:
         episode, t = unpack_row_key(key)
         return self.episode_start[episode] + t
 
-    @property
-    def transition_rows(self) -> Tensor:
-        """(M,) int64: rows that have a successor in their episode, in order."""
-        return torch.nonzero(self.t[1:] > 0)[:, 0]
-
     def action_after(self, rows: Tensor) -> Tensor:
         """a_t (..., A) float32 of (...,) int64 rows t that have a successor."""
         return self.action[rows + 1]
@@ -186,68 +179,28 @@ class Dataset:
         actions[..., 0, :] = 0
         return actions
 
-    def stacks(self, rows: Tensor, frame_stack: int = FRAME_STACK) -> Tensor:
-        """Frame stacks (..., 3 * frame_stack, S, S) uint8 of (...,) int64 rows, oldest frame first.
+    def stack_rows(self, rows: Tensor, frame_stack: int) -> Tensor:
+        """Rows (..., frame_stack) int64 of the frames in the stacks of (...,) int64 rows, oldest frame first.
 
-        A stack never reaches before its episode: there the first frame is repeated.
+        A stack never reaches before its episode: there the first frame is repeated. IndexError for a negative row.
         """
-        index = self.stack_rows(rows, frame_stack)
-        out = self._buffers.take((index.numel(), *self.frames.shape[1:])) if self.frames.device.type == "cpu" else None
-        frames = torch.index_select(self.frames, 0, index.reshape(-1), out=out)
-        return frames.view(*rows.shape, self.frames.shape[1] * frame_stack, *self.frames.shape[2:])
-
-    def stack_rows(self, rows: Tensor, frame_stack: int = FRAME_STACK) -> Tensor:
-        """Rows (..., frame_stack) int64 whose frames `stacks` puts together; IndexError for a negative row."""
-        require_positive(frame_stack=frame_stack)
         if rows.device.type == "cpu" and (rows < 0).any():  # elsewhere to look would mean to wait
             raise IndexError(f"row {int(rows.min())} is out of range for a set of {self.num_rows} rows")
         back = torch.arange(frame_stack - 1, -1, -1, device=rows.device)
         first = self.episode_start[self.episode[rows]]
         return torch.maximum(rows[..., None] - back, first[..., None])
 
-    def transitions(
-        self,
-        index: Index,
-        n_step: int = 1,
-        frame_stack: int = FRAME_STACK,
-        gamma: float = 0.99,
-        observations: Observations | None = None,
-    ) -> Transitions:
-        """Gather n-step transitions.
-
-        Args:
-            index: (B,) numbers in 0..num_transitions-1; they count the rows that have a successor, in order.
-            n_step: rewards to sum; fewer at an episode's end.
-            frame_stack: frames in an observation.
-            gamma: discount between the summed rewards.
-            observations: what makes observations of (B,) rows, in place of `stacks`.
-
-        Returns:
-            `Transitions`. With m = min(n_step, steps left) and d_i the product of the first i stored discounts,
-            `reward` is the sum of gamma^i d_i r_{t+i} for i < m, and `discount` is gamma^(m-1) d_m. The learner
-            multiplies its own gamma once more (acme's convention), also where m is cut short: for n_step = 1 both are
-            as stored.
-
-        Raises:
-            IndexError: an index is out of range.
-        """
-        rows = self._starts(self._index(index, self.num_transitions), self.windows_per_episode(2))
-        reward, discount, next_rows = self.n_step_returns(rows, n_step, gamma)
-        observations = observations or (lambda rows: self.stacks(rows, frame_stack))
-        return Transitions(
-            obs=observations(rows),
-            action=self.action_after(rows),
-            reward=reward,
-            discount=discount,
-            next_obs=observations(next_rows),
-            key=self.keys(rows),
-            next_key=self.keys(next_rows),
-        )
+    def rows_of_transitions(self, index: Index) -> Tensor:
+        """Rows (B,) int64 of (B,) numbers in 0..num_transitions-1, which count `transition_rows`; else IndexError."""
+        return self.transition_rows[self._index(index, self.num_transitions)]
 
     def n_step_returns(self, rows: Tensor, n_step: int, gamma: float) -> tuple[Tensor, Tensor, Tensor]:
-        """Reward and discount (B,) float32 (see `transitions`) and successor (B,) of each of (B,) int64 rows.
+        """Reward and discount (B,) float32 and successor (B,) int64 of each of (B,) int64 rows.
 
-        An episode's last row has no successor: there they are 0, 1 and the row itself.
+        With m = min(n_step, steps left) and d_i the product of the first i stored discounts, the reward is the sum of
+        gamma^i d_i r_{t+i} for i < m, and the discount is gamma^(m-1) d_m. The learner multiplies its own gamma once
+        more (acme's convention), also where m is cut short: for n_step = 1 both are as stored. An episode's last row
+        has no successor: there they are 0, 1 and the row itself.
         """
         require_positive(n_step=n_step)
         last = (self.episode_end - 1)[self.episode[rows]]
@@ -264,47 +217,33 @@ class Dataset:
         return torch.minimum(rows + n_step, (self.episode_end - 1)[self.episode[rows]])
 
     def num_windows(self, length: int) -> int:
-        """Number of windows of `length` consecutive rows of one episode; raises UserError as `windows` does."""
+        """Number of windows of `length` consecutive rows of one episode; raises UserError as `check_windows` does."""
         if length not in self._windows:
             self.check_windows(length)
             self._windows[length] = int(self.windows_per_episode(length).sum())
         return self._windows[length]
 
-    def windows(
-        self, index: Index, length: int, frame_stack: int = FRAME_STACK, observations: Observations | None = None
-    ) -> Windows:
-        """Gather windows of consecutive rows.
+    def window_rows(self, index: Index, length: int) -> Tensor:
+        """Rows (B, length) int64 of windows of consecutive rows.
 
         Args:
             index: (B,) numbers in 0..num_windows(length)-1; they count all starts within episodes, in order.
-            length: rows T of each window.
-            frame_stack: frames in an observation; a stack may reach before its window, never before its episode.
-            observations: what makes observations of (B, T) rows, in place of `stacks`.
-
-        Returns:
-            `Windows`, none of them padded. `action` of the last row is the next row's, outside the window, if any.
+            length: rows of each window.
 
         Raises:
             UserError: an episode is shorter than the window.
             IndexError: an index is out of range.
         """
-        start = self._starts(self._index(index, self.num_windows(length)), self.windows_per_episode(length))
-        rows = start[:, None] + torch.arange(length, device=start.device)
-        has_action = rows + 1 < self.episode_end[self.episode[rows]]
-        following = self.action_after(torch.where(has_action, rows, 0))
-        return Windows(
-            obs=self.stacks(rows, frame_stack) if observations is None else observations(rows),
-            prev_action=self.actions_before(rows),
-            action=following * has_action[..., None],
-            has_action=has_action,
-            length=torch.full_like(start, length),
-            key=self.keys(rows),
-        )
+        number, per_episode = self._index(index, self.num_windows(length)), self.windows_per_episode(length)
+        ends = per_episode.cumsum(0)
+        episode = torch.searchsorted(ends, number, right=True)
+        start = self.episode_start[episode] + number - (ends - per_episode)[episode]
+        return start[:, None] + torch.arange(length, device=start.device)
 
     def check_windows(self, length: int) -> None:
         """Raise UserError unless every episode has a window of `length` rows, but for those without a transition.
 
-        An episode of a single row has nothing to train on, whatever the window: `windows` leaves it out.
+        An episode of a single row has nothing to train on, whatever the window: `window_rows` leaves it out.
         """
         require_positive(length=length)
         self.require_transitions()
@@ -321,12 +260,6 @@ class Dataset:
     def windows_per_episode(self, length: int) -> Tensor:
         """(E,) rows from which `length` consecutive rows stay inside the episode: transitions for 2."""
         return (self.episode_end - self.episode_start - (length - 1)).clamp(min=0)
-
-    def _starts(self, number: Tensor, per_episode: Tensor) -> Tensor:
-        """Row of the start called `number` when each episode has `per_episode` of them, from its first row on."""
-        ends = per_episode.cumsum(0)
-        episode = torch.searchsorted(ends, number, right=True)
-        return self.episode_start[episode] + number - (ends - per_episode)[episode]
 
     def _index(self, index: Index, size: int) -> Tensor:
         """`index` as (B,) int64 on the set's device; checked where it is, so a CPU index never waits for a GPU."""

@@ -7,13 +7,14 @@ from typing import Any, get_args
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core.buffers import BUFFERS
 from vd4rl_pomdp.core.errors import refuse_unknown
 from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.core.tasks import FRAME_STACK
 from vd4rl_pomdp.core.types import Transitions, Windows
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, _shift
 from vd4rl_pomdp.corruptions.augmentation import Sharing, random_shift
-from vd4rl_pomdp.data.dataset import Dataset, Index
+from vd4rl_pomdp.data.dataset import Dataset, Index, require_positive
 
 
 class View:
@@ -41,6 +42,7 @@ class View:
             shared: what one shift is shared by.
         """
         refuse_unknown("sharing", shared, get_args(Sharing))
+        require_positive(frame_stack=frame_stack)
         self.dataset = dataset
         self.corruption = BatchCorruption(corruption or CorruptionConfig(), seed, *name)
         self.shifts = KeyStream(stream_seed(seed, "shift", *name))
@@ -63,18 +65,61 @@ class View:
         keys = self.corruption.keys(self.dataset.keys(rows))
         if _shift.by_lines(self.dataset.frames, self._pad):
             return self._observe_by_lines(rows, shift_key, keys)
-        stacks = self.dataset.stacks(rows, self._frame_stack)
+        stacks = self.stacks(rows)
         shifted_alike = stacks if len(shift_key) == len(rows) else stacks.flatten(0, rows.ndim - 1)
         shifted = random_shift(shifted_alike, shift_key, self._pad).view(stacks.shape)
         return self.corruption.corruption.apply_(shifted, keys)
 
+    def stacks(self, rows: Tensor) -> Tensor:
+        """(..., C, H, W) uint8 frame stacks of (...,) int64 rows as they are stored, neither shifted nor corrupted."""
+        frames = self.dataset.frames
+        index = self.dataset.stack_rows(rows, self._frame_stack).flatten()
+        out = BUFFERS.take((len(index), *frames.shape[1:])) if frames.device.type == "cpu" else None
+        stored = torch.index_select(frames, 0, index, out=out)
+        return stored.view(*rows.shape, frames.shape[1] * self._frame_stack, *frames.shape[2:])
+
     def windows(self, index: Index, length: int) -> Windows:
-        """`Dataset.windows` of what the agent sees."""
-        return self.dataset.windows(index, length, observations=self.observe)
+        """The windows that `Dataset.window_rows` numbers, as the agent sees them; none of them is padded.
+
+        A stack may reach before its window, never before its episode. `action` of the last row is the next row's,
+        outside the window, if there is one.
+        """
+        data, rows = self.dataset, self.dataset.window_rows(index, length)
+        has_action = rows + 1 < data.episode_end[data.episode[rows]]
+        following = data.action_after(torch.where(has_action, rows, 0))
+        return Windows(
+            obs=self.observe(rows),
+            prev_action=data.actions_before(rows),
+            action=following * has_action[..., None],
+            has_action=has_action,
+            length=torch.full_like(rows[:, 0], length),
+            key=data.keys(rows),
+        )
 
     def transitions(self, index: Index, n_step: int = 1, gamma: float = 0.99) -> Transitions:
-        """`Dataset.transitions` of what the agent sees; both ends are shifted and corrupted on their own."""
-        return self.dataset.transitions(index, n_step, gamma=gamma, observations=self.observe)
+        """The n-step transitions that `index` numbers, as the agent sees them.
+
+        Both ends are shifted and corrupted on their own.
+
+        Args:
+            index: (B,) numbers in 0..num_transitions-1; they count the rows that have a successor, in order.
+            n_step: rewards to sum, as `Dataset.n_step_returns` does; fewer at an episode's end.
+            gamma: discount between the summed rewards.
+
+        Raises:
+            IndexError: an index is out of range.
+        """
+        data, rows = self.dataset, self.dataset.rows_of_transitions(index)
+        reward, discount, next_rows = data.n_step_returns(rows, n_step, gamma)
+        return Transitions(
+            obs=self.observe(rows),
+            action=data.action_after(rows),
+            reward=reward,
+            discount=discount,
+            next_obs=self.observe(next_rows),
+            key=data.keys(rows),
+            next_key=data.keys(next_rows),
+        )
 
     def state_dict(self) -> dict[str, Any]:
         """Where the streams stand."""
@@ -90,7 +135,7 @@ class View:
         keys = keys.flatten()
         kept = corruption.kept(keys, stack)
         chosen = self.dataset.stack_rows(rows, stack).view(-1, stack).gather(1, kept)
-        images = _shift.BUFFERS.take((chosen.numel() + 1, *frames.shape[1:]))
+        images = BUFFERS.take((chosen.numel() + 1, *frames.shape[1:]))
         offset = _shift.draw_offset(shift_key, self._pad).repeat_interleave(chosen.numel() // max(1, len(shift_key)), 0)
         _shift.shift_by_lines(frames, chosen.flatten(), offset, images[:-1])
         corruption.change_(images[:-1].view(*chosen.shape, *images.shape[1:]), keys, kept)
@@ -103,5 +148,5 @@ def _spread(images: Tensor, kept: Tensor, stack: int) -> Tensor:
     images[-1] = 0
     source = torch.full((len(kept), stack), kept.numel())
     source.scatter_(1, kept, torch.arange(kept.numel()).view(kept.shape))
-    out = _shift.BUFFERS.take((source.numel(), *images.shape[1:]))
+    out = BUFFERS.take((source.numel(), *images.shape[1:]))
     return torch.index_select(images, 0, source.flatten(), out=out)

@@ -2,11 +2,11 @@
 
 from __future__ import annotations
 
+from itertools import groupby
 from math import cos, hypot, pi, sin
 from pathlib import Path
 from typing import Any
 
-import numpy as np
 from jinja2 import UndefinedError
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -21,7 +21,7 @@ from vd4rl_pomdp.report.templates import render
 from vd4rl_pomdp.runs.files import Row, files_below, read_json, write_json
 
 Study = dict[str, Any]
-"""What `theory.study.theory_study` returns."""
+"""What `studies.theory.theory_study` returns."""
 FILE = "theory.json"
 COLUMNS = {"correct": "correct classifier", "complete": "complete state", "discards": "discards noise"}
 LABEL: dict[str, Any] = {"fontsize": 7, "ha": "center", "va": "center", "zorder": 3}
@@ -57,12 +57,16 @@ def section(study: Study) -> str:
         "study": study,
         "columns": COLUMNS,
         "table": table_rows(study),
-        "facts": [(fact, [world_size(world) for world in fact["worlds"]]) for fact in study["facts"]],
+        "facts": list(by_title(study).items()),
         "diagram": to_svg(diagram_figure(study)),
-        "forced": to_svg(forced_figure(study)),
         "entropies": to_svg(entropy_figure(study["comparisons"])),
     }
     return render("theory_section.html", theory=shown)
+
+
+def by_title(study: Study) -> dict[str, list[Row]]:
+    """The rows of each fact, which are told of worlds."""
+    return {title: list(rows) for title, rows in groupby(study["facts"], key=lambda fact: fact["title"])}
 
 
 def table_rows(study: Study) -> list[Row]:
@@ -90,8 +94,13 @@ def _mark(value: bool) -> str:
 
 def print_theory(study: Study) -> None:
     """The study's main tables on the terminal."""
-    console = Console()
+    console, facts = Console(), by_title(study)
     appendix = study["counterexample"]["appendix"]
+    table = Table(box=None, padding=(0, 2, 0, 0))
+    for title in ("method", *COLUMNS.values()):
+        table.add_column(title, no_wrap=True)
+    for row in table_rows(study):
+        table.add_row(row["method"], *(f"{printed} | {' '.join(found)}" for printed, *found in row["entries"].values()))
     for line in (
         "Counted over all sequences of finite worlds; nothing is sampled or trained.",
         f"The paper's counterexample has {appendix['examples']} inverse examples for k = 1..10, diameter "
@@ -99,44 +108,21 @@ def print_theory(study: Study) -> None:
         "",
         "Table 1: the paper | " + ", ".join(study["tables"]),
         "(yes), (no): what the method sees does not decode that world's states, so that the paper claims nothing.",
+        table,
+        f"\nWhere the paper and enumeration differ: {len(facts)} facts",
     ):
         console.print(line, markup=False, highlight=False)
-    console.print(_terminal_table(study))
-    console.print(f"\nWhere the paper and enumeration differ: {len(study['facts'])} facts", highlight=False)
-    for number, fact in enumerate(study["facts"], 1):
-        console.print(_terminal_fact(number, fact))
-    console.print(f"\n* no smaller world does, of those with {study['family']}", markup=False, highlight=False)
-
-
-def _terminal_table(study: Study) -> Table:
-    table = Table(box=None, padding=(0, 2, 0, 0))
-    for title in ("method", *COLUMNS.values()):
-        table.add_column(title, no_wrap=True)
-    for row in table_rows(study):
-        table.add_row(row["method"], *(f"{printed} | {' '.join(found)}" for printed, *found in row["entries"].values()))
-    return table
-
-
-def _terminal_fact(number: int, fact: dict[str, Any]) -> Table:
-    """A fact as a small table: what is printed, the smallest world, what is exact there, what is left of the claim."""
-    table = Table(box=None, padding=(0, 1, 0, 0), show_header=False, title_justify="left", title_style="bold")
-    table.title = Text(f"\n{number}. {fact['title']}")
-    table.add_column(no_wrap=True)
-    table.add_column()
-    first, *others = fact["worlds"]
-    also = "; also on " + ", ".join(world["world"] for world in others) if others else ""
-    table.add_row("   printed", Text(fact["printed"]))
-    table.add_row("   world", Text(f"{world_size(first)}: {first['story']}"))
-    table.add_row("   exact", Text(first["exact"] + also))
-    table.add_row("   holds", Text(fact["holds"]))
-    return table
-
-
-def world_size(world: dict[str, Any]) -> str:
-    """A world's name and size, with a star if no smaller one shows the same."""
-    star = "*" if world["smallest"] else ""
-    noise = f" x {world['exogenous']}" if world["exogenous"] > 1 else ""
-    return f"{world['world']}{star}, {world['states']}{noise} state{'s' * (world['states'] > 1)}"
+    for number, (title, rows) in enumerate(facts.items(), 1):
+        table = Table(box=None, padding=(0, 1, 0, 0), show_header=False, title_justify="left", title_style="bold")
+        table.title = Text(f"\n{number}. {title}")
+        table.add_column(no_wrap=True)
+        table.add_column()
+        table.add_row("   printed", Text(rows[0]["printed"]))
+        for row in rows:
+            table.add_row(
+                f"   {row['world']}", Text(f"{row['quantity']}: printed {row['claimed']}, computed {row['computed']}")
+            )
+        console.print(table)
 
 
 def diagram_figure(study: Study) -> Figure:
@@ -157,13 +143,10 @@ def _draw(axes: Axes, diagram: dict[str, Any], states: list, transitions: list) 
     for (x, y), state, group in zip(positions, states, diagram["classes"], strict=True):
         axes.scatter([x], [y], s=480, color=COLOURS[group % len(COLOURS)], zorder=2)
         axes.text(x, y, f"{state[0]},{state[1]:+d}", color="white", ha="center", va="center", fontsize=8, zorder=3)
-    axes.set_title(_title(diagram), fontsize=10)
+    classes = len(set(diagram["classes"]))
+    axes.set_title(f"{diagram['title']}\n{diagram['blocks']} codes; classes of states: {classes}", fontsize=10)
     axes.set(xlim=(-1.45, 1.45), ylim=(-1.45, 1.45), aspect="equal")
     axes.axis("off")
-
-
-def _title(diagram: dict[str, Any]) -> str:
-    return f"{diagram['title']}\n{diagram['blocks']} codes; classes of states: {len(set(diagram['classes']))}"
 
 
 def _position(position: int, last: int) -> tuple[float, float]:
@@ -184,23 +167,6 @@ def _arrow(axes: Axes, start: tuple[float, float], end: tuple[float, float], act
     dx, dy = x1 - x0, y1 - y0
     out = bend / 2 - 0.13 / hypot(dx, dy)
     axes.text((x0 + x1) / 2 + out * dy, (y0 + y1) / 2 - out * dx, f"{action:+d}", color=colour, **LABEL)
-
-
-def forced_figure(study: Study) -> Figure:
-    """For every two states, the share of pairs of their histories that the objective must tell apart."""
-    names = [f"{x},{b:+d}" for x, b in study["states"]]
-    figure = Figure(figsize=(9.6, 6.4), layout="constrained")
-    panels = figure.subplots(2, 3)
-    for axes, diagram in zip(panels.flat, study["diagrams"], strict=True):
-        share = np.zeros((len(names), len(names)))
-        for one, other, value in diagram["forced"]:
-            share[one, other] = share[other, one] = value
-        picture = axes.imshow(share, cmap="Greys", vmin=0, vmax=1)
-        axes.set_title(diagram["title"], fontsize=10)
-        axes.set_xticks(range(len(names)), names, fontsize=7, rotation=90)
-        axes.set_yticks(range(len(names)), names, fontsize=7)
-    figure.colorbar(picture, ax=panels, shrink=0.5, label="share of pairs of histories that must differ")
-    return figure
 
 
 def entropy_figure(rows: list[Row]) -> Figure:

@@ -145,7 +145,7 @@ def _claim_view(dataset: Dataset, config: CorruptionConfig, shift: int) -> None:
     rows, key = torch.arange(dataset.num_rows).view(2, -1), torch.tensor([5, 6])
     apart, together = BatchCorruption(config, 1, "a"), View(dataset, config, shift, 1, "a")
     for _ in range(2):
-        expected = apart(random_shift(dataset.stacks(rows), key, shift).clone(), dataset.keys(rows))
+        expected = apart(random_shift(View(dataset).stacks(rows), key, shift).clone(), dataset.keys(rows))
         seen = together.observe(rows, key)
         claim(torch.equal(seen, expected), f"they differ under {config.corruption_mode} with a shift of {shift}")
 

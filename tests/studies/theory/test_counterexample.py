@@ -7,7 +7,7 @@ from gymnasium.utils.env_checker import check_env
 
 import vd4rl_pomdp.envs
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.studies.theory import counterexample as study
+from vd4rl_pomdp.studies.theory.facts import enumerated, inverse_examples
 from vd4rl_pomdp.studies.theory.gallery import BLANK, counterexample
 
 K2 = {((1, -1), (0, -1)), ((-1, 1), (0, 1)), ((-1, -1), (2, -1)), ((1, 1), (2, 1))}
@@ -30,13 +30,13 @@ def appendix_k4():
 @pytest.mark.parametrize(("k", "listed"), [(2, K2), (4, set(appendix_k4()))])
 def test_the_appendix_lists(k, listed):
     assert len(listed) == 2**k
-    examples = study.inverse_examples(counterexample(), k)
+    examples = inverse_examples(counterexample(), k)
     for start in ((0, -1), (0, 1)):
         assert {(actions, end) for s, actions, end in examples if s == start} == listed
 
 
 def test_the_counts_of_the_paper_and_what_it_leaves_out():
-    found = study.study(counterexample())
+    found = enumerated(counterexample())
     assert found["examples"] == 16368
     assert set(range(4, 11)) <= set(found["uniform_k"])
     assert found["uniform_k"] == list(range(3, 11)), "k = 3 is uniform, too"
@@ -46,7 +46,7 @@ def test_the_counts_of_the_paper_and_what_it_leaves_out():
 
 
 def test_the_main_texts_actions_give_other_claims():
-    found = study.study(counterexample((0, 1)))
+    found = enumerated(counterexample((0, 1)))
     assert found["examples"] == 16368
     assert found["uniform_k"] == []
     assert found["diameter"] == 4

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from collections.abc import Hashable
 from dataclasses import dataclass
+from fractions import Fraction
 
-from vd4rl_pomdp.studies.theory.law import Prediction, Variable, in_order, joint_law
+from vd4rl_pomdp.studies.theory.law import in_order, joint_law
 from vd4rl_pomdp.studies.theory.views import ObjectiveView
-from vd4rl_pomdp.studies.theory.world import AgentState, World
+from vd4rl_pomdp.studies.theory.world import Action, AgentState, World
 
 
 @dataclass(frozen=True)
@@ -50,17 +51,18 @@ def first_row(view: ObjectiveView, memory: Memory) -> int:
 
 @dataclass(frozen=True)
 class Clash:
-    """One sequence on which an objective's classifier is not the multi-step inverse."""
+    """One sequence on which an objective's classifier is not the multi-step inverse, and the action it is about."""
 
-    t: int
-    seen: dict[Variable, Hashable]
-    """What the objective is given."""
+    k: int
+    seen: dict[str, Hashable]
+    """What the objective is given: "o_t", "a_t-1", "o_t+2" and so on."""
     states: tuple[AgentState, AgentState]
     """s_t and s_{t+k}."""
-    exact: Prediction
-    """The Bayes-optimal classifier given what is seen."""
-    multi_step: Prediction
-    """P(a_t | s_t, s_{t+k})."""
+    action: Action
+    exact: Fraction
+    """Probability of the action given what is seen."""
+    multi_step: Fraction
+    """P(a_t | s_t, s_{t+k}) of it."""
 
 
 def clash(world: World, view: ObjectiveView, memory: Memory, k: int) -> Clash | None:
@@ -70,12 +72,17 @@ def clash(world: World, view: ObjectiveView, memory: Memory, k: int) -> Clash | 
     ends = [("s", t), ("s", t + k)]
     law = joint_law(world, visible | {("a", t), *ends})
     exact, multi = (law.given(group, ("a", t)).by_row() for group in (visible, ends))
-    apart = [max(abs(p - q) for p, q in zip(*both, strict=True)) for both in zip(exact, multi, strict=True)]
-    row = apart.index(max(apart))
-    if not apart[row]:
+    gaps = [[abs(p - q) for p, q in zip(*both, strict=True)] for both in zip(exact, multi, strict=True)]
+    row = max(range(len(gaps)), key=lambda i: max(gaps[i]))
+    place = gaps[row].index(max(gaps[row]))
+    if not gaps[row][place]:
         return None
-    (seen,), ((start, end),) = law.values(visible, [row]), law.values(ends, [row])
-    return Clash(t, dict(zip(in_order(visible), seen, strict=True)), (start, end), exact[row], multi[row])
+    (values,), (states,) = law.values(visible, [row]), law.values(ends, [row])
+    seen = {
+        f"{kind}_t{j - t:+d}".removesuffix("+0"): value
+        for (kind, j), value in zip(in_order(visible), values, strict=True)
+    }
+    return Clash(k, seen, states, world.actions[place], exact[row][place], multi[row][place])
 
 
 def compare(world: World, view: ObjectiveView, memory: Memory, k: int) -> Comparison:

@@ -1,216 +1,240 @@
-"""Where the paper's text and exact enumeration differ: one object a fact, with the worlds that show it.
+"""Where the paper's text and exact enumeration differ: its counterexample, counted, and ten statements held to worlds.
 
-A fact is checked where it stands. `contradicts` finds its numbers on a world that meets the assumptions of the claim,
-and `holds_on` says whether what is left of the claim holds there.
+The counterexample (section 3.2 and appendix) is about inverse examples: a start state, k actions and the state they
+lead to. The paper generates all of them for k = 1..10 and asks, for each pair of states, how the first action is
+distributed.
 """
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections import Counter
 from dataclasses import dataclass
-from inspect import getdoc
+from itertools import product
+from typing import Any
 
-from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.studies.theory import contradictions, remainders
-from vd4rl_pomdp.studies.theory.gallery import counterexample, echo, momentum
-from vd4rl_pomdp.studies.theory.small import alternator, flicker, hidden_switch, idle, ladder, switch, toggle
-from vd4rl_pomdp.studies.theory.world import World
+from vd4rl_pomdp.studies.theory.classifiers import Memory, clash
+from vd4rl_pomdp.studies.theory.decodability import future_memory, past_memory
+from vd4rl_pomdp.studies.theory.gallery import (
+    alternator,
+    counterexample,
+    echo,
+    flicker,
+    hidden_switch,
+    idle,
+    ladder,
+    momentum,
+    switch,
+    toggle,
+)
+from vd4rl_pomdp.studies.theory.partition import Relation, discards_noise, forced_shares, relation, state_relation
+from vd4rl_pomdp.studies.theory.views import VIEWS
+from vd4rl_pomdp.studies.theory.world import Action, AgentState, World, diameter, period
+
+MAX_K = 10
+GAPS = 4
+"""How many k are tried, from the first one that a statement is about."""
+
+
+def inverse_examples(world: World, k: int) -> list[tuple[AgentState, tuple[Action, ...], AgentState]]:
+    """Every (s_t, (a_t..a_{t+k-1}), s_{t+k})."""
+    found = []
+    for start in world.states:
+        for actions in product(world.actions, repeat=k):
+            state = start
+            for action in actions:
+                state = world.step[state, action]
+            found.append((start, actions, state))
+    return found
+
+
+def examples_by_k(world: World) -> list[dict[str, int]]:
+    """One row for every k: examples, pairs of states, and at how many of them the first action is known or uniform."""
+    rows = []
+    for k in range(1, MAX_K + 1):
+        first: dict[tuple[AgentState, AgentState], Counter[Action]] = {}
+        for start, actions, end in inverse_examples(world, k):
+            first.setdefault((start, end), Counter())[actions[0]] += 1
+        certain = sum(len(counts) == 1 for counts in first.values())
+        uniform = sum(len({counts[a] for a in world.actions}) == 1 for counts in first.values())
+        examples = sum(counts.total() for counts in first.values())
+        rows.append({"k": k, "examples": examples, "pairs": len(first), "certain": certain, "uniform": uniform})
+    return rows
+
+
+def enumerated(world: World) -> dict[str, Any]:
+    """What enumeration says of the counterexample, with one of the paper's two action sets."""
+    rows = examples_by_k(world)
+    return {
+        "actions": list(world.actions),
+        "by_k": rows,
+        "examples": sum(row["examples"] for row in rows),
+        "uniform_k": [row["k"] for row in rows if row["uniform"] == row["pairs"]],
+        "informative_k": [row["k"] for row in rows if row["uniform"] < row["pairs"]],
+        "certain_k": [row["k"] for row in rows if row["certain"] == row["pairs"]],
+        "diameter": diameter(world),
+        "period": period(world),
+        "m_with_actions": past_memory(world, actions=True),
+        "m_without_actions": past_memory(world, actions=False),
+        "n_with_actions": future_memory(world, actions=True),
+        "n_with_actions_literal": future_memory(world, actions=True, literal=True),
+    }
+
+
+def least_memory(world: World) -> Memory:
+    """The least m and n with actions; where no n decodes, that of the literal reading, or 0 if none does either."""
+    m = past_memory(world, actions=True)
+    ns = [future_memory(world, actions=True, literal=literal) for literal in (False, True)]
+    assert m is not None, f"{world.name}: no past decodes"
+    return Memory(m, next((n for n in ns if n is not None), 0))
 
 
 @dataclass(frozen=True)
 class Fact:
-    """One statement of the paper that enumeration contradicts."""
+    """A number of a world, as a statement of the paper has it and as it is."""
 
-    name: str
     title: str
     """What is true, in a line."""
-    methods: tuple[str, ...]
-    """Of Table 1; empty if the statement is about a world alone, or about all inverse models."""
     printed: str
     """What the paper prints, and where."""
-    exact: str
-    """What enumeration says of a world: a sentence with places for the numbers of `contradicts`."""
-    holds: str
-    """What is left of the claim."""
-    worlds: tuple[Callable[[], World], ...]
-    """Worlds that contradict the claim, the smallest first."""
-    contradicts: Callable[[World], Row | None]
-    """What contradicts the claim on a world, in numbers; None if nothing does."""
-    holds_on: Callable[[World], bool]
-    """Whether what is left of the claim holds on a world that contradicts it."""
-    searched: bool = True
-    """Whether no smaller world of `small.FAMILY` contradicts the claim. False: the claim is about this world alone."""
+    world: str
+    quantity: str
+    claimed: str
+    computed: str
 
 
-AT = (
-    "with m = {m}, n = {n}, k = {k}, s_t = {s_t}, s_{{t+k}} = {s_t+k}, P(a_t = {action}) is {exact} given what is seen "
-    "and {printed} given the states"
-)
-PAST_AT = AT.replace(" n = {n},", "")
-ON_STATES = "P(a_t | s_t, s_{t+k})"
-
-
-def main_text() -> World:
-    """The paper's own, with the actions of its main text, 0 and 1."""
-    return counterexample((0, 1))
-
-
-FACTS = (
-    Fact(
-        "reaches_back",
-        "A forward jump looks back behind m",
-        ("fj", "fj+a"),
-        f"P(a_t | rows t-m..t and t+k-m..t+k) is {ON_STATES} for every k > m (section 3.1)",
-        PAST_AT,
-        "k up to m, as printed. Beyond, FJ+A sees what MIK+A sees at the gap k-m with n = m actions, "
-        "as the paper counts them (here MIK+A reads a_{t+k}, too): it is "
-        "P(a_t | s_t, s_{t+k-m}) where its later window tells its first state",
-        (ladder, counterexample),
-        contradictions.forward_jump,
-        remainders.jumps_are_shorter,
+INVERSE = "P(a_t | s_t, s_{t+k})"
+PRINTED = {
+    "A forward jump looks back behind m": (
+        f"P(a_t | rows t-m..t and t+k-m..t+k) is {INVERSE} for every k > m (section 3.1)"
     ),
-    Fact(
-        "useful_jumps",
-        "Jumps beyond m are not useless to FJ+A",
-        ("fj+a",),
-        "on the counterexample k > m = 3 gives no signal, so that FJ and FJ+A fail (section 3.2)",
-        "pairs of states that are told apart in all histories, of {pairs}: by FJ+A with k up to {m}, {near}; with k up "
-        "to {max_k}, {far}; by the literal MIK+A, {masked}",
-        "with k up to m FJ+A can be a recorder of actions, as the paper argues",
-        (counterexample,),
-        contradictions.useful_jumps,
-        remainders.near_jumps_merge,
-        searched=False,
+    "Jumps beyond m are not useless to FJ+A": (
+        "on the counterexample k > m = 3 gives no signal, so that FJ and FJ+A fail (section 3.2)"
     ),
-    Fact(
-        "no_future",
-        "Without the leak, the counterexample breaks an assumption of MIK+A",
-        ("mik+a",),
+    "Without the leak, the counterexample breaks an assumption of MIK+A": (
         "the counterexample sets MIK+A apart from FJ and FJ+A (section 3.2); MIK+A assumes that the future decodes "
-        "(Table 1)",
-        "no number of later rows tells the state; " + AT,
-        "read literally, the future decodes, and MIK+A is the multi-step inverse",
-        (hidden_switch, counterexample),
-        contradictions.no_future,
-        remainders.literal_is_right,
+        "(Table 1)"
     ),
-    Fact(
-        "idle_k",
-        "On the counterexample k = 3 tells nothing",
-        (),
-        "k = 2 and k = 3 are needed to tell the states apart, and k > 3 is uniform (section 3.2)",
-        "at k = {idle} both first actions are equally likely for each of {pairs} pairs of states; k = {informative} "
-        "alone tell anything",
-        "16368 examples for k up to 10, diameter 3, m = 3, and uniform first actions from k = 4 to 10",
-        (counterexample,),
-        contradictions.idle_k,
-        remainders.counts_are_right,
-        searched=False,
+    "On the counterexample k = 3 tells nothing": (
+        "k = 2 and k = 3 are needed to tell the states apart, and k > 3 is uniform (section 3.2)"
     ),
-    Fact(
-        "main_text_actions",
-        "With the main text's actions 0 and 1 every k tells something",
-        (),
-        "a_t is 0 or 1, the diameter is 3, and k > 3 is uniform (section 3.2); the appendix has -1 and +1",
-        "k = {useful} are not uniform, and the diameter is {diameter}",
-        "there are 16368 examples here, too; what else is printed is true of -1 and +1",
-        (main_text,),
-        contradictions.never_idle,
-        remainders.examples_are_as_many,
-        searched=False,
+    "With the main text's actions 0 and 1 every k tells something": (
+        "a_t is 0 or 1, the diameter is 3, and k > 3 is uniform (section 3.2); the appendix has -1 and +1"
     ),
-    Fact(
-        "leaked_target",
-        "Read literally, the later view holds the action that is asked for",
-        ("mik+a literal", "fj+a literal"),
-        f"row t is (o_t, a_{{t-1}}) (section 2), the later view begins with row t+k (appendix), MIK+A is {ON_STATES} "
-        "from k = 1 on (section 3.1)",
-        AT,
-        "without a_{t+k-1} MIK+A is the multi-step inverse wherever past and future decode",
-        (idle,),
-        contradictions.leaked_target,
-        remainders.masked_is_right,
+    "Read literally, the later view holds the action that is asked for": (
+        f"row t is (o_t, a_{{t-1}}) (section 2), the later view begins with row t+k (appendix), MIK+A is {INVERSE} "
+        "from k = 1 on (section 3.1)"
     ),
-    Fact(
-        "leaked_mask",
-        "Read literally, MIK+A sees one of the masked actions at every k",
-        ("mik+a literal",),
-        f"row t is (o_t, a_{{t-1}}), and MIK+A is {ON_STATES} at every k (section 3.1)",
-        AT,
-        "without a_{t+k-1} as above, and with it where states record the last action",
-        (toggle, momentum),
-        contradictions.leaked_mask,
-        remainders.masked_is_right,
+    "Read literally, MIK+A sees one of the masked actions at every k": (
+        f"row t is (o_t, a_{{t-1}}), and MIK+A is {INVERSE} at every k (section 3.1)"
     ),
-    Fact(
-        "merged_states",
-        "MIK+A's past encoder may merge states that act alike",
-        ("mik+a",),
-        "MIK+A finds the complete agent-centric state (Table 1, section 3.2)",
-        "pairs of states that f must tell apart, with k up to {max_k} and both actions equally likely: {forced} of "
-        "{pairs}",
-        "one encoder for both ends has to tell all states apart",
-        (switch, echo),
-        contradictions.merged_states,
-        remainders.one_encoder_separates,
+    "MIK+A's past encoder may merge states that act alike": (
+        "MIK+A finds the complete agent-centric state (Table 1, section 3.2)"
     ),
-    Fact(
-        "merged_phases",
-        "Where states take turns, no inverse model tells the turns apart",
-        (),
+    "Where states take turns, no inverse model tells the turns apart": (
         "all k up to the diameter recover the state of a deterministic world (appendix), and k = 1 to 3 that of the "
-        "counterexample (section 3.2)",
-        "codes that one encoder on true states needs, with k up to {max_k}: {codes} for {states} states",
-        "states that can occur in the same row are told apart",
-        (alternator, counterexample),
-        contradictions.merged_phases,
-        remainders.phases_are_whole,
+        "counterexample (section 3.2)"
     ),
-    Fact(
-        "needed_noise",
-        "FJ+A's jumps beyond m may need the exogenous part",
-        ("fj+a",),
-        "FJ+A discards exogenous noise (Table 1)",
-        "with m = {m} and k up to {k} the best prediction depends on the exogenous part of the past",
-        "with k up to m it does not",
-        (flicker, counterexample),
-        contradictions.needed_noise,
-        remainders.near_jumps_discard,
-    ),
-)
+    "FJ+A's jumps beyond m may need the exogenous part": "FJ+A discards exogenous noise (Table 1)",
+}
+"""What the paper prints, and where, by what is true instead."""
 
 
-def told(fact: Fact, rows: Iterable[Row]) -> Row:
-    """A fact in JSON, with what shows it among the `table.disagreements`."""
-    return {
-        "name": fact.name,
-        "title": fact.title,
-        "methods": list(fact.methods),
-        "printed": fact.printed,
-        "worlds": [_on(fact, make, smallest=fact.searched and not place) for place, make in enumerate(fact.worlds)],
-        "holds": fact.holds,
-        "in_table": [row for row in rows if explanation(row) == fact.name],
-    }
+def facts() -> list[Fact]:
+    """Where text and enumeration differ, in the order of `PRINTED`: one row for each world that shows it.
+
+    Every world meets the assumptions of the statement that it contradicts. Window lengths m and n are the least that
+    decode.
+    """
+    theirs, main = counterexample(), counterexample((0, 1))
+    third, uniform = examples_by_k(theirs)[2], enumerated(main)["uniform_k"]
+    numbers = [
+        [_prediction(world, "fj+a", least_memory(world).m + 1) for world in (ladder(), theirs)],
+        [_jumps(theirs)],
+        [_prediction(world, "mik+a", 1) for world in (hidden_switch(), theirs)],
+        [
+            (
+                theirs.name,
+                "pairs at which k = 3 tells something",
+                "some",
+                f"{third['pairs'] - third['uniform']} of {third['pairs']}",
+            )
+        ],
+        [
+            (main.name, "k above 3 that are uniform", "4 to 10", ", ".join(map(str, uniform)) or "none"),
+            (main.name, "diameter", "3", str(diameter(main))),
+        ],
+        [_prediction(idle(), "mik+a literal", 1)],
+        [_prediction(world, "mik+a literal", 2) for world in (toggle(), momentum())],
+        [_merged(world) for world in (switch(), echo())],
+        [_codes(world) for world in (alternator(), theirs)],
+        [_noise(world) for world in (flicker(), theirs)],
+    ]
+    return [
+        Fact(title, printed, *row)
+        for (title, printed), rows in zip(PRINTED.items(), numbers, strict=True)
+        for row in rows
+    ]
 
 
-def _on(fact: Fact, make: Callable[[], World], smallest: bool) -> Row:
-    world = make()
-    numbers = fact.contradicts(world)
-    assert numbers is not None, f"{world.name} does not show {fact.name}"
-    size = {"states": len(world.states), "exogenous": len(world.exogenous), "observations": len(world.symbols)}
-    exact = fact.exact.format(**{key: _text(value) for key, value in numbers.items()})
-    label = {"world": world.name, "story": (getdoc(make) or "").split("\n")[0], "smallest": smallest} | size
-    return label | {"exact": exact, "numbers": numbers, "rest_holds": fact.holds_on(world)}
+Row = tuple[str, str, str, str]
+"""World, quantity, claimed and computed number."""
 
 
-def explanation(row: Row) -> str:
-    """The name of the fact that a row of `table.disagreements` is an instance of."""
-    if row["claim"] == "discards":
-        return "needed_noise"
-    if row["claim"] == "complete":
-        return "merged_phases" if row["period"] > 1 else "merged_states"
-    return "leaked_mask" if row["method"] == "mik+a literal" else "reaches_back"
+def _prediction(world: World, method: str, first_k: int) -> Row:
+    """The first k, of GAPS, at which a method is not the multi-step inverse: where, and both probabilities."""
+    memory = least_memory(world)
+    for k in range(first_k, first_k + GAPS):
+        if found := clash(world, VIEWS[method], memory, k):
+            where = f"m = {memory.m}, k = {k}, s_t = {found.states[0]}, s_{{t+k}} = {found.states[1]}"
+            return (
+                world.name, f"{method}'s P(a_t = {found.action}), {where}", str(found.multi_step), str(found.exact),
+            )  # fmt: skip
+    raise AssertionError(f"{method} is the multi-step inverse of {world.name}")
 
 
-def _text(value: object) -> str:
-    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)
+def _jumps(world: World) -> Row:
+    """States that FJ+A tells apart by jumps beyond m, beside those by shorter ones and by the literal MIK+A."""
+    m = least_memory(world).m
+    near, far = (always_apart(relation(world, VIEWS["fj+a"], Memory(m, m), range(1, k + 1))) for k in (m, m + 2))
+    masked = always_apart(relation(world, VIEWS["mik+a literal"], Memory(m, m), range(1, m + 1)))
+    aside = f"k up to {m}: {near[0]}; mik+a literal: {masked[0]}"
+    return (
+        world.name,
+        f"pairs of states apart by fj+a, k up to {m + 2} ({aside})",
+        str(near[0]),
+        "{} of {}".format(*far),
+    )
+
+
+def _merged(world: World) -> Row:
+    """States that MIK+A's past encoder has to tell apart, with both actions equally likely."""
+    reach = _reach(world)
+    apart, pairs = always_apart(relation(world, VIEWS["mik+a"], least_memory(world), range(1, reach + 1)))
+    return world.name, f"pairs of states apart by mik+a, k up to {reach}", f"{pairs} of {pairs}", f"{apart} of {pairs}"
+
+
+def _codes(world: World) -> Row:
+    """Codes that one encoder on true states needs at both ends, at every k up to twice the diameter."""
+    codes = len(set(state_relation(world, range(1, 2 * _reach(world) + 1)).coarsest().tolist()))
+    return world.name, f"codes on true states, k up to {2 * _reach(world)}", str(len(world.states)), str(codes)
+
+
+def _noise(world: World) -> Row:
+    """The first of two k beyond m up to which FJ+A's prediction depends on the exogenous part of its past."""
+    memory = least_memory(world)
+    needed = (
+        k
+        for k in (memory.m + 1, memory.m + 2)
+        if not discards_noise(relation(world, VIEWS["fj+a"], memory, range(1, k + 1)))
+    )
+    return world.name, f"fj+a needs the past's exogenous part, m = {memory.m}", "at no k", f"at k up to {next(needed)}"
+
+
+def always_apart(found: Relation) -> tuple[int, int]:
+    """Pairs of states all of whose histories every optimal representation separates, and all pairs."""
+    shares = forced_shares(found).values()
+    return sum(share == 1 for share in shares), len(shares)
+
+
+def _reach(world: World) -> int:
+    return max(1, diameter(world) or 0)

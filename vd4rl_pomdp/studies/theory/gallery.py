@@ -1,13 +1,15 @@
-"""Finite worlds on which the paper's claims are computed, each with exogenous noise and under two policies."""
+"""Finite worlds on which the paper's claims are computed: three with variants, and seven very small ones."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from fractions import Fraction
 
 from vd4rl_pomdp.studies.theory.world import (
     AgentState,
     Distribution,
     Exogenous,
+    Symbol,
     World,
     finite_world,
     with_noise,
@@ -73,6 +75,62 @@ def momentum() -> World:
         step=lambda s, a: ((s[0] + s[1] + a) % 3, (s[1] + a) % 3),
         drift=lambda xi: {xi: 1},
         emit=lambda s, xi: {s[0]: 1},
+    )
+
+
+def idle() -> World:
+    """Actions do nothing, and nothing is seen."""
+    return _tiny("idle", {0: (0, 0)}, {0: BLANK})
+
+
+def switch() -> World:
+    """The state is the last action, and is shown."""
+    return _tiny("switch", {0: (0, 1), 1: (0, 1)}, {0: 0, 1: 1})
+
+
+def hidden_switch() -> World:
+    """The state is the last action; nothing is seen."""
+    return _tiny("hidden switch", {0: (0, 1), 1: (0, 1)}, {0: BLANK, 1: BLANK})
+
+
+def toggle() -> World:
+    """Action 1 changes sides, action 0 stays; the side is shown."""
+    return _tiny("toggle", {0: (0, 1), 1: (1, 0)}, {0: 0, 1: 1})
+
+
+def alternator() -> World:
+    """Both actions change sides; the side is shown."""
+    return _tiny("alternator", {0: (1, 1), 1: (0, 0)}, {0: 0, 1: 1})
+
+
+def ladder() -> World:
+    """Action 1 climbs a step, action 0 falls to the ground, and from the top one falls; only the ground is shown."""
+    return _tiny("ladder", {0: (0, 1), 1: (0, 2), 2: (0, 0)}, {0: "ground", 1: BLANK, 2: BLANK})
+
+
+def flicker() -> World:
+    """The state is the last action; it is shown in every second row, when a light is on."""
+    return finite_world(
+        "flicker",
+        states=[0, 1],
+        exogenous=["dark", "light"],
+        actions=(0, 1),
+        step=lambda s, a: a,
+        drift=lambda xi: {"light" if xi == "dark" else "dark": 1},
+        emit=lambda s, xi: {s if xi == "light" else BLANK: 1},
+    )
+
+
+def _tiny(name: str, after: Mapping[int, tuple[int, int]], shown: Mapping[int, Symbol]) -> World:
+    """A world without an exogenous part: the states after actions 0 and 1, and what each state shows."""
+    return finite_world(
+        name,
+        states=list(after),
+        exogenous=["-"],
+        actions=(0, 1),
+        step=lambda s, a: after[s][a],
+        drift=lambda xi: {xi: 1},
+        emit=lambda s, xi: {shown[s]: 1},
     )
 
 

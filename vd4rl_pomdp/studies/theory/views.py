@@ -28,7 +28,9 @@ class ObjectiveView:
 
     def start(self, t: int, m: int) -> frozenset[Variable]:
         """What the representation of row t is computed from."""
-        return self._before(t, m)
+        first = {"none": t, "all": 0, "window": max(0, t - m)}[self.past]
+        earlier = first - 1 if self.literal and not self.masked else first
+        return _variables(range(first, t + 1), range(max(0, earlier), t) if self.actions else ())
 
     def end(self, t: int, k: int, m: int, n: int, rows: int) -> frozenset[Variable]:
         """What the representation of row t+k is computed from, in a window of `rows` rows.
@@ -36,7 +38,7 @@ class ObjectiveView:
         A future of n rows beyond t+k holds n+1 actions, as `MaskedInverse` reads it.
         """
         if not self.masked:
-            return self._before(t + k, m)
+            return self.start(t + k, m)
         last = min(rows, t + k + n + 1)
         shift = 1 if self.literal else 0
         actions = range(t + k - shift, last - shift) if self.actions else ()
@@ -45,11 +47,6 @@ class ObjectiveView:
     def visible(self, t: int, k: int, m: int, n: int, rows: int) -> frozenset[Variable]:
         """Everything a prediction may depend on."""
         return self.start(t, m) | self.end(t, k, m, n, rows)
-
-    def _before(self, row: int, m: int) -> frozenset[Variable]:
-        first = {"none": row, "all": 0, "window": max(0, row - m)}[self.past]
-        earlier = first - 1 if self.literal and not self.masked else first
-        return _variables(range(first, row + 1), range(max(0, earlier), row) if self.actions else ())
 
 
 def _variables(rows: range, actions: range | tuple) -> frozenset[Variable]:
