@@ -22,7 +22,7 @@ from vd4rl_pomdp.core.registry import REGISTRIES
 from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
 from vd4rl_pomdp.corruptions import make_corruption
 from vd4rl_pomdp.envs.mazes import get_maze
-from vd4rl_pomdp.sweeps.grid_file import load_grid
+from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.stages import check_cell
 
 ROOT = Path(__file__).parents[1]

@@ -29,7 +29,7 @@ from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.results import read_run
-from vd4rl_pomdp.sweeps.grid_file import load_grid
+from vd4rl_pomdp.sweeps.grid import load_grid
 
 _FIRST = next(cell for cell in load_grid("offline").cells() if cell.value("task") == "walker_walk")
 CELL = _FIRST.sections["finetune"] | {"workers": 1}

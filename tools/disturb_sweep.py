@@ -196,7 +196,9 @@ def compare(folder: Path, command: DisturbCommand) -> dict[str, Any]:
         print(events[-1], flush=True)
     codes = [code, sweep.driver.wait()]
     found = rows(folder / "disturbed")
-    attempts = [row for tried in SweepFolder(folder / "disturbed").attempts().values() for row in tried]
+    made = SweepFolder(folder / "disturbed")
+    jobs = [job for plan in made.plans() for job in plan.jobs]
+    attempts = [row for tried in made.attempts(jobs).values() for row in tried]
     return {
         "same": expected == found and bool(expected) and codes == [0, 0],
         "files_compared": len(expected),

@@ -22,9 +22,8 @@ from disturb_sweep import GRID
 
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 from vd4rl_pomdp.sweeps.folder import SweepFolder
-from vd4rl_pomdp.sweeps.found import FoundRuns
-from vd4rl_pomdp.sweeps.grid_file import load_grid
-from vd4rl_pomdp.sweeps.plan import DATA, JobPlanner
+from vd4rl_pomdp.sweeps.grid import load_grid
+from vd4rl_pomdp.sweeps.plan import DATA, plan_jobs
 
 
 @dataclass(frozen=True)
@@ -37,7 +36,7 @@ class TimeCommand:
 
 def by_hand(out: Path, grid: Path) -> None:
     """Run all commands one after the other."""
-    for job in JobPlanner(out, out / DATA, FoundRuns([]), FoundRuns([])).plan(load_grid(str(grid)).cells()):
+    for job in plan_jobs(load_grid(str(grid)).cells(), out, out / DATA)[0]:
         _run(["-m", "vd4rl_pomdp", *job.words])
 
 
@@ -62,7 +61,9 @@ def main(command: TimeCommand) -> None:
             began = time.monotonic()
             run(Path(folder) / name, grid)
             seconds[name] = round(time.monotonic() - began, 1)
-            attempts = SweepFolder(Path(folder) / name).attempts().values()
+            made = SweepFolder(Path(folder) / name)
+            jobs = [job for plan in made.plans() for job in plan.jobs] if name != "by_hand" else []
+            attempts = made.attempts(jobs).values()
             busy[name] = round(sum(row["seconds"] for rows in attempts for row in rows), 1)
             print(name, seconds[name], busy[name], flush=True)
     result = {

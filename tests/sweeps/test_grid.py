@@ -4,13 +4,13 @@ import re
 from pathlib import Path
 
 import pytest
+from vd4rl_pomdp.sweeps.grid_file import load_grid, names
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS, GymnasiumTask
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 from vd4rl_pomdp.studies.navigation.grid import condition_of, paper_rows
 from vd4rl_pomdp.sweeps.grid import GridCell, narrow
-from vd4rl_pomdp.sweeps.grid_file import load_grid, names
 from vd4rl_pomdp.sweeps.stages import check_cell, check_cells
 
 PAGE = Path(__file__).parents[2] / "docs" / "sweeps.md"

@@ -10,13 +10,13 @@ from pathlib import Path
 from types import ModuleType
 
 import pytest
+from vd4rl_pomdp.sweeps.work import DONE, FAILED, Ended, Work, ended, start_process
 
 from finetune.algorithms import ALGORITHMS
 from finetune.algorithms.bc import BC
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.sweeps.work import DONE, FAILED, Ended, Work, ended, start_process
 
 FILE = """
 from sibling import SUMMARY

@@ -7,6 +7,9 @@ from pathlib import Path
 
 import pytest
 from PIL import Image
+from vd4rl_pomdp.sweeps.estimate import Estimates
+from vd4rl_pomdp.sweeps.found import FoundRun, FoundRuns, runs_below, runs_kept
+from vd4rl_pomdp.sweeps.grid_file import load_grid
 
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
@@ -18,10 +21,7 @@ from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
 from vd4rl_pomdp.studies.navigation.exogenous import source_fingerprint
 from vd4rl_pomdp.sweeps import plan as module
-from vd4rl_pomdp.sweeps.estimate import Estimates
 from vd4rl_pomdp.sweeps.folder import SweepFolder
-from vd4rl_pomdp.sweeps.found import FoundRun, FoundRuns, runs_below, runs_kept
-from vd4rl_pomdp.sweeps.grid_file import load_grid
 from vd4rl_pomdp.sweeps.plan import DATA, JobPlanner
 from vd4rl_pomdp.sweeps.stages import recorded
 

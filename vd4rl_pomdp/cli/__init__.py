@@ -5,6 +5,7 @@ from __future__ import annotations
 import io
 import multiprocessing
 import os
+import signal
 import sys
 from collections.abc import Sequence
 
@@ -15,6 +16,7 @@ if os.name != "posix":
 from vd4rl_pomdp.cli import data, hub, navigation, parts, policy, stages, studies, sweeps
 from vd4rl_pomdp.cli.dispatch import COMMANDS
 from vd4rl_pomdp.cli.ends import run_to_end
+from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE
 
 COMMANDS |= {
     "demo": stages.DEMO,
@@ -42,7 +44,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # \u2028 and the like for what a terminal cannot show
-    end = run_to_end(words)
+    end = run_to_end(words, signal.SIG_IGN if JOB_VARIABLE in os.environ else signal.SIG_DFL)
     if end.line:
         print(end.line, file=sys.stderr)
     if end.code:

@@ -35,7 +35,7 @@ def run_to_end(words: Sequence[str], second: signal.Handlers = signal.SIG_DFL) -
         with interrupt.handled(second):
             run_stage(list(words))
     except UserError as error:
-        return End(2, error.cause, f"error: {in_one_line(error)}")
+        return End(error.code, error.cause, f"error: {in_one_line(error)}")
     except FloatingPointError as error:
         precision = "--update-precision" if words[:1] == ["finetune"] else "--precision"
         usual = f"lower --learning-rate or use {precision} fp32"
@@ -51,7 +51,7 @@ def run_to_end(words: Sequence[str], second: signal.Handlers = signal.SIG_DFL) -
         return End(141, INTERRUPTED)
     except OSError as error:
         told = disk_error(error.filename, error)
-        return End(2, told.cause, f"error: {told}")
+        return End(told.code, told.cause, f"error: {told}")
     except Exception:
         if (number := interrupt.arrived()) is None:
             raise

@@ -79,8 +79,7 @@ def _choice(command: ReportCommand) -> Choice:
         if command.only or command.change:
             raise UserError("--only and --change are about a grid's cells: name it with --grid")
         return ALL
-    from vd4rl_pomdp.sweeps.grid import narrow
-    from vd4rl_pomdp.sweeps.grid_file import load_grid
+    from vd4rl_pomdp.sweeps.grid import load_grid, narrow
     from vd4rl_pomdp.sweeps.members import GridMembers
 
     return GridMembers(command.grid, narrow(load_grid(command.grid, command.change).cells(), command.only))

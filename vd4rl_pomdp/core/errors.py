@@ -19,6 +19,10 @@ DONE, DIVERGED, INTERRUPTED = "done", "diverged", "interrupted"
 """Why a command ended that raised no UserError, which has a `cause` of its own."""
 
 
+TEMPORARY = 75
+"""Exit code of what the same command may not meet again, EX_TEMPFAIL of sysexits.h: a sweep tries it again."""
+
+
 class UserError(ValueError):
     """Bad input: the message is one line that says what is wrong, where, and what to do.
 
@@ -26,19 +30,23 @@ class UserError(ValueError):
     """
 
     cause = "refused"
-    """In one word why it ended: a sweep tries some causes again."""
+    """In one word why it ended."""
+    code = 2
+    """Exit code of the command."""
 
 
 class OutOfMemoryError(UserError):
     """The memory of the machine or its GPU did not suffice."""
 
     cause = "out of memory"
+    code = TEMPORARY
 
 
 class UnavailableError(UserError):
     """The system could not do now what it may do later: a disk that does not answer, too many open files."""
 
     cause = "unavailable"
+    code = TEMPORARY
 
 
 class DiskFullError(UnavailableError):
@@ -57,6 +65,7 @@ class WorkerDiedError(UserError):
     """A process that helped was ended from outside."""
 
     cause = "killed"
+    code = TEMPORARY
 
 
 class DivergedError(FloatingPointError):

@@ -34,10 +34,9 @@ from vd4rl_pomdp.sweeps.folder import (
     lost_among,
 )
 from vd4rl_pomdp.sweeps.options import LocalOptions
+from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE
 from vd4rl_pomdp.sweeps.plan import Job
 
-JOB_VARIABLE = "VD4RL_POMDP_JOB"
-"""Set in the environment of a job's process: a second signal ends it no sooner, and it may start no sweep."""
 POLL_S = 0.5
 PAUSE_S = 60.0
 """Before another attempt, whoever made the last."""
@@ -131,14 +130,14 @@ class Driver:
         return not rests and time.monotonic() >= self._not_before.get(job.name, 0)
 
     def _is_anothers(self, job: Job) -> bool:
-        """Whether another process has finished a job, or is at it."""
-        if is_finished(job):
-            del self._left[job.name]
-            return True
+        """Whether another process is at a job, or has finished it; asked in this order, it cannot end in between."""
         if in_use(job.folder):
             self._not_before[job.name] = time.monotonic() + IN_USE_S
-            return True
-        return False
+        elif is_finished(job):
+            del self._left[job.name]
+        else:
+            return False
+        return True
 
     def _begin(self, job: Job) -> None:
         log, place = self._folder.path / "logs" / f"{job.name}.log", self._free[0]

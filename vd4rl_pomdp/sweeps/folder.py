@@ -222,6 +222,9 @@ def in_lines(found: Mapping[str, Any]) -> list[str]:
     """A status as text."""
     counts = ", ".join(f"{number} {state}" for state, number in sorted(found["counts"].items()))
     left = "unknown" if found["seconds_left"] is None else f"{found['seconds_left'] / 3600:.1f} h"
-    shown = [f"{len(found['states'])} jobs: {counts}", f"{found['per_hour']:.1f} jobs an hour, {left} left at this rate"]
+    shown = [
+        f"{len(found['states'])} jobs: {counts}",
+        f"{found['per_hour']:.1f} jobs an hour, {left} left at this rate",
+    ]
     shown += [f"failed: {name}: {row['line']}" for name, row in found["failures"].items()]
     return shown + [f"running: {name}" for name, state in found["states"].items() if state == RUNNING]

@@ -8,7 +8,6 @@ from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.settings import LABELS
-from vd4rl_pomdp.core.tasks import SET_QUALITIES, UNKNOWN_QUALITY
 from vd4rl_pomdp.data.collect import set_quality
 from vd4rl_pomdp.report.load import Choice, without_options
 from vd4rl_pomdp.runs.files import Row
