@@ -7,7 +7,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from vd4rl_pomdp.sweeps.grid_file import load_grid
 
 from tests.helpers_report import grid_run
 from vd4rl_pomdp.cli import main
@@ -16,6 +15,7 @@ from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.results import read_results, write_results
+from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
 from vd4rl_pomdp.sweeps.stages import collection_of, recorded
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Sequence
 from dataclasses import fields, replace
 from functools import cache
 from pathlib import Path
@@ -37,16 +37,18 @@ def told(cell: GridCell, section: str) -> Values:
     return {name: value for name, value in cell.shared.items() if name in takes} | cell.sections[section]
 
 
-def check_cells(cells: Iterable[GridCell], grid: str) -> None:
+def check_cells(cells: Sequence[GridCell], grid: str) -> None:
     """Raise UserError, which begins with the grid's name, for settings that a stage does not have or take.
 
     Whether they fit the set, the machine and one another the stage itself says: its job then fails by itself.
     """
     try:
         for cell in cells:
+            refuse_number("seed", cell.seed, 0, MAX_SEED)
+        for cell in {repr((cell.shared | {"seed": 0}, cell.sections)): cell for cell in cells}.values():
+            config_of(cell, cell.chain[0])
             for section in cell.chain[1:]:
                 recorded(cell, section)
-            config_of(cell, cell.chain[0])
     except UserError as error:
         raise type(error)(f"{grid}: {error}") from error
 
@@ -55,7 +57,6 @@ def config_of(cell: GridCell, section: str) -> Any:
     """A stage's settings, its folders left open."""
     settings = told(cell, section)
     seed = settings.pop("seed", 0)
-    refuse_number("seed", seed, 0, MAX_SEED)
     try:
         return replace(_made(section, tuple(settings.items())), seed=seed)
     except UserError as error:
