@@ -69,5 +69,5 @@ class CURL(Objective):
 
     def _shifted(self, window: Windows) -> Windows:
         """The window, shifted anew: each row by itself, or all alike if the encoder has a memory."""
-        obs = window.obs if self.encoder.gru is not None else window.obs.flatten(0, 1)
+        obs = window.obs if self.encoder.memory is not None else window.obs.flatten(0, 1)
         return window.replace(obs=random_shift(obs, self.draws.keys(len(obs))).view_as(window.obs))

@@ -22,13 +22,13 @@ from vd4rl_pomdp.data.reference import Reference, action_error
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn, Observation
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.encoder_folder import encoder_hash, load_encoder, read_record
+from vd4rl_pomdp.nn.encoder_folder import CONFIG, WEIGHTS, load_encoder, read_record
 from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
 from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, LABELS_FILE
 from vd4rl_pomdp.runs.episodes import read_episodes
-from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.files import read_json, sha256
 from vd4rl_pomdp.runs.run import remedy
 from vd4rl_pomdp.runs.workers import run_jobs
 
@@ -152,17 +152,15 @@ def _environment(*place: Any) -> CorruptedEnv:
 
 
 @lru_cache(maxsize=1)
-def _agent(encoder: Path, policy: Path, content: tuple[str, str]) -> Agent:
+def _agent(encoder: Path, policy: Path, content: tuple[str, ...]) -> Agent:
     """The agent of two folders, read anew when another is asked for or they hold something else."""
     return Agent(load_encoder(encoder)[0], load_policy(policy))
 
 
-def _content(encoder: Path, policy: Path) -> tuple[str, str]:
-    """Names of what the folders of an agent hold."""
-    try:
-        return encoder_hash(encoder), encoder_hash(policy)  # whose files have the same names
-    except FileNotFoundError:
-        return "", ""  # loading says what is missing
+def _content(encoder: Path, policy: Path) -> tuple[str, ...]:
+    """Hashes of what the folders of an agent hold; files of both have the same names."""
+    files = (folder / name for folder in (encoder, policy) for name in (CONFIG, WEIGHTS))
+    return tuple(sha256(file) for file in files if file.exists())  # loading says what is missing
 
 
 def _draws(agent: Agent, job: EpisodeJob) -> Drawn:

@@ -17,7 +17,8 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data.reference import Reference
-from vd4rl_pomdp.nn.encoder_folder import EncoderCard, save_encoder
+from vd4rl_pomdp.nn.encoder import EncoderCard
+from vd4rl_pomdp.nn.encoder_folder import save_encoder
 from vd4rl_pomdp.runs import EPISODES_FILE, FILM_FILE, interrupt
 from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import Row, replacing_file

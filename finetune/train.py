@@ -28,10 +28,9 @@ from vd4rl_pomdp.data.format import read_plan, warn_of_earlier_pictures
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.envs.make import layout_of
-from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import (
     FILES_OF_RUN,
-    EncoderCard,
     copy_encoder,
     encoder_hash,
     load_encoder,
@@ -71,7 +70,7 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     refuse_outside(config, shift=(0, dataset.frame_size - 1))
     decisions = TASKS.named(card.task).decisions
     refuse_number("eval_length", config.eval_length, 1, max(decisions, FinetuneConfig.eval_length))
-    config = as_trained(config, card.method, card.end_to_end, encoder.gru is not None, decisions)
+    config = as_trained(config, card.method, card.end_to_end, encoder.memory is not None, decisions)
     if isinstance(config.memory, HistoryOptions):
         encoder.config = replace(encoder.config, **config.memory.encoder_changes)
     if encoder.reads_state:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from dataclasses import asdict
 from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from pretrain.config import MemoryOptions, TrainingConfig
+from pretrain.config import TrainingConfig, history_of
 from pretrain.objectives import METHODS, Method
 from pretrain.objectives.untrained import StateOptions
 from vd4rl_pomdp.core.errors import UserError
@@ -18,6 +19,7 @@ from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.nn.action_target import ActionTarget, make_action_target
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.frame import STATE, encoder_settings
+from vd4rl_pomdp.nn.memory import MemoryOptions
 from vd4rl_pomdp.nn.objective import ActionOptions, Objective
 
 
@@ -112,14 +114,15 @@ def _noise(options: Options, states: StateScale) -> dict[str, Any]:
 
 def _memory(config: TrainingConfig, method: Method) -> dict[str, Any]:
     """What an encoder's config says of its memory."""
-    memory = config.memory
-    if not isinstance(memory, MemoryOptions):
+    if not isinstance(config.memory, MemoryOptions):
         return {}
-    past = method.past if memory.m is None else memory.m
+    told = asdict(config.memory)
+    hidden, m = told.pop("hidden_dim"), told.pop("m")
+    past = method.past if m is None else m
     return {
-        "history": "gru",
+        "history": history_of(config.method, method, getattr(config, "history", "method")),
         "use_actions": method.use_actions,
-        "hidden_dim": memory.hidden_dim,
-        "gru_layers": memory.gru_layers,
+        "hidden_dim": hidden,
         "history_window": 0 if past is None else past + 1,
+        "memory_options": told,
     }

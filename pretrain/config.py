@@ -5,32 +5,18 @@ from __future__ import annotations
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal
+from typing import Annotated, Any, ClassVar
 
 import tyro
 
 from pretrain.objectives import METHODS, Method
-from vd4rl_pomdp.core.errors import MAX_SEED, UserError, flag_of, refuse_outside, refuse_unknown
-from vd4rl_pomdp.core.options import NO_OPTIONS, Limits, Options, StageConfig
+from vd4rl_pomdp.core.errors import MAX_SEED, OR_ONES_OWN, UserError, flag_of, refuse_outside, refuse_unknown
+from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
 from vd4rl_pomdp.corruptions import NO_CORRUPTION, CorruptionConfig
-from vd4rl_pomdp.nn.encoder import MAX_LAYERS
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS
+from vd4rl_pomdp.nn.memory import MEMORIES
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
-
-
-@dataclass(frozen=True)
-class MemoryOptions(Options):
-    """Options of encoders with a memory."""
-
-    hidden_dim: int = 256
-    """Units of each GRU layer."""
-    gru_layers: int = 1
-    """Layers of the GRU."""
-    m: int | None = None
-    """Rows before t that a state is computed from; None: what the method has (fj and fj+a 8, the others all)."""
-
-    limits: ClassVar[Limits] = {"hidden_dim": 1, "gru_layers": (1, MAX_LAYERS), "m": 0}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -94,8 +80,8 @@ class PretrainConfig(TrainingConfig):
     """The set's task, where neither its shards nor its folder's name tell."""
     shift: int = 4
     """Random shift in pixels; whether observations or windows share one is the method's choice."""
-    history: Literal["method", "gru"] = "method"
-    """Memory of the encoder: what the method has, or a GRU over the past also for methods that have none."""
+    history: str = "method"
+    """Memory of the encoder: method for the method's own (mostly gru, or none), or a memory's name, such as gru."""
     corruption: CorruptionConfig = NO_CORRUPTION
     """What makes the observations partial."""
 
@@ -123,10 +109,9 @@ class PretrainConfig(TrainingConfig):
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
         """Options of method, memory, frame encoder and corruption."""
         method = METHODS.named(values["method"])
-        recurrent = history_of(values["method"], method, values["history"]) == "gru"
         return {
             "options": method.options.fill(values),
-            "memory": (MemoryOptions if recurrent else Options).fill(values),
+            "memory": memory_options(history_of(values["method"], method, values["history"]), values),
             "frame": frame_options(method, values),
             "corruption": CorruptionConfig.fill(values),
         }
@@ -143,13 +128,20 @@ class PretrainConfig(TrainingConfig):
 
 
 def history_of(name: str, method: Method, history: str) -> str:
-    """Memory of a method's encoder, gru or none; one that it cannot have raises UserError."""
-    refuse_unknown("--history", history, ("method", "gru"))
+    """Name of the memory of a method's encoder, or none; one that it cannot have raises UserError."""
     if history == "method":
         return method.history
     if method.end_to_end or method.reads_state:
         raise UserError(f"{name} has no memory: --history {history} is for pretrained methods")
+    if history not in MEMORIES.broken:
+        refuse_unknown("--history", history, ("method", *MEMORIES), OR_ONES_OWN)
     return history
+
+
+def memory_options(history: str, values: Mapping[str, Any]) -> Options:
+    """Options of the memory called `history`; none for `none`."""
+    kind = Options if history == "none" else MEMORIES.named(history).options
+    return kind.fill(values)
 
 
 def frame_options(method: Method, values: Mapping[str, Any]) -> Options:

@@ -284,7 +284,7 @@ def option_called(name: str, base: type[Options] = Options) -> type[Options]:
         ("corruption", "window", "PretrainConfig"),
         ("corruption", "corruption_mode", "CorruptionConfig"),
         ("corruption", "max_k", "InverseOptions|MaskedActionOptions"),
-        ("frame_encoder", "hidden_dim", "MemoryOptions"),
+        ("frame_encoder", "hidden_dim", "GRUOptions"),
         ("algorithm", "updates", "FinetuneConfig"),
         ("algorithm", "readout", "HistoryOptions"),
     ],

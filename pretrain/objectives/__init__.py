@@ -28,11 +28,11 @@ class Method:
     None; the `StateScale` of the set if it regresses states), its options and the run's seed. An objective's class is
     one."""
     history: str = "none"
-    """Memory of its encoder, gru or none; --history gru gives one to those that have none."""
+    """Name of its encoder's memory, or none; --history chooses another."""
     use_actions: bool = False
-    """Whether the GRU reads past actions; without a memory of its own, under --history gru alone."""
+    """Whether the memory reads past actions; without a memory of its own, under --history alone."""
     past: int | None = None
-    """Rows before t that a GRU's state is computed from unless the user chooses m; None: all."""
+    """Rows before t that a state is computed from unless the user chooses m; None: all."""
     shift: Sharing | Literal["own"] = "window"
     """What shares one random shift: the observations of a window, or the frames of one observation, where what a window
     shares would give the answer away, or where its authors have it so; own: the objective shifts by itself, and what it
@@ -54,8 +54,7 @@ class Method:
 
     def __post_init__(self) -> None:
         """Raise UserError for a word that this class does not know, and for what cannot be together."""
-        for name, words in (("history", ("none", "gru")), ("shift", (*get_args(Sharing), "own"))):
-            refuse_unknown(f"{name} of a Method", getattr(self, name), words)
+        refuse_unknown("shift of a Method", self.shift, (*get_args(Sharing), "own"))
         if self.end_to_end and self.history != "none":
             raise UserError("a Method trained end to end has no memory: leave its history out")
         if _is(self.build, InverseObjective) and not _is(self.options, ActionOptions):

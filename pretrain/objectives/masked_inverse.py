@@ -27,15 +27,15 @@ from dataclasses import dataclass
 from typing import ClassVar, Literal
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import Limits
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.action_target import ActionTarget
 from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.memory import run_backward, run_over_next, run_over_versions
 from vd4rl_pomdp.nn.objective import InverseObjective, InverseOptions
-from vd4rl_pomdp.nn.sequence import run_gru_backward, run_gru_over_next, run_gru_over_versions
 
 
 @dataclass(frozen=True)
@@ -76,7 +76,7 @@ class MaskedInverse(InverseObjective):
                 "leave it out"
             )
         inputs = shape.feature_dim + (shape.action_dim + 1 if self.use_actions else 0)
-        self.backward_gru = nn.GRU(inputs, shape.hidden_dim, shape.gru_layers, batch_first=True)
+        self.backward_memory = encoder.make_memory(inputs)
 
     def representations(self, window: Windows) -> tuple[Tensor, Tensor]:
         """Forward states (B, T, D) and backward states (B, T, D)."""
@@ -86,10 +86,10 @@ class MaskedInverse(InverseObjective):
         if self.newest:
             blanked = [self._future_rows(self.encoder.frame(obs), window) for obs in self._blanked(window.obs)]
             span = None if self.n is None else self.n + 1
-            return past, run_gru_over_versions(self.backward_gru, [*blanked, rows], window.length, span)
+            return past, run_over_versions(self.backward_memory, [*blanked, rows], window.length, span)
         if self.n is None:
-            return past, run_gru_backward(self.backward_gru, rows, window.length)
-        return past, run_gru_over_next(self.backward_gru, rows, window.length, self.n + 1)
+            return past, run_backward(self.backward_memory, rows, window.length)
+        return past, run_over_next(self.backward_memory, rows, window.length, self.n + 1)
 
     def _blanked(self, obs: Tensor) -> list[Tensor]:
         """Observations as a future's first row, its second, ...: without the frames of before the first."""

@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.reading import build, parse_json, read_tensors, regular
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.nn.encoder_folder import EncoderCard
+from vd4rl_pomdp.nn.encoder import EncoderCard
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.metrics import read_metrics
 

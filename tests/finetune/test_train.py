@@ -22,7 +22,7 @@ from vd4rl_pomdp.core import registry
 from vd4rl_pomdp.core.errors import InUseError, UserError
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
-from vd4rl_pomdp.nn import encoder_folder, load_encoder
+from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.runs import memory
 from vd4rl_pomdp.runs.metrics import read_metrics
 
@@ -101,8 +101,7 @@ def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_th
 
 def test_code_that_has_changed_since_is_told(data, tmp_path, monkeypatch, capsys):
     code = {"frame_encoder tiny": "tiny.py 1"}
-    for module in (registry, encoder_folder):
-        monkeypatch.setattr(module, "sources", lambda settings: code)
+    monkeypatch.setattr(registry, "sources", lambda settings: code)
     encoder = run_pretrain(smoke_pretrain(data, tmp_path / "made", method="random")).path / "encoder"
     brief = {"updates": 2, "batch_size": 4, "eval_length": 2}
     run = run_finetune(smoke_finetune(encoder, data, tmp_path / "alike", **brief)).path

@@ -7,15 +7,16 @@ from safetensors.torch import save_file
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.types import Windows
-from vd4rl_pomdp.nn import Encoder, EncoderCard, EncoderConfig, load_encoder, save_encoder, sequence
-from vd4rl_pomdp.nn.sequence import run_gru_backward, run_gru_over_next, run_gru_over_versions
+from vd4rl_pomdp.nn import Encoder, EncoderCard, EncoderConfig, load_encoder, save_encoder
+from vd4rl_pomdp.nn.memory import GRU, GRUOptions, run_backward, run_memory, run_over_next, run_over_versions
 
 CARD = EncoderCard("mik+a", "walker_walk", "expert", {"corruption": "none"}, 0, 10, "smoke")
 
 
 def make(history: str, use_actions: bool, span: int = 0, layers: int = 1) -> Encoder:
     torch.manual_seed(0)
-    config = EncoderConfig(2, "nature", 16, history, use_actions, hidden_dim=12, gru_layers=layers, history_window=span)
+    told = {} if history == "none" else {"gru_layers": layers}
+    config = EncoderConfig(2, "nature", 16, history, use_actions, 12, span, memory_options=told)
     return Encoder(config).eval()
 
 
@@ -49,7 +50,7 @@ def test_streaming_and_batch_encodings_agree(history: str, use_actions: bool, sp
 @pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"history": "GRU"}, "unknown history 'GRU': choose one of none, gru"),
+        ({"history": "GRU"}, "unknown memory 'GRU': choose one of gru"),
         ({"readout": "state+frame"}, r"unknown readout 'state\+frame': choose one of state, frame, frame\+state"),
     ],
 )
@@ -95,11 +96,11 @@ def test_a_history_window_forgets_what_is_before_it_and_only_that():
 
 def test_the_backward_gru_starts_at_each_windows_last_real_row():
     torch.manual_seed(0)
-    gru = torch.nn.GRU(3, 4, batch_first=True)
+    gru = GRU(3, GRUOptions(hidden_dim=4))
     x, length = torch.randn(2, 6, 3), torch.tensor([6, 4])
-    out = run_gru_backward(gru, x, length)
+    out = run_backward(gru, x, length)
     for b in range(2):
-        alone, _ = gru(x[b : b + 1, : length[b]].flip(1))
+        alone, _ = run_memory(gru, x[b : b + 1, : length[b]].flip(1))
         torch.testing.assert_close(out[b, : length[b]], alone[0].flip(0))
 
 
@@ -108,14 +109,14 @@ def test_the_backward_gru_starts_at_each_windows_last_real_row():
 @pytest.mark.parametrize("number", [1, 3])
 def test_a_state_reads_its_own_version_of_each_row(number: int, layers: int, span: int | None):
     torch.manual_seed(0)
-    gru = torch.nn.GRU(3, 4, layers, batch_first=True)
+    gru = GRU(3, GRUOptions(hidden_dim=4, gru_layers=layers))
     versions, length = torch.randn(number, 2, 6, 3), torch.tensor([6, 4])
-    out = run_gru_over_versions(gru, list(versions), length, span)
+    out = run_over_versions(gru, list(versions), length, span)
     for b in range(2):
         for j in range(length[b]):
             read = range(j, min(length[b], j + (span or 99)))
             rows = torch.stack([versions[min(row - j, number - 1), b, row] for row in read])
-            torch.testing.assert_close(out[b, j], gru(rows.flip(0)[None])[0][0, -1])
+            torch.testing.assert_close(out[b, j], run_memory(gru, rows.flip(0)[None])[0][0, -1])
 
 
 def test_an_encoder_folder_gives_back_the_same_encoder(tmp_path):
@@ -145,15 +146,17 @@ def test_an_encoder_of_a_corruption_whose_file_was_not_run_says_so(tmp_path):
 
 def test_an_option_that_its_part_has_lost_is_no_default(tmp_path):
     encoder = Encoder(EncoderConfig(action_dim=6))
-    save_encoder(tmp_path, encoder, replace(CARD, corruption={"corruption": "none", "patch_size": 8}))
-    assert load_encoder(tmp_path)[1].corruption["patch_size"] == 8, "early versions told of what nothing read"
     save_encoder(tmp_path, encoder, replace(CARD, corruption={"corruption": "patch", "patch_height": 8}))
-    with pytest.raises(UserError, match="corruption patch has no option 'patch_height' by now"):
+    with pytest.raises(UserError, match="--patch-height is not read by the corruption patch"):
         load_encoder(tmp_path)
-    encoder.config = replace(encoder.config, frame_options={"depth": 3})
-    save_encoder(tmp_path, encoder, CARD)
-    with pytest.raises(UserError, match="frame encoder 'drq' has no option 'depth' by now"):
-        load_encoder(tmp_path)
+    for changes, told in (
+        ({"frame_options": {"depth": 3}}, "frame encoder 'drq' has no option 'depth'"),
+        ({"history": "gru", "memory_options": {"depth": 3}}, "memory 'gru' has no option 'depth'"),
+    ):
+        encoder.config = EncoderConfig(action_dim=6, **changes)
+        save_encoder(tmp_path, encoder, CARD)
+        with pytest.raises(UserError, match=told):
+            load_encoder(tmp_path)
 
 
 def test_weights_of_another_network_say_which_numbers_are_missing(tmp_path):
@@ -206,10 +209,9 @@ def test_an_encoder_card_of_nonsense_is_one_line(tmp_path, part, field, value):
         load_encoder(tmp_path)
 
 
-def test_a_span_beyond_the_window_costs_no_more_than_the_window(monkeypatch):
-    gru, x, length = torch.nn.GRU(3, 4, batch_first=True), torch.rand(2, 7, 3), torch.tensor([7, 5])
-    whole = run_gru_over_next(gru, x, length, 7)
-    read, run = [], sequence.run_gru
-    monkeypatch.setattr(sequence, "run_gru", lambda gru, x: (read.append(x.shape[1]), run(gru, x))[1])
-    assert torch.equal(run_gru_over_next(gru, x, length, 10**9), whole)
+def test_a_span_beyond_the_window_costs_no_more_than_the_window():
+    gru, x, length = GRU(3, GRUOptions(hidden_dim=4)), torch.rand(2, 7, 3), torch.tensor([7, 5])
+    whole, read = run_over_next(gru, x, length, 7), []
+    gru.register_forward_hook(lambda module, given, out: read.append(given[0].shape[1]))
+    assert torch.equal(run_over_next(gru, x, length, 10**9), whole)
     assert read == [7]

@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from tests.conformance.test_methods import ROWS, batch, build
+from vd4rl_pomdp.nn.memory import run_memory
 
 
 def assert_same_logits(first: torch.nn.Module, second: torch.nn.Module) -> None:
@@ -39,7 +40,7 @@ def test_mik_with_a_future_of_one_row_sees_that_row_alone():
     objective, window = build("mik", n=0), batch()
     future = objective.representations(window)[1]
     features = objective.encoder.frame(window.obs)
-    alone = torch.stack([objective.backward_gru(features[:, j : j + 1])[0][:, 0] for j in range(4)], 1)
+    alone = torch.stack([run_memory(objective.backward_memory, features[:, j : j + 1])[0][:, 0] for j in range(4)], 1)
     torch.testing.assert_close(future[:, :4], alone, atol=1e-6, rtol=1e-6)
 
 

@@ -15,8 +15,8 @@ from tests.runs.test_checkpoint import killed_at
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.format import read_rows
-from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
-from vd4rl_pomdp.nn.encoder_folder import EncoderCard, load_encoder, save_encoder
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig
+from vd4rl_pomdp.nn.encoder_folder import load_encoder, save_encoder
 from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.runs import ownership
 from vd4rl_pomdp.runs import run as module

@@ -14,7 +14,7 @@ from vd4rl_pomdp.core.registry import REGISTRIES, Registry
 
 @dataclass(frozen=True)
 class ListCommand:
-    """List methods, corruptions, algorithms, frame encoders and tasks, one line each."""
+    """List methods, corruptions, algorithms, frame encoders, memories and tasks, one line each."""
 
 
 def _list(words: Arguments, program: str) -> None:
@@ -45,4 +45,4 @@ def summary_of(part: Any) -> str:
     return text.strip().partition("\n")[0].removesuffix(".")
 
 
-LIST = Command("methods, corruptions, algorithms, frame encoders and tasks, one line each", _list)
+LIST = Command("methods, corruptions, algorithms, frame encoders, memories and tasks, one line each", _list)

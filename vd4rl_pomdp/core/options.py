@@ -274,7 +274,7 @@ def _reader(choosers: Iterable[str], name: str, values: Mapping[str, Any]) -> st
     for setting in choosers:
         parts: Mapping[str, Any] = REGISTRIES.get(setting, {})
         readers = [key for key, part in parts.items() if name in flat(getattr(part, "options", part).fill({}))]
-        if readers and values[setting] not in readers:
+        if readers and values[setting] not in (*readers, "method"):
             return f"the {REGISTRIES[setting].kind} {values[setting]}"
     chosen = (f"{setting.replace('_', ' ')} {values[setting]}" for setting in choosers if setting in values)
     return f"what is chosen ({', '.join(chosen)})"

@@ -35,6 +35,8 @@ class Registry(Mapping[str, Part], Generic[Part]):
         fits: Callable[[Any], bool],
         expected: str,
         refuse: Callable[[str, Any], None] = lambda name, part: None,
+        setting: str = "",
+        group: str = "",
     ) -> None:
         """See the class.
 
@@ -45,9 +47,11 @@ class Registry(Mapping[str, Part], Generic[Part]):
             fits: whether an object is a part of this kind.
             expected: what such an object is, for messages.
             refuse: raises UserError, without naming the part, for a name or an object of this kind that cannot work.
+            setting: the setting that names a part, if it is not called as the kind.
+            group: the group of entry points, if the kind's plural is another.
         """
-        self.kind, self.setting = kind, kind.replace(" ", "_")
-        self.group = f"vd4rl_pomdp.{self.setting}s"
+        self.kind, self.setting = kind, setting or kind.replace(" ", "_")
+        self.group = group or f"vd4rl_pomdp.{self.setting}s"
         self.broken: dict[str, str] = {}
         """Offered parts that cannot be loaded, and why."""
         self._parts = dict(own)

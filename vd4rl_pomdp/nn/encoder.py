@@ -1,4 +1,4 @@
-"""The representation that is kept: a frame encoder and, for sequence methods, a forward GRU over the past.
+"""The representation that is kept: a frame encoder and, for sequence methods, a memory of the past.
 
 `encode` (whole windows) and `step` (one row at a time, as the environment delivers them) agree to float tolerance.
 """
@@ -11,16 +11,12 @@ from typing import Any, Literal, NamedTuple, get_args
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.core.errors import UserError, refuse_unknown
+from vd4rl_pomdp.core.errors import UserError, first_line, refuse_unknown
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, STATE, FrameEncoder, StateFrame, make_frame_encoder
-from vd4rl_pomdp.nn.sequence import run_gru
+from vd4rl_pomdp.nn.memory import Memory, make_memory, run_memory
 
-MAX_LAYERS = 64
-"""Most layers of a GRU."""
-_TOO_SMALL = ("Kernel size can't be greater", "Output size is too small")
-"""What torch says of convolutions and poolings whose input is smaller than their kernel."""
 Readout = Literal["state", "frame", "frame+state"]
 """What of an encoder with a memory its representation is: s_t, e(o_t), or both one after the other."""
 
@@ -33,11 +29,10 @@ class EncoderConfig:
     frame_encoder: str = "drq"
     feature_dim: int = 256
     history: str = "none"
-    """gru: s_t is the state of a GRU over rows 0..t; none: s_t = e(o_t)."""
+    """Name of the memory that makes s_t of rows 0..t; none: s_t = e(o_t)."""
     use_actions: bool = False
-    """Whether the GRU also reads a_{t-1} in row t."""
+    """Whether the memory also reads a_{t-1} in row t."""
     hidden_dim: int = 256
-    gru_layers: int = 1
     history_window: int = 0
     """Rows the state is computed from, 0 for all since the episode's start."""
     readout: Readout = "state"
@@ -48,15 +43,76 @@ class EncoderConfig:
     """Height and width of an observation."""
     frame_options: dict[str, Any] = field(default_factory=dict)
     """What else the frame encoder was told, by name."""
+    memory_options: dict[str, Any] = field(default_factory=dict)
+    """What else the memory was told, by name."""
+
+
+@dataclass(frozen=True)
+class EncoderCard:
+    """Where an encoder comes from."""
+
+    method: str
+    task: str
+    quality: str
+    corruption: dict[str, Any]
+    """The corruption it was pretrained under, as the settings of CorruptionConfig."""
+    seed: int
+    steps: int
+    preset: str
+    end_to_end: str = ""
+    """Fine-tuning algorithm that trains the encoder, too; empty for a frozen encoder."""
+    action_loss: float | None = None
+    """For methods that predict actions: the mean of the last tenth of the pretraining's rows of metrics.
+
+    Each row is the mean over the steps since the row before; all count the same, also where they are of fewer steps.
+    """
+    data: str = ""
+    """Fingerprint of the set it was pretrained on."""
+    settings: dict[str, Any] = field(default_factory=dict)
+    """The pretraining's settings without seed, folders, device and logging; empty if they were not recorded."""
+
+
+@dataclass(frozen=True)
+class EncoderRecord:
+    """An encoder folder's config.json: what the encoder is and where it comes from.
+
+    `encoder` and `pretrain` name it, with its weights; the same encoder may have other values of all else.
+    """
+
+    encoder: EncoderConfig
+    pretrain: EncoderCard
+    version: str
+    """Version and commit of this package that wrote it."""
+    commit: str
+    frames: int | None = None
+    """Frames that the pretraining's batches held; None: not recorded."""
+    probe: dict[str, float] = field(default_factory=dict)
+    """Errors of linear probes, as `vd4rl_pomdp.nn.probes.probe_state` gives them; empty if none was fitted."""
+    plugins: dict[str, str] = field(default_factory=dict)
+    """Where parts come from that are not this package's, as `registry.origins` tells."""
+    sources: dict[str, str] = field(default_factory=dict)
+    """Their files, as `registry.sources` tells."""
+
+    @property
+    def parts(self) -> dict[str, str]:
+        """Names of the parts that made it, by the registries' `setting`."""
+        card = self.pretrain
+        named = {"method": card.method, "task": card.task, "corruption": card.corruption["corruption"]}
+        return named | {"frame_encoder": self.encoder.frame_encoder, "history": self.encoder.history}
+
+    @property
+    def code(self) -> dict[str, dict[str, str]]:
+        """What it says of their code, as `registry.code_of` does."""
+        return {"plugins": self.plugins, "sources": self.sources}
 
 
 class StreamState(NamedTuple):
     """What an encoder remembers between rows."""
 
     hidden: Tensor
-    """(layers, B, H); empty for memoryless encoders, and not read under a history window."""
+    """(L, B, W); empty for memoryless encoders, and not read under a history window."""
     rows: Tensor
-    """(B, L', F + A): the GRU's last inputs under a history window, else empty."""
+    """(B, L', F + A): the memory's last inputs under a history window, else empty."""
 
 
 def build_frame_encoder(config: EncoderConfig) -> FrameEncoder:
@@ -64,15 +120,13 @@ def build_frame_encoder(config: EncoderConfig) -> FrameEncoder:
     told = {"feature_dim": config.feature_dim} | config.frame_options
     options = FRAME_ENCODERS.named(config.frame_encoder).options.fill(told)
     if unknown := told.keys() - asdict(options).keys():
-        raise UserError(f"frame encoder {config.frame_encoder!r} has no option {min(unknown)!r} by now")
+        raise UserError(f"frame encoder {config.frame_encoder!r} has no option {min(unknown)!r}")
     try:
         return make_frame_encoder(config.frame_encoder, config.channels, config.size, options)
     except RuntimeError as error:
-        if not any(said in str(error) for said in _TOO_SMALL):
-            raise
         raise UserError(
-            f"frame encoder {config.frame_encoder!r} cannot read pictures of {config.size}x{config.size} pixels: "
-            "choose another --frame-encoder, or a set of larger frames"
+            f"frame encoder {config.frame_encoder!r} cannot read pictures of {config.size}x{config.size} pixels "
+            f"({first_line(error)}): choose another --frame-encoder, or a set of larger frames"
         ) from error
 
 
@@ -82,28 +136,43 @@ class Encoder(nn.Module):
     def __init__(self, config: EncoderConfig) -> None:
         super().__init__()
         self.config = config
-        for name, choices in (("history", ("none", "gru")), ("readout", get_args(Readout))):
-            refuse_unknown(name, getattr(config, name), choices)
+        refuse_unknown("readout", config.readout, get_args(Readout))
         if config.frame_encoder == STATE:
             config = self.config = replace(config, feature_dim=config.channels)
             self.frame: FrameEncoder | StateFrame = StateFrame(config.channels, **config.frame_options)
         else:
             self.frame = build_frame_encoder(config)
-        inputs = config.feature_dim + (config.action_dim if config.use_actions else 0)
-        self.gru = (
-            nn.GRU(inputs, config.hidden_dim, config.gru_layers, batch_first=True) if config.history == "gru" else None
-        )
+        if config.history == "none":
+            return
+        if hasattr(self, config.history):
+            raise UserError(f"memory {config.history!r}: an encoder has something of this name: choose another")
+        self.add_module(config.history, self.make_memory(self._row_width))
+
+    @property
+    def memory(self) -> Memory | None:
+        """What makes s_t of the rows up to t; its weights are called after it."""
+        return None if self.config.history == "none" else getattr(self, self.config.history)
+
+    @property
+    def _row_width(self) -> int:
+        """Width of what the memory reads at a row."""
+        return self.config.feature_dim + (self.config.action_dim if self.config.use_actions else 0)
+
+    def make_memory(self, inputs: int) -> Memory:
+        """Another memory of the encoder's kind and options for rows of width `inputs`, such as one of the future."""
+        told = {"hidden_dim": self.config.hidden_dim} | self.config.memory_options
+        return make_memory(self.config.history, inputs, told)
 
     @property
     def dim(self) -> int:
         """Width of the representation."""
         widths = {"frame": self.config.feature_dim, "state": self.config.hidden_dim}
-        return sum(widths[part] for part in self.config.readout.split("+")) if self.gru else widths["frame"]
+        return sum(widths[part] for part in self.config.readout.split("+")) if self.memory else widths["frame"]
 
     @property
     def remembers(self) -> bool:
         """Whether the representation depends on rows before."""
-        return self.gru is not None and self.config.readout != "frame"
+        return self.memory is not None and self.config.readout != "frame"
 
     @property
     def reads_state(self) -> bool:
@@ -124,15 +193,15 @@ class Encoder(nn.Module):
         """Representations from (B, T, F) frame features and (B, T, A) previous actions."""
         if not self.remembers:
             return features
-        return self._read(features, self._states(self._gru_rows(features, prev_action)))
+        return self._read(features, self._states(self._rows(features, prev_action)))
 
     def initial_state(self, batch: int) -> StreamState:
         """State before an episode's first row."""
         weight = next(self.parameters())
         hidden, rows = weight.new_zeros(0), weight.new_zeros(0)
-        if self.gru is not None:
-            hidden = weight.new_zeros(self.config.gru_layers, batch, self.config.hidden_dim)
-            rows = weight.new_zeros(batch, 0, self.gru.input_size)
+        if self.memory is not None:
+            hidden = self.memory.initial_state(batch)
+            rows = weight.new_zeros(batch, 0, self._row_width)
         return StreamState(hidden, rows)
 
     def step(self, obs: Tensor, prev_action: Tensor, state: StreamState) -> tuple[Tensor, StreamState]:
@@ -153,14 +222,14 @@ class Encoder(nn.Module):
         features = self.frame(obs)
         if not self.remembers:
             return features, state
-        assert self.gru is not None
-        row = self._gru_rows(features[:, None], prev_action[:, None])
+        assert self.memory is not None
+        row = self._rows(features[:, None], prev_action[:, None])
         span = self.config.history_window
         if span == 0:
-            out, hidden = run_gru(self.gru, row, state.hidden)
+            out, hidden = run_memory(self.memory, row, state.hidden)
             return self._read(features, out[:, 0]), state._replace(hidden=hidden)
         rows = torch.cat([state.rows, row], dim=1)[:, -span:]
-        newest = run_gru(self.gru, self._forget_first_action(rows))[0][:, -1]
+        newest = run_memory(self.memory, self._forget_first_action(rows))[0][:, -1]
         return self._read(features, newest), state._replace(rows=rows)
 
     def _refuse_other(self, obs: Tensor) -> None:
@@ -177,21 +246,21 @@ class Encoder(nn.Module):
         return torch.cat([features, states], dim=-1) if self.config.readout == "frame+state" else states
 
     def _states(self, rows: Tensor) -> Tensor:
-        """s_t (B, T, H) of the GRU's (B, T, I) inputs."""
-        assert self.gru is not None
+        """s_t (B, T, H) of the memory's (B, T, I) inputs."""
+        assert self.memory is not None
         span = self.config.history_window
         if span == 0 or rows.shape[1] <= span:
-            return run_gru(self.gru, rows)[0]
-        return torch.cat([run_gru(self.gru, rows[:, :span])[0], self._over_last_rows(rows, span)], dim=1)
+            return run_memory(self.memory, rows)[0]
+        return torch.cat([run_memory(self.memory, rows[:, :span])[0], self._over_last_rows(rows, span)], dim=1)
 
-    def _gru_rows(self, features: Tensor, prev_action: Tensor) -> Tensor:
+    def _rows(self, features: Tensor, prev_action: Tensor) -> Tensor:
         return torch.cat([features, prev_action.to(features)], dim=-1) if self.config.use_actions else features
 
     def _over_last_rows(self, rows: Tensor, span: int) -> Tensor:
         """States of rows span.. of (B, T, I), each computed anew from the last `span` rows: (B, T - span, H)."""
-        assert self.gru is not None
+        assert self.memory is not None
         recent = rows.unfold(1, span, 1)[:, 1:].transpose(2, 3)
-        states, _ = run_gru(self.gru, self._forget_first_action(recent.flatten(0, 1)))
+        states, _ = run_memory(self.memory, self._forget_first_action(recent.flatten(0, 1)))
         return states[:, -1].view(*recent.shape[:2], -1)
 
     def _forget_first_action(self, rows: Tensor) -> Tensor:

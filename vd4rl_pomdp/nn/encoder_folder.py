@@ -17,15 +17,14 @@ from torch.random import fork_rng
 
 from vd4rl_pomdp import __version__
 from vd4rl_pomdp.core.errors import UserError, disk_errors, first_line, in_one_line
-from vd4rl_pomdp.core.options import flat, option_names
 from vd4rl_pomdp.core.reading import build, parse_json, read_bytes, read_tensors
-from vd4rl_pomdp.core.registry import origins, sources
+from vd4rl_pomdp.core.registry import code_of
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
-from vd4rl_pomdp.nn.encoder_card import EncoderCard, EncoderOrigin, EncoderRecord
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig, EncoderRecord
 from vd4rl_pomdp.nn.frame import STATE
 from vd4rl_pomdp.nn.model_card import CARD, model_card
-from vd4rl_pomdp.runs.files import json_text, write_bytes, write_json
+from vd4rl_pomdp.runs.files import write_bytes, write_json
+from vd4rl_pomdp.runs.identity import content_hash
 from vd4rl_pomdp.runs.provenance import git_commit
 
 WEIGHTS, CONFIG = "model.safetensors", "config.json"
@@ -43,21 +42,15 @@ def save_encoder(folder: Path | str, encoder: Encoder, card: EncoderCard, frames
         frames: how many frames the batches of its pretraining held, if that is known.
     """
     weights = {name: value.cpu().contiguous().clone() for name, value in encoder.state_dict().items()}
-    record = EncoderRecord(encoder.config, card)
-    parts = record.parts
-    origin = EncoderOrigin(__version__, git_commit(), frames, plugins=origins(parts), sources=sources(parts))
-    _write(Path(folder), save(weights), replace(record, origin=origin))
+    record = EncoderRecord(encoder.config, card, __version__, git_commit(), frames)
+    _write(Path(folder), replace(record, **code_of(record.parts)), save(weights))
 
 
-def _write(folder: Path, weights: bytes, record: EncoderRecord) -> None:
+def _write(folder: Path, record: EncoderRecord, weights: bytes) -> None:
     """Write all files, config.json last: without it the folder is no encoder folder."""
     with disk_errors(folder):
         folder.mkdir(parents=True, exist_ok=True)
     write_bytes(folder / WEIGHTS, weights)
-    _write_record(folder, record)
-
-
-def _write_record(folder: Path, record: EncoderRecord) -> None:
     write_bytes(folder / CARD, model_card(record).encode())
     write_json(folder / CONFIG, asdict(record))
 
@@ -71,32 +64,18 @@ def copy_encoder(source: Path, target: Path, changes: Mapping[str, Any]) -> None
         changes: fields of the copy's `EncoderConfig` by name.
     """
     record = read_record(source)
-    _write(target, read_bytes(source / WEIGHTS), replace(record, encoder=replace(record.encoder, **changes)))
+    _write(target, replace(record, encoder=replace(record.encoder, **changes)), read_bytes(source / WEIGHTS))
 
 
 def tell_probe(folder: Path, errors: Mapping[str, float]) -> None:
-    """Add the errors of linear probes, as `EncoderOrigin.probe` has them, to what an encoder folder says of itself."""
-    record = read_record(folder)
-    _write_record(folder, replace(record, origin=replace(record.origin, probe=dict(errors))))
+    """Add the errors of linear probes, as `EncoderRecord.probe` has them, to what an encoder folder says of itself."""
+    _write(folder, replace(read_record(folder), probe=dict(errors)), read_bytes(folder / WEIGHTS))
 
 
 def encoder_hash(folder: Path) -> str:
-    """Name of an encoder: equal for equal weights and configs, wherever they lie and whenever they were written."""
-    digest = hashlib.blake2b(digest_size=12)
-    for content in (read_bytes(folder / WEIGHTS), _without_origin(read_bytes(folder / CONFIG))):
-        digest.update(hashlib.blake2b(content).digest())
-    return digest.hexdigest()
-
-
-def _without_origin(config: bytes) -> bytes:
-    """A config.json as it is without its origin; one of an earlier version, or a damaged one, as it is."""
-    try:
-        told = parse_json(config)
-    except ValueError:
-        return config
-    if not isinstance(told, dict) or "origin" not in told:
-        return config
-    return json_text({name: value for name, value in told.items() if name != "origin"}).encode()
+    """Name of an encoder: equal for equal weights, network and pretraining, wherever it lies and whoever wrote it."""
+    record, weights = read_record(folder), hashlib.blake2b(read_bytes(folder / WEIGHTS))
+    return content_hash([weights.hexdigest(), asdict(record.encoder), asdict(record.pretrain)])
 
 
 def load_encoder(
@@ -134,7 +113,7 @@ def load_encoder(
     try:
         with fork_rng(devices=[]):  # weights that are drawn here are read over
             encoder = Encoder(encoder_config)
-        _check_corruption(card)
+        CorruptionConfig.of(**card.corruption).check()
     except (KeyError, TypeError, RuntimeError, ValueError) as error:
         raise UserError(
             f"{folder}/config.json: names no encoder ({first_line(error)}); mend that, or pretrain it again"
@@ -152,17 +131,6 @@ def load_encoder(
     return encoder.eval().requires_grad_(False), card
 
 
-def _check_corruption(card: EncoderCard) -> None:
-    """Raise KeyError, TypeError or ValueError unless a card names a corruption, and options that some part has."""
-    config = CorruptionConfig.fill({"corruption": card.corruption["corruption"], **card.corruption})
-    if unknown := card.corruption.keys() - flat(config).keys() - option_names():  # early ones tell of unused ones, too
-        raise TypeError(f"corruption {config.corruption} has no option {min(unknown)!r} by now")
-    build(CorruptionConfig, {"corruption": config.corruption, "corruption_mode": config.corruption_mode})
-    for stage in config.stages:
-        build(type(stage), asdict(stage))
-    config.check()
-
-
 def read_record(folder: Path) -> EncoderRecord:
     """An encoder folder's config.json; raises UserError if there is none, a damaged one, or a pickle in its place."""
     with disk_errors(folder):
@@ -171,8 +139,8 @@ def read_record(folder: Path) -> EncoderRecord:
         raise UserError(f"{folder}: {pickles[0]} is a pickle, which can run code; only {WEIGHTS} is read")
     try:
         config = parse_json(read_bytes(folder / CONFIG))
-        origin = build(EncoderOrigin, config.get("origin", {}))
-        return EncoderRecord(build(EncoderConfig, config["encoder"]), build(EncoderCard, config["pretrain"]), origin)
+        parts = {"encoder": build(EncoderConfig, config["encoder"]), "pretrain": build(EncoderCard, config["pretrain"])}
+        return build(EncoderRecord, config | parts)
     except UserError:
         raise
     except (FileNotFoundError, ValueError, KeyError, TypeError, AttributeError) as error:

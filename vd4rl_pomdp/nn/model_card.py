@@ -7,7 +7,7 @@ from collections.abc import Iterator
 from dataclasses import asdict
 
 from vd4rl_pomdp.core.text import code, code_block, one_line
-from vd4rl_pomdp.nn.encoder_card import EncoderRecord
+from vd4rl_pomdp.nn.encoder import EncoderRecord
 
 CARD = "README.md"
 LICENSE = "mit"
@@ -61,7 +61,7 @@ def _front_matter(tags: list[str], license: str) -> list[str]:
 
 
 def _facts(record: EncoderRecord) -> Iterator[tuple[str, str]]:
-    card, shape, origin = record.pretrain, record.encoder, record.origin
+    card, shape = record.pretrain, record.encoder
     yield "method", code(card.method)
     yield "task, quality", f"{code(card.task)}, {code(card.quality)}"
     yield "data", f"fingerprint {code(card.data)}" if card.data else "not recorded"
@@ -69,16 +69,15 @@ def _facts(record: EncoderRecord) -> Iterator[tuple[str, str]]:
     yield "budget", _budget(record)
     yield "seed", str(card.seed)
     yield "encoder", f"{code(shape.frame_encoder)}, {shape.feature_dim} features, memory: {code(shape.history)}"
-    yield "linear probe", _probe(origin.probe)
+    yield "linear probe", _probe(record.probe)
     yield (
         "made by",
-        f"vd4rl-pomdp {one_line(origin.version) or 'of an unrecorded version'}"
-        + (f", commit {code(origin.commit)}" if origin.commit else ""),
+        f"vd4rl-pomdp {one_line(record.version)}" + (f", commit {code(record.commit)}" if record.commit else ""),
     )
 
 
 def _budget(record: EncoderRecord) -> str:
-    card, frames = record.pretrain, record.origin.frames
+    card, frames = record.pretrain, record.frames
     if card.end_to_end:
         return f"no pretraining: {code(card.end_to_end)} trains it with the policy"
     if frames == 0:

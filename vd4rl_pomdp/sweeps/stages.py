@@ -149,6 +149,6 @@ def _as_trained(cell: GridCell, config: Any) -> Any:
 
     before = config_of(cell, "pretrain")
     method = METHODS.named(before.method)
-    remembers = history_of(before.method, method, before.history) == "gru"
+    remembers = history_of(before.method, method, before.history) != "none"
     decisions = TASKS.named(cell.value("task")).decisions
     return as_trained(config, before.method, method.end_to_end, remembers, decisions)

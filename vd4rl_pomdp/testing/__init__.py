@@ -12,7 +12,8 @@ promise is broken, and by what. An unknown name or option raises UserError.
 from vd4rl_pomdp.testing.algorithms import check_algorithm
 from vd4rl_pomdp.testing.corruptions import check_corruption
 from vd4rl_pomdp.testing.frame_encoders import check_frame_encoder
+from vd4rl_pomdp.testing.memories import check_memory
 from vd4rl_pomdp.testing.methods import check_method
 from vd4rl_pomdp.testing.tasks import check_task
 
-__all__ = ["check_algorithm", "check_corruption", "check_frame_encoder", "check_method", "check_task"]
+__all__ = ["check_algorithm", "check_corruption", "check_frame_encoder", "check_memory", "check_method", "check_task"]

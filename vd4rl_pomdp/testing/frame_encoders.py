@@ -10,8 +10,8 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
-from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.encoder_folder import EncoderCard, load_encoder, save_encoder
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
+from vd4rl_pomdp.nn.encoder_folder import load_encoder, save_encoder
 from vd4rl_pomdp.nn.frame import FrameEncoder
 from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
 

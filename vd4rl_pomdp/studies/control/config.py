@@ -137,7 +137,7 @@ def fitting_methods() -> list[str]:
     """Names of what can be compared: objectives that predict actions and train a GRU, and the floors."""
     from pretrain.objectives import METHODS
 
-    fitting = (name for name, m in METHODS.items() if m.trained and m.history == "gru")
+    fitting = (name for name, m in METHODS.items() if m.trained and m.history != "none")
     return [NO_MEMORY, UNTRAINED, *(name for name in fitting if issubclass(METHODS[name].options, ActionOptions))]
 
 

@@ -66,7 +66,7 @@ def trained_policy(run: ControlRun, played: PlayedSet, encoder: Encoder) -> tupl
     config = FinetuneConfig.of("cpu", seed=run.seed, updates=run.updates, **memory)
     options: Any = config.options
     told: Any = config.memory
-    if encoder.gru is not None:
+    if encoder.memory is not None:
         encoder.config = replace(encoder.config, **told.encoder_changes)
     histories = Histories(played.dataset, told, options.n_step, run.seed)
     views = [HiddenView(played, run.hidden_share, run.seed, STAGE, number) for number in range(config.views)]

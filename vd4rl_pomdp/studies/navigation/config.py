@@ -6,7 +6,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, Literal
 
-from pretrain.config import MemoryOptions, TrainingConfig, frame_options
+from pretrain.config import TrainingConfig, frame_options, memory_options
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.core.errors import UserError, refuse_outside, refuse_unknown
 from vd4rl_pomdp.core.options import NO_OPTIONS, Limits, Options, flat, words_of
@@ -133,7 +133,7 @@ class NavigationConfig(TrainingConfig):
         reference = values["method"] in REFERENCES
         return {
             "options": (ReferenceOptions if reference else method.options).fill(values),
-            "memory": (MemoryOptions if method.history == "gru" else Options).fill(values),
+            "memory": memory_options(method.history, values),
             "frame": frame_options(method, values),
             "noise": (Options if values["exogenous"] == "none" else NoiseOptions).fill(values),
         }

@@ -13,7 +13,8 @@ from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.seeding import seed_networks
 from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, EncoderCard, save_encoder
+from vd4rl_pomdp.nn.encoder import EncoderCard
+from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, save_encoder
 from vd4rl_pomdp.runs import METRICS_FILE, NAVIGATION_FILE, TRAJECTORY_FILE
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import write_json

@@ -1,0 +1,109 @@
+"""Every memory keeps the contract of memories, another one finds its way in, and what breaks it is caught."""
+
+import pytest
+import torch
+
+from tests.helpers_pages import isolated_registries, load_example
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.nn.memory import GRU, MEMORIES, GRUOptions, MemoryPart
+from vd4rl_pomdp.testing import check_memory, check_method
+from vd4rl_pomdp.testing.contract import run_check
+from vd4rl_pomdp.testing.memories import (
+    CHECKS,
+    a_folder_gives_back_the_encoder,
+    a_state_depends_on_its_past_alone,
+    gradients_reach_all_parameters,
+    outputs_have_one_shape,
+    streaming_equals_batch,
+)
+
+
+@pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
+@pytest.mark.parametrize("options", [{}, {"gru_layers": 2}], ids=["one layer", "two"])
+def test_the_gru_keeps_its_promises(check, options):
+    run_check("memory", check, "gru", **options)
+
+
+@pytest.fixture
+def memories(tmp_path, monkeypatch):
+    with isolated_registries():
+        load_example("my_memory.py", tmp_path, monkeypatch)
+        yield MEMORIES
+
+
+def test_the_pages_memory_keeps_its_promises_and_those_of_the_methods_it_is_chosen_for(memories):
+    check_memory("linear")
+    check_memory("linear", slowest=0.9)
+    check_method("mik+a", history="linear")
+    check_method("fj+a", history="linear")
+
+
+class Averaged(GRU):
+    """Sees the whole window."""
+
+    def forward(self, rows, state):
+        return super().forward(rows - rows.mean(1, keepdim=True), state)
+
+
+class Forgetful(GRU):
+    """Begins anew with every call."""
+
+    def forward(self, rows, state):
+        return super().forward(rows, torch.zeros_like(state))
+
+
+class Wide(GRU):
+    def forward(self, rows, state):
+        out, state = super().forward(rows, state)
+        return torch.cat([out, out], -1), state
+
+
+class Unused(GRU):
+    def __init__(self, inputs, options):
+        super().__init__(inputs, options)
+        self.unused = torch.nn.Linear(2, 2)
+
+
+class Hidden(GRU):
+    """A weight that is in no state."""
+
+    scale = 1.0
+
+    def forward(self, rows, state):
+        Hidden.scale += 1
+        return super().forward(rows * Hidden.scale, state)
+
+
+@pytest.mark.parametrize(
+    ("kind", "check", "reason"),
+    [
+        (
+            Averaged,
+            a_state_depends_on_its_past_alone,
+            r"row 0 of window 1 has gradients to \(window, row\) \[\(1, 0\), ",
+        ),
+        (Forgetful, streaming_equals_batch, "they differ at row 1"),
+        (Wide, outputs_have_one_shape, r"\(3, 6, 14\)"),
+        (Unused, gradients_reach_all_parameters, "none reaches unused.bias, unused.weight"),
+        (Hidden, a_folder_gives_back_the_encoder, "its states differ"),
+    ],
+)
+def test_a_memory_that_breaks_a_promise_is_told_which_and_how(memories, kind, check, reason):
+    memories.register("mine", MemoryPart(kind, GRUOptions))
+    with pytest.raises(AssertionError, match=f"memory 'mine' breaks a promise(.|\n)*{reason}"):
+        run_check("memory", check, "mine")
+
+
+@pytest.mark.parametrize("name", ["none", "method"])
+def test_words_that_history_has_for_something_else_are_refused(memories, name):
+    with pytest.raises(UserError, match=f"memory '{name}': --history has this word"):
+        memories.register(name, MemoryPart(GRU, GRUOptions))
+
+
+def test_what_is_no_memory_is_refused_where_it_is_built(memories):
+    memories.register("mine", MemoryPart(lambda inputs, options: torch.nn.Identity()))
+    with pytest.raises(UserError, match=r"memory .mine. builds a Identity, not a vd4rl"):
+        check_memory("mine")
+    memories.register("frame", MemoryPart(GRU, GRUOptions))
+    with pytest.raises(UserError, match="memory 'frame': an encoder has something of this name"):
+        check_memory("frame")

@@ -1,0 +1,185 @@
+"""Memories: what reads rows one after the other, forwards over the past and backwards over the future of a window.
+
+Behind a frame encoder it makes s_t of the features of rows 0..t and, in methods with "+a", the actions before them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import torch
+from torch import Tensor, nn
+from torch.nn.functional import pad
+
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import Limits, Options, refuse_options
+from vd4rl_pomdp.core.registry import Registry
+
+
+@dataclass(frozen=True)
+class MemoryOptions(Options):
+    """Options of every memory."""
+
+    hidden_dim: int = 256
+    """Width of the memory's output s_t."""
+    m: int | None = None
+    """Rows before t that a state is computed from; None: what the method has (fj and fj+a 8, the others all)."""
+
+    limits: ClassVar[Limits] = {"hidden_dim": 1, "m": 0}
+
+
+@dataclass(frozen=True)
+class GRUOptions(MemoryOptions):
+    """Options of the GRU."""
+
+    gru_layers: int = 1
+    """Layers of the GRU."""
+
+    limits: ClassVar[Limits] = {"gru_layers": (1, 64)}
+
+
+class Memory(nn.Module):
+    """A recurrence. What it puts out at row j depends on rows 0..j and on the state before row 0 alone."""
+
+    def initial_state(self, batch: int) -> Tensor:
+        """State before an episode's first row: (L, batch, W) zeros in the precision of its weights."""
+        raise NotImplementedError
+
+    def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, T, I) rows, T > 0, and an (L, B, W) state -> (B, T, hidden_dim), and the state after the last row."""
+        raise NotImplementedError
+
+
+class GRU(nn.GRU, Memory):
+    """Gated recurrent units (Cho et al. 2014, arXiv 1406.1078), batch first."""
+
+    def __init__(self, inputs: int, options: GRUOptions) -> None:
+        super().__init__(inputs, options.hidden_dim, options.gru_layers, batch_first=True)
+
+    def initial_state(self, batch: int) -> Tensor:
+        """(gru_layers, batch, hidden_dim)."""
+        return next(self.parameters()).new_zeros(self.num_layers, batch, self.hidden_size)
+
+
+@dataclass(frozen=True)
+class MemoryPart:
+    """How to build a memory."""
+
+    build: Callable[[int, Any], Memory]
+    """From the width I of a row, and options. A memory's class is one."""
+    options: type[MemoryOptions] = MemoryOptions
+    """Class of its options."""
+    summary: str = ""
+    """One line that says what it is."""
+
+
+def _refuse_part(name: str, part: MemoryPart) -> None:
+    """Raise UserError for a memory that no setting could name, or whose options cannot work."""
+    if name in ("none", "method"):
+        raise UserError("--history has this word for something else: choose another name")
+    refuse_options(part.options, MemoryOptions)
+
+
+MEMORIES: Registry[MemoryPart] = Registry(
+    "memory",
+    {"gru": MemoryPart(GRU, GRUOptions, summary="gated recurrent units, in the paper's methods")},
+    lambda part: isinstance(part, MemoryPart),
+    "a vd4rl_pomdp.nn.memory.MemoryPart",
+    _refuse_part,
+    setting="history",
+    group="vd4rl_pomdp.memories",
+)
+"""All memories. Packages offer theirs in the group of entry points `vd4rl_pomdp.memories`."""
+
+
+def make_memory(name: str, inputs: int, settings: Mapping[str, Any]) -> Memory:
+    """Build a memory by name for rows of a width; a name or a setting that is unknown raises UserError."""
+    part = MEMORIES.named(name)
+    options = part.options.fill(settings)
+    if unknown := settings.keys() - vars(options).keys():
+        raise UserError(f"memory {name!r} has no option {min(unknown)!r}")
+    memory = part.build(inputs, options)
+    if not isinstance(memory, Memory):
+        raise UserError(f"memory {name!r} builds a {type(memory).__name__}, not a vd4rl_pomdp.nn.memory.Memory")
+    return memory
+
+
+def run_memory(memory: Memory, x: Tensor, state: Tensor | None = None) -> tuple[Tensor, Tensor]:
+    """Run a memory in its own precision, also inside autocast: (B, T, I) -> (B, T, H), and its state after that."""
+    if state is None:
+        state = memory.initial_state(len(x))
+    with torch.autocast(x.device.type, enabled=False):
+        return memory(x.to(next(memory.parameters()).dtype), state)
+
+
+def run_backward(memory: Memory, x: Tensor, length: Tensor) -> Tensor:
+    """Run a memory from each window's last real row to its first.
+
+    Args:
+        memory: reads rows backwards.
+        x: (B, T, I) inputs; rows at and after `length` are padding.
+        length: (B,) int64.
+
+    Returns:
+        (B, T, H): row j has seen rows j..length-1. Padding rows mean nothing and must not be used.
+    """
+    rows = torch.arange(x.shape[1], device=x.device)
+    flip = length[:, None] - 1 - rows
+    flip = torch.where(flip >= 0, flip, rows)  # padding stays behind the real rows
+    out, _ = run_memory(memory, _take_rows(x, flip))
+    return _take_rows(out, flip)
+
+
+def run_over_next(memory: Memory, x: Tensor, length: Tensor, span: int) -> Tensor:
+    """Like `run_backward`, but row j has seen rows j..j+span-1 alone: each state is computed anew from zero."""
+    batch, rows, width = x.shape
+    span = min(span, rows)
+    j = torch.arange(rows, device=x.device)
+    count = (length[:, None] - j).clamp(1, span)  # padding rows read themselves
+    index = (j[:, None] + count[..., None] - 1 - torch.arange(span, device=x.device)).maximum(j[:, None])
+    windows = _take_rows(x, index.view(batch, -1)).view(batch * rows, span, width)
+    out, _ = run_memory(memory, windows)
+    last = (count - 1).reshape(-1, 1)
+    return _take_rows(out, last).view(batch, rows, -1)
+
+
+def run_over_versions(memory: Memory, versions: Sequence[Tensor], length: Tensor, span: int | None = None) -> Tensor:
+    """Like `run_backward`, or `run_over_next` if there is a span, with rows that differ by the state they are read for.
+
+    Args:
+        memory: reads rows backwards.
+        versions: V tensors (B, T, I); the state of row j reads row j+i in version i, or V-1 if that is less.
+        length: (B,) int64.
+        span: rows that a state reads; None: all to the window's end.
+
+    Returns:
+        (B, T, H).
+    """
+    last = len(versions) - 1
+    batch, rows, _ = versions[0].shape
+    state = memory.initial_state(batch)
+    states, outputs = [state] * (rows + last), []
+    if span is None:  # from row j+V-1 on all states read the same rows, so one pass over these serves them
+        for j in reversed(range(rows)):
+            output, ahead = run_memory(memory, versions[last][:, j, None], state)
+            states[j] = state = torch.where((j < length)[:, None], ahead, state)
+            outputs.insert(0, output)
+        own = last
+    else:
+        own = min(span, rows)
+    state = torch.stack(states[last:], dim=2).flatten(1, 2)
+    output = torch.cat(outputs, dim=1) if outputs else state  # of the last row read, which the loop replaces
+    real = torch.arange(rows, device=length.device) < length[:, None]
+    for i in reversed(range(own)):
+        x = pad(versions[min(i, last)][:, i:], (0, 0, 0, min(i, rows)))
+        there = pad(real[:, i:], (0, min(i, rows))).flatten()
+        output, ahead = run_memory(memory, x.flatten(0, 1)[:, None], state)
+        state = torch.where(there[:, None], ahead, state)
+    return output.reshape(batch, rows, -1)
+
+
+def _take_rows(x: Tensor, index: Tensor) -> Tensor:
+    """Rows of (B, T, I) in the order given by (B, T) indices."""
+    return x.gather(1, index[..., None].expand(-1, -1, x.shape[2]))

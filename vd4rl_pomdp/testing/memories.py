@@ -1,0 +1,163 @@
+"""What every memory must satisfy: shapes, streams like batches, the past alone, padding, and a folder."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from vd4rl_pomdp.core.types import Windows, previous
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
+from vd4rl_pomdp.nn.encoder_folder import load_encoder, save_encoder
+from vd4rl_pomdp.nn.memory import Memory, make_memory, run_backward, run_memory
+from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
+
+BATCH, ROWS, INPUTS = 3, 6, 5
+_WIDTH = 7
+_METHODS = ({"method": "mik+a"}, {"method": "mik"}, {"method": "mik+a", "m": 2}, {"method": "mik", "m": 2})
+"""Memories that read actions and that do not, of the whole past and of three rows."""
+
+
+def check_memory(name: str, **options: Any) -> None:
+    """Check every promise of a memory.
+
+    Args:
+        name: of the memory in `vd4rl_pomdp.nn.memory.MEMORIES`.
+        options: its options.
+
+    Raises:
+        AssertionError: a promise is broken; says which one, and by what.
+        UserError: there is no such memory or option, or a setting of the training has an option's name.
+    """
+    from pretrain.config import PretrainConfig
+
+    PretrainConfig.of("smoke", history=name, **options)
+    run_checks("memory", CHECKS, name, **options)
+
+
+def make(name: str, **options: Any) -> Memory:
+    """The memory, for rows of INPUTS numbers; the same at every call."""
+    torch.manual_seed(0)
+    return make_memory(name, INPUTS, {"hidden_dim": _WIDTH} | options)
+
+
+def encoder_of(name: str, **settings: Any) -> Encoder:
+    """An encoder of observations of three numbers with the memory; the same at every call."""
+    from pretrain.build import build_objective, build_target
+    from pretrain.config import PretrainConfig
+
+    told = {"frame_encoder": "flat", "action_target": "mse", "hidden_dim": _WIDTH} | settings
+    config = PretrainConfig.of("smoke", history=name, **told)
+    torch.manual_seed(0)
+    return build_objective(config, 2, build_target(config, torch.zeros(1, 2).numpy()), None, (3, 1)).encoder.eval()
+
+
+def rows(batch: int = BATCH) -> Tensor:
+    """(batch, ROWS, INPUTS) random rows, the same at every call."""
+    return torch.randn(batch, ROWS, INPUTS, generator=torch.Generator().manual_seed(0))
+
+
+def windows() -> Windows:
+    """Random windows of ROWS rows without padding, the same at every call."""
+    g = torch.Generator().manual_seed(1)
+    obs = torch.randint(0, 256, (BATCH, ROWS, 3, 1, 1), generator=g, dtype=torch.uint8)
+    action = torch.rand(BATCH, ROWS, 2, generator=g)
+    real, length = torch.ones(BATCH, ROWS, dtype=torch.bool), torch.full((BATCH,), ROWS)
+    return Windows(obs, previous(action), action, real, length, torch.zeros(BATCH, ROWS, dtype=torch.int64))
+
+
+def outputs_have_one_shape(name: str, **options: Any) -> None:
+    """Rows (B, T, I) become finite (B, T, hidden_dim) in the precision of the weights, under bf16 autocast, too."""
+    memory = make(name, **options)
+    before, width = memory.initial_state(BATCH), ({"hidden_dim": _WIDTH} | options)["hidden_dim"]
+    claim(before.dim() == 3 and before.shape[1] == BATCH, f"its initial state is {tuple(before.shape)}, not (L, B, W)")
+    claim(not before.any(), "its initial state is not zero")
+    with torch.no_grad(), torch.autocast("cpu", torch.bfloat16):
+        out, after = run_memory(memory, rows())
+    found = tuple(out.shape), out.dtype
+    claim(found == ((BATCH, ROWS, width), torch.float32), f"{found[0]} {found[1]}")
+    claim(out.isfinite().all(), "some are not finite")
+    claim(after.shape == before.shape, f"its state is {tuple(before.shape)} before and {tuple(after.shape)} after")
+
+
+def streaming_equals_batch(name: str, **options: Any) -> None:
+    """Row by row an encoder gives what it gives for whole windows, with and without actions, over all rows or three."""
+    for method in _METHODS:
+        encoder, window = encoder_of(name, **method, **options), windows()
+        with torch.no_grad():
+            whole, state = encoder.encode(window), encoder.initial_state(BATCH)
+            for t in range(ROWS):
+                z, state = encoder.step(window.obs[:, t], window.prev_action[:, t], state)
+                claim_close(z, whole[:, t], f"they differ at row {t} of {shown(map(str, method.values()))}", 1e-5)
+
+
+def a_state_depends_on_its_past_alone(name: str, **options: Any) -> None:
+    """What is put out at a row has a gradient to that row and all rows before, and to nothing else."""
+    memory, x = make(name, **options).double(), rows().double().requires_grad_()
+    out, _ = run_memory(memory, x)
+    weights = torch.randn(out.shape[-1], generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    for t in range(ROWS):
+        (gradient,) = torch.autograd.grad((out[1, t] * weights).sum(), x, retain_graph=True)
+        reached = [tuple(place) for place in torch.nonzero(gradient.abs().amax(2)).tolist()]
+        expected = [(1, row) for row in range(t + 1)]
+        claim(reached == expected, f"row {t} of window 1 has gradients to (window, row) {reached}")
+
+
+def actions_are_read_where_a_method_has_them(name: str, **options: Any) -> None:
+    """s_t of "+a" changes with each action before row t, that of other methods with none."""
+    for method, reads in (("mik+a", True), ("mik", False)):
+        encoder, window = encoder_of(name, method=method, **options), windows()
+        changed = window.prev_action.clone()
+        changed[:, 2] += 1
+        with torch.no_grad():
+            moved = encoder.encode(window) != encoder.encode(window.replace(prev_action=changed))
+        claim(
+            moved.any(2).any(0).tolist() == [reads and t >= 2 for t in range(ROWS)],
+            f"a_1 moves rows {moved.any(2).any(0).tolist()} of {method}",
+        )
+
+
+def padding_is_not_read(name: str, **options: Any) -> None:
+    """Read backwards, as MIK's future, a padded window gives what it gives without its padding."""
+    memory, x, length = make(name, **options), rows(), torch.tensor([ROWS, 4, 1])
+    with torch.no_grad():
+        padded = run_backward(memory, x, length)
+        for b, real in enumerate(length.tolist()):
+            alone = run_memory(memory, x[b : b + 1, :real].flip(1))[0][0].flip(0)
+            claim_close(padded[b, :real], alone, f"a window of {real} rows differs", 1e-5)
+
+
+def gradients_reach_all_parameters(name: str, **options: Any) -> None:
+    """A loss on what is put out moves every parameter."""
+    memory = make(name, **options)
+    out, _ = run_memory(memory, rows())
+    (out * torch.randn(out.shape, generator=torch.Generator().manual_seed(0))).sum().backward()
+    still = [key for key, value in memory.named_parameters() if value.grad is None or not value.grad.any()]
+    claim(still == [], f"none reaches {shown(still)}")
+
+
+def a_folder_gives_back_the_encoder(name: str, **options: Any) -> None:
+    """Built from one seed memories are equal; saved as a folder and loaded, one gives the same states."""
+    encoder, window = encoder_of(name, **options), windows()
+    with TemporaryDirectory() as folder:
+        save_encoder(Path(folder), encoder, EncoderCard("mik+a", "", "", {"corruption": "none"}, 0, 0, "smoke"))
+        loaded, _ = load_encoder(folder)
+    claim(loaded.config == encoder.config, f"{encoder.config} came back as {loaded.config}")
+    with torch.no_grad():
+        states = encoder.encode(window)
+        claim_close(loaded.encode(window), states, "its states differ", 1e-5)
+        claim_close(encoder_of(name, **options).encode(window), states, "another build differs", 1e-5)
+
+
+CHECKS: tuple[Check, ...] = (
+    outputs_have_one_shape,
+    streaming_equals_batch,
+    a_state_depends_on_its_past_alone,
+    actions_are_read_where_a_method_has_them,
+    padding_is_not_read,
+    gradients_reach_all_parameters,
+    a_folder_gives_back_the_encoder,
+)
