@@ -18,7 +18,7 @@ from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.core.reading import regular
 from vd4rl_pomdp.core.types import Batch
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
-from vd4rl_pomdp.data import Dataset, View
+from vd4rl_pomdp.data import Dataset, StateView, View
 from vd4rl_pomdp.data.samplers import Sampler
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import StateFrame
@@ -64,28 +64,22 @@ class FrozenEncoder:
         self._shift, self._seed = shift, seed
         self.device = dataset.t.device
         self._corruption = corruption
-        self.states = dataset.states() if encoder.reads_state else torch.empty(0)
 
     def view(self, number: int) -> View:
         """One draw of corruption and shift; under `emission` all are corrupted alike."""
+        if isinstance(self.encoder.frame, StateFrame):
+            return StateView(self.dataset, self.encoder.frame.observe, self._corruption, self._seed, STAGE, number)
         return View(self.dataset, self._corruption, self._shift, self._seed, STAGE, number)
 
     @torch.no_grad()
     def rows(self, rows: Tensor, shift_key: Tensor, view: View) -> Tensor:
         """Frame features (N, F) of (N,) rows, shifted by (N,) keys, in chunks."""
-        if isinstance(self.encoder.frame, StateFrame):
-            return self._state_features(self.encoder.frame, rows, view)
         parts = []
         for part, key in zip(rows.split(CHUNK), shift_key.split(CHUNK), strict=True):
             obs = view.observe(part, key)
             with autocast(self.device, self.precision):
                 parts.append(self.encoder.frame(obs).float())
         return torch.cat(parts)
-
-    def _state_features(self, frame: StateFrame, rows: Tensor, view: View) -> Tensor:
-        """Simulator states of rows, with noise, if there is any, drawn as a corruption of pixels would be."""
-        key = view.corruption.keys(self.dataset.keys(rows)) if frame.noisy else torch.zeros_like(rows)
-        return frame(frame.observe(self.states[rows], key))
 
     @torch.no_grad()
     def episode(self, number: int, view: View) -> Tensor:

@@ -2,18 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import asdict
-from types import MappingProxyType
 from typing import Any
 
 import numpy as np
 
-from pretrain.config import TrainingConfig, history_of
-from pretrain.objectives import METHODS, Method
+from pretrain.config import HiddenOptions, TrainingConfig, history_of
+from pretrain.objectives import METHODS
 from pretrain.objectives.untrained import StateOptions
-from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.options import Options, flat
+from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.state_scale import StateScale
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.nn.action_target import ActionTarget, make_action_target
@@ -43,86 +40,43 @@ def build_objective(
     states: StateScale | None = None,
     observation: tuple[int, int] = (3 * FRAME_STACK, FRAME_SIZE),
 ) -> Objective:
-    """Build the objective of a config.
+    """Build the objective of a config, with an encoder of its own.
 
     Args:
         config: the run's settings.
         action_dim: width of actions.
         target: from `build_target`.
-        states: scale of the simulator's states, for methods that read or regress them.
-        observation: channels and size of an observation, for methods that read pixels.
+        states: scale of the simulator's states, where they are read or regressed.
+        observation: channels and size of an observation of pixels.
     """
-    method = METHODS.named(config.method)
-    if method.reads_state and states is not None:
-        return build_on_states(config, action_dim, target, len(states.std), _noise(config.options, states))
-    channels, size = observation
-    return _build(
-        config,
-        states if method.regresses_state else target,
-        action_dim=action_dim,
-        frame_encoder=config.frame_encoder,
-        **encoder_settings(config.frame),
-        channels=channels,
-        size=size,
-    )
+    method, memory = METHODS.named(config.method), {}
+    if method.reads_state or config.frame_encoder == STATE:
+        assert states is not None
+        shape = _state_shape(config, states)
+    else:
+        channels, size = observation
+        shape = {"frame_encoder": config.frame_encoder, "channels": channels, "size": size}
+        shape |= encoder_settings(config.frame)
+    if isinstance(config.memory, MemoryOptions):
+        told = asdict(config.memory)
+        hidden, m = told.pop("hidden_dim"), told.pop("m")
+        past = method.past if m is None else m
+        memory = {
+            "history": history_of(config.method, method, getattr(config, "history", "method")),
+            "use_actions": method.use_actions,
+            "hidden_dim": hidden,
+            "history_window": 0 if past is None else past + 1,
+            "memory_options": told,
+        }
+    encoder = Encoder(EncoderConfig(action_dim, **shape, **memory))
+    return method.build(encoder, states if method.regresses_state else target, config.options, config.seed)
 
 
-def build_on_states(
-    config: TrainingConfig,
-    action_dim: int,
-    target: ActionTarget | None,
-    state_dim: int,
-    frame_options: Mapping[str, Any] = MappingProxyType({}),
-) -> Objective:
-    """Build the objective of a config on states in place of pixels, whatever its method reads.
-
-    Args:
-        config: the run's settings; those of the frame encoder are not read.
-        action_dim: width of actions.
-        target: from `build_target`.
-        state_dim: width P of the states; observations are (..., P, 1, 1).
-        frame_options: what `StateFrame` is told.
-    """
-    return _build(
-        config,
-        target,
-        action_dim=action_dim,
-        frame_encoder=STATE,
-        feature_dim=state_dim,
-        frame_options=dict(frame_options),
-        channels=state_dim,
-        size=1,
-    )
-
-
-def _build(config: TrainingConfig, target: ActionTarget | StateScale | None, **shape: Any) -> Objective:
-    """The objective of a config on an encoder of a given shape, with the memory that the config says."""
-    method = METHODS.named(config.method)
-    encoder = EncoderConfig(**shape, **_memory(config, method))
-    objective = method.build(Encoder(encoder), target, config.options, config.seed)
-    if isinstance(objective, Objective) and not isinstance(getattr(objective, "encoder", None), Encoder):
-        raise UserError(f"the objective of the method {config.method} has no `encoder`: keep the one that it is given")
-    return objective
-
-
-def _noise(options: Options, states: StateScale) -> dict[str, Any]:
-    """What the `state` reference's encoder is told of noise; nothing if there is none."""
-    if not isinstance(options, StateOptions) or not (options.pose_noise or options.velocity_noise):
-        return {}
-    return {"noise": states.noise(options.pose_noise, options.velocity_noise).tolist()}
-
-
-def _memory(config: TrainingConfig, method: Method) -> dict[str, Any]:
-    """What an encoder's config says of its memory."""
-    if not isinstance(config.memory, MemoryOptions):
-        return {}
-    told = asdict(config.memory)
-    hidden, m = told.pop("hidden_dim"), told.pop("m")
-    past = method.past if m is None else m
-    return {
-        "history": history_of(config.method, method, getattr(config, "history", "method")),
-        "use_actions": method.use_actions,
-        "hidden_dim": hidden,
-        "history_window": 0 if past is None else past + 1,
-        "memory_options": told,
-    }
+def _state_shape(config: TrainingConfig, states: StateScale) -> dict[str, Any]:
+    """The encoder of simulator states: handed through, perhaps with noise, or standardised with coordinates hidden."""
+    options, told = config.options, {}
+    if isinstance(options, StateOptions) and (options.pose_noise or options.velocity_noise):
+        told = {"noise": states.noise(options.pose_noise, options.velocity_noise).tolist()}
+    if isinstance(config.frame, HiddenOptions):
+        told = {"mean": states.mean.tolist(), "std": states.std.tolist(), "hidden_share": config.frame.hidden_share}
+    return {"frame_encoder": STATE, "channels": len(states.std), "size": 1, "frame_options": told}

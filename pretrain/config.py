@@ -10,13 +10,25 @@ from typing import Annotated, Any, ClassVar
 import tyro
 
 from pretrain.objectives import METHODS, Method
-from vd4rl_pomdp.core.errors import MAX_SEED, OR_ONES_OWN, UserError, flag_of, refuse_outside, refuse_unknown
-from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
+from vd4rl_pomdp.core.errors import MAX_SEED, OR_ONES_OWN, UserError, refuse_outside, refuse_unknown
+from vd4rl_pomdp.core.options import NO_OPTIONS, Limits, Options, StageConfig
+from vd4rl_pomdp.core.tasks import FRAME_SIZES
 from vd4rl_pomdp.corruptions import NO_CORRUPTION, CorruptionConfig
-from vd4rl_pomdp.nn.frame import FRAME_ENCODERS
+from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, STATE
 from vd4rl_pomdp.nn.memory import MEMORIES
+from vd4rl_pomdp.nn.objective import ActionOptions
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
+
+
+@dataclass(frozen=True)
+class HiddenOptions(Options):
+    """Options of `--frame-encoder state`, which reads the simulator's standardised states in place of pixels."""
+
+    hidden_share: float = 0.0
+    """Share of a state's coordinates that are hidden, drawn anew in every row."""
+
+    limits: ClassVar[Limits] = {"hidden_share": (0, 1)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -40,7 +52,8 @@ class TrainingConfig(StageConfig):
     learning_rate: float = 3e-4
     """Adam's learning rate."""
     frame_encoder: str = "drq"
-    """Frame encoder: drq, nature (a fraction of its cost), nature_half (half the resolution), small or mixer."""
+    """Frame encoder: drq, nature (a fraction of its cost), nature_half (half the resolution), small or mixer; or
+    state, the simulator's, in place of pixels."""
     precision: Precision = "fp32"
     """fp32, or bf16 autocast."""
     device: str = "auto"
@@ -112,19 +125,20 @@ class PretrainConfig(TrainingConfig):
         return {
             "options": method.options.fill(values),
             "memory": memory_options(history_of(values["method"], method, values["history"]), values),
-            "frame": frame_options(method, values),
+            "frame": HiddenOptions.fill(values) if values["frame_encoder"] == STATE else frame_options(method, values),
             "corruption": CorruptionConfig.fill(values),
         }
 
     def check(self) -> None:
         """Refuse settings that cannot work, before anything is read or written."""
         super().check()
-        usual, method = self.defaults(self.preset), METHODS.named(self.method)
-        for name in ("frame_encoder", "shift") if method.reads_state else ():
-            if getattr(self, name) != usual[name]:
-                raise UserError(f"{flag_of(name)} is not read by the method {self.method}: leave it out")
-        if method.shift == "own" and self.shift != usual["shift"]:
-            raise UserError(f"--shift is not read by the method {self.method}, which shifts by itself: leave it out")
+        method = METHODS.named(self.method)
+        refuse_outside(self, shift=(0, FRAME_SIZES[1] - 1))
+        if self.batch_size < method.least_batch:
+            told = f"{self.method} tells windows apart: give it {method.least_batch}"
+            raise UserError(f"--batch-size is {self.batch_size}; {told}")
+        if self.frame_encoder == STATE and not (isinstance(self.options, ActionOptions) or self.method == "random"):
+            raise UserError(f"--frame-encoder state is for random and methods that predict actions, not {self.method}")
 
 
 def history_of(name: str, method: Method, history: str) -> str:

@@ -10,7 +10,8 @@ import torch
 
 from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
-from pretrain.train import PretrainTrainer
+from pretrain.train import make_batches
+from pretrain.trainer import Trainer
 from vd4rl_pomdp.core.seeding import seed_networks
 from vd4rl_pomdp.core.tasks import FRAME_STACK
 from vd4rl_pomdp.core.types import StepType
@@ -61,18 +62,19 @@ def ball_world(folder: Path, ball: bool = True) -> Dataset:
     return open_dataset(folder / "set", folder / "cache")
 
 
-def trainer_on(dataset: Dataset, method: str, **settings: Any) -> PretrainTrainer:
+def trainer_on(dataset: Dataset, method: str, **settings: Any) -> Trainer:
     """The training of a method on the ball's world, with its random shifts; small enough for seconds."""
     small = {"batch_size": 8, "window": 8, "frame_encoder": "small", "feature_dim": 32, "learning_rate": 1e-3}
     config = PretrainConfig.of("paper", method=method, **(small | settings))
     seed_networks(0, "ball")
     target = build_target(config, dataset.action_after(dataset.transition_rows).numpy())
-    return PretrainTrainer(build_objective(config, 2, target, None, (3 * FRAME_STACK, SIZE)), dataset, config)
+    objective = build_objective(config, 2, target, None, (3 * FRAME_STACK, SIZE))
+    return Trainer(objective, make_batches(dataset, config, objective), config)
 
 
 @torch.no_grad()
-def position_error(trainer: PretrainTrainer) -> float:
+def position_error(trainer: Trainer) -> float:
     """Error of a linear probe on the ball's position in unshifted pictures of held-out episodes, % of its deviation."""
-    dataset = trainer.dataset
+    dataset = trainer.batches.view.dataset
     features = trainer.objective.encoder.frame(View(dataset).stacks(torch.arange(dataset.num_rows)))
     return probe_error(features.numpy(), dataset.physics, dataset.episode.numpy())

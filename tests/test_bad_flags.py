@@ -34,7 +34,6 @@ VALID = {
     "navigation collect": ["--maze", "no_curtain", "--preset", "smoke", *OUT],
     "sweep run": ["quick", "--testing", "--dry-run", *OUT],
     "theory": OUT,
-    "control-study": ["--methods", "none", "--episodes", "2", "--decisions", "32", "--updates", "1", *OUT],
 }
 """Words after each command that are right; each test makes one flag's value wrong."""
 NO_FILE = ["nowhere", "file/below", "file", "empty", "foreign", "loop", "/dev/null", "n" * 300, os.fsdecode(b"a\xff")]

@@ -41,7 +41,6 @@ NOT_RUN = {
     "vd4rl-pomdp hub": "needs a Hub; test_hub has one of its own",
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
     "vd4rl-pomdp policy": "trains for hours; tests/policies trains less",
-    "vd4rl-pomdp control-study": "trains for minutes; studies/control trains less",
     "vd4rl-pomdp navigation": "trains for minutes to days; vd4rl_pomdp/studies/navigation/test_train trains less",
     "vd4rl-pomdp report": "the README's is run; tests/report makes all others",
     "vd4rl-pomdp results add": "tests/runs/results adds runs",
@@ -137,7 +136,7 @@ CHECKS = {
 
 def check_names(config: object) -> None:
     """Names that a command looks up after parsing must exist."""
-    if type(config).__name__ in ("NavigationConfig", "ControlConfig"):  # their methods are others, too
+    if type(config).__name__ == "NavigationConfig":  # their methods are others, too
         return
     for field, check in CHECKS.items():
         value = getattr(config, field, None)

@@ -23,7 +23,6 @@ def test_every_command_has_help(words, capsys):
     assert words[-1] in capsys.readouterr().out
 
 
-STUDY = ["--methods", "none", "--episodes", "2", "--decisions", "32", "--updates", "1", "--eval-episodes", "1"]
 SWEEP = ["sweep", "run", "quick", "--out", "y", "--dry-run"]
 
 
@@ -86,13 +85,6 @@ SWEEP = ["sweep", "run", "quick", "--out", "y", "--dry-run"]
         ([*SWEEP, "--executor", "cloud"], "unknown executor 'cloud': choose one of local"),
         (["sweep", "status", "file"], "file: holds no sweep; `vd4rl-pomdp sweep run GRID --out file` makes one"),
         (["sweep", "retry", "x"], "x: holds no sweep"),
-        (["control-study"], "Missing from vd4rl-pomdp control-study: --out"),
-        (
-            ["control-study", "--out", "x", "--methods", "acro"],
-            "unknown method of this study 'acro': choose one of none,",
-        ),
-        (["control-study", "--out", "x", "--hidden-shares", "2"], "--hidden-shares is 2.0; it must be at least 0 and"),
-        (["control-study", "--out", "file/below", *STUDY], "file/below"),
         (["pretrain", "--data", "x", "--out", "y", "--steps", "many"], "--steps: invalid literal"),
         (["finetune", "--encoder", "a", "--data", "b", "--out", "c", "--veiws", "3"], "Perhaps you meant: --views"),
     ],

@@ -40,16 +40,12 @@ def test_what_the_chosen_parts_do_not_read_is_refused(settings, reader):
         PretrainConfig.of("smoke", **settings).check()
 
 
-@pytest.mark.parametrize(("name", "value"), [("frame_encoder", "drq"), ("shift", 2)])
-def test_what_is_done_to_pictures_is_not_chosen_for_states(name, value):
-    with pytest.raises(UserError, match=f"--{name.replace('_', '-')} is not read by the method state"):
-        PretrainConfig.of("smoke", method="state", **{name: value}).check()
-
-
-def test_a_method_that_shifts_by_itself_is_told_no_shift():
-    with pytest.raises(UserError, match="--shift is not read by the method curl, which shifts by itself: leave it out"):
-        PretrainConfig.of("smoke", method="curl", shift=0).check()
-    PretrainConfig.of("smoke", method="driml", shift=0).check()
+def test_states_are_read_by_methods_that_predict_actions_and_by_the_floor():
+    for method in ("mik+a", "acro", "random"):
+        PretrainConfig.of("smoke", method=method, frame_encoder="state", hidden_share=0.5).check()
+    for method in ("curl", "bc", "supervised"):
+        with pytest.raises(UserError, match=f"--frame-encoder state is for .*, not {method}"):
+            PretrainConfig.of("smoke", method=method, frame_encoder="state").check()
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import torch
 
 from finetune.features import FrozenEncoder
 from pretrain.objectives import METHODS
-from pretrain.train import PretrainTrainer, _build
+from pretrain.train import make_batches, make_objective
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import fake_rows, write_fake_set
 from tests.helpers_stages import smoke_pretrain
@@ -17,9 +17,10 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.core.types import StateWindows, Windows
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.data import Dataset, WindowSampler, open_dataset
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.nn import load_encoder
+from vd4rl_pomdp.nn.objective import Objective
 from vd4rl_pomdp.nn.probes import probe_state
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.testing import check_method
@@ -39,17 +40,17 @@ def with_states(tmp_path) -> Dataset:
     return dataset
 
 
-def trainer(dataset: Dataset, tmp_path: Path, method: str, **changes: object) -> PretrainTrainer:
+def made(dataset: Dataset, tmp_path: Path, method: str, **changes: object) -> tuple[Objective, WindowSampler]:
     config = smoke_pretrain(dataset.path, tmp_path / "run", method=method, **changes)
-    torch.manual_seed(0)
-    return PretrainTrainer(_build(dataset, config), dataset, config)
+    objective = make_objective(dataset, config)
+    return objective, make_batches(dataset, config, objective)
 
 
 @pytest.mark.parametrize("name", METHODS)
 def test_windows_hold_the_states_of_their_own_rows_and_only_for_a_method_that_regresses_them(
     with_states, tmp_path, name
 ):
-    window = trainer(with_states, tmp_path, name).batch()
+    window = made(with_states, tmp_path, name)[1].sample()
     if name not in METHOD_NAMES:
         assert type(window) is Windows
         return
@@ -88,19 +89,19 @@ def test_the_prediction_of_row_t_is_of_the_state_of_row_t():
 
 
 def test_a_head_that_predicts_the_mean_has_a_loss_of_one_whatever_the_units(with_states, tmp_path):
-    made = trainer(with_states, tmp_path, "supervised", window=20)
-    torch.nn.init.zeros_(made.objective.head[-1].weight)
-    torch.nn.init.zeros_(made.objective.head[-1].bias)
-    whole = made.sampler.view.windows([0, 1], 20)
+    objective, batches = made(with_states, tmp_path, "supervised", window=20)
+    torch.nn.init.zeros_(objective.head[-1].weight)
+    torch.nn.init.zeros_(objective.head[-1].bias)
+    whole = batches.view.windows([0, 1], 20)
     states = with_states.states().view(2, 20, -1)
-    logs = made.objective.loss(StateWindows(**whole, state=states), 0.0)[1]
-    assert made.objective.head[-1].out_features == 16, "18 coordinates, two of which are constant"
+    logs = objective.loss(StateWindows(**whole, state=states), 0.0)[1]
+    assert objective.head[-1].out_features == 16, "18 coordinates, two of which are constant"
     assert {name: value.item() for name, value in logs.items()} == pytest.approx(
         {"loss": 1.0, "pose_loss": 1.0, "velocity_loss": 1.0}, rel=1e-4
     )
     moved = states.clone()
-    moved[..., :9] += 3 * made.dataset.state_scale().std[:9]
-    logs = made.objective.loss(StateWindows(**whole, state=moved), 0.0)[1]
+    moved[..., :9] += 3 * with_states.state_scale().std[:9]
+    logs = objective.loss(StateWindows(**whole, state=moved), 0.0)[1]
     assert logs["pose_loss"].item() == pytest.approx(10, rel=1e-3)
     assert logs["velocity_loss"].item() == pytest.approx(1, rel=1e-3)
     assert logs["loss"].item() == pytest.approx((8 * 10 + 8) / 16, rel=1e-3)
@@ -116,7 +117,7 @@ def test_a_set_without_states_or_with_one_only_is_refused_in_a_line(data, with_s
     assert not (tmp_path / "run").exists()
     with_states.physics[:] = 3
     with pytest.raises(UserError, match="states in this set are all the same"):
-        trainer(with_states, tmp_path, "supervised")
+        made(with_states, tmp_path, "supervised")
 
 
 SIZE = 16

@@ -15,16 +15,16 @@ from vd4rl_pomdp.runs import interrupt
 
 SLOW_STEPS = """
 import sys, time
-from pretrain.train import PretrainTrainer
+from pretrain.trainer import Trainer
 from vd4rl_pomdp.cli import main
-update = PretrainTrainer.update
+update = Trainer.update
 def slow(self):
     logs = update(self)
     if self.step == 3:
         print("in step 3", flush=True)
     time.sleep(0.2)
     return logs
-PretrainTrainer.update = slow
+Trainer.update = slow
 if __name__ == "__main__":
     main(sys.argv[1:])
 """

@@ -92,7 +92,6 @@ def commands(data: Path, run: Path) -> dict[str, list[str]]:
         "report compare": ["report", "compare", str(run), str(run)],
         "results add": ["results", "add", str(run)],
         "theory": ["theory"],
-        "control-study": ["control-study", "--methods", "none", "--seeds", "0"],
     }
 
 

@@ -14,7 +14,7 @@ from vd4rl_pomdp.runs.workers import run_jobs
 
 if TYPE_CHECKING:
     from pretrain.config import PretrainConfig
-    from pretrain.train import PretrainTrainer
+    from pretrain.trainer import Trainer
 
 STEPS = 3
 
@@ -29,14 +29,16 @@ def memory(folder: Path, frame_bytes: int) -> dict[str, float]:
     return ratios if private is None else ratios | {"second_process_over_frames": private / frame_bytes}
 
 
-def make_trainer(dataset: Dataset, config: PretrainConfig) -> PretrainTrainer:
+def make_trainer(dataset: Dataset, config: PretrainConfig) -> Trainer:
     """A trainer of the config's objective, its codebook fitted on a few actions."""
     from pretrain.build import build_objective, build_target
-    from pretrain.train import PretrainTrainer
+    from pretrain.train import make_batches
+    from pretrain.trainer import Trainer
 
     target = build_target(config, dataset.action[:2000].cpu().numpy())
     objective = build_objective(config, dataset.action_dim, target)
-    return PretrainTrainer(objective.to(dataset.t.device), dataset, config)
+    objective = objective.to(dataset.t.device)
+    return Trainer(objective, make_batches(dataset, config, objective), config)
 
 
 def touch(frames: torch.Tensor) -> None:

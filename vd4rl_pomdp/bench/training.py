@@ -35,7 +35,7 @@ def pretraining(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
         config = PretrainConfig.of("paper", corruption="patch+zero_frames", **given)
         trainer = make_trainer(dataset, config)
         steps[precision], batch, optimiser = alternating(
-            max(3, repeats // 3), trainer.update, trainer.batch, trainer.optimiser.step
+            max(3, repeats // 3), trainer.update, trainer.batches.sample, trainer.optimiser.step
         )
         results[f"{precision}_frames_per_s"] = config.batch_size * config.window / steps[precision]
         results[f"{precision}_overhead_share"] = (batch + optimiser) / steps[precision]
@@ -120,8 +120,8 @@ def maze_training() -> dict[str, float]:
     from vd4rl_pomdp.studies.navigation.config import NavigationConfig
     from vd4rl_pomdp.studies.navigation.data import MazeData
     from vd4rl_pomdp.studies.navigation.observations import open_maze_set
+    from vd4rl_pomdp.studies.navigation.probed import make_trainer
     from vd4rl_pomdp.studies.navigation.sets import PRESETS as SETS
-    from vd4rl_pomdp.studies.navigation.trainer import NavigationTrainer, make_objective
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
@@ -129,7 +129,6 @@ def maze_training() -> dict[str, float]:
         collect(replace(SETS["smoke"], **shape))  # type: ignore[arg-type]
         config = NavigationConfig.of("cpu", data=folder / "set", out=folder)
         data = MazeData(*open_maze_set(folder / "set", folder / "cache"), config, None)
-        device = pick_device("auto")
-        trainer = NavigationTrainer(make_objective(data, config).to(device), data.on(device), config)
-    step, sampling, optimiser = alternating(5, trainer.update, trainer.batch, trainer.optimiser.step)
+        trainer, _ = make_trainer(data, config, pick_device("auto"))
+    step, sampling, optimiser = alternating(5, trainer.update, trainer.batches.sample, trainer.optimiser.step)
     return {"training_steps_per_s": 1 / step, "training_overhead_share": (sampling + optimiser) / step}

@@ -1,4 +1,4 @@
-"""Commands that measure or summarise: report, results, theory, control-study, bench."""
+"""Commands that measure or summarise: report, results, theory, bench."""
 
 from __future__ import annotations
 
@@ -155,16 +155,6 @@ def _bench(words: Arguments, program: str) -> None:
         print_table(results)
 
 
-def _control_study(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.studies.control.config import ControlConfig
-    from vd4rl_pomdp.studies.control.study import control_study
-    from vd4rl_pomdp.studies.control.table import line_of, summary
-
-    config = parse(ControlConfig, words, program)
-    rows = control_study(config, lambda row: print(line_of(row), flush=True))
-    print(*summary(rows), sep="\n")
-
-
 COMMANDS: dict[str, Command | Mapping[str, Command]] = {
     "report": Command(
         "an HTML page, tables and figures about runs; report compare A B for two sets",
@@ -173,6 +163,5 @@ COMMANDS: dict[str, Command | Mapping[str, Command]] = {
     ),
     "results": {"add": Command("append finished runs to a results folder", _add)},
     "theory": Command("the paper's claims on finite worlds, by enumeration", _theory),
-    "control-study": Command("does memory pay? in minutes, on simulator states", _control_study),
     "bench": Command("speed and memory on this machine", _bench),
 }

@@ -2,6 +2,6 @@
 
 from vd4rl_pomdp.data.dataset import Dataset, open_dataset
 from vd4rl_pomdp.data.samplers import TransitionSampler, WindowSampler
-from vd4rl_pomdp.data.view import View
+from vd4rl_pomdp.data.view import StateView, View
 
-__all__ = ["Dataset", "TransitionSampler", "View", "WindowSampler", "open_dataset"]
+__all__ = ["Dataset", "StateView", "TransitionSampler", "View", "WindowSampler", "open_dataset"]

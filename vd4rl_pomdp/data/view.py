@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, get_args
 
 import torch
@@ -141,6 +142,34 @@ class View:
         corruption.change_(images[:-1].view(*chosen.shape, *images.shape[1:]), keys, kept)
         obs = images[:-1] if kept.shape[1] == stack else _spread(images, kept, stack)
         return obs.view(*rows.shape, stack * images.shape[1], *images.shape[2:])
+
+
+class StateView(View):
+    """Simulator states in place of pixels, as an encoder of states observes them."""
+
+    def __init__(
+        self,
+        dataset: Dataset,
+        observed: Callable[[Tensor, Tensor], Tensor],
+        corruption: CorruptionConfig,
+        seed: int,
+        *name: str | int,
+    ) -> None:
+        """See the class.
+
+        Args:
+            dataset: a set with simulator states.
+            observed: observations (..., P, 1, 1) of (..., P) states and (...,) int64 keys, `StateFrame.observe`.
+            corruption: keys are drawn as its are; its stages, which change pixels, play no part.
+            seed: the run's seed.
+            name: tells the views of a run apart.
+        """
+        super().__init__(dataset, corruption, 0, seed, *name)
+        self._states, self._observed = dataset.states(), observed
+
+    def observe(self, rows: Tensor, shift_key: Tensor | None = None) -> Tensor:
+        """(..., P, 1, 1) float32 of (...,) int64 rows; nothing is shifted."""
+        return self._observed(self._states[rows], self.corruption.keys(self.dataset.keys(rows)))
 
 
 def _spread(images: Tensor, kept: Tensor, stack: int) -> Tensor:

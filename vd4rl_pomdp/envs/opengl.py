@@ -54,10 +54,7 @@ def gl_error(error: BaseException) -> UserError:
         remedy += f", or {install}"
     if device in at_fault:
         remedy += ", which numbers one EGL device, from 0"
-    return UserError(
-        f"cannot render with {told} ({said}): {remedy}; what draws nothing, such as control-study, takes "
-        "MUJOCO_GL=disable"
-    )
+    return UserError(f"cannot render with {told} ({said}): {remedy}; what draws nothing takes MUJOCO_GL=disable")
 
 
 @contextlib.contextmanager

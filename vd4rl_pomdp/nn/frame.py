@@ -13,7 +13,7 @@ from torch import Tensor, nn
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import Limits, Options, refuse_options
 from vd4rl_pomdp.core.registry import Registry
-from vd4rl_pomdp.corruptions.keys import draw_normals
+from vd4rl_pomdp.corruptions.keys import DRAWS, derive_keys, draw_integers, draw_normals
 
 
 @dataclass(frozen=True)
@@ -216,22 +216,35 @@ class StateFrame(nn.Module):
     """Hands the simulator state through, in place of pixels: (..., P, 1, 1) -> (..., P) float32."""
 
     noise: Tensor
+    mean: Tensor
+    std: Tensor
 
-    def __init__(self, width: int, noise: Sequence[float] = ()) -> None:
+    def __init__(
+        self,
+        width: int,
+        noise: Sequence[float] = (),
+        mean: Sequence[float] = (),
+        std: Sequence[float] = (),
+        hidden_share: float = 0.0,
+    ) -> None:
         """See the class.
 
         Args:
             width: coordinates P of a state.
             noise: standard deviation of the noise that is added to each coordinate; empty for none.
+            mean, std: of each coordinate, which is standardised; empty: states stay as they are.
+            hidden_share: probability with which a coordinate is set to zero, its mean.
 
         Raises:
-            ValueError: noise of another width.
+            ValueError: numbers of another width.
         """
         super().__init__()
-        if len(noise) not in (0, width):
-            raise ValueError(f"noise of {len(noise)} coordinates for states of {width}")
-        self.width = width
-        self.register_buffer("noise", torch.tensor(noise, dtype=torch.float64), persistent=False)
+        for values in (noise, mean, std):
+            if len(values) not in (0, width):
+                raise ValueError(f"{len(values)} numbers for states of {width} coordinates")
+        self.width, self.hidden_share = width, hidden_share
+        for name, values in (("noise", noise), ("mean", mean), ("std", std)):
+            self.register_buffer(name, torch.tensor(values, dtype=torch.float64), persistent=False)
         self.nothing = nn.Parameter(torch.zeros(0))
         """Optimisers and files want one."""
 
@@ -249,22 +262,27 @@ class StateFrame(nn.Module):
         return obs.flatten(-3).float()
 
     @property
-    def noisy(self) -> bool:
-        """Whether states are observed with noise."""
-        return len(self.noise) > 0
+    def draws(self) -> bool:
+        """Whether what is observed of a state depends on a key."""
+        return len(self.noise) > 0 or self.hidden_share > 0
 
     def observe(self, state: Tensor, key: Tensor) -> Tensor:
         """Observations of states.
 
         Args:
-            state: (N, P) float32.
-            key: (N,) int64, what the noise of each is drawn from; equal keys give equal noise.
+            state: (..., P) float32.
+            key: (...,) int64, what noise and hidden coordinates are drawn from; equal keys give equal ones.
 
         Returns:
-            (N, P, 1, 1) float32.
+            (..., P, 1, 1) float32.
         """
-        if self.noisy:
-            state = (state + draw_normals(key, state.shape[1]) * self.noise).float()
+        if len(self.noise):
+            state = (state + draw_normals(key, state.shape[-1]) * self.noise).float()
+        if len(self.std):
+            state = ((state - self.mean) / torch.where(self.std > 0, self.std, 1)).float()
+        if self.hidden_share:
+            hidden = draw_integers(derive_keys(1, key), DRAWS, state.shape[-1]) < self.hidden_share * DRAWS
+            state = state.masked_fill(hidden, 0.0)
         return state[..., None, None]
 
 

@@ -43,24 +43,6 @@ class Objective(nn.Module, ABC):
         """Called after every optimiser step: the place for what no gradient moves, such as momentum encoders."""
 
 
-def require_loss(name: str, given: Any) -> tuple[Tensor, dict[str, Tensor]]:
-    """What `Objective.loss` of a method gave; raises UserError unless it is what the contract says."""
-    match given:
-        case (Tensor(requires_grad=True) as loss, dict() as logs) if "loss" in logs and all(
-            map(is_scalar, (loss, *logs.values()))
-        ):
-            return loss, logs
-    raise UserError(
-        f"the loss of the method {name} must be a scalar tensor with a gradient and a dictionary of detached ones, "
-        "`loss` among them"
-    )
-
-
-def is_scalar(value: Any) -> bool:
-    """Whether a value is a tensor of one element."""
-    return isinstance(value, Tensor) and value.numel() == 1
-
-
 @dataclass(frozen=True)
 class ActionOptions(Options):
     """Options of every objective that predicts actions."""

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from dataclasses import dataclass, fields
 from typing import TYPE_CHECKING, Any
 
@@ -11,6 +10,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.runs.checkpoint import pack, unpack
 from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
 
 if TYPE_CHECKING:
@@ -205,10 +205,7 @@ def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **option
     one, other = (make(name, seed=seed, **options) for seed in (0, 1))
     for number in range(3):
         one.update(batch(number))
-    kept = io.BytesIO()
-    torch.save(one.state_dict(), kept)
-    kept.seek(0)
-    other.load_state_dict(torch.load(kept, weights_only=True))  # as a checkpoint gives it back
+    other.load_state_dict(unpack(pack(one.state_dict())))
     for number in range(3, 3 + UPDATES):
         logs = []
         for seed, algorithm in enumerate((one, other)):

@@ -21,63 +21,63 @@ from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX, Measure, measure_rows
 from vd4rl_pomdp.studies.navigation.methods import UNTRAINED
 from vd4rl_pomdp.studies.navigation.probe import COMPONENTS, ErrorSums, StateProbe, refit
-from vd4rl_pomdp.studies.navigation.trainer import NavigationTrainer
+from vd4rl_pomdp.studies.navigation.probed import ProbedObjective
 
 TRAJECTORY_ROWS = 200
 """Rows of the held-out trajectory whose estimated states are kept for a figure."""
 
 
 @torch.no_grad()
-def evaluate(trainer: NavigationTrainer) -> tuple[dict[str, float], dict[str, float]]:
+def evaluate(probed: ProbedObjective) -> tuple[dict[str, float], dict[str, float]]:
     """Action losses, and errors of the probe as trained, on held-out windows."""
     sums: dict[str, float] = defaultdict(float)
     errors, count = ErrorSums(), 0
-    trainer.objective.eval()
-    for number in trainer.data.spread(trainer.config.evaluation_windows, held_out=True):
-        with autocast(trainer.device, trainer.config.precision):
-            _, logs, states = trainer.losses(trainer.data.windows(number))
-        errors.add(*states, trainer.config.burn_in)
+    probed.objective.eval()
+    for number in probed.data.spread(probed.config.evaluation_windows, held_out=True):
+        with autocast(probed.device, probed.config.precision):
+            _, logs = probed.loss(probed.data.windows(number), 1.0)
+        errors.add(*probed.states, probed.config.burn_in)
         count += len(number)
         for name, value in logs.items():
             sums[name] += float(value) * len(number)
-    return {name: value / count for name, value in sums.items()}, errors.both(trainer.data.states.std)
+    return {name: value / count for name, value in sums.items()}, errors.both(probed.data.states.std)
 
 
 @torch.no_grad()
-def encode(trainer: NavigationTrainer, number: Tensor, length: int | None = None) -> tuple[Tensor, Tensor]:
+def encode(probed: ProbedObjective, number: Tensor, length: int | None = None) -> tuple[Tensor, Tensor]:
     """Frozen states (B, T, D) float32 of windows, and their rows (B, T)."""
-    window = trainer.data.windows(number, length)
-    with autocast(trainer.device, trainer.config.precision):
-        return trainer.objective.encoder.encode(window).float(), trainer.data.dataset.rows(window.key)
+    window = probed.data.windows(number, length)
+    with autocast(probed.device, probed.config.precision):
+        return probed.encoder.encode(window).float(), probed.data.dataset.rows(window.key)
 
 
-def refitted_errors(trainer: NavigationTrainer) -> tuple[StateProbe, dict[str, dict[str, float]]]:
+def refitted_errors(probed: ProbedObjective) -> tuple[StateProbe, dict[str, dict[str, float]]]:
     """A probe fitted on frozen states of training windows, and its errors by split."""
-    config, states = trainer.config, trainer.data.states
-    trainer.objective.eval()
-    parts = [encode(trainer, number) for number in trainer.data.spread(config.refit_windows, held_out=False)]
+    config, states = probed.config, probed.data.states
+    probed.objective.eval()
+    parts = [encode(probed, number) for number in probed.data.spread(config.refit_windows, held_out=False)]
     features, rows = (torch.cat([part[i][:, config.burn_in :].flatten(0, 1) for part in parts]) for i in (0, 1))
     probe = refit(features, states.values[rows], config.refit_steps, config.seed)
     found = {}
     for split, held_out in (("training", False), ("held_out", True)):
         errors = ErrorSums()
-        for number in trainer.data.spread(config.evaluation_windows, held_out):
-            past, at = encode(trainer, number)
+        for number in probed.data.spread(config.evaluation_windows, held_out):
+            past, at = encode(probed, number)
             errors.add(probe(past), states.values[at], states.hidden[at], config.burn_in)
         found[split] = errors.both(states.std)
     return probe, found
 
 
-def measure(trainer: NavigationTrainer, log: Path) -> tuple[StateProbe, list[dict[str, Any]]]:
+def measure(probed: ProbedObjective, log: Path) -> tuple[StateProbe, list[dict[str, Any]]]:
     """The probe refitted on frozen states, and all rows that `results.json` keeps; `log` is the run's metrics.jsonl."""
-    probe, refitted = refitted_errors(trainer)
+    probe, refitted = refitted_errors(probed)
     values: dict[Measure, float] = {}
     for split, errors in refitted.items():
         values |= _errors(split, "refit", errors)
-    if trainer.config.method == UNTRAINED:  # its online probe and its action head were never trained
+    if probed.config.method == UNTRAINED:  # its online probe and its action head were never trained
         return probe, measure_rows(values)
-    losses, online = evaluate(trainer)
-    averages = _training_averages(log, trainer.config)
+    losses, online = evaluate(probed)
+    averages = _training_averages(log, probed.config)
     values |= _errors("held_out", "online", online) | _errors("training", "online", averages)
     if "action_loss" in losses:
         values |= _losses("training", averages) | _losses("held_out", losses)
@@ -115,12 +115,12 @@ def _training_averages(path: Path, config: NavigationConfig) -> dict[str, float]
     return {name: total / counts[name] for name, total in sums.items()}
 
 
-def write_trajectory(path: Path, trainer: NavigationTrainer, probe: StateProbe) -> None:
+def write_trajectory(path: Path, probed: ProbedObjective, probe: StateProbe) -> None:
     """True and estimated states of the first held-out trajectory, read as one stream."""
-    dataset, states = trainer.data.dataset, trainer.data.states
-    start = int(dataset.episode_start[trainer.data.first_held_out])
+    dataset, states = probed.data.dataset, probed.data.states
+    start = int(dataset.episode_start[probed.data.first_held_out])
     length = min(TRAJECTORY_ROWS, int((dataset.episode_end - dataset.episode_start).min()))
-    past, rows = encode(trainer, torch.tensor([_window_at(dataset, start, length)]), length)
+    past, rows = encode(probed, torch.tensor([_window_at(dataset, start, length)]), length)
     estimate = (probe(past)[0].detach() * states.std + states.mean).cpu()
     truth = (states.values[rows[0]] * states.std + states.mean).cpu()
     with replacing_file(path) as fresh, fresh.open("w", newline="", encoding="utf-8") as file:

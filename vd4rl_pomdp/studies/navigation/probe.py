@@ -63,28 +63,28 @@ class StateProbe(nn.Module):
         return self.net(self.standardise(z.detach() if frozen else z))
 
 
-class ErrorSums:
-    """Sums of absolute errors and their counts: over all rows and over hidden ones."""
+class ErrorSums(nn.Module):
+    """Sums of absolute errors and their counts: over all rows and over hidden ones. Both are part of its state."""
+
+    sums: Tensor
+    counts: Tensor
 
     def __init__(self) -> None:
-        self._sums = torch.zeros(2, STATE_DIM, dtype=torch.float64)
-        self._counts = torch.zeros(2, dtype=torch.float64)
+        super().__init__()
+        self.register_buffer("sums", torch.zeros(2, STATE_DIM, dtype=torch.float64))
+        self.register_buffer("counts", torch.zeros(2, dtype=torch.float64))
 
     def add(self, estimate: Tensor, truth: Tensor, hidden: Tensor, burn_in: int) -> None:
         """Count (B, T, 4) estimates against truths, a GPU is not waited for; rows before `burn_in` are left out."""
         error = (estimate.detach().float() - truth)[:, burn_in:].abs().flatten(0, 1)
         under = hidden[:, burn_in:].flatten()
         weights = torch.stack([torch.ones_like(under), under]).to(error)
-        self._sums = self._sums.to(error.device) + (weights @ error).double()
-        self._counts = self._counts.to(error.device) + weights.sum(1).double()
+        self.sums = self.sums.to(error.device) + (weights @ error).double()
+        self.counts = self.counts.to(error.device) + weights.sum(1).double()
 
-    def state(self) -> list[Tensor]:
-        """The sums and counts, for `restore`."""
-        return [self._sums, self._counts]
-
-    def restore(self, state: list[Tensor]) -> None:
-        """Go on counting."""
-        self._sums, self._counts = state
+    def reset(self) -> None:
+        """Count anew."""
+        self.sums, self.counts = torch.zeros_like(self.sums), torch.zeros_like(self.counts)
 
     def percent(self) -> dict[str, float]:
         """`state`, `position`, `velocity`, and the same with `_hidden` where any counted row was hidden."""
@@ -97,7 +97,7 @@ class ErrorSums:
 
     def _times(self, scale: Tensor) -> dict[str, float]:
         named: dict[str, float] = {}
-        sums, counts = self._sums.cpu(), self._counts.cpu()
+        sums, counts = self.sums.cpu(), self.counts.cpu()
         for number, suffix in enumerate(("", "_hidden")):
             if counts[number]:
                 means = 100 * scale * sums[number] / counts[number]

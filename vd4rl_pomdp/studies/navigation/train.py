@@ -8,9 +8,7 @@ from __future__ import annotations
 
 import shlex
 
-from pretrain.train import DECIDE_MEMORY, require_batch
 from vd4rl_pomdp.core.options import flat
-from vd4rl_pomdp.core.seeding import seed_networks
 from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.nn.encoder import EncoderCard
@@ -18,59 +16,51 @@ from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, save_encoder
 from vd4rl_pomdp.runs import METRICS_FILE, NAVIGATION_FILE, TRAJECTORY_FILE
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import write_json
-from vd4rl_pomdp.runs.memory import telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
 from vd4rl_pomdp.studies.navigation.data import open_data
 from vd4rl_pomdp.studies.navigation.measure import measure, write_trajectory
 from vd4rl_pomdp.studies.navigation.methods import UNTRAINED
-from vd4rl_pomdp.studies.navigation.trainer import STAGE, NavigationTrainer, make_objective
+from vd4rl_pomdp.studies.navigation.probed import STAGE, ProbedObjective, make_trainer
 
 RESULTS = (NAVIGATION_FILE, TRAJECTORY_FILE, *FILES_OF_RUN)
 """What a finished run holds."""
 
 
 def train(config: NavigationConfig) -> RunFolder:
-    """Run the stage, or go on with it; returns the run's folder."""
+    """Run the stage, or resume it; returns the run's folder."""
     config.check()
     refuse_inside(config.out)
-    with telling_memory(config, *DECIDE_MEMORY):
-        return _train(config)
-
-
-def _train(config: NavigationConfig) -> RunFolder:
     data = open_data(config)
-    seed_networks(config.seed, STAGE)
-    objective = make_objective(data, config)
-    device = pick_device(config.device)
-    require_batch(objective, device, config)
+    trainer, probed = make_trainer(data, config, pick_device(config.device))
+    labels = {"method": config.method, "task": data.maze.name}
     with RunFolder(config.out, STAGE, config, data.inputs, RESULTS) as run:
         if not run.finished:
-            trainer = NavigationTrainer(objective.to(device), data.on(device), config)
-            trainer.run(run, 0 if config.method == UNTRAINED else config.steps)
-            _conclude(run, trainer)
+            steps, last_averaged = 0 if config.method == UNTRAINED else config.steps, config.steps - config.average_last
+            trainer.run(run, steps, " ".join(reversed(labels.values())), labels, probed.take_errors, last_averaged)
+            _conclude(run, trainer.step, probed)
     return run
 
 
-def _conclude(run: RunFolder, trainer: NavigationTrainer) -> None:
+def _conclude(run: RunFolder, steps: int, probed: ProbedObjective) -> None:
     """Measure, and write what is kept of a run."""
-    config, data, trained = trainer.config, trainer.data, run.seconds
-    probe, rows = measure(trainer, run.path / METRICS_FILE)
-    write_trajectory(run.path / TRAJECTORY_FILE, trainer, probe)
+    config, data, trained = probed.config, probed.data, run.seconds
+    probe, rows = measure(probed, run.path / METRICS_FILE)
+    write_trajectory(run.path / TRAJECTORY_FILE, probed, probe)
     card = EncoderCard(
         method=config.method,
         task=data.maze.name,
         quality=data.maze.driver,
         corruption=flat(CorruptionConfig()),
         seed=config.seed,
-        steps=trainer.step,
+        steps=steps,
         preset=config.preset,
         data=data.dataset.fingerprint,
         settings=settings_of(run.config),
     )
-    frames = trainer.step * config.batch_size * config.window
-    save_encoder(run.path / "encoder", trainer.objective.encoder, card, frames)
+    frames = steps * config.batch_size * config.window
+    save_encoder(run.path / "encoder", probed.encoder, card, frames)
     record = {"maze": data.maze.name, "set": data.dataset.fingerprint, "command": shlex.join(command_of(config))}
     write_json(run.path / NAVIGATION_FILE, record | {"rows": rows})
-    run.finish(seconds=round(trained, 2), steps=trainer.step, frames=frames, total_seconds=round(run.seconds, 2))
+    run.finish(seconds=round(trained, 2), steps=steps, frames=frames, total_seconds=round(run.seconds, 2))
