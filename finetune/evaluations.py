@@ -73,7 +73,7 @@ class Evaluations:
         Raises:
             FloatingPointError: a weight is not finite.
         """
-        with interrupt.at_once():
+        with interrupt.deferred(False):
             self._keep(step, algorithm, loop)
             if not self._at(step):
                 self._play(step, loop)
@@ -104,7 +104,6 @@ class Evaluations:
         """Keep a film of the first episode, then append the rows of all."""
         self.drop_after(step - 1)
         episodes = evaluate(self._jobs(step), self.config.workers)
-        loop.require_owner()  # whoever took the run over meanwhile has rows of its own
         rows = episode_rows(episodes, labels(self.config, self.card) | {"step": step})
         if episodes[0].film is not None:
             with replacing_file(self.run / FILM_FILE) as fresh, fresh.open("wb") as file:

@@ -4,18 +4,10 @@ from __future__ import annotations
 
 from dataclasses import replace
 
-import numpy as np
-import torch
-
 from finetune.algorithms import ReturnOptions
 from finetune.config import FinetuneConfig
-from finetune.features import feature_type
-from finetune.histories import Histories
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_number
 from vd4rl_pomdp.core.options import NO_OPTIONS, flat
-from vd4rl_pomdp.data import Dataset
-from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.runs.memory import require_disk, require_memory
 
 
 def as_trained(config: FinetuneConfig, method: str, algorithm: str, remembers: bool, decisions: int) -> FinetuneConfig:
@@ -61,20 +53,6 @@ def _without_memory(config: FinetuneConfig, method: str) -> FinetuneConfig:
 def check_n_step(config: FinetuneConfig, longest: int) -> None:
     """Raise UserError for returns over more steps than the `longest` episode has."""
     refuse_number("n_step", return_options(config).n_step, 1, max(longest, ReturnOptions.n_step))
-
-
-def require_room(config: FinetuneConfig, dataset: Dataset, encoder: Encoder, device: torch.device, kept: bool) -> None:
-    """Refuse what plainly exceeds the memory or the disk: all views' features, or one batch through the networks.
-
-    Features that are `kept` on the disk already take no more of it.
-    """
-    histories = Histories(dataset, config.memory, 1, config.seed)
-    features = config.views * histories.features * encoder.dim * np.dtype(feature_type(encoder)).itemsize
-    require_memory(features, device, config, "views")
-    if not kept:
-        require_disk(features, config.out, config, "views")
-    row, weights = 2 * encoder.dim + 4 * config.hidden_dim, 15 * config.hidden_dim**2  # of float32 numbers
-    require_memory(4 * (config.batch_size * row + weights), device, config, "batch_size", "hidden_dim")
 
 
 def return_options(config: FinetuneConfig) -> ReturnOptions:

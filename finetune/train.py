@@ -17,7 +17,7 @@ from finetune.evaluations import POLICY, Evaluations, labels
 from finetune.features import STAGE, ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories, HistoryOptions
 from finetune.path import DataPath
-from finetune.settings import as_trained, check_n_step, require_room, return_options
+from finetune.settings import as_trained, check_n_step, return_options
 from vd4rl_pomdp.core.errors import refuse_number, refuse_outside
 from vd4rl_pomdp.core.registry import warn_of_other_code
 from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
@@ -44,7 +44,6 @@ from vd4rl_pomdp.runs import LABELS_FILE, PRETRAIN_TIMING_FILE, PROBE_FILE, REND
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.loop import training
-from vd4rl_pomdp.runs.memory import telling_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 
@@ -58,11 +57,6 @@ def finetune(config: FinetuneConfig) -> RunFolder:
     """Run the stage, or go on with it; writes the policy and `episodes.csv` into the run's folder."""
     config.check()
     refuse_inside(config.out)
-    with telling_memory(config, "views", "batch_size", "hidden_dim"):
-        return _finetune(config)
-
-
-def _finetune(config: FinetuneConfig) -> RunFolder:
     device = pick_device(config.device)
     dataset = open_dataset(config.data)
     dataset.require_transitions()
@@ -80,15 +74,14 @@ def _finetune(config: FinetuneConfig) -> RunFolder:
     card = replace(card, quality=dataset.quality or untold)  # the policy's set names its rows
     inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
     before = read_record(config.encoder)
-    run = RunFolder(config.out, STAGE, config, inputs, RESULTS, before.parts)
+    collection = read_plan(config.data)
+    run = RunFolder(config.out, STAGE, config, inputs, RESULTS, before.parts, collection)
     if run.finished:
         Evaluations(run.path, config, card, Reference()).require_all()
-    else:
-        require_room(config, dataset, encoder, device, FeatureFile(run.path, inputs).exists)
     with run:
         if not run.finished:
             warn_of_other_code(config.encoder, before.code, before.parts, "it was pretrained; pretrain it again")
-            warn_of_earlier_pictures(config.data, read_plan(config.data), TASKS.named(card.task))
+            warn_of_earlier_pictures(config.data, collection, TASKS.named(card.task))
             write_json(run.path / LABELS_FILE, labels(config, card))
             _keep_encoder(config, run.path)
             dataset.to(device)
@@ -180,14 +173,13 @@ class FinetuneTrainer:
             self.evaluations.drop_after(self.step)
             if self.step and loop.due(config.eval_every):
                 self.evaluations.carry_out(self.step, self.algorithm, loop)
-            while self.step < config.updates:
+            for step in loop:
                 loop.add(self.algorithm.update(self.sampler.sample()))  # type: ignore[arg-type]
-                self.step += 1
+                self.step = step
                 if loop.due(config.log_every):
                     loop.log()
-                evaluates = loop.due(config.eval_every)
-                loop.step_done(save=evaluates or self.step % config.checkpoint_every == 0)
-                if evaluates:
+                if loop.due(config.eval_every):
+                    loop.save()
                     self.evaluations.carry_out(self.step, self.algorithm, loop)
         if self.path:
             self.reference.with_path_error(self.path.action_error(self.algorithm.policy)).write(run.path)

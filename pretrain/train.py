@@ -18,6 +18,7 @@ from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK, TASKS, UNKNOWN_QUALI
 from vd4rl_pomdp.core.types import StateWindows
 from vd4rl_pomdp.corruptions import check_corruption_fits
 from vd4rl_pomdp.data import Dataset, StateView, View, WindowSampler, open_dataset
+from vd4rl_pomdp.data.format import read_plan
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.nn.encoder import EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, save_encoder
@@ -39,7 +40,8 @@ def pretrain(config: PretrainConfig) -> RunFolder:
     method, dataset = METHODS.named(config.method), open_dataset(config.data)
     config = replace(config, task=_task_of(dataset, config))
     objective = make_objective(dataset, config).to(pick_device(config.device))
-    with RunFolder(config.out, STAGE, config, {"data": dataset.fingerprint}, FILES_OF_RUN) as run:
+    inputs, collection = {"data": dataset.fingerprint}, read_plan(config.data)
+    with RunFolder(config.out, STAGE, config, inputs, FILES_OF_RUN, collection=collection) as run:
         if not run.finished:
             dataset.to(next(objective.parameters()).device)
             trainer = Trainer(objective, make_batches(dataset, config, objective), config)

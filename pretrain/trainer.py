@@ -87,11 +87,10 @@ class Trainer:
             also_at: a step after which a row of metrics is written, too.
         """
         with training(run, self, title, steps, labels=labels) as loop:
-            while self.step < steps:
+            for step in loop:
                 loop.add(self.update())
-                if loop.due(self.config.log_every) or self.step == also_at:
+                if loop.due(self.config.log_every) or step == also_at:
                     loop.log("loss", **measures())
-                loop.step_done(save=loop.due(self.config.checkpoint_every))
             loop.require_finite(self.objective)
 
     def state(self) -> dict[str, Any]:

@@ -18,6 +18,10 @@ LARGE = (".safetensors", ".hdf5", ".png")
 """What the Hub keeps as large files."""
 
 
+def git_oid(content: bytes) -> str:
+    return hashlib.sha1(b"blob %d\0" % len(content) + content).hexdigest()
+
+
 @dataclass
 class Repo:
     private: bool = False
@@ -60,9 +64,6 @@ class Hub:
         """Files that are sent with a wrong byte."""
         self.status: dict[str, int] = {}
         """Statuses with which requests fail, by a part of their path."""
-        self.gated: set[str] = set()
-        self.silent = ""
-        """A part of the paths of requests that are answered after 15 s."""
 
     def files(self, repo: str, revision: str = "main") -> dict[str, bytes]:
         found = self.repos[repo]
@@ -85,8 +86,6 @@ class _Handler(BaseHTTPRequestHandler):
         body = self.rfile.read(int(self.headers["Content-Length"] or 0))
         path = unquote(urlsplit(self.path).path)
         self.hub.requests[f"{self.command} {path}"] += 1
-        if self.hub.silent and self.hub.silent in path:
-            threading.Event().wait(15)
         try:
             for part, status in self.hub.status.items():
                 if part in path:
@@ -122,8 +121,6 @@ class _Handler(BaseHTTPRequestHandler):
         return self.headers["Authorization"] == f"Bearer {TOKEN}"
 
     def _repo(self, name: str, write: bool = False) -> Repo:
-        if name in self.hub.gated and not self._writes:
-            raise RefusedError(403, "GatedRepo", "ask its owner")
         repo = self.hub.repos.get(name)
         if repo is None or (repo.private and not self._writes):
             raise RefusedError(404, "RepoNotFound", "Repository not found")
@@ -136,10 +133,12 @@ class _Handler(BaseHTTPRequestHandler):
         if not self._writes:
             raise RefusedError(401, "", "Invalid username or password.")
         name = f"{asked.get('type', 'model')}s/{asked['organization']}/{asked['name']}"
-        repo = self.hub.repos[name] = Repo(asked.get("visibility") == "private")
-        repo.commit("main", {".gitattributes": b"*.hdf5 filter=lfs\n"})
-        host = f"http://{self.headers['Host']}/"
-        self._json({"url": host + name.removeprefix("models/"), "id": name.partition("/")[2]})
+        host, there = f"http://{self.headers['Host']}/", name in self.hub.repos
+        if not there:
+            repo = self.hub.repos[name] = Repo(asked.get("visibility") == "private")
+            repo.commit("main", {".gitattributes": b"*.hdf5 filter=lfs\n"})
+        told = {"url": host + name.removeprefix("models/"), "id": name.partition("/")[2]}
+        self._send(409 if there else 200, json.dumps(told).encode(), {"Content-Type": "application/json"})
 
     def info(self, kind: str, name: str, revision: str | None, body: bytes) -> None:
         repo = self._repo(f"{kind}/{name}")
@@ -148,6 +147,11 @@ class _Handler(BaseHTTPRequestHandler):
             raise RefusedError(404, "RevisionNotFound", f"Invalid rev id: {revision}")
         names = [{"rfilename": path} for path in repo.commits[commit]]
         self._json({"id": name, "sha": commit, "private": repo.private, "siblings": names, "tags": []})
+
+    def tree(self, kind: str, name: str, revision: str, body: bytes) -> None:
+        repo = self._repo(f"{kind}/{name}")
+        files = repo.commits.get(repo.at(revision) or "", {})
+        self._json([{"type": "file", "path": p, "size": len(c), "oid": git_oid(c)} for p, c in files.items()])
 
     def branch(self, kind: str, name: str, branch: str, body: bytes) -> None:
         repo = self._repo(f"{kind}/{name}", write=True)
@@ -228,6 +232,7 @@ _ROUTES = [
     (r"/api/validate-yaml", _Handler.yaml),
     (r"/api/(models|datasets)/([^/]+/[^/]+)(?:/revision/(.+))?", _Handler.info),
     (r"/api/(models|datasets)/([^/]+/[^/]+)/branch/(.+)", _Handler.branch),
+    (r"/api/(models|datasets)/([^/]+/[^/]+)/tree/(.+)", _Handler.tree),
     (r"/api/(models|datasets)/([^/]+/[^/]+)/preupload/(.+)", _Handler.preupload),
     (r"/api/(models|datasets)/([^/]+/[^/]+)/commit/(.+)", _Handler.commit),
     (rf"/{_REPO}\.git/info/lfs/objects/batch", _Handler.batch),

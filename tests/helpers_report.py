@@ -9,8 +9,7 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.data.reference import Reference
-from vd4rl_pomdp.report.load import load_runs
-from vd4rl_pomdp.report.tables import label
+from vd4rl_pomdp.report.load import label, load_runs
 from vd4rl_pomdp.runs.episodes import append_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.identity import identity
@@ -56,7 +55,9 @@ def write_run(
     return folder
 
 
-def describe(run: Path, card: dict[str, Any] | None = None, data: str = "", **config: Any) -> Path:
+def describe(
+    run: Path, card: dict[str, Any] | None = None, data: str = "", encoder_seed: int | None = None, **config: Any
+) -> Path:
     """Give a run of `write_run` settings: its own config, its encoder's card, and the fingerprint of its data."""
     record = read_json(run / "config.json")
     record["config"] |= {"updates": 10, "preset": "cpu", "batch_size": 256, "views": 4} | config
@@ -66,6 +67,7 @@ def describe(run: Path, card: dict[str, Any] | None = None, data: str = "", **co
         settings |= {k: v for k, v in card.items() if k not in ("data",)}
         corruption = {"corruption": "patch", "patch_size": settings["patch_size"]}
         facts = {"corruption": corruption, "steps": settings["steps"], "preset": settings["preset"]}
+        facts |= {} if encoder_seed is None else {"seed": encoder_seed}
         (run / "encoder").mkdir()
         write_json(
             run / "encoder" / "config.json", {"pretrain": facts | {"settings": settings, "data": card.get("data", "")}}
@@ -112,7 +114,7 @@ def pretraining(place: Path) -> Path:
 def pooled(folder: Path) -> dict[str, int]:
     """Seeds by the label under which a folder's runs are pooled."""
     runs = load_runs([folder])
-    return dict(Counter(label(run.labels | {"variant": run.variant}) for run in runs for _ in run.rows))
+    return dict(Counter(label(run.named) for run in runs for _ in run.rows))
 
 
 def grid(tmp_path: Path) -> Path:

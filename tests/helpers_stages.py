@@ -2,12 +2,15 @@
 
 import hashlib
 from pathlib import Path
+from typing import Any
+
+import torch
 
 import finetune.config
 import pretrain.config
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 
-VARYING = ("timing.json", "pretrain_timing.json", "machine.json", "manifest.json")
+VARYING = ("timing.json", "pretrain_timing.json", "machine.json")
 
 
 def contents(folder: Path) -> dict[str, str]:
@@ -16,13 +19,24 @@ def contents(folder: Path) -> dict[str, str]:
 
 
 def _stable(path: Path) -> bytes:
-    """A file's bytes without run paths."""
+    """A file's content without run paths and seconds."""
     text = path.read_bytes()
+    if path.suffix == ".pt":
+        return repr(_spelled(torch.load(path, weights_only=True)["state"])).encode()
     if path.name == "results.json":
         return b"\n".join(line for line in text.splitlines() if b'"command"' not in line)
     if path.name == "config.json":
         return b"\n".join(line for line in text.splitlines() if b'"out"' not in line and b'"encoder":' not in line)
     return text
+
+
+def _spelled(node: Any) -> Any:
+    """A state without tensors, whose pickle would tell which words are one object."""
+    if isinstance(node, torch.Tensor):
+        return str(node.dtype), tuple(node.shape), hashlib.sha256(node.numpy().tobytes()).hexdigest()
+    if isinstance(node, dict):
+        return {key: _spelled(value) for key, value in node.items()}
+    return [_spelled(value) for value in node] if isinstance(node, list | tuple) else node
 
 
 class CutError(Exception):

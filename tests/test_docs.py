@@ -1,5 +1,6 @@
 """Code blocks of the README and of docs/: Python is executed, commands are parsed, and run where that takes seconds."""
 
+import functools
 import re
 import shlex
 import subprocess
@@ -39,8 +40,9 @@ NOT_RUN = {
     "vd4rl-pomdp data collect": "renders whole episodes; data/test_collect runs shorter ones",
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
     "vd4rl-pomdp hub": "needs a Hub; test_hub has one of its own",
+    "python tools/train_actor.py": "trains for hours; tests/tools trains less",
+    "python tools/export_actor.py": "as above",
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
-    "vd4rl-pomdp policy": "trains for hours; tests/policies trains less",
     "vd4rl-pomdp navigation": "trains for minutes to days; vd4rl_pomdp/studies/navigation/test_train trains less",
     "vd4rl-pomdp report": "the README's is run; tests/report makes all others",
     "vd4rl-pomdp results add": "tests/runs/results adds runs",
@@ -138,9 +140,10 @@ def check_names(config: object) -> None:
     """Names that a command looks up after parsing must exist."""
     if type(config).__name__ == "NavigationConfig":  # their methods are others, too
         return
+    told = config.keywords if isinstance(config, functools.partial) else vars(config)
     for field, check in CHECKS.items():
-        value = getattr(config, field, None)
-        for name in value if isinstance(value, list) else [value]:
+        value = told.get(field)
+        for name in value if isinstance(value, list | tuple) else [value]:
             if name:
                 check(name)
 

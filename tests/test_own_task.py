@@ -27,8 +27,6 @@ from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import read_shard
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.nn import load_encoder
-from vd4rl_pomdp.policies.config import PolicyConfig, recipes
-from vd4rl_pomdp.policies.train import train_policy
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.runs.episodes import read_episodes
 
@@ -166,7 +164,7 @@ def test_frames_that_are_drawn_at_their_own_size_are_not_said_to_be_shrunk(tasks
         ({"quality": "medium_replay"}, "centre has no states"),
         (
             {"task": "cartpole_swingup", "quality": "expert"},
-            "no expert actor ships for cartpole_swingup .*policy train",
+            "no expert actor ships for cartpole_swingup .*train_actor",
         ),
         ({"task": "cartpole_swingup", "quality": "expert_noisy"}, "names no noise of its own: .*--action-noise"),
         ({"frame_size": 15}, "--frame-size is 15; it must be at least 16 and at most 480"),
@@ -288,11 +286,3 @@ def test_a_set_is_not_continued_in_another_size(tasks, tmp_path):
     with pytest.raises(UserError, match="another frame_size"):
         collect(replace(config, frame_size=64), 8)
     collect(config, 8)
-
-
-def test_policies_have_a_recipe_for_every_task_and_are_trained_where_there_are_states(tasks, tmp_path):
-    assert set(recipes()) == {"walker_walk", "cheetah_run", "humanoid_walk", "cartpole_swingup", "centre"}
-    assert recipes()["cartpole_swingup"] == replace(recipes()["cheetah_run"], task="cartpole_swingup")
-    with pytest.raises(UserError, match="centre has no states for an actor to read"):
-        train_policy(PolicyConfig("centre", tmp_path / "run"))
-    assert not (tmp_path / "run").exists()

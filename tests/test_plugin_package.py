@@ -180,29 +180,6 @@ def file_hash(place: Path) -> str:
     return sha256((place / "site" / "their_parts.py").read_bytes()).hexdigest()[:12]
 
 
-def test_another_version_of_a_package_is_other_code_and_so_is_another_file(python, tmp_path):
-    asked = "from vd4rl_pomdp.core.registry import *; from pretrain.objectives import METHODS; "
-    asked += "named = {'method': 'sharp'}; "
-    told = python("-c", f"{asked}print({{'plugins': origins(named), 'sources': sources(named)}})")
-    assert (
-        told
-        == str(
-            {"plugins": {"method sharp": ORIGIN}, "sources": {"method sharp": f"their_parts.py {file_hash(tmp_path)}"}}
-        )
-        + "\n"
-    )
-    changed = f"{asked}print(of_other_code({told.strip()}, named))"
-    assert python("-c", changed) == "[]\n"
-    (info,) = (tmp_path / "site").glob("*.dist-info")
-    metadata = (info / "METADATA").read_text()
-    (info / "METADATA").write_text(metadata.replace("1.2", "1.3"))
-    assert python("-c", changed) == "['method sharp']\n"
-    (info / "METADATA").write_text(metadata)
-    with (tmp_path / "site" / "their_parts.py").open("a") as file:
-        file.write("# changed\n")
-    assert python("-c", changed) == "['method sharp']\n"
-
-
 USE = f"""
 from vd4rl_pomdp import testing
 from vd4rl_pomdp.cli import main

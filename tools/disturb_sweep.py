@@ -118,9 +118,9 @@ def kill_the_driver(sweep: Sweep, draw: random.Random) -> str:
 def truncate_a_checkpoint(sweep: Sweep, draw: random.Random) -> str:
     """Kill all jobs when one has two checkpoints, and cut its newest in half."""
     while True:
-        for path in sweep.out.rglob("checkpoints/*/state.safetensors"):
-            run, step = path.parents[2], path.parent.name
-            if path.parent.name.isdecimal() and len(_steps(run)) > 1 and int(step) == max(_steps(run)):
+        for path in sweep.out.rglob("checkpoints/*.pt"):
+            run, step = path.parents[1], path.stem
+            if step.isdecimal() and len(_steps(run)) > 1 and int(step) == max(_steps(run)):
                 for job in sweep.jobs:
                     os.kill(job, signal.SIGKILL)
                 if not (run / "timing.json").exists() and path.exists():
@@ -131,7 +131,7 @@ def truncate_a_checkpoint(sweep: Sweep, draw: random.Random) -> str:
 
 
 def _steps(run: Path) -> list[int]:
-    return [int(path.name) for path in (run / "checkpoints").iterdir() if path.name.isdecimal()]
+    return [int(path.stem) for path in (run / "checkpoints").iterdir() if path.stem.isdecimal()]
 
 
 def fill_the_disk(sweep: Sweep, draw: random.Random) -> str:

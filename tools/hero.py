@@ -57,7 +57,7 @@ def returns() -> dict[str, tuple[float, float, float]]:
     here = [run for run in offline_table.main_runs() if tuple(run.labels[name] for name in labels) == SETTING]
     found = {}
     for method in COLOURS:
-        episodes = episodes_of([run for run in here if run.labels["method"] == method])
+        episodes = episodes_of([run for run in here if run.method == method])
         low, high = mean_interval(episodes)
         found[method] = (float(episodes.mean()), low, high)
     return found

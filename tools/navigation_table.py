@@ -3,29 +3,32 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from dataclasses import replace
 from itertools import pairwise
 from pathlib import Path
 
+import numpy as np
+
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
-from vd4rl_pomdp.report.layout import number
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs.results import read_results
-from vd4rl_pomdp.studies.navigation.grid import Condition
-from vd4rl_pomdp.studies.navigation.measures import Measure, online_error, refitted_error
-from vd4rl_pomdp.studies.navigation.methods import METHOD_NAMES, OBJECTIVES, UNTRAINED
-from vd4rl_pomdp.studies.navigation.runs import NavigationRun, load_runs
-from vd4rl_pomdp.studies.navigation.tables import Entry, entry_of
+from vd4rl_pomdp.studies.navigation.claims import Numbers
+from vd4rl_pomdp.studies.navigation.measures import (
+    OBJECTIVES,
+    UNTRAINED,
+    Condition,
+    Measure,
+    online_error,
+    paper_number,
+    refitted_error,
+)
+from vd4rl_pomdp.studies.navigation.runs import NavigationRun, frame_of, load_runs, numbers_of
 
 RESULTS = Path(__file__).parents[1] / "results" / "navigation"
 REFITTED = [refitted_error(component) for component in ("state", "position", "velocity")]
 """In percent, on held-out trajectories."""
 REFITTED_RAW = [error.raw() for error in REFITTED]
-MEASURES = (
-    *(online_error(component).raw() for component in ("state", "position", "velocity")),
-    *REFITTED,
-    *REFITTED_RAW,
-)
+PAPERS_WAY = [online_error(component).raw() for component in ("state", "position", "velocity")]
+MEASURES = (*PAPERS_WAY, *REFITTED, *REFITTED_RAW)
 """Of a maze's table: the paper's way and units, then both units by the refitted probe."""
 REFERENCES = {
     UNTRAINED: "untrained",
@@ -44,10 +47,6 @@ STARS, COMPASS = "first_person", "compass_first_person"
 PICTURES = {"rgb50": "colour, 50x50", "rgb100": "colour, 100x100"}
 """Pictures other than the preset's, as the pages call them."""
 _ORDER = ("mik+a", "fj+a", "ah", "mik", "fj", "ah+a", "no_history")
-_HEAD = (
-    "| | seeds | " + " | ".join(f"`{name}`" for name in _ORDER) + " |",
-    "|---|---:|" + "---:|" * len(_ORDER),
-)
 
 
 def main_runs() -> list[NavigationRun]:
@@ -55,125 +54,26 @@ def main_runs() -> list[NavigationRun]:
     return load_runs(read_results(RESULTS))
 
 
-def first_person_runs() -> list[NavigationRun]:
-    """The runs of the grid `first_person`."""
-    return load_runs(read_results(RESULTS / "first_person"))
+def numbers_in(folder: str = ".") -> Numbers:
+    """Numbers of the runs of results/navigation, or of a folder within it."""
+    return numbers_of(frame_of(load_runs(read_results(RESULTS / folder))))
 
 
-def first_rung_runs() -> list[NavigationRun]:
-    """The runs of that grid at its smallest budget."""
-    return load_runs(read_results(RESULTS / "first_person" / "small"))
+def values(numbers: Numbers, condition: Condition, measure: Measure) -> list[float]:
+    """One number a seed, in order."""
+    return list(numbers.get((*condition, *measure), {}).values())
 
 
-def picture_runs() -> list[NavigationRun]:
-    """Runs in first person with other pictures, or another learning rate, than the preset's: one seed of each."""
-    return [load_runs([result])[0] for result in read_results(RESULTS / "first_person" / "pictures")]
+def _mean(numbers: Numbers, condition: Condition, measure: Measure) -> str:
+    """Mean and standard error over seeds; a dash if there is no seed."""
+    found = values(numbers, condition, measure)
+    return mean_and_error(found, 1) if found else "–"
 
 
-def measured(runs: list[NavigationRun]) -> list[str]:
-    """The paper's own mazes in which every objective was trained at K = 15."""
-    return [
-        maze
-        for maze in PAPER_MAZES
-        if all(len(entry_of(Condition(maze, name), MEASURES[0], runs).numbers) for name in OBJECTIVES)
-    ]
-
-
-def maze_lines(runs: list[NavigationRun], maze: str) -> Iterator[str]:
-    """All methods at K = 15 in one maze, those with the smallest state errors first, then the references."""
-    yield "| | seeds | state | position | velocity | state, position, velocity in % | the same raw x 100 |"
-    yield "|---|---:|---:|---:|---:|---:|---:|"
-    rows = {name: [entry_of(Condition(maze, name), one, runs) for one in MEASURES] for name in METHOD_NAMES}
-    for method in (*sorted(OBJECTIVES, key=lambda name: rows[name][0].numbers.mean()), *REFERENCES):
-        yield _line(_called(method), rows[method])
-
-
-def state_lines(runs: list[NavigationRun], ks: Sequence[int]) -> Iterator[str]:
-    """State errors of all objectives by maze and K, in both units."""
-    yield from _HEAD
-    for k in ks:
-        for maze in measured(runs):
-            yield from _state_lines(runs, f"K = {k}", Condition(maze, "", k))
-
-
-def texture_lines(runs: list[NavigationRun]) -> Iterator[str]:
-    """State errors at K = 15 with textures in the pictures, and without them."""
-    yield from _HEAD
-    for maze in measured(runs):
-        if with_them := list(_state_lines(runs, "textures", Condition(maze, "", exogenous=True))):
-            yield from (*with_them, *_state_lines(runs, "without", Condition(maze, "")))
-
-
-def _state_lines(runs: list[NavigationRun], words: str, cell: Condition) -> Iterator[str]:
-    """State errors under a condition in the paper's way and units, then in percent by the refitted probe."""
-    yield from _state_line(runs, words, cell)
-    yield from _state_line(runs, f"{words}, in %", cell, refitted_error("state"))
-
-
-def _state_line(
-    runs: list[NavigationRun], words: str, cell: Condition, measure: Measure = MEASURES[0]
-) -> Iterator[str]:
-    """One error of all objectives under a condition, whose method is left open; no line if none was trained."""
-    entries = [entry_of(replace(cell, method=name), measure, runs) for name in _ORDER]
-    counts = {len(entry.numbers) for entry in entries} - {0}
-    if counts:
-        seeds = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
-        yield f"| {cell.maze.replace('_', ' ')}, {words} | {seeds} | {' | '.join(map(_cell, entries))} |"
-
-
-def first_person_lines(runs: list[NavigationRun]) -> Iterator[str]:
-    """Errors under the compass of all that was trained there, those with the smallest state errors first."""
-    yield "| | seeds | state, position, velocity | raw x 100 | probe beside the model: position, velocity | raw x 100 |"
-    yield "|---|---:|---:|---:|---:|---:|"
-    objectives = {
-        f"`{name}`{words}": Condition(COMPASS, name, self_prediction=bool(words))
-        for name in OBJECTIVES
-        for words in ("", " with self-prediction")
-    }
-    told = objectives | {words: Condition(COMPASS, name) for name, words in REFERENCES.items()}
-    online = [one._replace(probe="online") for one in REFITTED[1:]]
-    measures = [*REFITTED, *REFITTED_RAW, *online, *(one.raw() for one in online)]
-    rows = {name: [entry_of(condition, one, runs) for one in measures] for name, condition in told.items()}
-    trained = [name for name, (state, *_) in rows.items() if len(state.numbers)]
-    for name in sorted(trained, key=lambda one: rows[one][0].numbers.mean()):
-        cells = list(map(_cell, rows[name]))
-        columns = " | ".join(", ".join(cells[i:j]) for i, j in pairwise((0, 3, 6, 8, 10)))
-        yield f"| {name} | {len(rows[name][0].numbers)} | {columns} |"
-
-
-def first_rung_lines(runs: list[NavigationRun]) -> Iterator[str]:
-    """Errors of position and velocity at the smallest budget, under the stars and under the compass, in both units."""
-    yield "| | `first_person` | raw x 100 | `compass_first_person` | raw x 100 |"
-    yield "|---|---:|---:|---:|---:|"
-    for method in (*REFERENCES, "no_history", "mik+a", "ah+a"):
-        cells = [_place_and_speed(Condition(maze, method), runs) for maze in (STARS, COMPASS)]
-        yield f"| {_called(method)} | {' | '.join(cells)} |"
-
-
-def picture_lines(runs: list[NavigationRun], usual: list[NavigationRun]) -> Iterator[str]:
-    """Errors of position and velocity under the stars by what is changed, in both units, below those of the preset.
-
-    Args:
-        runs: those with one setting changed.
-        usual: runs of the preset.
-    """
-    methods = ("supervised_picture", "supervised", "mik+a")
-    yield "| | " + " | ".join(f"{_called(name)} | raw x 100" for name in methods) + " |"
-    yield "|---|" + "---:|" * (2 * len(methods))
-    groups: dict[str, list[NavigationRun]] = {"the preset: grey, 50x50, rate 0.002": usual}
-    for run in runs:
-        config = run.result.record["config"]
-        told = PICTURES.get(config["picture"]) or f"rate {config['learning_rate']:g}"
-        groups.setdefault(told, []).append(run)
-    for words, members in groups.items():
-        cells = [_place_and_speed(Condition(STARS, name), members) for name in methods]
-        yield f"| {words} | {' | '.join(cells)} |"
-
-
-def _place_and_speed(condition: Condition, runs: list[NavigationRun]) -> str:
-    """Two cells: errors of position and velocity by the refitted probe, in percent and in raw units."""
-    entries = [[entry_of(condition, error, runs) for error in unit] for unit in (REFITTED[1:], REFITTED_RAW[1:])]
-    return " | ".join(", ".join(map(_mean, unit)) for unit in entries)
+def _cell(numbers: Numbers, condition: Condition, measure: Measure) -> str:
+    """Mean and standard error over seeds, and the paper's number; a dash if there is no seed."""
+    paper = paper_number(condition, measure) if values(numbers, condition, measure) else None
+    return _mean(numbers, condition, measure) + ("" if paper is None else f" ({paper:.1f})")
 
 
 def _called(method: str) -> str:
@@ -181,39 +81,121 @@ def _called(method: str) -> str:
     return REFERENCES.get(method, f"`{method}`")
 
 
-def hard_lines(runs: list[NavigationRun]) -> Iterator[str]:
+def _head(columns: Sequence[str]) -> Iterator[str]:
+    """A table's first two lines; its first column, which names the rows, has no title."""
+    yield f"| | {' | '.join(columns)} |"
+    yield "|---|" + "---:|" * len(columns)
+
+
+def maze_lines(numbers: Numbers, maze: str) -> Iterator[str]:
+    """All methods at K = 15 in one maze, those with the smallest state errors first, then the references."""
+    yield from _head(("seeds", "state", "position", "velocity", "state, position, velocity in %", "the same raw x 100"))
+    ranked = sorted(OBJECTIVES, key=lambda name: np.mean(values(numbers, Condition(maze, name), MEASURES[0])))
+    for method in (*ranked, *REFERENCES):
+        condition = Condition(maze, method)
+        cells = [_cell(numbers, condition, one) for one in PAPERS_WAY]
+        cells += [", ".join(_mean(numbers, condition, one) for one in unit) for unit in (REFITTED, REFITTED_RAW)]
+        yield f"| {_called(method)} | {len(values(numbers, condition, REFITTED[0]))} | {' | '.join(cells)} |"
+
+
+def _measured(numbers: Numbers) -> list[str]:
+    """The paper's own mazes in which every objective was trained at K = 15."""
+    return [
+        maze for maze in PAPER_MAZES if all(values(numbers, Condition(maze, name), MEASURES[0]) for name in OBJECTIVES)
+    ]
+
+
+def state_lines(numbers: Numbers, ks: Sequence[int]) -> Iterator[str]:
+    """State errors of all objectives by maze and K, in both units."""
+    yield from _head(["seeds", *(f"`{name}`" for name in _ORDER)])
+    for k in ks:
+        for maze in _measured(numbers):
+            yield from _state_lines(numbers, f"K = {k}", Condition(maze, "", k))
+
+
+def texture_lines(numbers: Numbers) -> Iterator[str]:
+    """State errors at K = 15 with textures in the pictures, and without them."""
+    yield from _head(["seeds", *(f"`{name}`" for name in _ORDER)])
+    for maze in _measured(numbers):
+        if with_them := list(_state_lines(numbers, "textures", Condition(maze, "", exogenous=True))):
+            yield from (*with_them, *_state_lines(numbers, "without", Condition(maze, "")))
+
+
+def _state_lines(numbers: Numbers, words: str, cell: Condition) -> Iterator[str]:
+    """State errors of all objectives under a condition, in the paper's way and units, then in percent when refitted.
+
+    The condition's method is left open; no line if none was trained.
+    """
+    for told, measure in ((words, MEASURES[0]), (f"{words}, in %", REFITTED[0])):
+        conditions = [cell._replace(method=name) for name in _ORDER]
+        counts = {len(values(numbers, condition, measure)) for condition in conditions} - {0}
+        if counts:
+            seeds = " to ".join(str(count) for count in sorted({min(counts), max(counts)}))
+            cells = " | ".join(_cell(numbers, condition, measure) for condition in conditions)
+            yield f"| {cell.maze.replace('_', ' ')}, {told} | {seeds} | {cells} |"
+
+
+def first_person_lines(numbers: Numbers) -> Iterator[str]:
+    """Errors under the compass of all that was trained there, those with the smallest state errors first."""
+    beside = "probe beside the model: position, velocity"
+    yield from _head(("seeds", "state, position, velocity", "raw x 100", beside, "raw x 100"))
+    told = {
+        f"`{name}`{words}": Condition(COMPASS, name, self_prediction=bool(words))
+        for name in OBJECTIVES
+        for words in ("", " with self-prediction")
+    } | {words: Condition(COMPASS, name) for name, words in REFERENCES.items()}
+    online = [one._replace(probe="online") for one in REFITTED[1:]]
+    measures = [*REFITTED, *REFITTED_RAW, *online, *(one.raw() for one in online)]
+    state = {name: values(numbers, condition, REFITTED[0]) for name, condition in told.items()}
+    for name in sorted(filter(state.get, told), key=lambda one: np.mean(state[one])):
+        cells = [_cell(numbers, told[name], one) for one in measures]
+        columns = " | ".join(", ".join(cells[i:j]) for i, j in pairwise((0, 3, 6, 8, 10)))
+        yield f"| {name} | {len(state[name])} | {columns} |"
+
+
+def first_rung_lines(numbers: Numbers) -> Iterator[str]:
+    """Errors of position and velocity at the smallest budget, under the stars and under the compass, in both units."""
+    yield from _head((f"`{STARS}`", "raw x 100", f"`{COMPASS}`", "raw x 100"))
+    for method in (*REFERENCES, "no_history", "mik+a", "ah+a"):
+        cells = [_place_and_speed(numbers, Condition(maze, method)) for maze in (STARS, COMPASS)]
+        yield f"| {_called(method)} | {' | '.join(cells)} |"
+
+
+def picture_lines(usual: Numbers) -> Iterator[str]:
+    """Errors of position and velocity under the stars by what is changed, in both units, below those of the preset.
+
+    Each changed setting has one seed; `usual` are numbers of the preset.
+    """
+    methods = ("supervised_picture", "supervised", "mik+a")
+    yield from _head([words for name in methods for words in (_called(name), "raw x 100")])
+    groups: dict[str, list[NavigationRun]] = {}
+    for result in read_results(RESULTS / "first_person" / "pictures"):
+        config = result.record["config"]
+        told = PICTURES.get(config["picture"]) or f"rate {config['learning_rate']:g}"
+        groups.setdefault(told, []).extend(load_runs([result]))
+    changed = {words: numbers_of(frame_of(members)) for words, members in groups.items()}
+    for words, numbers in ({"the preset: grey, 50x50, rate 0.002": usual} | changed).items():
+        cells = [_place_and_speed(numbers, Condition(STARS, name)) for name in methods]
+        yield f"| {words} | {' | '.join(cells)} |"
+
+
+def _place_and_speed(numbers: Numbers, condition: Condition) -> str:
+    """Two cells: errors of position and velocity by the refitted probe, in percent and in raw units."""
+    units = REFITTED[1:], REFITTED_RAW[1:]
+    return " | ".join(", ".join(_mean(numbers, condition, error) for error in unit) for unit in units)
+
+
+def hard_lines(numbers: Numbers) -> Iterator[str]:
     """Errors of position and velocity at K = 15 in the harder mazes, with what they can be in raw units."""
-    yield f"| | {' | '.join(f'`{maze}`' for maze in HARD_SPREADS)} |"
-    yield "|---|" + "---:|" * len(HARD_SPREADS)
+    yield from _head([f"`{maze}`" for maze in HARD_SPREADS])
     for method in (*_ORDER, *REFERENCES):
         cells = []
         for maze, spreads in HARD_SPREADS.items():
-            entries = [entry_of(Condition(maze, method), error, runs) for error in REFITTED[1:]]
-            cells.append(", ".join(filter(None, map(_bounded, entries, spreads))))
+            parts = []
+            for error, spread in zip(REFITTED[1:], spreads, strict=True):
+                if found := values(numbers, Condition(maze, method), error):
+                    low, high = (np.mean(found) * deviation for deviation in spread)
+                    parts.append(f"{mean_and_error(found, 1)} ({low:.1f} to {high:.1f})")
+            cells.append(", ".join(parts))
         if any(cells):
-            yield f"| {_called(method)} | {' | '.join(cell or number(None) for cell in cells)} |"
-
-
-def _bounded(entry: Entry, spread: tuple[float, float]) -> str:
-    """Percent of deviations, and the raw x 100 that it lies between; nothing if there is no seed."""
-    if not len(entry.numbers):
-        return ""
-    low, high = (entry.numbers.mean() * deviation for deviation in spread)
-    return f"{_mean(entry)} ({low:.1f} to {high:.1f})"
-
-
-def _line(name: str, entries: list[Entry]) -> str:
-    cells = list(map(_mean, entries[3:]))
-    averages = " | ".join(map(_cell, entries[:3]))
-    return f"| {name} | {len(entries[-1].numbers)} | {averages} | {', '.join(cells[:3])} | {', '.join(cells[3:])} |"
-
-
-def _cell(entry: Entry) -> str:
-    """Mean and standard error over seeds, and the paper's number; a dash if there is no seed."""
-    shown = len(entry.numbers) and entry.paper is not None
-    return _mean(entry) + (f" ({entry.paper:.1f})" if shown else "")
-
-
-def _mean(entry: Entry) -> str:
-    """Mean and standard error over seeds; a dash if there is no seed."""
-    return mean_and_error(entry.numbers.tolist(), 1) if len(entry.numbers) else number(None)
+            yield f"| {_called(method)} | {' | '.join(cell or '–' for cell in cells)} |"

@@ -2,20 +2,28 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from itertools import product
 from pathlib import Path
 
 import numpy as np
+import pandas as pd
 from scipy.stats import spearmanr
 
 from vd4rl_pomdp.report.gates import FAILED, PASSED, UNKNOWN, episodes_of, gates, returns_of
-from vd4rl_pomdp.report.layout import number, with_interval
-from vd4rl_pomdp.report.load import PROBES, LoadedRun, load_runs
-from vd4rl_pomdp.report.measures import mean_if_known
-from vd4rl_pomdp.report.overall import aggregate, improvement
-from vd4rl_pomdp.report.stats import difference_interval, mean_interval
-from vd4rl_pomdp.report.tables import TOLD_STATES, evaluations
+from vd4rl_pomdp.report.load import (
+    ACTION_ERRORS,
+    CONDITION,
+    PROBES,
+    TOLD_STATES,
+    Run,
+    episodes_frame,
+    groups,
+    load_runs,
+    runs_frame,
+)
+from vd4rl_pomdp.report.stats import difference_interval, mean_interval, number, with_interval
+from vd4rl_pomdp.report.tables import aggregate, evaluations, improvement
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.sweeps.grid import load_grid
@@ -51,14 +59,14 @@ ASIDE = RESULTS / "offline" / "clean_evaluation.csv"
 """Policies that were played with nothing hidden after their runs had ended."""
 
 
-def main_runs() -> list[LoadedRun]:
+def main_runs() -> list[Run]:
     """Finished TD3+BC of the two grids, without variants."""
     cells = [cell for name in GRIDS for cell in load_grid(name).cells()]
     found = load_runs([RESULTS / name for name in GRIDS], choice=GridMembers(" and ".join(GRIDS), cells))
     return [run for run in found if run.rows and run.finished and not run.variant]
 
 
-def return_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+def return_lines(runs: Sequence[Run]) -> Iterator[str]:
     """Returns of the main methods, a row for every set and corruption."""
     shown = (*(f"`{name}`" for name in MAIN), "`mik+a` less `acro`", "the same, played clean")
     yield f"| set (data's return) | {' | '.join(shown)} | `acro` trained with nothing hidden |"
@@ -72,7 +80,7 @@ def return_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
         yield f"| {name} | {' | '.join(cells)} | {_told(_of(here, 'acro', CLEAN))} |"
 
 
-def contrast_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+def contrast_lines(runs: Sequence[Run]) -> Iterator[str]:
     """The paper's claims as differences with intervals, on every set, as trained and played with nothing hidden."""
     yield f"| set | played | {' | '.join(CONTRASTS)} | `mik+a` less the best other |"
     yield "|---|---|" + "---:|" * (len(CONTRASTS) + 1)
@@ -87,15 +95,15 @@ def contrast_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
                 yield f"| {table_name(*place, corruption)} | {words} | {' | '.join(cells)} |"
 
 
-def _best_other(runs: Sequence[LoadedRun], corruption: str) -> str:
+def _best_other(runs: Sequence[Run], corruption: str) -> str:
     """The method with two seeds or more that returns most, but for `mik+a`, references and those told the states."""
     here = [run for run in runs if run.labels["corruption"] == corruption]
-    methods = {run.labels["method"] for run in here} - {"mik+a", "state", UNTRAINED, *TOLD_STATES}
+    methods = {run.method for run in here} - {"mik+a", "state", UNTRAINED, *TOLD_STATES}
     known = {method: _of(here, method, corruption) for method in methods}
     return max((m for m in known if len(known[m]) > 1), key=lambda method: returns_of(known[method]).mean())
 
 
-def _less(runs: Sequence[LoadedRun], corruption: str, method: str, other: str, clean: bool) -> str:
+def _less(runs: Sequence[Run], corruption: str, method: str, other: str, clean: bool) -> str:
     """Mean return of a method less that of another, and its interval; a dash where one of them was not played so."""
     one, two = (_episodes(_of(runs, name, corruption), clean) for name in (method, other))
     if one is None or two is None:
@@ -104,7 +112,7 @@ def _less(runs: Sequence[LoadedRun], corruption: str, method: str, other: str, c
     return text if text.startswith("-") else f"+{text}"
 
 
-def _episodes(runs: list[LoadedRun], clean: bool) -> np.ndarray | None:
+def _episodes(runs: list[Run], clean: bool) -> np.ndarray | None:
     """Returns of runs, (n, episodes); None where a policy was not played with nothing hidden."""
     if not clean:
         return episodes_of(runs) if runs else None
@@ -116,31 +124,34 @@ def _episodes(runs: list[LoadedRun], clean: bool) -> np.ndarray | None:
     return np.array(found) if found and all(found) else None
 
 
-def aggregate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+def aggregate_lines(runs: Sequence[Run]) -> Iterator[str]:
     """The report's statistics over sets, of the methods that all of them have."""
     yield "| sets | method | interquartile mean | mean | chance that `mik+a` ends above it |"
     yield "|---|---|---:|---:|---:|"
-    groups: dict[str, list[LoadedRun]] = {}
-    for run in runs:
-        place, corruption = _place(run), run.labels["corruption"]
-        if place in SETS and corruption in (HIDDEN, PATCHES) and run.labels["method"] in MAIN:
-            kind = "noisy, exploratory" if place[1] in EXPLORATORY else "of the paper's qualities"
-            groups.setdefault(kind + ALONE * (corruption == PATCHES), []).append(run)
-    for kind, mine in groups.items():
-        rows = evaluations(mine)
-        above = {row["other"]: row for row in improvement(rows) if row["method"] == "mik+a"}
-        for row in sorted(aggregate(rows, []), key=lambda row: -row["mean"]):
+    shown = [
+        run
+        for run in runs
+        if _place(run) in SETS and run.labels["corruption"] in (HIDDEN, PATCHES) and run.method in MAIN
+    ]
+    for (exploratory, corruption), mine in groups(shown, _kind).items():
+        kind = ("noisy, exploratory" if exploratory else "of the paper's qualities") + ALONE * (corruption == PATCHES)
+        evaluated = evaluations(episodes_frame(mine))
+        chances = improvement(evaluated)
+        above = chances[chances["method"] == "mik+a"].set_index("other")
+        table = aggregate(evaluated, pd.DataFrame(columns=list(CONDITION)))
+        for row in table.sort_values("mean", ascending=False, kind="stable").to_dict("records"):
             cells = [with_interval(row[name], row[f"{name}_low"], row[f"{name}_high"]) for name in ("iqm", "mean")]
-            chance = above.get(row["method"])
-            cells.append(
-                number(None)
-                if chance is None
-                else with_interval(chance["probability"], chance["low"], chance["high"], 2)
-            )
+            known = row["method"] in above.index
+            chance = above.loc[row["method"], ["probability", "low", "high"]] if known else [None] * 3
+            cells.append(with_interval(*chance, 2))
             yield f"| {row['tasks']} {kind} | `{row['method']}` | {' | '.join(cells)} |"
 
 
-def measured_sets(runs: Sequence[LoadedRun]) -> Iterator[tuple[str, str, str]]:
+def _kind(run: Run) -> tuple[bool, str]:
+    return run.labels["quality"] in EXPLORATORY, run.labels["corruption"]
+
+
+def measured_sets(runs: Sequence[Run]) -> Iterator[tuple[str, str, str]]:
     """Task, quality and corruption of which the pages tell and of which anything is there."""
     measured = {(*_place(run), run.labels["corruption"]) for run in runs}
     asked = ((*place, corruption) for corruption, place in product((HIDDEN, PATCHES), SETS))
@@ -152,7 +163,7 @@ def table_name(task: str, quality: str, corruption: str) -> str:
     return f"{task}, {quality}" + ALONE * (corruption == PATCHES)
 
 
-def gate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+def gate_lines(runs: Sequence[Run]) -> Iterator[str]:
     """What has to hold on a set before methods are ranked on it."""
     yield (
         "| set | data's return | `state`, of it | `acro` with nothing hidden, of it | best of it | best less `random` |"
@@ -169,23 +180,21 @@ def gate_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
         yield f"| {row['name']} | {row['data_return']:.0f} | {' | '.join(shares)} | {above} | {row['passed']} |"
 
 
-def rank_lines(runs: Sequence[LoadedRun]) -> Iterator[str]:
+def rank_lines(runs: Sequence[Run]) -> Iterator[str]:
     """How well what is known of a policy orders the returns on a set, with and without untrained encoders."""
-    yield "| set | passed | runs | " + " | ".join(GOING_WITH) + " |"
+    yield "| set | passed | runs | " + " | ".join(GOING_WITH.values()) + " |"
     yield "|---|---|---:|" + "---:|" * len(GOING_WITH)
+    table = runs_frame(runs)
+    table = table[table[PROBES[0]].notna() & ~table["method"].isin(TOLD_STATES)]  # with a probe that is held out
     for row in _judged(runs):
-        place = row["task"], row["quality"]
-        probed = _probed(
-            [run for run in runs if (*_place(run), run.labels["corruption"]) == (*place, row["corruption"])]
-        )
-        trained = [run for run in probed if run.labels["method"] != UNTRAINED]
-        cells = (
-            f"{_rank_correlation(probed, known)}, {_rank_correlation(trained, known)}" for known in GOING_WITH.values()
-        )
+        places = ["task", "quality", "corruption"]
+        probed = table[(table[places] == [row[name] for name in places]).all(axis=1)]
+        trained = probed[probed["method"] != UNTRAINED]
+        cells = (f"{_rank_correlation(probed, name)}, {_rank_correlation(trained, name)}" for name in GOING_WITH)
         yield f"| {row['name']} | {row['passed']} | {len(probed)}, {len(trained)} | {' | '.join(cells)} |"
 
 
-def _judged(runs: Sequence[LoadedRun]) -> Iterator[Row]:
+def _judged(runs: Sequence[Run]) -> Iterator[Row]:
     """Gates of the sets that pages tell of, by their `name`s there, and whether they are `passed`."""
     for row in gates(list(runs)):
         place = row["task"], row["quality"]
@@ -194,55 +203,34 @@ def _judged(runs: Sequence[LoadedRun]) -> Iterator[Row]:
             yield row | {"name": table_name(*place, row["corruption"]), "passed": passed}
 
 
-def _rank_correlation(runs: list[LoadedRun], known: Callable[[LoadedRun], float | None]) -> str:
+def _rank_correlation(table: pd.DataFrame, error: str) -> str:
     """Spearman's, of an error and the return over runs: -1 where the one that errs less always returns more.
 
     A dash for a single run, which has no order, and where a run does not know its error.
     """
-    errors = [known(run) for run in runs]
-    if len(runs) < 2 or None in errors:
+    if len(table) < 2 or table[error].isna().any():
         return number(None)
-    return f"{spearmanr(errors, returns_of(runs)).statistic:.2f}"
+    return f"{spearmanr(table[error], table['return']).statistic:.2f}"
 
 
-def _probe_error(probe: str) -> Callable[[LoadedRun], float | None]:
-    return lambda run: run.representation[probe]
-
-
-def _path_error(run: LoadedRun) -> float | None:
-    return run.reference.path_error
-
-
-def _loop_error(run: LoadedRun) -> float | None:
-    return mean_if_known(row["action_error"] for row in run.last)
-
-
-GOING_WITH: dict[str, Callable[[LoadedRun], float | None]] = {
-    "probe of the pose": _probe_error(PROBES[0]),
-    "probe of the velocity": _probe_error(PROBES[1]),
-    "actions on the data": _path_error,
-    "actions in closed loop": _loop_error,
+GOING_WITH = {
+    **dict(zip(PROBES, ("probe of the pose", "probe of the velocity"), strict=True)),
+    **dict(zip(ACTION_ERRORS, ("actions on the data", "actions in closed loop"), strict=True)),
 }
-"""Errors that returns may go with."""
+"""Errors that returns may go with, by their columns in the frame of runs."""
 
 
-def _probed(runs: Sequence[LoadedRun]) -> list[LoadedRun]:
-    """Those with a probe that is held out: not of methods that were told the states."""
-    known = (run for run in runs if run.representation[PROBES[0]] is not None)
-    return [run for run in known if run.labels["method"] not in TOLD_STATES]
-
-
-def _place(run: LoadedRun) -> tuple[str, str]:
+def _place(run: Run) -> tuple[str, str]:
     return run.labels["task"], run.labels["quality"]
 
 
-def _of(runs: Sequence[LoadedRun], method: str, corruption: str) -> list[LoadedRun]:
+def _of(runs: Sequence[Run], method: str, corruption: str) -> list[Run]:
     """Runs of a method under a corruption, by seed."""
-    mine = [run for run in runs if (run.labels["method"], run.labels["corruption"]) == (method, corruption)]
+    mine = [run for run in runs if (run.method, run.labels["corruption"]) == (method, corruption)]
     return sorted(mine, key=lambda run: run.labels["seed"])
 
 
-def _told(runs: list[LoadedRun]) -> str:
+def _told(runs: list[Run]) -> str:
     """Mean return and its interval, and how many seeds if fewer than three; a dash if there is none."""
     if not runs:
         return number(None)

@@ -33,7 +33,7 @@ class Config:
 
 def pages() -> dict[str, Tables]:
     """Tables of each page, which is told by its path in the repository."""
-    returns, mazes = offline_table.main_runs(), navigation_table.main_runs()
+    returns, mazes = offline_table.main_runs(), navigation_table.numbers_in()
     return {
         "results/control/README.md": {
             "gates": offline_table.gate_lines(returns),
@@ -47,13 +47,13 @@ def pages() -> dict[str, Tables]:
         },
         "results/navigation/longer/README.md": {"hard": navigation_table.hard_lines(mazes)},
         "results/navigation/first_person/README.md": {
-            "first person": navigation_table.first_person_lines(navigation_table.first_person_runs())
+            "first person": navigation_table.first_person_lines(navigation_table.numbers_in("first_person"))
         },
         "results/navigation/first_person/pictures/README.md": {
-            "pictures": navigation_table.picture_lines(navigation_table.picture_runs(), mazes),
+            "pictures": navigation_table.picture_lines(mazes),
         },
         "results/navigation/first_person/small/README.md": {
-            "first rung": navigation_table.first_rung_lines(navigation_table.first_rung_runs()),
+            "first rung": navigation_table.first_rung_lines(navigation_table.numbers_in("first_person/small")),
         },
         "results/offline/README.md": {
             "returns": offline_table.return_lines(returns),

@@ -1,94 +1,64 @@
+"""Every command has help, a slip is one line and exit code 2, and every other end has its own code."""
+
+import multiprocessing
 import os
+import signal
 import subprocess
 import sys
 
 import pytest
 
-from vd4rl_pomdp.cli import COMMANDS, ends, main
+from finetune.algorithms import ALGORITHMS
+from finetune.algorithms.bc import BC
+from vd4rl_pomdp.cli import COMMANDS, main, run_to_end, stages
 from vd4rl_pomdp.cli.parsing import show
-from vd4rl_pomdp.runs.interrupt import Terminated
+from vd4rl_pomdp.core.registry import REGISTRIES
 
-NAMES = [
-    [name, *([inner] if inner else [])]
-    for name, entry in COMMANDS.items()
-    for inner in (entry if isinstance(entry, dict) else [None, *entry.inner])
+SWEEP = ["sweep", "run", "quick", "--out", "y", "--dry-run"]
+PRETRAIN = ["pretrain", "--data", "x", "--out", "y"]
+SLIPS = [
+    (["pretrian"], "unknown command 'vd4rl-pomdp pretrian': choose one of demo, list, data"),
+    (["data", "chekc"], "choose one of collect"),
+    (["list", "--foo"], "Unrecognized options: --foo"),
+    (["data", "check", "x\ny"], "x y: no such folder"),
+    (["pretrain", "--preset", "huge"], "unknown preset 'huge': choose one of paper, cpu, smoke"),
+    ([*PRETRAIN, "--corruption", "fog"], "unknown corruption 'fog'"),
+    ([*PRETRAIN, "--corruption", "patch+patch"], "corruption 'patch+patch' names patch twice"),
+    ([*PRETRAIN, "--method", "m"], "unknown method 'm'"),
+    ([*PRETRAIN, "--method", "random", "--codes", "3"], "Unrecognized options: --codes"),
+    ([*PRETRAIN, "--precision", "fp8"], "invalid choice 'fp8'"),
+    ([*PRETRAIN, "--steps", "many"], "--steps: invalid literal"),
+    ([*PRETRAIN, "--patch-size", "0", "--corruption", "patch"], "--patch-size is 0; it must be at least 1"),
+    (["pretrain", "--data", "nowhere", "--out", "x"], "nowhere: no such folder"),
+    (["pretrain", "--data", "x"], "Missing from vd4rl-pomdp pretrain: --out"),
+    (["pretrain", "--data", "x", "--out", os.fsdecode(b"\xff")], "'\\udcff' is not UTF-8"),
+    (["finetune", "--encoder", "a", "--data", "b", "--out", "c", "--veiws", "3"], "Perhaps you meant: --views"),
+    (["finetune", "--encoder", "nowhere", "--data", "nowhere", "--out", "x"], "nowhere"),
+    (["data", "collect", "--task", "ant", "--quality", "random", "--out", "x"], "unknown task 'ant'"),
+    (["navigation", "collect"], "--maze"),
+    (["report"], "no runs are named: name at least one"),
+    (["report", "nowhere"], "nowhere: no such folder"),
+    (["theory", "--out", "file/below"], "file/below: cannot be used (not a directory)"),
+    (["demo", "--preset", "huge"], "unknown preset 'huge': choose one of cpu, smoke"),
+    (["sweep", "run", "huge", "--out", "x"], "unknown grid 'huge': choose one of control,"),
+    ([*SWEEP, "--change", "pretrain.method=acor"], "'acor': choose one of"),
+    ([*SWEEP, "--executor", "cloud"], "unknown executor 'cloud': choose one of local"),
+    (["sweep", "status", "file"], "file: holds no sweep"),
 ]
 
 
-@pytest.mark.parametrize("words", NAMES, ids=" ".join)
-def test_every_command_has_help(words, capsys):
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_command_has_help_and_its_group_a_list(name, capsys):
     with pytest.raises(SystemExit) as end:
-        main([*words, "--help"])
+        main([*name.split(), "--help"])
     assert end.value.code in (0, None)
-    assert words[-1] in capsys.readouterr().out
+    assert name in capsys.readouterr().out
+    for words in ([], name.split()[: 0 if name.startswith("report") else -1]):
+        main(words)
+        assert COMMANDS[name][1] in capsys.readouterr().out
 
 
-SWEEP = ["sweep", "run", "quick", "--out", "y", "--dry-run"]
-
-
-@pytest.mark.parametrize(
-    ("words", "message"),
-    [
-        (["pretrian"], "unknown command 'vd4rl-pomdp pretrian': choose one of demo, list, data"),
-        (["data", "chekc"], "choose one of collect"),
-        (["data", "check", "nowhere"], "nowhere"),
-        (["pretrain", "--data", "nowhere", "--out", "x"], "nowhere: no such folder"),
-        (["pretrain", "--preset", "huge"], "unknown preset 'huge': choose one of paper, cpu, smoke"),
-        (["pretrain", "--data", "x", "--out", "y", "--corruption", "fog"], "unknown corruption 'fog'"),
-        (["pretrain", "--data", "x", "--out", "y", "--method", "m"], "unknown method 'm'"),
-        (["data", "collect", "--task", "ant", "--quality", "random", "--out", "x"], "unknown task 'ant'"),
-        (["finetune", "--encoder", "nowhere", "--data", "nowhere", "--out", "x"], "nowhere"),
-        (["report", "nowhere"], "nowhere: no such folder"),
-        (["policy", "train", "--task", "ant", "--out", "x"], "unknown task 'ant'"),
-        (["policy", "train", "--out", "x"], "--task"),
-        (["policy", "train", "--task", "walker_walk", "--out", "x", "--seed", "-1"], "--seed is -1"),
-        (["data", "check", "x\ny"], "x y: no such folder"),
-        (["pretrain", "--data", "x", "--out", "y", "--precision", "fp8"], "Invalid choice invalid choice 'fp8'"),
-        (["policy", "export", "nowhere", "--out", "x"], "nowhere"),
-        (["policy", "train", "--task", "walker_walk", "--out", "file/below"], "file/below"),
-        (["theory", "--out", "file/below"], "file/below: cannot be used (not a directory)"),
-        (["data", "card", "nowhere"], "nowhere"),
-        (["demo", "--preset", "huge"], "unknown preset 'huge': choose one of cpu, smoke"),
-        (["pretrain", "--data", "x"], "Missing from vd4rl-pomdp pretrain: --out"),
-        (["pretrain"], "Missing from vd4rl-pomdp pretrain: --data PATH"),
-        (["finetune"], "--encoder"),
-        (["navigation", "train"], "--data"),
-        (["navigation", "collect"], "--maze"),
-        (["pretrain", "--data", "", "--out", "y"], "--data names nothing"),
-        (["pretrain", "--data=", "--out", "y"], "--data= names nothing"),
-        (["pretrain", "--data", "x", "--out", os.fsdecode(b"\xff")], "'\\udcff' is not UTF-8"),
-        (["evaluate", ""], "the first word names nothing"),
-        (["report"], "no runs are named: name at least one"),
-        (["sweep", "run", "huge", "--out", "x"], "unknown grid 'huge': choose one of control,"),
-        (["sweep", "run", "nowhere.toml", "--out", "x"], "nowhere.toml: cannot be used (no such file or directory)"),
-        (["sweep", "run", "quick"], "Missing from vd4rl-pomdp sweep run: --out"),
-        ([*SWEEP, "--change", "preset=foo"], "unknown preset 'foo'"),
-        ([*SWEEP, "--change", "seed=-1"], "--seed is -1"),
-        ([*SWEEP, "--change", "steps=3"], "'steps' is no setting of a grid"),
-        ([*SWEEP, "--change", "pretrain.method=acor"], "'acor': choose one of"),
-        (
-            [*SWEEP, "--change", "pretrain.method=random", "pretrain.codes=3"],
-            "--codes is not read by the method random",
-        ),
-        (
-            [*SWEEP, "--change", "pretrain.method=acro", "finetune.random_histories=0.5"],
-            "--random-histories is not read: acro has no memory",
-        ),
-        ([*SWEEP, "--change", "pretrain.method=drq_bc", "finetune.views=2"], "--views is not read by"),
-        ([*SWEEP, "--only", "method=curl"], "the grid has mik+a, acro, random; write name=value,value"),
-        (
-            [*SWEEP, "--only", "method=acro", "--only", "seed=0"],
-            "--only is given twice: name all its values behind one",
-        ),
-        ([*SWEEP, "--change=seed=1", "--dry-run", "--change=preset=cpu"], "--change is given twice"),
-        ([*SWEEP, "--preset", "cpu"], "--preset is a setting of the grid's trainings: change it by --change preset="),
-        ([*SWEEP, "--executor", "cloud"], "unknown executor 'cloud': choose one of local"),
-        (["sweep", "status", "file"], "file: holds no sweep; `vd4rl-pomdp sweep run GRID --out file` makes one"),
-        (["sweep", "retry", "x"], "x: holds no sweep"),
-        (["pretrain", "--data", "x", "--out", "y", "--steps", "many"], "--steps: invalid literal"),
-        (["finetune", "--encoder", "a", "--data", "b", "--out", "c", "--veiws", "3"], "Perhaps you meant: --views"),
-    ],
-)
+@pytest.mark.parametrize(("words", "message"), SLIPS)
 def test_a_slip_is_one_line_and_exit_code_2(words, message, capsys, tmp_path, monkeypatch):
     monkeypatch.chdir(tmp_path)
     (tmp_path / "file").touch()
@@ -109,54 +79,62 @@ def test_a_tilde_behind_an_equals_sign_is_the_users_folder(tmp_path, monkeypatch
     assert f"error: {tmp_path}/set: no such folder" in capsys.readouterr().err
 
 
-def test_a_signal_while_words_are_read_is_no_slip(monkeypatch):
-    def end(*words, **options):
-        raise Terminated
+def raised(kind: type[BaseException], *words: object):
+    def command(*_: object) -> None:
+        raise kind(*words)
 
-    monkeypatch.setattr("tyro.cli", end)
-    ended = ends.run_to_end(["data", "check", "x"])
-    assert (ended.code, ended.line) == (143, "terminated: re-run the same command to resume")
+    return command
 
 
-@pytest.mark.parametrize(("stage", "flag"), [("pretrain", "--precision"), ("finetune", "--update-precision")])
-def test_a_training_that_diverged_names_its_own_flag(stage, flag, monkeypatch):
-    def diverge(words):
-        raise FloatingPointError("critic_loss is nan")
+@pytest.mark.parametrize(
+    ("act", "code", "line"),
+    [
+        (lambda *_: signal.raise_signal(signal.SIGINT), 130, "interrupted: re-run the same command to resume"),
+        (lambda *_: signal.raise_signal(signal.SIGTERM), 143, "terminated: re-run the same command to resume"),
+        (raised(FloatingPointError, "loss is nan"), 1, "error: training diverged, loss is nan; lower --learning-rate"),
+        (raised(OSError, 28, "No space left", "a"), 2, "error: a: the disk is full: free some space and re-run"),
+    ],
+)
+def test_every_end_has_a_code_and_a_line(act, code, line, monkeypatch):
+    monkeypatch.setattr(stages, "list_parts", act)
+    end = run_to_end(["list"])
+    assert end.code == code
+    assert end.line.startswith(line)
 
-    monkeypatch.setattr(ends, "run_stage", diverge)
-    end = ends.run_to_end([stage, "--out", "x"])
-    assert (end.code, end.line) == (
-        1,
-        f"error: training diverged, critic_loss is nan; lower --learning-rate or use {flag} fp32",
-    )
+
+def test_a_defect_is_raised(monkeypatch):
+    monkeypatch.setattr(stages, "list_parts", raised(AttributeError, "a defect"))
+    with pytest.raises(AttributeError, match="a defect"):
+        run_to_end(["list"])
 
 
-@pytest.mark.parametrize("package", ["vd4rl_pomdp", "vd4rl_pomdp.cli"])
-def test_the_package_is_the_program_and_its_help_needs_neither_numpy_nor_torch(package, capsys):
+def test_a_file_that_calls_main_while_a_worker_imports_it_is_told_where_to_put_that(monkeypatch, capsys):
+    monkeypatch.setattr(multiprocessing.current_process(), "_inheriting", True, raising=False)
+    with pytest.raises(SystemExit) as end:
+        main(["list"])
+    assert end.value.code == 2
+    assert 'call main() below `if __name__ == "__main__":`' in capsys.readouterr().err
+
+
+def test_the_list_of_commands_needs_neither_numpy_nor_torch_and_a_reader_may_go():
     code = (
-        f"import runpy, sys; sys.argv = ['x', '--help']; runpy.run_module({package!r}, run_name='__main__');"
+        "import runpy, sys; sys.argv = ['x', '--help']; runpy.run_module('vd4rl_pomdp', run_name='__main__');"
         "sys.exit(bool({'numpy', 'torch', 'triton'} & set(sys.modules)))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
-    main(["--help"])
-    assert done.stdout == capsys.readouterr().out
+    words = [sys.executable, "-m", "vd4rl_pomdp", "theory", "--help"]
+    process = subprocess.Popen(words, stdout=subprocess.PIPE, stderr=subprocess.PIPE)
+    assert process.stdout is not None
+    process.stdout.close()
+    assert (process.communicate()[1], process.returncode) == (b"", 141)
 
 
 def test_a_terminal_that_is_not_utf_8_is_shown_what_it_can():
-    line = [sys.executable, "-m", "vd4rl_pomdp.cli"]
-    environment = os.environ | {"PYTHONIOENCODING": "ascii"}
-    shown = subprocess.run([*line, "theory", "--help"], capture_output=True, env=environment)
-    assert (shown.returncode, shown.stderr) == (0, b"")
+    line, environment = [sys.executable, "-m", "vd4rl_pomdp.cli"], os.environ | {"PYTHONIOENCODING": "ascii"}
     refused = subprocess.run([*line, "data", "check", "ζ"], capture_output=True, env=environment)
     assert (refused.returncode, refused.stderr.count(b"\n")) == (2, 1)
     assert refused.stderr.startswith(b"error: \\u03b6: no such folder")
-
-
-def test_without_words_the_commands_are_listed(capsys):
-    main([])
-    shown = capsys.readouterr().out
-    assert all(name in shown for name in COMMANDS)
 
 
 def test_results_stay_on_one_line_each(capsys):
@@ -171,8 +149,25 @@ def test_results_stay_on_one_line_each(capsys):
     ]
 
 
-def test_a_tilde_before_no_user_is_a_word(tmp_path, monkeypatch, capsys):
-    monkeypatch.chdir(tmp_path)
-    with pytest.raises(SystemExit, match="2"):
-        main(["report", "nowhere", "--out=~no_such_user/x"])
-    assert "nowhere: no such folder" in capsys.readouterr().err
+def test_every_part_has_a_line_that_says_what_it_is_and_where_it_comes_from(capsys, monkeypatch):
+    class Mine(BC):
+        """My own algorithm.
+
+        More about it.
+        """
+
+        summary = ""
+
+    monkeypatch.setattr(ALGORITHMS, "broken", {"theirs": "their_package: ImportError: gone"})
+    with ALGORITHMS.isolated():
+        ALGORITHMS.register("mine", Mine)
+        main(["list"])
+    shown = capsys.readouterr().out
+    lines = {line.split()[0]: line.split(maxsplit=1)[1:] for line in shown.splitlines() if line.startswith("  ")}
+    assert set(REGISTRIES) == {"method", "corruption", "algorithm", "frame_encoder", "history", "task"}
+    for registry in REGISTRIES.values():
+        assert f"--{registry.setting.replace('_', '-')}   " in shown
+        assert registry.group in shown
+        assert [name for name in registry if not lines.get(name)] == []
+    assert "  mine      My own algorithm   [registered by a call]" in shown
+    assert "  theirs    cannot be loaded: their_package: ImportError: gone" in shown

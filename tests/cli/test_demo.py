@@ -8,7 +8,7 @@ from vd4rl_pomdp.cli import demo as demos
 from vd4rl_pomdp.cli.demo import conclusion, demo, demo_jobs, show_navigation
 from vd4rl_pomdp.runs.episodes import append_episodes
 from vd4rl_pomdp.runs.files import write_json
-from vd4rl_pomdp.studies.navigation.grid import Condition
+from vd4rl_pomdp.studies.navigation.measures import Condition
 
 METHODS = ("mik+a", "acro", "random")
 LABELS = {"task": "walker_walk", "quality": "expert_noisy", "corruption": "patch+zero_frames"}

@@ -196,7 +196,7 @@ def test_a_quality_without_an_actor_is_one_sentence(tmp_path, monkeypatch, quali
     from vd4rl_pomdp.policies import actor as actors
 
     monkeypatch.setattr(actors, "ASSETS", tmp_path / "none")
-    with pytest.raises(UserError, match=r"actor ships for humanoid_walk .* policy train --task humanoid_walk"):
+    with pytest.raises(UserError, match=r"actor ships for humanoid_walk .* train_actor.py humanoid_walk"):
         collect(config(tmp_path / "set", task="humanoid_walk", quality=quality), LENGTH)
     assert not (tmp_path / "set").exists()
 

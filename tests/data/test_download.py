@@ -15,8 +15,7 @@ from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.data.download import RemoteFile, download, manifest
 from vd4rl_pomdp.data.format import shard_paths
-from vd4rl_pomdp.hub import Repository
-from vd4rl_pomdp.hub.contents import checked
+from vd4rl_pomdp.hub import push
 
 CONTENT = {"0_a_expert.hdf5": bytes(range(256)) * 40, "1_a_expert.hdf5": b"second" * 999, "0_a_medium.hdf5": b"m" * 500}
 EXPERT = "walker_walk/expert/84px"
@@ -332,7 +331,7 @@ def test_a_part_of_a_published_set_is_told_with_what_gets_the_rest(mirror, tmp_p
 
 def test_a_part_of_a_published_set_gets_no_card_and_is_not_pushed(mirror, tmp_path):
     place = part_of_a_set(mirror, tmp_path, ["0_a_expert.hdf5"])
-    for tell in (write_card, lambda folder: checked(folder, Repository.named("datasets/lab/set"), "mit")):
+    for tell in (write_card, lambda folder: push(folder, "datasets/lab/set")):
         with pytest.raises(UserError, match="is a part of V-D4RL's walker_walk expert"):
             tell(place)
 

@@ -55,20 +55,9 @@ def test_a_set_whose_actor_has_changed_is_played_again(played, tmp_path, monkeyp
     ]
 
 
-def test_a_folder_has_one_owner_from_the_first_read_to_the_last_row(played, tmp_path, monkeypatch):
+def test_a_folder_has_one_owner(played, tmp_path):
     with owned(tmp_path), pytest.raises(UserError, match="is in use by process"):
         module.tabulate(tmp_path, ["walker_walk"], ["random"], 2, 1)
-    module.tabulate(tmp_path, ["walker_walk"], ["random"], 2, 1)
-    before = (tmp_path / "returns.csv").read_text()
-
-    def taken_over(config):
-        (tmp_path / ".owner.json").write_text('{"host": "elsewhere", "pid": 1}')
-        return [7.0] * config.episodes
-
-    monkeypatch.setattr(module, "replay_returns", taken_over)
-    with pytest.raises(UserError, match="was taken over by process 1 on elsewhere"):
-        module.tabulate(tmp_path, ["walker_walk"], ["expert"], 2, 1)
-    assert (tmp_path / "returns.csv").read_text() == before
 
 
 def test_a_foreign_file_is_not_taken_for_a_table(played, tmp_path):

@@ -1,6 +1,3 @@
-import json
-from importlib.metadata import version
-
 import numpy as np
 import pytest
 from safetensors.numpy import save_file
@@ -9,42 +6,11 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.policies import Actor, Ladder, actor, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.policies.actor import read_ladder
-from vd4rl_pomdp.policies.export import CARD_EPISODES, LADDER_RUNGS, episode_returns
 
-ACTORS = sorted(p.stem for p in actor.ASSETS.glob("*.json"))
 LADDERS = sorted(p.stem.removesuffix("_replay") for p in actor.ASSETS.glob("*_replay.safetensors"))
-AT_LEAST = {
-    "walker_walk_expert": 950,
-    "walker_walk_medium": 450,
-    "cheetah_run_expert": 850,
-    "cheetah_run_medium": 400,
-    "humanoid_walk_expert": 700,
-    "humanoid_walk_medium": 350,
-}
-
-PLAYED = 8
-"""Episodes of a card that are played again."""
-
-
-@pytest.mark.parametrize("name", ACTORS)
-def test_an_actor_returns_what_its_card_says(name):
-    """To the digit, but for an episode: processors differ in a state's last bit, which a fall magnifies."""
-    task, quality = name.rsplit("_", 1)
-    shipped = load_actor(task, quality)
-    card = json.loads((actor.ASSETS / f"{name}.json").read_text())
-    assert {k: card[k] for k in shipped.card} == shipped.card
-    assert len(card["returns"]) == CARD_EPISODES
-    assert card["return_mean"] == round(float(np.mean(card["returns"])), 3) >= AT_LEAST.get(name, 0)
-    differing = [k for k in ("mujoco", "dm-control") if version(k) != card["versions"][k]]
-    if differing:
-        pytest.skip(f"the card was written with another {' and '.join(differing)}")
-    found, said = np.array(episode_returns(shipped, TASKS.named(task), PLAYED)), np.array(card["returns"][:PLAYED])
-    assert (found == said).sum() >= PLAYED - 1
-    assert found.mean() == pytest.approx(said.mean(), rel=0.02)
 
 
 def test_the_required_actors_ship_and_all_stay_small():
-    assert set(AT_LEAST) <= set(ACTORS)
     assert {"walker_walk", "cheetah_run", "humanoid_walk"} <= set(LADDERS)
     assert sum(p.stat().st_size for p in actor.ASSETS.iterdir()) < 10e6
 
@@ -55,7 +21,7 @@ def test_a_ladder_leads_to_the_medium_actor(task):
     steps = ladder.card["decisions"]
     assert steps == sorted(set(steps))
     assert steps[-1] == medium.card["decisions"]
-    assert 10 <= len(steps) <= LADDER_RUNGS
+    assert 10 <= len(steps) <= 15
     top = ladder.rungs[-1]
     for name, value in medium.weights.items():
         np.testing.assert_array_equal(top.weights[name], value.astype(np.float16).astype(np.float32))

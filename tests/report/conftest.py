@@ -1,8 +1,15 @@
-"""Figures are drawn for the page alone, unless a test asks for their files."""
+"""Figures are drawn where a test asks for them."""
 
 import pytest
 
-from vd4rl_pomdp.report import figures
+from vd4rl_pomdp.report import figures, page
+
+SECTIONS = ("scores", "profiles", "curves", "probes", "errors", "costs", "losses")
+
+
+@pytest.fixture
+def drawn() -> None:
+    """A test with this one gets figures, in the page alone."""
 
 
 @pytest.fixture
@@ -11,6 +18,9 @@ def figure_files() -> None:
 
 
 @pytest.fixture(autouse=True)
-def _page_alone(monkeypatch, request):
-    if "figure_files" not in request.fixturenames:
-        monkeypatch.setattr(figures, "FORMATS", {})
+def _without_figures(monkeypatch, request):
+    if "figure_files" in request.fixturenames:
+        return
+    monkeypatch.setattr(figures, "FORMATS", {})
+    if "drawn" not in request.fixturenames:
+        monkeypatch.setattr(page, "_plots", lambda runs, made: {name: [] for name in SECTIONS})

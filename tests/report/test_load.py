@@ -1,12 +1,15 @@
-"""Damaged runs are named, and nothing is written."""
+"""Runs as a report loads them: what pools under one label, what is missing, and what is damaged."""
 
 import numpy as np
 import pytest
 
-from tests.helpers_report import describe, write_run
+from tests.helpers_report import describe, pooled, write_run
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.report import write_report
+from vd4rl_pomdp.report.gaps import find_gaps
+from vd4rl_pomdp.report.load import Choice, episodes_frame, load_runs, runs_frame
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
+from vd4rl_pomdp.runs.files import read_json, write_json
 
 
 def test_bad_input_is_one_line(tmp_path):
@@ -42,14 +45,13 @@ def test_cut_rows_and_films_are_named(tmp_path):
             write_report([tmp_path / "a"], tmp_path / "out")
 
 
-@pytest.mark.parametrize("value", ["nan", "inf", "-inf"])
 @pytest.mark.parametrize("column", ["score", "return"])
-def test_a_score_that_is_no_number_is_refused(tmp_path, value, column):
+def test_a_score_that_is_no_number_is_refused(tmp_path, column):
     run = write_run(tmp_path / "runs/a", "acro", 3, {10: [1.0, 2.0]})
     rows = read_episodes(run / "episodes.csv")
     (run / "episodes.csv").unlink()
-    append_episodes(run / "episodes.csv", [rows[0], rows[1] | {column: value}])
-    with pytest.raises(UserError, match=rf"episodes\.csv: .*{value}"):
+    append_episodes(run / "episodes.csv", [rows[0], rows[1] | {column: "nan"}])
+    with pytest.raises(UserError, match=r"episodes\.csv: .*nan"):
         write_report([tmp_path / "runs"], tmp_path / "out")
     assert not (tmp_path / "out").exists()
 
@@ -62,9 +64,229 @@ def test_labels_and_cards_that_are_not_whole_are_named(tmp_path):
     (tmp_path / "runs" / "b" / "labels.json").write_text("{}")
     with pytest.raises(UserError, match=r"b/labels\.json: has no 'method'"):
         write_report([tmp_path / "runs"], tmp_path / "out")
-    (run / "encoder" / "config.json").write_text("{}")
-    with pytest.raises(UserError, match="does not say how the encoder was pretrained"):
-        write_report([run], tmp_path / "out")
-    (run / "encoder" / "config.json").write_text('{"pretrain": {"corruption": ["patch"]}}')
-    with pytest.raises(UserError, match=r"a: its files are damaged"):
-        write_report([run], tmp_path / "out")
+    for card, words in (("{}", "does not say how"), ('{"pretrain": {"corruption": ["patch"]}}', "files are damaged")):
+        (run / "encoder" / "config.json").write_text(card)
+        with pytest.raises(UserError, match=words):
+            write_report([run], tmp_path / "out")
+
+
+def test_the_frames_hold_every_run_and_every_episode(tmp_path):
+    write_run(tmp_path / "a", "acro", 0, {5: [1.0, 2.0], 10: [3.0, 5.0]})
+    (write_run(tmp_path / "b", "mik", 1, {5: [7.0]}) / "timing.json").unlink()
+    runs = load_runs([tmp_path])
+    episodes = episodes_frame(runs)
+    assert episodes.groupby(["method", "step"])["score"].mean().to_dict() == {
+        ("acro", 5): 1.5, ("acro", 10): 4.0, ("mik", 5): 7.0,
+    }  # fmt: skip
+    (row,) = runs_frame(runs).to_dict("records")
+    assert (row["method"], row["score"], row["return"], row["best_step"], row["finetune_seconds"]) == (
+        "acro", 4.0, 40.0, 10, 3.0,
+    )  # fmt: skip
+
+
+def test_runs_pool_whatever_their_seed_folder_device_and_logging(tmp_path):
+    for seed in (0, 1):
+        run = write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [1.0]})
+        noise = {"out": str(run), "encoder": str(seed), "device": str(seed), "log_every": seed, "workers": seed}
+        describe(run, {}, data="f00", **noise)
+    assert pooled(tmp_path / "runs") == {"acro": 2}
+
+
+DIFFERENT = {
+    "steps": ({"card": {"steps": 20}}, {"card": {"steps": 60}}, ["steps 20", "steps 60"]),
+    "updates": ({"card": {}, "updates": 5}, {"card": {}, "updates": 9}, ["updates 5", "updates 9"]),
+    "same name": (
+        {"card": {"batch_size": 8}},
+        {"card": {"batch_size": 16}},
+        ["pretraining batch_size 8", "pretraining batch_size 16"],
+    ),
+    "data": (
+        {"card": {"data": "a" * 24}, "data": "a" * 24},
+        {"card": {"data": "b" * 24}, "data": "b" * 24},
+        ["data aaaaaaaa", "data bbbbbbbb"],
+    ),
+    "data before": (
+        {"card": {"data": "a" * 24}, "data": "a" * 24},
+        {"card": {"data": "b" * 24}, "data": "a" * 24},
+        ["pretraining data the same", "pretraining data bbbbbbbb"],
+    ),
+    "new option": ({"card": {"m": 8}}, {"card": {}}, ["m 8", "m unset"]),
+    "plain": ({"card": {"history": "method"}}, {"card": {"history": "gru"}}, ["", "history gru"]),
+    "later": ({"card": {"m": 8}}, {"card": {"m": 8, "future_frames": "newest"}}, ["", "future_frames newest"]),
+    "two": (
+        {"card": {}, "random_histories": 0.0, "views": 4},
+        {"card": {}, "random_histories": 0.5, "views": 8},
+        ["views 4", "views 8, random_histories 0.5"],
+    ),
+    "preset": (
+        {"card": {"preset": "cpu", "steps": 20}, "preset": "cpu", "views": 4},
+        {"card": {"preset": "smoke", "steps": 60}, "preset": "smoke", "views": 1},
+        ["preset cpu", "preset smoke"],
+    ),
+}
+
+
+@pytest.mark.parametrize(("one", "other", "words"), DIFFERENT.values(), ids=DIFFERENT)
+def test_runs_that_differ_are_rows_of_their_own(tmp_path, one, other, words):
+    for seed in (0, 1):
+        for folder, settings in (("one", one), ("other", other)):
+            describe(write_run(tmp_path / f"runs/{folder}{seed}", "acro", seed, {10: [1.0]}), **settings)
+    write_run(tmp_path / "runs/random", "random", 0, {10: [1.0]})
+    names = [", ".join(filter(None, ("acro", word))) for word in words]
+    assert pooled(tmp_path / "runs") == dict.fromkeys(names, 2) | {"random": 1}
+
+
+def test_runs_of_two_formats_do_not_pool(tmp_path):
+    for seed in (0, 1):
+        run = describe(write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [1.0]}), {})
+        write_json(run / "config.json", read_json(run / "config.json") | {"format": 3 + seed})
+    assert pooled(tmp_path / "runs") == {"acro, format 3": 1, "acro, format 4": 1}
+
+
+def corruptions_of(runs):
+    """By method, the corruptions that a report tells apart."""
+    found = {}
+    for run in load_runs([runs]):
+        found.setdefault(run.method, set()).add(run.labels["corruption"])
+    return found
+
+
+def under_own_corruption(run, options, **config):
+    """Give a run an encoder that was trained under a corruption with options of its own, and settings."""
+    describe(run, options, **config)
+    card = read_json(run / "encoder" / "config.json")
+    card["pretrain"]["corruption"] = {"corruption": "patch"} | options
+    write_json(run / "encoder" / "config.json", card)
+
+
+def test_a_corruption_of_other_options_is_another_setting_whatever_the_method(tmp_path):
+    for method, size in (("acro", 16), ("mik+a", 48), ("mik", 48)):
+        for seed in (0, 1):
+            run = write_run(tmp_path / f"{method}{seed}", method, seed, {10: [1.0 + seed + size]})
+            describe(run, {"patch_size": size}, data="f00")
+    write_run(tmp_path / "early", "random", 0, {10: [1.0]})
+    few, many = "patch, patch_size 16", "patch, patch_size 48"
+    assert corruptions_of(tmp_path) == {"acro": {few}, "mik+a": {many}, "mik": {many}, "random": {"patch"}}
+
+
+def test_an_option_is_not_a_corruptions_because_it_is_called_like_one_of_it(tmp_path):
+    for gamma, discount in ((1, 0.9), (1, 0.99), (2, 0.99)):
+        run = write_run(tmp_path / f"acro{gamma}{discount}", "acro", 0, {10: [1.0]})
+        under_own_corruption(run, {"gamma": gamma}, gamma=discount)
+    assert {(run.labels["corruption"], run.variant) for run in load_runs([tmp_path])} == {
+        ("patch, gamma 1", "gamma 0.9"),
+        ("patch, gamma 1", "gamma 0.99"),
+        ("patch, gamma 2", "gamma 0.99"),
+    }
+
+
+def test_where_nothing_is_hidden_no_option_counts(tmp_path):
+    for size in (16, 48):
+        run = write_run(tmp_path / f"acro{size}", "acro", size, {10: [1.0]}, labels={"corruption": "none"})
+        describe(run, {"patch_size": size})
+    assert corruptions_of(tmp_path) == {"acro": {"none"}}
+
+
+def by_set(tmp_path, budgets):
+    """Runs of two methods on several sets, with budgets by method and set."""
+    for (method, name), updates in budgets.items():
+        labels = dict(zip(("task", "quality"), name.split(), strict=True))
+        run = write_run(tmp_path / f"runs/{method}-{name}", method, 0, {10: [1.0]}, labels=labels)
+        describe(run, {}, updates=updates)
+    return tmp_path / "runs"
+
+
+def test_a_budget_of_each_set_makes_no_variants_and_stands_beside_the_set(tmp_path):
+    sets = {"walker_walk expert": 20, "cheetah_run expert": 60, "cheetah_run medium": 20}
+    runs = by_set(tmp_path, {(method, name): sets[name] for method in ("acro", "mik+a") for name in sets})
+    assert pooled(runs) == {"acro": 3, "mik+a": 3}
+    page = write_report([runs], tmp_path / "report").page.read_text()
+    for name, updates in sets.items():
+        assert f"<td>{name}</td><td>updates {updates}</td>" in page
+
+
+def test_a_budget_of_one_method_alone_is_no_sets_own(tmp_path):
+    expert, medium = "walker_walk expert", "walker_walk medium"
+    runs = by_set(tmp_path, {("acro", expert): 20, ("acro", medium): 60, ("mik+a", medium): 20})
+    assert pooled(runs) == {"acro, updates 20": 1, "acro, updates 60": 1, "mik+a": 1}
+
+
+def test_a_preset_stands_for_what_it_decides_and_the_page_says_all(tmp_path):
+    for preset, k in (("cpu", 15), ("cpu", 1), ("smoke", 3)):
+        run = write_run(tmp_path / f"runs/{preset}{k}", "acro", 0, {10: [1.0]})
+        describe(run, {"max_k": k, "preset": preset, "steps": len(preset)}, preset=preset)
+    labels = {"acro, preset cpu, max_k 15", "acro, preset cpu, max_k 1", "acro, preset smoke, max_k 3"}
+    assert set(pooled(tmp_path / "runs")) == labels
+    page = write_report([tmp_path / "runs"], tmp_path / "out").page.read_text()
+    assert "<td>preset smoke, steps 5, pretraining preset smoke, max_k 3</td>" in page
+
+
+def on_encoder(folder, seed, encoder, quality="expert"):
+    """A run of acro whose encoder was pretrained with a seed of its own."""
+    run = write_run(folder / f"{quality}-{encoder}-{seed}", "acro", seed, {10: [1.0]}, labels={"quality": quality})
+    return describe(run, {}, encoder_seed=encoder)
+
+
+def test_seeds_on_one_encoder_are_no_replicates_of_the_method(tmp_path):
+    for seed in (0, 1, 2):
+        on_encoder(tmp_path / "one", seed, encoder=0)
+        on_encoder(tmp_path / "own", seed, encoder=seed)
+    assert pooled(tmp_path / "own") == {"acro": 3}
+    assert pooled(tmp_path / "one") == {"acro": 1, "acro, pretraining seed 0": 2}
+    gaps = [(row["variant"], row["seed"]) for row in find_gaps(load_runs([tmp_path / "one"]))]
+    assert gaps == [("", 1), ("", 2)], "seed 0 on the encoder of its own is no gap of those that share it"
+    for seed, quality in enumerate(("expert", "medium")):
+        for own in (2, 3):
+            on_encoder(tmp_path / "runs", own, encoder=seed, quality=quality)
+    assert pooled(tmp_path / "runs") == {"acro, pretraining seed 0": 2, "acro, pretraining seed 1": 2}
+    assert pooled(tmp_path / "runs" / "expert-0-2") == {"acro, pretraining seed 0": 1}
+
+
+def test_an_ablation_is_missing_elsewhere_but_a_budget_for_every_task_is_not(tmp_path):
+    runs = tmp_path / "runs"
+    for k in (1, 15):
+        describe(write_run(runs / f"expert{k}", "mik+a", 0, {10: [1.0]}), {"max_k": k})
+    describe(write_run(runs / "medium", "mik+a", 0, {10: [1.0]}, labels={"quality": "medium"}), {"max_k": 15})
+    for quality, steps in (("expert", 20), ("medium", 60)):
+        run = write_run(runs / f"{quality}-acro", "acro", 0, {10: [1.0]}, labels={"quality": quality})
+        describe(run, {"steps": steps})
+    describe(write_run(runs / "none", "random", 0, {10: [1.0]}, labels={"corruption": "none"}), {"steps": 20})
+    for size in (16, 48):
+        run = write_run(runs / f"patch{size}", "random", 0, {10: [1.0]})
+        describe(run, {"patch_size": size}, data=f"f{size}")
+    names = ("quality", "corruption", "method", "variant")
+    variants = [("mik+a", "max_k 1"), ("mik+a", "max_k 15"), ("acro", "steps 20"), ("acro", "steps 60")]
+    assert {tuple(row[name] for name in names) for row in find_gaps(load_runs([runs]))} == {
+        ("medium", "patch, patch_size 16", "mik+a", "max_k 1"),
+        ("medium", "patch, patch_size 16", "random", ""),
+        *(("expert", "patch, patch_size 48", *variant) for variant in variants),
+        *(("expert", "none", *variant) for variant in variants),
+    }
+
+
+def test_the_state_is_not_missing_where_other_pixels_of_the_same_set_are_hidden(tmp_path):
+    for method, quality, corruption in (
+        *(("acro", quality, corruption) for quality in ("expert", "medium") for corruption in ("none", "patch")),
+        ("state", "expert", "none"),
+    ):
+        labels = {"quality": quality, "corruption": corruption}
+        describe(write_run(tmp_path / f"{method}-{quality}-{corruption}", method, 0, {10: [1.0]}, labels=labels), {})
+    names = ("quality", "corruption", "method")
+    assert {tuple(row[name] for name in names) for row in find_gaps(load_runs([tmp_path]))} == {
+        ("medium", "none", "state"),
+        ("medium", "patch", "state"),
+    }
+
+
+def test_policies_that_are_wanted_are_missed_where_anything_of_their_setting_is_there(tmp_path):
+    labels = {"task": "walker_walk", "quality": "expert", "corruption": "patch", "algorithm": "td3_bc"}
+    describe(write_run(tmp_path / "a", "acro", 0, {10: [1.0]}), {"patch_size": 16})
+
+    class Wanted(Choice):
+        wanted = tuple(
+            labels | {"method": method, "quality": quality, "seed": seed}
+            for method, quality, seed in (("acro", "expert", 0), ("acro", "expert", 1), ("mik", "medium", 4))
+        )
+
+    found = find_gaps(load_runs([tmp_path]), Wanted())
+    assert [(row["method"], row["seed"], row["state"]) for row in found] == [("acro", 1, "missing")]

@@ -1,20 +1,243 @@
-"""What a page carries: figures with files and words, tables that can be set elsewhere, and thousands of runs."""
+"""What a report's page, its files and the terminal say."""
 
 import csv
+import hashlib
+import io
+import os
 import re
 import shutil
+import subprocess
+import sys
 from html.parser import HTMLParser
-from itertools import pairwise
 from pathlib import Path
 
+import pandas as pd
+import pytest
+from rich.console import Console
+
 import pretrain.objectives
-from tests.helpers_report import METHODS, describe, grid, pretraining, write_grid, write_run
+from tests.helpers_report import METHODS, describe, grid, pretraining, write_grid, write_run, write_seeds
 from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.reference import Reference
-from vd4rl_pomdp.report import figures, films, layout, tables, write, write_report
-from vd4rl_pomdp.report.figures import style
-from vd4rl_pomdp.report.load import LoadedRun
+from vd4rl_pomdp.report import figures, films, print_summary, write_report
+from vd4rl_pomdp.report.render import write_latex
+from vd4rl_pomdp.runs.episodes import drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
+
+ROOT = Path(__file__).parents[2]
+
+
+def table(path: Path) -> list[dict[str, str]]:
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def cells(page: Path, heading: str) -> list[list[str]]:
+    """Cells of the first table after a heading, row by row."""
+    part = page.read_text().partition(heading)[2].partition("</table>")[0]
+    rows = (re.findall(r"<td>(.*?)</td>", row, re.DOTALL) for row in part.split("<tr")[1:])
+    return [row for row in rows if row]
+
+
+def test_a_report_counts_seeds_not_episodes(tmp_path, drawn):
+    for seed, scores in enumerate([[10.0, 30.0], [40.0, 40.0]]):
+        write_run(tmp_path / f"runs/acro/{seed}", "acro", seed, {5: [90.0, 90.0], 10: scores}, film=seed == 0)
+    write_run(tmp_path / "runs/random/0", "random", 0, {10: [95.0]})
+    page, summary, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
+    acro, random = summary.to_dict("records")
+    assert (acro["method"], random["method"]) == ("acro", "random"), "references come last, whatever their score"
+    assert acro["score"] == pytest.approx(30.0)
+    assert (acro["seeds"], acro["episodes"], acro["best_step"]) == (2, 4, 5)
+    assert acro["low"] < 20 < 40 < acro["high"], "two seeds, at 20 and 40, tell little"
+    assert pd.isna(random["low"])
+    assert len(table(tmp_path / "out" / "episodes.csv")) == 9
+    text = page.read_text()
+    assert "data:image/webp;base64" in text
+    assert not re.search(r'(src|href)="?(https?:)?//', text), "the page must not need a network"
+
+
+def test_last_and_best_evaluation_stand_apart(tmp_path):
+    for seed in range(2):
+        write_run(tmp_path / f"runs/{seed}", "acro", seed, {5: [90.0 + seed], 10: [20.0 + seed]})
+    page, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
+    (row,) = cells(page, "<h3>walker_walk")
+    assert row == ["acro", "20.5 [14.1, 26.9]", "10", "90.5 [84.1, 96.9]", "5", "2†", "2"]
+
+
+def test_the_report_of_mazes_is_named_where_there_are_only_mazes(tmp_path):
+    with pytest.raises(UserError, match="no evaluated run yet; `vd4rl-pomdp navigation report` reports its mazes"):
+        write_report([ROOT / "results" / "navigation" / "longer"], tmp_path / "out")
+    assert not (tmp_path / "out").exists()
+
+
+def test_references_with_their_own_algorithm_stand_in_the_same_table(tmp_path):
+    write_run(tmp_path / "runs/acro", "acro", 0, {10: [50.0]})
+    end_to_end = write_run(tmp_path / "runs/bc", "bc", 0, {10: [20.0]}, labels={"algorithm": "bc"})
+    write_json(end_to_end / "probe.json", {"probe_pose": 12.5, "probe_velocity": 34.5})
+    write_json(end_to_end / "pretrain_timing.json", {"seconds": 7.0})
+    page, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
+    assert [row[0] for row in cells(page, "<h3>walker_walk expert, patch</h3>")] == ["acro", "bc"]
+    acro, bc = table(tmp_path / "out" / "runs.csv")
+    assert (acro["method"], acro["return"], acro["probe_pose"]) == ("acro", "500.0", "")
+    assert (bc["probe_pose"], bc["probe_velocity"]) == ("12.5", "34.5")
+    assert (bc["pretrain_seconds"], bc["finetune_seconds"]) == ("7.0", "3.0")
+    chances = [(row["method"], row["probability"], row["wins"]) for row in table(tmp_path / "out" / "improvement.csv")]
+    assert chances == [("acro", "", "1.0"), ("bc", "", "0.0")], "one pair of runs tells no probability"
+    assert cells(page, "Probability of improvement</h2>") == [["acro", "", "1 of 1"], ["bc", "0 of 1", ""]]
+
+
+@pytest.mark.parametrize(("method", "noted"), [("supervised+a", True), ("acro", False)])
+def test_a_probe_of_what_was_told_the_states_is_not_read_as_the_others(tmp_path, method, noted):
+    """Its episodes are held out from the probe alone."""
+    page, *_ = write_report([write_run(tmp_path / "runs/0", method, 0, {10: [30.0]})], tmp_path / "out")
+    part = page.read_text().partition("<h2>Representations</h2>")[2].partition("<h2>")[0]
+    assert (f"{method}: trained on the states of all episodes" in part) == noted
+
+
+def test_an_ablation_is_two_rows_everywhere(tmp_path):
+    for k in (1, 15):
+        describe(write_run(tmp_path / f"runs/{k}", "mik+a", 0, {5: [k], 10: [k]}, film=True), {"max_k": k})
+    page, summary, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
+    assert summary.set_index("variant")["score"].to_dict() == {"max_k 15": 15.0, "max_k 1": 1.0}
+    text = page.read_text()
+    for name in ("mik+a, max_k 1", "mik+a, max_k 15"):
+        assert f"<td>{name}</td>" in text
+        assert f"<h3>finetune {name}, walker_walk expert, patch, seed 0</h3>" in text
+    for name in ("summary", "curves", "aggregate", "runs"):
+        assert {row["variant"] for row in table(tmp_path / "out" / f"{name}.csv")} == {"max_k 1", "max_k 15"}
+
+
+def test_missing_cells_and_seeds_are_shown_as_missing(tmp_path):
+    page, summary, *_ = write_report([grid(tmp_path)], tmp_path / "out")
+    found = summary.set_index(["quality", "method"])[["score", "missing"]].fillna(-1.0).T.to_dict("list")
+    assert found == {
+        ("expert", "acro"): [21.0, ""],
+        ("expert", "mik+a"): [20.5, "seed 2 missing"],
+        ("medium", "acro"): [9.0, ""],
+        ("medium", "mik+a"): [-1.0, "seed 0 missing"],
+    }
+    assert cells(page, "<h3>walker_walk medium")[1] == ["mik+a", "–", "–", "–", "–", "0†", "0", "seed 0 missing"]
+    missing = [(row["quality"], row["seed"], row["state"]) for row in table(tmp_path / "out" / "missing.csv")]
+    assert missing == [("expert", "2", "missing"), ("medium", "0", "missing")]
+    states = {
+        (row["quality"], row["method"], row["seed"]): row["state"] for row in table(tmp_path / "out" / "runs.csv")
+    }
+    gone = {place for place, state in states.items() if state == "missing"}
+    assert (len(states), gone) == (8, {("expert", "mik+a", "2"), ("medium", "mik+a", "0")})
+
+
+def test_unfinished_and_diverged_runs_are_named_and_kept_out_of_final_scores(tmp_path):
+    runs = grid(tmp_path)
+    cut = runs / "acro2"
+    (cut / "timing.json").unlink()
+    rows = [line for line in (cut / "episodes.csv").read_text().splitlines() if ",10,0," not in line]
+    (cut / "episodes.csv").write_text("\n".join(rows) + "\n")
+    (cut / "metrics.jsonl").write_text('{"step": 7, "bc_loss": 0.5}\n')
+    write_json(runs / "mik+a1" / "diverged.json", {"step": 7, "message": "critic_loss is nan <b>"})
+    page, summary, *_ = write_report([runs], tmp_path / "out")
+    found = summary.set_index(["quality", "method"])
+    told = [found.loc[("expert", name), ["score", "seeds", "missing"]].tolist() for name in ("acro", "mik+a")]
+    assert told == [
+        [20.5, 2, "seed 2 unfinished at 7 of 10 updates"],
+        [20.0, 1, "seed 1 diverged at update 7 of 10; seed 2 missing"],
+    ]
+    text = page.read_text()
+    assert "4 finished runs, 2 unfinished or diverged" in text
+    assert f"<td>{cut}</td>" in text
+    assert "<td>diverged at update 7 of 10: critic_loss is nan &lt;b&gt;</td>" in text
+    curves = {(r["quality"], r["method"], r["step"]): r["seeds"] for r in table(tmp_path / "out" / "curves.csv")}
+    assert (curves["expert", "acro", "5"], curves["expert", "acro", "10"]) == ("3", "2"), "curves show what there is"
+    write_report([tmp_path / "out"], tmp_path / "again")
+    assert (tmp_path / "again" / "summary.csv").read_text() == (tmp_path / "out" / "summary.csv").read_text()
+
+
+def test_a_report_of_unfinished_runs_alone_says_so(tmp_path, drawn):
+    (describe(write_run(tmp_path / "runs/a", "acro", 0, {5: [1.0]}), {}) / "timing.json").unlink()
+    page, summary, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
+    assert summary["missing"].tolist() == ["seed 0 unfinished at 10 of 10 updates"]
+    assert "0 finished runs, 1 unfinished" in page.read_text()
+
+
+def test_a_report_writes_over_nothing_but_an_earlier_report(tmp_path, capsys):
+    for seed in (0, 1):
+        write_run(tmp_path / f"runs/{seed}", "acro", seed, {10: [25.0]})
+    write_run(tmp_path / "runs/random", "random", 0, {10: [1.0]})
+    (tmp_path / "notes").mkdir()
+    (tmp_path / "notes" / "index.html").write_text("mine")
+
+    def files():
+        return {p: hashlib.sha256(p.read_bytes()).digest() for p in tmp_path.rglob("*") if p.is_file()}
+
+    before = files()
+    for out in ("runs", "runs/0", "runs/0/report", "notes"):
+        with pytest.raises(SystemExit) as end:
+            main(["report", str(tmp_path / "runs"), "--out", str(tmp_path / out)])
+        assert end.value.code == 2
+        assert "choose another --out" in capsys.readouterr().err
+        assert files() == before
+    write_report([tmp_path / "runs"], tmp_path / "out")
+    first = {p.name for p in (tmp_path / "out").iterdir()}
+    with pytest.raises(UserError, match="the results of 2 runs that would be lost"):
+        write_report([tmp_path / "runs" / "0"], tmp_path / "out")
+    assert {p.name for p in (tmp_path / "out").iterdir()} == first
+    assert set(before.items()) <= set(files().items())
+
+
+def test_a_report_is_made_again_from_its_own_folder(tmp_path, drawn):
+    runs = grid(tmp_path)
+    (runs / "acro1" / "timing.json").unlink()
+    pretraining(runs / "pretrain")
+    first = write_report([runs], tmp_path / "one")
+    second = write_report([tmp_path / "one"], tmp_path / "two")
+    assert second.gates == first.gates
+    for file in sorted((tmp_path / "one").rglob("*.*")):
+        text, other = (path.read_text() for path in (file, tmp_path / "two" / file.relative_to(tmp_path / "one")))
+        assert text.replace(str(runs / "acro1"), "HERE") == other.replace(str(tmp_path / "one"), "HERE"), file.name
+    rows = (tmp_path / "two" / "runs.jsonl").read_bytes()
+    write_report([tmp_path / "two"], tmp_path / "two")
+    assert (tmp_path / "two" / "runs.jsonl").read_bytes() == rows, "beside the rows"
+
+
+HOSTILE = '$\\frac$ <b>=1+1</b>, "x"|`y`\n[/red]_\u2028μ'
+
+
+def test_a_methods_name_is_text_and_nothing_else(tmp_path, capsys, drawn):
+    write_run(tmp_path / "runs/a", HOSTILE, 0, {5: [1.0], 10: [2.0]}, film=True, labels={"quality": "_$x_$"})
+    main(["report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")])
+    assert "<b>=1+1" in capsys.readouterr().out.replace("\n", "")
+    page = (tmp_path / "out" / "index.html").read_text(encoding="utf-8")
+    assert "<b>" not in page
+    assert "&lt;b&gt;=1+1&lt;/b&gt;" in page
+    for name in ("summary", "episodes", "runs", "curves"):
+        assert {row["method"] for row in table(tmp_path / "out" / f"{name}.csv")} == {HOSTILE}
+    rows = read_episodes(tmp_path / "runs" / "a" / "episodes.csv")
+    drop_episodes_after(tmp_path / "runs" / "a" / "episodes.csv", 5)
+    assert read_episodes(tmp_path / "runs" / "a" / "episodes.csv") == rows[:1]
+
+
+def test_latex_sets_any_text(tmp_path):
+    texts = pd.DataFrame({"a b": ["{~^\\}", "seed_2"], "50%": ["–", "$x_1$ & #"]})
+    write_latex(tmp_path / "a.tex", texts, 1, "95% of it.")
+    found = (tmp_path / "a.tex").read_text()
+    for text in (
+        r"\caption{95\% of it. \dag{}: fewer than 5 seeds.}",
+        r"\begin{longtable}{lr}",
+        r"a b & 50\% \\",
+        r"\{\textasciitilde \textasciicircum \textbackslash \} & -- \\",
+        r"seed\_2 & \$x\_1\$ \& \# \\",
+    ):
+        assert text in found
+
+
+def test_a_machine_that_does_not_speak_utf8_ends_no_command(tmp_path):
+    write_run(tmp_path / "runs/a", "μ", 0, {10: [2.0]})
+    words = [sys.executable, "-m", "vd4rl_pomdp.cli", "report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
+    ascii_only = {"LC_ALL": "C", "PYTHONCOERCECLOCALE": "0", "PYTHONUTF8": "0", "PYTHONIOENCODING": "ascii"}
+    done = subprocess.run(words, capture_output=True, env=os.environ | ascii_only)
+    assert (done.returncode, b"\\u03bc" in done.stdout) == (0, True), done.stderr
+    for name in ("index.html", "summary.csv", "episodes.csv"):
+        assert "μ" in (tmp_path / "out" / name).read_text(encoding="utf-8")
 
 
 class Page(HTMLParser):
@@ -41,7 +264,8 @@ def test_every_figure_has_its_files_its_words_and_n(tmp_path, figure_files):
         write_json(runs / f"acro{seed}" / "probe.json", {"probe_pose": 20.0 + seed, "probe_velocity": 40.0})
         Reference(500.0, None, 0.01).write(runs / f"acro{seed}")
     page, *_ = write_report([runs], tmp_path / "out")
-    found = {path.name for path in (tmp_path / "out" / "figures").iterdir()}
+    folder = tmp_path / "out" / "figures"
+    found = {path.name for path in folder.iterdir()}
     names = {"scores_patch", "profiles", "curves_patch", "probes_patch", "errors_patch", "costs", "losses"}
     assert found == {f"{name}.{kind}" for name in names for kind in ("csv", "png", "pdf")}
     shown = Page(page)
@@ -52,47 +276,59 @@ def test_every_figure_has_its_files_its_words_and_n(tmp_path, figure_files):
     captions = re.findall(r"<figcaption>(.*?)</figcaption>", page.read_text(), re.DOTALL)
     assert all("n = " in caption for caption in captions)
     assert "(warning: fewer than 5)" in captions[0]
-    with (tmp_path / "out" / "figures" / "scores_patch.csv").open() as file:
-        rows = list(csv.DictReader(file))
-    assert sorted(row["score"] for row in rows if row["kind"] == "seed" and row["method"] == "acro") == [
-        "20.0", "21.0", "22.0", "9.0",
-    ]  # fmt: skip
-    (tmp_path / "out" / "figures" / "scores_old.png").touch()
+    seeds = [
+        row["score"] for row in table(folder / "scores_patch.csv") if (row["kind"], row["method"]) == ("seed", "acro")
+    ]
+    assert sorted(seeds) == ["20.0", "21.0", "22.0", "9.0"]
+    mine = [folder / name for name in ("mine.png", "my_scores.csv", "poster.pdf")]
+    for file in (*mine, folder / "scores_old.png"):
+        file.touch()
     write_report([runs], tmp_path / "out")
-    assert {path.name for path in (tmp_path / "out" / "figures").iterdir()} == found, "an earlier one goes"
+    left = {path.name for path in folder.iterdir()} - {file.name for file in mine}
+    assert left == found, "figures of an earlier report go, nobody else's"
+    assert all(file.exists() for file in mine)
 
 
-def test_lines_of_many_methods_differ_in_more_than_colour():
-    looks = [tuple(map(str, style(number).values())) for number in range(60)]
-    assert len(set(looks)) == 60
-    for one, other in pairwise(looks):
-        assert sum(a != b for a, b in zip(one, other, strict=True)) == 3
-    alike = [(a, b) for a in looks[:14] for b in looks[:14] if a < b and a[0] == b[0]]
-    assert all(a[1] != b[1] and a[2] != b[2] for a, b in alike), "what shares a colour has other dashes and markers"
+def test_figures_show_returns_below_zero_best_evaluations_and_gaps(tmp_path, monkeypatch, drawn):
+    plots = {}
+    monkeypatch.setattr(figures, "save_plot", lambda _, plot: plots.update({plot.name: plot}))
+    for method, score in {"mik+a": -20.0, "acro": -60.0}.items():
+        for seed in (0, 1):
+            run = write_run(tmp_path / f"runs/{method}{seed}", method, seed, {5: [score + 9], 10: [score + seed]})
+            write_json(run / "probe.json", {"probe_pose": 20.0, "probe_velocity": 40.0})
+            Reference(512.3).write(run)
+    write_run(tmp_path / "runs/bc", "bc", 2, {10: [-50.0]})
+    write_report([tmp_path / "runs"], tmp_path / "out")
+    (scores,) = plots["scores_patch"].figure.axes
+    assert scores.get_title() == "walker_walk expert (data return 512)"
+    assert [text.get_text() for text in scores.get_yticklabels()] == ["mik+a (×1)", "acro (×1)", "bc (×2)"]
+    low, high = scores.get_xlim()
+    assert low < -60 < 0 <= high
+    offsets = [points for dots in scores.collections for points in dots.get_offsets().tolist()]
+    assert [-11.0, 0.0] in offsets, "the best evaluation of the first bar"
+    assert plots["curves_patch"].figure.axes[0].get_ylim()[0] < -60
+    (profile,) = plots["profiles"].figure.axes
+    assert profile.get_xlim() == (-60.0, 0.0)
+    pose = plots["probes_patch"].figure.axes[0]
+    dots = {
+        label: handle.get_offsets().tolist() for handle, label in zip(*pose.get_legend_handles_labels(), strict=True)
+    }
+    assert dots == {"mik+a": [[20.0, -190.0], [20.0, -200.0]], "acro": [[20.0, -590.0], [20.0, -600.0]]}
 
 
-def test_the_packages_methods_look_the_same_whatever_else_a_report_tells_of():
-    assert set(tables.LOOKS) == set(pretrain.objectives.METHODS)
-    few, many = write._looks(["acro", "random"]), write._looks(["acro", "acro, m 4", "mine", "mik", "random"])
+def test_methods_look_the_same_whatever_else_a_report_tells_of():
+    assert set(figures.LOOKS) == set(pretrain.objectives.METHODS)
+    few, many = figures.looks_of(["acro", "random"]), figures.looks_of(["acro", "acro, m 4", "mine", "random"])
     assert {name: many[name] for name in few} == few
-    assert list(many) == ["acro", "acro, m 4", "mine", "mik", "random"], "places are those of the names"
-    assert {many["acro, m 4"], many["mine"]} == {len(tables.LOOKS), len(tables.LOOKS) + 1}
+    assert {many["acro, m 4"], many["mine"]} == {len(figures.LOOKS), len(figures.LOOKS) + 1}
+    looks = [str(figures.style(number)) for number in many.values()]
+    assert len(set(looks)) == len(looks) >= 12
 
 
-def test_last_and_best_evaluation_stand_apart(tmp_path):
-    for seed in range(2):
-        write_run(tmp_path / f"runs/{seed}", "acro", seed, {5: [90.0 + seed], 10: [20.0 + seed]})
-    page, summary, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
-    cells = re.findall(r"<td[^>]*>([^<]*)</td>", page.read_text().partition("<h3>walker_walk")[2])[:9]
-    assert cells == ["acro", "20.5", "[14.1, 26.9]", "10", "90.5", "[84.1, 96.9]", "5", "2†", "2"]
-    assert round(summary[0]["best_low"], 1) == 84.1
-
-
-def test_published_scores_are_lines_where_the_set_is_theirs_and_nothing_is_hidden(tmp_path):
+def test_published_scores_are_lines_where_the_set_is_theirs_and_nothing_is_hidden(tmp_path, drawn):
     places = {
         "theirs": ({"corruption": "none"}, {"collection": {}}),
         "ours": ({"corruption": "none", "task": "cheetah_run"}, {"collection": {"episodes": 2}}),
-        "unknown": ({"corruption": "none", "task": "humanoid_walk"}, {}),
         "hidden": ({"corruption": "patch"}, {"collection": {}}),
     }
     for name, (labels, record) in places.items():
@@ -101,62 +337,35 @@ def test_published_scores_are_lines_where_the_set_is_theirs_and_nothing_is_hidde
     page, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
     text = page.read_text()
     assert text.count("<!-- DrQ+BC -->") == 1
-    after = text.partition("<!-- DrQ+BC -->")[2].partition("</svg>")[0]
-    titles = re.findall(r"<!-- (\w+_(?:run|walk) expert) -->", after)
-    assert titles == ["walker_walk expert"], "a panel's title is drawn after its lines"
     captions = re.findall(r"<figcaption>(Final scores.*?)</figcaption>", text, re.DOTALL)
     assert ["published scores" in caption for caption in captions] == ["under none" in caption for caption in captions]
-
-
-def test_latex_sets_any_text():
-    table = layout.ShownTable(
-        "50% & $x_1$", ("a", "b#"), [layout.Line(("{~^\\}", "–")), layout.Line(("x",), "seed_2 <missing>")]
-    )
-    found = layout.latex([table], "n")
-    for text in (
-        r"\caption{50\% \& \$x\_1\$. n}",
-        r"\begin{tabular}{lr}",
-        r"a & b\# \\",
-        r"\{\textasciitilde{}\textasciicircum{}\textbackslash{}\} & -- \\",
-        r"x & \multicolumn{1}{l}{\emph{seed\_2 \textless{}missing\textgreater{}}} \\",
-        *(r"\toprule", r"\midrule", r"\bottomrule"),
-    ):
-        assert text in found
 
 
 def test_a_film_is_read_once_and_those_beyond_the_pages_room_are_counted(tmp_path, monkeypatch):
     for method in ("acro", "mik", "random"):
         for seed in (0, 1):
             write_run(tmp_path / f"runs/{method}{seed}", method, seed, {10: [1.0]}, film=True)
-    read = []
-    film = LoadedRun.film
-    monkeypatch.setattr(LoadedRun, "film", lambda self: (read.append(self.path), film(self))[1])
+    read, read_film = [], films.read_film
+    monkeypatch.setattr(films, "read_film", lambda path: (read.append(path), read_film(path))[1])
     page, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
     assert len(read) == len(set(read)) == 3
     text = page.read_text()
     assert text.count("data:image/webp") == text.count("data:image/png;base64") == 3
-    assert ".movie { display: none; }" in text.partition("@media print")[2], "strips are printed, movies are not"
     monkeypatch.setattr(films, "MOST_BYTES", 1.5 * len(text) / 3)
     page, *_ = write_report([tmp_path / "runs"], tmp_path / "other")
     assert page.read_text().count("data:image/webp") == 1
     assert "2 more films are left out" in page.read_text()
 
 
-def test_a_report_of_five_thousand_runs_drops_nothing_and_stays_small(tmp_path):
+def test_a_report_of_thousands_of_runs_drops_nothing_and_stays_small(tmp_path):
     runs = write_grid(tmp_path / "grid", episodes=2)
-    assert runs > 4900
     page, summary, *_ = write_report([tmp_path / "grid"], tmp_path / "out")
-    assert page.stat().st_size < 10 * 2**20
-    assert sum(row["seeds"] for row in summary) == runs
-    for name, expected in (("runs.csv", runs), ("episodes.csv", 6 * runs)):
-        with (tmp_path / "out" / name).open() as file:
-            assert sum(1 for _ in file) == expected + 1
+    assert runs > 4900
+    assert summary["seeds"].sum() == runs
     assert len(summary) == 3 * 3 * 2 * len(METHODS)
+    assert page.stat().st_size < 10 * 2**20
+    assert [len(table(tmp_path / "out" / name)) for name in ("runs.csv", "episodes.csv")] == [runs, 6 * runs]
     assert (tmp_path / "out" / "runs.jsonl").read_bytes() == (tmp_path / "grid" / "runs.jsonl").read_bytes()
-    text = page.read_text()
-    assert all(f"<td>{method}</td>" in text for method in METHODS)
-    panels = re.findall(r"<!-- cheetah_run (\w+) -->", text)
-    assert panels[:3] == ["expert", "medium_expert", "medium"], "the paper's qualities first, a row each"
 
 
 def test_runs_of_a_condition_share_one_entry(tmp_path):
@@ -172,46 +381,43 @@ def test_files_of_figures_have_plain_names_of_their_own():
     found = [figures.file_name("scores", name) for name in names]
     assert found[0] == "scores_patch+zero_frames"
     assert len(set(found)) == len(names)
-    assert all(re.fullmatch(r"[A-Za-z0-9+._-]+", name) for name in found)
-    assert not any(".." in name for name in found[1:])
+    assert all(re.fullmatch(r"[A-Za-z0-9+._-]+", name) and ".." not in name for name in found)
 
 
-def test_code_of_a_pretraining_and_of_its_policy_is_told(tmp_path, capsys):
+def test_what_was_not_made_of_the_same_is_told(tmp_path, capsys):
     before = {"sources": {"method mine": "mine.py 0", "frame_encoder own": "own.py 0"}}
-    after = {"sources": {"method mine": "mine.py 1", "frame_encoder own": "own.py 1"}}
+    after = {
+        "plugins": {"frame_encoder own": "theirs 1.0"},
+        "sources": {"method mine": "x", "frame_encoder own": "own.py 1"},
+    }
     for seed, told in enumerate(({}, after)):
         run = describe(write_run(tmp_path / f"runs/{seed}", "mine", seed, {10: [1.0]}), {}, "one")
         write_json(run / "config.json", read_json(run / "config.json") | told)
         write_json(run / "encoder/config.json", read_json(run / "encoder/config.json") | {"origin": before})
-    main(["report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")])
-    told = "frame_encoder own has 2 states of its code: own.py 0 (mine); own.py 0 then own.py 1 (mine)"
-    assert capsys.readouterr().err == f"warning: {told}\n", "nothing of a method is used after its pretraining"
-
-
-def test_what_was_not_made_of_the_same_is_told(tmp_path, capsys):
-    parts = {"plugins": {"method mine": "theirs 1.0"}, "sources": {"method mine": "mine.py 1"}}
-    for number, (method, data, told) in enumerate(
-        (
-            ("acro", "one", {}),
-            ("mine", "one", parts),
-            ("mine", "one", parts | {"sources": {"method mine": "mine.py 2"}}),
-        )
-    ):
-        run = describe(write_run(tmp_path / f"runs/{number}", method, number, {10: [1.0]}), data=data)
-        write_json(run / "config.json", read_json(run / "config.json") | told)
     other = describe(write_run(tmp_path / "runs/other", "random", 0, {10: [1.0]}), data="two")
-    describe(write_run(tmp_path / "runs/medium", "acro", 0, {10: [1.0]}, labels={"quality": "medium"}), data="three")
     words = ["report", str(tmp_path / "runs"), "--out", str(tmp_path / "out")]
     main(words)
     told = [
-        "the set of walker_walk expert has 2 contents: one (acro, mine); two (random)",
-        "method mine has 2 states of its code: theirs 1.0, mine.py 1 (mine); theirs 1.0, mine.py 2 (mine)",
+        "the set of walker_walk expert has 2 contents: one (mine); two (random)",
+        "frame_encoder own has 2 states of its code: own.py 0 (mine); own.py 0 then theirs 1.0, own.py 1 (mine)",
     ]
     assert capsys.readouterr().err == "".join(f"warning: {sentence}\n" for sentence in told)
     page = (tmp_path / "out" / "index.html").read_text()
-    assert [sentence in page for sentence in told] == [True, True]
-    for run in (other, tmp_path / "runs/2"):
-        shutil.rmtree(run)
+    assert all(sentence in page for sentence in told)
+    shutil.rmtree(other)
+    shutil.rmtree(tmp_path / "runs/1")
     main([*words[:3], str(tmp_path / "again")])
     assert capsys.readouterr().err == ""
     assert "Not made of the same" not in (tmp_path / "again" / "index.html").read_text()
+
+
+def test_no_label_is_broken_within_a_word_at_eighty_columns(tmp_path):
+    runs = tmp_path / "runs"
+    write_seeds(runs, {("mik+a", "patch"): (50.0, 60.0, 55.0), ("acro", "patch"): (10.0, 12.0, 11.0)}, 600)
+    write_seeds(runs, {("mik+a", "none"): (70.0, 71.0, 72.0)}, 600, random_histories=0.5)
+    shown = io.StringIO()
+    print_summary(write_report([runs], tmp_path / "out"), Console(file=shown, width=80))
+    assert "seeds 0, 1, 2" in shown.getvalue(), "a column that takes room"
+    assert shown.getvalue().count("random_histories") == 2, "a line in each table"
+    borders = [line[-1] for line in shown.getvalue().splitlines() if line[:1] in tuple("┏┃┡│└")]
+    assert set(borders) == set("┓┃┩│┘"), "a table that is wider than the terminal loses its right border"

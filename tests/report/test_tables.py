@@ -3,10 +3,15 @@
 from typing import Any
 
 import numpy as np
+import pandas as pd
 import pytest
 import scipy.stats
 
-from vd4rl_pomdp.report import overall, tables
+from tests.helpers_report import write_run
+from vd4rl_pomdp.data.reference import Reference
+from vd4rl_pomdp.report import tables
+from vd4rl_pomdp.report.load import CONDITION, load_runs, runs_frame
+from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 
 SCORES = {
     # (method, task): {seed: scores of the last evaluation's two episodes}
@@ -17,9 +22,9 @@ SCORES = {
 }
 
 
-def rows() -> list[dict[str, Any]]:
+def rows() -> pd.DataFrame:
     """Two evaluations of every run, of two episodes each: at step 5 all score 99, at step 10 as above."""
-    return [
+    found = [
         {
             "method": method,
             "task": task,
@@ -34,14 +39,18 @@ def rows() -> list[dict[str, Any]]:
         for seed, scores in seeds.items()
         for step in (5, 10)
     ]
+    return pd.DataFrame(found)
 
 
-def of(table: list[dict[str, Any]], **names: Any) -> list[dict[str, Any]]:
-    return [row for row in table if all(row[name] == value for name, value in names.items())]
+NO_GAPS = pd.DataFrame(columns=[*CONDITION, "seed", "state"])
+
+
+def of(table: pd.DataFrame, **names: Any) -> list[dict[str, Any]]:
+    return [row for row in table.to_dict("records") if all(row[name] == value for name, value in names.items())]
 
 
 def test_a_summary_is_of_the_last_evaluation_and_names_the_best_beside_it():
-    (row,) = of(tables.summary(rows(), []), method="acro", task="walker_walk")
+    (row,) = of(tables.summary(rows(), NO_GAPS), method="acro", task="walker_walk")
     assert (row["step"], row["score"], row["seeds"], row["episodes"]) == (10, 30.0, 2, 4)
     assert (row["best_step"], row["best_score"], row["few_seeds"]) == (5, 99.0, True)
     error, free = (200 / 2 + 50 / 2) ** 0.5, 125**2 / (100**2 + 25**2)  # seeds 20 and 40, episodes 25 and 35
@@ -56,7 +65,7 @@ def test_curves_show_mean_and_range_over_seeds_at_every_evaluation():
 
 
 def test_aggregates_are_over_the_runs_of_all_tasks_at_their_end():
-    (row,) = of(overall.aggregate(rows(), []), method="acro")
+    (row,) = of(tables.aggregate(rows(), NO_GAPS), method="acro")
     assert row["iqm"] == pytest.approx((40 + 60) / 2), "the middle half of 20, 40, 60, 80"
     assert row["optimality_gap"] == pytest.approx(50.0)
     assert (row["tasks"], row["seeds"]) == (2, 2)
@@ -64,26 +73,98 @@ def test_aggregates_are_over_the_runs_of_all_tasks_at_their_end():
 
 def test_what_lacks_tasks_stands_below_what_has_them_all():
     """Its mean is of other tasks: easier ones, perhaps."""
-    lacking = [row for row in rows() if (row["method"], row["task"]) != ("mik", "cheetah_run")]
-    for row in of(lacking, method="mik"):
-        row["score"] = 95.0
-    found = overall.aggregate(lacking, [])
+    table = rows()
+    lacking = table[(table["method"] != "mik") | (table["task"] != "cheetah_run")]
+    lacking = lacking.assign(score=lacking["score"].mask(lacking["method"] == "mik", 95.0))
+    found = tables.aggregate(lacking, NO_GAPS).to_dict("records")
     assert [(row["method"], row["tasks"], row["of_tasks"]) for row in found] == [("acro", 2, 2), ("mik", 1, 2)]
     assert found[1]["iqm"] > found[0]["iqm"]
 
 
 def test_profiles_are_shares_of_runs_above_a_score():
-    found = of(overall.profiles(rows()), method="mik")
+    found = of(tables.profiles(rows()), method="mik")
     shares = {row["threshold"]: row["share"] for row in found}
     assert [shares[at] for at in (0, 30, 60)] == [0.75, 0.25, 0.25], "runs end at 20, 30, 90 and 0"
     assert all(row["low"] <= row["share"] <= row["high"] for row in found)
 
 
 def test_improvement_compares_runs_of_one_task_and_averages_over_tasks():
-    (row,) = of(overall.improvement(rows()), method="acro", other="mik")
+    (row,) = of(tables.improvement(rows()), method="acro", other="mik")
     walker = np.mean([0.5, 0.0, 1.0, 1.0])  # 20 and 40 against 20 and 30
     cheetah = np.mean([0.0, 1.0, 0.0, 1.0])  # 60 and 80 against 90 and 0
     assert row["probability"] == pytest.approx((walker + cheetah) / 2)
     assert row["tasks"] == 2
-    (other,) = of(overall.improvement(rows()), method="mik", other="acro")
+    (other,) = of(tables.improvement(rows()), method="mik", other="acro")
     assert row["probability"] + other["probability"] == pytest.approx(1.0)
+
+
+def evaluated_clean(run, returns, errors):
+    """Give a run's last evaluation, whose action errors become the first of two, one under none with the second."""
+    episodes = [row for row in read_episodes(run / "episodes.csv") if row["step"] == 10]
+    (run / "episodes.csv").unlink()
+    append_episodes(run / "episodes.csv", [row | {"action_error": errors[0]} for row in episodes])
+    clean = {"evaluated_under": "none", "action_error": errors[1]}
+    append_episodes(run / "episodes.csv", [episodes[0] | clean | {"return": r, "score": r / 10} for r in returns])
+
+
+def control(folder):
+    """What the methods of a folder's runs do, by method."""
+    return tables.control(runs_frame(load_runs([folder]))).set_index("method").to_dict("index")
+
+
+def test_scores_are_as_trained_and_the_control_table_tells_of_both(tmp_path):
+    for seed, score in enumerate((30.0, 50.0)):
+        run = write_run(tmp_path / str(seed), "acro", seed, {10: [score, 90.0]})
+        Reference(500.0, None, 0.01 * (seed + 1)).write(run)
+        evaluated_clean(run, [401.0, 399.0, 900.0], (0.1, 0.2))
+    write_run(tmp_path / "mik", "mik", 0, {10: [70.0]})
+    frame = runs_frame(load_runs([tmp_path]))
+    assert frame.set_index(["method", "seed"])["score"].to_dict() == {("acro", 0): 60, ("acro", 1): 70, ("mik", 0): 70}
+    found = control(tmp_path)
+    numbers = ("data_return", "return", "share_above_80", "action_error", "path_error", "seeds")
+    assert [round(found["acro"][name], 4) for name in numbers] == [500, 650, 0.75, 0.1, 0.015, 2]
+    clean = ("clean_return", "clean_share_above_80", "clean_action_error")
+    assert [round(found["acro"][name], 4) for name in clean] == [566.6667, 0.6667, 0.2]
+    assert [name for name in (*numbers, *clean) if not np.isnan(found["mik"][name])] == ["return", "seeds"]
+
+
+def test_a_mean_that_a_seed_does_not_know_is_not_told(tmp_path):
+    """It would stand beside a number of seeds that are not behind it."""
+    runs = [write_run(tmp_path / str(seed), "acro", seed, {10: [30.0 + seed]}) for seed in (0, 1)]
+    evaluated_clean(runs[0], [400.0], (0.1, 0.2))
+    row = control(tmp_path)["acro"]
+    assert (row["return"], np.isnan(row["clean_return"]), row["seeds"]) == (305.0, True, 2)
+
+
+def test_what_was_trained_clean_counts_as_both(tmp_path):
+    write_run(tmp_path / "0", "acro", 0, {10: [30.0]}, labels={"corruption": "none"})
+    row = control(tmp_path)["acro"]
+    assert (row["return"], row["clean_return"]) == (300.0, 300.0)
+
+
+def test_returns_are_those_of_the_episodes_whatever_divides_the_tasks_scores(tmp_path):
+    run = write_run(tmp_path / "0", "acro", 0, {5: [9.0], 10: [30.0, 90.0]})
+    episodes = read_episodes(run / "episodes.csv")
+    (run / "episodes.csv").unlink()
+    append_episodes(run / "episodes.csv", [row | {"return": row["score"]} for row in episodes])
+    (row,) = tables.representations(tables.all_runs(runs_frame(load_runs([tmp_path])), NO_GAPS)).to_dict("records")
+    assert (row["return"], control(tmp_path)["acro"]["return"]) == (60.0, 60.0)
+
+
+def told_losses(seed: int, every: int, loss: float, steps: int = 50_000):
+    """A pretraining that told of a loss at some steps."""
+    named = dict.fromkeys(CONDITION, "") | {"method": "acro", "seed": seed}
+    return named, [(step, loss + 1 / step) for step in range(every, steps + 1, every)]
+
+
+def test_losses_are_means_at_steps_that_all_runs_told_of():
+    found = tables.losses([told_losses(0, 100, 1.0), told_losses(1, 150, 2.0, 49_800)])
+    assert found["step"].tolist() == list(range(300, 49_801, 300))
+    assert found["action_loss"].to_numpy() == pytest.approx(1.5 + 1 / found["step"].to_numpy())
+    assert set(found["seeds"]) == {2}
+
+
+def test_a_long_loss_curve_is_thinned_and_keeps_its_ends():
+    steps = tables.losses([told_losses(0, 100, 1.0)])["step"].tolist()
+    assert (steps[0], steps[-1], len(steps)) == (100, 50_000, 200)
+    assert steps == sorted(set(steps))

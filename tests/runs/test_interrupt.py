@@ -10,7 +10,7 @@ from pathlib import Path
 import pytest
 
 from tests.helpers_data import write_fake_set
-from tests.runs.test_workers import _alive
+from tests.runs.test_workers import alive
 from vd4rl_pomdp.runs import interrupt
 
 SLOW_STEPS = """
@@ -31,24 +31,22 @@ if __name__ == "__main__":
 SLOW_JOBS = """
 import sys
 from tests.runs.test_workers import tell_and_sleep
-from vd4rl_pomdp.cli import COMMANDS, main
-from vd4rl_pomdp.cli.dispatch import Command
+from vd4rl_pomdp.cli import main, stages
 from vd4rl_pomdp.runs.workers import run_jobs
-COMMANDS["jobs"] = Command("", lambda words, program: list(run_jobs(tell_and_sleep, [0, 1], 2)))
+stages.list_parts = lambda words, program: list(run_jobs(tell_and_sleep, [0, 1], 2))
 if __name__ == "__main__":
-    main(["jobs"])
+    main(["list"])
 """
 HANGING = """
 import sys, time
-from vd4rl_pomdp.cli import COMMANDS, main
-from vd4rl_pomdp.cli.dispatch import Command
+from vd4rl_pomdp.cli import main, stages
 from vd4rl_pomdp.runs import interrupt
 def hang(words, program):
     with interrupt.deferred():
         print("hanging", flush=True)
         time.sleep(60)
-COMMANDS["hang"] = Command("", hang)
-main(["hang"])
+stages.list_parts = hang
+main(["list"])
 """
 ENDS = [(signal.SIGINT, 130, "interrupted"), (signal.SIGTERM, 143, "terminated")]
 
@@ -84,7 +82,7 @@ def test_a_training_run_keeps_its_running_step_and_goes_on_from_there(tmp_path, 
     kept = f"{word}: {tmp_path / 'run'} keeps step 3; re-run the same command to resume"
     assert said(program) == [kept]
     assert program.returncode == code
-    assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["3"]
+    assert [path.name for path in (tmp_path / "run" / "checkpoints").iterdir()] == ["3.pt"]
     assert not list((tmp_path / "run").glob(".*"))
 
 
@@ -95,7 +93,7 @@ def test_workers_end_with_the_first_signal(tmp_path, number, code, word):
     os.killpg(program.pid, number)  # as a terminal's Ctrl-C and a cluster's scancel do
     assert said(program) == [f"{word}: re-run the same command to resume"]
     assert program.returncode == code
-    assert not any(map(_alive, workers))
+    assert not any(map(alive, workers))
 
 
 def test_a_signal_while_workers_start_is_the_callers_business(tmp_path):
@@ -109,7 +107,7 @@ def test_a_signal_while_workers_start_is_the_callers_business(tmp_path):
     os.killpg(program.pid, signal.SIGINT)
     assert said(program) == ["interrupted: re-run the same command to resume"]
     assert program.returncode == 130
-    while any(_alive(int(pid)) for pid in pids):  # the tracker ends when it finds its caller gone
+    while any(alive(int(pid)) for pid in pids):  # the tracker ends when it finds its caller gone
         time.sleep(0.01)
 
 
@@ -125,23 +123,18 @@ def test_a_second_signal_ends_the_program_at_once(tmp_path, number, code, word):
 
 
 def test_a_library_caller_gets_the_exceptions_and_its_handlers_back():
-    before = [signal.getsignal(number) for number in interrupt.SIGNALS]
-    with pytest.raises(interrupt.Interrupted), interrupt.handled():
-        signal.raise_signal(signal.SIGINT)
-    with pytest.raises(SystemExit) as end, interrupt.handled():
-        signal.raise_signal(signal.SIGTERM)
-    assert end.value.code == 143
-    assert [signal.getsignal(number) for number in interrupt.SIGNALS] == before
-
-
-def test_a_terminal_that_is_closed_counts_as_sigterm_unless_it_is_ignored():
     before = signal.signal(signal.SIGHUP, signal.SIG_DFL)
+    handlers = [signal.getsignal(number) for number in interrupt.SIGNALS]
     try:
-        with pytest.raises(interrupt.Terminated), interrupt.handled(), interrupt.hangups():
-            signal.raise_signal(signal.SIGHUP)
-        assert signal.getsignal(signal.SIGHUP) == signal.SIG_DFL
+        with pytest.raises(interrupt.Interrupted), interrupt.handled():
+            signal.raise_signal(signal.SIGINT)
+        for number in (signal.SIGTERM, signal.SIGHUP):
+            with pytest.raises(interrupt.Terminated) as end, interrupt.handled():
+                signal.raise_signal(number)
+            assert end.value.code == 143
+        assert [signal.getsignal(number) for number in interrupt.SIGNALS] == handlers
         signal.signal(signal.SIGHUP, signal.SIG_IGN)  # as nohup has it
-        with interrupt.handled(), interrupt.hangups():
+        with interrupt.handled():
             signal.raise_signal(signal.SIGHUP)
     finally:
         signal.signal(signal.SIGHUP, before)
@@ -158,7 +151,7 @@ def test_a_signal_waits_for_the_end_of_a_deferred_step_except_where_it_need_not(
             steps.append(2)
 
     def in_an_evaluation() -> None:
-        with interrupt.handled(), interrupt.deferred(), interrupt.at_once():
+        with interrupt.handled(), interrupt.deferred(), interrupt.deferred(False):
             signal.raise_signal(signal.SIGTERM)
             steps.append(3)
 

@@ -1,13 +1,32 @@
-"""Means of a row: what counts, over which steps, and where a state comes back."""
+"""Rows of metrics: what counts in a mean, and what wandb and TensorBoard get of a run, also of one that was cut."""
 
+from __future__ import annotations
+
+import json
 import math
+import os
+import signal
+import struct
+import subprocess
+import sys
+from collections.abc import Iterator
+from dataclasses import dataclass
+from pathlib import Path
+from types import ModuleType
+from typing import Any
 
 import pytest
 import torch
+from tensorboardX.proto.event_pb2 import Event
+from wandb.proto.wandb_internal_pb2 import Record
 
+from finetune.train import finetune as run_finetune
+from pretrain.train import pretrain as run_pretrain
+from tests.helpers_stages import CutError, contents, cut_at, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.checkpoint import pack, unpack
-from vd4rl_pomdp.runs.metrics import Means
+from vd4rl_pomdp.runs.metrics import Means, MetricsLog, mirrors_of, read_metrics, wandb_names
+from vd4rl_pomdp.runs.run import RunFolder
 
 STEPS = [{"loss": 0.1, "actor": 1.0}, {"loss": 0.2}, {"loss": 0.6, "actor": 4.0}, {"loss": 0.7}]
 
@@ -24,6 +43,9 @@ def test_a_scalar_counts_the_steps_that_gave_it_and_each_row_begins_anew():
     means.add(logs(STEPS[3]))
     assert means.take() == pytest.approx({"loss": 0.7})
     assert means.take() == {}
+    for value in (1.0, float("nan"), 1.0):
+        means.add({"loss": torch.tensor(value)})
+    assert math.isnan(means.take()["loss"])
 
 
 @pytest.mark.parametrize("name", ["step", "eval/return/none"])
@@ -45,27 +67,14 @@ def test_a_checkpoint_between_two_rows_changes_no_bit(cut):
     assert list(after.take().items()) == list(whole.take().items())
 
 
-def test_a_tensor_that_changes_later_keeps_the_number_that_was_added():
+def test_what_is_added_is_a_number_of_its_own_in_single_precision():
     means, weight = Means(), torch.nn.Parameter(torch.tensor(1.0))
-    means.add({"weight": weight})
+    for _ in range(1000):
+        means.add({"weight": weight, "half": torch.tensor(1.0, dtype=torch.bfloat16)})
     with torch.no_grad():
         weight.fill_(9.0)
     assert not any(total.requires_grad for total, _ in means.state_dict().values()), "no graph is kept alive"
-    assert means.take() == {"weight": 1.0}
-
-
-def test_many_numbers_of_half_precision_are_summed_in_single():
-    means = Means()
-    for _ in range(1000):
-        means.add({"loss": torch.tensor(1.0, dtype=torch.bfloat16)})
-    assert means.take() == {"loss": 1.0}
-
-
-def test_one_step_that_gives_no_number_is_seen_in_the_mean():
-    means = Means()
-    for value in (1.0, float("nan"), 1.0):
-        means.add({"loss": torch.tensor(value)})
-    assert math.isnan(means.take()["loss"])
+    assert means.take() == {"weight": 1.0, "half": 1.0}
 
 
 def test_adding_reads_no_value():
@@ -75,3 +84,233 @@ def test_adding_reads_no_value():
         means.add({"loss": torch.zeros((), device="meta")})
     with pytest.raises((NotImplementedError, RuntimeError)):
         means.take()
+
+
+def test_rows_after_the_checkpoint_and_a_cut_one_are_dropped(tmp_path):
+    path = tmp_path / "metrics.jsonl"
+    log = MetricsLog(path, 0)
+    for step in (1, 2, 3):
+        log.write(step, {"loss": step / 2})
+    path.open("a").write('{"step": 4, "lo')
+    MetricsLog(path, 2).write(3, {"loss": 9.0})
+    assert [json.loads(line) for line in path.read_text().splitlines()] == [
+        {"step": 1, "loss": 0.5},
+        {"step": 2, "loss": 1.0},
+        {"step": 3, "loss": 9.0},
+    ]
+    with pytest.raises(FloatingPointError, match="loss is nan in the row of step 4"):
+        log.write(4, {"loss": float("nan")})
+
+
+FINETUNE = {"updates": 4, "eval_every": 2, "checkpoint_every": 2, "batch_size": 4, "eval_length": 2, "log_every": 1}
+LABELS = {"method": "mik+a", "task": "walker_walk", "quality": "expert", "corruption": "patch"}
+
+
+@dataclass(frozen=True)
+class Config:
+    out: Path
+    data: Path = Path("data")
+    seed: int = 0
+    max_k: int = 1
+    wandb: str = "off"
+    tensorboard: bool = False
+
+
+def run_at(out: Path, **changes: Any) -> RunFolder:
+    return RunFolder(out, "pretrain", Config(out, **changes), {"data": "abc"})
+
+
+def open_log(run: RunFolder, step: int = 0) -> MetricsLog:
+    run.path.mkdir(exist_ok=True)
+    return MetricsLog(run.path / "metrics.jsonl", step, mirrors_of(run, LABELS, {}))
+
+
+def wandb_records(run: Path) -> Iterator[Record]:
+    """The records of a run's one .wandb file: LevelDB's log format, in blocks of 32 KiB, after a header of 7 bytes."""
+    (file,) = run.glob("wandb/offline-run-*/*.wandb")
+    content, place, whole = file.read_bytes(), 7, b""
+    while place + 7 <= len(content):
+        if (left := -place % 32768) and left < 7:
+            place += left
+        _, length, kind = struct.unpack("<IHB", content[place : place + 7])
+        whole += content[place + 7 : place + 7 + length]
+        place += 7 + length
+        if kind in (1, 4):
+            yield Record.FromString(whole)
+            whole = b""
+
+
+def wandb_rows(run: Path) -> list[dict[str, float]]:
+    records = wandb_records(run)
+    rows = [{i.key or i.nested_key[0]: json.loads(i.value_json) for i in r.history.item} for r in records]
+    return [{name: v for name, v in row.items() if not name.startswith("_")} for row in rows if row]
+
+
+def tensorboard_numbers(run: Path) -> dict[tuple[str, int], float]:
+    """What the run's one event file holds; each record is framed by its length."""
+    (file,) = (run / "tensorboard").iterdir()
+    content, place, shown = file.read_bytes(), 0, {}
+    while place < len(content):
+        (length,) = struct.unpack("<Q", content[place : place + 8])
+        event = Event.FromString(content[place + 12 : place + 12 + length])
+        shown |= {(value.tag, event.step): value.simple_value for value in event.summary.value}
+        place += 16 + length
+    return shown
+
+
+def assert_all_mirrored(run: Path) -> list[dict[str, float]]:
+    """Both mirrors hold every row of a run's metrics.jsonl once, in order; returns them."""
+    rows = read_metrics(run / "metrics.jsonl")
+    assert wandb_rows(run) == rows
+    expected = {(n.replace("+", "_"), r["step"]): v for r in rows for n, v in r.items() if n != "step"}
+    shown = tensorboard_numbers(run)
+    assert shown.keys() == expected.keys()
+    assert all(shown[place] == pytest.approx(expected[place], rel=1e-6) for place in expected)
+    return rows
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_both_get_the_whole_config_and_every_row_also_of_a_run_that_was_cut(encoder, data, tmp_path, monkeypatch):
+    changes = FINETUNE | {"wandb": "offline", "tensorboard": True}
+    with monkeypatch.context() as patch:
+        cut_at(patch, 2)
+        with pytest.raises(CutError):
+            run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **FINETUNE))  # mirrored from its second part
+    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **changes)).path
+    first = next(record.run for record in wandb_records(run) if record.HasField("run"))
+    assert first.run_id == (run / "wandb" / "id").read_text()
+    assert (first.project, first.job_type) == ("vd4rl-pomdp", "finetune")
+    assert {"finetune", "mik+a", "patch+zero_frames", "walker_walk", "expert", "td3_bc"} == set(first.tags)
+    config = {item.key: json.loads(item.value_json) for item in first.config.update}
+    stored = json.loads((run / "config.json").read_text())
+    assert (stored["config"] | {"wandb": "offline", "tensorboard": True}).items() <= config.items()
+    told = {name: config[name] for name in ("method", "corruption", "task", "quality", "stage")}
+    assert told == {**LABELS, "corruption": "patch+zero_frames", "stage": "finetune"}
+    assert config["pretraining"] == json.loads((encoder / "config.json").read_text())["pretrain"]
+    rows = assert_all_mirrored(run)
+    assert "eval/score/none" in rows[-1]
+    untracked = contents(run_finetune(smoke_finetune(encoder, data, tmp_path / "untracked", **FINETUNE)).path)
+    assert untracked.items() <= contents(run).items()
+
+
+KILLED = """
+import os, signal, sys
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.runs.metrics import MetricsLog
+write = MetricsLog.write
+def kill_at_40(self, step, metrics):
+    write(self, step, metrics)
+    if step == 40:
+        os.kill(os.getpid(), signal.SIGKILL)
+MetricsLog.write = kill_at_40
+if __name__ == "__main__":
+    main(sys.argv[1:])
+"""
+
+
+@pytest.mark.usefixtures("own_cache")
+def test_a_killed_run_lacks_no_row_once_it_is_resumed(data, tmp_path):
+    out, script = tmp_path / "run", tmp_path / "killed.py"
+    script.write_text(KILLED)
+    changes = {"method": "no_history", "log_every": 1, "checkpoint_every": 30, "steps": 50, "wandb": "offline"}
+    words = ["pretrain", "--preset", "smoke", "--data", data, "--out", out, "--corruption", "patch", "--tensorboard"]
+    words += [word for name, value in changes.items() for word in (f"--{name.replace('_', '-')}", value)]
+    apart = {name: value for name, value in os.environ.items() if name != "WANDB_SERVICE"}  # a process of its own
+    command = [sys.executable, script, *words]
+    killed = subprocess.run(list(map(str, command)), env=apart | {"PYTHONPATH": os.getcwd()}, capture_output=True)
+    assert killed.returncode == -signal.SIGKILL, killed.stderr
+    assert len(read_metrics(out / "metrics.jsonl")) == 40
+    run_pretrain(smoke_pretrain(data, out, corruption="patch", tensorboard=True, **changes))
+    assert [row["step"] for row in assert_all_mirrored(out)] == list(range(1, 51))
+
+
+class Faulty(ModuleType):
+    """A wandb that fails at one of its calls."""
+
+    def __init__(self, place: str = "nothing") -> None:
+        super().__init__("wandb")
+        self._place = place
+        self.calls: list[str] = []
+        self.asked: list[dict[str, Any]] = []
+        self.sent: list[int] = []
+        self.summary: dict[str, float] = {}
+
+    def __getattr__(self, name: str) -> Any:
+        if name.startswith("__"):
+            raise AttributeError(name)
+
+        def call(*given: Any, **words: Any) -> Any:
+            self.calls.append(name)
+            if name == self._place:
+                raise RuntimeError(f"{name}\nbroke")
+            self.asked += [words] if name == "init" else []
+            self.sent += [given[0]["step"]] if name == "log" else []
+            return self
+
+        return call
+
+
+@pytest.mark.parametrize("place", ["init", "log", "finish"])
+def test_a_failing_wandb_warns_once_and_metrics_go_on(tmp_path, monkeypatch, capsys, place):
+    monkeypatch.setitem(sys.modules, "wandb", faulty := Faulty(place))
+    log = open_log(run_at(tmp_path, wandb="online"))
+    for step in (1, 2, 3):
+        log.write(step, {"loss": 0.5})
+    log.close()
+    warnings = capsys.readouterr().err.splitlines()
+    assert warnings == [f"warning: wandb fails ({place} broke); the run continues, {tmp_path} has it all"]
+    assert faulty.calls.count(place) == 1
+    assert len(read_metrics(tmp_path / "metrics.jsonl")) == 3
+
+
+def test_a_disk_that_fills_under_tensorboard_warns_once(tmp_path, monkeypatch, capsys):
+    """In this thread: tensorboardX's writer would wait for one that has died."""
+    log = open_log(run_at(tmp_path, tensorboard=True))
+
+    def full(*_: Any) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("tensorboardX.event_file_writer.EventsWriter.flush", full)
+    for step in range(1, 9):
+        log.write(step, {"loss": 1.0})
+    log.close()
+    assert capsys.readouterr().err.count("warning: TensorBoard fails ([Errno 28] No space left on device)") == 1
+
+
+@pytest.mark.parametrize(
+    ("changes", "module"), [({"wandb": "offline"}, "wandb"), ({"tensorboard": True}, "tensorboardX")]
+)
+def test_what_is_not_installed_is_named_with_what_brings_it(tmp_path, monkeypatch, capsys, changes, module):
+    for name in [name for name in sys.modules if name.split(".")[0] == module]:
+        monkeypatch.delitem(sys.modules, name)
+    monkeypatch.setitem(sys.modules, module, None)
+    open_log(run_at(tmp_path, **changes)).write(1, {"loss": 0.5})
+    assert "; `pip install '.[tracking]'` in the package's folder); the run continues" in capsys.readouterr().err
+    assert read_metrics(tmp_path / "metrics.jsonl") == [{"step": 1, "loss": 0.5}]
+
+
+def test_online_a_run_that_resumes_is_the_same_and_gets_the_rows_that_the_server_lacks(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "wandb", fake := Faulty())
+    run, other = (run_at(tmp_path / name, wandb="online") for name in "ab")
+    log = open_log(run)
+    for step in (1, 2, 3, 5):
+        log.write(step, {"loss": step / 10})
+    fake.summary, fake.sent = {"step": 3, "loss": 0.3}, []
+    open_log(run, 5).write(6, {"loss": 0.6})
+    assert fake.sent == [3, 5, 6]
+    open_log(other)
+    ids = [words["id"] for words in fake.asked]
+    assert ids[0] == ids[1] != ids[2]
+    assert all((words["resume"], words["mode"]) == ("allow", "online") for words in fake.asked)
+
+
+def test_seeds_of_one_experiment_share_a_group_and_other_settings_do_not(tmp_path):
+    one, other, wide = (wandb_names(run_at(tmp_path, **c), LABELS, {}) for c in ({}, {"seed": 1}, {"max_k": 15}))
+    assert one["group"] == other["group"] != wide["group"]
+    assert (one["name"], other["name"]) == tuple(f"pretrain mik+a walker_walk expert patch seed {i}" for i in (0, 1))
+    card = {"settings": {"max_k": 1}, "seed": 0, "method": "mik+a"}
+    cards = [card, card | {"seed": 1}, card | {"settings": {"max_k": 2}}]
+    assert len({wandb_names(run_at(tmp_path), LABELS, told)["group"] for told in cards}) == 2
+    long = wandb_names(run_at(tmp_path, seed=2**31 - 1), LABELS | {"method": "m" * 300}, {})
+    assert (len(long["name"]), len(long["group"]), max(map(len, long["tags"]))) == (128, 128, 64)
+    assert long["name"].endswith(" seed 2147483647")

@@ -1,4 +1,4 @@
-"""A run folder: begun by one process, gone on with as the same run only."""
+"""A run folder: begun by one process, resumed as the same run only."""
 
 import json
 import os
@@ -18,7 +18,6 @@ from vd4rl_pomdp.data.format import read_rows
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig
 from vd4rl_pomdp.nn.encoder_folder import load_encoder, save_encoder
 from vd4rl_pomdp.policies.actor import Actor, read_actor
-from vd4rl_pomdp.runs import ownership
 from vd4rl_pomdp.runs import run as module
 from vd4rl_pomdp.runs.files import read_json, write_csv, write_json
 from vd4rl_pomdp.runs.run import RunFolder
@@ -37,22 +36,18 @@ INPUTS = {"data": "abc"}
 
 
 def begin(out: Path, inputs: dict[str, str] = INPUTS, **changes: object) -> RunFolder:
-    return RunFolder(out, "stage", Config(out, **changes), inputs)
+    return RunFolder(out, "stage", Config(out, **changes), inputs, collection={"task": "mine"})
 
 
-def test_the_record_holds_format_config_and_inputs(tmp_path):
-    with begin(tmp_path):
-        record = read_json(tmp_path / "config.json")
-    assert record["format"] == module.FORMAT
-    assert (record["stage"], record["inputs"], record["config"]["seed"]) == ("stage", INPUTS, 0)
-    assert (tmp_path / "machine.json").exists()
-    assert not list(tmp_path.glob(".*"))
-
-
-def test_only_the_same_run_goes_on_wherever_its_data_lies(tmp_path):
+def test_only_the_same_run_resumes_wherever_its_data_lies(tmp_path):
     with begin(tmp_path) as run:
+        assert not any(path.name.endswith(".tmp") for path in tmp_path.iterdir())
         run.finish()
+    record = read_json(tmp_path / "config.json")
+    assert (record["format"], record["stage"], record["inputs"]) == (module.FORMAT, "stage", INPUTS)
+    assert (record["config"]["seed"], record["collection"]) == (0, {"task": "mine"})
     before = {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()}
+    assert before.keys() == {"config.json", "machine.json", "timing.json"}
     with begin(tmp_path, data=Path("moved"), workers=7, log_every=9) as again:
         assert again.finished
     with pytest.raises(UserError, match=r"another config \(seed\)"):
@@ -62,31 +57,8 @@ def test_only_the_same_run_goes_on_wherever_its_data_lies(tmp_path):
     with pytest.raises(UserError, match=r"stage stage"):
         RunFolder(tmp_path, "other", Config(tmp_path), INPUTS)
     assert {path.name: path.stat().st_mtime_ns for path in tmp_path.iterdir()} == before
-
-
-@dataclass(frozen=True)
-class Later(Config):
-    future_frames: str = "all"
-
-
-def test_a_run_from_before_a_setting_goes_on_with_what_it_did(tmp_path):
-    with begin(tmp_path) as run:
-        run.finish()
-    assert RunFolder(tmp_path, "stage", Later(tmp_path), INPUTS).finished
-    with pytest.raises(UserError, match=r"another config \(future_frames\)"):
-        RunFolder(tmp_path, "stage", Later(tmp_path, future_frames="newest"), INPUTS)
-
-
-@pytest.mark.parametrize("stored", [1, 99])
-def test_a_run_of_another_format_is_refused(tmp_path, stored):
-    with begin(tmp_path):
-        pass
-    record = read_json(tmp_path / "config.json")
-    write_json(
-        tmp_path / "config.json",
-        {k: v for k, v in record.items() if k != "format"} | ({"format": 99} if stored == 99 else {}),
-    )
-    with pytest.raises(UserError, match=f"run of format {stored}, this version writes format {module.FORMAT}"):
+    write_json(tmp_path / "config.json", record | {"format": 99})
+    with pytest.raises(UserError, match=f"run of format 99, this version writes format {module.FORMAT}"):
         begin(tmp_path)
 
 
@@ -98,40 +70,21 @@ def test_a_folder_with_something_else_is_refused(tmp_path, content):
     assert [path.name for path in tmp_path.iterdir()] == [content]
 
 
-def test_what_a_run_goes_on_with_is_recorded_where_it_is_new(tmp_path, monkeypatch):
-    now = {"processor": "A", "git_commit": "one"}
+def test_the_record_is_of_the_start_that_counts_and_tells_what_later_ones_had(tmp_path, monkeypatch):
+    now = {}
     monkeypatch.setattr(module, "machine", lambda device: {"processor": now["processor"]})
     monkeypatch.setattr(module, "git_commit", lambda: now["git_commit"])
-    for processor, commit in (("A", "one"), ("A", "one"), ("B", "one"), ("B", "one"), ("B", "two"), ("A", "one")):
+    starts = [("A", "lost"), ("A", "one"), ("A", "one"), ("B", "one"), ("B", "one"), ("B", "two"), ("A", "one")]
+    for processor, commit in starts:
         now |= {"processor": processor, "git_commit": commit}
         with begin(tmp_path) as run:
-            run.save(1, {})
-    told = read_json(tmp_path / "machine.json")
-    later = [(part["processor"], part["git_commit"]) for part in told["continued"]]
-    assert (told["processor"], later) == ("A", [("B", "one"), ("B", "two"), ("A", "one")])
-    assert told["continued"][0]["versions"] == read_json(tmp_path / "config.json")["versions"]
-    monkeypatch.setattr(module, "code_of", lambda parts: {"plugins": {}, "sources": {"method mine": "mine.py 2"}})
-    with begin(tmp_path):
-        pass
-    assert read_json(tmp_path / "config.json")["sources"] == {}
-    assert read_json(tmp_path / "machine.json")["continued"][-1]["sources"] == {"method mine": "mine.py 2"}
-    write_json(tmp_path / "machine.json", told | {"continued": 7})
-    with pytest.raises(UserError, match=r"machine\.json: is damaged"), begin(tmp_path):
-        pass
-
-
-def test_the_record_of_a_run_that_has_kept_nothing_is_of_the_start_that_counts(tmp_path, monkeypatch):
-    for commit, size in (("one", 1), ("two", 2), ("three", 2)):
-        monkeypatch.setattr(module, "git_commit", lambda commit=commit: commit)
-        monkeypatch.setattr(module, "machine", lambda device, commit=commit: {"processor": commit})
-        told = {"plugins": {}, "sources": {"method mine": f"mine.py {size}"}}
-        monkeypatch.setattr(module, "code_of", lambda parts, told=told: told)
-        with begin(tmp_path) as run:
-            if commit != "one":
+            if commit != "lost":
                 run.save(1, {})
     record, told = (read_json(tmp_path / f"{name}.json") for name in ("config", "machine"))
-    assert (record["git_commit"], record["sources"], told["processor"]) == ("two", {"method mine": "mine.py 2"}, "two")
-    assert [part["git_commit"] for part in told["continued"]] == ["three"]
+    later = [(part["processor"], part["git_commit"]) for part in told["continued"]]
+    assert (record["git_commit"], told["processor"]) == ("one", "A")
+    assert later == [("B", "one"), ("B", "two"), ("A", "one")]
+    assert told["continued"][0]["versions"] == record["versions"]
 
 
 def test_a_second_owner_is_refused_and_finds_the_end_of_the_first(tmp_path):
@@ -150,8 +103,7 @@ def _begin_and_save(out: Path) -> None:
 
 
 @pytest.mark.skipif(not hasattr(os, "fork"), reason="needs fork")
-def test_a_run_that_is_killed_at_its_beginning_goes_on(tmp_path, monkeypatch):
-    monkeypatch.setattr(ownership, "EMPTY_S", 0.05)
+def test_a_run_that_is_killed_at_its_beginning_resumes(tmp_path):
     for number in range(1, 200):
         out = tmp_path / str(number)
         if not killed_at(number, lambda out=out: _begin_and_save(out)):
@@ -188,28 +140,11 @@ def test_all_files_follow_the_umask(tmp_path):
     finally:
         os.umask(before)
     assert {name for name, mode in modes.items() if mode not in (0o640, 0o750)} == set()
-    assert {".lock", ".owner.json", "state.safetensors", "config.json", "checkpoints"} < set(modes)
-
-
-def test_what_may_not_be_read_is_not_called_damaged(tmp_path, monkeypatch):
-    with begin(tmp_path) as run:
-        run.save(1, {"step": 1})
-    read = Path.read_bytes
-
-    def refuse(path: Path) -> bytes:
-        if path.name == "state.json":
-            raise PermissionError(13, "Permission denied")
-        return read(path)
-
-    monkeypatch.setattr(Path, "read_bytes", refuse)
-    with (
-        pytest.raises(UserError, match=r"state.json: may not be used \(permission denied\); ask its owner"),
-        begin(tmp_path) as run,
-    ):
-        run.restore(lambda state: None)
+    assert {".lock", "1.pt", "config.json", "checkpoints"} < set(modes)
 
 
 READERS = {
+    "1.pt": lambda folder: RunFolder(folder / "run", "stage", Config(folder / "run"), INPUTS).restore(print),
     "model.safetensors": lambda folder: load_encoder(folder / "encoder"),
     "config.json": lambda folder: load_encoder(folder / "encoder"),
     "0_fake.hdf5": lambda folder: read_rows(folder / "set" / "0_fake.hdf5"),
@@ -221,13 +156,14 @@ READERS = {
 
 @pytest.fixture(scope="module")
 def foreign(tmp_path_factory) -> Path:
-    """An encoder, a set with its store, and an actor."""
+    """An encoder, a set with its store, an actor and a run."""
     folder = tmp_path_factory.mktemp("foreign")
     config = EncoderConfig(channels=9, size=84, action_dim=6, frame_encoder="nature", feature_dim=8)
     card = EncoderCard("acro", "walker_walk", "expert", {"corruption": "none"}, 0, 1, "smoke")
     save_encoder(folder / "encoder", Encoder(config), card)
     open_dataset(write_fake_set(folder / "set"), folder / "cache")
     Actor({"mean.weight": np.zeros((3, 2), np.float32)}, {"task": "first_person"}).save(folder / "actor.safetensors")
+    _begin_and_save(folder / "run")
     return folder
 
 

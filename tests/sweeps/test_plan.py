@@ -18,7 +18,7 @@ from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
 from vd4rl_pomdp.runs.results import find_results
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-from vd4rl_pomdp.studies.navigation.exogenous import source_fingerprint
+from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
 from vd4rl_pomdp.sweeps import plan as module
 from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.grid import load_grid

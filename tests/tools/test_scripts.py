@@ -10,9 +10,6 @@ import pytest
 import torch
 
 from finetune.evaluation import EVALUATION_SEED, Agent
-from pretrain.train import pretrain
-from tests.helpers_data import write_fake_set
-from tests.helpers_stages import smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.corruptions import CorruptionConfig
@@ -21,7 +18,6 @@ from vd4rl_pomdp.envs.corrupted import CorruptedEnv
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.policies.actor import load_actor
-from vd4rl_pomdp.policies.export import episode_returns
 
 SCRIPTS = Path(__file__).parents[2] / "tools"
 
@@ -65,14 +61,6 @@ def test_who_hands_over_is_the_actor_of_the_data(tmp_path, monkeypatch):
         script.actor_of(tmp_path)
 
 
-def test_the_comparison_writes_over_no_run(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(SCRIPTS)
-    script = importlib.import_module("hand_over")
-    (tmp_path / "config.json").write_text('{"stage": "finetune"}')
-    with pytest.raises(UserError, match=r"lies inside .* which holds a run"):
-        script.main(script.Config((tmp_path,), out=tmp_path / "episodes.csv"))
-
-
 def test_actors_on_noisy_states_play_their_own_episodes_and_lose_return(tmp_path, monkeypatch, capsys):
     monkeypatch.syspath_prepend(SCRIPTS)
     script = importlib.import_module("noisy_states")
@@ -81,56 +69,14 @@ def test_actors_on_noisy_states_play_their_own_episodes_and_lose_return(tmp_path
     with (tmp_path / "table.csv").open() as file:
         rows = [(row["actor"], row["pose_noise"], float(row["return"])) for row in csv.DictReader(file)]
     for actor, mine in (("expert", rows[:4]), ("medium", rows[4:])):
-        exact = episode_returns(load_actor("cheetah_run", actor), TASKS["cheetah_run"], 2, EVALUATION_SEED)
+        exact = importlib.import_module("export_actor").episode_returns(
+            load_actor("cheetah_run", actor), TASKS["cheetah_run"], 2, EVALUATION_SEED
+        )
         assert mine[:2] == [(actor, "0", round(value, 4)) for value in exact]
         assert all(row[:2] == (actor, "34") and row[2] < 0.8 * exact[0] for row in mine[2:])
     assert all(value < 0.2 * rows[0][2] for *_, value in rows[2:4]), "the expert's gait asks for more than the medium's"
     alone, noisy = (line.split(": ")[1].split() for line in capsys.readouterr().out.splitlines()[:2])
     assert float(noisy[0]) > 2 * float(alone[0]), "falls, which only the noisy episodes have, vary the height"
-
-
-@pytest.mark.parametrize(
-    ("settings", "message"),
-    [
-        ({"pose_noises": (1,)}, "give as many of one as of the other"),
-        ({"pose_noises": (0, -1, 0, 0, 0)}, "--pose-noises is -1"),
-        ({"tasks": ()}, "name at least one"),
-        ({"episodes": 0}, "--episodes is 0"),
-        ({"tasks": ("humanoid_walk",)}, "choose a planar task"),
-        ({"tasks": ("walker",)}, "unknown task"),
-    ],
-)
-def test_the_measurement_is_refused_in_a_line(tmp_path, monkeypatch, settings, message):
-    monkeypatch.syspath_prepend(SCRIPTS)
-    script = importlib.import_module("noisy_states")
-    with pytest.raises(UserError, match=message):
-        script.main(script.Config(**settings, out=tmp_path / "table.csv"))
-
-
-def test_what_a_cell_saves_leaves_its_return_as_it_is(tmp_path, monkeypatch):
-    monkeypatch.syspath_prepend(SCRIPTS)
-    script = importlib.import_module("cell_cost")
-    data = write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25, 30])
-    encoder = pretrain(smoke_pretrain(data, tmp_path / "made", method="mik")).path / "encoder"
-    cell = {"updates": 4, "eval_every": 4, "eval_episodes": 2, "eval_length": 6, "eval_clean": False, "workers": 1}
-    monkeypatch.setattr(script, "CELL", cell | {"batch_size": 4, "hidden_dim": 8, "views": 1})
-    monkeypatch.setitem(script.CHANGES, "a second evaluation", {"eval_every": 2})
-    undrawn, frame = [], CorruptedEnv._frame
-    monkeypatch.setattr(
-        CorruptedEnv, "_frame", lambda *words: (undrawn.append(words[1].frame is None), frame(*words))[1]
-    )
-    returns, hidden = {}, {}
-    for change in script.CHANGES:
-        undrawn.clear()
-        script.main(script.Config((encoder,), data, (change,), tmp_path / "table.csv"))
-        with (tmp_path / "table.csv").open() as file:
-            (row,) = csv.DictReader(file)
-        assert float(row["seconds"]) > 0
-        returns[row["change"]], hidden[row["change"]] = row["return"], (sum(undrawn), len(undrawn))
-    assert len({told for change, told in returns.items() if change != "float32 updates"}) == 1
-    assert hidden["all frames drawn"] == (0, 14)
-    assert hidden["none"][0] > 0
-    assert hidden["a second evaluation"][1] == 28
 
 
 def test_another_python_makes_the_environment_anew(tmp_path):

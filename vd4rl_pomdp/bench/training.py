@@ -116,12 +116,11 @@ def _updates_per_s(
 
 def maze_training() -> dict[str, float]:
     """Steps/s of `navigation train --preset cpu`, and the share of a step that sampling and the optimiser take."""
+    from vd4rl_pomdp.studies.navigation.collect import PRESETS as SETS
     from vd4rl_pomdp.studies.navigation.collect import collect
     from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-    from vd4rl_pomdp.studies.navigation.data import MazeData
-    from vd4rl_pomdp.studies.navigation.observations import open_maze_set
+    from vd4rl_pomdp.studies.navigation.data import MazeData, open_maze_set
     from vd4rl_pomdp.studies.navigation.probed import make_trainer
-    from vd4rl_pomdp.studies.navigation.sets import PRESETS as SETS
 
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)

@@ -1,51 +1,144 @@
-"""The command line: one subcommand a stage. Bad input ends with one line and exit code 2, never with a traceback."""
+"""The command line: one function a command. Bad input ends in one line and exit code 2, never in a traceback."""
 
 from __future__ import annotations
 
+import importlib
 import io
 import multiprocessing
 import os
+import re
 import signal
 import sys
 from collections.abc import Sequence
+from dataclasses import dataclass
 
-if os.name != "posix":
-    print("error: vd4rl-pomdp runs on Linux and macOS; on Windows use its subsystem for Linux (WSL)", file=sys.stderr)
-    sys.exit(2)
-
-from vd4rl_pomdp.cli import data, hub, navigation, parts, policy, stages, studies, sweeps
-from vd4rl_pomdp.cli.dispatch import COMMANDS
-from vd4rl_pomdp.cli.ends import run_to_end
+from vd4rl_pomdp import __version__
+from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError, disk_error, in_one_line
+from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE
 
-COMMANDS |= {
-    "demo": stages.DEMO,
-    "list": parts.LIST,
-    "data": data.COMMANDS,
-    "hub": hub.COMMANDS,
-    "policy": policy.COMMANDS,
-    **stages.COMMANDS,
-    "navigation": navigation.COMMANDS,
-    "sweep": sweeps.COMMANDS,
-    **studies.COMMANDS,
+PROGRAM = "vd4rl-pomdp"
+COMMANDS = {
+    "demo": ("stages.demo", "every stage on a small set, in minutes"),
+    "list": ("stages.list_parts", "all parts that have a name: methods, corruptions, algorithms and the like"),
+    "data collect": ("data.collect", "render a set in V-D4RL's format from the shipped actors"),
+    "data download": ("data.download", "fetch a published V-D4RL set"),
+    "data card": ("data.card", "describe a set: returns, origin, film strip"),
+    "data table": ("data.table", "tabulate the returns and the cost of all sets"),
+    "data check": ("data.check", "validate a set and replay its actions"),
+    "data parity": ("data.parity", "compare rendered pixels with the data's"),
+    "hub push": ("hub.push", "write an encoder or a data set to the Hugging Face Hub"),
+    "hub pull": ("hub.pull", "fetch and check what was pushed"),
+    "pretrain": ("stages.pretrain", "train an encoder"),
+    "finetune": ("stages.finetune", "train a policy on a frozen encoder, by TD3+BC or another algorithm"),
+    "evaluate": ("stages.evaluate", "evaluate a fine-tuned run again"),
+    "navigation collect": ("studies.navigation_collect", "a maze's data, with true states"),
+    "navigation train": ("studies.navigation_train", "an objective on a maze, beside a state probe"),
+    "navigation policy": ("studies.navigation_policy", "train the first-person policy (PPO) that ships"),
+    "navigation report": ("studies.navigation_report", "the paper's tables and figures about runs"),
+    "sweep run": ("sweeps.run", "carry out a grid, or resume it"),
+    "sweep status": ("sweeps.show_status", "counts, rate, time left and failures of a sweep"),
+    "sweep retry": ("sweeps.retry", "run failures again"),
+    "sweep join": ("sweeps.join", "help with a sweep on this machine"),
+    "sweep list": ("sweeps.list_grids", "the grids that ship"),
+    "report": ("studies.report", "an HTML page, tables and figures about runs"),
+    "report compare": ("studies.compare", "two result sets side by side"),
+    "results add": ("studies.add", "append finished runs to a results folder"),
+    "theory": ("studies.theory", "the paper's claims on finite worlds, by enumeration"),
+    "bench": ("studies.bench", "speed and memory on this machine"),
 }
-_UNGUARDED = (
-    "error: processes that help import the file that was started, which calls main() then, too: put that call below "
-    'if __name__ == "__main__":'
-)
+"""Function, within this package, and summary of every command. A function takes the words behind its name, and what
+stands before them. Its module is imported when it is called: it may take seconds (torch), and the list of commands does
+not need it."""
+
+
+@dataclass(frozen=True)
+class End:
+    """What is left of a command."""
+
+    code: int = 0
+    line: str = ""
+    """What the user is told, empty if nothing is."""
+
+
+_NO_MEMORY = re.compile("out of memory|allocate memory|Storage size calculation overflowed|ALLOC_FAILED")
+"""What torch says, of a CPU and of a GPU's libraries."""
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Entry point of `vd4rl-pomdp`."""
     if getattr(multiprocessing.current_process(), "_inheriting", False):  # which a worker is while it imports its file
-        print(_UNGUARDED, file=sys.stderr)
+        print(
+            'error: worker processes import this file: call main() below `if __name__ == "__main__":`', file=sys.stderr
+        )
         sys.exit(2)
-    words = list(sys.argv[1:] if arguments is None else arguments)
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # \u2028 and the like for what a terminal cannot show
-    end = run_to_end(words, signal.SIG_IGN if JOB_VARIABLE in os.environ else signal.SIG_DFL)
+    second = signal.SIG_IGN if JOB_VARIABLE in os.environ else signal.SIG_DFL
+    end = run_to_end(sys.argv[1:] if arguments is None else arguments, second)
     if end.line:
         print(end.line, file=sys.stderr)
     if end.code:
         sys.exit(end.code)
+
+
+def run_to_end(words: Sequence[str], second: signal.Handlers = signal.SIG_DFL) -> End:
+    """Do what `vd4rl-pomdp WORDS` does; only a defect is raised.
+
+    Args:
+        words: the command line.
+        second: what a second signal does.
+    """
+    try:
+        for word in words:
+            word.encode()  # names and paths go into files and pages, which are UTF-8
+        with interrupt.handled(second):
+            name = next((n for n in (" ".join(words[:2]), *words[:1]) if n in COMMANDS), None)
+            if name is None:
+                _show_commands(list(words))
+            else:
+                module, _, function = COMMANDS[name][0].partition(".")
+                command = getattr(importlib.import_module(f"{__name__}.{module}"), function)
+                command(list(words[len(name.split()) :]), f"{PROGRAM} {name}")
+    except UserError as error:
+        return End(error.code, f"error: {in_one_line(error)}")
+    except UnicodeEncodeError as error:
+        return End(2, f"error: {error.object!a} is not UTF-8: use another name")
+    except FloatingPointError as error:
+        return End(1, f"error: training diverged, {error}; lower --learning-rate or use fp32")
+    except KeyboardInterrupt as error:
+        return End(130, _resume("interrupted", str(error)))
+    except interrupt.Terminated as error:
+        return End(143, _resume("terminated", error.reason))
+    except BrokenPipeError:  # what read the output is gone, as `head` goes
+        return End(141)
+    except (MemoryError, RuntimeError) as error:
+        if not isinstance(error, MemoryError) and not _NO_MEMORY.search(str(error)):
+            raise
+        line = f"error: out of memory ({in_one_line(error)[:200]}); lower --batch-size, or what else sets the size"
+        return End(OutOfMemoryError.code, line)
+    except OSError as error:
+        told = disk_error(error.filename, error)
+        return End(told.code, f"error: {told}")
+    return End()
+
+
+def _resume(how: str, kept: str) -> str:
+    """One line for a signal's end; what was `kept` is where a training loop stood."""
+    return f"{how}: {kept + '; ' if kept else ''}re-run the same command to resume"
+
+
+def _show_commands(words: list[str]) -> None:
+    """Print all commands, or those of a group; raise UserError for a word that is neither."""
+    if words[:1] == ["--version"]:
+        print(__version__)
+        return
+    group = [] if not words or words[0].startswith("-") else words[:1]
+    listed = {n: summary for n, (_, summary) in COMMANDS.items() if n.split()[: len(group)] == group}
+    if not listed or (group and len(words) > 1 and not words[1].startswith("-")):
+        choices = [n.split()[-1] for n in listed] or dict.fromkeys(n.split()[0] for n in COMMANDS)
+        raise UserError(f"unknown command '{' '.join([PROGRAM, *words[:2]])}': choose one of {', '.join(choices)}")
+    print(f"usage: {' '.join([PROGRAM, *group])} COMMAND [--flags]   (COMMAND --help says more)\n")
+    for name, summary in listed.items():
+        print(f"  {name:<{max(map(len, listed))}}  {summary}")

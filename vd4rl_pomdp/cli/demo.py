@@ -14,14 +14,14 @@ from pathlib import Path
 from vd4rl_pomdp.core.errors import refuse_no_folder, refuse_unknown
 from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.envs.mazes import get_maze
-from vd4rl_pomdp.report.measures import PROBES
+from vd4rl_pomdp.report.load import PROBES
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs import EPISODES_FILE, PROBE_FILE
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.outputs import refuse_kept
 from vd4rl_pomdp.runs.workers import count_workers
-from vd4rl_pomdp.studies.navigation.film import write_film
+from vd4rl_pomdp.studies.navigation.figures import write_film
 from vd4rl_pomdp.studies.navigation.measures import refitted_error
 from vd4rl_pomdp.studies.navigation.runs import find_navigation, load_runs
 from vd4rl_pomdp.sweeps.driver import visible_gpus

@@ -1,167 +1,174 @@
-"""Commands that measure or summarise: report, results, theory, bench."""
+"""Commands that measure or summarise: report, results, theory, bench, navigation."""
 
 from __future__ import annotations
 
-import json
+import json as json_library
 import sys
-from collections.abc import Mapping
-from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
 
 import tyro
 
-from vd4rl_pomdp.cli.dispatch import Arguments, Command
-from vd4rl_pomdp.cli.parsing import parse, show
-
-if TYPE_CHECKING:
-    from vd4rl_pomdp.report.load import Choice
+from vd4rl_pomdp.cli.parsing import command, parse, parse_stage, show, with_presets
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.runs import NAVIGATION_FILE
 
 
-@dataclass(frozen=True)
-class ReportCommand:
-    """Write an HTML page, tables and figures about fine-tuning runs; `report compare A B` puts two sets together."""
+@command
+def report(
+    runs: tyro.conf.Positional[list[Path]],
+    out: Path = Path("report"),
+    grid: str = "",
+    only: tuple[str, ...] = (),
+    change: tuple[str, ...] = (),
+) -> None:
+    """Write an HTML page, tables and figures about fine-tuning runs; `report compare A B` puts two sets together.
 
-    runs: tyro.conf.Positional[list[Path]]
-    """Run folders, results folders, or folders that contain some; what `theory --out` wrote adds its section."""
-    out: Path = Path("report")
-    """Folder of the report."""
-    grid: str = ""
-    """Report the cells of this grid alone: one that ships (`vd4rl-pomdp sweep list`), or a TOML or Python file."""
-    only: list[str] = field(default_factory=list)
-    """Of the grid, cells with these values alone: method=mik+a,acro seed=0."""
-    change: list[str] = field(default_factory=list)
-    """Settings that the grid was carried out with in place of its own: preset=cpu finetune.updates=20000."""
+    Args:
+        runs: Run folders, results folders, or folders that contain some; what `theory --out` wrote adds its section.
+        out: Folder of the report.
+        grid: Report the cells of this grid alone: one that ships (`vd4rl-pomdp sweep list`), or a TOML or Python file.
+        only: Of the grid, cells with these values alone: method=mik+a,acro seed=0.
+        change: Settings that the grid was carried out with in place of its own: preset=cpu finetune.updates=20000.
+    """
+    from vd4rl_pomdp.report import print_summary, write_report
+    from vd4rl_pomdp.report.load import ALL
+
+    choice = ALL
+    if grid:
+        from vd4rl_pomdp.sweeps.grid import load_grid, narrow
+        from vd4rl_pomdp.sweeps.members import GridMembers
+
+        choice = GridMembers(grid, narrow(load_grid(grid, list(change)).cells(), list(only)))
+    elif only or change:
+        raise UserError("--only and --change are about a grid's cells: name it with --grid")
+    written = write_report(_named(runs), out, choice)
+    print_summary(written)
+    for sentence in written.unlike:
+        print(f"warning: {sentence}", file=sys.stderr)
+    print(f"report: {written.page}")
 
 
-@dataclass(frozen=True)
-class CompareCommand:
-    """Compare two result sets, condition by condition: scores, their difference, n, and settings that differ."""
-
-    a: tyro.conf.Positional[Path]
-    """Run folder, results folder, or folder that contains some."""
-    b: tyro.conf.Positional[Path]
-    """What it is compared with, likewise."""
-    out: Path | None = None
-    """Also write an HTML page, CSV and LaTeX into this folder."""
+def _named(runs: list[Path]) -> list[Path]:
+    """Folders that a command line names, at least one."""
+    if not runs:
+        raise UserError("no runs are named: name at least one folder")
+    return runs
 
 
-def _compare(words: Arguments, program: str) -> None:
+@command
+def compare(a: tyro.conf.Positional[Path], b: tyro.conf.Positional[Path], out: Path | None = None) -> None:
+    """Compare two result sets, condition by condition: scores, their difference, n, and settings that differ.
+
+    Args:
+        a: Run folder, results folder, or folder that contains some.
+        b: What it is compared with, likewise.
+        out: Also write an HTML page, CSV and LaTeX into this folder.
+    """
     from vd4rl_pomdp.report.compare import check_out, compare_results, print_comparison, write_comparison
 
-    command = parse(CompareCommand, words, program)
-    if command.out is not None:
-        check_out(command.out)
-    comparison = compare_results(command.a, command.b)
-    page = None if command.out is None else write_comparison(comparison, command.out)
+    if out is not None:
+        check_out(out)
+    comparison = compare_results(a, b)
+    page = None if out is None else write_comparison(comparison, out)
     print_comparison(comparison)
     if page is not None:
         print(f"comparison: {page}")
 
 
-def _report(words: Arguments, program: str) -> None:
-    from vd4rl_pomdp.report import print_summary, write_report
-
-    command = parse(ReportCommand, words, program)
-    report = write_report(command.runs, command.out, _choice(command))
-    print_summary(report)
-    for sentence in report.unlike:
-        print(f"warning: {sentence}", file=sys.stderr)
-    print(f"report: {report.page}")
-
-
-def _choice(command: ReportCommand) -> Choice:
-    """What a report is about."""
-    from vd4rl_pomdp.core.errors import UserError
-    from vd4rl_pomdp.report.load import ALL
-
-    if not command.grid:
-        if command.only or command.change:
-            raise UserError("--only and --change are about a grid's cells: name it with --grid")
-        return ALL
-    from vd4rl_pomdp.sweeps.grid import load_grid, narrow
-    from vd4rl_pomdp.sweeps.members import GridMembers
-
-    return GridMembers(command.grid, narrow(load_grid(command.grid, command.change).cells(), command.only))
-
-
-@dataclass(frozen=True)
-class AddCommand:
+@command
+def add(runs: tyro.conf.Positional[list[Path]], out: Path) -> None:
     """Append finished runs to a results folder: their small files and raw evaluation rows, without weights and films.
 
     A run that is there already stays as it is, whatever its rows.
+
+    Args:
+        runs: Run folders, results folders, or folders that contain some.
+        out: The results folder, made if missing.
     """
-
-    runs: tyro.conf.Positional[list[Path]]
-    """Run folders, results folders, or folders that contain some."""
-    out: Path
-    """The results folder, made if missing."""
-
-
-def _add(words: Arguments, program: str) -> None:
     from vd4rl_pomdp.runs.results import add_results
 
-    command = parse(AddCommand, words, program)
-    added = add_results(command.runs, command.out)
-    print(f"{command.out}: {added.in_words}")
+    print(f"{out}: {add_results(_named(runs), out).in_words}")
 
 
-@dataclass(frozen=True)
-class TheoryCommand:
-    """Compute the paper's claims on finite worlds by enumeration, and list where its text differs."""
+@command
+def theory(json: bool = False, out: Path | None = None) -> None:
+    """Compute the paper's claims on finite worlds by enumeration, and list where its text differs.
 
-    json: bool = False
-    """Print one JSON object."""
-    out: Path | None = None
-    """Also write an HTML page with figures, and the JSON, into this folder."""
-
-
-def _theory(words: Arguments, program: str) -> None:
+    Args:
+        json: Print one JSON object.
+        out: Also write an HTML page with figures, and the JSON, into this folder.
+    """
     from vd4rl_pomdp.report.theory import FILE, print_theory, write_theory
     from vd4rl_pomdp.runs.outputs import refuse_foreign
     from vd4rl_pomdp.studies.theory import theory_study
 
-    command = parse(TheoryCommand, words, program)
-    if command.out is not None:
-        refuse_foreign(command.out, "study of the theory", FILE)
-        command.out.mkdir(parents=True, exist_ok=True)  # before anything is computed
+    if out is not None:
+        refuse_foreign(out, "study of the theory", FILE)
+        out.mkdir(parents=True, exist_ok=True)  # before anything is computed
     study = theory_study()
-    if command.json:
-        print(json.dumps(study))
+    if json:
+        print(json_library.dumps(study))
     else:
         print_theory(study)
-    if command.out is not None:
-        print(f"page: {write_theory(study, command.out)}", file=sys.stderr if command.json else sys.stdout)
+    if out is not None:
+        print(f"page: {write_theory(study, out)}", file=sys.stderr if json else sys.stdout)
 
 
-@dataclass(frozen=True)
-class BenchCommand:
-    """Measure speed and memory of every stage on this machine, as ratios within one run."""
+@command
+def bench(json: bool = False, quick: bool = False) -> None:
+    """Measure speed and memory of every stage on this machine, as ratios within one run.
 
-    json: bool = False
-    """Print one JSON object instead of a table."""
-    quick: bool = False
-    """A tenth of the frames and fewer repetitions: rougher numbers, and a peak memory that fixed costs dominate."""
-
-
-def _bench(words: Arguments, program: str) -> None:
+    Args:
+        json: Print one JSON object instead of a table.
+        quick: A tenth of the frames and fewer repetitions: rougher numbers; fixed costs dominate the peak memory.
+    """
     from vd4rl_pomdp.bench.suite import bench, print_table
 
-    command = parse(BenchCommand, words, program)
-    results = bench(command.quick)
-    if command.json:
+    results = bench(quick)
+    if json:
         show(results, as_json=True)
     else:
         print_table(results)
 
 
-COMMANDS: dict[str, Command | Mapping[str, Command]] = {
-    "report": Command(
-        "an HTML page, tables and figures about runs; report compare A B for two sets",
-        _report,
-        {"compare": Command("two result sets side by side", _compare)},
-    ),
-    "results": {"add": Command("append finished runs to a results folder", _add)},
-    "theory": Command("the paper's claims on finite worlds, by enumeration", _theory),
-    "bench": Command("speed and memory on this machine", _bench),
-}
+def navigation_collect(words: list[str], program: str) -> None:
+    """Collect a maze's data."""
+    from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig, collect
+
+    config = with_presets(MazeCollectConfig, PRESETS, words, program)
+    print(f"{len(collect(config))} shards in {config.out}")
+
+
+def navigation_train(words: list[str], program: str) -> None:
+    """Train an objective on a maze."""
+    from vd4rl_pomdp.studies.navigation.config import NavigationConfig
+    from vd4rl_pomdp.studies.navigation.train import train
+
+    run = train(parse_stage(NavigationConfig, words, program))
+    print(f"results: {run.path / NAVIGATION_FILE}")
+
+
+def navigation_policy(words: list[str], program: str) -> None:
+    """Train the policy that walks the first-person maze."""
+    from vd4rl_pomdp.studies.navigation.drivers import FirstPersonConfig, train_first_person
+
+    config = parse(FirstPersonConfig, words, program)
+    card = train_first_person(config).card
+    print(f"{config.out}: {card['goals_in_20_episodes']} goals in 20 episodes")
+
+
+@command
+def navigation_report(
+    runs: tyro.conf.Positional[list[Path]], out: Path = Path("navigation-report"), pictures: bool = True
+) -> None:
+    """Write the paper's navigation tables and figures about finished runs.
+
+    Args:
+        runs: Run folders, results folders, or folders that contain some.
+        out: Folder of the report.
+        pictures: Also draw sample observations, which needs OpenGL.
+    """
+    from vd4rl_pomdp.studies.navigation.collect import sample_observations
+    from vd4rl_pomdp.studies.navigation.report import write_report
+
+    print(f"report: {write_report(_named(runs), out, sample_observations if pictures else None)}")

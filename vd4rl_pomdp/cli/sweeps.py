@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from vd4rl_pomdp.cli.dispatch import Command
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
@@ -244,12 +243,3 @@ def list_grids(words: list[str], program: str) -> None:
     for name in names():
         grid = load_grid(name)
         print(f"{name:<18} {len(grid.cells()):>5} cells  {grid.title}")
-
-
-COMMANDS = {
-    "run": Command("carry out a grid, or go on with it", run),
-    "status": Command("counts, rate, time left and failures of a sweep", show_status),
-    "retry": Command("take up failures again", retry),
-    "join": Command("help with a sweep on this machine", join),
-    "list": Command("the grids that ship", list_grids),
-}

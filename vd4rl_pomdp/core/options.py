@@ -6,16 +6,11 @@ nested in the stage's config; on the command line and in records all settings st
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Mapping
-from dataclasses import MISSING, dataclass, fields
-from inspect import get_annotations
-from pathlib import Path
-from typing import Any, ClassVar, Literal, Self, get_args, get_origin, get_type_hints
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, fields
+from typing import Any, ClassVar, Self
 
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_outside, refuse_unknown
-from vd4rl_pomdp.core.reading import fits
-from vd4rl_pomdp.core.registry import REGISTRIES
-from vd4rl_pomdp.core.settings import LABELS, NO_SETTINGS
 
 Limits = Mapping[str, float | tuple[float, float]]
 """Lowest, or lowest and highest, value of numbers by name."""
@@ -28,154 +23,19 @@ class Options:
     limits: ClassVar[Limits] = {}
     """What the numbers among a class's own fields may be."""
 
-    def __post_init__(self) -> None:
-        _adapt(self)
-
     @classmethod
     def fill(cls, values: Mapping[str, Any]) -> Self:
         """Options with those of many values that they have a field for, and their own defaults."""
         return cls(**{field.name: values[field.name] for field in fields(cls) if field.name in values})
 
     def check(self) -> None:
-        """Raise UserError for a value that cannot work, here or in options within."""
-        _refuse_types(self)
+        """Raise UserError for a number out of range, here or in options within."""
         for kind in type(self).__mro__:
             refuse_outside(self, **vars(kind).get("limits", {}))
-        check_options(self)
-
-
-_KINDS = {bool: "True or False", int: "an integer", float: "a number", str: "a word", Path: "a path"}
-_TAKEN = NO_SETTINGS | {*LABELS, "format", "help"}
-"""Names by which runs are known, and which no option of a part can have: records and reports take them for these."""
-
-
-def _adapt(config: Any) -> None:
-    """Make an integer a float, and a word a path, where that is what is wanted: records know one form of each."""
-    hints = get_type_hints(type(config))
-    for field in fields(config):
-        value, hint = getattr(config, field.name), hints[field.name]
-        wanted = get_args(hint) or (hint,)
-        if type(value) is int and float in wanted and int not in wanted:
-            object.__setattr__(config, field.name, float(value))
-        if type(value) is str and Path in wanted and str not in wanted:
-            object.__setattr__(config, field.name, Path(value))
+        _check_options(self)
 
 
 NO_OPTIONS = Options()
-
-
-def _refuse_types(config: Any) -> None:
-    """Raise UserError for a value that is not of its annotated type."""
-    hints = get_type_hints(type(config))
-    for option in fields(config):
-        value, hint = getattr(config, option.name), hints[option.name]
-        if fits(value, hint):
-            continue
-        if get_origin(hint) is Literal:
-            raise UserError(f"{flag_of(option.name)} is {value!r}: choose one of {', '.join(map(str, get_args(hint)))}")
-        raise UserError(f"{flag_of(option.name)} is {value!r}: it must be {_KINDS.get(hint, hint)}")
-
-
-def flat(config: Any) -> dict[str, Any]:
-    """All settings of a config by name, its options' included.
-
-    Raises:
-        UserError: two of them have one name, so that one flag would set both, and a record hold one of them.
-    """
-    found: dict[str, Any] = {}
-    owners: dict[str, str] = {}
-    for owner, name, value in _settings(config):
-        if name in found:
-            raise UserError(
-                f"{owners[name]} and {owner} both have the setting {name!r}, and {flag_of(name)} cannot set two: "
-                "rename it in the part of your own"
-            )
-        found[name], owners[name] = value, owner
-    return found
-
-
-def words_of(settings: Mapping[str, Any]) -> list[str]:
-    """Settings as words of a command line."""
-    words: list[str] = []
-    for name, value in settings.items():
-        flag = flag_of(name)
-        if isinstance(value, bool):
-            words.append(flag if value else f"--no-{flag[2:]}")
-        else:
-            words += [f"{flag}={value}"] if str(value).startswith("-") else [flag, str(value)]
-    return words
-
-
-def _settings(config: Any) -> Iterator[tuple[str, str, Any]]:
-    """Class, name and value of every setting of a config, its options' included."""
-    for field in fields(config):
-        value = getattr(config, field.name)
-        nested = options_in(value)
-        if nested is None:
-            yield type(config).__name__, field.name, value
-        for options in nested or ():
-            yield from _settings(options)
-
-
-def options_in(value: Any) -> tuple[Options, ...] | None:
-    """The options that a field holds; None for a field that is a setting itself."""
-    if isinstance(value, Options):
-        return (value,)
-    return value if isinstance(value, tuple) and all(isinstance(part, Options) for part in value) else None
-
-
-def check_options(config: Any) -> None:
-    """Raise UserError for a value that cannot work among all options of a config."""
-    for field in fields(config):
-        for options in options_in(getattr(config, field.name)) or ():
-            options.check()
-
-
-def refuse_options(kind: Any, base: type[Options] = Options) -> None:
-    """Raise UserError for what cannot be the class of a part's options: flags or records would lose some of them.
-
-    Args:
-        kind: what a part names as this class.
-        base: a class that it is, or is derived from.
-    """
-    if not (isinstance(kind, type) and issubclass(kind, base)):
-        raise UserError(
-            f"its options are {kind!r}: name a class that is derived from {base.__module__}.{base.__name__}"
-        )
-    for fault in (*_undecorated(kind), *_unkept(kind), *_unlimited(kind)):
-        raise UserError(fault)
-    flat(kind.fill({}))
-
-
-def _undecorated(kind: type[Options]) -> Iterator[str]:
-    """Classes whose fields are no options, because nothing made them fields."""
-    for base in kind.__mro__:
-        own = [hint for hint in get_annotations(base).values() if "ClassVar" not in str(hint)]
-        if own and issubclass(base, Options) and "__dataclass_fields__" not in vars(base):
-            yield f"{base.__name__} has options, but is no dataclass: write @dataclass(frozen=True) above it"
-
-
-def _unkept(kind: type[Options]) -> Iterator[str]:
-    """Fields that cannot be options: by their names, or because no record gives back their values."""
-    for field in fields(kind):
-        where = f"the option {field.name!r} of {kind.__name__}"
-        if hasattr(Options, field.name):
-            yield f"{where} hides Options.{field.name}: rename it"
-        if field.name in _TAKEN:
-            yield f"{where} has a name by which runs are known (labels, seed, folders, logging): rename it"
-        default = field.default if field.default_factory is MISSING else field.default_factory()
-        if not isinstance(default, bool | int | float | str | Options | None):
-            yield f"{where} needs a default that is a number, a word, a truth value or None: records keep nothing else"
-
-
-def _unlimited(kind: type[Options]) -> Iterator[str]:
-    """Names in `limits` that are not those of numbers."""
-    defaults = {field.name: field.default for field in fields(kind)}
-    for base in kind.__mro__:
-        for name in vars(base).get("limits", {}):
-            default = defaults.get(name, "")
-            if isinstance(default, bool) or not isinstance(default, int | float | None):
-                yield f"limits of {base.__name__} name {name!r}, which is no number among its options: mend the name"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -189,9 +49,6 @@ class StageConfig:
     """Values by setting, by preset; an option is taken where the chosen parts have it."""
     choosers: ClassVar[tuple[str, ...]] = ()
     """Settings that choose parts, and with them which options there are."""
-
-    def __post_init__(self) -> None:
-        _adapt(self)
 
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
@@ -213,7 +70,10 @@ class StageConfig:
         parts = cls.parts(values)
         own = {field.name for field in fields(cls)} - parts.keys()
         config = cls(**({name: values[name] for name in own} | parts))
-        config.check_read(settings)
+        known = flat(config)
+        for name in settings.keys() - known.keys():
+            chosen = (f"the {c.replace('_', ' ')} {values[c]}" for c in cls.choosers if c in values)
+            raise UserError(f"{flag_of(name)} is not read by {', '.join(chosen)}: leave it out")
         return config
 
     @classmethod
@@ -222,17 +82,9 @@ class StageConfig:
         refuse_unknown("preset", preset, cls.presets)
         return flat(cls()) | dict(cls.presets[preset]) | {"preset": preset}
 
-    def check_read(self, names: Iterable[str]) -> None:
-        """Raise UserError for the first of some settings that this config has not: set, it would change nothing."""
-        known = flat(self)
-        for name in names:
-            if name not in known:
-                raise UserError(f"{flag_of(name)} is not read by {_reader(self.choosers, name, known)}: leave it out")
-
     def check(self) -> None:
         """Refuse settings that cannot work, before anything is read or written."""
-        _refuse_types(self)
-        check_options(self)
+        _check_options(self)
 
     def altered(self, **changes: Any) -> Self:
         """The same with other settings, perhaps other parts; what differs from the preset's defaults is kept.
@@ -259,6 +111,74 @@ class StageConfig:
         return {name: value for name, value in flat(self).items() if name in self.choosers and name in own}
 
 
+def options_in(value: Any) -> tuple[Options, ...] | None:
+    """The options that a field holds; None for a field that is a setting itself."""
+    if isinstance(value, Options):
+        return (value,)
+    return value if isinstance(value, tuple) and all(isinstance(part, Options) for part in value) else None
+
+
+def _check_options(config: Any) -> None:
+    for field in fields(config):
+        for options in options_in(getattr(config, field.name)) or ():
+            options.check()
+
+
+def flat(config: Any) -> dict[str, Any]:
+    """All settings of a config by name, its options' included.
+
+    Raises:
+        UserError: two of them have one name, so that one flag would set both, and a record hold one of them.
+    """
+    found: dict[str, Any] = {}
+    owners: dict[str, str] = {}
+    for owner, name, value in _settings(config):
+        if name in found:
+            raise UserError(
+                f"{owners[name]} and {owner} both have the setting {name!r}, and {flag_of(name)} cannot set two: "
+                "rename it in the part of your own"
+            )
+        found[name], owners[name] = value, owner
+    return found
+
+
+def _settings(config: Any) -> Iterator[tuple[str, str, Any]]:
+    """Class, name and value of every setting of a config, its options' included."""
+    for field in fields(config):
+        value = getattr(config, field.name)
+        nested = options_in(value)
+        if nested is None:
+            yield type(config).__name__, field.name, value
+        for options in nested or ():
+            yield from _settings(options)
+
+
+def words_of(settings: Mapping[str, Any]) -> list[str]:
+    """Settings as words of a command line."""
+    words: list[str] = []
+    for name, value in settings.items():
+        flag = flag_of(name)
+        if isinstance(value, bool):
+            words.append(flag if value else f"--no-{flag[2:]}")
+        else:
+            words += [f"{flag}={value}"] if str(value).startswith("-") else [flag, str(value)]
+    return words
+
+
+def refuse_options(kind: Any, base: type[Options] = Options) -> None:
+    """Raise UserError for what cannot be the class of a part's options.
+
+    Args:
+        kind: what a part names as this class.
+        base: a class that it is, or is derived from.
+    """
+    if not (isinstance(kind, type) and issubclass(kind, base)):
+        raise UserError(
+            f"its options are {kind!r}: name a dataclass that is derived from {base.__module__}.{base.__name__}"
+        )
+    flat(kind.fill({}))
+
+
 def option_names() -> set[str]:
     """Names of the options of all parts that there are."""
     kinds, found = [Options], set[str]()
@@ -267,14 +187,3 @@ def option_names() -> set[str]:
         kinds += kind.__subclasses__()
         found |= {field.name for field in fields(kind)}
     return found
-
-
-def _reader(choosers: Iterable[str], name: str, values: Mapping[str, Any]) -> str:
-    """What would read a setting if it were chosen otherwise: the one part, or all that was chosen."""
-    for setting in choosers:
-        parts: Mapping[str, Any] = REGISTRIES.get(setting, {})
-        readers = [key for key, part in parts.items() if name in flat(getattr(part, "options", part).fill({}))]
-        if readers and values[setting] not in (*readers, "method"):
-            return f"the {REGISTRIES[setting].kind} {values[setting]}"
-    chosen = (f"{setting.replace('_', ' ')} {values[setting]}" for setting in choosers if setting in values)
-    return f"what is chosen ({', '.join(chosen)})"

@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import ast
 import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from hashlib import sha256
-from importlib.metadata import EntryPoint, entry_points
-from itertools import accumulate
+from importlib.metadata import entry_points
 from pathlib import Path
 from typing import Any, Generic, TypeVar
 
@@ -17,10 +15,6 @@ from vd4rl_pomdp.core.errors import OR_ONES_OWN, UserError, refuse_unknown
 Part = TypeVar("Part")
 BY_CALL = "registered by a call"
 """Origin of the parts that a process has added itself."""
-_INSTALLED = "site-packages"
-"""Folder of an environment's packages, which are one another's neighbours by chance."""
-_OWN_PACKAGES = ("vd4rl_pomdp", "pretrain", "finetune", "baselines")
-"""This project's, whose commit a record tells."""
 REGISTRIES: dict[str, Registry[Any]] = {}
 """Every registry by its kind, in the order in which they were made."""
 
@@ -57,12 +51,9 @@ class Registry(Mapping[str, Part], Generic[Part]):
         self._parts = dict(own)
         self._origins: dict[str, str] = {}
         self._sources: dict[str, str] = {}
-        """Of parts that are not this package's, what `source` says: of the file as it was when it was loaded, since
-        that is what runs."""
+        """Of parts that are not this package's: the file and its hash when it was loaded, since that is what runs."""
         self._fits, self._expected, self._refuse = fits, expected, refuse
         self._loaded = False
-        for name, part in own.items():
-            self._refuse_faulty(name, part)
         REGISTRIES[self.setting] = self
 
     def register(self, name: str, part: Part, replace: bool = False) -> None:
@@ -73,11 +64,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
             part: the part.
             replace: whether it may take the place of one that such a call added, as where a notebook's cell runs again.
         """
-        if not isinstance(name, str):
-            raise UserError(f"a {self.kind} is called {name!r}: a name is a string")
-        self._add(name, part, BY_CALL, replace)
-        caller = sys._getframe(1)
-        self._sources[name] = _source_of(Path(caller.f_code.co_filename), caller.f_globals.get("__package__") or "")
+        self._add(name, part, BY_CALL, sys._getframe(1).f_code.co_filename, replace)
 
     @property
     def has_added(self) -> bool:
@@ -118,7 +105,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
         return self._origins.get(name, "")
 
     def source(self, name: str) -> str:
-        """The file that registered or offers a part, and a hash of its code; "" for this package's own."""
+        """The file that registered or offers a part, and its hash; "" for this package's own, or a notebook's cell."""
         return self._sources.get(name, "")
 
     def __getitem__(self, name: str) -> Part:
@@ -133,11 +120,9 @@ class Registry(Mapping[str, Part], Generic[Part]):
         self._load_offered()
         return len(self._parts)
 
-    def _add(self, name: str, part: Any, origin: str, replace: bool = False) -> None:
-        by_calls = origin == BY_CALL == self._origins.get(name)
-        if name in self._parts and not (replace and by_calls):
-            remedy = ", or replace=True to take its place" if by_calls else ""
-            raise UserError(f"a {self.kind} called {name!r} exists already: choose another name{remedy}")
+    def _add(self, name: str, part: Any, origin: str, file: str, replace: bool = False) -> None:
+        if name in self._parts and not (replace and origin == BY_CALL == self._origins.get(name)):
+            raise UserError(f"a {self.kind} called {name!r} exists already: choose another name")
         if not self._fits(part):
             raise UserError(f"{self.kind} {name!r} is a {type(part).__name__}, not {self._expected}")
         if name in ("", ".", "..") or any(sign in name for sign in "/,= "):
@@ -145,14 +130,14 @@ class Registry(Mapping[str, Part], Generic[Part]):
                 f"{self.kind} {name!r}: folders and `--only` are made of names, without slashes, commas, blanks or "
                 "equals signs: choose another"
             )
-        self._refuse_faulty(name, part)
-        self._parts[name], self._origins[name] = part, origin
-
-    def _refuse_faulty(self, name: str, part: Any) -> None:
         try:
             self._refuse(name, part)
         except UserError as error:
             raise UserError(f"{self.kind} {name!r}: {error}") from None
+        self._parts[name], self._origins[name] = part, origin
+        path = Path(file)
+        content = path.read_bytes() if path.is_file() else None
+        self._sources[name] = "" if content is None else f"{path.name} {sha256(content).hexdigest()[:12]}"
 
     def _load_offered(self) -> None:
         """Add what installed packages offer; what cannot be loaded is told of once, and left out."""
@@ -161,66 +146,14 @@ class Registry(Mapping[str, Part], Generic[Part]):
         self._loaded = True  # first: a package may look into this registry while it is loaded
         for entry in entry_points(group=self.group):
             try:
-                self._add(entry.name, entry.load(), _package_of(entry))
-                self._sources[entry.name] = _source_of_module(entry.module)
+                part = entry.load()
+                origin = f"{entry.dist.name} {entry.dist.version}" if entry.dist else "an installed package"
+                self._add(entry.name, part, origin, getattr(sys.modules[entry.module], "__file__", None) or "")
             except Exception as error:  # other people's code may raise anything
                 reason = str(error) if isinstance(error, UserError) else f"{type(error).__name__}: {error}"
                 self.broken[entry.name] = f"{entry.value}: {' '.join(reason.split())}"
                 warning = f"warning: {self.kind} {entry.name!r} cannot be loaded ({self.broken[entry.name]})"
                 print(warning, file=sys.stderr)
-
-
-def _package_of(entry: EntryPoint) -> str:
-    return f"{entry.dist.name} {entry.dist.version}" if entry.dist is not None else "an installed package"
-
-
-def _source_of_module(name: str) -> str:
-    """As `_source_of`, of a module that has been imported; "" for one that is no file."""
-    module = sys.modules[name]
-    return _source_of(Path(getattr(module, "__file__", None) or ""), module.__package__ or "")
-
-
-def _source_of(file: Path, package: str) -> str:
-    """A file's name, and a hash of it and of what it has imported from its own folder, or from anywhere in its package.
-
-    Empty for a notebook's cell.
-    """
-    if not file.is_file():
-        return ""
-    first = file.resolve()
-    folder = first.parents[package.count(".")]
-    found, waiting = {first: package}, [first]
-    while waiting:
-        path = waiting.pop()
-        for module in filter(None, map(sys.modules.get, _imported_by(path, found[path]))):
-            other = Path(getattr(module, "__file__", None) or "").resolve()
-            if other not in found and _is_beside(other, folder, module.__name__):
-                found[other] = module.__package__ or ""
-                waiting.append(other)
-    content = b"".join(path.read_bytes() for path in (first, *sorted(found.keys() - {first})))
-    return f"{file.name} {sha256(content).hexdigest()[:12]}"
-
-
-def _imported_by(file: Path, package: str) -> Iterator[str]:
-    """Full names of the modules, and perhaps of some things in them, that a file's statements import."""
-    for node in ast.walk(ast.parse(file.read_bytes())) if file.suffix == ".py" else ():
-        if isinstance(node, ast.Import):
-            names = [alias.name for alias in node.names]
-        elif isinstance(node, ast.ImportFrom):
-            parents = package.split(".")[: len(package.split(".")) + 1 - node.level] if node.level else []
-            base = [*parents, *filter(None, [node.module])]
-            names = [".".join([*base, alias.name]) for alias in node.names]
-        else:
-            continue
-        for name in names:
-            yield from accumulate(name.split("."), "{}.{}".format)
-
-
-def _is_beside(file: Path, folder: Path, name: str) -> bool:
-    """Whether a module's file lies in a folder or below it, and neither an environment nor this project brings it."""
-    if not (file.is_file() and file.is_relative_to(folder)) or name.partition(".")[0] in _OWN_PACKAGES:
-        return False
-    return _INSTALLED not in (folder.name, *file.relative_to(folder).parts)
 
 
 def origins(settings: Mapping[str, Any]) -> dict[str, str]:
@@ -248,21 +181,10 @@ def code_of(settings: Mapping[str, Any]) -> dict[str, dict[str, str]]:
     return {"plugins": origins(settings), "sources": sources(settings)}
 
 
-def changed_since(told: Mapping[str, str]) -> list[str]:
-    """The parts, of some that `sources` told of in another process, that this one has from another file."""
-    named = [(part, then, *part.split(" ", 1)) for part, then in told.items()]
-    known = ((part, then, REGISTRIES[kind].source(name)) for part, then, kind, name in named if kind in REGISTRIES)
-    return [part for part, then, now in known if now not in ("", then)]
-
-
 def of_other_code(record: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
     """The parts that settings name and whose file or package is another by now than the one a run's record tells of."""
-    changed = [
-        part
-        for name, there in code_of(settings).items()
-        for part, now in there.items()
-        if record.get(name, {}).get(part, now) != now
-    ]
+    here = code_of(settings)
+    changed = [part for kind in here for part, now in here[kind].items() if record.get(kind, {}).get(part, now) != now]
     return list(dict.fromkeys(changed))
 
 
@@ -277,6 +199,16 @@ def warn_of_other_code(place: object, record: Mapping[str, Any], settings: Mappi
     """
     for part in of_other_code(record, settings):
         print(f"warning: {place}: the code of {part} has changed since {what}", file=sys.stderr)
+
+
+def changed_since(told: Mapping[str, str]) -> list[str]:
+    """The parts, of some that `sources` told of in another process, that this one has from another file."""
+    parts = [(part, then, *part.split(" ", 1)) for part, then in told.items()]
+    return [
+        part
+        for part, then, kind, name in parts
+        if kind in REGISTRIES and REGISTRIES[kind].source(name) not in ("", then)
+    ]
 
 
 def _named(settings: Mapping[str, Any]) -> Iterator[tuple[str, Registry[Any], str]]:

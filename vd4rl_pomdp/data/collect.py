@@ -34,7 +34,6 @@ from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.files import jsonable
-from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.progress import ProgressLine
@@ -135,8 +134,6 @@ def check_config(config: CollectConfig) -> None:
     task = TASKS.named(config.task)
     refuse_outside(config, episodes=(1, MOST_EPISODES), episodes_per_shard=1, seed=(0, MAX_SEED), workers=0)
     refuse_outside(config, action_noise=(0, MAX_NOISE), frame_size=FRAME_SIZES)
-    shard = min(config.episodes, config.episodes_per_shard) * (task.decisions + 1)
-    require_memory(shard * 3 * config.frame_size**2, CPU, config, "episodes", "episodes_per_shard", "frame_size")
     refuse_unknown("quality to collect", config.quality, SET_QUALITIES)
     base = _base(config)
     layout = layout_of(task)  # also refuses an environment that cannot be built

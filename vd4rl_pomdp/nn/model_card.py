@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 from collections.abc import Iterator
 from dataclasses import asdict
+from typing import Any
 
 from vd4rl_pomdp.core.text import code, code_block, one_line
 from vd4rl_pomdp.nn.encoder import EncoderRecord
@@ -24,9 +25,12 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
         license: the licence that its owner gives it, as the Hub spells it; empty: the card names none.
     """
     card = record.pretrain
+    tags = dict.fromkeys([*TAGS, card.method, card.task, card.corruption["corruption"]])
+    values: dict[str, Any] = {"license": license} if license else {}
+    values |= {"library_name": "vd4rl-pomdp", "pipeline_tag": TAGS[0]}
     return "\n".join(
         [
-            *_front_matter([*TAGS, card.method, card.task, card.corruption["corruption"]], license),
+            *front_matter(values | {"tags": [one_line(tag) for tag in tags]}),
             "",
             f"# {code(card.method)} on {code(card.task)}",
             "",
@@ -52,11 +56,8 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
     )
 
 
-def _front_matter(tags: list[str], license: str) -> list[str]:
+def front_matter(values: dict[str, Any]) -> list[str]:
     """YAML, its texts as JSON has them, which is YAML, too."""
-    told = [one_line(tag) for tag in dict.fromkeys(tags)]
-    values: dict[str, str | list[str]] = {"license": license} if license else {}
-    values |= {"library_name": "vd4rl-pomdp", "pipeline_tag": TAGS[0], "tags": told}
     return ["---", *(f"{name}: {json.dumps(value)}" for name, value in values.items()), "---"]
 
 

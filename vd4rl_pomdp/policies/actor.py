@@ -30,7 +30,7 @@ OBSERVATION_CLIP = 10.0
 """Standardised observations are cut off here."""
 LAYER_NORM_EPSILON = 1e-6
 ASSETS = Path(__file__).parent / "assets"
-_REMEDY = "make one with `vd4rl-pomdp policy train`"
+_REMEDY = "take another copy"
 
 
 @dataclass(frozen=True)
@@ -238,6 +238,6 @@ def _shipped(task: str, quality: str) -> Path:
         have = ", ".join(sorted(p.stem for p in ASSETS.glob("*.safetensors"))) or "none"
         raise UserError(
             f"no {quality} actor ships for {task} (shipped: {have}); "
-            f"train one with `vd4rl-pomdp policy train --task {task}`"
+            f"train one with the repository's `tools/train_actor.py {task}`"
         )
     return path

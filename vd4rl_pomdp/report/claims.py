@@ -17,14 +17,12 @@ from vd4rl_pomdp.report.gates import (
     Sides,
     as_it_is,
     difference,
-    place_of,
     returns_of,
     seeds_by_variant,
     seen_under,
     sides,
 )
-from vd4rl_pomdp.report.load import LoadedRun
-from vd4rl_pomdp.report.tables import REFERENCES, grouped, label
+from vd4rl_pomdp.report.load import REFERENCES, Run, groups, label
 from vd4rl_pomdp.runs.files import Row
 
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "not told apart", "too few seeds"
@@ -82,7 +80,7 @@ CLAIMS = (
 )
 
 
-def judge_claims(runs: list[LoadedRun], unranked: Collection[tuple[str, ...]] = ()) -> list[Row]:
+def judge_claims(runs: list[Run], unranked: Collection[tuple[str, ...]] = ()) -> list[Row]:
     """One row for every claim and setting of which both sides have finished runs, with its `verdict`.
 
     `difference` is the left side's mean return less the right one's, `low` and `high` its 95% interval, by which it is
@@ -94,7 +92,7 @@ def judge_claims(runs: list[LoadedRun], unranked: Collection[tuple[str, ...]] = 
         unranked: settings that are undecided: there nothing is judged.
     """
     finished = [run for run in runs if run.evaluated and not run.end_to_end]
-    settings = sorted({place_of(run) for run in finished})
+    settings = sorted({run.of(GATED) for run in finished})
     rows = (_row(claim, place, finished, unranked) for claim in CLAIMS for place in settings)
     return [row for row in rows if row is not None]
 
@@ -103,18 +101,18 @@ def tally(rows: list[Row]) -> str:
     """What becomes of a claim over its settings: "holds in 1 of 2 settings; too few seeds in 1"."""
     if rows[0]["kind"] == DISTANCE:
         return ""
-    counts = {verdict: len(members) for (verdict,), members in grouped(rows, ("verdict",))}
+    counts = {verdict: len(members) for verdict, members in groups(rows, lambda row: str(row["verdict"])).items()}
     held = f"{HOLDS} in {counts.pop(HOLDS, 0)} of {len(rows)} setting{'s' * (len(rows) != 1)}"
     return "; ".join([held, *(f"{verdict} in {count}" for verdict, count in counts.items())])
 
 
 def _row(
-    claim: ReturnClaim, place: tuple[str, ...], runs: list[LoadedRun], unranked: Collection[tuple[str, ...]]
+    claim: ReturnClaim, place: tuple[str, ...], runs: list[Run], unranked: Collection[tuple[str, ...]]
 ) -> Row | None:
     task, quality, corruption, algorithm = place
     if claim.hidden == (corruption == "none"):
         return None
-    alike = [run for run in runs if _at(run, task, quality, algorithm)]
+    alike = [run for run in runs if run.of(("task", "quality", "algorithm")) == (task, quality, algorithm)]
     left = _runs_of(claim.left, claim.right, corruption, alike)
     right = _runs_of(claim.right, claim.left, corruption, alike)
     compared = sides(left, right) if claim.right.method else _decisive(left, right)
@@ -128,7 +126,7 @@ def _row(
     return row | {"verdict": _verdict(row, compared, place in unranked)}
 
 
-def _decisive(left: list[LoadedRun], others: list[LoadedRun]) -> Sides:
+def _decisive(left: list[Run], others: list[Run]) -> Sides:
     """The comparison that decides a claim about every other method.
 
     Of those with other methods and variants it is the one that refutes it with the highest return, or else that leaves
@@ -149,19 +147,15 @@ def _beyond(low: float | None, high: float | None) -> str:
     return HOLDS if low > 0 else FAILS if high < 0 else OPEN
 
 
-def _at(run: LoadedRun, *place: str) -> bool:
-    return tuple(run.labels[name] for name in ("task", "quality", "algorithm")) == place
-
-
-def _runs_of(side: Contender, other: Contender, corruption: str, runs: Iterable[LoadedRun]) -> list[LoadedRun]:
+def _runs_of(side: Contender, other: Contender, corruption: str, runs: Iterable[Run]) -> list[Run]:
     """Runs of one side: of a method as it is, or of all other methods."""
     seen = seen_under("none" if side.clean else corruption, runs)
     if side.method:
         return as_it_is(side.method, seen, side.history)
-    return [run for run in seen if run.labels["method"] not in (other.method, *REFERENCES)]
+    return [run for run in seen if run.method not in (other.method, *REFERENCES)]
 
 
-def _side(name: str, runs: list[LoadedRun]) -> Row:
+def _side(name: str, runs: list[Run]) -> Row:
     """Columns about one side."""
     shown = label(runs[0].named)
     return {name: shown, f"{name}_return": float(returns_of(runs).mean()), f"{name}_seeds": len(runs)}

@@ -2,37 +2,31 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+import pandas as pd
 from rich.console import Console
-from rich.table import Table as TerminalTable
+from rich.table import Table
 from rich.text import Text
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.text import write_text
 from vd4rl_pomdp.report import stats
-from vd4rl_pomdp.report.facts import commits, machines
-from vd4rl_pomdp.report.figures import seeds_note
-from vd4rl_pomdp.report.layout import Line, ShownTable, interval, with_interval, write_latex
-from vd4rl_pomdp.report.load import CONDITION, LoadedRun, load_runs
-from vd4rl_pomdp.report.present import by_setting
-from vd4rl_pomdp.report.tables import SCORE, SCORES_NOTE, evaluations, final_episodes, grouped, label, mean_and_ends
-from vd4rl_pomdp.report.templates import render
-from vd4rl_pomdp.runs.files import Row, write_csv
+from vd4rl_pomdp.report.figures import seeds_note, write_table
+from vd4rl_pomdp.report.load import CONDITION, Run, groups, label, load_runs, setting
+from vd4rl_pomdp.report.page import made_with
+from vd4rl_pomdp.report.render import Columns, block, render, texts, write_latex
+from vd4rl_pomdp.report.stats import interval, with_interval
+from vd4rl_pomdp.report.tables import SCORE, mean_and_ends
+from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 
 FILE = "comparison"
 """Its files' name, which tells a comparison's folder."""
-Conditions = dict[tuple, list[LoadedRun]]
+Conditions = dict[tuple, list[Run]]
 """Finished runs by the values of CONDITION."""
-_KEY = CONDITION[:-1]
-"""What two conditions share, however their variants are called."""
-_COLUMNS = ("method", "settings, A → B", "A", "B", "B – A", "95% interval", "seeds")
-_WORDS = 2
-"""Columns that hold words."""
 
 
 class Side(NamedTuple):
@@ -43,8 +37,8 @@ class Side(NamedTuple):
     """Runs with scores."""
     others: int
     """Unfinished and diverged runs, of which no score is compared."""
-    commits: str
-    machines: str
+    made: str
+    """Commits and machines."""
 
 
 class SideBySide(NamedTuple):
@@ -65,139 +59,106 @@ def compare_results(one: Path, other: Path) -> SideBySide:
     Raises:
         UserError: a path holds no evaluated run, or a file is damaged.
     """
-    runs = [_loaded(path) for path in (one, other)]
-    first, second = map(_conditions, runs)
+    (mine, first), (theirs, second) = _loaded(one), _loaded(other)
     partners = _partners(first, second)
-    pairs: list[tuple[tuple | None, tuple | None]] = [(mine, partners.get(mine)) for mine in first]
-    pairs += [(None, theirs) for theirs in second if theirs not in partners.values()]
-    rows = [_row(first.get(mine or ()), second.get(theirs or ()), mine or theirs or ()) for mine, theirs in pairs]
-    sides = _side(one, runs[0]), _side(other, runs[1])
-    return SideBySide(sides, sorted(rows, key=lambda row: [str(row[name]) for name in CONDITION]))
+    rows = [_row(key, runs, second.get(partners.get(key, ()), [])) for key, runs in first.items()]
+    rows += [_row(key, [], runs) for key, runs in second.items() if key not in partners.values()]
+    return SideBySide((mine, theirs), sorted(rows, key=lambda row: [str(row[name]) for name in CONDITION]))
 
 
-def _loaded(path: Path) -> list[LoadedRun]:
+def _loaded(path: Path) -> tuple[Side, Conditions]:
     runs = [run for run in load_runs([path]) if run.stage == "finetune"]
-    if not any(run.evaluated for run in runs):
+    finished = [run for run in runs if run.evaluated]
+    if not finished:
         raise UserError(f"{path}: holds no finished and evaluated run to compare")
-    return runs
-
-
-def _conditions(runs: list[LoadedRun]) -> Conditions:
-    finished = [run.named | {"run": run} for run in runs if run.evaluated]
-    return {key: [row["run"] for row in members] for key, members in grouped(finished, CONDITION)}
+    side = Side(path, len(finished), len(runs) - len(finished), made_with(finished))
+    return side, groups(finished, lambda run: run.of(CONDITION))
 
 
 def _partners(first: Conditions, second: Conditions) -> dict[tuple, tuple]:
     """By condition of the first set, that of the second which it is compared with, if there is one."""
-    settings = {_what_was_done(runs): theirs for theirs, runs in second.items()}
-    equal = {mine: _what_was_done(runs) for mine, runs in first.items()}
-    found = {mine: settings[done] for mine, done in equal.items() if done in settings}
+    settings = {_what_was_done(runs): key for key, runs in second.items()}
+    equal = {key: settings.get(_what_was_done(runs)) for key, runs in first.items()}
+    found = {key: partner for key, partner in equal.items() if partner is not None}
     free = second.keys() - set(found.values())
-    named = {mine: _of_like_name(mine, first, second) for mine in first if mine not in found}
-    return found | {mine: theirs for mine, theirs in named.items() if theirs in free}
+    for key in first.keys() - found.keys():
+        # Of a method with a lone variant on either side, whatever its settings.
+        alike, theirs = ([one for one in part if one[:-1] == key[:-1]] for part in (first, second))
+        partner = key if key in second else theirs[0] if len(alike) == len(theirs) == 1 else None
+        if partner in free:
+            found[key] = partner
+    return found
 
 
-def _of_like_name(mine: tuple, first: Conditions, second: Conditions) -> tuple | None:
-    """The condition of the second set that is called as one of the first; of a lone variant the other's; or nothing."""
-    if mine in second:
-        return mine
-    alike, theirs = ([key for key in part if key[: len(_KEY)] == mine[: len(_KEY)]] for part in (first, second))
-    return theirs[0] if len(alike) == len(theirs) == 1 else None
-
-
-def _what_was_done(runs: list[LoadedRun]) -> tuple:
+def _what_was_done(runs: list[Run]) -> tuple:
     """What a condition's runs computed on what, as their files have it: not by names that depend on other runs."""
     labels = (value for name, value in runs[0].result.labels.items() if name != "seed")
-    settings = {frozenset(run.settings.items()) for run in runs}
-    return *labels, frozenset(settings)
+    return *labels, frozenset(frozenset(run.settings.items()) for run in runs)
 
 
-def _row(one: list[LoadedRun] | None, other: list[LoadedRun] | None, key: tuple) -> Row:
+def _row(key: tuple, one: list[Run], other: list[Run]) -> Row:
     """A condition's row; what a set does not have is None."""
     row: Row = dict(zip(CONDITION, key, strict=True))
-    for side, runs in zip("ab", (one, other), strict=True):
-        row |= _score(side, None if runs is None else final_episodes(evaluations(runs)))
-    found = _difference(one, other) if one and other else (None, None, None)
-    row |= dict(zip(("difference", "low", "high"), found, strict=True))
-    return row | {"settings": _differing(one, other) if one and other else ""}
+    scores = [stats.by_episode([[episode["score"] for episode in run.last] for run in runs]) for runs in (one, other)]
+    for side, mine in zip("ab", scores, strict=True):
+        nothing = dict.fromkeys((f"score_{side}", f"low_{side}", f"high_{side}"))
+        row |= (mean_and_ends(mine, suffix=f"_{side}") if len(mine) else nothing) | {f"seeds_{side}": len(mine)}
+    row |= {"difference": None, "low": None, "high": None, "settings": ""}
+    if one and other:
+        a, b = scores
+        same = {run.result.id for run in one} == {run.result.id for run in other} and np.array_equal(a, b)
+        row["low"], row["high"] = (None if same else stats.difference_interval(b, a)) or (None, None)
+        row |= {"difference": float(b.mean() - a.mean()), "settings": _differing(one, other)}
+    return row
 
 
-def _difference(one: list[LoadedRun], other: list[LoadedRun]) -> tuple[float, float | None, float | None]:
-    """The second's mean score over the first's, with its interval; none where both are the same runs."""
-    first, second = (final_episodes(evaluations(runs)) for runs in (one, other))
-    same = {run.result.id for run in one} == {run.result.id for run in other} and np.array_equal(first, second)
-    ends = None if same else stats.difference_interval(second, first)
-    return float(second.mean() - first.mean()), *(ends or (None, None))
-
-
-def _score(side: str, scores: np.ndarray | None) -> Row:
-    values = (None, None, None, 0) if scores is None else (*mean_and_ends(scores), len(scores))
-    return dict(zip((f"{name}_{side}" for name in ("score", "low", "high", "seeds")), values, strict=True))
-
-
-def _differing(one: list[LoadedRun], other: list[LoadedRun]) -> str:
+def _differing(one: list[Run], other: list[Run]) -> str:
     """Settings whose values are not the same in both sets: "steps 20 → 60, views 4 → 1"."""
-    names = dict.fromkeys(name for run in (*one, *other) for name in run.settings)
     told = []
-    for name in names:
+    for name in dict.fromkeys(name for run in (*one, *other) for name in run.settings):
         mine, theirs = (sorted({run.settings.get(name, "unset") for run in runs}) for runs in (one, other))
         if mine != theirs:
             told.append(f"{name} {' or '.join(mine)} → {' or '.join(theirs)}")
     return ", ".join(told)
 
 
-def _side(path: Path, runs: list[LoadedRun]) -> Side:
-    finished = [run for run in runs if run.evaluated]
-    return Side(path, len(finished), len(runs) - len(finished), commits(finished), machines(finished))
+def _told(row: Row) -> str:
+    if not row["seeds_a"] or not row["seeds_b"]:
+        return f"only in {'A' if row['seeds_a'] else 'B'}"
+    return row["settings"] or "the same"
 
 
-def tables(comparison: SideBySide) -> list[ShownTable]:
-    """The comparison as the page shows it, one table a setting."""
-    return [
-        ShownTable(name, _COLUMNS, [Line(_cells(row)) for row in members], _WORDS, _note(members))
-        for name, members in by_setting(comparison.rows)
-    ]
-
-
-def _note(rows: list[Row]) -> str:
-    return seeds_note([{"seeds": row[name]} for row in rows for name in ("seeds_a", "seeds_b")])
-
-
-def _cells(row: Row) -> tuple[str, ...]:
-    scores = (with_interval(row[f"score_{s}"], row[f"low_{s}"], row[f"high_{s}"]) for s in "ab")
-    difference = "–" if row["difference"] is None else f"{row['difference']:+.1f}"
-    if row["difference"] is None:
-        told = f"only in {'B' if row['score_a'] is None else 'A'}"
-    else:
-        told = row["settings"] or "the same"
-    seeds = f"{row['seeds_a']} | {row['seeds_b']}"
-    return label(row), told, *scores, difference, interval(row["low"], row["high"]), seeds
+_COLUMNS: Columns = {
+    "setting": setting,
+    "method": label,
+    "settings, A → B": _told,
+    "A": lambda row: with_interval(row["score_a"], row["low_a"], row["high_a"]),
+    "B": lambda row: with_interval(row["score_b"], row["low_b"], row["high_b"]),
+    "B – A": lambda row: "–" if pd.isna(row["difference"]) else f"{row['difference']:+.1f}",
+    "95% interval": lambda row: interval(row["low"], row["high"]),
+    "seeds": lambda row: f"{row['seeds_a']} | {row['seeds_b']}",
+}
 
 
 def print_comparison(comparison: SideBySide, console: Console | None = None) -> None:
-    """The comparison on the terminal, one table a setting."""
+    """The comparison on the terminal, one table a setting, narrow enough for 80 columns.
+
+    Settings stand under the method's label, intervals under their numbers.
+    """
     console = console or Console()
     for name, side in zip("AB", comparison.sides, strict=True):
         others = f", {side.others} unfinished or diverged" if side.others else ""
         console.print(f"{name}: {side.path}, {side.finished} finished runs{others}", markup=False, highlight=False)
-    for table in tables(comparison):
-        console.print(_terminal(table))
-
-
-def _terminal(table: ShownTable) -> TerminalTable:
-    """Narrow enough for 80 columns: settings stand under the method's label, intervals under their numbers."""
-    shown = TerminalTable(title=Text(table.title), title_justify="left")
-    for place, name in enumerate(_stacked(table.columns)):
-        shown.add_column(name, overflow="fold", justify="right" if place else "left", no_wrap=place > 0)
-    for line in table.lines:
-        shown.add_row(*map(Text, _stacked(line.cells)))
-    return shown
-
-
-def _stacked(cells: Sequence[str]) -> tuple[str, ...]:
-    name, told, *scores, difference, between, seeds = cells
-    apart = f"{difference}\n{between}".removesuffix(f"\n{interval(None, None)}")
-    return f"{name}\n  {told}", *(score.replace(" [", "\n[") for score in scores), apart, seeds
+    for place, rows in groups(comparison.rows, setting).items():
+        table = Table(title=Text(place), title_justify="left")
+        for number, name in enumerate(("method\n  settings, A → B", "A", "B", "B – A\n95% interval", "seeds")):
+            table.add_column(name, overflow="fold", justify="right" if number else "left", no_wrap=number > 0)
+        for row in rows:
+            name, told, *scores, difference, between, seeds = [text(row) for text in list(_COLUMNS.values())[1:]]
+            apart = f"{difference}\n{between}".removesuffix("\n–")
+            stacked = [f"{name}\n  {told}", *(score.replace(" [", "\n[") for score in scores), apart, seeds]
+            table.add_row(*map(Text, stacked))
+        console.print(table)
 
 
 def check_out(out: Path) -> None:
@@ -209,9 +170,19 @@ def write_comparison(comparison: SideBySide, out: Path) -> Path:
     """Write the comparison as page, CSV and LaTeX into a folder that `check_out` accepts; returns the page."""
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
-    shown = tables(comparison)
-    write_csv(out / f"{FILE}.csv", list(comparison.rows[0]), comparison.rows)
-    write_latex(out / f"{FILE}.tex", shown, SCORES_NOTE)
-    page = render("compare.html", score=SCORE, sides=comparison.sides, tables=shown, file=FILE)
+    rows = pd.DataFrame(comparison.rows)
+    shown = texts(rows, _COLUMNS)
+    blocks = [
+        block(
+            str(place),
+            part.drop(columns="setting"),
+            2,
+            seeds_note(rows.loc[part.index, ["seeds_a", "seeds_b"]].stack()),
+        )
+        for place, part in shown.groupby("setting", sort=False)
+    ]
+    write_table(out / f"{FILE}.csv", rows)
+    write_latex(out / f"{FILE}.tex", shown, 3, f"{SCORE}. Mean over seeds, 95% t intervals over seeds and episodes.")
+    page = render("compare.html", score=SCORE, sides=comparison.sides, tables=blocks, file=FILE)
     write_text(out / "index.html", page)
     return out / "index.html"

@@ -4,15 +4,22 @@ from __future__ import annotations
 
 import base64
 import io
-from collections.abc import Iterable, Iterator
+import zlib
+from collections.abc import Iterable
+from pathlib import Path
 from typing import NamedTuple
+from zipfile import BadZipFile
 
 import numpy as np
 from PIL import Image
 
-from vd4rl_pomdp.report.facts import title
-from vd4rl_pomdp.report.load import LoadedRun
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.reading import read_bytes
+from vd4rl_pomdp.report.load import CONDITION, Run, title
 from vd4rl_pomdp.runs import FILM_FILE
+
+FILM = {"clean": 4, "corrupted": 4, "return": 1}
+"""Arrays of a film and their axes."""
 
 STRIP_FRAMES = 8
 """Frames in a film strip, at most."""
@@ -35,17 +42,33 @@ class Shown(NamedTuple):
     """Return of the episode."""
 
 
-def shown_films(runs: Iterable[LoadedRun]) -> tuple[list[Shown], int]:
+def read_film(path: Path) -> Film:
+    """Pictures of an evaluation episode; raises UserError for a damaged file."""
+    try:
+        with np.load(io.BytesIO(read_bytes(path))) as file:
+            film = dict(file)
+        if [film[name].ndim for name in FILM] != list(FILM.values()):
+            raise ValueError("its arrays have other shapes")
+        return film
+    except UserError:
+        raise
+    except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
+        raise UserError(f"{path}: cannot be read ({error}); remove it, and the report goes without") from error
+
+
+def shown_films(runs: Iterable[Run]) -> tuple[list[Shown], int]:
     """The film of the first seed of every method and setting, each read once, and how many found no room."""
-    chosen: dict[tuple[str, ...], LoadedRun] = {}
+    chosen: dict[tuple, Run] = {}
     for run in runs:
         if run.rows and run.result.folder and (run.path / FILM_FILE).exists():
-            chosen.setdefault(run.identity[:-1], run)
+            chosen.setdefault(run.of(CONDITION), run)
     shown, size = [], 0
     for run in chosen.values():
-        film = run.film()
+        film = read_film(run.path / FILM_FILE)
         name = f"{title(run)}, seed {run.labels['seed']}"
-        made = Shown(name, _base64(strip(film)), _base64(movie(film)), _share(film), film["return"][-1])
+        images = [base64.b64encode(picture).decode() for picture in (strip(film), movie(film))]
+        share = min(1.0, len(film["clean"]) / STRIP_FRAMES)
+        made = Shown(name, *images, share, film["return"][-1])
         size += len(made.strip) + len(made.movie)
         if size > MOST_BYTES:
             break
@@ -53,22 +76,17 @@ def shown_films(runs: Iterable[LoadedRun]) -> tuple[list[Shown], int]:
     return shown, len(chosen) - len(shown)
 
 
-def _share(film: Film) -> float:
-    return min(1.0, len(film["clean"]) / STRIP_FRAMES)
-
-
 def strip(film: Film) -> bytes:
     """PNG film strip: clean frames above, the frames of the corrupted stacks (oldest to newest) below."""
     chosen = np.unique(np.linspace(0, len(film["clean"]) - 1, STRIP_FRAMES).astype(int))
     stacks = film["corrupted"][chosen].reshape(len(chosen), -1, 3, *film["corrupted"].shape[-2:])
-    rows = [film["clean"][chosen], *stacks.swapaxes(0, 1)]
-    return _png(np.concatenate([np.concatenate(list(_spaced(row)), axis=1) for row in rows], axis=0))
-
-
-def _spaced(images: np.ndarray) -> Iterator[np.ndarray]:
-    """(N, 3, H, W) -> images (H + 2, W + 2, 3) with a white border."""
-    for image in images:
-        yield np.pad(image.transpose(1, 2, 0), ((1, 1), (1, 1), (0, 0)), constant_values=255)
+    rows = np.stack([film["clean"][chosen], *stacks.swapaxes(0, 1)]).transpose(0, 1, 3, 4, 2)
+    framed = np.pad(rows, ((0, 0), (0, 0), (1, 1), (1, 1), (0, 0)), constant_values=255)
+    frames, height, width = framed.shape[1:4]
+    image = framed.swapaxes(1, 2).reshape(len(rows) * height, frames * width, 3)
+    buffer = io.BytesIO()
+    Image.fromarray(image).save(buffer, "PNG", optimize=True)
+    return buffer.getvalue()
 
 
 def movie(film: Film) -> bytes:
@@ -80,13 +98,3 @@ def movie(film: Film) -> bytes:
     buffer = io.BytesIO()
     frames[0].save(buffer, "WEBP", save_all=True, append_images=frames[1:], duration=80, loop=0, quality=60)
     return buffer.getvalue()
-
-
-def _png(image: np.ndarray) -> bytes:
-    buffer = io.BytesIO()
-    Image.fromarray(image).save(buffer, "PNG", optimize=True)
-    return buffer.getvalue()
-
-
-def _base64(data: bytes) -> str:
-    return base64.b64encode(data).decode()

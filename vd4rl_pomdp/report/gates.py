@@ -18,10 +18,8 @@ from vd4rl_pomdp.core.errors import told_apart
 from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import STATE
-from vd4rl_pomdp.report.grouping import groups
-from vd4rl_pomdp.report.layout import interval
-from vd4rl_pomdp.report.load import SETTING, LoadedRun
-from vd4rl_pomdp.report.tables import REFERENCES, grouped
+from vd4rl_pomdp.report.load import REFERENCES, SETTING, Run, groups
+from vd4rl_pomdp.report.stats import interval
 from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, is_plain, of_corruption, unlike
 from vd4rl_pomdp.runs.files import Row
 
@@ -36,13 +34,13 @@ _NOT_PRETRAINED = ("random", STATE)
 class Sides(NamedTuple):
     """What is compared: seeds of two methods, each of one variant, or nothing where one has no run."""
 
-    left: list[LoadedRun]
-    right: list[LoadedRun]
+    left: list[Run]
+    right: list[Run]
     unlike: list[str]
     """Settings in which they differ; empty where the comparison is one of methods."""
 
 
-def gates(runs: list[LoadedRun]) -> list[Row]:
+def gates(runs: list[Run]) -> list[Row]:
     """One row for every task, quality, corruption and algorithm with frozen encoders' finished runs, and its `verdict`.
 
     `data_return` is a mean over the sets behind its runs; `state_share`, `acro_share` and `best_share`, the best
@@ -51,27 +49,23 @@ def gates(runs: list[LoadedRun]) -> list[Row]:
     95% interval. What is not known is None.
     """
     finished = [run for run in runs if run.evaluated and not run.end_to_end]
-    return [_gate(key, finished) for key in sorted({place_of(run) for run in finished})]
+    return [_gate(key, finished) for key in sorted({run.of(GATED) for run in finished})]
 
 
 def unranked(table: list[Row], names: Sequence[str] = GATED) -> set[tuple[str, ...]]:
     """The settings that are undecided: values of some columns, where all rows that have them miss a gate."""
-    places = grouped(table, names)
-    return {place for place, rows in places if all(row["verdict"].startswith(FAILED) for row in rows)}
+    places = groups(table, lambda row: tuple(row[name] for name in names))
+    return {place for place, rows in places.items() if all(row["verdict"].startswith(FAILED) for row in rows)}
 
 
-def place_of(run: LoadedRun) -> tuple[str, ...]:
-    """Values of GATED: the setting in which a run is compared with others."""
-    return tuple(str(run.labels[name]) for name in GATED)
-
-
-def _gate(key: tuple[str, ...], runs: list[LoadedRun]) -> Row:
+def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
     task, quality, corruption, algorithm = key
-    alike = [run for run in runs if place_of(run)[:2] == (task, quality) and place_of(run)[3] == algorithm]
+    alike = [run for run in runs if run.of(("task", "quality", "algorithm")) == (task, quality, algorithm)]
     here, clean = (seen_under(under, alike) for under in (corruption, "none"))
     state, acro = best_of(as_it_is("state", here)), best_of(as_it_is("acro", clean))
-    learned = [run for run in here if run.labels["method"] not in REFERENCES]
-    compared = sides(learned, as_it_is("random", here))
+    learned = [run for run in here if run.method not in REFERENCES]
+    floor = as_it_is("random", here)
+    compared = sides(learned, floor)
     above, (low, high) = difference(compared)
     data = {value for run in here if (value := run.reference.data_return) is not None}
     row = dict(zip(GATED, key, strict=True)) | {
@@ -83,24 +77,45 @@ def _gate(key: tuple[str, ...], runs: list[LoadedRun]) -> Row:
         "best_share": _share(compared.left),
         **{"above_random": above, "low": low, "high": high},
     }
-    return row | {"verdict": _verdict(row, state, acro, compared.unlike)}
+    missed, unknown = [], []
+    for name, least, words, reference in (
+        ("state_share", STATE_SHARE, "state", state),
+        ("acro_share", ACRO_SHARE, "acro under none", acro),
+    ):
+        if row[name] is None:
+            unknown.append(_no_share(words, reference))
+        elif row[name] < least:
+            share = told_apart(row[name], least, 2)[0]
+            missed.append(f"{words} returns {share} of the data's return, less than {least}")
+    if compared.unlike:
+        unknown.append(f"best and random have other {', '.join(compared.unlike)}")
+    elif not floor or not learned:
+        unknown.append("no method but references was measured" if floor else "random was not measured")
+    elif row["low"] is None:
+        unknown.append("best and random need two seeds each that differ")
+    elif row["low"] <= 0:
+        missed.append(f"best minus random is {row['above_random']:.0f} {interval(row['low'], row['high'], 0)}")
+    if missed:
+        return row | {"verdict": f"{FAILED}: {'; '.join(missed)}"}
+    told = f"{UNKNOWN}: {'; '.join(dict.fromkeys(unknown))}" if unknown else PASSED
+    return row | {"verdict": told}
 
 
-def seen_under(corruption: str, runs: Iterable[LoadedRun]) -> list[LoadedRun]:
+def seen_under(corruption: str, runs: Iterable[Run]) -> list[Run]:
     """Runs under a corruption, and seeds of `state` of others where it has none: nothing is hidden from it."""
-    found: dict[tuple[str, ...], LoadedRun] = {}
+    found: dict[tuple[str, ...], Run] = {}
     for run in sorted(runs, key=lambda run: run.labels["corruption"] != corruption):
-        if run.labels["corruption"] == corruption or run.labels["method"] == STATE:
-            found.setdefault((str(run.labels["method"]), run.variant, str(run.labels["seed"])), run)
+        if run.labels["corruption"] == corruption or run.method == STATE:
+            found.setdefault(run.of(("method", "variant", "seed")), run)
     return list(found.values())
 
 
-def as_it_is(method: str, runs: Iterable[LoadedRun], history: str = "method") -> list[LoadedRun]:
+def as_it_is(method: str, runs: Iterable[Run], history: str = "method") -> list[Run]:
     """The runs of a method as it is: those that add nothing to it but a history."""
-    return [run for run in runs if run.labels["method"] == method and is_plain(run.settings, history)]
+    return [run for run in runs if run.method == method and is_plain(run.settings, history)]
 
 
-def best_of(runs: Iterable[LoadedRun]) -> list[LoadedRun]:
+def best_of(runs: Iterable[Run]) -> list[Run]:
     """The seeds of the method and variant whose mean return is highest, none if there is no run.
 
     One with a single seed is taken only where none has more.
@@ -108,7 +123,7 @@ def best_of(runs: Iterable[LoadedRun]) -> list[LoadedRun]:
     return max(seeds_by_variant(runs), key=_preference, default=[])
 
 
-def sides(left: Iterable[LoadedRun], right: Iterable[LoadedRun]) -> Sides:
+def sides(left: Iterable[Run], right: Iterable[Run]) -> Sides:
     """Of the pairs of a method and variant of each side the one to be compared.
 
     First come pairs of like settings, then those with more than one seed on both sides, then those that return most.
@@ -119,35 +134,35 @@ def sides(left: Iterable[LoadedRun], right: Iterable[LoadedRun]) -> Sides:
     return max(alike or pairs, key=lambda pair: _preference(pair.left, pair.right), default=Sides([], [], []))
 
 
-def seeds_by_variant(runs: Iterable[LoadedRun]) -> list[list[LoadedRun]]:
+def seeds_by_variant(runs: Iterable[Run]) -> list[list[Run]]:
     """Seeds by method and variant; where they share an encoder, their spread is not that of a method."""
     own = (run for run in runs if ENCODER_SEED not in run.settings)
-    return list(groups(own, lambda run: (run.labels["method"], run.variant)).values())
+    return list(groups(own, lambda run: run.of(("method", "variant"))).values())
 
 
-def _preference(*compared: list[LoadedRun]) -> tuple[int, float]:
+def _preference(*compared: list[Run]) -> tuple[int, float]:
     """How many have more than one seed, and the sum of their mean returns."""
     return sum(len(seeds) > 1 for seeds in compared), sum(float(returns_of(seeds).mean()) for seeds in compared)
 
 
-def _unlike(one: LoadedRun, other: LoadedRun) -> list[str]:
+def _unlike(one: Run, other: Run) -> list[str]:
     """Settings that both have, but not alike, other than what a claim is about and what hides pixels.
 
     Of a method that is not pretrained, only settings of fine-tuning count.
     """
     names = (one.settings.keys() & other.settings.keys()) - of_corruption(one.settings).keys()
     for run in (one, other):
-        if run.labels["method"] in _NOT_PRETRAINED:
+        if run.method in _NOT_PRETRAINED:
             names &= settings_of(run.record["config"]).keys() | {DATA[0]}
     return unlike(one.settings, other.settings, names)
 
 
-def returns_of(runs: list[LoadedRun]) -> np.ndarray:
+def returns_of(runs: list[Run]) -> np.ndarray:
     """Mean return of each run's last evaluation, (n,)."""
     return np.array([np.mean([row["return"] for row in run.last]) for run in runs])
 
 
-def episodes_of(runs: list[LoadedRun], clean: bool = False) -> np.ndarray:
+def episodes_of(runs: list[Run], clean: bool = False) -> np.ndarray:
     """Returns of the episodes of each run's last evaluation, or of that with nothing hidden, (n, episodes)."""
     return stats.by_episode([[row["return"] for row in (run.last_clean if clean else run.last)] for run in runs])
 
@@ -165,38 +180,14 @@ def difference(compared: Sides, clean: bool = False) -> tuple[float | None, tupl
     return float(best.mean() - floor.mean()), stats.difference_interval(best, floor) or (None, None)
 
 
-def _share(runs: list[LoadedRun]) -> float | None:
+def _share(runs: list[Run]) -> float | None:
     """Mean share of its own data's return that a run returns; None if there is no run, or a data return not above 0."""
     data = [run.reference.data_return for run in runs]
     known = [value for value in data if value is not None and value > 0]
     return float((returns_of(runs) / known).mean()) if runs and len(known) == len(runs) else None
 
 
-def _verdict(row: Row, state: list[LoadedRun], acro: list[LoadedRun], differing: list[str]) -> str:
-    """A word, and why."""
-    missed, unknown = [], []
-    for name, least, words, runs in (
-        ("state_share", STATE_SHARE, "state", state),
-        ("acro_share", ACRO_SHARE, "acro under none", acro),
-    ):
-        if row[name] is None:
-            unknown.append(_no_share(words, runs))
-        elif row[name] < least:
-            missed.append(
-                f"{words} returns {told_apart(row[name], least, 2)[0]} of the data's return, less than {least}"
-            )
-    if differing:
-        unknown.append(f"best and random have other {', '.join(differing)}")
-    elif row["low"] is None:
-        unknown.append("best and random need two seeds each that differ")
-    elif row["low"] <= 0:
-        missed.append(f"best minus random is {row['above_random']:.0f} {interval(row['low'], row['high'], 0)}")
-    if missed:
-        return f"{FAILED}: {'; '.join(missed)}"
-    return f"{UNKNOWN}: {'; '.join(dict.fromkeys(unknown))}" if unknown else PASSED
-
-
-def _no_share(words: str, runs: list[LoadedRun]) -> str:
+def _no_share(words: str, runs: list[Run]) -> str:
     """Why the share of a reference is not known."""
     if not runs:
         return f"{words} was not measured"

@@ -1,21 +1,22 @@
-"""Runs as a report looks at them: what their files tell, and in what they differ from one another."""
+"""Runs as a report looks at them: one typed record each, from which the frame of runs and that of evaluations are made.
+
+A number of a table goes this way: rows of `episodes.csv` (`runs.results`), a `Run`, `runs_frame` or
+`episodes_frame`, a group-by in `report.tables`.
+"""
 
 from __future__ import annotations
 
-import io
-import zlib
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from pathlib import Path
-from typing import Any
-from zipfile import BadZipFile
+from typing import Any, TypeVar
 
 import numpy as np
+import pandas as pd
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.reading import read_bytes
-from vd4rl_pomdp.data.reference import Reference
-from vd4rl_pomdp.report.grouping import groups
+from vd4rl_pomdp.data.reference import Reference, summarise
 from vd4rl_pomdp.report.variants import (
     DATA,
     OF_CORRUPTION,
@@ -27,7 +28,8 @@ from vd4rl_pomdp.report.variants import (
     read_settings,
     without,
 )
-from vd4rl_pomdp.runs import FILM_FILE, REFERENCE_FILE
+from vd4rl_pomdp.runs import REFERENCE_FILE
+from vd4rl_pomdp.runs.episodes import COLUMNS
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.results import Result, find_results, whole_files
 
@@ -39,10 +41,28 @@ IDENTITY = (*CONDITION, "seed")
 """Columns that tell a run's rows from all others of a report: what its files name it by, and its variant."""
 PROBES = ("probe_pose", "probe_velocity")
 """Errors of linear probes of an encoder."""
+COSTS = ("pretrain_seconds", "finetune_seconds")
+ACTION_ERRORS = ("path_error", "action_error")
+"""Of a policy, on the data's rows and in closed loop."""
+CONTROL = {"return": "return_mean", "share_above_80": "share_above_80", "action_error": "action_error"}
+"""Columns that tell of the last evaluation, also as `clean_` under no corruption, and what `summarise` calls them."""
 END_TO_END = ("bc", "drq_bc")
 """References that bring their own algorithm."""
-FILM = {"clean": 4, "corrupted": 4, "return": 1}
-"""Arrays of a film and their axes."""
+TOLD_STATES = ("supervised", "supervised+a")
+"""Methods whose encoders are trained on the simulator's states, those of the episodes that a probe holds out, too."""
+REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, "state")
+"""Methods that are references, floors and ceilings: last in a table."""
+
+Member = TypeVar("Member")
+Key = TypeVar("Key", bound=Hashable)
+
+
+def groups(members: Iterable[Member], key: Callable[[Member], Key]) -> dict[Key, list[Member]]:
+    """Members by key, keys in the order in which they first come."""
+    found: dict[Key, list[Member]] = {}
+    for member in members:
+        found.setdefault(key(member), []).append(member)
+    return found
 
 
 class Choice:
@@ -65,32 +85,26 @@ class Choice:
 ALL = Choice()
 
 
-def without_options(row: Row, names: Iterable[str]) -> tuple[Any, ...]:
+def without_options(row: Mapping[str, Any], names: Iterable[str]) -> tuple[Any, ...]:
     """Some labels of a run or gap, without what tells a corruption's options apart."""
     return tuple(row[name].partition(",")[0] if name == "corruption" else row[name] for name in names)
 
 
 @dataclass(frozen=True)
-class LoadedRun:
+class Run:
     """A run of any stage, finished or not."""
 
     result: Result
     """Its files."""
-    labels: dict[str, Any]
+    labels: Row
     """Values of `settings.LABELS`; the task is empty until the run has opened its data. The corruption is followed
     by its options where other runs have others of the same name, "patch, patch_size 48": that is another setting."""
     settings: Settings
     """All settings in which runs of its method may differ, in words."""
-    rows: list[Row]
-    """Evaluation rows under the corruption of training."""
-    others: list[Row]
-    """Evaluation rows under other corruptions: under none, if it was trained under one."""
-    seconds: float | None
-    """Wall-clock time; None while the run is unfinished."""
-    representation: dict[str, float | None]
-    """Measures of its encoder: action_loss, PROBES, pretrain_seconds."""
     reference: Reference
     """What its policy is held against."""
+    measures: dict[str, float | None]
+    """Of its encoder and costs: action_loss, PROBES, COSTS; None where it is not known."""
     of_set: Settings = field(default_factory=dict)
     """Its settings that go by the set, such as a budget; they make no variants."""
     parts: Parts = ("", "")
@@ -102,14 +116,19 @@ class LoadedRun:
         return self.result.path
 
     @property
-    def record(self) -> dict[str, Any]:
+    def record(self) -> Row:
         """config.json: stage, config, versions, git_commit, command, inputs."""
         return self.result.record
 
     @property
     def stage(self) -> str:
         """What it does: "pretrain", "finetune" or "navigation"."""
-        return self.result.record["stage"]
+        return self.record["stage"]
+
+    @property
+    def method(self) -> str:
+        """Its method, without its variant."""
+        return self.labels["method"]
 
     @property
     def set_name(self) -> str:
@@ -122,33 +141,36 @@ class LoadedRun:
         return ", ".join(filter(None, self.parts))
 
     @property
-    def named(self) -> dict[str, Any]:
-        """Its labels and its variant."""
-        return self.labels | {"variant": self.variant}
-
-    @property
-    def identity(self) -> tuple[str, ...]:
+    def named(self) -> Row:
         """Values of IDENTITY."""
-        return tuple(str(self.named[name]) for name in IDENTITY)
+        return {name: self.variant if name == "variant" else self.labels[name] for name in IDENTITY}
+
+    def of(self, names: Iterable[str]) -> tuple[Any, ...]:
+        """Values of some columns of IDENTITY."""
+        named = self.named
+        return tuple(named[name] for name in names)
 
     @property
     def end_to_end(self) -> bool:
-        """Whether its encoder was trained with the policy; what early versions did not record, the method tells."""
-        return bool(self.result.encoder.get("end_to_end")) or self.labels["method"] in END_TO_END
+        """Whether its encoder was trained with the policy."""
+        return bool(self.result.encoder.get("end_to_end")) or self.method in END_TO_END
 
-    @property
+    @cached_property
+    def rows(self) -> list[Row]:
+        """Evaluation rows under the corruption of training."""
+        return [row for row in self.result.rows if row["evaluated_under"] == row["corruption"]]
+
+    @cached_property
     def last(self) -> list[Row]:
         """Rows of its last evaluation, under the corruption of training."""
-        return self._at_end(self.rows)
+        end = max((row["step"] for row in self.rows), default=None)
+        return [row for row in self.rows if row["step"] == end]
 
-    @property
+    @cached_property
     def last_clean(self) -> list[Row]:
         """Rows of its last evaluation under no corruption, whatever it was trained under; empty if there was none."""
-        return [row for row in self._at_end([*self.rows, *self.others]) if row["evaluated_under"] == "none"]
-
-    def _at_end(self, rows: list[Row]) -> list[Row]:
-        end = max((row["step"] for row in self.rows), default=None)
-        return [row for row in rows if row["step"] == end]
+        end = {row["step"] for row in self.last}
+        return [row for row in self.result.rows if row["step"] in end and row["evaluated_under"] == "none"]
 
     @property
     def finished(self) -> bool:
@@ -171,144 +193,157 @@ class LoadedRun:
             return f"diverged at {unit[:-1]} {self.result.diverged.get('step', self.result.step)} of {last}"
         return f"unfinished at {self.result.step} of {last} {unit}"
 
-    def film(self) -> dict[str, np.ndarray]:
-        """Pictures of an evaluation episode, for a run that kept them; raises UserError for a damaged file."""
-        path = self.path / FILM_FILE
-        try:
-            with np.load(io.BytesIO(read_bytes(path))) as file:
-                film = dict(file)
-            if [film[name].ndim for name in FILM] != list(FILM.values()):
-                raise ValueError("its arrays have other shapes")
-            return film
-        except UserError:
-            raise
-        except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
-            raise UserError(f"{path}: cannot be read ({error}); remove it, and the report goes without") from error
+
+def label(row: Mapping[str, Any]) -> str:
+    """A method's name in tables and figures, with the algorithm where it is not TD3+BC, and its variant."""
+    algorithm = "" if row["method"] in END_TO_END or row["algorithm"] == "td3_bc" else row["algorithm"]
+    return ", ".join(filter(None, (row["method"], algorithm, row["variant"])))
 
 
-def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choice = ALL) -> list[LoadedRun]:
+def setting(row: Mapping[str, Any]) -> str:
+    """Task, quality and corruption in words."""
+    return f"{row['task']} {row['quality']}, {row['corruption']}"
+
+
+def title(run: Run) -> str:
+    """A run's stage, method and setting, all but its seed."""
+    return f"{run.stage} {label(run.named)}, {setting(run.labels)}"
+
+
+def labels(table: pd.DataFrame) -> pd.Series:
+    """`label` of every row."""
+    return pd.Series([label(row) for row in table.to_dict("records")], table.index, dtype=object)
+
+
+def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choice = ALL) -> list[Run]:
     """The chosen runs at or below the paths, of run folders and results folders; `but` as in `find_results`.
 
     Raises:
         UserError: there is no run, two have the same identity, or a file of one is damaged.
     """
-    read = [_load(result) for result in choice.among(find_results(paths, but))]
-    loaded = [replace(run, of_set=own) for run, own in zip(read, _of_sets(read), strict=True)]
-    told = zip(loaded, _corruptions(loaded), strict=True)
-    runs = [replace(run, labels=run.labels | {"corruption": words}) for run, words in told]
-    named = [replace(run, parts=parts) for run, parts in zip(runs, compare(runs), strict=True)]
-    _refuse_twins(named)
-    return named
+    runs = [_load(result) for result in choice.among(find_results(paths, but))]
+    runs = [replace(run, of_set=own) for run, own in zip(runs, _of_sets(runs), strict=True)]
+    corruptions = _corruptions(runs)
+    runs = [replace(run, labels=run.labels | {"corruption": c}) for run, c in zip(runs, corruptions, strict=True)]
+    runs = [replace(run, parts=parts) for run, parts in zip(runs, variants(runs), strict=True)]
+    seen: dict[tuple[Any, ...], Path] = {}
+    for run in runs:
+        other = seen.setdefault(run.of(IDENTITY), run.path) if run.rows else run.path
+        if other is not run.path:
+            raise UserError(f"{run.path} and {other}: two runs of one method, setting and seed; report one of them")
+    return runs
 
 
-def _corruptions(runs: list[LoadedRun]) -> list[str]:
-    """What hides pixels from each run, in words; an option that early runs do not record is not told apart."""
-    options = sorted({name for run in runs for name in of_corruption(run.settings)})
-    settings = [{name.removeprefix(OF_CORRUPTION): own.get(name, "") for name in options} for own in _settings(runs)]
-    words = _differences(runs, settings, lambda run: run.labels["corruption"])
-    names = [str(run.labels["corruption"]) for run in runs]
-    return [
-        name if name == "none" else ", ".join(filter(None, (name, told)))
-        for name, told in zip(names, words, strict=True)
-    ]
+def _load(result: Result) -> Run:
+    """A run of its files; raises UserError for files that are valid JSON, but not what a run writes."""
+    with whole_files(result.place):
+        probe, stored = result.files.get("probe", {}), result.files.get("reference")
+        told = {
+            "action_loss": result.encoder.get("action_loss"),
+            **{name: probe.get(name) for name in PROBES},
+            "pretrain_seconds": result.files.get("pretrain_timing", {}).get("seconds"),
+            "finetune_seconds": result.files["timing"]["seconds"] if result.finished else None,
+        }
+        if wrong := [value for value in told.values() if value is not None and not isinstance(value, int | float)]:
+            raise TypeError(f"{wrong[0]!r} is no number")
+        reference = Reference() if stored is None else Reference.parse(result.path / REFERENCE_FILE, stored)
+        return Run(result, result.labels, read_settings(result.record, result.card), reference, told)
 
 
-def compare(runs: list[LoadedRun], brief: bool = True) -> list[Parts]:
-    """The settings in which each run differs from others of its stage, method and algorithm."""
-    settings = _settings(runs)
-    methods = [without(own, {*of_corruption(own), *DATA}) for own in settings]
-    data = [{name: own[name] for name in DATA if name in own} for own in settings]
-    of_methods = _differences(runs, methods, _method, brief)
-    of_data = _differences(runs, data, lambda run: (*_method(run), run.set_name, run.labels["corruption"]))
-    return list(zip(of_methods, of_data, strict=True))
-
-
-def _differences(
-    runs: list[LoadedRun], settings: list[Settings], alike: Callable[[LoadedRun], Any], brief: bool = True
-) -> list[str]:
-    """What differs of some settings among the runs that are alike, run by run."""
-    words = [""] * len(runs)
-    for members in groups(range(len(runs)), lambda number: alike(runs[number])).values():
-        for number, told in zip(members, differences([settings[i] for i in members], brief), strict=True):
-            words[number] = told
-    return words
-
-
-def _settings(runs: list[LoadedRun]) -> list[Settings]:
-    """The runs' settings, without what goes by the set."""
-    return [without(run.settings, run.of_set) for run in runs]
-
-
-def _of_sets(runs: list[LoadedRun]) -> list[Settings]:
+def _of_sets(runs: list[Run]) -> list[Settings]:
     """Each run's settings that go by its set.
 
     A corruption's options do if they do in all runs, since it has one name whatever learns under it; other settings if
     they do in all runs of one stage and algorithm.
     """
-    options = _by_set(runs, [of_corruption(run.settings) for run in runs])
-    others = {
-        _kind(members[0]): _by_set(members, [without(run.settings, of_corruption(run.settings)) for run in members])
-        for members in groups(runs, _kind).values()
-    }
-    found = (options[run.set_name] | others[_kind(run)][run.set_name] for run in runs)
-    return [dict(sorted(own.items())) for own in found]
+    found = of_sets([of_corruption(run.settings) for run in runs], [run.set_name for run in runs])
+    for places in groups(range(len(runs)), lambda i: (runs[i].stage, runs[i].labels["algorithm"])).values():
+        others = [without(runs[i].settings, of_corruption(runs[i].settings)) for i in places]
+        for i, own in zip(places, of_sets(others, [runs[i].set_name for i in places]), strict=True):
+            found[i] = dict(sorted((found[i] | own).items()))
+    return found
 
 
-def _by_set(runs: list[LoadedRun], settings: list[Settings]) -> dict[str, Settings]:
-    return of_sets(settings, [run.set_name for run in runs])
+def _corruptions(runs: list[Run]) -> list[str]:
+    """What hides pixels from each run, in words: its name, and the options in which others of the name differ."""
+    settings = [
+        {name.removeprefix(OF_CORRUPTION): value for name, value in of_corruption(own).items()} for own in _own(runs)
+    ]
+    words = _differences(runs, settings, lambda run: run.labels["corruption"])
+    names = [run.labels["corruption"] for run in runs]
+    told = zip(names, words, strict=True)
+    return [name if name == "none" else ", ".join(filter(None, (name, options))) for name, options in told]
 
 
-def _kind(run: LoadedRun) -> tuple[str, str]:
-    return run.stage, str(run.labels["algorithm"])
+def variants(runs: list[Run], brief: bool = True) -> list[Parts]:
+    """The settings in which each run differs from others of its stage, method and algorithm, and their data."""
+    methods = [without(own, {*of_corruption(own), *DATA}) for own in _own(runs)]
+    data = [{name: own[name] for name in DATA if name in own} for own in _own(runs)]
+    of_methods = _differences(runs, methods, _method, brief)
+    of_data = _differences(runs, data, lambda run: (*_method(run), run.set_name, run.labels["corruption"]))
+    return list(zip(of_methods, of_data, strict=True))
 
 
-def _method(run: LoadedRun) -> tuple[str, str, str]:
-    return *_kind(run), str(run.labels["method"])
+def _method(run: Run) -> tuple[str, str, str]:
+    return run.stage, run.labels["algorithm"], run.method
 
 
-def _load(result: Result) -> LoadedRun:
-    """A run of its files; raises UserError for files that are valid JSON, but not what a run writes."""
-    with whole_files(result.place):
-        return LoadedRun(
-            result=result,
-            labels=result.labels,
-            settings=read_settings(result.record, result.card),
-            rows=[row for row in result.rows if row["evaluated_under"] == row["corruption"]],
-            others=[row for row in result.rows if row["evaluated_under"] != row["corruption"]],
-            seconds=_number(result.files["timing"]["seconds"]) if result.finished else None,
-            representation=_representation(result),
-            reference=_reference(result),
-        )
+def _own(runs: list[Run]) -> list[Settings]:
+    """The runs' settings, without what goes by the set."""
+    return [without(run.settings, run.of_set) for run in runs]
 
 
-def _reference(result: Result) -> Reference:
-    stored = result.files.get("reference")
-    return Reference() if stored is None else Reference.parse(result.path / REFERENCE_FILE, stored)
+def _differences(
+    runs: list[Run], settings: list[Settings], alike: Callable[[Run], Hashable], brief: bool = True
+) -> list[str]:
+    """What differs of some settings among the runs that are alike, run by run; nothing where none are recorded."""
+    words = [""] * len(runs)
+    recorded = [i for i, own in enumerate(settings) if own]
+    for places in groups(recorded, lambda i: alike(runs[i])).values():
+        for i, told in zip(places, differences([settings[i] for i in places], brief), strict=True):
+            words[i] = told
+    return words
 
 
-def _representation(result: Result) -> dict[str, float | None]:
-    probe, timing = (result.files.get(name, {}) for name in ("probe", "pretrain_timing"))
-    return {
-        "action_loss": _number(result.encoder.get("action_loss")),
-        **{name: _number(probe.get(name)) for name in PROBES},
-        "pretrain_seconds": _number(timing.get("seconds")),
-    }
+def episodes_frame(runs: Iterable[Run]) -> pd.DataFrame:
+    """One row for every evaluation episode: `id` and IDENTITY of its run, and the columns of `episodes.csv`.
+
+    `as_trained` tells those under the corruption of training.
+    """
+    rows = [
+        row | run.named | {"id": run.result.id, "as_trained": row["evaluated_under"] == row["corruption"]}
+        for run in runs
+        for row in run.result.rows
+    ]
+    columns = ["id", *IDENTITY, *(name for name in COLUMNS if name not in IDENTITY), "as_trained"]
+    return pd.DataFrame(rows, columns=columns).astype({"as_trained": bool})
 
 
-def _number(value: Any) -> float | None:
-    if value is not None and not isinstance(value, int | float):
-        raise TypeError(f"{value!r} is no number")
-    return value
+def runs_frame(runs: Iterable[Run]) -> pd.DataFrame:
+    """One row for every finished and evaluated run: encoder, scores, control, costs and provenance; None is unknown."""
+    table = pd.DataFrame([_run_row(run) for run in runs if run.evaluated], columns=[*IDENTITY, *_RUN])
+    return table.astype({name: float for name in _RUN if name not in ("id", "git_commit", "machine", "state")})
 
 
-def _refuse_twins(runs: list[LoadedRun]) -> None:
-    """Raise UserError for two evaluated runs with the same identity."""
-    seen: dict[tuple[str, ...], Path] = {}
-    for run in runs:
-        if not run.rows:
-            continue
-        if run.identity in seen:
-            raise UserError(
-                f"{run.path} and {seen[run.identity]}: two runs of one method, setting and seed; report one of them"
-            )
-        seen[run.identity] = run.path
+_RUN = (
+    *("id", "action_loss", *PROBES, *ACTION_ERRORS, "score", "return", "best_score", "best_step"),
+    *("data_return", "share_above_80", *(f"clean_{name}" for name in CONTROL)),
+    *(*COSTS, "git_commit", "machine", "state"),
+)
+
+
+def _run_row(run: Run) -> Row:
+    scores = {step: np.mean([row["score"] for row in rows]) for step, rows in groups(run.rows, _step).items()}
+    best = max(scores, key=scores.__getitem__)
+    row: Row = {"id": run.result.id, "state": run.progress, "machine": run.result.machine}
+    row |= {"git_commit": run.result.commit, "data_return": run.reference.data_return}
+    row |= {"score": scores[max(scores)], "best_score": scores[best], "best_step": best}
+    row |= run.named | run.measures | {"path_error": run.reference.path_error}
+    for prefix, episodes in (("", run.last), ("clean_", run.last_clean)):
+        summed = summarise(episodes, run.reference) if episodes else {}
+        row |= {prefix + name: summed.get(key) for name, key in CONTROL.items()}
+    return row
+
+
+def _step(row: Row) -> int:
+    return row["step"]

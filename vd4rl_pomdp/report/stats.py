@@ -200,3 +200,19 @@ def mean_and_error(values: Sequence[float], digits: int = 0) -> str:
     """In words: the mean and its standard error, or the mean alone of a single value."""
     error = f" ± {np.std(values, ddof=1) / math.sqrt(len(values)):.{digits}f}" if len(values) > 1 else ""
     return f"{np.mean(values):.{digits}f}{error}"
+
+
+def number(value: float | None, digits: int = 1) -> str:
+    """A number, or a dash for one that is not known."""
+    return "–" if value is None or math.isnan(value) else f"{value:z.{digits}f}"
+
+
+def interval(low: float | None, high: float | None, digits: int = 1) -> str:
+    """An interval in brackets, or a dash."""
+    known = low is not None and high is not None and not math.isnan(low)
+    return f"[{low:z.{digits}f}, {high:z.{digits}f}]" if known else "–"
+
+
+def with_interval(value: float | None, low: float | None, high: float | None, digits: int = 1) -> str:
+    """A number and its interval, as far as they are known."""
+    return f"{number(value, digits)} {interval(low, high, digits)}".removesuffix(" –")

@@ -1,68 +1,46 @@
-"""From evaluations to tables of scores by condition: everything a figure shows is in one of them."""
+"""The tables of a report: group-bys of the frames of runs and of evaluations. Every figure shows one of them.
+
+CONDITION, the columns that all seeds of an experiment share, comes first. What is not known is missing.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Sequence
+from collections.abc import Collection
+from itertools import combinations
+from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from vd4rl_pomdp.report import stats
-from vd4rl_pomdp.report.gaps import condition_of, in_words
-from vd4rl_pomdp.report.grouping import groups
-from vd4rl_pomdp.report.load import CONDITION, END_TO_END, SETTING, LoadedRun
+from vd4rl_pomdp.report.gaps import in_words
+from vd4rl_pomdp.report.load import CONDITION, CONTROL, COSTS, IDENTITY, PROBES, REFERENCES, SETTING, labels
 from vd4rl_pomdp.runs.files import Row
 
-TOLD_STATES = ("supervised", "supervised+a")
-"""Methods whose encoders are trained on the simulator's states, those of the episodes that a probe holds out, too."""
-REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, "state")
-"""Methods that are references, floors and ceilings: last in a table."""
-LOOKS = (
-    *("mik+a", "mik", "acro", "ah+a", "fj+a", "supervised+a", "random", "ah", "fj", "supervised", "state"),
-    *("curl", "driml", "homer", "one_step_inverse", "no_history", "bc", "drq_bc"),
-)
-"""The package's methods in the order of their looks, which are the same in every report: the first differ in colour."""
 SCORE = "Score = return / 10 or the task's own divisor"
 """What tables and pages say of their scores."""
-SCORES_NOTE = f"{SCORE}. Mean over seeds, 95% t intervals over seeds and episodes."
-"""What stands below a table of scores."""
-_MEASURED = (
-    *("step", "score", "low", "high", "seeds", "episodes", "few_seeds"),
-    *("best_step", "best_score", "best_low", "best_high"),
-)
+SERIES = CONDITION[2:]
+"""What a method's runs on all tasks share."""
+THRESHOLDS = 101
+"""Number of scores at which a performance profile is computed."""
+MANY = 2_000
+"""Bootstrap samples of each of the many intervals of a profile or a matrix."""
+AGGREGATES = ("iqm", "median", "mean", "optimality_gap")
+POINTS = 200
+"""Points of a loss curve, at most."""
+ENDS = ("", "_low", "_high")
 
 
-def label(row: Row) -> str:
-    """A method's name in tables and figures, with the algorithm where it is not TD3+BC, and its variant."""
-    algorithm = "" if row["method"] in END_TO_END else _algorithm(row)
-    return ", ".join(filter(None, (row["method"], algorithm, row["variant"])))
+def evaluations(episodes: pd.DataFrame) -> pd.DataFrame:
+    """One row for every evaluation of a run as trained: IDENTITY, step, `score`, and `scores` of its episodes.
+
+    The seed is the replicate: the score is the mean over the evaluation's episodes.
+    """
+    by_step = episodes[episodes["as_trained"]].groupby([*IDENTITY, "step"], sort=False)["score"]
+    return by_step.agg(score="mean", scores=list).reset_index()
 
 
-def setting(row: Row) -> str:
-    """Task, quality and corruption in words."""
-    return f"{row['task']} {row['quality']}, {row['corruption']}"
-
-
-def with_algorithm(row: Row) -> str:
-    """A setting in words, with the algorithm where it is not TD3+BC."""
-    return ", ".join(filter(None, (setting(row), _algorithm(row))))
-
-
-def _algorithm(row: Row) -> str:
-    return "" if row["algorithm"] == "td3_bc" else row["algorithm"]
-
-
-def evaluations(runs: Iterable[LoadedRun]) -> list[Row]:
-    """One row for every evaluation of a run: CONDITION, seed, step, mean `score`, and the `scores` of its episodes."""
-    table = []
-    for run in runs:
-        named = run.named
-        for (step, *_), episodes in grouped(run.rows, ("step",)):
-            scores = [row["score"] for row in episodes]
-            table.append(named | {"step": step, "score": float(np.mean(scores)), "scores": scores})
-    return table
-
-
-def summary(rows: list[Row], gaps: list[Row], unranked: Collection[tuple[str, ...]] = ()) -> list[Row]:
+def summary(evaluated: pd.DataFrame, gaps: pd.DataFrame, unranked: Collection[tuple[str, ...]] = ()) -> pd.DataFrame:
     """Scores of every condition, mean over seeds with 95% interval: of the last evaluation, and of the best one.
 
     The highest score of a setting (task, quality, corruption) comes first, unless it is `unranked`: there names decide.
@@ -70,103 +48,234 @@ def summary(rows: list[Row], gaps: list[Row], unranked: Collection[tuple[str, ..
     finished seed has no numbers.
 
     Args:
-        rows: evaluations of finished runs.
+        evaluated: evaluations of finished runs.
         gaps: of `find_gaps`.
         unranked: settings whose methods are not ranked.
     """
-    absent = groups(gaps, condition_of)
-    table = []
-    for group, members in grouped(rows, CONDITION):
-        condition = dict(zip(CONDITION, group, strict=True))
-        table.append(condition | _scores(members) | _absent(absent.pop(group, [])))
-    nothing = dict.fromkeys(_MEASURED) | {"seeds": 0, "episodes": 0}
-    table += [
-        dict(zip(CONDITION, group, strict=True)) | nothing | _absent(members) for group, members in absent.items()
+    rows = {condition: _scores(seeds) for condition, seeds in evaluated.groupby(list(CONDITION), sort=False)}
+    absent = {
+        condition: {"absent": len(seeds), "missing": in_words(seeds.to_dict("records"))}
+        for condition, seeds in gaps.groupby(list(CONDITION), sort=False)
+    }
+    nothing: Row = {"seeds": 0, "episodes": 0, "absent": 0, "missing": ""}
+    found = [
+        dict(zip(CONDITION, condition, strict=True)) | nothing | rows.get(condition, {}) | absent.get(condition, {})
+        for condition in dict.fromkeys([*rows, *absent])
     ]
-    return sorted(table, key=lambda row: _summary_order(row, unranked))
+    columns = (
+        *(*CONDITION, "step", "score", "low", "high", "seeds", "episodes", "few_seeds"),
+        *("best_step", "best_score", "best_low", "best_high", "absent", "missing"),
+    )
+    table = pd.DataFrame(found, columns=list(columns))
+    places = table[list(SETTING)].itertuples(index=False, name=None)
+    by_name = pd.Series([place in unranked for place in places], table.index, dtype=bool)
+    return _ordered(table, -table["score"].astype(float).mask(by_name, 0.0), labels(table))
 
 
-def _absent(gaps: list[Row]) -> Row:
-    return {"absent": len(gaps), "missing": in_words(gaps)}
+def _scores(rows: pd.DataFrame) -> Row:
+    """Numbers of one condition."""
+    means = rows.groupby("step")["score"].mean()
+    found: Row = {}
+    for prefix, step in (("", means.index.max()), ("best_", means.idxmax())):
+        seeds = rows.loc[rows["step"] == step, "scores"]
+        found |= {f"{prefix}step": step} | mean_and_ends(stats.by_episode(list(seeds)), prefix)
+        if not prefix:
+            found |= {"seeds": len(seeds), "episodes": sum(map(len, seeds)), "few_seeds": len(seeds) < stats.FEW_SEEDS}
+    return found
 
 
-def _scores(rows: list[Row]) -> Row:
-    """Values of _MEASURED of one condition."""
-    curve = _by_step(rows)
-    final = max(curve)
-    best = max(curve, key=lambda step: _seeds(curve[step]).mean())
-    found: Row = {"step": final, "best_step": best}
-    ends = {step: mean_and_ends(_by_episode(curve[step])) for step in {final, best}}
-    for prefix, step in (("", final), ("best_", best)):
-        found |= dict(zip((f"{prefix}score", f"{prefix}low", f"{prefix}high"), ends[step], strict=True))
-    count = len(curve[final])
-    found |= {"seeds": count, "episodes": sum(len(row["scores"]) for row in curve[final])}
-    return {name: (found | {"few_seeds": count < stats.FEW_SEEDS})[name] for name in _MEASURED}
-
-
-def mean_and_ends(scores: np.ndarray) -> tuple[float, float | None, float | None]:
+def mean_and_ends(scores: np.ndarray, prefix: str = "", suffix: str = "") -> Row:
     """Mean of (seeds, episodes) scores, and the ends of its interval."""
-    return float(scores.mean()), *(stats.mean_interval(scores) or (None, None))
+    low, high = stats.mean_interval(scores) or (None, None)
+    values = {"score": float(scores.mean()), "low": low, "high": high}
+    return {f"{prefix}{name}{suffix}": value for name, value in values.items()}
 
 
-def curves(rows: list[Row]) -> list[Row]:
+def _ordered(table: pd.DataFrame, *keys: pd.Series) -> pd.DataFrame:
+    """By setting, references last, then by some keys; what is not known stands at the end."""
+    columns = [table[name] for name in SETTING if name in table] + [table["method"].isin(REFERENCES), *keys]
+    order = pd.concat(columns, axis=1, ignore_index=True).pipe(lambda told: told.sort_values(list(told), kind="stable"))
+    return table.loc[order.index].reset_index(drop=True)
+
+
+def curves(evaluated: pd.DataFrame) -> pd.DataFrame:
     """Mean over seeds, and their range, at every evaluation."""
-    table = []
-    for group, members in grouped(rows, CONDITION):
-        for step, at_step in sorted(_by_step(members).items()):
-            scores = _seeds(at_step)
-            table.append(
-                dict(zip(CONDITION, group, strict=True))
-                | {"step": step, "score": float(scores.mean())}
-                | {"low": float(scores.min()), "high": float(scores.max()), "seeds": len(scores)}
-            )
-    return table
+    by_step = evaluated.groupby([*CONDITION, "step"], sort=False)["score"]
+    return by_step.agg(score="mean", low="min", high="max", seeds="size").reset_index().pipe(_by_condition, "step")
 
 
-def final_scores(rows: list[Row]) -> np.ndarray:
-    """Score of every seed of one condition at its last evaluation, (n,)."""
-    curve = _by_step(rows)
-    return _seeds(curve[max(curve)])
+def _by_condition(table: pd.DataFrame, *then: str) -> pd.DataFrame:
+    """Conditions in the order in which they first come, each ordered by some columns."""
+    place = table.groupby(list(CONDITION), sort=False).ngroup()
+    order = table.assign(_place=place).sort_values(["_place", *then], kind="stable").index
+    return table.loc[order].reset_index(drop=True)
 
 
-def final_episodes(rows: list[Row]) -> np.ndarray:
-    """The same episode by episode, (n, episodes)."""
-    curve = _by_step(rows)
-    return _by_episode(curve[max(curve)])
+def final_scores(evaluated: pd.DataFrame) -> pd.DataFrame:
+    """The last evaluations of every condition, a row a seed."""
+    return evaluated[evaluated["step"] == evaluated.groupby(list(CONDITION), sort=False)["step"].transform("max")]
 
 
-def table_order(row: Row) -> tuple:
-    """By setting, references last, the highest score first, and rows without a score at the end."""
-    place = tuple(row.get(name, "") for name in SETTING)
-    score = row["iqm"] if "iqm" in row else row.get("score", row.get("return"))
-    return *place, row["method"] in REFERENCES, np.inf if score is None else -float(score)
+def _strata(finals: pd.DataFrame) -> stats.Strata:
+    """Final score of every seed, one array a task and quality."""
+    return [seeds.to_numpy() for _, seeds in finals.groupby(["task", "quality"], sort=False)["score"]]
 
 
-def _summary_order(row: Row, unranked: Collection[tuple[str, ...]]) -> tuple:
-    """`table_order`, but by name where methods are not ranked."""
-    *place, reference, score = table_order(row)
-    return *place, reference, 0.0 if tuple(place) in unranked else score, label(row)
+def aggregate(evaluated: pd.DataFrame, gaps: pd.DataFrame) -> pd.DataFrame:
+    """AGGREGATES over the tasks and qualities of every method and corruption, with stratified 95% intervals.
+
+    `of_tasks` is the number of tasks and qualities under the corruption: a row with fewer `tasks` cannot be compared
+    with the others, and stands below them. `seeds` is the least number that a task has. A method that has not been run
+    has no numbers.
+    """
+    finals = final_scores(evaluated)
+    everything = pd.concat([finals[list(CONDITION)], gaps[list(CONDITION)]])
+    of_tasks = everything.drop_duplicates(list(SETTING)).groupby("corruption").size()
+    rows = []
+    measured = dict(list(finals.groupby(list(SERIES), sort=False)))
+    for series in everything.groupby(list(SERIES), sort=False).groups:
+        row = dict(zip(SERIES, series, strict=True)) | {"tasks": 0, "of_tasks": of_tasks[series[0]], "seeds": 0}
+        if series in measured:
+            strata = _strata(measured[series])
+            row |= _aggregates(strata) | {"tasks": len(strata), "seeds": min(map(len, strata))}
+        rows.append(row)
+    numbers = [f"{name}{end}" for name in AGGREGATES for end in ENDS]
+    table = pd.DataFrame(rows, columns=[*SERIES, *numbers, "tasks", "of_tasks", "seeds"])
+    return _ordered(table, table["tasks"] < table["of_tasks"], -table["iqm"].astype(float))
 
 
-def grouped(rows: Iterable[Row], names: Sequence[str]) -> list[tuple[tuple, list[Row]]]:
-    """Rows by their values in some columns, in the order in which these first come."""
-    return list(groups(rows, lambda row: tuple(row[name] for name in names)).items())
+def _aggregates(strata: stats.Strata) -> Row:
+    scores, chosen = np.concatenate(strata), stats.aggregates(strata)
+    intervals = stats.bootstrap_intervals(strata, chosen, np.random.default_rng(0))
+    found: Row = {}
+    for name, statistic in chosen.items():
+        values = (float(statistic(scores)), *(intervals[name] or (None, None)))
+        found |= {f"{name}{end}": value for end, value in zip(ENDS, values, strict=True)}
+    return found
 
 
-def by_label(rows: Iterable[Row]) -> list[tuple[str, list[Row]]]:
-    """Rows by their method's name in tables and figures, likewise."""
-    return list(groups(rows, label).items())
+def improvement(evaluated: pd.DataFrame) -> pd.DataFrame:
+    """Probability that a run of one method beats one of another on the same task, averaged over common tasks.
+
+    A probability has a stratified 95% interval; where a method has a single seed on some task there is none, as one
+    pair of runs tells no probability. `wins` of `pairs` of runs are known in any case; ties count half.
+    """
+    rows: list[Row] = []
+    finals = final_scores(evaluated)
+    for corruption, members in finals.assign(label=labels(finals)).groupby("corruption", sort=False):
+        final = {
+            name: {task: seeds.to_numpy() for task, seeds in mine.groupby(["task", "quality"], sort=False)["score"]}
+            for name, mine in members.groupby("label", sort=False)
+        }
+        for name, other in combinations(final, 2):
+            if common := [task for task in final[name] if task in final[other]]:
+                row = _improvement([final[name][task] for task in common], [final[other][task] for task in common])
+                chance, low, high = (None if row[k] is None else 1 - row[k] for k in ("probability", "high", "low"))
+                turned = {"probability": chance, "low": low, "high": high, "wins": row["pairs"] - row["wins"]}
+                rows.append({"corruption": corruption, "method": name, "other": other} | row)
+                rows.append({"corruption": corruption, "method": other, "other": name} | row | turned)
+    columns = ["corruption", "method", "other", "probability", "low", "high", "wins", "pairs", "tasks", "seeds"]
+    return pd.DataFrame(rows, columns=columns)
 
 
-def _by_step(rows: list[Row]) -> dict[int, list[Row]]:
-    return {step[0]: members for step, members in grouped(rows, ("step",))}
+def _improvement(strata: stats.Strata, others: stats.Strata) -> Row:
+    found = stats.improvement_interval(strata, others, np.random.default_rng(0), MANY)
+    pairs = [len(one) * len(other) for one, other in zip(strata, others, strict=True)]
+    chances = [stats.probability_of_improvement([a], [b]) for a, b in zip(strata, others, strict=True)]
+    low, high = found or (None, None)
+    return {
+        **{"probability": float(np.mean(chances)) if found else None, "low": low, "high": high},
+        **{"wins": float(np.dot(chances, pairs)), "pairs": sum(pairs), "tasks": len(pairs)},
+        "seeds": min(map(len, (*strata, *others))),
+    }
 
 
-def _seeds(rows: list[Row]) -> np.ndarray:
-    """Score of every seed at one evaluation."""
-    return np.array([row["score"] for row in rows])
+def profiles(evaluated: pd.DataFrame) -> pd.DataFrame:
+    """Share of runs (all tasks and seeds of a method) whose final score is above each threshold, with 95% bands.
+
+    Thresholds go from 0, or the lowest score below it, to 100, or to 0 where no score is above it.
+    """
+    finals = final_scores(evaluated)
+    top = 100 if (finals["score"] > 0).any() or not (finals["score"] < 0).any() else 0
+    thresholds = np.linspace(min(0.0, finals["score"].min()), top, THRESHOLDS)
+    parts = []
+    for (corruption, _), members in finals.assign(label=labels(finals)).groupby(["corruption", "label"], sort=False):
+        strata = _strata(members)
+        low, high = stats.profile_band(strata, thresholds, np.random.default_rng(0), MANY) or (np.nan, np.nan)
+        share = stats.performance_profile(np.concatenate(strata), thresholds)
+        names = {"corruption": corruption, "method": members["label"].iloc[0], "runs": len(members)}
+        parts.append(pd.DataFrame(names | {"threshold": thresholds, "share": share, "low": low, "high": high}))
+    return pd.concat(parts, ignore_index=True) if parts else pd.DataFrame()
 
 
-def _by_episode(rows: list[Row]) -> np.ndarray:
-    """The same episode by episode, (n, episodes)."""
-    return stats.by_episode([row["scores"] for row in rows])
+def all_runs(runs: pd.DataFrame, gaps: pd.DataFrame) -> pd.DataFrame:
+    """The frame of runs, and rows with a state but no numbers for those that are missing or did not finish."""
+    table = pd.DataFrame(runs.to_dict("records") + gaps.to_dict("records"), columns=runs.columns)
+    return _ordered(table, -table["score"].astype(float))
+
+
+def representations(table: pd.DataFrame) -> pd.DataFrame:
+    """Means over the finished seeds of every condition in a table of runs: encoder, return, costs; and the gaps.
+
+    What a seed does not know is missing.
+    """
+    means = _means(table[table["score"].notna()], ["action_loss", *PROBES, "return", *COSTS])
+    gaps = [
+        (*condition, in_words(seeds[seeds["score"].isna()].to_dict("records")))
+        for condition, seeds in table.groupby(list(CONDITION), sort=False)
+    ]
+    found = pd.DataFrame(gaps, columns=[*CONDITION, "missing"]).merge(means, how="left", on=list(CONDITION))
+    return _ordered(found.fillna({"seeds": 0}), -found["return"])
+
+
+def _means(table: pd.DataFrame, names: list[str]) -> pd.DataFrame:
+    """Means of some columns by condition, each known only if all seeds know it, and how many `seeds` there are."""
+    grouped = table.groupby(list(CONDITION), sort=False)
+    means = grouped[names].agg(lambda column: column.astype(float).mean(skipna=False))
+    return means.assign(seeds=grouped.size()).reset_index()
+
+
+def costs(table: pd.DataFrame) -> pd.DataFrame:
+    """Mean, least and most seconds of both stages by method, over all finished runs of a table, and their machines."""
+    finished = table[table["score"].notna()]
+    grouped = finished.assign(method=labels(finished)).groupby("method", sort=False)
+    spans = {
+        f"{cost}{end}": (cost, how) for cost in COSTS for end, how in (("", "mean"), ("_min", "min"), ("_max", "max"))
+    }
+    found = grouped.agg(
+        runs=("seed", "size"), **spans, machines=("machine", lambda names: "; ".join(sorted({*names} - {""})))
+    )
+    return found.reset_index()
+
+
+def control(table: pd.DataFrame) -> pd.DataFrame:
+    """What the policies of every condition do, beside the data they learned from: means over the finished seeds.
+
+    Return, share of episodes above 80% of the data's return, and action error in closed loop are those of the last
+    evaluation: as trained, and under no corruption (`clean_`).
+    """
+    names = ["data_return", *CONTROL, *(f"clean_{name}" for name in CONTROL), "path_error"]
+    found = _means(table[table["score"].notna()], names)
+    return _ordered(found, -found["return"])
+
+
+def losses(curves: list[tuple[Row, list[tuple[int, float]]]]) -> pd.DataFrame:
+    """Mean action loss over the pretraining runs of every condition, at most POINTS of the steps that all tell of.
+
+    Args:
+        curves: IDENTITY of each finished pretraining, and its losses by step.
+    """
+    rows = [named | {"step": step, "action_loss": loss} for named, told in curves for step, loss in told]
+    table = pd.DataFrame(rows, columns=[*IDENTITY, "step", "action_loss"])
+    by_step = table.groupby([*CONDITION, "step"], sort=False)["action_loss"].agg(action_loss="mean", seeds="size")
+    found = by_step.reset_index().pipe(_by_condition, "step")
+    seeds = table.groupby(list(CONDITION), sort=False)["seed"].transform("nunique")
+    runs = table.assign(seeds=seeds).drop_duplicates(list(CONDITION))[[*CONDITION, "seeds"]]
+    found = found.merge(runs, on=[*CONDITION, "seeds"])  # steps of which all runs tell
+    parts: list[Any] = [_thinned(part) for _, part in found.groupby(list(CONDITION), sort=False)]
+    return pd.concat(parts, ignore_index=True) if parts else found
+
+
+def _thinned(table: pd.DataFrame) -> pd.DataFrame:
+    """At most POINTS rows of a table, the first and the last among them."""
+    return table.iloc[np.linspace(0, len(table) - 1, min(len(table), POINTS)).round().astype(int)]

@@ -17,7 +17,7 @@ from rich.text import Text
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.text import write_text
 from vd4rl_pomdp.report.figures import COLOURS, to_svg
-from vd4rl_pomdp.report.templates import render
+from vd4rl_pomdp.report.render import render
 from vd4rl_pomdp.runs.files import Row, files_below, read_json, write_json
 
 Study = dict[str, Any]

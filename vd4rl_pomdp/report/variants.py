@@ -6,7 +6,7 @@ run has its own config, its encoder's, and the data of both.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Iterable, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from typing import Any
 
 from vd4rl_pomdp.core.settings import LATER, settings_of
@@ -17,9 +17,6 @@ Settings = dict[str, str]
 Parts = tuple[str, str]
 """What differs among all runs of a method, and of the data among those of one setting."""
 
-UNKNOWN = "pretraining"
-"""Key in the settings of a run whose encoder does not say how it was pretrained."""
-_NOT_RECORDED = "not recorded"
 _UNSET = "unset"
 _PRESETS = ("preset", "pretraining preset")
 DATA = ("data", "pretraining data")
@@ -54,11 +51,11 @@ def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Setting
     found |= {OF_CORRUPTION + name: value for name, value in hiding.items()}
     found |= {"format": record["format"]} if "format" in record else {}
     words = {name: _words(value) for name, value in found.items() if name not in _LABELS}
-    if record["stage"] == "finetune" and not card.get("settings"):
-        words[UNKNOWN] = _NOT_RECORDED
     if card.get("seed", record["config"]["seed"]) != record["config"]["seed"]:
         words[ENCODER_SEED] = str(card["seed"])
-    return words | _data(record.get("inputs", {}).get("data"), card.get("data"))
+    data, first = record.get("inputs", {}).get("data"), card.get("data")
+    prints = zip(DATA, (data, "the same" if data and first == data else first), strict=True)
+    return words | {name: value[:8] for name, value in prints if value}
 
 
 def of_corruption(settings: Settings) -> Settings:
@@ -83,12 +80,6 @@ def unlike(one: Settings, other: Settings, names: Collection[str]) -> list[str]:
     return [name for name in found if name in _PRESETS] or found
 
 
-def _data(own: str | None, before: str | None) -> Settings:
-    """Short fingerprints of the sets behind a run, as far as they are recorded."""
-    shown = {"data": own, "pretraining data": "the same" if own and before == own else before}
-    return {name: value[:8] for name, value in shown.items() if value}
-
-
 def _words(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
@@ -97,31 +88,26 @@ def _words(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def of_sets(settings: Sequence[Settings], sets: Sequence[str]) -> dict[str, Settings]:
-    """Settings that go by the set, such as a budget: every run on a set has them so, and those on another otherwise.
+def of_sets(settings: Sequence[Settings], sets: Sequence[str]) -> list[Settings]:
+    """Of each run the settings that go by the set, such as a budget: all runs on a set agree in them, sets differ.
 
     Args:
         settings: of all runs that are looked at together.
         sets: task and quality of each run.
-
-    Returns:
-        By set, its values of these settings.
     """
-    found: dict[str, dict[str, set[str]]] = {}
+    values: dict[str, dict[str, set[str]]] = {}
     for one, place in zip(settings, sets, strict=True):
-        for name in one.keys() - {UNKNOWN, ENCODER_SEED, *DATA}:
-            found.setdefault(name, {}).setdefault(place, set()).add(one[name])
-    own = {
-        name: {place: min(values) for place, values in by_set.items()}
-        for name, by_set in found.items()
-        if all(len(values) == 1 for values in by_set.values()) and len(set().union(*by_set.values())) > 1
-    }
-    return {
-        place: {name: own[name][place] for name in sorted(own) if place in own[name]} for place in dict.fromkeys(sets)
-    }
+        for name in one.keys() - {ENCODER_SEED, *DATA}:
+            values.setdefault(name, {}).setdefault(place, set()).add(one[name])
+    own = [
+        name
+        for name, by_set in values.items()
+        if all(len(found) == 1 for found in by_set.values()) and len(set().union(*by_set.values())) > 1
+    ]
+    return [{name: one[name] for name in sorted(own) if name in one} for one in settings]
 
 
-def differences(settings: list[Settings], brief: bool = True) -> list[str]:
+def differences(settings: Sequence[Settings], brief: bool = True) -> list[str]:
     """What differs among some settings: "max_k 1, steps 20"; nothing for a value that adds nothing.
 
     ENCODER_SEED is told even where it does not differ: no other name says that seeds share an encoder.
@@ -130,40 +116,24 @@ def differences(settings: list[Settings], brief: bool = True) -> list[str]:
         settings: those that count, without what goes by the set.
         brief: whether a preset is named in place of the settings that it decides.
     """
-    known = dict.fromkeys(name for one in settings for name in one)
-    names = [name for name in known if name != ENCODER_SEED and _differs(settings, name)]
+    names = [name for name in dict.fromkeys(name for one in settings for name in one) if name != ENCODER_SEED]
+    columns = {name: [one.get(name, LATER.get(name, _UNSET)) for one in settings] for name in names}
+    columns = {name: column for name, column in columns.items() if len(set(column)) > 1}
     # An option of a chosen part is not there without the part: naming the part says it all.
-    everywhere = [name for name in names if all(_value(one, name) != _UNSET for one in settings)]
-    names = [name for name in names if name in everywhere or not _decided(settings, name, everywhere)]
-    deciding: list[str] = []
-    for preset in _PRESETS if brief else ():
-        if preset in names and not _decided(settings, preset, deciding):
-            deciding.append(preset)
-    names = [name for name in names if name in deciding or not _decided(settings, name, deciding)]
-    values = [{name: _value(one, name) for name in names} | _encoder_seed(one) for one in settings]
-    return [", ".join(f"{k} {v}" for k, v in one.items() if v not in ("", PLAIN.get(k))) for one in values]
+    everywhere = [name for name, column in columns.items() if _UNSET not in column]
+    columns = {name: column for name, column in columns.items() if not _decided(name, columns, everywhere)}
+    presets: list[str] = []
+    for name in _PRESETS if brief else ():
+        if name in columns and not _decided(name, columns, presets):
+            presets.append(name)
+    columns = {name: column for name, column in columns.items() if not _decided(name, columns, presets)}
+    told = [{name: column[i] for name, column in columns.items()} for i in range(len(settings))]
+    for own, one in zip(told, settings, strict=True):
+        own |= {name: value for name, value in one.items() if name == ENCODER_SEED}
+    return [", ".join(f"{name} {value}" for name, value in own.items() if value != PLAIN.get(name)) for own in told]
 
 
-def _encoder_seed(settings: Settings) -> Settings:
-    return {name: value for name, value in settings.items() if name == ENCODER_SEED}
-
-
-def _value(settings: Settings, name: str) -> str:
-    """A value in words; none where an encoder does not say how it was pretrained."""
-    if name in settings:
-        return settings[name]
-    if name in DATA:
-        return _NOT_RECORDED
-    return "" if UNKNOWN in settings or name == UNKNOWN else LATER.get(name, _UNSET)
-
-
-def _differs(settings: list[Settings], name: str) -> bool:
-    values = {_value(one, name) for one in settings}
-    return len(values if name == UNKNOWN else values - {""}) > 1
-
-
-def _decided(settings: list[Settings], name: str, by: Iterable[str]) -> bool:
-    """Whether a setting that differs is the same wherever those of `by` are."""
-    deciding = [tuple(_value(one, other) for other in by) for one in settings]
-    pairs = {(first, _value(one, name)) for first, one in zip(deciding, settings, strict=True)}
-    return len(pairs) == len(set(deciding))
+def _decided(name: str, columns: Mapping[str, list[str]], by: Sequence[str]) -> bool:
+    """Whether a setting has the same value wherever others, of which it is none, have the same."""
+    deciding = list(zip(*(columns[other] for other in by), strict=True)) or [()] * len(columns[name])
+    return name not in by and len(set(zip(deciding, columns[name], strict=True))) == len(set(deciding))

@@ -125,7 +125,7 @@ def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
 
 
 @contextmanager
-def appending(path: Path) -> Iterator[Any]:
+def appending(path: Path) -> Iterator[IO[str]]:
     """A text file to append lines to, which are on the disk when the block ends: a checkpoint may tell of them.
 
     Where the system can, a process that appends to the same file waits.
@@ -134,18 +134,13 @@ def appending(path: Path) -> Iterator[Any]:
         UserError: the system refuses.
     """
     with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
-        _wait_for(file)
+        with suppress(ImportError, OSError):
+            import fcntl  # not on Windows
+
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX)  # not on every file system
         yield file
         file.flush()
         os.fsync(file.fileno())
-
-
-def _wait_for(file: IO[str]) -> None:
-    """Lock an open file until it is closed, unless the system or the file system has no such locks."""
-    with suppress(ImportError, OSError):
-        import fcntl  # not on Windows
-
-        fcntl.flock(file.fileno(), fcntl.LOCK_EX)
 
 
 def synchronise(path: Path) -> None:

@@ -1,4 +1,4 @@
-"""What every training loop needs around its steps: the newest checkpoint, metrics, progress, and an end on a signal."""
+"""The loop that every training shares: restore, count steps, log, save, and end on a signal without losing a step."""
 
 from __future__ import annotations
 
@@ -10,10 +10,9 @@ from torch import Tensor, nn
 
 from vd4rl_pomdp.runs import METRICS_FILE, interrupt
 from vd4rl_pomdp.runs.checkpoint import State
-from vd4rl_pomdp.runs.metrics import Means, MetricsLog
+from vd4rl_pomdp.runs.metrics import Means, MetricsLog, mirrors_of
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.run import RunFolder
-from vd4rl_pomdp.runs.sinks import open_sinks
 
 
 class Learner(Protocol):
@@ -23,24 +22,47 @@ class Learner(Protocol):
     """Steps done."""
 
     def state(self) -> State:
-        """Everything needed to go on to the bit."""
+        """Everything needed to resume to the bit."""
 
     def restore(self, state: State) -> None:
-        """Go on from `state`."""
+        """Resume from `state`."""
 
 
 class Loop:
-    """A learner on its way to its last step; made by `training`."""
+    """The steps that are left of a training; made by `training`.
+
+    for step in loop:
+        loop.add(learner.update())  # which adds one to `learner.step`
+        if loop.due(config.log_every):
+            loop.log("loss")
+    """
 
     def __init__(
         self, run: RunFolder, learner: Learner, means: Means, total: int, log: MetricsLog, progress: ProgressLine
     ) -> None:
         self._run, self._learner, self._means, self._total = run, learner, means, total
         self._log, self._progress = log, progress
+        self._saved = learner.step
+
+    def __iter__(self) -> Iterator[int]:
+        """Number of each step, which the loop's body does; its state is then saved if that is due, or a signal came."""
+        while self._learner.step < self._total:
+            yield self._learner.step + 1
+            self._progress.advance()
+            if self.due(self._run.config["checkpoint_every"]) or interrupt.asked():
+                self.save()
 
     def due(self, every: int) -> bool:
         """Whether the step just done is one of every so many, or the last."""
         return self._learner.step % every == 0 or self._learner.step == self._total
+
+    def save(self) -> None:
+        """Keep the state after the step just done, and end here if a signal asks for it."""
+        step = self._learner.step
+        if step != self._saved:
+            self._run.save(step, {"learner": self._learner.state(), "means": self._means.state_dict()})
+            self._saved = step
+        interrupt.check(f"{self._run.path} keeps step {step}")
 
     def add(self, logs: dict[str, Tensor]) -> None:
         """Count the scalars of the step just done for the next row of metrics."""
@@ -52,37 +74,21 @@ class Loop:
         The numbers named in `shown`, or all, stand in the progress line.
         """
         row = self._means.take() | more
-        self._write(row)
+        self._log.write(self._learner.step, row)
         self.show(**{name: row[name] for name in shown or row})
 
     def log_evaluation(self, row: dict[str, float]) -> None:
         """Write what an evaluation after the step just done gave, by names that begin with `metrics.EVALUATION`."""
-        self._write(row)
-
-    def _write(self, row: dict[str, float]) -> None:
-        self.require_owner()
         self._log.write(self._learner.step, row)
-
-    def require_finite(self, module: nn.Module) -> None:
-        """Raise FloatingPointError if a weight is not finite: what the last step did stands in no row of metrics."""
-        if not all(weights.isfinite().all() for weights in module.parameters()):
-            raise FloatingPointError(f"{self._run.path}: weights are not finite after step {self._learner.step}")
-
-    def require_owner(self) -> None:
-        """Raise an error if another process has taken the run over."""
-        self._run.require_owner()
 
     def show(self, **numbers: float) -> None:
         """Show numbers in the progress line."""
         self._progress.advance(0, **numbers)
 
-    def step_done(self, save: bool) -> None:
-        """Count a step; save a checkpoint if it is time to, or if a signal asks for the end, which then comes."""
-        if save or interrupt.asked():
-            state = {"learner": self._learner.state(), "means": self._means.state_dict()}
-            self._run.save(self._learner.step, state)
-        self._progress.advance()
-        interrupt.check(f"{self._run.path} keeps step {self._learner.step}")
+    def require_finite(self, module: nn.Module) -> None:
+        """Raise FloatingPointError if a weight is not finite: what the last step did stands in no row of metrics."""
+        if not all(weights.isfinite().all() for weights in module.parameters()):
+            raise FloatingPointError(f"{self._run.path}: weights are not finite after step {self._learner.step}")
 
 
 @contextmanager
@@ -114,7 +120,7 @@ def training(
         means.load_state_dict(state["means"])
 
     run.restore(restore)
-    log = MetricsLog(run.path / METRICS_FILE, learner.step, open_sinks(run, labels, card or {}))
+    log = MetricsLog(run.path / METRICS_FILE, learner.step, mirrors_of(run, labels, card or {}))
     with closing(log), ProgressLine(title, total, unit, learner.step) as progress, interrupt.deferred():
         try:
             yield Loop(run, learner, means, total, log, progress)

@@ -10,8 +10,9 @@ from pathlib import Path
 
 from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_error
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
-from vd4rl_pomdp.data.format import PLAN, is_shard, is_shard_name
 from vd4rl_pomdp.runs import CONFIG_FILE
+
+_SET_FILES = (".hdf5", ".h5")
 
 
 def refuse_inside(out: Path) -> None:
@@ -42,16 +43,17 @@ def refuse_foreign(out: Path, what: str, *marks: str) -> None:
 
 
 def kept_in(folder: Path) -> str | None:
-    """What a folder keeps: "a run", "a policy", "an encoder", "a data set", or None for nothing of the kind."""
-    config = folder / CONFIG_FILE
-    if config.is_file():
-        if (folder / "model.safetensors").is_file():
+    """What a folder keeps, by its files: "a run", "a policy", "an encoder", "a data set", or None for nothing."""
+    names = set(_names(folder))
+    if CONFIG_FILE in names:
+        if "model.safetensors" in names:
             return "an encoder"
-        if any((folder / name).exists() for name in ("curve.csv", "snapshots")):
+        if names & {"curve.csv", "snapshots"}:
             return "a policy"
-        if _is_run(config):
+        if _is_run(folder / CONFIG_FILE):
             return "a run"
-    return "a data set" if _is_set(folder) else None
+    is_set = "collection.json" in names or any(name.lower().endswith(_SET_FILES) for name in names)
+    return "a data set" if is_set else None
 
 
 def _is_run(config: Path) -> bool:
@@ -64,17 +66,10 @@ def _is_run(config: Path) -> bool:
     return isinstance(record, dict) and "stage" in record
 
 
-def _is_set(folder: Path) -> bool:
-    if (folder / PLAN).is_file():
-        return True
-    shards = (folder / name for name in _names(folder) if is_shard_name(name))
-    return any(path.is_file() and is_shard(path) for path in shards)
-
-
 def _names(folder: Path) -> list[str]:
     """Names in a folder, without hidden ones; empty if it may not be listed, which writing there then reports."""
     try:
-        return [path.name for path in folder.iterdir() if not path.name.startswith(".")]
+        return [name for name in os.listdir(folder) if not name.startswith(".")]
     except OSError as error:
         if isinstance(told := disk_error(folder, error), UnavailableError):
             raise told from error

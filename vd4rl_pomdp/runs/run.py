@@ -1,7 +1,7 @@
-"""A run is a folder: config.json first, then metrics.jsonl, checkpoints/ and results; the same command continues it.
+"""A run is a folder: config.json first, then metrics.jsonl, checkpoints/ and results; the same command resumes it.
 
-Everything but `timing.json`, `machine.json` and the checkpoint's `manifest.json` is the same whether a run was
-interrupted or not. One process owns the folder at a time.
+Everything but `timing.json`, `machine.json` and the seconds in a checkpoint is the same whether a run was interrupted
+or not. One process owns the folder at a time.
 """
 
 from __future__ import annotations
@@ -16,17 +16,17 @@ from typing import Any, Self
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.registry import code_of, warn_of_other_code
-from vd4rl_pomdp.core.settings import LATER, RUNTIME_FIELDS
-from vd4rl_pomdp.data.format import read_plan
+from vd4rl_pomdp.core.settings import RUNTIME_FIELDS
 from vd4rl_pomdp.runs import CONFIG_FILE, DIVERGED_FILE, EPISODES_FILE, FORMAT, MACHINE_FILE, TIMING_FILE
-from vd4rl_pomdp.runs.checkpoint import Checkpoints, State, fitting, pack, unpack
+from vd4rl_pomdp.runs.checkpoint import Checkpoints, State
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_json
-from vd4rl_pomdp.runs.ownership import Owner, owned
+from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.provenance import CONTINUED, command, git_commit, machine, versions
 
 _CODE = ("versions", "git_commit", "plugins", "sources")
 """What a record tells of the code."""
+_NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
 def remedy(folder: Path) -> str:
@@ -38,7 +38,7 @@ def remedy(folder: Path) -> str:
 
 
 class RunFolder:
-    """A run's files; `with` begins the run or goes on with it, owns its folder meanwhile, and answers signals."""
+    """A run's files; `with` begins or resumes the run, owns its folder meanwhile, and answers signals."""
 
     def __init__(
         self,
@@ -47,7 +47,8 @@ class RunFolder:
         config: Any,
         inputs: dict[str, str],
         results: Sequence[str] = (),
-        parts: Mapping[str, str] = MappingProxyType({}),
+        parts: Mapping[str, str] = _NOTHING,
+        collection: Mapping[str, Any] = _NOTHING,
     ) -> None:
         """Nothing is written yet.
 
@@ -58,6 +59,7 @@ class RunFolder:
             inputs: hashes of what the run reads, by name: the data's fingerprint, the encoder's hash.
             results: files that a finished run holds.
             parts: names of parts that the inputs bring along, by the registries' `setting`: an encoder's corruption.
+            collection: how the data were collected, for the record.
 
         Raises:
             UserError: the folder holds something else, a run with other settings, inputs or of another format, or one
@@ -70,8 +72,7 @@ class RunFolder:
         self._checkpoints = Checkpoints(path)
         self._started, self._before = time.monotonic(), 0.0
         self._stack = ExitStack()
-        self._owner: Owner | None = None
-        self._results = results
+        self._results, self._collection = results, dict(collection)
         self._parts = self.config | parts
         self._check()
 
@@ -83,35 +84,32 @@ class RunFolder:
             if holds_anything(self.path):
                 raise UserError(f"{self.path}: is not empty and holds no run; choose another --out")
             return
-        if stored.get("format", 1) != FORMAT:
+        if stored.get("format") != FORMAT:
             raise UserError(
-                f"{self.path}: holds a run of format {stored.get('format', 1)}, this version writes format {FORMAT} "
-                "and cannot go on with it; choose another --out"
+                f"{self.path}: holds a run of format {stored.get('format')}, this version writes format {FORMAT} "
+                "and cannot resume it; choose another --out"
             )
-        old, inputs = (part if isinstance(part := stored.get(name), dict) else {} for name in ("config", "inputs"))
-        keys = set(self.config) - RUNTIME_FIELDS  # an earlier version recorded options that nothing read, too
-        differing = sorted(k for k in keys if (LATER | old).get(k) != self.config[k])
+        config, inputs = (part if isinstance(part := stored.get(name), dict) else {} for name in ("config", "inputs"))
+        differing = sorted(k for k in self.config.keys() - RUNTIME_FIELDS if config.get(k) != self.config[k])
         if stored["stage"] != self.stage or differing:
             what = ", ".join(differing) or f"stage {stored['stage']}"
             raise UserError(f"{self.path}: holds a run with another config ({what}); choose another --out or remove it")
-        self._check_inputs(inputs)
+        for name, now in self.inputs.items():
+            if inputs.get(name) != now:
+                raise UserError(
+                    f"{self.path}: holds a run with other content of --{name} ({self.config.get(name)} was "
+                    f"{inputs.get(name)} and is {now}); give it what it began with, or choose another --out"
+                )
         lost = next((name for name in self._results if self.finished and not (self.path / name).exists()), None)
         if lost:
             raise UserError(f"{self.path / lost}: is gone; {remedy(self.path)}")
 
-    def _check_inputs(self, old: dict[str, str]) -> None:
-        """Raise UserError if data or encoder are others than those the run began with."""
-        for name, now in self.inputs.items():
-            if old.get(name) != now:
-                raise UserError(
-                    f"{self.path}: holds a run with other content of --{name} ({self.config.get(name)} was "
-                    f"{old.get(name)} and is {now}); give it what it began with, or choose another --out"
-                )
-
     def __enter__(self) -> Self:
-        self._warn_of_other_code()
+        kept = {} if self._begins else read_json(self.path / CONFIG_FILE)
+        what = "this run began, which resumes or counts all the same; remove the run to compute it anew"
+        warn_of_other_code(self.path, kept, self._parts, what)
         if not self.finished:
-            self._owner = self._stack.enter_context(owned(self.path))
+            self._stack.enter_context(owned(self.path))
             try:
                 self._check()  # another process may have begun or ended it since
                 self._begin()
@@ -120,46 +118,32 @@ class RunFolder:
                 raise
         return self
 
-    def _warn_of_other_code(self) -> None:
-        kept = {} if self._begins else read_json(self.path / CONFIG_FILE)
-        what = "this run began, which goes on or counts all the same; remove the run to compute it anew"
-        warn_of_other_code(self.path, kept, self._parts, what)
-
     @property
     def _begins(self) -> bool:
-        """Whether nothing is there that the run could go on with: what was recorded before tells of nothing."""
+        """Whether nothing is there to resume from: what was recorded before tells of nothing."""
         return not (self.finished or self._checkpoints.steps() or (self.path / EPISODES_FILE).exists())
 
     @property
     def code(self) -> dict[str, Any]:
         """What the run began with, once it has: versions, commit, and where parts not of this package come from."""
         record = read_json(self.path / CONFIG_FILE)
-        return {name: record.get(name, {}) for name in _CODE}  # early ones tell of no parts
-
-    def _code_now(self) -> dict[str, Any]:
-        return {"versions": versions(), "git_commit": git_commit()} | code_of(self._parts)
+        return {name: record.get(name, {}) for name in _CODE}
 
     def _begin(self) -> None:
+        """Write what the run begins with, or add to it where what it resumes with is something else."""
+        now = {"versions": versions(), "git_commit": git_commit()} | code_of(self._parts)
+        hardware, path = machine(self.config.get("device", "auto")), self.path / MACHINE_FILE
         if self._begins:
             record = {"format": FORMAT, "stage": self.stage, "config": self.config, "inputs": self.inputs}
-            origin = {"command": command(), "collection": read_plan(Path(self.config["data"]))}
-            write_json(self.path / CONFIG_FILE, record | self._code_now() | origin)
-        (self.path / DIVERGED_FILE).unlink(missing_ok=True)
-        self._keep_machine()
-
-    def _keep_machine(self) -> None:
-        """Record the hardware; of a run that goes on, that and the code where they are others by now."""
-        path, now = self.path / MACHINE_FILE, machine(self.config.get("device", "auto"))
+            write_json(self.path / CONFIG_FILE, record | now | {"command": command(), "collection": self._collection})
         if self._begins or not path.exists():
-            write_json(path, now)
-            return
-        told = read_json(path)
-        parts = told.pop(CONTINUED, [])
-        if not isinstance(parts, list):
-            raise UserError(f"{path}: is damaged ({CONTINUED!r} is no list); remove it and re-run the same command")
-        part, begun = now | self._code_now(), told | self.code
-        if part != (begun | parts[-1] if parts else begun):
-            write_json(path, told | {CONTINUED: [*parts, part]})
+            write_json(path, hardware)
+        else:
+            told = read_json(path)
+            later = told.pop(CONTINUED, [])
+            if (told | self.code | (later[-1] if later else {})) != hardware | now:
+                write_json(path, told | {CONTINUED: [*later, hardware | now]})
+        (self.path / DIVERGED_FILE).unlink(missing_ok=True)
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
@@ -182,34 +166,23 @@ class RunFolder:
         Raises:
             UserError: it does not fit the run, or evaluations are there, which follow a checkpoint, and none is.
         """
-        checkpoint = self._checkpoints.newest()
-        if checkpoint is None and read_episodes(self.path / EPISODES_FILE):
+        seconds = self._checkpoints.restore(take)
+        if seconds is None and read_episodes(self.path / EPISODES_FILE):
             raise UserError(
                 f"{self.path}: has evaluations, but the checkpoints that they were made after are gone: put them back, "
                 "or remove the folder to start the run again"
             )
-        if checkpoint is not None:
-            self._before = checkpoint.seconds
-            with fitting(checkpoint):
-                take(unpack(checkpoint.files))
+        self._before = seconds or 0.0
 
     def save(self, step: int, state: State) -> None:
         """Keep the state after a step as the newest checkpoint."""
-        self.require_owner()
-        self._checkpoints.add(step, pack(state), self.seconds)
-
-    def require_owner(self) -> None:
-        """Raise an error if another process has taken the run over; see `Owner.check`."""
-        assert self._owner is not None, "a run is written inside its `with` block"
-        self._owner.check()
+        self._checkpoints.add(step, state, self.seconds)
 
     def mark_diverged(self, step: int, message: str) -> None:
-        """Say that a number was no longer finite after `step`; going on with the run takes the mark away."""
-        self.require_owner()
+        """Say that a number was no longer finite after `step`; resuming the run takes the mark away."""
         write_json(self.path / DIVERGED_FILE, {"step": step, "message": message})
 
     def finish(self, **more: Any) -> None:
         """Mark the run as done, keeping its wall-clock seconds and the last checkpoint."""
-        self.require_owner()
         self._checkpoints.prune(1)
         write_json(self.path / TIMING_FILE, {"seconds": round(self.seconds, 2)} | more)

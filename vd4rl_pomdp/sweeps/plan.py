@@ -384,7 +384,7 @@ def _adds_the_same(run: FoundRun) -> bool:
 
 @cache
 def _images_in(source: str) -> str:
-    from vd4rl_pomdp.studies.navigation.exogenous import source_fingerprint
+    from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
 
     return source_fingerprint(source)
 

@@ -70,7 +70,7 @@ def _made(section: str, items: tuple[tuple[str, Any], ...]) -> Any:
     if section == "collect":
         return _collection(kind, settings, {"task": None, "quality": None, "out": Path()})
     if section == "navigation_collect":
-        from vd4rl_pomdp.studies.navigation.sets import PRESETS
+        from vd4rl_pomdp.studies.navigation.collect import PRESETS
 
         preset = settings.get("preset", "paper")
         refuse_unknown("preset", preset, PRESETS)
@@ -94,9 +94,9 @@ def _config_class(section: str) -> Any:
         from finetune.config import FinetuneConfig
 
         return FinetuneConfig
-    from vd4rl_pomdp.studies.navigation import config, sets
+    from vd4rl_pomdp.studies.navigation import collect, config
 
-    return sets.MazeCollectConfig if section == "navigation_collect" else config.NavigationConfig
+    return collect.MazeCollectConfig if section == "navigation_collect" else config.NavigationConfig
 
 
 def _collection(kind: Any, settings: Values, defaults: Values) -> Any:

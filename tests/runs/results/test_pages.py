@@ -13,9 +13,8 @@ import numpy as np
 import pytest
 
 from vd4rl_pomdp.report.gates import episodes_of
-from vd4rl_pomdp.report.layout import with_interval
 from vd4rl_pomdp.report.load import load_runs
-from vd4rl_pomdp.report.stats import difference_interval, mean_interval
+from vd4rl_pomdp.report.stats import difference_interval, mean_interval, with_interval
 from vd4rl_pomdp.studies.navigation.measures import online_error, refitted_error
 from vd4rl_pomdp.studies.navigation.report import write_report
 
@@ -59,7 +58,7 @@ def of_returns(folders: Iterable[str]) -> Iterator[str]:
     groups = defaultdict(lambda: defaultdict(list))
     for run in load_runs([ROOT / "results" / name for name in folders]):
         if run.rows and run.finished:
-            kind = run.labels["corruption"], run.labels["algorithm"], run.labels["method"], run.variant
+            kind = run.labels["corruption"], run.labels["algorithm"], run.method, run.variant
             groups[run.set_name][kind].append(run)
             yield told(estimate(row["return"] for row in run.last), 0)
     for methods in groups.values():
@@ -73,8 +72,8 @@ def of_shifts() -> Iterator[str]:
     runs = [run for name in ("control", "control/budget") for run in load_runs([ROOT / "results" / name])]
     groups = defaultdict(list)
     for run in runs:
-        if run.set_name == "walker_walk expert_noisy" and run.labels["method"] in ("acro", "acro_shifted"):
-            groups[run.labels["corruption"], run.labels["method"], run.variant].append(run)
+        if run.set_name == "walker_walk expert_noisy" and run.method in ("acro", "acro_shifted"):
+            groups[run.labels["corruption"], run.method, run.variant].append(run)
     return intervals([episodes_of(mine) for mine in groups.values()])
 
 
@@ -88,13 +87,14 @@ def intervals(returns: list[np.ndarray]) -> Iterator[str]:
 
 def of_mazes(script: ModuleType) -> Iterator[str]:
     """Of the pages' measures in every maze; differences only between settings of one method in one maze."""
-    groups = defaultdict(lambda: defaultdict(list))
+    numbers = script.numbers_in()
+    conditions = defaultdict(set)
     for run in script.main_runs():
-        groups[run.condition.maze, run.condition.method][run.condition].append(run)
-    for conditions, measure in itertools.product(groups.values(), MEASURES):
-        numbers = [script.entry_of(condition, measure, mine).numbers for condition, mine in conditions.items()]
+        conditions[run.condition.maze, run.condition.method].add(run.condition)
+    for mine, measure in itertools.product(conditions.values(), MEASURES):
+        found = [script.values(numbers, condition, measure) for condition in sorted(mine)]
         for digits in (1, 2):
-            yield from with_differences(map(estimate, numbers), digits)
+            yield from with_differences(map(estimate, found), digits)
 
 
 @pytest.fixture(scope="module")

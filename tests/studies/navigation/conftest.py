@@ -3,8 +3,7 @@ from pathlib import Path
 
 import pytest
 
-from vd4rl_pomdp.studies.navigation.collect import collect
-from vd4rl_pomdp.studies.navigation.sets import PRESETS
+from vd4rl_pomdp.studies.navigation.collect import PRESETS, collect
 
 
 @pytest.fixture(scope="session")

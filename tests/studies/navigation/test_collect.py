@@ -12,8 +12,7 @@ from vd4rl_pomdp.data import open_dataset, shards
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.envs.maze import MazeEnv
 from vd4rl_pomdp.envs.mazes import MAZES
-from vd4rl_pomdp.studies.navigation.collect import _explore, _Job, _roll_out, collect
-from vd4rl_pomdp.studies.navigation.sets import PRESETS, MazeCollectConfig
+from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig, _explore, _Job, _roll_out, collect
 
 
 def small(out: Path, **changes: object) -> MazeCollectConfig:

@@ -11,9 +11,8 @@ from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
-from vd4rl_pomdp.studies.navigation.data import MazeData, open_data
-from vd4rl_pomdp.studies.navigation.methods import METHOD_NAMES, OBJECTIVES
-from vd4rl_pomdp.studies.navigation.observations import open_maze_set
+from vd4rl_pomdp.studies.navigation.data import MazeData, open_data, open_maze_set
+from vd4rl_pomdp.studies.navigation.measures import METHOD_NAMES, OBJECTIVES
 from vd4rl_pomdp.studies.navigation.probe import ErrorSums, StateProbe, refit
 from vd4rl_pomdp.studies.navigation.probed import ProbedObjective, learning_rate, make_trainer
 from vd4rl_pomdp.studies.navigation.train import train
@@ -225,7 +224,7 @@ def test_the_learning_rate_rises_then_falls():
 
 
 def test_noise_is_added_to_what_the_model_sees(maze_set, tmp_path):
-    from vd4rl_pomdp.studies.navigation.exogenous import ExogenousNoise
+    from vd4rl_pomdp.studies.navigation.pictures import ExogenousNoise
 
     noise = ExogenousNoise("photographs", 0.5, 0)
     for picture, shape in (("grey50", (1, 50, 50)), ("rgb50", (3, 50, 50)), ("rgb100", (3, 100, 100))):

@@ -8,49 +8,75 @@ resumes an interrupted collection and ends in the same files.
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+import torch
 
 from vd4rl_pomdp.core.errors import MAX_SEED, MOST_ROWS, refuse_outside
 from vd4rl_pomdp.core.seeding import episode_seed
 from vd4rl_pomdp.core.tasks import MOST_EPISODES
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
-from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, Style, check_maze, get_maze
+from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MAZES, MOST_STEPS, Style, check_maze, get_maze
 from vd4rl_pomdp.runs.files import jsonable
-from vd4rl_pomdp.runs.memory import CPU, require_memory
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.provenance import versions
-from vd4rl_pomdp.studies.navigation.sets import MazeCollectConfig
+from vd4rl_pomdp.studies.navigation.pictures import TEXTURES, ExogenousNoise, to_grey50
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.envs.maze import MazeEnv
 
 _RUNTIME_FIELDS = ("out", "workers", "preset")
+SAMPLES = 6
+"""Sample observations of a maze."""
+_FIRST_SAMPLE, _SAMPLE_STEP = 20, 12
 
 
 @dataclass(frozen=True)
-class _Job:
-    """One trajectory to roll out."""
+class MazeCollectConfig:
+    """Settings of `vd4rl-pomdp navigation collect`."""
 
     maze: str
-    trajectory: int
-    seed: int
-    rows: int
-    action_repeat: int
+    """no_curtain, one_curtain, three_curtains or first_person; compass_first_person; or one of the four after hard_."""
+    out: Path
+    """Folder of the set."""
+    preset: str = "paper"
+    """paper, cpu or smoke: the defaults of all other settings."""
+    trajectories: int = 500
+    """Trajectories in all; the last tenth is held out from training."""
+    trajectory_rows: int = 1000
+    """Rows of each trajectory."""
+    action_repeat: int = ACTION_REPEAT
+    """Simulator steps of 0.01 s for one action."""
+    seed: int = 0
+    """Seed of starts, goals and what is random about actions."""
+    workers: int = 0
+    """Processes that simulate and draw; 0 uses every core."""
+    trajectories_per_shard: int = 5
+    """Trajectories in a shard."""
+
+
+_CPU = MazeCollectConfig("", Path(), preset="cpu", trajectories=100)
+PRESETS = {
+    "paper": MazeCollectConfig("", Path()),
+    "cpu": _CPU,
+    "smoke": replace(_CPU, preset="smoke", trajectories=10, trajectory_rows=120),
+}
+"""Defaults by preset: 500k rows as in the paper, 100k, and 1,200 rows."""
 
 
 def collect(config: MazeCollectConfig) -> list[Path]:
     """Collect the set, or what is missing of it; returns its shards."""
     check_config(config)
     refuse_inside(config.out)
+    shape = config.seed, config.trajectory_rows, config.action_repeat
     shards = [
-        Shard(path, [_job(config, i) for i in trajectories], _attributes(config))
+        Shard(path, [_Job(config.maze, i, *shape) for i in trajectories], _attributes(config))
         for path, trajectories in _plan(config)
     ]
     with owned(config.out):
@@ -65,12 +91,6 @@ def collection(config: MazeCollectConfig) -> dict[str, Any]:
     return {name: value for name, value in jsonable(asdict(config)).items() if name not in _RUNTIME_FIELDS}
 
 
-def drive(maze: str, rows: int) -> Columns:
-    """Rows of the first trajectory of seed 0, by key, without writing anything."""
-    check_maze(maze)
-    return _roll_out(_Job(maze, 0, 0, rows, ACTION_REPEAT))
-
-
 def check_config(config: MazeCollectConfig) -> None:
     """Raise UserError for settings that make no set."""
     check_maze(config.maze)
@@ -78,8 +98,6 @@ def check_config(config: MazeCollectConfig) -> None:
         config, trajectories=(1, MOST_EPISODES), trajectory_rows=(2, MOST_ROWS), action_repeat=(1, MOST_STEPS),
         seed=(0, MAX_SEED), trajectories_per_shard=1, workers=0,
     )  # fmt: skip
-    rows = config.trajectory_rows * min(config.trajectories, config.trajectories_per_shard)
-    require_memory(rows * 3 * PICTURE_SIZE**2, CPU, config, "trajectory_rows", "trajectories_per_shard")
 
 
 def _plan(config: MazeCollectConfig) -> Iterator[tuple[Path, range]]:
@@ -89,8 +107,15 @@ def _plan(config: MazeCollectConfig) -> Iterator[tuple[Path, range]]:
         yield config.out / f"{number}_{config.maze}.hdf5", range(start, stop)
 
 
-def _job(config: MazeCollectConfig, trajectory: int) -> _Job:
-    return _Job(config.maze, trajectory, config.seed, config.trajectory_rows, config.action_repeat)
+@dataclass(frozen=True)
+class _Job:
+    """One trajectory to roll out."""
+
+    maze: str
+    trajectory: int
+    seed: int
+    rows: int
+    action_repeat: int
 
 
 def _roll_out(job: _Job) -> Columns:
@@ -132,8 +157,7 @@ def _explore(action: np.ndarray, style: Style, rng: np.random.Generator) -> np.n
 
 def _controller(env: MazeEnv, rng: np.random.Generator) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """What drives: the action for a state and a goal."""
-    from vd4rl_pomdp.studies.navigation.first_person import FirstPersonController
-    from vd4rl_pomdp.studies.navigation.planner import Planner, WaypointPlanner
+    from vd4rl_pomdp.studies.navigation.drivers import FirstPersonController, Planner, WaypointPlanner
 
     if env.maze_spec.first_person:
         return FirstPersonController(env).act
@@ -162,3 +186,19 @@ def _attributes(config: MazeCollectConfig) -> dict[str, Any]:
         "random_share": style.random_share,
         "versions": {k: v for k, v in versions().items() if k in packages},
     }
+
+
+def sample_observations() -> dict[str, np.ndarray]:
+    """Pictures along a drive through every maze, then of one in grey and with exogenous noise.
+
+    Returns:
+        (SAMPLES, 3, H, W) uint8 by name.
+    """
+    rows = _FIRST_SAMPLE + _SAMPLE_STEP * (SAMPLES - 1) + 1
+    drives = {maze: _roll_out(_Job(maze, 0, 0, rows, ACTION_REPEAT)) for maze in MAZES}
+    samples = {maze: drive["observation"][_FIRST_SAMPLE::_SAMPLE_STEP] for maze, drive in drives.items()}
+    pictures = torch.from_numpy(samples["three_curtains"])
+    noise = ExogenousNoise(TEXTURES, 0.5, 0)
+    samples["three_curtains, grey50"] = to_grey50(pictures).expand(-1, 3, -1, -1).numpy()
+    samples[f"three_curtains, exogenous {TEXTURES}"] = noise(pictures, torch.arange(len(pictures))).numpy()
+    return samples

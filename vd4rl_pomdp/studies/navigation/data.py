@@ -1,20 +1,79 @@
-"""A maze's set as the model sees it: windows of observations with the true states of their rows."""
+"""A maze's set as a model sees it: windows of pictures with the true states of their rows.
+
+Exogenous noise may be added to the pictures; the small presets see a quarter of their pixels, in grey.
+"""
 
 from __future__ import annotations
+
+from pathlib import Path
 
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.types import Windows
-from vd4rl_pomdp.data import Dataset, View
-from vd4rl_pomdp.envs.mazes import MazeSpec
+from vd4rl_pomdp.data import Dataset, View, open_dataset
+from vd4rl_pomdp.envs.mazes import MAZES, PICTURE_SIZE, MazeSpec
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, NoiseOptions
-from vd4rl_pomdp.studies.navigation.exogenous import ExogenousNoise
-from vd4rl_pomdp.studies.navigation.observations import MazeView, open_maze_set
+from vd4rl_pomdp.studies.navigation.pictures import SHAPES, ExogenousNoise, Picture, to_grey50, to_rgb50
 from vd4rl_pomdp.studies.navigation.probe import TrueStates
 
+_BLOCK = 1000
 HELD_OUT = 10
 """One in this many trajectories, the last ones, is never trained on."""
+
+
+def open_maze_set(path: Path, cache: Path | None = None) -> tuple[Dataset, MazeSpec]:
+    """A set of maze data and its maze; raises UserError if it is of something else or holds no true states."""
+    dataset = open_dataset(path, cache)
+    attributes = dataset.store.meta["attributes"]
+    names = {stored.get("task") for stored in attributes}
+    for wrong, what in (
+        (len(names) != 1 or not names <= set(MAZES), "names no maze"),
+        (dataset.frame_size != PICTURE_SIZE, f"has frames of {dataset.frame_size} pixels, mazes of {PICTURE_SIZE}"),
+        (dataset.physics is None, "holds no true states ('physics'), which the probe needs"),
+    ):
+        if wrong:
+            raise UserError(f"{path}: {what}; collect a set with `vd4rl-pomdp navigation collect`")
+    check_trajectories(dataset.num_episodes, str(path))
+    if (rows := dataset.episode_end - dataset.episode_start).min() < 2:
+        raise UserError(
+            f"{path}: trajectory {int(rows.argmin())} is a single row, without a step; take it out of the set, or "
+            "collect the set again"
+        )
+    return dataset, MAZES[names.pop()]
+
+
+def check_trajectories(number: int, where: str) -> None:
+    """Raise UserError for a set of so few trajectories that none can be held out."""
+    if number < 2:
+        raise UserError(f"{where}: a single trajectory leaves none to be held out; collect more --trajectories")
+
+
+class MazeView(View):
+    """A maze's set as a model sees it: one picture a row, with the exogenous noise of its key."""
+
+    def __init__(self, dataset: Dataset, noise: ExogenousNoise | None) -> None:
+        super().__init__(dataset, frame_stack=1)
+        self._noise = noise
+
+    def observe(self, rows: Tensor, shift_key: Tensor | None = None) -> Tensor:
+        """Observations (N, ..., 3, 100, 100) uint8 of (N, ...) int64 rows."""
+        pictures = super().observe(rows, shift_key)
+        if self._noise is None:
+            return pictures
+        noisy = self._noise(pictures.flatten(0, -4), self.dataset.keys(rows).flatten())
+        return noisy.view(pictures.shape)
+
+    def shrunk(self, picture: Picture) -> View:
+        """The same at 50x50, drawn once for all: training then never touches the large pictures."""
+        channels, size = SHAPES[picture]
+        shrink = to_grey50 if channels == 1 else to_rgb50
+        small = torch.empty(self.dataset.num_rows, channels, size, size, dtype=torch.uint8)
+        for rows in torch.arange(self.dataset.num_rows).split(_BLOCK):
+            small[rows] = shrink(self.observe(rows))
+        self.dataset.frames = small
+        return View(self.dataset, frame_stack=1)
 
 
 def open_data(config: NavigationConfig) -> MazeData:

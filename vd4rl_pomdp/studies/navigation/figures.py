@@ -1,4 +1,4 @@
-"""Pictures of the navigation report: accuracy bars, trajectories over the maze, and what a model is shown."""
+"""Pictures of the navigation study: accuracy bars, trajectories over the maze, what a model is shown, and a film."""
 
 from __future__ import annotations
 
@@ -7,16 +7,24 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
 from matplotlib.patches import Rectangle
+from PIL import Image, ImageDraw
 
-from vd4rl_pomdp.envs.mazes import FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
-from vd4rl_pomdp.studies.navigation.claims import paper_number
-from vd4rl_pomdp.studies.navigation.grid import Condition, condition_of, paper_rows
-from vd4rl_pomdp.studies.navigation.measures import Measure
-from vd4rl_pomdp.studies.navigation.methods import OBJECTIVES, REFERENCES
-from vd4rl_pomdp.studies.navigation.runs import NavigationRun, is_missing, read_trajectory
+from vd4rl_pomdp.envs.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, MAZES, MazeSpec
+from vd4rl_pomdp.studies.navigation.measures import (
+    OBJECTIVES,
+    REFERENCES,
+    Condition,
+    Measure,
+    condition_of,
+    paper_number,
+    paper_rows,
+)
+from vd4rl_pomdp.studies.navigation.runs import NavigationRun, numbers_of, read_trajectory
+from vd4rl_pomdp.studies.navigation.tables import conditions_of, is_missing
 
 _ESTIMATE = "#d55e00"
 _VARIANTS = {
@@ -31,118 +39,113 @@ _OFFSETS, _WIDTH = (-0.27, 0.0, 0.27), 0.25
 _SEED: dict[str, Any] = {"color": "black", "linestyle": "", "marker": ".", "markersize": 3}
 _MARK: dict[str, Any] = {"color": "#e69f00", "linestyle": "", "marker": "_", "markersize": 9, "markeredgewidth": 2.5}
 _NO_RUN: dict[str, Any] = {"color": "#999999", "linestyle": "", "marker": "x", "markersize": 4}
+SIDE, HEAD = 240, 22
+"""Of a film, pixels of a panel's maze, and of the line above it."""
+_FINE = 2
+_SHOWN = 1.75
+"""How far from the centre is shown: the free cells, and some of the walls around them."""
+_MILLISECONDS = 80
+"""Of a frame: a little slower than the mass is."""
+_WALL, _FLOOR, _PAPER, _INK = (228, 201, 168), (58, 82, 110), (255, 255, 255), (30, 30, 30)
+_CURTAIN, _TRUE, _RING = (200, 140, 85, 165), (90, 200, 90), (255, 90, 0)
 
 
-def accuracy_bars(runs: list[NavigationRun], measure: Measure, path: Path) -> None:
+def accuracy_bars(frame: pd.DataFrame, measure: Measure, path: Path) -> bool:
     """State prediction accuracy, 100 - error, of every objective and maze, as in the paper's bar plot.
 
-    A panel for each maze whose runs have the measure. The paper's marks stand beside raw units alone. What a maze lacks
-    and the paper, another maze or the references have is crossed.
+    A panel for each maze whose runs have the measure; False, and no file, if none has. The paper's marks stand beside
+    raw units alone. What a maze lacks and the paper, another maze or the references have is crossed.
     """
-    mazes = [maze for maze in MAZES if any(run.condition.maze == maze and measure in run.values for run in runs)]
-    columns = min(2, len(mazes))
+    shown = frame[(frame[list(Measure._fields)] == list(measure)).all(axis=1)]
+    mazes = [maze for maze in MAZES if maze in set(shown["maze"])]
+    if not mazes:
+        return False
+    numbers, columns, methods = numbers_of(shown), min(2, len(mazes)), [*OBJECTIVES, *REFERENCES]
     rows = -(-len(mazes) // columns)
     figure = Figure(figsize=(1 + 5.2 * columns, 0.8 + 2.9 * rows), layout="constrained")
     panels = figure.subplots(rows, columns, sharey=True, squeeze=False)
-    methods = [*OBJECTIVES, *REFERENCES]
+    expected = _expected(frame, mazes)
     for axes in panels.flat[len(mazes) :]:
         axes.set_axis_off()
     for axes, maze in zip(panels.flat, mazes, strict=False):
         for place, method in enumerate(methods):
             for offset, (max_k, self_prediction, colour) in zip(_OFFSETS, _VARIANTS.values(), strict=True):
-                _bar(axes, place + offset, Condition(maze, method, max_k, self_prediction), runs, measure, colour)
+                condition, at = Condition(maze, method, max_k, self_prediction), place + offset
+                if accuracy := [100 - error for error in numbers.get((*condition, *measure), {}).values()]:
+                    axes.bar(at, np.mean(accuracy), _WIDTH, color=colour)
+                    axes.plot([at] * len(accuracy), accuracy, **_SEED)
+                elif condition in expected:
+                    axes.plot(at, 2, **_NO_RUN)
+                if (paper := paper_number(condition, measure)) is not None:
+                    axes.plot(at, 100 - paper, **_MARK)
         axes.set_title(maze, fontsize=10)
         axes.set_xticks(range(len(methods)), methods, rotation=40, ha="right", fontsize=8)
         axes.spines[["top", "right"]].set_visible(False)
         axes.set_xlim(-0.6, len(methods) - 0.4)
-    panels[0, 0].set_ylim(min(0.0, *(100 - run.values[measure] for run in runs if measure in run.values)), 100)
+    panels[0, 0].set_ylim(min(0.0, 100 - shown["value"].max()), 100)
     for axes in panels[:, 0]:
         axes.set_ylabel(f"100 - state error ({'raw x 100' if measure.is_raw else '% of std'})")
     handles: list[Any] = [Rectangle((0, 0), 1, 1, color=colour) for *_, colour in _VARIANTS.values()]
     marks = {"a seed": _SEED, **({"the paper": _MARK} if measure.is_raw else {}), "no run": _NO_RUN}
     handles += [Line2D([], [], **style) for style in marks.values()]
-    names = [*_VARIANTS, *marks]
-    figure.legend(handles, names, loc="outside upper center", ncols=3 if columns == 1 else 6, frameon=False)
+    legend: dict[str, Any] = {"loc": "outside upper center", "ncols": 3 if columns == 1 else 6, "frameon": False}
+    figure.legend(handles, [*_VARIANTS, *marks], **legend)
     figure.savefig(path, dpi=130, metadata={"Software": None})
+    return True
 
 
-def _bar(
-    axes: Any, place: float, condition: Condition, runs: list[NavigationRun], measure: Measure, colour: str
-) -> None:
-    accuracy = [100 - run.values[measure] for run in runs if run.condition == condition and measure in run.values]
-    if accuracy:
-        axes.bar(place, np.mean(accuracy), _WIDTH, color=colour)
-        axes.plot([place] * len(accuracy), accuracy, **_SEED)
-    elif is_missing(condition, runs) or _in_the_paper(condition) or _is_reference(condition):
-        axes.plot(place, 2, **_NO_RUN)
-    paper = paper_number(condition, measure)
-    if paper is not None:
-        axes.plot(place, 100 - paper, **_MARK)
-
-
-def _in_the_paper(condition: Condition) -> bool:
-    """Whether the paper's tables have it."""
-    return condition in {condition_of(row, condition.maze) for row in paper_rows()}
-
-
-def _is_reference(condition: Condition) -> bool:
-    """Whether it is a reference at its only K, which every maze is held against."""
-    return condition == Condition(condition.maze, condition.method) and condition.method in REFERENCES
+def _expected(frame: pd.DataFrame, mazes: list[str]) -> set[Condition]:
+    """Conditions of some mazes that the paper, another maze, or a table of references has."""
+    trained = conditions_of(frame)
+    told = {condition_of(row, maze) for row in paper_rows() for maze in mazes}
+    told |= {Condition(maze, method) for method in REFERENCES for maze in mazes}
+    elsewhere = (condition._replace(maze=maze) for condition in trained for maze in mazes)
+    return told | {condition for condition in elsewhere if is_missing(condition, trained)}
 
 
 def trajectories(runs: list[NavigationRun], path: Path) -> bool:
     """A held-out trajectory over the maze with the refitted probe's estimates; False if no run has one."""
-    chosen = [_first(runs, Condition(maze, method)) for maze in MAZES for method in _DRIVEN]
-    found = [run for run in chosen if run is not None]
-    if not found:
+    found: dict[Condition, Path] = {}
+    for run in runs:
+        if run.trajectory is not None and run.condition == Condition(run.condition.maze, run.condition.method):
+            found.setdefault(run.condition, run.trajectory)
+    methods = [method for method in _DRIVEN if any(condition.method == method for condition in found)]
+    mazes = [maze for maze in MAZES if any(Condition(maze, method) in found for method in methods)]
+    if not mazes:
         return False
-    mazes = [maze for maze in MAZES if any(run.condition.maze == maze for run in found)]
-    methods = tuple(method for method in _DRIVEN if any(run.condition.method == method for run in found))
     figure = Figure(figsize=(3.2 * len(methods), 3.3 * len(mazes)), layout="constrained")
     panels = figure.subplots(len(mazes), len(methods), squeeze=False)
     for maze, row in zip(mazes, panels, strict=True):
         for method, axes in zip(methods, row, strict=True):
             axes.set_axis_off()
-            run = _first(found, Condition(maze, method))
-            if run is not None:
-                _draw_trajectory(axes, run)
+            if trajectory := found.get(Condition(maze, method)):
+                _draw_trajectory(axes, MAZES[maze], read_trajectory(trajectory))
+                axes.set_title(f"{maze}: {method}", fontsize=9)
             else:
                 axes.text(0.5, 0.5, f"{maze}: {method}\nno run", ha="center", va="center", transform=axes.transAxes)
     figure.savefig(path, dpi=120, metadata={"Software": None})
     return True
 
 
-def _first(runs: list[NavigationRun], condition: Condition) -> NavigationRun | None:
-    return next((run for run in runs if run.condition == condition and run.trajectory is not None), None)
-
-
-def _draw_trajectory(axes: Any, run: NavigationRun) -> None:
-    assert run.trajectory is not None
-    table = read_trajectory(run.trajectory)
-    draw_maze(axes, MAZES[run.condition.maze])
-    for names, colour, label in ((("x", "y"), "black", "true"), (("estimated_x", "estimated_y"), _ESTIMATE, "probe")):
-        axes.plot(
-            *(table[name][:_DRIVEN_ROWS] for name in names), color=colour, lw=1, marker=".", markersize=2.5, label=label
-        )
-    axes.set_title(f"{run.condition.maze}: {run.condition.method}", fontsize=9)
-    axes.legend(fontsize=7, loc="center left", framealpha=0.9)
-
-
-def draw_maze(axes: Any, maze: MazeSpec) -> None:
-    """Walls, free cells and curtains, seen from the top."""
-    axes.add_patch(Rectangle((-HALF_SIZE, -HALF_SIZE), 2 * HALF_SIZE, 2 * HALF_SIZE, color="#e4c9a8", zorder=0))
+def _draw_trajectory(axes: Any, maze: MazeSpec, table: Mapping[str, np.ndarray]) -> None:
+    """True and estimated places over walls, free cells and curtains, seen from the top."""
+    side = 2 * HALF_SIZE
+    axes.add_patch(Rectangle((-HALF_SIZE, -HALF_SIZE), side, side, color="#e4c9a8", zorder=0))
     for row, column in FREE_CELLS:
         corner = column - HALF_SIZE, HALF_SIZE - row - 1
         axes.add_patch(Rectangle(corner, 1, 1, color="#f7f7f7", zorder=0))
     for curtain in maze.curtains:
-        corner = curtain.center[0] - curtain.half[0], curtain.center[1] - curtain.half[1]
-        axes.add_patch(
-            Rectangle(corner, 2 * curtain.half[0], 2 * curtain.half[1], color="#5b5b78", alpha=0.25, zorder=1)
-        )
+        (x, y), (half_x, half_y) = curtain.center, curtain.half
+        curtained = Rectangle((x - half_x, y - half_y), 2 * half_x, 2 * half_y, color="#5b5b78", alpha=0.25, zorder=1)
+        axes.add_patch(curtained)
     axes.set(xlim=(-HALF_SIZE, HALF_SIZE), ylim=(-HALF_SIZE, HALF_SIZE), aspect="equal")
+    for names, colour, label in ((("x", "y"), "black", "true"), (("estimated_x", "estimated_y"), _ESTIMATE, "probe")):
+        points = [table[name][:_DRIVEN_ROWS] for name in names]
+        axes.plot(*points, color=colour, lw=1, marker=".", markersize=2.5, label=label)
+    axes.legend(fontsize=7, loc="center left", framealpha=0.9)
 
 
-def sample_observations(samples: Mapping[str, np.ndarray], path: Path) -> None:
+def observations(samples: Mapping[str, np.ndarray], path: Path) -> bool:
     """A row of pictures for each name: (n, 3, H, W) uint8, as many for all."""
     columns = max(map(len, samples.values()))
     figure = Figure(figsize=(1.5 * columns + 1.6, 1.55 * len(samples)), layout="constrained")
@@ -153,3 +156,68 @@ def sample_observations(samples: Mapping[str, np.ndarray], path: Path) -> None:
             axes.set(xticks=[], yticks=[])
         row[0].set_ylabel(name.replace(", ", "\n"), fontsize=8)
     figure.savefig(path, dpi=100, metadata={"Software": None})
+    return True
+
+
+def write_film(trajectories: Mapping[str, Path], maze: MazeSpec, path: Path) -> None:
+    """Write an animated GIF with one panel for each name.
+
+    The true mass is a green disc, under curtains as one sees through them here; the estimate is an orange ring.
+
+    Args:
+        trajectories: `trajectory.csv` of runs on that maze, by what to write above them.
+        maze: whose walls and curtains are drawn.
+        path: the file.
+    """
+    tables = {name: read_trajectory(file) for name, file in trajectories.items()}
+    ground = _ground(maze)
+    frames = [
+        _join([_panel(name, table, row, maze, ground) for name, table in tables.items()])
+        for row in range(min(len(table["x"]) for table in tables.values()))
+    ]
+    frames[0].save(path, save_all=True, append_images=frames[1:], duration=_MILLISECONDS, loop=0)
+
+
+def to_pixels(x: float, y: float) -> tuple[float, float]:
+    """Column and row within a panel of a position in the maze."""
+    return (x + _SHOWN) / (2 * _SHOWN) * SIDE, HEAD + (_SHOWN - y) / (2 * _SHOWN) * SIDE
+
+
+def _panel(name: str, table: Mapping[str, np.ndarray], row: int, maze: MazeSpec, ground: Image.Image) -> Image.Image:
+    """One method's maze at one moment."""
+    image = ground.copy()
+    draw = ImageDraw.Draw(image, "RGBA")
+    draw.ellipse(_around(table["x"][row], table["y"][row], BALL_RADIUS), fill=_TRUE)
+    for curtain in maze.curtains:
+        (x, y), (half_x, half_y) = curtain.center, curtain.half
+        corners = to_pixels(x - half_x, y + half_y), to_pixels(x + half_x, y - half_y)
+        draw.rectangle([_FINE * number for corner in corners for number in corner], fill=_CURTAIN)
+    at = table["estimated_x"][row], table["estimated_y"][row]
+    draw.ellipse(_around(*at, BALL_RADIUS), outline=_RING, width=3 * _FINE)
+    small = image.resize((SIDE, SIDE + HEAD), Image.Resampling.LANCZOS)
+    ImageDraw.Draw(small).text((6, 5), f"{name}: mass and estimate", fill=_INK)
+    return small
+
+
+def _ground(maze: MazeSpec) -> Image.Image:
+    """The maze without the mass, finer than it is shown."""
+    image = Image.new("RGB", (SIDE * _FINE, (SIDE + HEAD) * _FINE), _PAPER)
+    draw = ImageDraw.Draw(image)
+    draw.rectangle([0, HEAD * _FINE, SIDE * _FINE, (SIDE + HEAD) * _FINE], fill=_WALL)
+    for row, column in FREE_CELLS:
+        corners = [to_pixels(column - HALF_SIZE + i, HALF_SIZE - row - i) for i in (0, 1)]
+        draw.rectangle([_FINE * number for corner in corners for number in corner], fill=_FLOOR)
+    return image
+
+
+def _around(x: float, y: float, radius: float) -> list[float]:
+    (left, top), (right, bottom) = to_pixels(x - radius, y + radius), to_pixels(x + radius, y - radius)
+    return [_FINE * number for number in (left, top, right, bottom)]
+
+
+def _join(panels: list[Image.Image]) -> Image.Image:
+    """Panels side by side."""
+    joined = Image.new("RGB", (sum(panel.width for panel in panels), panels[0].height), _PAPER)
+    for number, panel in enumerate(panels):
+        joined.paste(panel, (number * panel.width, 0))
+    return joined

@@ -18,8 +18,7 @@ from vd4rl_pomdp.runs.device import autocast
 from vd4rl_pomdp.runs.files import replacing_file
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX, Measure, measure_rows
-from vd4rl_pomdp.studies.navigation.methods import UNTRAINED
+from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX, UNTRAINED, Measure, measure_rows
 from vd4rl_pomdp.studies.navigation.probe import COMPONENTS, ErrorSums, StateProbe, refit
 from vd4rl_pomdp.studies.navigation.probed import ProbedObjective
 

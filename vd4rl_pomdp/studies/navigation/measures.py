@@ -1,12 +1,54 @@
-"""What is measured of a run on a maze: the name of each number, as a run and a report keep it."""
+"""What is measured, and of what: methods, conditions, measures, and the paper's numbers for them.
+
+A number of a run is named by its `Condition`, its seed and its `Measure`; the fields of both are columns of every table
+of runs.
+"""
 
 from __future__ import annotations
 
+import csv
 from collections.abc import Mapping
+from functools import cache
+from pathlib import Path
 from typing import Any, NamedTuple
 
+from vd4rl_pomdp.envs.mazes import PAPER_MAZES
+
+PAPER = Path(__file__).parent / "paper.csv"
+"""The paper's numbers: one line a table row, one column a maze."""
 RAW_PREFIX = "raw_"
 """Before an error's name: it is in the simulator's units x 100, which the paper's numbers seem to be."""
+
+OBJECTIVES = ("no_history", "ah", "ah+a", "fj", "fj+a", "mik", "mik+a")
+UNTRAINED = "random"
+WITH_MEMORY = ("supervised", "supervised+a")
+SUPERVISED = ("supervised_picture", *WITH_MEMORY)
+REFERENCES = (UNTRAINED, *SUPERVISED)
+"""What a table is read against: mik+a's network untrained; no_history's, ah's and ah+a's trained on the true states."""
+METHOD_NAMES = (*OBJECTIVES, *REFERENCES)
+"""The paper's objectives, the floor and the ceilings."""
+
+
+class Condition(NamedTuple):
+    """What all seeds of an experiment share: what a run trains, without its seed and budget."""
+
+    maze: str
+    method: str
+    max_k: int = 15
+    self_prediction: bool = False
+    exogenous: bool = False
+    literal_future: bool = False
+
+    @property
+    def name(self) -> str:
+        """What messages and files call it."""
+        return f"{self.maze}/{self.short}"
+
+    @property
+    def short(self) -> str:
+        """Its name without the maze."""
+        words = {"sp": self.self_prediction, "exo": self.exogenous, "literal": self.literal_future}
+        return "-".join([self.method, f"K{self.max_k}", *(word for word, told in words.items() if told)])
 
 
 class Measure(NamedTuple):
@@ -23,15 +65,6 @@ class Measure(NamedTuple):
     """Rows that count: all, or hidden for those in which a curtain covers the mass."""
     k: int = 0
     """Pairs (t, t+k) that an action loss is over; 0 is the mean over all k, and stands in every error."""
-
-    @property
-    def paper(self) -> str:
-        """What the paper has in its tables under this name: state, position, velocity or action_loss; "" for none."""
-        if self.k or self.rows != "all":
-            return ""
-        if self.measure == "action_loss":
-            return self.measure
-        return self.measure.removeprefix(RAW_PREFIX).removesuffix("_error") if self.is_raw else ""
 
     @property
     def is_raw(self) -> bool:
@@ -61,10 +94,41 @@ def held_out_loss(k: int = 0) -> Measure:
 
 
 def measure_of(row: Mapping[str, Any]) -> Measure:
-    """The measure that a row of results.json or rows.csv is about; raises KeyError, TypeError or ValueError if none."""
+    """The measure that a row of results.json is about; raises KeyError, TypeError or ValueError if none."""
     return Measure(row["measure"], row["split"], row["probe"], row["rows"], int(row["k"]))
 
 
 def measure_rows(values: Mapping[Measure, float]) -> list[dict[str, Any]]:
     """One row for each value: the measure's fields and `value`."""
     return [measure._asdict() | {"value": value} for measure, value in values.items()]
+
+
+@cache
+def paper_rows() -> list[dict[str, str]]:
+    """The paper's tables, line by line."""
+    with PAPER.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def condition_of(row: Mapping[str, str], maze: str) -> Condition:
+    """The condition that a line of the paper's tables is about."""
+    method = row["objective"].lower().replace(" ", "_")
+    return Condition(maze, method, int(row["k_max"]), row["self_prediction"] == "Y", row["exogenous"] == "Y")
+
+
+@cache
+def _paper_numbers() -> dict[tuple[Condition, str], float]:
+    """The paper's number for every condition, and the raw error or action loss that it is one of."""
+    names = {"action_loss": "action_loss"}
+    return {
+        (condition_of(row, maze), names.get(what := row["component"], f"{RAW_PREFIX}{what}_error")): float(row[maze])
+        for row in paper_rows()
+        for maze in PAPER_MAZES
+    }
+
+
+def paper_number(condition: Condition, measure: Measure) -> float | None:
+    """The paper's number for a condition of one of its own mazes and a measure in its units; None for all others."""
+    if measure.k or measure.rows != "all":
+        return None
+    return _paper_numbers().get((condition, measure.measure))

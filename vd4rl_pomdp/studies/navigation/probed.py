@@ -17,8 +17,8 @@ from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.objective import InverseObjective, Objective
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.studies.navigation.data import MazeData
-from vd4rl_pomdp.studies.navigation.methods import SUPERVISED
-from vd4rl_pomdp.studies.navigation.observations import SHAPES
+from vd4rl_pomdp.studies.navigation.measures import SUPERVISED
+from vd4rl_pomdp.studies.navigation.pictures import SHAPES
 from vd4rl_pomdp.studies.navigation.probe import ErrorSums, StateProbe
 
 _SUPERVISED_RATE = 0.5

@@ -1,34 +1,34 @@
-"""Finished navigation runs: read from run folders or results folders, and kept as a results folder."""
+"""Finished navigation runs: read from run and results folders, as one tidy frame, and kept as a results folder."""
 
 from __future__ import annotations
 
 import csv
 import io
 import math
-import shlex
 import shutil
 from collections.abc import Iterable, Sequence
-from dataclasses import asdict, dataclass, fields, replace
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.reading import build, read_bytes
+from vd4rl_pomdp.core.reading import read_bytes
 from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.envs.mazes import MAZES
 from vd4rl_pomdp.runs import TRAJECTORY_FILE
 from vd4rl_pomdp.runs.files import write_csv
 from vd4rl_pomdp.runs.results import Result, find_results, refuse_loss, write_results
-from vd4rl_pomdp.studies.navigation.grid import Condition
-from vd4rl_pomdp.studies.navigation.measures import Measure, measure_of, measure_rows
-from vd4rl_pomdp.studies.navigation.sets import PRESETS
+from vd4rl_pomdp.studies.navigation.collect import PRESETS
+from vd4rl_pomdp.studies.navigation.measures import UNTRAINED, Condition, Measure, measure_of
 
 ROWS, TRAJECTORIES = "rows.csv", "trajectories"
-
-_IDENTITY = (*(field.name for field in fields(Condition)), "preset", "seed")
-_MEASURED = (*Measure._fields, "value")
+KEYS = [*Condition._fields, *Measure._fields]
+"""Columns that name a number; all seeds of it make a mean."""
+COLUMNS = [*Condition._fields, "preset", "seed", *Measure._fields, "value"]
+"""Of the frame of runs, and of rows.csv."""
 _DRAWN = ("x", "y", "estimated_x", "estimated_y")
 """Columns of a trajectory that figures and films draw."""
 
@@ -40,36 +40,53 @@ class NavigationRun:
     result: Result
     """Its files."""
     condition: Condition
-    preset: str
-    seed: int
     values: dict[Measure, float]
-    facts: dict[str, str]
-    """Its provenance: steps, seconds, data, machine, command."""
-    trajectory: Path | None
-    """A held-out trajectory with estimated states."""
+    """To six digits, as a table keeps them."""
 
     @property
-    def identity(self) -> dict[str, Any]:
+    def preset(self) -> str:
+        """The preset that it was trained with."""
+        return self.result.record["config"]["preset"]
+
+    @property
+    def seed(self) -> int:
+        """Its seed."""
+        return self.result.record["config"]["seed"]
+
+    @property
+    def identity(self) -> tuple[Any, ...]:
         """What tells this run from others."""
-        told = {k: int(v) if isinstance(v, bool) else v for k, v in asdict(self.condition).items()}
-        return told | {"preset": self.preset, "seed": self.seed}
+        return (*self.condition, self.preset, self.seed)
 
     @property
-    def collection(self) -> dict[str, Any]:
-        """How its set was made, by setting of `MazeCollectConfig`; {} if nothing whole tells.
+    def command(self) -> str:
+        """The command that trains it."""
+        return self.result.files["results"].get("command", self.result.record["command"])
 
-        Early runs, which do not tell, took their preset's.
+    @property
+    def settings(self) -> dict[str, str]:
+        """Steps, set, and the settings that change results and are no part of its condition.
+
+        Exogenous images are told by their content. What an untrained network does not do is left out.
         """
-        usual = asdict(PRESETS[self.preset])
-        sizes = {name: usual[name] for name in ("trajectories", "trajectory_rows")}
-        told = self.result.record.get("collection", sizes) or {}
-        kept = {name: value for name, value in told.items() if name in usual and type(value) is type(usual[name])}
-        return kept if sizes.keys() <= kept.keys() else {}
+        record, results = self.result.record, self.result.files["results"]
+        told = settings_of(record["config"]) | {"steps": self.result.files["timing"]["steps"], "set": results["set"]}
+        if "exogenous" in record.get("inputs", {}):
+            told["exogenous"] = record["inputs"]["exogenous"]
+        left_out = {"method", "max_k", "literal_future", "preset", "steps" * (self.condition.method == UNTRAINED)}
+        return {name: str(value) for name, value in told.items() if name not in left_out}
 
     @property
     def file_name(self) -> str:
         """Name of its trajectory beside the CSV files."""
         return f"{self.condition.name.replace('/', '-')}-seed{self.seed}.csv"
+
+    @property
+    def trajectory(self) -> Path | None:
+        """A held-out trajectory with estimated states: a run folder has one, a results folder may have it."""
+        folder = self.result.path
+        path = folder / TRAJECTORY_FILE if self.result.folder else folder / TRAJECTORIES / self.file_name
+        return path if path.is_file() else None
 
 
 def read_trajectory(path: Path) -> dict[str, np.ndarray]:
@@ -86,114 +103,89 @@ def read_trajectory(path: Path) -> dict[str, np.ndarray]:
         raise UserError(f"{path}: is no trajectory of a run ({error}); train the run again") from error
 
 
-def flags_of(command: str) -> dict[str, str]:
-    """Flags of a command line by field name: "--max-k 1 --k-embedding" is {"max_k": "1", "k_embedding": "yes"}.
-
-    Numbers are written in one way, so that 1 and 1.0 agree.
-    """
-    flags: dict[str, str] = {}
-    name = ""
-    for word in _split(command):
-        if word.startswith("--"):
-            flag, _, value = word[2:].partition("=")
-            name = flag.replace("-", "_")
-            flags[name] = _number(value) if value else "yes"
-        elif name:
-            flags[name] = _number(word)
-    return flags
-
-
-def _split(command: str) -> list[str]:
-    try:
-        return shlex.split(command)
-    except ValueError as error:
-        raise UserError(f"a run's command is damaged ({error}): {command}") from error
-
-
-def _number(word: str) -> str:
-    try:
-        return f"{float(word):g}"
-    except ValueError:
-        return word
-
-
 def find_navigation(sources: Sequence[Path], but: Path | None = None) -> list[Result]:
     """Runs of `navigation train` at or below some paths, finished or not; `but` and errors as in `find_results`."""
     return [result for result in find_results(sources, but) if result.record["stage"] == "navigation"]
 
 
-def load_runs(results: Sequence[Result]) -> list[NavigationRun]:
+def load_runs(results: Iterable[Result]) -> list[NavigationRun]:
     """The finished ones among some runs, in order.
 
     Raises:
         UserError: none is finished, one is damaged, two results are of the same run, seeds of one condition differ in
             their steps, data or settings, or a value is not finite.
     """
-    runs: dict[tuple[Any, ...], NavigationRun] = {}
-    for run in (_read_run(result) for result in results if result.finished):
-        other = runs.setdefault(tuple(run.identity.values()), run)
-        if other is not run:
-            places = f"{other.result.path} and {run.result.path}"
-            raise UserError(f"{places}: {run.condition.name} seed {run.seed} is there twice; keep one")
+    runs = sorted((_read_run(result) for result in results if result.finished), key=lambda run: run.identity)
     if not runs:
         raise UserError("no finished run of `vd4rl-pomdp navigation train` is there; name folders of some")
-    presets = sorted({run.preset for run in runs.values()})
+    presets = sorted({run.preset for run in runs})
     if len(presets) > 1:
         raise UserError(f"runs of different presets ({', '.join(presets)}) do not make one table; report them apart")
-    _refuse_mixtures(runs.values())
-    return sorted(runs.values(), key=lambda run: tuple(run.identity.values()))
-
-
-def comparable(runs: Sequence[NavigationRun]) -> list[dict[str, str]]:
-    """Steps, data, and the settings that change results and are no part of a condition, run by run.
-
-    Those of their configs if all have whole ones. The flags of their commands else: early runs kept no more, and a
-    setting that none names is "the preset's". Exogenous images are told by their content, where it is known.
-    """
-    whole = all("format" in run.result.record for run in runs)
-    told = [run.result.record["config"] if whole else flags_of(run.facts["command"]) for run in runs]
-    names = {} if whole else dict.fromkeys((name for one in told for name in one), "the preset's")
-    found = [{name: str(value) for name, value in settings_of(names | one).items()} for one in told]
-    told_apart = {"method", "max_k", "literal_future", "preset"}
-    facts = [{name: run.facts[name] for name in ("steps", "set")} | _images(run) for run in runs]
-    return [
-        {k: v for k, v in one.items() if k not in told_apart} | fact for one, fact in zip(found, facts, strict=True)
-    ]
-
-
-def _images(run: NavigationRun) -> dict[str, str]:
-    inputs = run.result.record.get("inputs", {})
-    return {"exogenous": inputs["exogenous"]} if "exogenous" in inputs else {}
-
-
-def is_missing(condition: Condition, runs: Iterable[NavigationRun]) -> bool:
-    """Whether a condition has no run, although its maze has runs and the same condition has some in another maze."""
-    conditions = {run.condition for run in runs}
-    return (
-        condition not in conditions
-        and any(other.maze == condition.maze for other in conditions)
-        and any(replace(other, maze=condition.maze) == condition for other in conditions)
-    )
-
-
-def progress(result: Result) -> str:
-    """How far an unfinished run is: "at 10 of 30 steps"."""
-    return f"at {result.step} of {result.record['config'].get('steps', '?')} steps"
-
-
-def _refuse_mixtures(runs: Iterable[NavigationRun]) -> None:
-    """Seeds of one condition make a mean only if they had the same budget, data and settings."""
     first: dict[Condition, NavigationRun] = {}
-    for run in runs:
-        other = first.setdefault(run.condition, run)
-        others, mine = comparable([other, run])
-        for name in dict.fromkeys((*others, *mine)):
-            values = [settings.get(name, "none") for settings in (others, mine)]
-            if values[0] != values[1]:
-                raise UserError(
-                    f"{run.condition.name}: seeds {other.seed} and {run.seed} differ in their {name} "
-                    f"({', '.join(values)}) and make no mean; report them apart"
-                )
+    for before, run in zip([None, *runs], runs, strict=False):
+        if before is not None and before.identity == run.identity:
+            places = f"{before.result.path} and {run.result.path}"
+            raise UserError(f"{places}: {run.condition.name} seed {run.seed} is there twice; keep one")
+        _refuse_mixture(first.setdefault(run.condition, run), run)
+    return runs
+
+
+def _refuse_mixture(other: NavigationRun, run: NavigationRun) -> None:
+    """Seeds of one condition make a mean only if they had the same budget, data and settings."""
+    for name in {**other.settings, **run.settings}:
+        values = [one.settings.get(name, "none") for one in (other, run)]
+        if values[0] != values[1]:
+            raise UserError(
+                f"{run.condition.name}: seeds {other.seed} and {run.seed} differ in their {name} "
+                f"({', '.join(values)}) and make no mean; report them apart"
+            )
+
+
+def _read_run(result: Result) -> NavigationRun:
+    """A finished run from its files; raises UserError where they are damaged."""
+    try:
+        config, results, timing = result.record["config"], result.files["results"], result.files["timing"]
+        for name, value, known in (("maze", results["maze"], MAZES), ("preset", config["preset"], PRESETS)):
+            if value not in known:
+                raise ValueError(f"its {name} is {value!r}")
+        if not results["rows"]:
+            raise ValueError("it has measured nothing")
+        if not all(isinstance(timing[name], int | float) for name in ("steps", "seconds")):
+            raise TypeError("timing.json holds no numbers")
+        condition = Condition(
+            str(results["maze"]),
+            str(config["method"]),
+            int(config.get("max_k", 1)),  # like the other options, of some methods alone
+            config.get("self_prediction", 0.0) > 0,
+            config["exogenous"] != "none",
+            bool(config.get("literal_future", False)),
+        )
+        values = {measure_of(row): float(f"{row['value']:.6g}") for row in results["rows"]}
+        run = NavigationRun(result, condition, values)
+        assert run.settings, "a run without a set"
+    except (KeyError, TypeError, ValueError) as error:
+        raise UserError(f"{result.place}: its results are damaged ({error}); train it again") from error
+    if wrong := {measure.measure: value for measure, value in values.items() if not math.isfinite(value)}:
+        name, value = next(iter(wrong.items()))
+        raise UserError(f"{result.place}: a {name} is {value}: the run has diverged; train it again or leave it out")
+    if result.folder and run.trajectory is None:
+        raise UserError(f"{result.path / TRAJECTORY_FILE}: is missing or no file; train it again")
+    return run
+
+
+def frame_of(runs: Iterable[NavigationRun]) -> pd.DataFrame:
+    """Every number of some runs: one row for each, with COLUMNS."""
+    rows = ((*run.identity, *measure, value) for run in runs for measure, value in run.values.items())
+    return pd.DataFrame(rows, columns=COLUMNS)
+
+
+def numbers_of(frame: pd.DataFrame) -> dict[tuple[Any, ...], dict[int, float]]:
+    """Numbers by seed, for each condition and measure: the key is `(*condition, *measure)`."""
+    found: dict[tuple[Any, ...], dict[int, float]] = {}
+    keys = frame[KEYS].itertuples(index=False, name=None)
+    for key, seed, value in zip(keys, frame["seed"], frame["value"], strict=True):
+        found.setdefault(key, {})[seed] = value
+    return found
 
 
 def save_runs(runs: list[NavigationRun], out: Path) -> None:
@@ -204,67 +196,12 @@ def save_runs(runs: list[NavigationRun], out: Path) -> None:
     results = [run.result for run in runs]
     refuse_loss(results, out)
     write_results(out, results)
-    rows = [run.identity | row | {"value": f"{row['value']:.6g}"} for run in runs for row in measure_rows(run.values)]
-    write_csv(out / ROWS, (*_IDENTITY, *_MEASURED), rows)
+    frame = frame_of(runs)
+    switches = frame.select_dtypes(bool).astype(int)
+    rows = frame.assign(**switches, value=[f"{value:.6g}" for value in frame["value"]])
+    write_csv(out / ROWS, COLUMNS, rows.to_dict("records"))
     (out / TRAJECTORIES).mkdir(exist_ok=True)
     for run in runs:
         target = out / TRAJECTORIES / run.file_name
         if run.trajectory is not None and run.trajectory.resolve() != target.resolve():
             shutil.copyfile(run.trajectory, target)
-
-
-def _read_run(result: Result) -> NavigationRun:
-    try:
-        return _with_trajectory(_run_of(result))
-    except UserError:
-        raise
-    except (KeyError, TypeError, ValueError) as error:
-        raise UserError(f"{result.place}: its results are damaged ({error}); train it again") from error
-
-
-def _run_of(result: Result) -> NavigationRun:
-    record, results, timing = result.record, result.files["results"], result.files["timing"]
-    config = record["config"]
-    named = {
-        "maze": results["maze"],
-        "method": config["method"],
-        "exogenous": config["exogenous"] != "none",
-        "max_k": config.get("max_k", 1),  # these three are options of some methods alone
-        "self_prediction": config.get("self_prediction", 0.0) > 0,
-        "literal_future": config.get("literal_future", False),
-    }
-    for name, value, known in (("maze", results["maze"], MAZES), ("preset", config["preset"], PRESETS)):
-        if value not in known:
-            raise ValueError(f"its {name} is {value!r}")
-    if not results["rows"]:
-        raise ValueError("it has measured nothing")
-    condition = build(Condition, named)
-    if not all(isinstance(timing[name], int | float) for name in ("steps", "seconds")):
-        raise TypeError("timing.json holds no numbers")
-    facts: dict[str, Any] = {
-        "steps": timing["steps"],
-        "seconds": timing["seconds"],
-        "set": results["set"],
-        "machine": result.machine,
-        "command": results.get("command", record["command"]),
-    }
-    values = {measure_of(row): _finite(result.place, row, f"{row['value']:.6g}") for row in results["rows"]}
-    told = {name: str(fact) for name, fact in facts.items()}
-    return NavigationRun(result, condition, config["preset"], config["seed"], values, told, None)
-
-
-def _with_trajectory(run: NavigationRun) -> NavigationRun:
-    """A run with its trajectory: a run folder has one, a results folder may have it."""
-    folder = run.result.path
-    path = folder / TRAJECTORY_FILE if run.result.folder else folder / TRAJECTORIES / run.file_name
-    if path.is_file():
-        return replace(run, trajectory=path)
-    if run.result.folder:
-        raise UserError(f"{path}: is missing or no file; train it again")
-    return run
-
-
-def _finite(place: str, row: dict[str, Any], value: str) -> float:
-    if not math.isfinite(float(value)):
-        raise UserError(f"{place}: a {row['measure']} is {value}: the run has diverged; train it again or leave it out")
-    return float(value)

@@ -1,23 +1,34 @@
-"""The tables of the navigation report: the paper's, each number beside its own where units agree, and four more."""
+"""The tables of the navigation report: the paper's, each number beside its own where units agree, and four more.
+
+Their layout is one frame, with a line for every number that a table has a place for; the numbers are a group-by of the
+frame of runs, merged into it.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from dataclasses import dataclass, replace
-from itertools import groupby
+from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+import pandas as pd
 
 from vd4rl_pomdp.envs.mazes import MAZES, PAPER_MAZES
 from vd4rl_pomdp.report.stats import mean_interval
 from vd4rl_pomdp.runs.files import write_csv
-from vd4rl_pomdp.studies.navigation.claims import paper_number
-from vd4rl_pomdp.studies.navigation.grid import Condition, condition_of, paper_rows
-from vd4rl_pomdp.studies.navigation.measures import Measure, held_out_loss, refitted_error
-from vd4rl_pomdp.studies.navigation.methods import METHOD_NAMES, OBJECTIVES, REFERENCES
-from vd4rl_pomdp.studies.navigation.runs import NavigationRun, is_missing
+from vd4rl_pomdp.studies.navigation.measures import (
+    METHOD_NAMES,
+    OBJECTIVES,
+    RAW_PREFIX,
+    REFERENCES,
+    Condition,
+    Measure,
+    condition_of,
+    held_out_loss,
+    paper_number,
+    paper_rows,
+    refitted_error,
+)
+from vd4rl_pomdp.studies.navigation.runs import KEYS
 
 _REFITTED = "held-out trajectories, probe refitted on frozen states"
 PROTOCOLS = {
@@ -29,6 +40,7 @@ _LOSS_PROTOCOLS = {
     "training averages (the paper's way)": ("training", ""),
     "held-out trajectories": ("held_out", ""),
 }
+_UNITS = {False: "% of a standard deviation", True: "raw units x 100, beside the paper"}
 _TITLES = {
     "state_error": "State estimation errors, K = 1 and 15",
     "position_error": "Position errors, K = 15",
@@ -45,204 +57,155 @@ _TITLES = {
 _PAPER_TABLES = tuple(_TITLES)[:7]
 MAIN_TEXT = ("no_curtain", "three_curtains")
 """Mazes of the tables in the paper's main text."""
+LITERAL = Condition("", "mik+a", 1, literal_future=True)
+Line = tuple[str, str, str, Condition, Measure]
+"""Of the layout: table, view, row, and what stands there."""
 
 
-@dataclass(frozen=True)
-class Entry:
-    """One number of a table."""
+def make_tables(frame: pd.DataFrame) -> pd.DataFrame:
+    """The paper's six tables (position and velocity are one of them), then four of our own: one line a number.
 
-    condition: Condition
-    measure: Measure
-    numbers: np.ndarray
-    """(n,) one for each seed."""
-    of_seeds: int
-    """Seeds that the maze was trained with, under any condition."""
-    missing: bool
-    """Whether its maze has runs, and its condition has some in another maze, but it has none itself."""
-
-    @property
-    def paper(self) -> float | None:
-        """The paper's number."""
-        return paper_number(self.condition, self.measure)
-
-    def text(self) -> str:
-        """Mean, interval, seeds, and the paper's number in brackets; "no run" for one that is missing."""
-        paper = "" if self.paper is None else f"({self.paper:.1f})"
-        if not len(self.numbers):
-            return f"no run {paper}".rstrip() if self.missing else paper
-        interval = self.interval()
-        spread = "" if interval is None else f" [{interval[0]:.1f}, {interval[1]:.1f}]"
-        seeds = f"n={len(self.numbers)}" + (f" of {self.of_seeds}" if len(self.numbers) < self.of_seeds else "")
-        return f"**{self.numbers.mean():.1f}**{spread} {seeds} {paper}".rstrip()
-
-    def interval(self) -> tuple[float, float] | None:
-        """95% t interval over seeds."""
-        return mean_interval(self.numbers[:, None]) if len(self.numbers) else None
+    Returns:
+        `table`, `view` and `row` where the number stands, KEYS, `numbers` by seed, their `mean`, `low` and `high` (95%
+        t interval), `seeds` and `of_seeds`, those with which the maze was trained under any condition; the `paper`'s
+        number; and whether it is `missing`, see `is_missing`.
+        Rows of a table for which neither a run nor the paper has a number are left out, and tables that no run has.
+    """
+    lines = list(_layout(frame))
+    places = [(*line[:3], *line[3], *line[4]) for line in lines]
+    cells = pd.DataFrame(places, columns=["table", "view", "row", *KEYS])
+    trained = conditions_of(frame)
+    cells["paper"] = [paper_number(condition, measure) for _, _, _, condition, measure in lines]
+    cells["missing"] = [is_missing(condition, trained) for _, _, _, condition, _ in lines]
+    groups = frame.groupby(KEYS)["value"].agg(numbers=np.array).reset_index()
+    cells = cells.merge(groups, how="left", on=KEYS)
+    cells["numbers"] = [found if isinstance(found, np.ndarray) else np.empty(0) for found in cells["numbers"]]
+    cells["seeds"] = cells["numbers"].map(len)
+    cells["of_seeds"] = cells["maze"].map(frame.groupby("maze")["seed"].nunique())
+    cells["mean"] = [found.mean() if len(found) else None for found in cells["numbers"]]
+    ends = [mean_interval(found[:, None]) if len(found) else None for found in cells["numbers"]]
+    cells[["low", "high"]] = [end or (None, None) for end in ends]
+    told = (cells["seeds"] > 0) | cells["paper"].notna()
+    of_row = [cells["table"], cells["view"], cells["row"]]
+    return cells[told.groupby(of_row).transform("any") & (cells["seeds"].groupby(of_row[:2]).transform("max") > 0)]
 
 
-@dataclass(frozen=True)
-class Table:
-    """Rows of entries, one column a maze."""
-
-    name: str
-    protocol: str
-    mazes: tuple[str, ...]
-    rows: list[tuple[str, list[Entry]]]
-
-    def lines(self) -> list[tuple[str, list[Entry]]]:
-        """Rows with a number of a run or of the paper; no rows at all if no run has a number."""
-        if not any(len(entry.numbers) for _, entries in self.rows for entry in entries):
-            return []
-        return [row for row in self.rows if any(len(e.numbers) or e.paper is not None for e in row[1])]
+def conditions_of(frame: pd.DataFrame) -> set[Condition]:
+    """The conditions that have runs."""
+    return {Condition(*row) for row in frame[list(Condition._fields)].drop_duplicates().itertuples(index=False)}
 
 
-def make_tables(runs: list[NavigationRun]) -> list[Table]:
-    """The paper's six tables (position and velocity are one of them), then four of our own."""
-    tables = []
+def is_missing(condition: Condition, trained: set[Condition]) -> bool:
+    """Whether a condition has no run, although its maze has runs and the same condition has some in another maze."""
+    return (
+        condition not in trained
+        and any(other.maze == condition.maze for other in trained)
+        and any(other[1:] == condition[1:] for other in trained)
+    )
+
+
+def _layout(frame: pd.DataFrame) -> Iterator[Line]:
+    """What stands where in every table, table by table and row by row."""
+    mazes = {raw: _mazes(frame, raw) for raw in (False, True)}
     for name in _PAPER_TABLES:
         for protocol, (split, probe) in (_LOSS_PROTOCOLS if name == "action_loss" else PROTOCOLS).items():
             for raw in (False,) if name == "action_loss" else (False, True):
-                tables.append(_paper_table(name, protocol, split, probe, raw, runs))
-    for make in (_references_table, _hidden_table):
-        tables += [make(raw, runs) for raw in (False, True)]
-    others = _others(runs)
-    return [*tables, _by_k_table(runs), *(_others_table(others, raw, runs) for raw in (False, True) if others)]
-
-
-def _mazes(runs: list[NavigationRun], raw: bool = False) -> tuple[str, ...]:
-    """Columns of a table: the paper's mazes if any of them has runs (with raw numbers), and variants that have some."""
-    trained = {run.condition.maze for run in runs if not raw or any(measure.is_raw for measure in run.values)}
-    paper = trained & set(PAPER_MAZES)
-    return tuple(maze for maze in MAZES if maze in trained or (paper and maze in PAPER_MAZES))
-
-
-def _in_units(protocol: str, raw: bool) -> str:
-    return f"{protocol}; {'raw units x 100, beside the paper' if raw else '% of a standard deviation'}"
-
-
-def _paper_table(name: str, protocol: str, split: str, probe: str, raw: bool, runs: list[NavigationRun]) -> Table:
-    mazes = tuple(maze for maze in _mazes(runs, raw) if name != "exogenous_main" or MAZES[maze].paper in MAIN_TEXT)
-    rows = []
-    for line in paper_rows():
-        if line["table"] != name.removesuffix("_main"):
-            continue
-        component = line["component"] if name == "action_loss" else f"{line['component']}_error"
-        measure = Measure(component, split, probe)
-        options = "".join(f", {o}" for o in ("self-prediction",) if line["self_prediction"] == "Y")
-        label = f"{line['objective']}, K={line['k_max']}{options}"
-        shown = measure.raw() if raw else measure
-        rows.append((label, [entry_of(condition_of(line, maze), shown, runs) for maze in mazes]))
-    return Table(name, protocol if name == "action_loss" else _in_units(protocol, raw), mazes, rows)
-
-
-def _references_table(raw: bool, runs: list[NavigationRun]) -> Table:
-    """What the paper does not show: the floor, the ceilings, and the literal future."""
-    mazes = _mazes(runs, raw)
-    rows = []
-    for method in REFERENCES:
-        for component in ("state", "position", "velocity"):
-            measure = _refitted(component, raw)
-            rows.append(
-                (f"{method}, {component}", [entry_of(Condition(maze, method), measure, runs) for maze in mazes])
-            )
-    literal = [Condition(maze, "mik+a", 1, literal_future=True) for maze in mazes]
-    for name, measure in {"state error": _refitted("state", raw), "action loss": held_out_loss()}.items():
-        rows.append(
-            (f"MIK+A, literal future, K=1, {name}", [entry_of(condition, measure, runs) for condition in literal])
-        )
-    return Table("references", _in_units(_REFITTED, raw), mazes, rows)
-
-
-def _hidden_table(raw: bool, runs: list[NavigationRun]) -> Table:
-    """Errors on hidden steps alone."""
-    mazes = tuple(maze for maze in _mazes(runs, raw) if MAZES[maze].curtains)
-    rows = []
-    for method in METHOD_NAMES:
-        for component in ("position", "velocity"):
-            measure = _refitted(component, raw, rows="hidden")
-            rows.append(
-                (f"{method}, {component}", [entry_of(Condition(maze, method), measure, runs) for maze in mazes])
-            )
-    return Table("hidden", _in_units(_REFITTED, raw), mazes, rows)
-
-
-def _others(runs: list[NavigationRun]) -> list[Condition]:
-    """Conditions, without their mazes, that neither the paper nor the references have."""
-    told = [condition_of(line, "") for line in paper_rows()]
-    told += [*(Condition("", method) for method in REFERENCES), Condition("", "mik+a", 1, literal_future=True)]
-    return [found for found in dict.fromkeys(replace(run.condition, maze="") for run in runs) if found not in told]
-
-
-def _others_table(others: list[Condition], raw: bool, runs: list[NavigationRun]) -> Table:
-    """State errors of conditions that no other table has."""
-    mazes, measure = _mazes(runs, raw), _refitted("state", raw)
-    rows = [(one.short, [entry_of(replace(one, maze=maze), measure, runs) for maze in mazes]) for one in others]
-    return Table("others", _in_units(_REFITTED, raw), mazes, rows)
-
-
-def _refitted(component: str, raw: bool, rows: str = "all") -> Measure:
-    measure = refitted_error(component, rows)
-    return measure.raw() if raw else measure
-
-
-def _by_k_table(runs: list[NavigationRun]) -> Table:
-    """Action losses at a small, a middle and the greatest k."""
-    mazes, rows = _mazes(runs), []
+                view = protocol if name == "action_loss" else f"{protocol}; {_UNITS[raw]}"
+                yield from _paper_table(name, view, Measure("", split, probe), mazes[raw], raw)
+    for raw in (False, True):
+        view = f"{_REFITTED}; {_UNITS[raw]}"
+        for row, condition, measure in _references():
+            yield from _row("references", view, row, condition, measure.raw() if raw else measure, mazes[raw])
+    for raw in (False, True):
+        view, hiding = f"{_REFITTED}; {_UNITS[raw]}", [maze for maze in mazes[raw] if MAZES[maze].curtains]
+        for method in METHOD_NAMES:
+            for component in ("position", "velocity"):
+                measure = refitted_error(component, "hidden")
+                shown = measure.raw() if raw else measure
+                yield from _row("hidden", view, f"{method}, {component}", Condition("", method), shown, hiding)
     for method in OBJECTIVES:
         for k in (1, 5, 15):
-            entries = [entry_of(Condition(maze, method), held_out_loss(k), runs) for maze in mazes]
-            rows.append((f"{method}, k={k}", entries))
-    return Table("by_k", "held-out trajectories", mazes, rows)
+            where = "by_k", "held-out trajectories", f"{method}, k={k}"
+            yield from _row(*where, Condition("", method), held_out_loss(k), mazes[False])
+    others = _others(frame)
+    for raw in (False, True):
+        measure = refitted_error("state").raw() if raw else refitted_error("state")
+        for condition in others:
+            view = f"{_REFITTED}; {_UNITS[raw]}"
+            yield from _row("others", view, condition.short, condition, measure, mazes[raw])
 
 
-def entry_of(condition: Condition, measure: Measure, runs: list[NavigationRun]) -> Entry:
-    """One measure of a condition, as some runs have it."""
-    numbers = [run.values[measure] for run in runs if run.condition == condition and measure in run.values]
-    seeds = {run.seed for run in runs if run.condition.maze == condition.maze}
-    return Entry(condition, measure, np.array(numbers), len(seeds), is_missing(condition, runs))
+def _row(table: str, view: str, row: str, condition: Condition, measure: Measure, mazes: Iterable[str]) -> list[Line]:
+    return [(table, view, row, condition._replace(maze=maze), measure) for maze in mazes]
 
 
-def table_sections(tables: list[Table]) -> Iterable[str]:
-    """Lines of a page's part: every table under its title."""
-    for name, variants in groupby(tables, lambda table: table.name):
-        yield from (f"## {_TITLES[name]}", "")
-        for table in variants:
-            yield from _markdown(table)
+def _mazes(frame: pd.DataFrame, raw: bool) -> list[str]:
+    """Columns of a table: the paper's mazes if any of them has runs (with raw numbers), and variants that have some."""
+    told = frame[frame["measure"].str.startswith(RAW_PREFIX)] if raw else frame
+    trained = set(told["maze"])
+    paper = trained & set(PAPER_MAZES)
+    return [maze for maze in MAZES if maze in trained or (paper and maze in PAPER_MAZES)]
 
 
-def _markdown(table: Table) -> list[str]:
-    """A table under its protocol; lines that neither a run nor the paper has a number for are left out."""
-    if not table.lines():
-        return [f"*{table.protocol}*: no run yet.", ""]
-    lines = [f"*{table.protocol}*", "", "| | " + " | ".join(table.mazes) + " |", "|---|" + "---|" * len(table.mazes)]
-    for label, entries in table.lines():
-        lines.append(f"| {label} | {' | '.join(entry.text() for entry in entries)} |")
-    return [*lines, ""]
+def _paper_table(name: str, view: str, measure: Measure, mazes: list[str], raw: bool) -> Iterator[Line]:
+    """One of the paper's tables; `measure` lacks what is measured."""
+    shown = [maze for maze in mazes if name != "exogenous_main" or MAZES[maze].paper in MAIN_TEXT]
+    for line in paper_rows():
+        if line["table"] == name.removesuffix("_main"):
+            what = line["component"] if name == "action_loss" else f"{line['component']}_error"
+            options = ", self-prediction" if line["self_prediction"] == "Y" else ""
+            label, found = f"{line['objective']}, K={line['k_max']}{options}", measure._replace(measure=what)
+            yield from _row(name, view, label, condition_of(line, ""), found.raw() if raw else found, shown)
 
 
-def write_tables(tables: list[Table], path: Path) -> None:
+def _references() -> Iterator[tuple[str, Condition, Measure]]:
+    """What the paper does not show: the floor, the ceilings, and the literal future."""
+    for method in REFERENCES:
+        for component in ("state", "position", "velocity"):
+            yield f"{method}, {component}", Condition("", method), refitted_error(component)
+    yield "MIK+A, literal future, K=1, state error", LITERAL, refitted_error("state")
+    yield "MIK+A, literal future, K=1, action loss", LITERAL, held_out_loss()
+
+
+def _others(frame: pd.DataFrame) -> list[Condition]:
+    """Conditions, without their mazes, that neither the paper nor the references have."""
+    told = {condition_of(line, "") for line in paper_rows()}
+    told |= {*(Condition("", method) for method in REFERENCES), LITERAL}
+    found = frame[list(Condition._fields)].assign(maze="").drop_duplicates().itertuples(index=False)
+    return [condition for condition in (Condition(*row) for row in found) if condition not in told]
+
+
+def cell_text(cell: pd.Series) -> str:
+    """Mean, interval, seeds, and the paper's number in brackets; "no run" for one that is missing."""
+    paper = "" if pd.isna(cell["paper"]) else f"({cell['paper']:.1f})"
+    if not cell["seeds"]:
+        return f"no run {paper}".rstrip() if cell["missing"] else paper
+    spread = "" if pd.isna(cell["low"]) else f" [{cell['low']:.1f}, {cell['high']:.1f}]"
+    seeds = f"n={cell['seeds']}" + (f" of {cell['of_seeds']:.0f}" if cell["seeds"] < cell["of_seeds"] else "")
+    return f"**{cell['mean']:.1f}**{spread} {seeds} {paper}".rstrip()
+
+
+def table_sections(cells: pd.DataFrame) -> Iterator[str]:
+    """Lines of a page's part: every table under its title, a column for each maze."""
+    texts = cells.assign(text=cells.apply(cell_text, axis=1))
+    for name, title in _TITLES.items():
+        mine = texts[texts["table"] == name]
+        if mine.empty and name == "others":
+            continue
+        yield from (f"## {title}", "", *([] if len(mine) else ["No run yet.", ""]))
+        for view, table in mine.groupby("view", sort=False):
+            mazes, rows = table["maze"].unique(), table["row"].unique()
+            wide = table.pivot(index="row", columns="maze", values="text").loc[rows, mazes]
+            yield from (f"*{view}*", "", "| | " + " | ".join(mazes) + " |", "|---|" + "---|" * len(mazes))
+            yield from (f"| {label} | {' | '.join(row)} |" for label, row in zip(rows, wide.to_numpy(), strict=True))
+            yield ""
+
+
+def write_tables(cells: pd.DataFrame, path: Path) -> None:
     """Write every number of the tables as CSV."""
-    names = ["table", "view", "row", "maze", "mean", "low", "high", "seeds", "paper"]
-    rows = (
-        _csv_row(table, label, maze, entry)
-        for table in tables
-        for label, entries in table.lines()
-        for maze, entry in zip(table.mazes, entries, strict=True)
-        if len(entry.numbers) or entry.missing
-    )
-    write_csv(path, names, rows)
-
-
-def _csv_row(table: Table, label: str, maze: str, entry: Entry) -> dict[str, Any]:
-    low, high = entry.interval() or ("", "")
-    return {
-        "table": table.name,
-        "view": table.protocol,
-        "row": label,
-        "maze": maze,
-        "mean": f"{entry.numbers.mean():.4g}" if len(entry.numbers) else "",
-        "low": low if low == "" else f"{low:.4g}",
-        "high": high if high == "" else f"{high:.4g}",
-        "seeds": len(entry.numbers),
-        "paper": "" if entry.paper is None else entry.paper,
-    }
+    shown = cells[(cells["seeds"] > 0) | cells["missing"]].copy()
+    for name in ("mean", "low", "high"):
+        shown[name] = ["" if pd.isna(value) else f"{value:.4g}" for value in shown[name]]
+    shown["paper"] = ["" if pd.isna(value) else value for value in shown["paper"]]
+    columns = ["table", "view", "row", "maze", "mean", "low", "high", "seeds", "paper"]
+    write_csv(path, columns, shown[columns].to_dict("records"))

@@ -11,6 +11,7 @@ import shlex
 from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data.format import read_plan
 from vd4rl_pomdp.nn.encoder import EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, save_encoder
 from vd4rl_pomdp.runs import METRICS_FILE, NAVIGATION_FILE, TRAJECTORY_FILE
@@ -21,7 +22,7 @@ from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig, command_of
 from vd4rl_pomdp.studies.navigation.data import open_data
 from vd4rl_pomdp.studies.navigation.measure import measure, write_trajectory
-from vd4rl_pomdp.studies.navigation.methods import UNTRAINED
+from vd4rl_pomdp.studies.navigation.measures import UNTRAINED
 from vd4rl_pomdp.studies.navigation.probed import STAGE, ProbedObjective, make_trainer
 
 RESULTS = (NAVIGATION_FILE, TRAJECTORY_FILE, *FILES_OF_RUN)
@@ -35,7 +36,7 @@ def train(config: NavigationConfig) -> RunFolder:
     data = open_data(config)
     trainer, probed = make_trainer(data, config, pick_device(config.device))
     labels = {"method": config.method, "task": data.maze.name}
-    with RunFolder(config.out, STAGE, config, data.inputs, RESULTS) as run:
+    with RunFolder(config.out, STAGE, config, data.inputs, RESULTS, collection=read_plan(config.data)) as run:
         if not run.finished:
             steps, last_averaged = 0 if config.method == UNTRAINED else config.steps, config.steps - config.average_last
             trainer.run(run, steps, " ".join(reversed(labels.values())), labels, probed.take_errors, last_averaged)

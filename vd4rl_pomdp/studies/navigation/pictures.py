@@ -1,4 +1,6 @@
-"""Exogenous noise: an image from a pool is added to each observation, and has nothing to do with the agent.
+"""What a model is shown of a maze: its picture, or a grey quarter of it, with exogenous noise if that is asked for.
+
+Exogenous noise is an image from a pool that is added to each observation, and has nothing to do with the agent.
 
 A row's key chooses its image, so that a row always shows the same one, as in a real environment. The pool consists of
 generated textures, of crops of the two photographs that scikit-learn ships, or of a folder's images: CIFAR-10's python
@@ -11,6 +13,7 @@ import hashlib
 import io
 from pathlib import Path
 from pickletools import genops
+from typing import Literal
 
 import numpy as np
 import torch
@@ -24,6 +27,11 @@ from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.corruptions.keys import derive_keys, draw_integers
 from vd4rl_pomdp.envs.mazes import PICTURE_SIZE
 
+Picture = Literal["rgb100", "rgb50", "grey50"]
+_HALF = PICTURE_SIZE // 2
+SHAPES: dict[Picture, tuple[int, int]] = {"rgb100": (3, PICTURE_SIZE), "rgb50": (3, _HALF), "grey50": (1, _HALF)}
+"""Channels and size of an observation."""
+_LUMA = (0.299, 0.587, 0.114)
 TEXTURES, PHOTOGRAPHS = "textures", "photographs"
 """Names of the pools that need no files."""
 POOL = 1024
@@ -202,3 +210,20 @@ def _to_size(images: np.ndarray) -> Tensor:
     planes = torch.from_numpy(np.array(images)).permute(0, 3, 1, 2).float()
     resized = F.interpolate(planes, (PICTURE_SIZE, PICTURE_SIZE), mode="bilinear", antialias=True)
     return resized.round_().clamp_(0, 255).to(torch.uint8)
+
+
+def to_grey50(pictures: Tensor) -> Tensor:
+    """Area averages of the luminance: (N, 3, 100, 100) uint8 -> (N, 1, 50, 50) uint8."""
+    weights = torch.tensor(_LUMA, device=pictures.device) / 4
+    return torch.einsum("nchw,c->nhw", _sums(pictures).float(), weights).round_().to(torch.uint8)[:, None]
+
+
+def to_rgb50(pictures: Tensor) -> Tensor:
+    """Area averages: (N, 3, 100, 100) uint8 -> (N, 3, 50, 50) uint8."""
+    return ((_sums(pictures) + 2) // 4).to(torch.uint8)
+
+
+def _sums(pictures: Tensor) -> Tensor:
+    """Sums over 2x2 pixels, int16."""
+    corners = [pictures[..., row::2, column::2].short() for row in (0, 1) for column in (0, 1)]
+    return corners[0] + corners[1] + corners[2] + corners[3]

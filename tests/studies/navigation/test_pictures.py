@@ -8,8 +8,8 @@ import torch
 from PIL import Image
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.studies.navigation import exogenous
-from vd4rl_pomdp.studies.navigation.exogenous import POOL, ExogenousNoise, load_pool
+from vd4rl_pomdp.studies.navigation import pictures
+from vd4rl_pomdp.studies.navigation.pictures import POOL, ExogenousNoise, load_pool
 
 
 @pytest.fixture(scope="module")
@@ -106,8 +106,8 @@ def test_of_a_folder_of_many_images_only_those_of_the_pool_are_read(tmp_path, mo
     cifar_binary(tmp_path, count=3)
     whole = load_pool(str(tmp_path), 0)
     assert len(whole) == 15
-    monkeypatch.setattr(exogenous, "POOL", 6)
-    with mock.patch.object(exogenous, "_read_image", wraps=exogenous._read_image) as read:
+    monkeypatch.setattr(pictures, "POOL", 6)
+    with mock.patch.object(pictures, "_read_image", wraps=pictures._read_image) as read:
         assert torch.equal(load_pool(str(tmp_path), 0), whole[:6])
     assert 1 <= read.call_count <= 6
 

@@ -4,7 +4,7 @@ from PIL import Image, ImageSequence
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.envs.mazes import BALL_RADIUS, MAZES
-from vd4rl_pomdp.studies.navigation.film import HEAD, SIDE, to_pixels, write_film
+from vd4rl_pomdp.studies.navigation.figures import HEAD, SIDE, to_pixels, write_film
 
 MAZE = MAZES["three_curtains"]
 TRUE, GUESS = (-1.0, 1.0), (1.0, -1.0)

@@ -1,6 +1,10 @@
+"""What a model is shown of a maze."""
+
 import torch
 
-from vd4rl_pomdp.studies.navigation.observations import to_grey50, to_rgb50
+from vd4rl_pomdp.envs.mazes import MAZES
+from vd4rl_pomdp.studies.navigation.collect import SAMPLES, sample_observations
+from vd4rl_pomdp.studies.navigation.pictures import to_grey50, to_rgb50
 
 
 def test_grey_quarters_are_area_averages_of_the_luminance():
@@ -19,3 +23,11 @@ def test_colours_survive_at_half_the_size():
     assert (small[0, 2] == 101).all()
     assert (small[1, 0, :, :25] == 7).all()
     assert int((small > 0).sum()) == 2500 + 1250
+
+
+def test_sample_observations_are_of_different_moments_and_mazes():
+    samples = sample_observations()
+    assert list(samples) == [*MAZES, "three_curtains, grey50", "three_curtains, exogenous textures"]
+    assert [len(pictures) for pictures in samples.values()] == [SAMPLES] * 11
+    assert all(len({picture.tobytes() for picture in pictures}) > 1 for pictures in samples.values())
+    assert len({pictures.tobytes() for pictures in samples.values()}) == 11

@@ -1,0 +1,183 @@
+"""What drives through the mazes, and that it drives as the paper's generator does."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.envs.maze import CELL_OFFSET, MazeEnv
+from vd4rl_pomdp.envs.mazes import MAZES
+from vd4rl_pomdp.policies.actor import read_actor
+from vd4rl_pomdp.studies.navigation.collect import _controller, _explore
+from vd4rl_pomdp.studies.navigation.drivers import (
+    FirstPersonConfig,
+    Planner,
+    WaypointPlanner,
+    goals_reached,
+    shipped_actor,
+    train_first_person,
+)
+
+ROWS = 1500
+
+
+def test_the_planner_reaches_goals_everywhere():
+    env = MazeEnv("hard_no_curtain", 5, pixels=False)
+    planner = Planner(env)
+    _, info = env.reset(seed=0)
+    reached, places = 0, []
+    for _ in range(600):
+        _, reward, _, _, info = env.step(planner.act(info["state"], info["goal"]))
+        reached += int(reward)
+        places.append(info["state"][:2])
+    assert reached > 20
+    cells = {tuple(env.maze.cell_xy_to_rowcol(place)) for place in places}
+    assert len(cells) == 7, "all cells of the U were visited"
+
+
+def test_the_papers_planner_halts_beside_every_centre_on_its_way():
+    env = MazeEnv("no_curtain", 5, pixels=False)
+    planner = WaypointPlanner(env, np.random.default_rng(0))
+    env.reset(seed=0, options={"state": np.array([-1.0, 1.0, 0.0, 0.0])})
+    env.goal = goal = np.array([-1.0, -1.0]) + CELL_OFFSET
+    slowest = {}
+    for _ in range(200):
+        before = env.state[:2]
+        _, reward, *_ = env.step(planner.act(env.state, goal))
+        moved = np.linalg.norm(env.state[:2] - before)
+        cell = tuple(np.round(env.state[:2] - CELL_OFFSET / 2))
+        slowest[cell] = min(slowest.get(cell, np.inf), moved)
+        if reward:
+            break
+    assert reward
+    assert list(slowest) == [(-1, 1), (0, 1), (1, 1), (1, 0), (1, -1), (0, -1), (-1, -1)]
+    assert all(moved < WaypointPlanner.NEAR for moved in slowest.values()), slowest
+
+
+def test_waypoints_lie_between_the_centre_of_a_cell_and_its_point():
+    env = MazeEnv("no_curtain", 5, pixels=False)
+    env.reset(seed=0)
+    ahead = []
+    for seed in range(50):
+        planner = WaypointPlanner(env, np.random.default_rng(seed))
+        planner.act(np.array([-1.0, 1.0, 0.0, 0.0]), np.array([1.2, -0.2]))
+        ahead.append(planner._ahead)
+    centers = np.array([(0, 1), (1, 1)])
+    beside = (np.array(ahead)[:, :2] - centers) * np.sign(CELL_OFFSET)
+    assert beside.min() >= 0
+    assert beside.max() <= 0.2
+    assert np.ptp(beside, axis=0).min() > 0.15
+    np.testing.assert_array_equal(np.array(ahead)[:, 2], np.tile([1.2, -0.2], (50, 1)))
+
+
+def test_a_waypoint_is_passed_at_walking_pace_only():
+    env = MazeEnv("no_curtain", 5, pixels=False)
+    env.reset(seed=0)
+    goal = np.array([1.2, -0.2])
+    for travel, passed in ((0.2, 0), (0.05, 1)):
+        planner = WaypointPlanner(env, np.random.default_rng(0))
+        planner.act(np.array([-1.0, 1.0, 0.0, 0.0]), goal)
+        waypoint, left = planner._ahead[0], len(planner._ahead)
+        for place in (waypoint - [0, 0.09 + travel], waypoint - [0, 0.09]):
+            planner.act(np.array([*place, 0.0, 0.0]), goal)
+        assert left - len(planner._ahead) == passed, travel
+
+
+def drive(maze: str, seeds: int) -> tuple[np.ndarray, np.ndarray]:
+    """States (seeds, ROWS, P) and actions of drives that are not drawn."""
+    env, states, actions = MazeEnv(maze, pixels=False), [], []
+    for seed in range(seeds):
+        rng = np.random.default_rng(seed)
+        act, (_, info) = _controller(env, rng), env.reset(seed=seed)
+        for _ in range(ROWS):
+            actions.append(_explore(act(info["state"], info["goal"]), env.maze_spec.style, rng))
+            states.append(env.step(actions[-1])[-1]["state"])
+            info = {"state": states[-1], "goal": env.goal}
+    return np.array(states).reshape(seeds, ROWS, -1), np.array(actions).reshape(seeds, ROWS, -1)
+
+
+@pytest.fixture(scope="module")
+def top() -> np.ndarray:
+    """(N, 4) states under the paper's planner."""
+    return np.concatenate(drive("three_curtains", 6)[0])
+
+
+def test_three_curtains_hide_the_mass_a_fifth_of_the_time_and_the_hard_ones_a_third(top):
+    """Theirs is hidden some 22% of the time: ours, if a seventh of the ball's radius may be left to see."""
+    three = MAZES["three_curtains"]
+    assert three.hidden(top).mean() == pytest.approx(0.185, abs=0.02)
+    nearly = replace(three, style=replace(three.style, hidden_reach=0.17))
+    assert nearly.hidden(top).mean() == pytest.approx(0.22, abs=0.02)
+    hard = np.concatenate(drive("hard_three_curtains", 4)[0])
+    assert MAZES["hard_three_curtains"].hidden(hard).mean() == pytest.approx(0.36, abs=0.04)
+
+
+def test_knowing_nothing_of_velocity_costs_in_raw_units_what_the_paper_prints(top):
+    """No History's velocity errors are printed as 91.5 to 91.9; as shares of a standard deviation they cannot be."""
+    velocity = top[:, 2:]
+    ignorance = np.abs(velocity - velocity.mean(0)).mean(0)
+    assert 100 * ignorance.mean() == pytest.approx(91.5, rel=0.15)
+    assert 100 * (ignorance / velocity.std(0)).max() < 80
+    assert (np.abs(velocity) > 5).any(), "velocities are limited once a decision"
+    assert np.abs(velocity).max() < 6.2
+    np.testing.assert_allclose(velocity.std(0), 1.5, atol=0.15)
+
+
+def test_a_decision_in_first_person_turns_by_at_most_a_quarter_of_a_radian():
+    states, actions = drive("first_person", 2)
+    turned = np.abs(np.diff(states[:, :, 2]))
+    assert turned.max() == pytest.approx(0.27, abs=0.02)
+    assert turned.mean() > 0.05
+    assert np.abs(actions).max() <= 1
+
+
+@pytest.mark.parametrize("maze", ["first_person", "hard_first_person"])
+def test_the_shipped_first_person_policy_reaches_goals_and_an_idle_one_does_not(maze):
+    actor = shipped_actor(MAZES[maze])
+    assert actor.card["algorithm"] == "PPO"
+    reached = goals_reached(actor, maze, actor.card["action_repeat"], 3)
+    idle = replace(actor, weights={name: value * 0 for name, value in actor.weights.items()})
+    assert reached >= 11
+    assert goals_reached(idle, maze, actor.card["action_repeat"], 3) < reached / 3
+
+
+def test_every_first_person_maze_is_driven_by_an_actor_of_its_kinematics():
+    actors = {name: shipped_actor(spec) for name, spec in MAZES.items() if spec.first_person}
+    assert actors["compass_first_person"].card == actors["first_person"].card
+    means = [actors[name].weights["mean.weight"] for name in ("first_person", "hard_first_person")]
+    assert not np.array_equal(*means)
+
+
+def test_a_maze_that_a_planner_drives_through_trains_no_actor(tmp_path):
+    with pytest.raises(UserError, match="--maze is no_curtain, which a planner drives through"):
+        train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", maze="no_curtain"))
+
+
+def test_a_policy_of_no_decisions_is_refused(tmp_path):
+    with pytest.raises(UserError, match="--decisions is 0"):
+        train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", decisions=0))
+
+
+def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
+    trained = train_first_person(FirstPersonConfig(tmp_path / "actor.safetensors", decisions=2000))
+    stored = read_actor(tmp_path / "actor.safetensors")
+    seen = np.array([0.3, -0.2, 1.0, 0.1], np.float32)
+    np.testing.assert_array_equal(stored.act(seen), trained.act(seen))
+    assert stored.card["decisions"] == 2048, "whole rounds of PPO"
+    spread = [stored.act(seen, np.random.default_rng(i)) for i in range(50)]
+    assert np.std(spread, axis=0).min() > 0.1
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "dangling link", "link to itself"])
+def test_a_policy_replaces_nothing_but_a_policy(tmp_path, kind):
+    out = tmp_path / "actor.safetensors"
+    if kind == "file":
+        out.write_text("mine\n")
+    elif kind == "folder":
+        out.mkdir()
+    else:
+        out.symlink_to("nothing" if kind == "dangling link" else out.name)
+    with pytest.raises(UserError, match=r"actor\.safetensors: is there already and holds no actor"):
+        train_first_person(FirstPersonConfig(out, decisions=1))
+    assert kind != "file" or out.read_text() == "mine\n"

@@ -1,0 +1,395 @@
+"""Train the actors that collect data: soft actor-critic on simulator states (SBX), for each task by its own recipe.
+
+`python tools/train_actor.py humanoid_walk --out RUN`, with the extra `policy`; re-run the same command to resume.
+`python tools/train_actor.py my_task.py my_task --out RUN` first runs a file, which registers a task of one's own.
+
+RUN keeps `snapshots/` (an actor every `eval_every` decisions), `curve.csv` (its mean return), `checkpoint.safetensors`
+(networks, optimisers, replay buffer) and `networks.safetensors` (what another machine can start from, small enough for
+a repository). At the end, the chosen actors are written beside them (see `export_actor`).
+"""
+
+from __future__ import annotations
+
+import json
+import runpy
+import shutil
+import sys
+from dataclasses import asdict, dataclass, replace
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, Literal
+
+import jax
+import numpy as np
+import optax
+import tyro
+from export_actor import (
+    CARD_SEED,
+    CURVE,
+    CURVE_COLUMNS,
+    NETWORKS,
+    PROGRESS,
+    SETTINGS,
+    StateEnv,
+    episode_returns,
+    export_run,
+    exported_actors,
+    read_curve,
+    snapshot_path,
+)
+from safetensors.numpy import load, save
+from sbx import SAC
+from stable_baselines3.common.logger import Logger
+from stable_baselines3.common.vec_env import DummyVecEnv, VecNormalize
+
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.tasks import TASKS, Task
+from vd4rl_pomdp.envs.make import layout_of
+from vd4rl_pomdp.policies.actor import OBSERVATION_CLIP, Actor
+from vd4rl_pomdp.runs.files import write_bytes
+
+CHECKPOINT = "checkpoint.safetensors"
+REPLAY_ARRAYS = ("observations", "next_observations", "actions", "rewards", "dones", "timeouts")
+STATISTICS = ("mean", "var", "count")
+DECISIONS_A_ROUND = 4
+"""Decisions between two rounds of updates, or one for each environment if those are more."""
+RANDOM_DECISIONS = 1_000
+"""Uniformly random decisions that a new run begins with, times its environments (ten at most)."""
+
+
+@dataclass(frozen=True)
+class PolicyConfig:
+    """Settings of one actor's training; the task chooses the defaults."""
+
+    task: tyro.conf.Suppress[str]
+    out: Path
+    """Run folder; re-run the same command to resume."""
+    decisions: int = 300_000
+    """Environment decisions in all."""
+    seed: int = 0
+    """Seed of the networks, the replay draws and the training episodes."""
+    learning_rate: float = 7e-4
+    """Adam's learning rate, for actor and critics."""
+    network: Literal["mlp", "simba"] = "mlp"
+    """mlp: two hidden layers; simba: one residual block with layer norms (arXiv 2410.09754)."""
+    hidden: int = 256
+    """Units of a hidden layer, or width of the residual stream."""
+    critic_norm: bool = False
+    """Layer norm after each hidden layer of an mlp's critics."""
+    normalise: bool = False
+    """Standardise observations by running statistics."""
+    n_step: int = 1
+    """Steps of the critics' returns."""
+    envs: int = 1
+    """Environments that take turns with the updates."""
+    updates_per_decision: float = 1.0
+    """Gradient steps for each decision."""
+    batch_size: int = 256
+    """Transitions in a gradient step."""
+    temperature: float = 1.0
+    """Initial weight of the entropy."""
+    temperature_rate: float = 7e-4
+    """Adam's learning rate for that weight."""
+    target_entropy: float = -1.0
+    """Entropy per action dimension that the temperature aims at."""
+    replay_size: int = 1_000_000
+    """Transitions kept for the updates."""
+    eval_every: int = 5_000
+    """Decisions between two snapshots."""
+    eval_episodes: int = 5
+    """Episodes behind each point of the learning curve."""
+    stop_at: float = 1000.0
+    """End early once a snapshot's mean return reaches this."""
+    start_from: Path | None = None
+    """Begin a new run where another one stood: a folder with its config.json, curve.csv and networks.safetensors."""
+    refill: int = 100_000
+    """After --start-from: decisions of the old policy that fill the empty replay before the first update."""
+    critic_warmup: int = 20_000
+    """After --start-from: updates of the critics alone, before the actor learns on."""
+
+
+_STEADY = PolicyConfig(
+    "",
+    Path(),
+    learning_rate=5e-4,
+    critic_norm=True,
+    normalise=True,
+    n_step=3,
+    temperature_rate=1e-4,
+    target_entropy=-0.5,
+)
+"""What all tasks but walker_walk share."""
+_GENERAL = replace(_STEADY, decisions=600_000, envs=4, temperature=0.1, replay_size=800_000, eval_every=4_000)
+"""What a task without a recipe of its own gets: cheetah_run's."""
+RECIPES: dict[str, PolicyConfig] = {
+    "walker_walk": PolicyConfig("walker_walk", Path()),
+    "cheetah_run": replace(_GENERAL, task="cheetah_run"),
+    "humanoid_walk": replace(
+        _STEADY,
+        task="humanoid_walk",
+        decisions=20_000_000,
+        envs=16,
+        updates_per_decision=0.5,
+        temperature=0.01,
+        eval_every=24_000,
+    ),
+}
+"""Defaults by task. Plain SAC is enough for walker_walk. The others get standardised observations, layer norms in the
+critics and three-step returns; humanoid_walk also more fresh decisions for each update: physics is far cheaper than
+gradients. Where a run has levelled off, another from it (--start-from) with other steps or exploration climbs on."""
+
+
+def build(config: PolicyConfig, task: Task) -> SAC:
+    """A new learner; its environments standardise observations only if the config says so."""
+    envs = DummyVecEnv([lambda: StateEnv(task)] * config.envs)
+    rounds = max(1, DECISIONS_A_ROUND // config.envs)
+    network = {"net_arch": [config.hidden] if config.network == "simba" else [config.hidden, config.hidden]}
+    model = SAC(
+        "SimbaPolicy" if config.network == "simba" else "MlpPolicy",
+        VecNormalize(envs, norm_obs=config.normalise, norm_reward=False, clip_obs=OBSERVATION_CLIP),
+        learning_rate=config.learning_rate,
+        qf_learning_rate=config.learning_rate,
+        buffer_size=config.replay_size,
+        learning_starts=RANDOM_DECISIONS * min(config.envs, 10),
+        batch_size=config.batch_size,
+        train_freq=rounds,
+        gradient_steps=max(1, round(rounds * config.envs * config.updates_per_decision)),
+        n_steps=config.n_step,
+        ent_coef=f"auto_{config.temperature}",
+        target_entropy=config.target_entropy * layout_of(task).action_dim,
+        policy_kwargs=network | ({"layer_norm": True} if config.critic_norm else {}),
+        seed=config.seed,
+    )
+    model.set_logger(Logger(None, []))  # its own would leave an empty folder among the temporary files
+    _set_temperature_rate(model, config.temperature_rate)
+    return model
+
+
+def _set_temperature_rate(model: SAC, rate: float) -> None:
+    """Give the temperature a learning rate of its own; SBX takes the actor's."""
+    state, optimiser = model.ent_coef_state, optax.adam(rate)
+    model.ent_coef_state = state.replace(tx=optimiser, opt_state=optimiser.init(state.params))
+
+
+def export_actor(model: SAC, config: PolicyConfig, decisions: int) -> Actor:
+    """The learner's policy as an `Actor`."""
+    params = model.policy.actor_state.params["params"]
+    weights = _simba_weights(params) if config.network == "simba" else _mlp_weights(params)
+    if config.normalise:
+        envs = model.get_vec_normalize_env()
+        weights["observation.mean"] = envs.obs_rms.mean
+        weights["observation.std"] = np.sqrt(envs.obs_rms.var + envs.epsilon)
+    card = {"task": config.task, "decisions": decisions, "algorithm": "SAC", "seed": config.seed}
+    card["versions"] = {name: version(name) for name in ("sbx-rl", "jax")}
+    return Actor({name: np.asarray(value, np.float32) for name, value in weights.items()}, card)
+
+
+def _mlp_weights(params: Any) -> dict[str, Any]:
+    """Dense layers in order: the hidden ones, mean and log_std."""
+    names = [f"hidden.{i}" for i in range(len(params) - 2)] + ["mean", "log_std"]
+    return {key: value for i, name in enumerate(names) for key, value in _dense(name, params[f"Dense_{i}"]).items()}
+
+
+def _simba_weights(params: Any) -> dict[str, Any]:
+    weights = _dense("embed", params["Dense_0"]) | _norm("norm", params["LayerNorm_0"])
+    weights |= _dense("mean", params["Dense_1"]) | _dense("log_std", params["Dense_2"])
+    for i in range(sum(name.startswith("SimbaResidualBlock") for name in params)):
+        block = params[f"SimbaResidualBlock_{i}"]
+        weights |= _norm(f"block.{i}.norm", block["LayerNorm_0"])
+        weights |= _dense(f"block.{i}.up", block["Dense_0"]) | _dense(f"block.{i}.down", block["Dense_1"])
+    return weights
+
+
+def _dense(name: str, layer: Any) -> dict[str, Any]:
+    return {f"{name}.weight": layer["kernel"], f"{name}.bias": layer["bias"]}
+
+
+def _norm(name: str, layer: Any) -> dict[str, Any]:
+    return {f"{name}.scale": layer["scale"], f"{name}.bias": layer["bias"]}
+
+
+def save_networks(model: SAC, path: Path) -> None:
+    """Write actor, critics, temperature and observation statistics, without optimisers, to one small file."""
+    leaves, _ = jax.tree_util.tree_flatten(_networks(model))
+    arrays = {f"{i:04d}": np.array(leaf) for i, leaf in enumerate(leaves)} | _statistics(model)
+    write_bytes(path, save(arrays))
+
+
+def start_from_networks(model: SAC, path: Path) -> None:
+    """Load what `save_networks` wrote; the target critics become copies of the critics."""
+    stored = load(path.read_bytes())
+    leaves, structure = jax.tree_util.tree_flatten(_networks(model))
+    if any(f"{i:04d}" not in stored or stored[f"{i:04d}"].shape != leaf.shape for i, leaf in enumerate(leaves)):
+        raise UserError(f"{path}: holds networks of another shape; use the --network and --hidden they were made with")
+    loaded = [jax.numpy.asarray(stored[f"{i:04d}"]) for i in range(len(leaves))]
+    actor, critics, temperature = jax.tree_util.tree_unflatten(structure, loaded)
+    policy = model.policy
+    policy.actor_state = policy.actor_state.replace(params=actor)
+    policy.qf_state = policy.qf_state.replace(params=critics, target_params=critics)
+    model.ent_coef_state = model.ent_coef_state.replace(params=temperature)
+    _set_statistics(model, stored)
+
+
+def refill(model: SAC, decisions: int, critic_updates: int) -> None:
+    """Fill the empty replay with the policy's own noisy decisions, then train the critics with the actor frozen."""
+    settings = model.gradient_steps, model.learning_starts, model.lr_schedule
+    model.gradient_steps, model.learning_starts = 0, 0
+    model.learn(decisions, reset_num_timesteps=False)
+    model.gradient_steps, model.learning_starts, schedule = settings
+    model.lr_schedule = lambda _: 0.0  # the critics have a rate of their own
+    temperature = model.ent_coef_state
+    for _ in range(critic_updates // model.gradient_steps):
+        model.train(model.gradient_steps, model.batch_size)
+        model.ent_coef_state = temperature
+    model.lr_schedule = schedule
+
+
+def save_checkpoint(model: SAC, run: Path) -> None:
+    """Write all that the decisions made so far have left, in place of the checkpoint before."""
+    leaves, _ = jax.tree_util.tree_flatten(_states(model))
+    buffer: Any = model.replay_buffer
+    stop = buffer.buffer_size if buffer.full else buffer.pos
+    arrays = {f"{i:04d}": np.array(leaf) for i, leaf in enumerate(leaves)} | _statistics(model)
+    arrays |= {f"replay.{k}": np.ascontiguousarray(getattr(buffer, k)[:stop]) for k in REPLAY_ARRAYS}
+    arrays["counters"] = np.array([model.num_timesteps, model._n_updates, buffer.pos])
+    write_bytes(run / CHECKPOINT, save(arrays))
+
+
+def restore_checkpoint(model: SAC, run: Path) -> int:
+    """Load the checkpoint; returns the decisions made so far, 0 without one. New episodes begin there."""
+    if not (run / CHECKPOINT).exists():
+        return 0
+    stored = load((run / CHECKPOINT).read_bytes())
+    decisions, updates, position = map(int, stored["counters"])
+    model.set_random_seed(_seed_from(model.seed or 0, decisions))
+    policy, buffer = model.policy, model.replay_buffer
+    leaves, structure = jax.tree_util.tree_flatten(_states(model))
+    restored = [np.asarray(stored[f"{i:04d}"], dtype=np.asarray(leaf).dtype) for i, leaf in enumerate(leaves)]
+    states = jax.tree_util.tree_unflatten(structure, [jax.numpy.asarray(leaf) for leaf in restored])
+    policy.actor_state, policy.qf_state, model.ent_coef_state, model.key, policy.key = states
+    _set_statistics(model, stored)
+    stop = len(stored["replay.rewards"])
+    for name in REPLAY_ARRAYS:
+        getattr(buffer, name)[:stop] = stored[f"replay.{name}"]
+    buffer.pos, buffer.full = position, stop == buffer.buffer_size
+    buffer.timeouts[position - 1] = True  # the episodes under way are not continued
+    model.num_timesteps, model._n_updates = decisions, updates
+    return decisions
+
+
+def _seed_from(seed: int, decisions: int) -> int:
+    """Of a run that goes on: other episodes than it began with, and than those that evaluate. Gymnasium adds to it."""
+    return stream_seed(seed, "policy", "resumed", decisions) % 2**31
+
+
+def _states(model: SAC) -> tuple[Any, ...]:
+    """Everything SBX learns, optimisers included, and the keys of its draws."""
+    policy = model.policy
+    return policy.actor_state, policy.qf_state, model.ent_coef_state, model.key, policy.key
+
+
+def _networks(model: SAC) -> tuple[Any, ...]:
+    return model.policy.actor_state.params, model.policy.qf_state.params, model.ent_coef_state.params
+
+
+def _statistics(model: SAC) -> dict[str, np.ndarray]:
+    envs: Any = model.get_vec_normalize_env()
+    if not envs.norm_obs:
+        return {}
+    return {f"observation.{name}": np.asarray(getattr(envs.obs_rms, name), np.float64) for name in STATISTICS}
+
+
+def _set_statistics(model: SAC, stored: dict[str, np.ndarray]) -> None:
+    envs: Any = model.get_vec_normalize_env()
+    if envs.norm_obs:
+        for name in STATISTICS:
+            setattr(envs.obs_rms, name, stored[f"observation.{name}"])
+
+
+def train_actor(config: PolicyConfig) -> dict[str, Path]:
+    """Train, or resume training, and export the actors: the exported files by quality.
+
+    Raises:
+        UserError: a task without states, or a folder that holds something else than this run.
+    """
+    task, run = TASKS.named(config.task), config.out
+    if not layout_of(task).state_dim:
+        raise UserError(f"{config.task} has no states for an actor to read: choose a task of dm_control")
+    _begin(config)
+    model = build(config, task)
+    done = restore_checkpoint(model, run)
+    curve = [row for row in read_curve(run) if row[0] <= done]  # without what a killed run wrote after its checkpoint
+    if done == 0 and config.start_from is not None:
+        curve = _start_from(model, config, config.start_from)
+        done = int(model.num_timesteps)
+    while done < config.decisions and (not curve or curve[-1][1] < config.stop_at):
+        model.learn(min(config.eval_every, config.decisions - done), reset_num_timesteps=done == 0)
+        done = int(model.num_timesteps)
+        actor = export_actor(model, config, done)
+        returns = episode_returns(actor, task, config.eval_episodes, CARD_SEED - config.eval_episodes)
+        curve.append((done, float(np.mean(returns))))
+        actor.save(snapshot_path(run, done))
+        _write_curve(run, curve)
+        save_networks(model, run / NETWORKS)
+        save_checkpoint(model, run)
+        print(f"{config.task}: {done:,} of {config.decisions:,} decisions, mean return {curve[-1][1]:.1f}", flush=True)
+    return export_run(run, run)
+
+
+def _begin(config: PolicyConfig) -> None:
+    """Write a new run's settings; of a run that is there, refuse other ones. Its length may change."""
+    kept = {k: v for k, v in asdict(config).items() if k not in ("out", "decisions", "stop_at")}
+    kept["start_from"] = None if config.start_from is None else str(config.start_from)
+    path = config.out / SETTINGS
+    if path.exists():
+        stored = json.loads(path.read_text(encoding="utf-8"))
+        if differing := [name for name, value in kept.items() if stored.get(name) != value]:
+            raise UserError(f"{config.out}: holds a run with another {', '.join(differing)}; choose another --out")
+        return
+    if config.out.exists() and any(config.out.iterdir()):
+        raise UserError(f"{config.out}: is not empty and holds no training run; choose another --out")
+    if config.start_from is not None and not all((config.start_from / name).exists() for name in PROGRESS):
+        raise UserError(f"{config.start_from}: lacks one of {', '.join(PROGRESS)}; name the folder of a run")
+    config.out.mkdir(parents=True, exist_ok=True)
+    write_bytes(path, (json.dumps(kept, indent=1) + "\n").encode())
+
+
+def _start_from(model: SAC, config: PolicyConfig, start: Path) -> list[tuple[int, float]]:
+    """Take over another run's networks, curve, which is returned, and snapshots; its replay is made anew."""
+    start_from_networks(model, start / NETWORKS)
+    curve = read_curve(start)
+    (config.out / "snapshots").mkdir(exist_ok=True)
+    for step, actor in exported_actors(start, config.task):
+        actor.save(snapshot_path(config.out, step))
+    for step, _ in curve:
+        if snapshot_path(start, step).exists():
+            shutil.copy(snapshot_path(start, step), snapshot_path(config.out, step))
+    _write_curve(config.out, curve)
+    model.num_timesteps = curve[-1][0]
+    refill(model, config.refill, config.critic_warmup)
+    return curve
+
+
+def _write_curve(run: Path, curve: list[tuple[int, float]]) -> None:
+    lines = [",".join(CURVE_COLUMNS), *(f"{step},{mean:.3f}" for step, mean in curve)]
+    write_bytes(run / CURVE, ("\n".join(lines) + "\n").encode())
+
+
+def main() -> None:
+    """Train by the command line."""
+    words = sys.argv[1:]
+    if words and words[0].endswith(".py"):
+        runpy.run_path(words.pop(0))
+    recipes = {name: RECIPES.get(name, replace(_GENERAL, task=name)) for name in TASKS}
+    presets = {name: (f"train on {name}", replace(recipe, out=tyro.MISSING)) for name, recipe in recipes.items()}
+    try:
+        for quality, path in train_actor(tyro.extras.overridable_config_cli(presets, args=words)).items():
+            print(f"{quality}: {path}")
+    except UserError as error:
+        print(f"error: {error}", file=sys.stderr)
+        sys.exit(2)
+
+
+if __name__ == "__main__":
+    main()

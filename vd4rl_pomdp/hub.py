@@ -1,0 +1,199 @@
+"""Encoders and data sets on the Hugging Face Hub, by huggingface_hub's own transfers.
+
+A repository that `push` wrote holds a listing beside the files: their kind, their licence, and the SHA-256 of each, by
+which `pull` judges what it was sent. Encoders are model repositories, OWNER/NAME; data sets are datasets/OWNER/NAME, as
+in the Hub's own addresses. Endpoint and token are those of huggingface_hub: HF_ENDPOINT, HF_TOKEN, `hf auth login`.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import sys
+import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import Any
+
+from huggingface_hub import HfApi
+from huggingface_hub.errors import HfHubHTTPError, HTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
+from huggingface_hub.utils import disable_progress_bars
+
+from vd4rl_pomdp import __version__
+from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line
+from vd4rl_pomdp.core.reading import read_bytes
+from vd4rl_pomdp.core.text import code, code_block, one_line
+from vd4rl_pomdp.data.episodes import join_shards
+from vd4rl_pomdp.data.format import check_frames, is_shard_name, read_attributes, read_rows, shard_files, shard_paths
+from vd4rl_pomdp.data.manifest import check_whole, task_and_quality
+from vd4rl_pomdp.nn.encoder_folder import CONFIG, WEIGHTS, load_encoder, read_record
+from vd4rl_pomdp.nn.model_card import CARD, LICENSE, TAGS, front_matter, model_card
+from vd4rl_pomdp.runs.files import read_json, sha256, write_bytes, write_json
+from vd4rl_pomdp.runs.outputs import kept_in, refuse_inside
+
+LISTING = "vd4rl_pomdp.json"
+"""Name of the listing beside the files."""
+ENCODER, SET = "an encoder", "a data set"
+"""What a repository holds, in the words of `runs.outputs.kept_in`."""
+_FORMAT = 1
+_PATTERNS = {ENCODER: [CONFIG, WEIGHTS], SET: ["*.hdf5", "*.HDF5", "*.h5", "*.H5", "*.json", "*.md", "*.png"]}
+"""Files of each kind: a push replaces all of them, and leaves whatever else its owner keeps there."""
+
+
+def push(folder: Path, repository: str, private: bool = False, revision: str = "main", license: str = LICENSE) -> str:
+    """Write an encoder or a data set as one commit; returns its address.
+
+    Args:
+        folder: an encoder's or a set's folder, which is checked first.
+        repository: OWNER/NAME or datasets/OWNER/NAME, made if there is none; one of something else is refused.
+        private: make it private.
+        revision: branch to write to, made if there is none.
+        license: the licence that its card names, as the Hub spells it.
+
+    Raises:
+        UserError: the folder holds neither or a damaged one, or the Hub refuses or cannot be reached.
+    """
+    name, kind = _repository(repository)
+    held = kept_in(folder) or (SET if shard_files(folder) else None)  # a damaged shard is told what is wrong with it
+    if held != kind:
+        raise UserError(
+            f"{folder}: holds {held or 'nothing of the kind'}, not {kind}, which {repository} is the name for; name "
+            "RUN/encoder and OWNER/NAME, or a folder of shards and datasets/OWNER/NAME"
+        )
+    files = _checked(folder, kind)
+    card = model_card(read_record(folder), name, license) if kind == ENCODER else _set_card(folder, name, license)
+    listing = {"format": _FORMAT, "kind": kind, "sha256": {f.name: sha256(f) for f in files}, "license": license}
+    with _hub(repository) as (api, where), tempfile.TemporaryDirectory() as staged:
+        api.create_repo(**where, private=private or None, exist_ok=True)
+        there = set(api.list_repo_files(**where)) - {".gitattributes", CARD}
+        if there and LISTING not in there:
+            raise UserError(f"{repository}: holds files that were not pushed by vd4rl-pomdp; choose another name")
+        if revision != "main":
+            api.create_branch(**where, branch=revision, exist_ok=True)
+        for file in files:
+            (Path(staged) / file.name).symlink_to(file.resolve())
+        write_bytes(Path(staged) / CARD, card.encode())
+        write_json(Path(staged) / LISTING, listing)
+        message = f"{kind.split()[-1].capitalize()} of vd4rl-pomdp {__version__}"
+        commit: Any = api.upload_folder(
+            **where, folder_path=staged, revision=revision, commit_message=message, delete_patterns=_PATTERNS[kind]
+        )
+    return str(commit.commit_url)
+
+
+def pull(repository: str, folder: Path, revision: str = "main") -> bool:
+    """Fetch an encoder or a data set; returns whether anything was fetched: what is there and right is left as it is.
+
+    A pull that was cut is resumed; `folder` appears when all of it is there and right.
+
+    Args:
+        repository: one that `push` wrote.
+        folder: folder to make; an empty one will do.
+        revision: branch, tag or commit.
+
+    Raises:
+        UserError: the folder holds something else, what was sent is damaged, or the Hub refuses or cannot be reached.
+    """
+    _, kind = _repository(repository)
+    folder = Path(os.path.abspath(folder))
+    refuse_inside(folder)
+    staged = folder.with_name(f".{folder.name}.pull")
+    with _hub(repository) as (api, where):
+        api.hf_hub_download(**where, filename=LISTING, revision=revision, local_dir=staged)
+        listing = _read_listing(staged / LISTING, kind, repository)
+        if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
+            shutil.rmtree(staged)
+            others = {shard.name for shard in shard_files(folder)} - listing.keys()  # would make it another set
+            if folder.is_dir() and not others and not _wrong(folder, listing):
+                return False
+            raise UserError(f"{folder}: is not empty and holds something else than {repository}; choose another folder")
+        api.snapshot_download(**where, revision=revision, local_dir=staged, allow_patterns=[*listing])
+    with disk_errors(folder):
+        if wrong := _wrong(staged, listing):
+            (staged / wrong[0]).unlink(missing_ok=True)
+            raise UserError(
+                f"{repository}: {wrong[0]} has a wrong SHA-256 and was removed; pull again, or ask its owner"
+            )
+        license = str(read_json(staged / LISTING).get("license", ""))
+        for path in list(staged.iterdir()):
+            if path.name not in listing:  # of huggingface_hub, or of a cut pull of another repository
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
+        _checked(staged, kind)
+        if kind == ENCODER:
+            write_bytes(staged / CARD, model_card(read_record(staged), license=license).encode())
+        staged.rename(folder)
+    return True
+
+
+def _repository(text: str) -> tuple[str, str]:
+    """Name and kind of OWNER/NAME, an encoder's, or datasets/OWNER/NAME, a set's."""
+    name = text.removeprefix("datasets/")
+    if name.count("/") != 1 or not all(name.split("/")):
+        raise UserError(
+            f"{text!r} names no repository: write OWNER/NAME for an encoder, datasets/OWNER/NAME for a data set"
+        )
+    return name, ENCODER if name == text else SET
+
+
+@contextmanager
+def _hub(repository: str) -> Iterator[tuple[HfApi, dict[str, str]]]:
+    """Client and the repository as its methods take it; what the Hub refuses, or its absence, is one sentence."""
+    if not sys.stderr.isatty():
+        disable_progress_bars()
+    name, kind = _repository(repository)
+    try:
+        api = HfApi(os.environ.get("HF_ENDPOINT"), library_name="vd4rl-pomdp", library_version=__version__)
+        yield api, {"repo_id": name, "repo_type": "dataset" if kind == SET else "model"}
+    except UserError:
+        raise
+    except OfflineModeIsEnabled as error:
+        raise UserError("HF_HUB_OFFLINE is set, so that nothing is sent or fetched; unset it") from error
+    except (HfHubHTTPError, HTTPError, LocalEntryNotFoundError, RuntimeError, ValueError) as error:
+        raise UserError(
+            f"{repository}: the Hub refuses or does not answer ({in_one_line(error)}); check the name, --revision, "
+            "HF_TOKEN or `hf auth login`, and the network"
+        ) from error
+
+
+def _read_listing(path: Path, kind: str, repository: str) -> dict[str, str]:
+    """SHA-256 by name of the files that a repository lists; raises UserError if the listing is damaged."""
+    listing = read_json(path)
+    files = listing.get("sha256")
+    names = set(files) if isinstance(files, dict) else set()
+    fits = names == {CONFIG, WEIGHTS} if kind == ENCODER else any(map(is_shard_name, names))
+    plain = all(Path(name).name == name and not name.startswith(".") and name != CARD for name in names)
+    if (listing.get("format"), listing.get("kind")) != (_FORMAT, kind) or not (fits and plain):
+        raise UserError(f"{repository}: its {LISTING} is of another version or damaged; ask its owner")
+    return dict(files)
+
+
+def _wrong(folder: Path, listing: dict[str, str]) -> list[str]:
+    """Files of a listing that a folder has not, or with another content."""
+    return [n for n, digest in listing.items() if not (folder / n).is_file() or sha256(folder / n) != digest]
+
+
+def _checked(folder: Path, kind: str) -> list[Path]:
+    """Files of a kind in a folder; UserError if the encoder does not load, or the set's rows are not whole."""
+    if kind == ENCODER:
+        load_encoder(folder)
+        return [folder / CONFIG, folder / WEIGHTS]
+    shards = shard_paths(folder)
+    check_whole(folder, shards)
+    check_frames(shards)
+    join_shards(folder, shards, [read_rows(shard) for shard in shards])
+    kept = [p for p in folder.iterdir() if p.suffix in (".json", ".md", ".png") and not p.name.startswith(".")]
+    return sorted([*shards, *(path for path in kept if path.name not in (CARD, LISTING))])
+
+
+def _set_card(folder: Path, repository: str, license: str) -> str:
+    """README.md of a data set: its data card, or what its files tell if it has none."""
+    names = task_and_quality(folder, [read_attributes(shard) for shard in shard_paths(folder)])
+    told = folder / "card.md"
+    title = f"# {', '.join(code(name or 'unknown') for name in names)}\n"
+    body = read_bytes(told).decode(errors="replace") if told.is_file() else title
+    use = code_block([f"vd4rl-pomdp hub pull datasets/{repository} FOLDER"], "bash")
+    tags = [*TAGS[:2], *(one_line(name) for name in names if name)]
+    return "\n".join(
+        [*front_matter({"license": license, "tags": tags}), "", body.rstrip(), "", "## Use it", "", *use, ""]
+    )

@@ -1,0 +1,378 @@
+"""Results that outlive their run folders: one folder an experiment, small enough to commit.
+
+    runs.jsonl     one JSON object a run: its id, and what its small files hold, by their names
+    episodes.csv   raw evaluation rows, the run's id first
+
+A report of a results folder is the same as one of the run folders, but for films. Both files are written whole, the
+rows first: rows of a run that runs.jsonl does not name were left by a cut writing, and are ignored.
+"""
+
+from __future__ import annotations
+
+import json
+import sys
+from collections.abc import Iterable, Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.reading import parse_json, read_bytes
+from vd4rl_pomdp.core.settings import LABELS, settings_of
+from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
+from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
+from vd4rl_pomdp.runs.files import Row, files_below, read_json, replacing_file, write_csv
+from vd4rl_pomdp.runs.identity import content_hash, identity
+from vd4rl_pomdp.runs.metrics import read_metrics
+from vd4rl_pomdp.runs.outputs import refuse_foreign
+from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.provenance import CONTINUED
+from vd4rl_pomdp.runs.run import remedy
+
+RUNS = "runs.jsonl"
+FILES = {Path(file).stem: file for file in RECORDS} | {"encoder": f"encoder/{CONFIG_FILE}"}
+"""A run's small files: the name of their content in runs.jsonl, and their place in the run folder."""
+
+
+@dataclass(frozen=True)
+class Result:
+    """One run, finished or not, from its folder or from a results folder."""
+
+    id: str
+    """Name of what it computes, see `runs.identity`."""
+    path: Path
+    """Its folder, or the results folder that tells of it."""
+    files: dict[str, dict[str, Any]]
+    """Content of the FILES that it has."""
+    step: int
+    """The last step of which its metrics tell, 0 before the first."""
+    losses: list[tuple[int, float]]
+    """Step and action loss in the course of a pretraining."""
+    rows: list[Row]
+    """Evaluation rows, one an episode."""
+    folder: bool = False
+    """Whether `path` is its own folder."""
+
+    @property
+    def place(self) -> str:
+        """Where it is told of, for a message."""
+        return str(self.path) if self.folder else f"{self.path}: run {self.id}"
+
+    @property
+    def record(self) -> dict[str, Any]:
+        """config.json: stage, config, inputs, versions, git_commit, command."""
+        return self.files["config"]
+
+    @property
+    def parts(self) -> list[dict[str, Any]]:
+        """Hardware and `git_commit` of the run, and of each later part of it that had others."""
+        told = self.files.get("machine", {})
+        return [told | {"git_commit": self.record.get("git_commit")}, *told.get(CONTINUED, [])]
+
+    @property
+    def machine(self) -> str:
+        """What it was computed on: its GPU, or its processor and cores; "A then B" if it moved, empty if unknown."""
+        return _in_turn(map(_hardware, self.parts))
+
+    @property
+    def commit(self) -> str:
+        """The commit it was computed with, likewise."""
+        return _in_turn(part.get("git_commit") for part in self.parts)
+
+    @property
+    def encoder(self) -> dict[str, Any]:
+        """What its encoder says of its pretraining; empty where there is none yet."""
+        return self.files.get("encoder", {}).get("pretrain", {})
+
+    @property
+    def origin(self) -> dict[str, Any]:
+        """What its encoder says of the code that made it, and of its probe; empty where there is none yet."""
+        return self.files.get("encoder", {}).get("origin", {})
+
+    @property
+    def card(self) -> dict[str, Any]:
+        """The same of the encoder that it started from; empty for a pretraining run."""
+        return self.encoder if self.record["stage"] == "finetune" else {}
+
+    @property
+    def labels(self) -> dict[str, Any]:
+        """Values of LABELS; the task is empty until the run has opened its data."""
+        return {name: self.files["labels"][name] for name in LABELS}
+
+    @property
+    def measured(self) -> list[Row]:
+        """What it found: evaluation rows, or the measures of a navigation run."""
+        return self.rows or self.files.get("results", {}).get("rows", [])
+
+    @property
+    def finished(self) -> bool:
+        """Whether the run has come to its end."""
+        return "timing" in self.files
+
+    @property
+    def diverged(self) -> dict[str, Any] | None:
+        """Where it diverged, as `step` and `message`; None if it did not."""
+        return self.files.get("diverged")
+
+    @property
+    def settled(self) -> bool:
+        """Whether nothing is left to be done: it has finished, or it diverged."""
+        return self.finished or self.diverged is not None
+
+    @property
+    def ending(self) -> int:
+        """How much is told of its end: 0 that it has none yet, 1 that it diverged, 2 that it finished."""
+        return self.settled + self.finished
+
+
+def _in_turn(words: Iterable[Any]) -> str:
+    return " then ".join(dict.fromkeys(str(word) for word in words if word))
+
+
+def _hardware(part: dict[str, Any]) -> str | None:
+    if part.get("gpu"):
+        return str(part["gpu"])
+    processor, cores = part.get("processor"), part.get("cores")
+    return f"{processor}, {cores} cores" if processor and cores else processor
+
+
+def read_run(folder: Path | str) -> Result:
+    """What a run folder holds; raises UserError for damaged files."""
+    folder = Path(folder)
+    files = {name: read_json(folder / place) for name, place in FILES.items() if (folder / place).exists()}
+    if "encoder" in files and not isinstance(files["encoder"].get("pretrain"), dict):
+        raise UserError(f"{folder / FILES['encoder']}: does not say how the encoder was pretrained; pretrain it again")
+    metrics, path = read_metrics(folder / METRICS_FILE), folder / EPISODES_FILE
+    # A row that was cut with its run is left out; a finished run has none.
+    found = read_episodes(path) if "timing" in files else episodes_until(path, sys.maxsize)
+    rows = [{name: row[name] for name in COLUMNS} for row in found]
+    step = max((int(row["step"]) for row in (*metrics, *rows)), default=0)
+    with whole_files(folder):
+        losses = [(int(row["step"]), row["action_loss"]) for row in metrics if "action_loss" in row]
+        pretraining = files["config"]["stage"] == "pretrain"
+        run = Result("", folder, files, step, losses if pretraining else [], rows, True)
+        _check(run)
+        _check_last_evaluation(run)
+        files["labels"] = files.get("labels", {}) | _labels(run)
+        return replace(run, id=_id(run))
+
+
+def _check_last_evaluation(run: Result) -> None:
+    """Raise UserError if a finished fine-tuning's folder lacks episodes of its last evaluation."""
+    last, episodes = run.files.get("timing", {}).get("updates"), run.record["config"].get("eval_episodes")
+    found = [row for row in run.rows if row["step"] == last and row["evaluated_under"] == row["corruption"]]
+    if last is not None and episodes is not None and len(found) < episodes:
+        what = f"{len(found)} of {episodes} episodes of the last evaluation"
+        raise UserError(f"{run.path / EPISODES_FILE}: has {what}; {remedy(run.path)}")
+
+
+def _labels(run: Result) -> dict[str, Any]:
+    """A run's labels: from its rows, from its labels.json, or else as many as its config tells."""
+    known = run.rows[0] if run.rows else run.files.get("labels")
+    if known is not None:
+        if missing := [name for name in LABELS if name not in known]:
+            raise UserError(f"{run.path / FILES['labels']}: has no {missing[0]!r}; {remedy(run.path)}")
+        return {name: known[name] for name in LABELS}
+    told = {"method": run.path.name, "task": run.encoder.get("task"), "quality": run.encoder.get("quality")}
+    told |= run.record["config"]
+    return {name: told.get(name) or "" for name in LABELS if name != "seed"} | {"seed": told["seed"]}
+
+
+def _id(run: Result) -> str:
+    """Its identity; of a policy whose encoder or data were not recorded whole, a hash of what is."""
+    data = run.record.get("inputs", {}).get("data")
+    if data and ({"settings", "seed"} <= run.card.keys() or run.record["stage"] != "finetune"):
+        return identity(run.record, run.card)
+    return content_hash([run.record["stage"], settings_of(run.record["config"]), run.labels, run.card, data])
+
+
+def _check(run: Result) -> None:
+    """Look at the parts of a run that everything relies on; raises KeyError, TypeError or AttributeError."""
+    if not all(isinstance(part, dict) for part in (*run.files.values(), *run.parts, run.record["config"], run.encoder)):
+        raise TypeError("a part of it is no JSON object")
+    if "seed" not in run.record["config"]:
+        raise TypeError("its record holds no settings")
+    if not isinstance(run.record["stage"], str):
+        raise TypeError(f"its stage is {run.record['stage']!r}")
+
+
+@contextmanager
+def whole_files(where: Path | str) -> Iterator[None]:
+    """Whatever is wrong with a run's content becomes a sentence that says where."""
+    try:
+        yield
+    except UserError:
+        raise
+    except (KeyError, TypeError, ValueError, AttributeError) as error:
+        raise UserError(f"{where}: its files are damaged ({error}); take another copy, or leave it out") from error
+
+
+def read_results(folder: Path | str) -> list[Result]:
+    """All runs of a results folder; raises UserError if it is none, or damaged."""
+    folder = Path(folder)
+    path, by_run = folder / RUNS, dict[str, list[Row]]()
+    lines = read_lines(path)  # before the rows, which are written first: one that is written meanwhile lacks none
+    for row in read_episodes(folder / EPISODES_FILE):
+        if "id" not in row:
+            raise UserError(f"{folder / EPISODES_FILE}: has no column 'id'; it was not written beside {RUNS}")
+        shared = {name: sys.intern(row[name]) if isinstance(row[name], str) else row[name] for name in COLUMNS}
+        by_run.setdefault(row["id"], []).append(shared)
+    runs = [_parse(path, number, line, by_run) for number, line in enumerate(lines, 1)]
+    if len({run.id for run in runs}) != len(runs):
+        raise UserError(f"{path}: names a run twice; remove one of the two lines")
+    return runs
+
+
+def read_lines(path: Path) -> list[str]:
+    """The lines of a runs.jsonl; raises UserError for one that is missing, empty or no text."""
+    try:
+        lines = read_bytes(path).decode().splitlines()
+    except FileNotFoundError as error:
+        raise UserError(f"{path.parent}: holds no {RUNS}, so it is no results folder") from error
+    except UnicodeDecodeError as error:
+        raise UserError(f"{path}: is no UTF-8 ({error}); take another copy") from error
+    if not lines:
+        raise UserError(f"{path}: is empty; take another copy, or remove it")
+    return lines
+
+
+def _parse(path: Path, number: int, line: str, by_run: dict[str, list[Row]]) -> Result:
+    """A line's run, with the rows that it had when the line was written: a cut writing may have added later ones."""
+    with whole_files(f"{path}: line {number}"):
+        told = parse_json(line)
+        files = {name: told[name] for name in FILES if name in told}
+        losses = [(int(step), float(loss)) for step, loss in told.get("losses", [])]
+        rows, count = by_run.get(told["id"], []), int(told["episodes"])
+        if len(rows) < count:
+            where = path.parent / EPISODES_FILE
+            raise UserError(f"{where}: has {len(rows)} of {count} rows of run {told['id']}; take another copy")
+        run = Result(told["id"], path.parent, files, int(told["step"]), losses, rows[:count])
+        _check(run)
+        return run
+
+
+def write_results(out: Path, runs: Iterable[Result]) -> None:
+    """Write runs as a results folder that holds nothing else of the kind; a reader sees each file whole."""
+    runs = list(runs)
+    with disk_errors(out):
+        out.mkdir(parents=True, exist_ok=True)
+    write_csv(out / EPISODES_FILE, ("id", *COLUMNS), ({"id": run.id} | row for run in runs for row in run.rows))
+    with replacing_file(out / RUNS) as fresh, fresh.open("w", encoding="utf-8") as file:
+        for run in runs:
+            files = {name: run.files[name] for name in FILES if name in run.files}
+            told = {"id": run.id, **files, "step": run.step, "episodes": len(run.rows)}
+            file.write(json.dumps(told | ({"losses": run.losses} if run.losses else {})) + "\n")
+
+
+def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[Result]:
+    """Every run at or below some paths, each once: of a run folder, or else of a results folder.
+
+    Results folders within a results folder are other experiments: they are read where they are named themselves.
+
+    Args:
+        paths: run folders, results folders, and folders that contain some.
+        but: a results folder that is not read unless it is named itself.
+
+    Raises:
+        UserError: a path is missing, there is no run, two runs of one id have different rows, or a file is damaged.
+    """
+    if not paths:
+        raise UserError("name at least one run folder, or a folder that contains some")
+    found: dict[str, Result] = {}
+    for run in _found([Path(path) for path in paths], but):
+        found[run.id] = _better(found[run.id], run) if run.id in found else run
+    if not found:
+        raise UserError(
+            f"{paths[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl) and no results "
+            f"folder (which holds {RUNS})"
+        )
+    return list(found.values())
+
+
+def _found(paths: Sequence[Path], but: Path | None) -> Iterator[Result]:
+    if missing := [path for path in paths if not path.exists()]:
+        raise UserError(f"{missing[0]}: no such folder")
+    files = [file for path in paths for file in files_below(path, CONFIG_FILE)]
+    yield from (read_run(file.parent) for file in dict.fromkeys(files) if "stage" in read_json(file))
+    places: dict[Path, None] = {}
+    for path in paths:
+        below = {file.parent for file in files_below(path, RUNS)}
+        places |= dict.fromkeys(place for place in sorted(below) if below.isdisjoint(place.parents))
+    for place in places:
+        if but is None or place in paths or place.resolve() != but.resolve():
+            yield from read_results(place)
+
+
+def _better(one: Result, other: Result) -> Result:
+    """Of two tales of one run the one that finished, else diverged; then that of its folder, then the one ahead."""
+    if one.settled and one.ending == other.ending and one.measured != other.measured:
+        raise UserError(f"{other.path} and {one.path}: two runs of one method, setting and seed; name one of them")
+    return max(one, other, key=lambda run: (run.ending, run.folder, len(run.measured), run.step))
+
+
+class Added(NamedTuple):
+    """What became of some runs."""
+
+    added: int
+    known: int
+    """There already with the same rows."""
+    kept: int
+    """There already with other rows, which stay."""
+    unfinished: int
+    """Neither finished nor diverged, so left out."""
+
+    @property
+    def in_words(self) -> str:
+        """One line: "2 runs added, 1 there already"."""
+        told = (
+            (self.known, "there already"),
+            (self.kept, "there already with other rows, which stay (remove their lines to replace them)"),
+            (self.unfinished, "unfinished and left out"),
+        )
+        return ", ".join(
+            [f"{self.added} run{'s' * (self.added != 1)} added", *(f"{n} {what}" for n, what in told if n)]
+        )
+
+
+def add_results(paths: Sequence[Path | str], out: Path | str) -> Added:
+    """Append the runs at or below some paths to a results folder, each once; no row that is there changes.
+
+    An unfinished run of the folder, such as a report of that time keeps, gives way to the same run when it is settled,
+    and one that diverged to the same run when it has finished after all.
+
+    Raises:
+        UserError: as `find_results`, or `out` holds something else, is damaged or is in use.
+    """
+    out = Path(out)
+    refuse_foreign(out, "results", RUNS, "README.md")  # whose page may be there before the first run
+    found = find_results(paths, out)
+    with owned(out):
+        there = _kept(out)
+        settled = [run for run in found if run.settled]
+        fresh = {run.id: run for run in settled if run.id not in there or run.ending > there[run.id].ending}
+        if fresh:
+            write_results(out, (there | fresh).values())
+    again = [run for run in settled if run.id not in fresh]
+    known = sum(run.measured == there[run.id].measured for run in again)
+    return Added(len(fresh), known, len(again) - known, len(found) - len(settled))
+
+
+def _kept(out: Path) -> dict[str, Result]:
+    """The runs of a results folder by id, none before the first."""
+    return {run.id: run for run in read_results(out)} if (out / RUNS).exists() else {}
+
+
+def refuse_loss(runs: Sequence[Result], out: Path) -> None:
+    """Raise UserError if writing runs as the results folder `out` would lose settled ones, or rows, that it holds."""
+    there = [run for run in _kept(out).values() if run.settled]
+    written = {run.id: run for run in runs if run.settled}
+    if lost := [run for run in there if run.id not in written]:
+        raise UserError(
+            f"{out}: holds the results of {len(lost)} runs that would be lost; name the folder among those to report, "
+            "remove it, or choose another --out"
+        )
+    for run in there:
+        other = written[run.id]
+        if run.measured != other.measured and other.ending <= run.ending:
+            raise UserError(f"{out}: holds other rows of run {run.id}, which would be lost; choose another --out")
