@@ -12,12 +12,10 @@ from PIL import Image
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.data.collect import CollectConfig, collection
-from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
+from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.results import find_results
-from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
 from vd4rl_pomdp.sweeps import plan as module
 from vd4rl_pomdp.sweeps.folder import SweepFolder
@@ -378,12 +376,6 @@ def test_a_run_that_added_other_images_is_another(tmp_path):
     Image.new("RGB", (9, 9), "blue").save(tmp_path / "one.png")
     module._images_in.cache_clear()
     assert module._found({run.recipe: [run]}, run.recipe, AnySet()) is None
-
-
-def test_a_navigation_run_is_planned_as_it_is_recorded():
-    for cell in load_grid("navigation").cells()[::7]:
-        settings = cell.sections["navigation_train"] | {"preset": "cpu", "seed": cell.seed}
-        assert recorded(cell, "navigation_train") == jsonable(flat(NavigationConfig.of(**settings)))
 
 
 def test_a_set_of_ones_own_quality_is_taken_where_it_is_there_and_its_runs_are_the_grids(tmp_path, capsys, own_cache):

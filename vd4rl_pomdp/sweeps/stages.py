@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import fields, replace
+from dataclasses import replace
 from functools import cache
-from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_number, refuse_unknown
-from vd4rl_pomdp.core.options import flat
+from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
+from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_number
+from vd4rl_pomdp.core.options import flat, words_of
 from vd4rl_pomdp.core.settings import settings_of
-from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.identity import recipe
@@ -27,6 +27,8 @@ COMMANDS = {
 """Words of every section's command."""
 STAGES = {"pretrain": "pretrain", "finetune": "finetune", "navigation_train": "navigation"}
 """What a training's record calls its stage, by section."""
+_READS = {"pretrain": ("data",), "finetune": ("data", "encoder"), "navigation_train": ("data",)}
+"""Folders that a stage is given, beside the one it writes."""
 _TAKES = {"collect": (), "navigation_collect": ("preset",)}
 """What a stage takes of the shared settings, where that is not all of them."""
 
@@ -54,60 +56,42 @@ def check_cells(cells: Sequence[GridCell], grid: str) -> None:
 
 
 def config_of(cell: GridCell, section: str) -> Any:
-    """A stage's settings, its folders left open."""
+    """A stage's settings, as its own command line reads them, its folders left open."""
     settings = told(cell, section)
-    seed = settings.pop("seed", 0)
+    later = {"seed": settings.pop("seed", 0)}
+    if section == "collect" and settings.get("quality", "expert") not in SET_QUALITIES:
+        later |= {"quality": settings["quality"]}  # of a set of one's own, which no command collects
+        settings |= {"quality": "expert"}
     try:
-        return replace(_made(section, tuple(settings.items())), seed=seed)
+        return replace(_parsed(section, tuple(words_of(settings))), **later)
     except UserError as error:
         raise type(error)(f"{section}: {error}") from error
 
 
 @cache
-def _made(section: str, items: tuple[tuple[str, Any], ...]) -> Any:
+def _parsed(section: str, words: tuple[str, ...]) -> Any:
     """The settings of a section, once for all seeds."""
-    settings, kind = dict(items), _config_class(section)
-    if section == "collect":
-        return _collection(kind, settings, {"task": None, "quality": None, "out": Path()})
-    if section == "navigation_collect":
-        from vd4rl_pomdp.studies.navigation.collect import PRESETS
-
-        preset = settings.get("preset", "paper")
-        refuse_unknown("preset", preset, PRESETS)
-        return _collection(kind, settings, vars(PRESETS[preset]) | {"maze": None})
-    config = kind.of(**settings)
-    config.check()
-    return config
-
-
-def _config_class(section: str) -> Any:
-    """The class of a section's settings, imported when it is needed."""
+    program = " ".join(("vd4rl-pomdp", *COMMANDS[section]))
+    line = [*words, *words_of(dict.fromkeys((*_READS.get(section, ()), "out"), "-"))]
     if section == "collect":
         from vd4rl_pomdp.data.collect import CollectConfig
 
-        return CollectConfig
+        return parse(CollectConfig, line, program)
     if section == "pretrain":
         from pretrain.config import PretrainConfig
 
-        return PretrainConfig
+        return parse_stage(PretrainConfig, line, program)
     if section == "finetune":
         from finetune.config import FinetuneConfig
 
-        return FinetuneConfig
-    from vd4rl_pomdp.studies.navigation import collect, config
+        return parse_stage(FinetuneConfig, line, program)
+    if section == "navigation_collect":
+        from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig
 
-    return collect.MazeCollectConfig if section == "navigation_collect" else config.NavigationConfig
+        return with_presets(MazeCollectConfig, PRESETS, line, program)
+    from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 
-
-def _collection(kind: Any, settings: Values, defaults: Values) -> Any:
-    """A collection's settings, of which a grid has to tell those whose default is None."""
-    for name in settings:
-        refuse_unknown("setting", name, (field.name for field in fields(kind)))
-    values = defaults | settings
-    for name in defaults:
-        if values[name] is None:
-            raise UserError(f"names no {name}: give it one")
-    return kind(**values)
+    return parse_stage(NavigationConfig, line, program)
 
 
 def collection_of(cell: GridCell) -> Values:
