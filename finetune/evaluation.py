@@ -17,7 +17,6 @@ from vd4rl_pomdp.core.registry import warn_of_other_code
 from vd4rl_pomdp.core.settings import LABELS
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, MOST_EPISODES, TASKS, Task
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.data.format import warn_of_earlier_pictures
 from vd4rl_pomdp.data.reference import Reference, action_error
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn, Observation
 from vd4rl_pomdp.envs.make import layout_of
@@ -274,7 +273,6 @@ def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int)
     record = _record(run)
     warn_of_other_code(run, record, read_record(run / "encoder").parts, what)
     task = TASKS.named(card.task)
-    warn_of_earlier_pictures(run, record.get("collection") or {}, task)
     chosen = own_and_none(CorruptionConfig.fill(card.corruption))
     if corruption is not None:
         chosen = [CorruptionConfig.fill(card.corruption | {"corruption": corruption})]

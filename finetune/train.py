@@ -24,7 +24,7 @@ from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.core.tasks import TASKS, UNKNOWN_QUALITY
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
-from vd4rl_pomdp.data.format import read_plan, warn_of_earlier_pictures
+from vd4rl_pomdp.data.folder import read_plan
 from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.envs.make import layout_of
@@ -81,7 +81,6 @@ def finetune(config: FinetuneConfig) -> RunFolder:
     with run:
         if not run.finished:
             warn_of_other_code(config.encoder, before.code, before.parts, "it was pretrained; pretrain it again")
-            warn_of_earlier_pictures(config.data, collection, TASKS.named(card.task))
             write_json(run.path / LABELS_FILE, labels(config, card))
             _keep_encoder(config, run.path)
             dataset.to(device)

@@ -18,7 +18,7 @@ from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK, TASKS, UNKNOWN_QUALI
 from vd4rl_pomdp.core.types import StateWindows
 from vd4rl_pomdp.corruptions import check_corruption_fits
 from vd4rl_pomdp.data import Dataset, StateView, View, WindowSampler, open_dataset
-from vd4rl_pomdp.data.format import read_plan
+from vd4rl_pomdp.data.folder import read_plan
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.nn.encoder import EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, save_encoder

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from vd4rl_pomdp.core.types import StepType
-from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.data.format import FRAMES_KEY, read_frames, read_rows, write_shard
 
 
 def fake_frame(episode: int, t: int) -> np.ndarray:
@@ -88,3 +88,9 @@ def write_fake_set(
     for name, start, end in zip(names, edges[:-1], edges[1:], strict=True):
         write_shard(folder / name, {k: v[start:end] for k, v in rows.items()}, attributes or {})
     return folder
+
+
+def read_shard(path: Path) -> dict[str, np.ndarray]:
+    """Read and validate one shard: `read_rows` and, as `observation`, its (N, 3, S, S) uint8 frames."""
+    rows = read_rows(path)
+    return {FRAMES_KEY: np.concatenate(list(read_frames(path))), **rows}

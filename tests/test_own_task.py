@@ -18,13 +18,12 @@ import pretrain.config
 from finetune.evaluation import Episode, episode_rows, evaluate_run
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
+from tests.helpers_data import read_shard
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask
 from vd4rl_pomdp.data import View, open_dataset
-from vd4rl_pomdp.data.card import EARLIER
 from vd4rl_pomdp.data.check import check_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
-from vd4rl_pomdp.data.format import read_shard
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.report import write_report
@@ -128,33 +127,6 @@ def test_actions_are_rescaled_and_pictures_shrunk(tasks):
     mean = picture.reshape(60, 2, 60, 2, 3).astype(float).mean((1, 3)).transpose(2, 0, 1)
     assert np.abs(row.frame - mean).max() <= 0.5
     assert (row.state.size, row.physics.size) == (0, 0)
-
-
-def test_sets_say_how_their_pictures_were_shrunk_and_those_of_before_that_they_do_not(tasks, tmp_path, capsys):
-    data, row = tmp_path / "centre" / "random", "| pictures shrunk by | {} |"
-    config = CollectConfig("centre", "random", data, episodes=2, workers=1, frame_size=50)
-    collect(config, 8)
-    plan = json.loads((data / "collection.json").read_text())
-    assert plan.pop("downscaling") == "area means"
-    assert row.format("area means") in (data / "card.md").read_text()
-    stages(data, tmp_path / "now")
-    assert "shrunk" not in capsys.readouterr().err
-    (data / "collection.json").write_text(json.dumps(plan))
-    collect(config, 8)  # which is whole, and stays
-    assert row.format(EARLIER) in (data / "card.md").read_text()
-    run = stages(data, tmp_path / "before")
-    assert f"warning: {data}: pictures of its set were shrunk by an earlier version" in capsys.readouterr().err
-    evaluate_run(run, "none", 1, 1)
-    assert f"warning: {run}: pictures of its set were shrunk by an earlier version" in capsys.readouterr().err
-    (data / "provenance.json").unlink()
-    with pytest.raises(UserError, match="was begun by an earlier version with another downscaling, and is not whole"):
-        collect(config, 8)
-
-
-def test_frames_that_are_drawn_at_their_own_size_are_not_said_to_be_shrunk(tasks, tmp_path):
-    collect(CollectConfig("cartpole_swingup", "random", tmp_path, episodes=2, workers=1, frame_size=50), 8)
-    assert "downscaling" not in json.loads((tmp_path / "collection.json").read_text())
-    assert "shrunk" not in (tmp_path / "card.md").read_text()
 
 
 @pytest.mark.parametrize(

@@ -24,9 +24,8 @@ from vd4rl_pomdp import __version__
 from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line
 from vd4rl_pomdp.core.reading import read_bytes
 from vd4rl_pomdp.core.text import code, code_block, one_line
-from vd4rl_pomdp.data.episodes import join_shards
-from vd4rl_pomdp.data.format import check_frames, is_shard_name, read_attributes, read_rows, shard_files, shard_paths
-from vd4rl_pomdp.data.manifest import check_whole, task_and_quality
+from vd4rl_pomdp.data.folder import is_shard_name, join_shards, shard_files, shard_paths, task_and_quality
+from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_rows
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, WEIGHTS, load_encoder, read_record
 from vd4rl_pomdp.nn.model_card import CARD, LICENSE, TAGS, front_matter, model_card
 from vd4rl_pomdp.runs.files import read_json, sha256, write_bytes, write_json
@@ -179,8 +178,7 @@ def _checked(folder: Path, kind: str) -> list[Path]:
         load_encoder(folder)
         return [folder / CONFIG, folder / WEIGHTS]
     shards = shard_paths(folder)
-    check_whole(folder, shards)
-    check_frames(shards)
+    read_frame_size(shards)
     join_shards(folder, shards, [read_rows(shard) for shard in shards])
     kept = [p for p in folder.iterdir() if p.suffix in (".json", ".md", ".png") and not p.name.startswith(".")]
     return sorted([*shards, *(path for path in kept if path.name not in (CARD, LISTING))])

@@ -130,6 +130,18 @@ def test_the_list_of_commands_needs_neither_numpy_nor_torch_and_a_reader_may_go(
     assert (process.communicate()[1], process.returncode) == (b"", 141)
 
 
+def test_a_missing_extra_ends_in_one_line_that_names_it(tmp_path):
+    words = ["navigation", "collect", "--maze", "no_curtain", "--preset", "smoke", "--workers", "1", "--out", "x"]
+    code = (
+        "import sys; sys.modules['gymnasium_robotics'] = None; from vd4rl_pomdp.cli import main\n"
+        f"if __name__ == '__main__': main({words})"
+    )
+    environment = os.environ | {"PYTHONPATH": os.getcwd()}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "`pip install '.[navigation]'`" in done.stderr
+
+
 def test_a_terminal_that_is_not_utf_8_is_shown_what_it_can():
     line, environment = [sys.executable, "-m", "vd4rl_pomdp.cli"], os.environ | {"PYTHONIOENCODING": "ascii"}
     refused = subprocess.run([*line, "data", "check", "ζ"], capture_output=True, env=environment)

@@ -13,8 +13,8 @@ from vd4rl_pomdp.core.text import markdown
 from vd4rl_pomdp.data import card as module
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.card import write_card
+from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.data.published import published_scores
 
 MADE = {"task": "cheetah_run", "set": "medium_replay", "policy": "medium_replay", "seed": 7, "render": "fast"}
 

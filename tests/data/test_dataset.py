@@ -7,7 +7,8 @@ from tests.helpers_data import fake_action, fake_reward, fake_rows, frame_identi
 from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError
 from vd4rl_pomdp.core.types import row_key
 from vd4rl_pomdp.data import TransitionSampler, View, WindowSampler, open_dataset
-from vd4rl_pomdp.data.format import shard_paths, write_shard
+from vd4rl_pomdp.data.folder import shard_paths
+from vd4rl_pomdp.data.format import write_shard
 
 LENGTHS = (5, 3, 260)
 ROWS = [(e, t) for e, length in enumerate(LENGTHS) for t in range(length)]

@@ -6,9 +6,10 @@ import h5py
 import numpy as np
 import pytest
 
-from tests.helpers_data import fake_rows, write_fake_set
+from tests.helpers_data import fake_rows, read_shard, write_fake_set
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.data.format import read_attributes, read_dtypes, read_frames, read_shard, shard_paths, write_shard
+from vd4rl_pomdp.data.folder import shard_paths
+from vd4rl_pomdp.data.format import read_attributes, read_dtypes, read_frames, write_shard
 
 
 @pytest.fixture
@@ -269,9 +270,6 @@ def test_attributes_that_are_no_json_object_are_refused(shard, stored):
         read_attributes(shard)
 
 
-def test_capital_suffixes_are_shards_and_a_cut_download_is_no_set(tmp_path):
+def test_capital_suffixes_are_shards(tmp_path):
     write_fake_set(tmp_path, (4, 4), cuts=(4,), names=["0_fake.hdf5", "1_fake.HDF5"])
     assert [path.name for path in shard_paths(tmp_path)] == ["0_fake.hdf5", "1_fake.HDF5"]
-    (tmp_path / "2_fake.hdf5.part").touch()
-    with pytest.raises(UserError, match=r"2_fake\.hdf5\.part: the set's download is not finished"):
-        shard_paths(tmp_path)

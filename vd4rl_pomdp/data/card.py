@@ -10,29 +10,23 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from matplotlib.figure import Figure
 
 from vd4rl_pomdp.core.errors import UserError, disk_error
 from vd4rl_pomdp.core.tasks import SCORE_DIVISOR
 from vd4rl_pomdp.core.text import code, markdown, plain, write_text
 from vd4rl_pomdp.core.types import StepType
-from vd4rl_pomdp.data.episodes import episode_returns, join_shards
-from vd4rl_pomdp.data.format import (
+from vd4rl_pomdp.data.folder import (
     PROVENANCE,
-    check_frames,
-    read_attributes,
-    read_plan,
-    read_rows,
-    read_some_frames,
+    episode_returns,
+    join_shards,
+    published_scores,
     shard_paths,
+    task_and_quality,
 )
-from vd4rl_pomdp.data.manifest import check_whole, task_and_quality
-from vd4rl_pomdp.data.published import published_scores
+from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_rows, read_some_frames
 from vd4rl_pomdp.runs.files import read_json
 
 FILM_FRAMES = 10
-EARLIER = "an earlier version: area means only if a frame's size divides the picture's height and width"
-"""How the pictures of a set without simulator states were shrunk whose collection.json does not say."""
 LINES = 0.82
 """Height of bars and lines; above is the legend's place."""
 HOW = {
@@ -69,8 +63,7 @@ def write_card(path: Path) -> Path:
     if path.is_file():
         raise UserError(f"{path}: is one file; a card describes a whole set: name its folder")
     shards = shard_paths(path)
-    check_whole(path, shards)
-    check_frames(shards)
+    read_frame_size(shards)
     parts = [read_rows(shard) for shard in shards]
     rows = join_shards(path, shards, parts)
     attributes = [read_attributes(shard) for shard in shards]
@@ -80,7 +73,7 @@ def write_card(path: Path) -> Path:
     lengths = np.diff([*starts, len(rows["reward"])])
     published = _published(*names)
     film = _film(shards, [len(part["reward"]) for part in parts], starts, lengths, returns)
-    text = _text(path, names, attributes, returns, lengths, published, "physics" in rows)
+    text = _text(path, names, attributes, returns, lengths, published)
     try:
         (path / "card.png").write_bytes(_picture(names, returns, published, film))
         write_text(path / "card.md", text)
@@ -113,6 +106,8 @@ def _film(
 def _picture(
     names: tuple[str | None, str | None], returns: np.ndarray, published: float | None, film: np.ndarray
 ) -> bytes:
+    from matplotlib.figure import Figure  # slow to load
+
     figure = Figure(figsize=(8.4, 4.0), layout="constrained", dpi=110)
     above, below = figure.subplots(2, 1, height_ratios=(2.4, 1))
     low, top = min(returns.min(), 0.0), max(returns.max(), published or 0.0, 1.0)
@@ -145,7 +140,6 @@ def _text(
     returns: np.ndarray,
     lengths: np.ndarray,
     published: float | None,
-    simulated: bool,
 ) -> str:
     rows = {
         "episodes": len(returns),
@@ -157,7 +151,7 @@ def _text(
         "return, quartiles": ", ".join(f"{q:.1f}" for q in np.quantile(returns, (0.25, 0.5, 0.75))),
         "published return of plain BC on V-D4RL's set": "none" if published is None else f"{published:.0f}",
     }
-    lines = {name: markdown(str(value)) for name, value in rows.items()} | _origin(path, attributes, simulated)
+    lines = {name: markdown(str(value)) for name, value in rows.items()} | _origin(path, attributes)
     table = "\n".join(f"| {name} | {value} |" for name, value in lines.items())
     how = HOW.get(names[1] or "", "") if attributes[0] else "A published set, or one that records no origin."
     return (
@@ -169,11 +163,8 @@ def _span(low: Any, high: Any) -> str:
     return f"{low}" if low == high else f"{low} to {high}"
 
 
-def _origin(path: Path, attributes: list[dict[str, Any]], simulated: bool) -> dict[str, str]:
-    """Seed, actors, rendering, versions and commit, as the set's files record them, in Markdown.
-
-    `simulated` sets hold simulator states, and their frames are drawn at their own size.
-    """
+def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, str]:
+    """Seed, actors, rendering, versions and commit, as the set's files record them, in Markdown."""
     if not attributes[0]:
         return {}
     first = attributes[0]
@@ -181,8 +172,6 @@ def _origin(path: Path, attributes: list[dict[str, Any]], simulated: bool) -> di
     facts = {"seed": first.get("seed"), "render": first.get("render")}
     facts["noise added to actions, standard deviation"] = first.get("action_noise")
     facts |= {f"actor {name}, SHA-256": sha for name, sha in actors.items()}
-    if not simulated:
-        facts["pictures shrunk by"] = read_plan(path).get("downscaling", EARLIER)
     record = path / PROVENANCE
     if record.exists():
         provenance = read_json(record)

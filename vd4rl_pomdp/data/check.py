@@ -11,7 +11,7 @@ import numpy as np
 from vd4rl_pomdp.core.errors import UserError, first_line
 from vd4rl_pomdp.core.tasks import TASKS, DMCTask
 from vd4rl_pomdp.data.dataset import Dataset, open_dataset
-from vd4rl_pomdp.data.format import read_attributes, read_dtypes, shard_paths
+from vd4rl_pomdp.data.format import read_dtypes
 from vd4rl_pomdp.data.store import verify_store
 from vd4rl_pomdp.envs.mazes import MAZES
 
@@ -39,9 +39,9 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
         UserError: the set or its decoded form is damaged.
     """
     path = Path(path)
-    attributes = read_attributes(shard_paths(path)[0])
-    is_maze = attributes.get("task") in MAZES
     dataset = open_dataset(path, cache)
+    attributes = dataset.store.meta["attributes"][0]
+    is_maze = attributes.get("task") in MAZES
     verify_store(dataset.store)
     _check_actions(dataset)
     returns = dataset.returns.numpy()
@@ -63,7 +63,7 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
         "task": dataset.task,
         "quality": dataset.quality,
         "shards": dataset.store.meta["shards"],
-        "dtypes": _dtypes(shard_paths(path)),
+        "dtypes": _dtypes([path] if path.is_file() else [path / name for name in dataset.store.meta["shards"]]),
         "store_ok": True,
     }
 

@@ -23,19 +23,16 @@ from vd4rl_pomdp.core.tasks import (
     NOISY_QUALITIES,
     SET_QUALITIES,
     TASKS,
-    GymnasiumTask,
     NoisyQuality,
     Quality,
     Task,
 )
-from vd4rl_pomdp.data.format import DOWNSCALING
-from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
+from vd4rl_pomdp.data.shards import Columns, Shard, collect_set
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.outputs import refuse_inside
-from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import versions
 from vd4rl_pomdp.runs.workers import run_jobs
@@ -111,13 +108,11 @@ def collect(config: CollectConfig, length: int | None = None) -> list[Path]:
         )
         for path, episodes, collector in plan
     ]
-    with owned(config.out):
-        made = DOWNSCALING if isinstance(TASKS.named(config.task), GymnasiumTask) else {}
-        claim_set(config.out, collection(config) | {"actors": _hashes(plan)}, made)
-        collect_shards(config.out, shards, _roll_out, config.workers, ("collect", "episodes"), config.task)
-        from vd4rl_pomdp.data.card import write_card  # draws; the processes that render need it not
+    settings = collection(config) | {"actors": _hashes(plan)}
+    collect_set(config.out, settings, shards, _roll_out, config.workers, ("collect", "episodes"), config.task)
+    from vd4rl_pomdp.data.card import write_card  # draws; the processes that render need it not
 
-        write_card(config.out)
+    write_card(config.out)
     return [shard.path for shard in shards]
 
 

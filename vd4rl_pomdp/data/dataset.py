@@ -14,9 +14,7 @@ from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError
 from vd4rl_pomdp.core.state_scale import StateScale
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.core.types import StepType, row_key, unpack_row_key
-from vd4rl_pomdp.data.episodes import episode_returns
-from vd4rl_pomdp.data.format import shard_paths
-from vd4rl_pomdp.data.manifest import check_whole, task_and_quality
+from vd4rl_pomdp.data.folder import episode_returns, task_and_quality
 from vd4rl_pomdp.data.store import Store, open_store
 from vd4rl_pomdp.envs.make import layout_of
 
@@ -36,8 +34,6 @@ def open_dataset(path: Path | str, cache: Path | str | None = None) -> Dataset:
         UserError: the set is missing, empty, damaged, incomplete, a part of a published one, or of two frame sizes.
     """
     path = Path(path)
-    if path.is_dir():
-        check_whole(path, shard_paths(path))
     return Dataset(path, open_store(path, Path(cache) if cache else None))
 
 

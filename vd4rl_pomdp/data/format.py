@@ -13,29 +13,20 @@ from __future__ import annotations
 import io
 import json
 import os
-import re
-import sys
-from collections import defaultdict
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from itertools import count
 from pathlib import Path
 from typing import Any
 
 import h5py
 import numpy as np
 
-from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors, in_one_line, system_error
+from vd4rl_pomdp.core.errors import UnavailableError, UserError, in_one_line, system_error
 from vd4rl_pomdp.core.reading import parse_json, regular
-from vd4rl_pomdp.core.tasks import FRAME_SIZES, GymnasiumTask, Task
+from vd4rl_pomdp.core.tasks import FRAME_SIZES
 from vd4rl_pomdp.core.types import StepType
-from vd4rl_pomdp.runs.files import read_json, write_bytes
+from vd4rl_pomdp.runs.files import write_bytes
 
-SUFFIXES = (".hdf5", ".h5")
-PLAN, PROVENANCE = "collection.json", "provenance.json"
-"""What a collection writes before its first shard, and after its last."""
-DOWNSCALING = {"downscaling": "area means"}
-"""What a collection.json says of a Gymnasium task's pictures; earlier ones say nothing."""
 FRAMES_KEY = "observation"
 _ROW_KEYS = {"action": 2, "reward": 1, "discount": 1, "step_type": 1, "physics": 2}
 _OPTIONAL = "physics"
@@ -45,103 +36,6 @@ _BLOCK_ROWS = 1024
 _LARGEST = np.finfo(np.float32).max
 """What is larger, or not a number, would be infinite or none where it is used."""
 _REPAIR = "download or collect it again"
-
-
-def is_shard_name(name: str) -> bool:
-    """Whether a file of this name is a shard: hidden ones are none."""
-    return not name.startswith(".") and name.lower().endswith(SUFFIXES)
-
-
-def read_plan(folder: Path) -> dict[str, Any]:
-    """How a set was collected, as its collection.json has it; empty for sets of other makers."""
-    return read_json(folder / PLAN) if (folder / PLAN).is_file() else {}
-
-
-def warn_of_earlier_pictures(place: object, plan: Mapping[str, Any], task: Task) -> None:
-    """Tell on stderr if a set, by its collection.json, has pictures that its task draws otherwise by now."""
-    if plan and isinstance(task, GymnasiumTask) and DOWNSCALING.keys() - plan.keys():
-        print(
-            f"warning: {place}: pictures of its set were shrunk by an earlier version, whose pixels are no means of "
-            "areas unless a frame's size divides the picture's: if it does not, collect it again",
-            file=sys.stderr,
-        )
-
-
-def shard_files(folder: Path) -> list[Path]:
-    """Files of a folder that are called shards, in no order; none without a folder. `shard_paths` checks them."""
-    with disk_errors(folder):
-        return [path for path in folder.iterdir() if is_shard_name(path.name)] if folder.is_dir() else []
-
-
-def shard_paths(folder: Path) -> list[Path]:
-    """Shards of a set in the order of their rows; `folder` may also name a single shard.
-
-    Sorted by name without its leading number, then by that number, digits compared as numbers: `10_mixed` follows
-    `9_mixed`, and the two halves of a medium_expert folder are not interleaved. Hidden files are no shards.
-
-    Raises:
-        UserError: there is no such folder, no shard in it, a number is left out or there twice among shards whose
-            names agree otherwise, or a download or collection of it was cut.
-    """
-    if folder.is_file():
-        return [folder]
-    if not folder.is_dir():
-        raise UserError(f"{folder}: no such folder; collect a set there or download one with `vd4rl-pomdp data`")
-    refuse_partial(folder)
-    if (folder / PLAN).exists() and not (folder / PROVENANCE).exists():
-        raise UserError(f"{folder}: the set's collection is not finished; start the command that collects it again")
-    shards = shard_files(folder)
-    if not shards:
-        with disk_errors(folder):
-            first = min((path for path in folder.rglob("*") if is_shard_name(path.name)), default=None)
-        hint = f"name a folder of shards such as {first.parent}" if first else "collect or download a set there"
-        raise UserError(f"{folder}: holds no .hdf5 shards; {hint}")
-    _refuse_twins(folder, shards)
-    _refuse_gaps(folder, shards)
-    return sorted(shards, key=_shard_order)
-
-
-def _refuse_gaps(folder: Path, shards: Sequence[Path]) -> None:
-    """Raise UserError unless the numbers of shards whose names agree otherwise are 0, 1, 2, ..."""
-    numbers: dict[str, set[int]] = defaultdict(set)
-    for rest, number in map(shard_number, shards):
-        if number is not None:
-            numbers[rest].add(number)
-    for rest, found in numbers.items():
-        lacking = next(number for number in count() if number not in found)
-        if lacking < max(found):
-            raise UserError(
-                f"{folder}: has the shard {max(found)}{rest}, but none called {lacking}{rest}; {_REPAIR}, or number "
-                "the shards of a set of your own 0, 1, 2, ..."
-            )
-
-
-def _refuse_twins(folder: Path, shards: Sequence[Path]) -> None:
-    """Raise UserError if two shards, such as 0_x.h5 and 0_x.hdf5, have one name and number: rows would count twice."""
-    found: dict[tuple[str, int | None], Path] = {}
-    for shard in sorted(shards):
-        if (twin := found.setdefault(shard_number(shard), shard)) is not shard:
-            raise UserError(f"{folder}: has both {twin.name} and {shard.name}, which are one shard; remove one")
-
-
-def refuse_partial(folder: Path) -> None:
-    """Raise UserError if a set's download began in a folder and did not end."""
-    with disk_errors(folder):
-        partial = next(folder.glob("[!.]*.part"), None)
-    if partial:
-        raise UserError(f"{partial}: the set's download is not finished; re-run the same `data download` command")
-
-
-def shard_number(path: Path) -> tuple[str, int | None]:
-    """Name of a shard without its leading number, and that number (None if the name has none)."""
-    number, rest = re.fullmatch(r"(\d*)(.*)", path.stem, re.DOTALL).groups()  # type: ignore[union-attr]
-    return rest, int(number) if number else None
-
-
-def _shard_order(path: Path) -> tuple[list[tuple[int, str]], int]:
-    rest, number = shard_number(path)
-    words = [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", rest)]
-    return words, -1 if number is None else number
 
 
 def write_shard(path: Path, rows: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> None:
@@ -199,11 +93,6 @@ def read_frame_size(shards: Sequence[Path]) -> int:
     return sizes[0]
 
 
-def check_frames(shards: Sequence[Path]) -> None:
-    """Raise UserError unless `read_frame_size` can tell the size of a set's frames."""
-    read_frame_size(shards)
-
-
 def _frame_size(path: Path) -> int:
     low, high = FRAME_SIZES
     with _open(path) as file:
@@ -219,12 +108,6 @@ def _frame_size(path: Path) -> int:
         return shape[-1]
 
 
-def read_shard(path: Path) -> dict[str, np.ndarray]:
-    """Read and validate one shard: `read_rows` and, as `observation`, its (N, 3, S, S) uint8 frames."""
-    rows = read_rows(path)
-    return {FRAMES_KEY: np.concatenate(list(read_frames(path))), **rows}
-
-
 def read_rows(path: Path) -> dict[str, np.ndarray]:
     """Read and validate all of a shard but its pixels.
 
@@ -238,7 +121,7 @@ def read_rows(path: Path) -> dict[str, np.ndarray]:
     Raises:
         UserError: the file is truncated or no HDF5, lacks a key, or holds a wrong shape, dtype or value.
     """
-    check_frames([path])
+    read_frame_size([path])
     with _open(path) as file:
         keys = _present(path, file)
         rows = {key: file[key][()] for key in keys if key != FRAMES_KEY}
@@ -264,20 +147,6 @@ def read_some_frames(path: Path, rows: np.ndarray) -> np.ndarray:
     """Frames of a shard's rows, (R, 3, S, S) uint8, given increasing row numbers (R,)."""
     with _open(path) as file:
         return file[FRAMES_KEY][rows]
-
-
-def is_shard(path: Path) -> bool:
-    """Whether a file has a shard's keys; raises UnavailableError if the disk does not tell now.
-
-    It is not locked: what another program writes may be a shard, too.
-    """
-    try:
-        with h5py.File(path, "r", locking=False) as file:
-            return set(file) >= {FRAMES_KEY, "action", "reward", "step_type"}
-    except (OSError, RuntimeError, KeyError) as error:
-        if isinstance(told := system_error(path, error), UnavailableError):
-            raise told from error
-        return False
 
 
 @contextmanager

@@ -18,7 +18,7 @@ import numpy as np
 from vd4rl_pomdp.core.errors import refuse_number, refuse_unknown
 from vd4rl_pomdp.core.tasks import MOST_EPISODES, SET_QUALITIES, TASKS
 from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, replay_returns
-from vd4rl_pomdp.data.format import PROVENANCE
+from vd4rl_pomdp.data.folder import PROVENANCE
 from vd4rl_pomdp.policies.actor import ships
 from vd4rl_pomdp.runs.files import Row, read_csv, read_json, write_csv, write_json
 from vd4rl_pomdp.runs.outputs import refuse_foreign

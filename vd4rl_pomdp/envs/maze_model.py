@@ -11,19 +11,22 @@ import os
 import tempfile
 from pathlib import Path
 
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.envs.maze_sky import FACE, sky_texture
 from vd4rl_pomdp.envs.mazes import Curtain, MazeSpec, Sky, Style
 from vd4rl_pomdp.envs.opengl import gl_errors
 from vd4rl_pomdp.envs.rendering import mujoco
 
-with (
-    gl_errors(),
-    contextlib.redirect_stderr(io.StringIO()),
-):  # gymnasium-robotics announces changes of environments that are not used here
-    import gymnasium_robotics
-    from gymnasium_robotics.envs.maze.maps import U_MAZE
-    from gymnasium_robotics.envs.maze.maze_v4 import Maze
-    from gymnasium_robotics.envs.maze.point import PointEnv
+try:
+    with gl_errors(), contextlib.redirect_stderr(io.StringIO()):  # it announces changes that do not matter here
+        import gymnasium_robotics
+        from gymnasium_robotics.envs.maze.maps import U_MAZE
+        from gymnasium_robotics.envs.maze.maze_v4 import Maze
+        from gymnasium_robotics.envs.maze.point import PointEnv
+except ImportError as error:
+    raise UserError(
+        f"the mazes need gymnasium-robotics ({error}): `pip install '.[navigation]'` in the package's folder"
+    ) from error
 
 POINT_XML = Path(gymnasium_robotics.__file__).parent / "envs" / "assets" / "point" / "point.xml"
 COLLISION_RADIUS = 0.1

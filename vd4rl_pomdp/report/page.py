@@ -21,7 +21,7 @@ from rich.text import Text
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.core.text import write_text
-from vd4rl_pomdp.data.published import published_scores
+from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import figures, tables
 from vd4rl_pomdp.report.claims import judge_claims, tally
 from vd4rl_pomdp.report.figures import Plot, seeds_note, to_svg, write_table

@@ -18,17 +18,8 @@ from vd4rl_pomdp.core.options import words_of
 from vd4rl_pomdp.core.registry import of_other_code
 from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, SET_QUALITIES, TASKS
-from vd4rl_pomdp.data.format import (
-    PLAN,
-    PROVENANCE,
-    read_attributes,
-    read_frame_size,
-    read_plan,
-    refuse_partial,
-    shard_files,
-    shard_paths,
-)
-from vd4rl_pomdp.data.manifest import task_and_quality
+from vd4rl_pomdp.data.folder import PLAN, PROVENANCE, read_plan, shard_files, shard_paths, task_and_quality
+from vd4rl_pomdp.data.format import read_attributes, read_frame_size
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.data.store import open_store
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, encoder_hash
@@ -83,7 +74,6 @@ class DataSet:
 
     def check(self) -> None:
         """Raise UserError unless its folder holds the set, or the set can be collected there."""
-        refuse_partial(self.folder)
         if self.foreign:
             self._check_foreign()
         elif (self.folder / PLAN).exists():
@@ -101,9 +91,9 @@ class DataSet:
 
     def _check_foreign(self) -> None:
         """Raise UserError if shards that nothing here collected tell another task, or frames of another size."""
+        shards = shard_paths(self.folder)
         if self.section != "collect":
             return
-        shards = shard_paths(self.folder)
         task, _ = task_and_quality(self.folder, [read_attributes(shard) for shard in shards])
         asked = self.wanted["task"], self.wanted.get("frame_size") or FRAME_SIZE
         for has, wanted in zip((task, read_frame_size(shards)), asked, strict=True):

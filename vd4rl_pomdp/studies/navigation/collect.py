@@ -20,11 +20,10 @@ from vd4rl_pomdp.core.errors import MAX_SEED, MOST_ROWS, refuse_outside
 from vd4rl_pomdp.core.seeding import episode_seed
 from vd4rl_pomdp.core.tasks import MOST_EPISODES
 from vd4rl_pomdp.core.types import StepType
-from vd4rl_pomdp.data.shards import Columns, Shard, claim_set, collect_shards
+from vd4rl_pomdp.data.shards import Columns, Shard, collect_set
 from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MAZES, MOST_STEPS, Style, check_maze, get_maze
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.outputs import refuse_inside
-from vd4rl_pomdp.runs.ownership import owned
 from vd4rl_pomdp.runs.provenance import versions
 from vd4rl_pomdp.studies.navigation.pictures import TEXTURES, ExogenousNoise, to_grey50
 
@@ -79,10 +78,8 @@ def collect(config: MazeCollectConfig) -> list[Path]:
         Shard(path, [_Job(config.maze, i, *shape) for i in trajectories], _attributes(config))
         for path, trajectories in _plan(config)
     ]
-    with owned(config.out):
-        claim_set(config.out, collection(config))
-        title = f"collect {config.maze}", "trajectories"
-        collect_shards(config.out, shards, _roll_out, config.workers, title, config.maze)
+    title = f"collect {config.maze}", "trajectories"
+    collect_set(config.out, collection(config), shards, _roll_out, config.workers, title, config.maze)
     return [shard.path for shard in shards]
 
 

@@ -11,7 +11,7 @@ import shlex
 from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.data.format import read_plan
+from vd4rl_pomdp.data.folder import read_plan
 from vd4rl_pomdp.nn.encoder import EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, save_encoder
 from vd4rl_pomdp.runs import METRICS_FILE, NAVIGATION_FILE, TRAJECTORY_FILE

@@ -1,0 +1,270 @@
+"""A set is a folder of shards: which are its, in what order, whether all of them are there, and what it is called."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+from collections import defaultdict
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from functools import cache
+from importlib.resources import files
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
+from vd4rl_pomdp.core.types import StepType
+from vd4rl_pomdp.data.format import read_attributes
+from vd4rl_pomdp.runs.files import read_json
+
+SUFFIXES = (".hdf5", ".h5")
+PLAN, PROVENANCE = "collection.json", "provenance.json"
+"""What a collection writes before its first shard, and after its last."""
+_TOLD = 4
+"""How many files a message names."""
+
+
+@dataclass(frozen=True)
+class RemoteFile:
+    """One published 84-pixel shard."""
+
+    path: str
+    """vd4rl/main/{task}/{quality}/84px/{file}: its place on the mirror."""
+    size: int
+    """Bytes."""
+    sha256: str
+
+    def target(self, destination: Path) -> Path:
+        """Where the file goes: destination/{task}/{quality}/84px/{file}."""
+        return destination.joinpath(*self.path.split("/")[2:])
+
+
+@cache
+def manifest() -> tuple[RemoteFile, ...]:
+    """All 84-pixel shards that V-D4RL publishes."""
+    rows = csv.DictReader(_packaged("manifest.tsv"), delimiter="\t")
+    return tuple(RemoteFile(row["path"], int(row["bytes"]), row["sha256"]) for row in rows)
+
+
+def published_scores() -> list[dict[str, str]]:
+    """Scores (return / 10) of methods trained on each published set, fully observed, one row a set.
+
+    Columns: `env`, `dataset`, then methods. Sources: V-D4RL (Lu et al. 2022, arXiv 2206.04779), and for `rebrac`
+    Tarasov et al. 2023 (arXiv 2305.09836).
+    """
+    return list(csv.DictReader(_packaged("published_scores.csv")))
+
+
+def _packaged(name: str) -> list[str]:
+    return files("vd4rl_pomdp.data").joinpath(name).read_text(encoding="utf-8").splitlines()
+
+
+def read_plan(folder: Path) -> dict[str, Any]:
+    """How a set was collected, as its collection.json has it; empty for sets of other makers."""
+    return read_json(folder / PLAN) if (folder / PLAN).is_file() else {}
+
+
+def is_shard_name(name: str) -> bool:
+    """Whether a file of this name is a shard: hidden ones are none."""
+    return not name.startswith(".") and name.lower().endswith(SUFFIXES)
+
+
+def shard_files(folder: Path) -> list[Path]:
+    """Files of a folder that are called shards, in no order; none without a folder. `shard_paths` checks them."""
+    with disk_errors(folder):
+        return [path for path in folder.iterdir() if is_shard_name(path.name)] if folder.is_dir() else []
+
+
+def shard_paths(folder: Path) -> list[Path]:
+    """Shards of a set in the order of their rows; `folder` may also name a single shard.
+
+    Sorted by name without its leading number, then by that number, digits compared as numbers: `10_mixed` follows
+    `9_mixed`, and the two halves of a medium_expert folder are not interleaved. Hidden files are no shards.
+
+    Raises:
+        UserError: there is no such folder, no shard in it, a number is left out or there twice among shards whose
+            names agree otherwise, its collection was cut, or it is a part of a published set.
+    """
+    if folder.is_file():
+        return [folder]
+    if not folder.is_dir():
+        raise UserError(f"{folder}: no such folder; collect a set there or download one with `vd4rl-pomdp data`")
+    if (folder / PLAN).exists() and not (folder / PROVENANCE).exists():
+        raise UserError(f"{folder}: the set's collection is not finished; start the command that collects it again")
+    shards = shard_files(folder)
+    if not shards:
+        with disk_errors(folder):
+            first = min((path for path in folder.rglob("*") if is_shard_name(path.name)), default=None)
+        hint = f"name a folder of shards such as {first.parent}" if first else "collect or download a set there"
+        raise UserError(f"{folder}: holds no .hdf5 shards; {hint}")
+    _refuse_part(folder, shards)
+    _refuse_misnumbered(folder, shards)
+    return sorted(shards, key=_shard_order)
+
+
+def _shard_number(path: Path) -> tuple[str, int | None]:
+    """Name of a shard without its leading number, and that number (None if the name has none)."""
+    number, rest = re.fullmatch(r"(\d*)(.*)", path.stem, re.DOTALL).groups()  # type: ignore[union-attr]
+    return rest, int(number) if number else None
+
+
+def _shard_order(path: Path) -> tuple[list[tuple[int, str]], int]:
+    rest, number = _shard_number(path)
+    words = [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", rest)]
+    return words, -1 if number is None else number
+
+
+def _refuse_misnumbered(folder: Path, shards: Sequence[Path]) -> None:
+    """Raise UserError unless shards whose names agree otherwise are numbered 0, 1, 2, ..., each of them once."""
+    alike: dict[str, dict[int | None, Path]] = defaultdict(dict)
+    for shard in sorted(shards):
+        rest, number = _shard_number(shard)
+        if twin := alike[rest].get(number):
+            raise UserError(f"{folder}: has both {twin.name} and {shard.name}, which are one shard; remove one")
+        alike[rest][number] = shard
+    for rest, found in alike.items():
+        numbers = sorted(number for number in found if number is not None)
+        if numbers != list(range(len(numbers))):
+            lacking = min(set(range(len(numbers))) - set(numbers))
+            raise UserError(
+                f"{folder}: has the shard {numbers[-1]}{rest}, but none called {lacking}{rest}; download or collect it "
+                "again, or number the shards of a set of your own 0, 1, 2, ..."
+            )
+
+
+def _refuse_part(path: Path, shards: Sequence[Path]) -> None:
+    """Raise UserError for a part of a published set.
+
+    A shard of the name and size of a published one is that. Other sets are their makers' business, unless they tell
+    nothing of who made them and all their shards are called as those of the published set of their folder are.
+    """
+    with disk_errors(path):
+        sizes = {shard.name: shard.stat().st_size if shard.exists() else -1 for shard in shards}
+    published: dict[tuple[str | None, str | None], dict[str, int]] = defaultdict(dict)
+    for file in manifest():
+        *_, of_task, of_quality, _, name = file.path.split("/")
+        published[of_task, of_quality][name] = file.size
+    alike = [key for key, wanted in published.items() if sizes.keys() <= wanted.keys()]
+    certain = [key for key in alike if sizes.items() & published[key].items()]
+    key = named = task_and_quality(path, [])
+    if certain and named not in certain:
+        key = min(certain, key=lambda key: len(published[key]))  # the shards of expert are in medium_expert, too
+    elif key not in alike or (not certain and read_attributes(shards[0])):
+        return
+    (task, quality), wanted = key, published[key]
+    told = [f"{name} is missing" for name in wanted if name not in sizes]
+    if certain:
+        told += [f"{n} has {size} bytes, not {wanted[n]}" for n, size in sizes.items() if size != wanted[n]]
+    if not told:
+        return
+    more = f" and {len(told) - _TOLD} more" if len(told) > _TOLD else ""
+    out = path.parents[2] if path.parts[-3:] == (task, quality, "84px") else "DIR"
+    raise UserError(
+        f"{path}: is a part of V-D4RL's {task} {quality} ({', '.join(told[:_TOLD])}{more}); get the rest with "
+        f"`vd4rl-pomdp data download --task {task} --quality {quality} --out {out}`, or give the shards other names to "
+        "train on them alone"
+    )
+
+
+def task_and_quality(path: Path, attributes: list[dict[str, Any]]) -> tuple[str | None, str | None]:
+    """Task and quality of a set: as the attributes of all its shards say, else as its folders are named.
+
+    A quality of one's own is the name of a folder within its task's.
+    """
+    task, quality = _name(path, attributes, "task", tuple(TASKS)), _name(path, attributes, "set", SET_QUALITIES)
+    return task, quality or (path.name if path.parent.name in TASKS else None)
+
+
+def _name(path: Path, attributes: list[dict[str, Any]], attribute: str, choices: tuple[str, ...]) -> str | None:
+    stored = {str(one[attribute]) for one in attributes if one.get(attribute)}
+    if len(stored) > 1:
+        raise UserError(f"{path}: its shards come from {' and '.join(sorted(stored))}; keep one set in a folder")
+    folders = *path.resolve().parts, *Path(os.path.abspath(path)).parts  # a link's name comes before its target's
+    named = (part for part in reversed(folders) if part in choices)
+    return stored.pop() if stored else next(named, None)
+
+
+def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str, np.ndarray]]) -> dict[str, np.ndarray]:
+    """Concatenate the rows of all shards into those of the set.
+
+    Args:
+        path: the set, or a single shard.
+        shards: its files, as `shard_paths` gives them.
+        parts: their rows, as `read_rows` gives them.
+
+    Raises:
+        UserError: the shards differ in width or keys, an episode's beginning is missing, or a collected set has not
+            as many episodes as its collection.json says.
+    """
+    for shard, part in zip(shards, parts, strict=True):
+        _agree(shards[0], parts[0], shard, part)
+    starts = np.cumsum([0, *(len(part["reward"]) for part in parts)])
+    rows = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
+    _check_order(shards, starts, rows["step_type"])
+    check_count(path, int((rows["step_type"] == StepType.FIRST).sum()))
+    return rows
+
+
+def _agree(first: Path, expected: Mapping[str, np.ndarray], shard: Path, part: Mapping[str, np.ndarray]) -> None:
+    if expected.keys() != part.keys():
+        key = min(expected.keys() ^ part.keys())
+        having, lacking = (shard, first) if key in part else (first, shard)
+        raise UserError(f"{having}: has {key!r}, {lacking.name} has not; keep one set in a folder")
+    for key, value in part.items():
+        if value.shape[1:] != expected[key].shape[1:]:
+            widths = f"{value.shape[1]} dimensions, in {first.name} {expected[key].shape[1]}"
+            raise UserError(f"{shard}: {key!r} has {widths}; keep one set in a folder")
+
+
+def check_count(path: Path, episodes: int) -> None:
+    """Refuse a collected set that lacks episodes; a set of other makers says nothing of their number."""
+    plan = read_plan(path)
+    planned = plan.get("episodes", plan.get("trajectories", episodes))  # as its command calls them
+    if episodes != planned:
+        raise UserError(
+            f"{path}: holds {episodes} episodes, its {PLAN} says {planned}: is a shard missing or of another set? "
+            "collect or download it again"
+        )
+
+
+def _check_order(shards: Sequence[Path], starts: np.ndarray, step_type: np.ndarray) -> None:
+    """Every row that does not begin an episode must continue the one of the row before it."""
+
+    def fail(row: int, what: str) -> None:
+        shard = int(np.searchsorted(starts, row, side="right")) - 1
+        raise UserError(f"{shards[shard]}: row {row - starts[shard]} {what}")
+
+    missing = "; is a shard before this one missing or renamed?"
+    if step_type[0] != StepType.FIRST:
+        fail(0, f"has step_type {step_type[0]}, but the first row of a set begins an episode{missing}")
+    astray = np.flatnonzero((step_type[:-1] == StepType.LAST) & (step_type[1:] != StepType.FIRST)) + 1
+    if len(astray):
+        fail(int(astray[0]), f"follows an episode's last row without beginning a new one{missing}")
+    for previous, shard, row in zip(shards[:-1], shards[1:], starts[1:-1], strict=True):
+        if step_type[row] != StepType.FIRST and not _adjacent(previous, shard):
+            fail(int(row), f"continues an episode, but not that of {previous.name}{missing}")
+
+
+def _adjacent(previous: Path, shard: Path) -> bool:
+    """Whether a shard can be the one right after another: unless both are numbered, their order is all we know."""
+    (previous_rest, before), (rest, number) = _shard_number(previous), _shard_number(shard)
+    return before is None or number is None or (rest == previous_rest and number == before + 1)
+
+
+def episode_returns(reward: np.ndarray, starts: np.ndarray) -> np.ndarray:
+    """Undiscounted returns of all episodes.
+
+    Args:
+        reward: (N,) float64 of all rows; that of an episode's first row, which no action led to, does not count.
+        starts: (E,) int64, first row of every episode.
+
+    Returns:
+        (E,) float64.
+    """
+    paid = reward.copy()
+    paid[starts] = 0.0
+    return np.add.reduceat(paid, starts)
