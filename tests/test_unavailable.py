@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import pydoc
 import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
@@ -131,6 +132,29 @@ def test_whoever_may_open_no_more_files_is_told_that_it_passes(world):
             wrong[name] = repr(error)
         else:
             wrong[name] = "read"
+    assert wrong == {}
+
+
+def test_what_someone_else_may_read_alone_is_neither_called_damaged_nor_to_be_made_again(world, tmp_path, monkeypatch):
+    def refusing(open_file):
+        def refuse(path, *arguments, **options):
+            if not isinstance(path, int) and Path(os.fspath(path)).is_relative_to(tmp_path):
+                raise PermissionError(errno.EACCES, "Permission denied")
+            return open_file(path, *arguments, **options)
+
+        return refuse
+
+    for place in ("io.open", "builtins.open", "h5py.File", "safetensors.safe_open"):
+        monkeypatch.setattr(place, refusing(pydoc.locate(place)))
+    wrong = {}
+    for name in world.keys() - {"listing", "what a policy replaces"}:  # which are not whole, or need not be
+        try:
+            world[name]()
+        except UserError as error:
+            if "may not be used (permission denied); ask its owner for access" not in str(error):
+                wrong[name] = str(error)
+        except Exception as error:
+            wrong[name] = repr(error)
     assert wrong == {}
 
 

@@ -114,8 +114,8 @@ def test_a_set_without_a_transition_is_refused_whatever_the_method(tmp_path, met
 
 
 def test_weights_that_no_memory_holds_are_told_as_such(data, tmp_path):
-    words = ["pretrain", "--preset", "smoke", "--data", str(data), "--method", "acro", "--out", str(tmp_path / "out")]
-    end = run_to_end([*words, "--feature-dim", "1000000000"])
+    words = ["pretrain", "--preset", "smoke", "--data", str(data), "--method", "mik+a", "--out", str(tmp_path / "out")]
+    end = run_to_end([*words, "--hidden-dim", "1000000"])
     assert end.code == 2
     assert end.line.startswith("error: out of memory")
 
