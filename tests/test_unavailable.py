@@ -33,7 +33,6 @@ from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import read_csv
 from vd4rl_pomdp.runs.outputs import kept_in
 from vd4rl_pomdp.runs.results import RUNS, read_lines
-from vd4rl_pomdp.studies.navigation.drivers import _refuse_other
 from vd4rl_pomdp.studies.navigation.pictures import _read_cifar, _read_image, load_pool, source_fingerprint
 from vd4rl_pomdp.studies.navigation.runs import read_trajectory
 from vd4rl_pomdp.sweeps.folder import read_plan
@@ -96,7 +95,6 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
         "checkpoint": lambda: Checkpoints(run).restore(lambda state: None),
         "actor": lambda: read_actor(actor),
         "ladder": lambda: read_ladder(ladder),
-        "what a policy replaces": lambda: _refuse_other(actor),
         "film": lambda: read_film(run / FILM_FILE),
         "episodes": lambda: read_episodes(run / "episodes.csv"),
         "episodes of a cut run": lambda: episodes_until(run / "episodes.csv", 1),
