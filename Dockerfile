@@ -15,7 +15,7 @@ RUN apt-get update \
 ENV PATH=/opt/venv/bin:$PATH MUJOCO_GL=egl LP_NUM_THREADS=1
 ARG PIP_EXTRA_INDEX_URL
 COPY --from=build /wheels /source/constraints.txt /opt/
-RUN pip install --no-cache-dir -c /opt/constraints.txt /opt/*.whl
+RUN pip install --no-cache-dir -c /opt/constraints.txt "$(echo /opt/*.whl)[navigation]"
 WORKDIR /study
 RUN vd4rl-pomdp demo --preset smoke --out smoke && rm -r smoke
 ENTRYPOINT ["vd4rl-pomdp"]

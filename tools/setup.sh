@@ -54,7 +54,7 @@ if [ "$(version "$VENV/bin/python")" != "$(version "$PYTHON")" ]; then
 fi
 say "setup: installing Python packages (a few minutes the first time)"
 pip_install() { "$VENV/bin/python" -m pip install --quiet --disable-pip-version-check -c constraints.txt "$@"; }
-pip_install -e ".[dev,policy,tracking]"
+pip_install -e ".[dev,navigation,policy,tracking,slurm,ray]"
 pip_install --no-deps dm-control # which Python 3.13 gets no other way; elsewhere it is there already
 
 can_render() {

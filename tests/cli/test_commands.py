@@ -95,7 +95,7 @@ def raised(kind: type[BaseException], *words: object):
         (lambda *_: signal.raise_signal(signal.SIGINT), 130, "interrupted: re-run the same command to resume"),
         (lambda *_: signal.raise_signal(signal.SIGTERM), 143, "terminated: re-run the same command to resume"),
         (raised(FloatingPointError, "loss is nan"), 1, "error: training diverged, loss is nan; lower --learning-rate"),
-        (raised(OSError, 28, "No space left", "a"), 2, "error: a: the disk is full: free some space and re-run"),
+        (raised(OSError, 28, "No space left", "a"), 75, "error: a: the disk is full: free some space and re-run"),
     ],
 )
 def test_every_end_has_a_code_and_a_line(act, code, line, monkeypatch):
@@ -131,6 +131,18 @@ def test_the_list_of_commands_needs_neither_numpy_nor_torch_and_a_reader_may_go(
     assert process.stdout is not None
     process.stdout.close()
     assert (process.communicate()[1], process.returncode) == (b"", 141)
+
+
+def test_a_missing_extra_ends_in_one_line_that_names_it(tmp_path):
+    words = ["navigation", "collect", "--maze", "no_curtain", "--preset", "smoke", "--workers", "1", "--out", "x"]
+    code = (
+        "import sys; sys.modules['gymnasium_robotics'] = None; from vd4rl_pomdp.cli import main\n"
+        f"if __name__ == '__main__': main({words})"
+    )
+    environment = os.environ | {"PYTHONPATH": os.getcwd()}
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, cwd=tmp_path, env=environment)
+    assert (done.returncode, done.stderr.count("\n")) == (2, 1), done.stderr
+    assert "`pip install '.[navigation]'`" in done.stderr
 
 
 def test_a_terminal_that_is_not_utf_8_is_shown_what_it_can():

@@ -16,7 +16,7 @@ from typing import Any
 import gymnasium
 import numpy as np
 
-from vd4rl_pomdp.core.errors import refuse_number
+from vd4rl_pomdp.core.errors import UserError, refuse_number
 from vd4rl_pomdp.envs import Info
 from vd4rl_pomdp.envs.maze_renderers import FACE, ExactRenderer, MazeRenderer, make_renderer, sky_texture
 from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, Curtain, MazeSpec, Sky, Style, get_maze
@@ -24,14 +24,16 @@ from vd4rl_pomdp.envs.opengl import gl_errors
 from vd4rl_pomdp.envs.pixels import Render, check_render, checked_action
 from vd4rl_pomdp.envs.rendering import mujoco
 
-with (
-    gl_errors(),
-    contextlib.redirect_stderr(io.StringIO()),
-):  # gymnasium-robotics announces changes of environments that are not used here
-    import gymnasium_robotics
-    from gymnasium_robotics.envs.maze.maps import U_MAZE
-    from gymnasium_robotics.envs.maze.maze_v4 import Maze
-    from gymnasium_robotics.envs.maze.point import PointEnv
+try:
+    with gl_errors(), contextlib.redirect_stderr(io.StringIO()):  # it announces changes that do not matter here
+        import gymnasium_robotics
+        from gymnasium_robotics.envs.maze.maps import U_MAZE
+        from gymnasium_robotics.envs.maze.maze_v4 import Maze
+        from gymnasium_robotics.envs.maze.point import PointEnv
+except ImportError as error:
+    raise UserError(
+        f"the mazes need gymnasium-robotics ({error}): `pip install '.[navigation]'` in the package's folder"
+    ) from error
 
 POINT_XML = Path(gymnasium_robotics.__file__).parent / "envs" / "assets" / "point" / "point.xml"
 COLLISION_RADIUS = 0.1
