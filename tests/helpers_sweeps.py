@@ -1,56 +1,74 @@
-"""Sweeps without training: jobs that a scripted executor ends."""
+"""Sweeps without training: a program of one's own stands in for `vd4rl-pomdp`, and does what each job's script says."""
 
+import json
+import time
+from collections.abc import Callable
 from pathlib import Path
 
-from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.runs.identity import recipe
+from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder
 from vd4rl_pomdp.sweeps.plan import Job
-from vd4rl_pomdp.sweeps.work import DONE, Ended, Work
 
-_RECORD = {"stage": "pretrain", "config": {"seed": 0}}
+RECORD = {"stage": "pretrain", "config": {"seed": 0}, "inputs": {"data": "its set"}}
+PROGRAM = """
+import json, os, sys, time
+from pathlib import Path
+from vd4rl_pomdp.runs.ownership import owned
+folder, script = Path(sys.argv[1]), Path(sys.argv[1] + ".script")
+with owned(folder):
+    if (folder / "timing.json").exists():  # another driver was faster
+        sys.exit()
+    with (folder / "begun").open("a") as file:
+        seen = {name: os.environ.get(name) for name in ("OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES")}
+        print(json.dumps(seen | {"time": time.time(), "cores": len(os.sched_getaffinity(0))}), file=file)
+    ends = json.loads(script.read_text()) if script.exists() else []
+    script.write_text(json.dumps(ends[1:]))
+    end = ends[0] if ends else "done"
+    while end == "wait" and not (folder.parent / "go").exists():
+        time.sleep(0.02)
+    print("its last line", flush=True)
+    if end == "kill":
+        os.kill(os.getpid(), 9)
+    if isinstance(end, int):
+        sys.exit(end)
+    (folder / "config.json").write_text(json.dumps(RECORD))
+    (folder / "timing.json").write_text("{}")
+    with (folder / "ended").open("a") as file:
+        print(time.time(), file=file)
+"""
 
 
-def job(out: Path, name: str, *needs: str, section: str = "pretrain") -> Job:
-    return Job(name, section, out / name, ("list",), needs, recipe=recipe(_RECORD, {}), content="its set")
+def job(out: Path, name: str, *needs: str, ends: tuple[int | str, ...] = ()) -> Job:
+    """A job that ends as told, one end an attempt, and then well.
+
+    Args:
+        out: the sweep's folder.
+        name: the job's.
+        needs: names of jobs before it.
+        ends: exit codes, "kill" (SIGKILL), or "wait" (well, once OUT/go is there).
+    """
+    out.mkdir(exist_ok=True)
+    (out / f"{name}.script").write_text(json.dumps(ends))
+    return Job(name, "pretrain", out / name, [str(out / name)], list(needs), recipe=recipe(RECORD, {}))
 
 
-def finish(folder: Path, seed: int = 0, content: str = "its set") -> None:
-    """Leave what a finished run leaves, one of another recipe for another seed, or on another set."""
-    folder.mkdir(parents=True, exist_ok=True)
-    write_json(folder / "config.json", _RECORD | {"config": {"seed": seed}, "inputs": {"data": content}})
-    write_json(folder / "timing.json", {"seconds": 1.0})
+def keep_plan(out: Path, *jobs: Job, name: str = "plan") -> Plan:
+    """A plan of such jobs."""
+    program = out / "program.py"
+    if not program.exists():
+        program.write_text(PROGRAM.replace("RECORD", repr(RECORD)))
+    return SweepFolder(out).keep_plan(name, jobs, [str(program)])
 
 
-class Scripted:
-    """An executor whose jobs end as a script says, one cause an attempt, and then in success; a poll ends them all."""
+def begun(job: Job) -> list[dict]:
+    """What each of a job's processes saw of its environment."""
+    path = job.folder / "begun"
+    return [json.loads(line) for line in path.read_text().splitlines()] if path.exists() else []
 
-    def __init__(self, jobs: list[Job], script: dict[str, list[str]] | None = None, slots: int = 2) -> None:
-        self.folders = {job.name: job.folder for job in jobs}
-        self.script = script or {}
-        self.slots = self.largest = slots
-        self.started: list[tuple[str, int]] = []
-        self.running: list[Work] = []
-        self.most = 0
-        self.stopped = False
 
-    def fits(self, slots: int) -> bool:
-        return sum(work.slots for work in self.running) + slots <= self.slots
-
-    def start(self, work: Work) -> None:
-        self.started.append((work.name, work.slots))
-        self.running.append(work)
-        self.most = max(self.most, sum(work.slots for work in self.running))
-
-    def ended(self) -> list[Ended]:
-        over, self.running = self.running, []
-        return [self._end(work.name) for work in over]
-
-    def _end(self, name: str) -> Ended:
-        causes = self.script.get(name, [])
-        cause = causes.pop(0) if causes else DONE
-        if cause == DONE:
-            finish(self.folders[name])
-        return Ended(name, cause, "" if cause == DONE else f"its {cause} line")
-
-    def stop(self) -> None:
-        self.stopped = True
+def until(holds: Callable[[], object], seconds: float = 120.0) -> None:
+    """Wait for what must become true."""
+    end = time.monotonic() + seconds
+    while not holds():
+        assert time.monotonic() < end, "it did not come"
+        time.sleep(0.05)

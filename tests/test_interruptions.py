@@ -21,19 +21,31 @@ from pretrain.trainer import Trainer
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.runs import run as run_module
 from vd4rl_pomdp.runs.episodes import read_episodes
-from vd4rl_pomdp.runs.files import read_json, write_json
+from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
 from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
 from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.studies.navigation.collect import PRESETS
+from vd4rl_pomdp.studies.navigation.collect import collect as collect_maze
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.studies.navigation.measures import RAW_PREFIX
 from vd4rl_pomdp.studies.navigation.probe import COMPONENTS
 from vd4rl_pomdp.studies.navigation.train import train as run_navigation
 
-FINETUNE = {"updates": 12, "eval_every": 6, "checkpoint_every": 4, "batch_size": 4, "eval_length": 2, "log_every": 3}
+FINETUNE = {
+    "eval_episodes": 2,
+    "updates": 12,
+    "eval_every": 6,
+    "checkpoint_every": 4,
+    "batch_size": 4,
+    "eval_length": 2,
+    "log_every": 3,
+}
 
 
 @pytest.fixture(autouse=True, scope="module")
@@ -53,6 +65,12 @@ def data(tmp_path_factory) -> Path:
 @pytest.fixture(scope="module")
 def encoder(data, tmp_path_factory) -> Path:
     return run_pretrain(smoke_pretrain(data, tmp_path_factory.mktemp("made"), method="no_history")).path / "encoder"
+
+
+@pytest.fixture(scope="module")
+def finetuned(data, encoder, tmp_path_factory) -> Path:
+    """A whole run with `FINETUNE`."""
+    return run_finetune(smoke_finetune(encoder, data, tmp_path_factory.mktemp("finetuned") / "run", **FINETUNE)).path
 
 
 @pytest.fixture(scope="module")
@@ -209,13 +227,12 @@ def test_a_full_disk_is_one_sentence_and_the_same_command_resumes(stage, whole, 
     assert contents(tmp_path / "cut") == whole
 
 
-@pytest.mark.parametrize("name", [".config.json.tmp", ".machine.json.tmp"])
-def test_a_disk_that_is_full_from_the_start_leaves_a_folder_that_goes_on(data, tmp_path, monkeypatch, name):
+def test_a_disk_that_is_full_from_the_start_leaves_a_folder_that_resumes(data, tmp_path, monkeypatch):
     config = smoke_pretrain(data, tmp_path / "run", method="no_history")
     write = Path.write_text
 
     def full(path: Path, content: str, **options: Any) -> int:
-        if path.name == name:
+        if path.name == ".machine.json.tmp":
             raise OSError(errno.ENOSPC, "No space left on device")
         return write(path, content, **options)
 
@@ -234,12 +251,8 @@ def test_a_run_that_another_process_writes_is_refused_by_every_stage(stage, tmp_
 
 
 def test_a_set_that_another_process_collects_is_refused(tmp_path):
-    from vd4rl_pomdp.data import collect
-    from vd4rl_pomdp.studies.navigation.collect import PRESETS
-    from vd4rl_pomdp.studies.navigation.collect import collect as collect_maze
-
     configs = [
-        (collect.collect, collect.CollectConfig("walker_walk", "random", tmp_path / "set", workers=1)),
+        (collect, CollectConfig("walker_walk", "random", tmp_path / "set", workers=1)),
         (collect_maze, replace(PRESETS["smoke"], maze="no_curtain", out=tmp_path / "set", workers=1)),
     ]
     for run, config in configs:
@@ -248,77 +261,47 @@ def test_a_set_that_another_process_collects_is_refused(tmp_path):
         assert not list((tmp_path / "set").iterdir())
 
 
-def changed(data: Path, by: Path) -> Path:
-    """Another content behind the same path."""
-    shutil.rmtree(data)
-    return Path(shutil.copytree(by, data))
-
-
-@pytest.mark.parametrize("when", ["unfinished", "finished"])
-def test_a_run_whose_data_changed_is_refused_untouched(encoder, tmp_path, monkeypatch, when):
-    data = write_fake_set(tmp_path / "data" / "walker_walk" / "expert", [20, 25, 30])
+def test_changed_data_or_another_encoder_is_refused_and_nothing_is_touched(encoder, finetuned, data, tmp_path):
     other = write_fake_set(tmp_path / "other" / "walker_walk" / "expert", [20, 30, 25])
-    configs = {
-        run_pretrain: smoke_pretrain(data, tmp_path / "pretrain", method="no_history"),
-        run_finetune: smoke_finetune(encoder, data, tmp_path / "finetune", **FINETUNE),
-    }
-    for run, config in configs.items():
-        run(config)
-        if when == "unfinished":
-            (config.out / "timing.json").unlink()
-    before = {run: contents(config.out) for run, config in configs.items()}
-    changed(data, other)
-    for run, config in configs.items():
-        with pytest.raises(UserError, match=r"holds a run with other content of --data"):
-            run(config)
-        assert contents(config.out) == before[run]
-
-
-def test_a_finished_run_whose_encoder_was_replaced_keeps_its_labels(encoder, data, tmp_path):
-    mine = shutil.copytree(encoder, tmp_path / "encoder")
-    config = smoke_finetune(mine, data, tmp_path / "run", **FINETUNE)
-    run_finetune(config)
-    before = contents(config.out)
-    replaced = run_pretrain(smoke_pretrain(data, tmp_path / "acro", method="acro")).path / "encoder"
-    changed(mine, replaced)
-    with pytest.raises(UserError, match=r"holds a run with other content of --encoder"):
-        run_finetune(config)
-    assert contents(config.out) == before
-    assert read_json(config.out / "labels.json")["method"] == "no_history"
-    moved = smoke_finetune(encoder, data, tmp_path / "run", **FINETUNE)
-    assert run_finetune(moved).finished
-
-
-def test_record_and_card_name_the_inputs(encoder, data, tmp_path):
-    from vd4rl_pomdp.data import open_dataset
-
+    acro = run_pretrain(smoke_pretrain(data, tmp_path / "acro", method="acro")).path / "encoder"
+    inputs = read_json(finetuned / "config.json")["inputs"]
     fingerprint = open_dataset(data).fingerprint
-    assert read_json(encoder / "config.json")["pretrain"]["data"] == fingerprint
+    assert read_json(encoder / "config.json")["pretrain"]["data"] == inputs["data"] == fingerprint
     assert read_json(encoder.parent / "config.json")["inputs"] == {"data": fingerprint}
-    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **FINETUNE))
-    inputs = read_json(run.path / "config.json")["inputs"]
-    assert inputs["data"] == fingerprint
-    assert set(inputs) == {"data", "encoder"}
+    pretraining = shutil.copytree(encoder.parent, tmp_path / "pretrain")
+    finetuning = shutil.copytree(finetuned, tmp_path / "finetune")
+    attempts = [
+        (run_pretrain, smoke_pretrain(other, pretraining, method="no_history"), "data"),
+        (run_finetune, smoke_finetune(encoder, other, finetuning, **FINETUNE), "data"),
+        (run_finetune, smoke_finetune(acro, data, finetuning, **FINETUNE), "encoder"),
+    ]
+    for finished in (True, False):
+        before = contents(tmp_path)
+        for run, config, name in attempts:
+            with pytest.raises(UserError, match=f"holds a run with other content of --{name}"):
+                run(config)
+        assert contents(tmp_path) == before
+        if finished:
+            moved = shutil.copytree(encoder, tmp_path / "moved")
+            assert run_finetune(smoke_finetune(moved, data, finetuning, **FINETUNE)).finished
+            (pretraining / "timing.json").unlink()
+            (finetuning / "timing.json").unlink()
 
 
-def test_features_of_other_inputs_or_damaged_ones_are_made_anew(encoder, data, tmp_path, monkeypatch):
-    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **FINETUNE))
-    config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
-    with monkeypatch.context() as patch:
-        fill_disk(patch, ".pt.tmp", 1)
-        with pytest.raises(UserError):
-            run_finetune(config)
-    features, origin = config.out / "features.npy", config.out / "features.json"
-    assert read_json(origin).keys() == {"data", "encoder", "sha256", "versions", "git_commit", "plugins", "sources"}
-    features.write_bytes(features.read_bytes()[:-100] + bytes(100))
-    run_finetune(config)
-    assert contents(config.out) == contents(whole.path)
-    assert not features.exists()
-    assert not origin.exists()
+def test_a_run_whose_checkpoints_are_gone_keeps_its_evaluations(encoder, finetuned, data, tmp_path):
+    config = smoke_finetune(encoder, data, shutil.copytree(finetuned, tmp_path / "run"), **FINETUNE)
+    (config.out / "timing.json").unlink()
+    shutil.rmtree(config.out / "checkpoints")
+    before = (config.out / "episodes.csv").read_bytes()
+    with pytest.raises(UserError, match=r"run: has evaluations, but the checkpoints .* are gone: put them back"):
+        run_finetune(config)
+    assert (config.out / "episodes.csv").read_bytes() == before
 
 
-@pytest.mark.parametrize("changed", [False, True])
-def test_features_that_other_code_made_are_made_anew_and_probed_anew(encoder, data, tmp_path, monkeypatch, changed):
+@pytest.mark.parametrize("change", ["none", "damage", "code"])
+def test_features_are_kept_unless_they_are_damaged_or_of_other_code(
+    encoder, finetuned, data, tmp_path, monkeypatch, change
+):
     config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
     encode, encoded = finetune.features._encode_all, []
     monkeypatch.setattr(finetune.features, "_encode_all", lambda *words: (encoded.append(words), encode(*words))[1])
@@ -326,24 +309,24 @@ def test_features_that_other_code_made_are_made_anew_and_probed_anew(encoder, da
         fill_disk(patch, ".pt.tmp", 1)
         with pytest.raises(UserError):
             run_finetune(config)
-    write_json(config.out / "probe.json", {"probe_pose": 1.0, "probe_velocity": 2.0})
-    if changed:
-        monkeypatch.setattr(
-            run_module, "code_of", lambda parts: {"plugins": {}, "sources": {"corruption mine": "mine.py 2"}}
-        )
+    features = config.out / "features.npy"
+    if change == "damage":
+        features.write_bytes(features.read_bytes()[:-100] + bytes(100))
+    if change == "code":
+        monkeypatch.setattr(run_module, "code_of", lambda parts: {"plugins": {}, "sources": {"corruption mine": "2"}})
     run_finetune(config)
-    assert len(encoded) == 1 + changed
-    assert (config.out / "probe.json").exists() != changed, "this set has no states to probe anew"
+    assert len(encoded) == 1 + (change != "none")
+    assert not features.exists()
+    mine, whole = contents(config.out), contents(finetuned)
+    assert {name for name in mine if mine[name] != whole[name]} <= {"config.json"}
 
 
 @pytest.mark.parametrize(("evaluation", "rows_written"), [(1, 1), (2, 2)])
 def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
-    encoder, data, tmp_path, monkeypatch, evaluation, rows_written
+    encoder, finetuned, data, tmp_path, monkeypatch, evaluation, rows_written
 ):
     """Also in the last one, where rows under the run's own corruption alone are not all."""
-    changes = FINETUNE | {"eval_episodes": 2}
-    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes))
-    config = smoke_finetune(encoder, data, tmp_path / "cut", **changes)
+    config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
     append, evaluations = finetune.evaluations.append_episodes, []
 
     def cut(path: Path, rows: list[dict[str, Any]]) -> None:
@@ -358,22 +341,8 @@ def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
         patch.setattr(finetune.evaluations, "append_episodes", cut)
         with pytest.raises(KeyboardInterrupt):
             run_finetune(config)
-    monkeypatch.setattr(td3_bc.TD3BC, "update", _fail if evaluation == 2 else td3_bc.TD3BC.update)
+    if evaluation == 2:
+        monkeypatch.setattr(td3_bc.TD3BC, "update", lambda *_: pytest.fail("the last checkpoint is kept"))
     run_finetune(config)
-    assert contents(config.out) == contents(whole.path)
+    assert contents(config.out) == contents(finetuned)
     assert [row["step"] for row in read_episodes(config.out / "episodes.csv")] == [6, 6, 12, 12, 12, 12]
-
-
-def test_a_run_whose_checkpoints_are_gone_keeps_its_evaluations(encoder, data, tmp_path):
-    config = smoke_finetune(encoder, data, tmp_path / "run", **FINETUNE)
-    run_finetune(config)
-    (config.out / "timing.json").unlink()
-    shutil.rmtree(config.out / "checkpoints")
-    before = (config.out / "episodes.csv").read_bytes()
-    with pytest.raises(UserError, match=r"run: has evaluations, but the checkpoints .* are gone: put them back"):
-        run_finetune(config)
-    assert (config.out / "episodes.csv").read_bytes() == before
-
-
-def _fail(*arguments: object) -> None:
-    raise AssertionError("the checkpoint before the evaluation is kept")

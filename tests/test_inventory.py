@@ -22,7 +22,7 @@ from vd4rl_pomdp.core.options import option_names
 from vd4rl_pomdp.core.registry import REGISTRIES
 from vd4rl_pomdp.nn.action_target import ACTION_TARGETS
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-from vd4rl_pomdp.sweeps.grid_file import load_grid
+from vd4rl_pomdp.sweeps.grid import load_grid
 
 with Path(__file__).with_name("inventory.tsv").open(newline="", encoding="utf-8") as file:
     ROWS = list(csv.DictReader(file, delimiter="\t"))

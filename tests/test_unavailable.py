@@ -3,6 +3,7 @@
 import errno
 import fcntl
 import os
+import pydoc
 import resource
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, nullcontext, suppress
@@ -19,7 +20,7 @@ from tests.helpers_data import write_fake_set
 from tests.nn.test_encoder import CARD, make
 from tests.studies.navigation.test_pictures import python_batch
 from vd4rl_pomdp.cli import run_to_end
-from vd4rl_pomdp.core.errors import UnavailableError, UserError, system_error
+from vd4rl_pomdp.core.errors import TEMPORARY, UnavailableError, UserError, system_error
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows
 from vd4rl_pomdp.data.store import verify_store
@@ -36,7 +37,7 @@ from vd4rl_pomdp.runs.results import RUNS, read_lines
 from vd4rl_pomdp.studies.navigation.drivers import _refuse_other
 from vd4rl_pomdp.studies.navigation.pictures import _read_cifar, _read_image, load_pool, source_fingerprint
 from vd4rl_pomdp.studies.navigation.runs import read_trajectory
-from vd4rl_pomdp.sweeps.folder import _read_plan
+from vd4rl_pomdp.sweeps.folder import read_plan
 
 ADVICE = ("damaged", "truncated", "delete", "download", "collect", "remove", "train", "replace", "another copy")
 """What may not be said of a whole file."""
@@ -111,7 +112,7 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
         "CIFAR-10, binary": lambda: _read_cifar(images / "data_batch_1.bin"),
         "CIFAR-10, Python": lambda: _read_cifar(images / "data_batch_1"),
         "name of a pool": lambda: source_fingerprint(str(images)),
-        "plan of a sweep": lambda: _read_plan(run / "plan.json"),
+        "plan of a sweep": lambda: read_plan(run / "plan.json"),
     }
 
 
@@ -134,6 +135,29 @@ def test_whoever_may_open_no_more_files_is_told_that_it_passes(world):
     assert wrong == {}
 
 
+def test_what_someone_else_may_read_alone_is_neither_called_damaged_nor_to_be_made_again(world, tmp_path, monkeypatch):
+    def refusing(open_file):
+        def refuse(path, *arguments, **options):
+            if not isinstance(path, int) and Path(os.fspath(path)).is_relative_to(tmp_path):
+                raise PermissionError(errno.EACCES, "Permission denied")
+            return open_file(path, *arguments, **options)
+
+        return refuse
+
+    for place in ("io.open", "builtins.open", "h5py.File", "safetensors.safe_open"):
+        monkeypatch.setattr(place, refusing(pydoc.locate(place)))
+    wrong = {}
+    for name in world.keys() - {"listing", "what a policy replaces"}:  # which are not whole, or need not be
+        try:
+            world[name]()
+        except UserError as error:
+            if "may not be used (permission denied); ask its owner for access" not in str(error):
+                wrong[name] = str(error)
+        except Exception as error:
+            wrong[name] = repr(error)
+    assert wrong == {}
+
+
 @pytest.fixture
 def shard(tmp_path) -> Path:
     return min(write_fake_set(tmp_path / "walker_walk" / "expert").glob("*.hdf5"))
@@ -145,7 +169,7 @@ def test_a_shard_that_another_program_has_locked_passes_and_names_what_reads_it(
         with pytest.raises(UnavailableError, match="HDF5_USE_FILE_LOCKING=FALSE"):
             read_rows(shard)
         end = run_to_end(["data", "check", str(shard.parent)])
-        assert (end.code, end.cause) == (2, UnavailableError.cause), "what a sweep tries again"
+        assert end.code == TEMPORARY, "what a sweep tries again"
         assert kept_in(shard.parent) == "a data set"
     assert run_to_end(["data", "check", str(shard.parent)]).code == 0
 

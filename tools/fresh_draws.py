@@ -28,7 +28,7 @@ from vd4rl_pomdp.nn.policy import load_policy
 from vd4rl_pomdp.policies.actor import read_actor
 from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_inside
-from vd4rl_pomdp.sweeps.found import run_at
+from vd4rl_pomdp.sweeps.plan import run_at
 
 
 @dataclass(frozen=True)

@@ -8,7 +8,7 @@ from pathlib import Path
 from vd4rl_pomdp.report.gates import returns_of
 from vd4rl_pomdp.report.load import PROBES, Run, load_runs
 from vd4rl_pomdp.report.stats import number
-from vd4rl_pomdp.sweeps.grid_file import load_grid
+from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
 
 RESULTS = Path(__file__).parents[1] / "results"

@@ -26,7 +26,7 @@ from vd4rl_pomdp.report.stats import difference_interval, mean_interval, number,
 from vd4rl_pomdp.report.tables import aggregate, evaluations, improvement
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.sweeps.grid_file import load_grid
+from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
 
 RESULTS = Path(__file__).parents[1] / "results"

@@ -92,7 +92,7 @@ def raised(kind: type[BaseException], *words: object):
         (lambda *_: signal.raise_signal(signal.SIGINT), 130, "interrupted: re-run the same command to resume"),
         (lambda *_: signal.raise_signal(signal.SIGTERM), 143, "terminated: re-run the same command to resume"),
         (raised(FloatingPointError, "loss is nan"), 1, "error: training diverged, loss is nan; lower --learning-rate"),
-        (raised(OSError, 28, "No space left", "a"), 2, "error: a: the disk is full: free some space and re-run"),
+        (raised(OSError, 28, "No space left", "a"), 75, "error: a: the disk is full: free some space and re-run"),
     ],
 )
 def test_every_end_has_a_code_and_a_line(act, code, line, monkeypatch):

@@ -55,8 +55,9 @@ def test_the_demo_uses_every_stage(tmp_path, preset):
 def test_the_demo_is_one_sweep_that_ends_with_report_conclusion_and_film(tmp_path, capsys):
     carried, commands = [], []
 
-    def carry_out(jobs, folder, kind, options):
-        assert [job.name for job in folder.jobs()] == [job.name for job in jobs], "`sweep status` knows them"
+    def carry_out(plans, folder, kind, options):
+        assert folder.plans() == plans, "`sweep status` knows them"
+        (jobs,) = (plan.jobs for plan in plans)
         carried.append((kind, options.jobs))
         write_returns(jobs)
         write_navigation(jobs)

@@ -325,22 +325,6 @@ def test_methods_look_the_same_whatever_else_a_report_tells_of():
     assert len(set(looks)) == len(looks) >= 12
 
 
-def test_published_scores_are_lines_where_the_set_is_theirs_and_nothing_is_hidden(tmp_path, drawn):
-    places = {
-        "theirs": ({"corruption": "none"}, {"collection": {}}),
-        "ours": ({"corruption": "none", "task": "cheetah_run"}, {"collection": {"episodes": 2}}),
-        "hidden": ({"corruption": "patch"}, {"collection": {}}),
-    }
-    for name, (labels, record) in places.items():
-        run = write_run(tmp_path / "runs" / name, "acro", 0, {10: [50.0]}, labels=labels)
-        write_json(run / "config.json", read_json(run / "config.json") | record)
-    page, *_ = write_report([tmp_path / "runs"], tmp_path / "out")
-    text = page.read_text()
-    assert text.count("<!-- DrQ+BC -->") == 1
-    captions = re.findall(r"<figcaption>(Final scores.*?)</figcaption>", text, re.DOTALL)
-    assert ["published scores" in caption for caption in captions] == ["under none" in caption for caption in captions]
-
-
 def test_a_film_is_read_once_and_those_beyond_the_pages_room_are_counted(tmp_path, monkeypatch):
     for method in ("acro", "mik", "random"):
         for seed in (0, 1):
@@ -357,13 +341,13 @@ def test_a_film_is_read_once_and_those_beyond_the_pages_room_are_counted(tmp_pat
     assert "2 more films are left out" in page.read_text()
 
 
-def test_a_report_of_thousands_of_runs_drops_nothing_and_stays_small(tmp_path):
-    runs = write_grid(tmp_path / "grid", episodes=2)
+def test_a_report_of_a_thousand_runs_drops_nothing_and_stays_small(tmp_path):
+    runs = write_grid(tmp_path / "grid", seeds=5, episodes=2)
     page, summary, *_ = write_report([tmp_path / "grid"], tmp_path / "out")
-    assert runs > 4900
+    assert runs > 1000
     assert summary["seeds"].sum() == runs
     assert len(summary) == 3 * 3 * 2 * len(METHODS)
-    assert page.stat().st_size < 10 * 2**20
+    assert page.stat().st_size < 2 * 2**20
     assert [len(table(tmp_path / "out" / name)) for name in ("runs.csv", "episodes.csv")] == [runs, 6 * runs]
     assert (tmp_path / "out" / "runs.jsonl").read_bytes() == (tmp_path / "grid" / "runs.jsonl").read_bytes()
 

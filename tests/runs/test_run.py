@@ -2,22 +2,14 @@
 
 import json
 import os
-import pydoc
 import stat
 from dataclasses import dataclass
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from tests.helpers_data import write_fake_set
 from tests.runs.test_checkpoint import killed_at
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.data import open_dataset
-from vd4rl_pomdp.data.format import read_rows
-from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig
-from vd4rl_pomdp.nn.encoder_folder import load_encoder, save_encoder
-from vd4rl_pomdp.policies.actor import Actor, read_actor
 from vd4rl_pomdp.runs import run as module
 from vd4rl_pomdp.runs.files import read_json, write_csv, write_json
 from vd4rl_pomdp.runs.run import RunFolder
@@ -141,43 +133,3 @@ def test_all_files_follow_the_umask(tmp_path):
         os.umask(before)
     assert {name for name, mode in modes.items() if mode not in (0o640, 0o750)} == set()
     assert {".lock", "1.pt", "config.json", "checkpoints"} < set(modes)
-
-
-READERS = {
-    "1.pt": lambda folder: RunFolder(folder / "run", "stage", Config(folder / "run"), INPUTS).restore(print),
-    "model.safetensors": lambda folder: load_encoder(folder / "encoder"),
-    "config.json": lambda folder: load_encoder(folder / "encoder"),
-    "0_fake.hdf5": lambda folder: read_rows(folder / "set" / "0_fake.hdf5"),
-    "reward.npy": lambda folder: open_dataset(folder / "set", folder / "cache"),
-    "meta.json": lambda folder: open_dataset(folder / "set", folder / "cache"),
-    "actor.safetensors": lambda folder: read_actor(folder / "actor.safetensors"),
-}
-
-
-@pytest.fixture(scope="module")
-def foreign(tmp_path_factory) -> Path:
-    """An encoder, a set with its store, an actor and a run."""
-    folder = tmp_path_factory.mktemp("foreign")
-    config = EncoderConfig(channels=9, size=84, action_dim=6, frame_encoder="nature", feature_dim=8)
-    card = EncoderCard("acro", "walker_walk", "expert", {"corruption": "none"}, 0, 1, "smoke")
-    save_encoder(folder / "encoder", Encoder(config), card)
-    open_dataset(write_fake_set(folder / "set"), folder / "cache")
-    Actor({"mean.weight": np.zeros((3, 2), np.float32)}, {"task": "first_person"}).save(folder / "actor.safetensors")
-    _begin_and_save(folder / "run")
-    return folder
-
-
-@pytest.mark.parametrize("name", READERS)
-def test_a_file_of_someone_else_is_neither_called_damaged_nor_to_be_made_again(foreign, monkeypatch, name):
-    def refusing(open_file):
-        def refuse(path, *arguments, **options):
-            if Path(os.fspath(path)).name == name:
-                raise PermissionError(13, "Permission denied")
-            return open_file(path, *arguments, **options)
-
-        return refuse
-
-    for place in ("io.open", "builtins.open", "h5py.File", "safetensors.safe_open"):
-        monkeypatch.setattr(place, refusing(pydoc.locate(place)))
-    with pytest.raises(UserError, match=rf"{name}: may not be used \(permission denied\); ask its owner for access"):
-        READERS[name](foreign)

@@ -1,324 +1,238 @@
-"""What is started when, what is tried again, and that nothing is done twice."""
+"""What is started when, what is tried again, that nothing is done twice, and what is told: with real processes."""
 
-import errno
+import json
 import os
 import shutil
 import time
 from dataclasses import replace
-from pathlib import Path
+from multiprocessing import get_context
 
 import pytest
 
-from tests.helpers_sweeps import Scripted, finish, job
+from tests.helpers_sweeps import begun, job, keep_plan, until
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.errors import TEMPORARY, DiskFullError, UserError
 from vd4rl_pomdp.sweeps import driver
-from vd4rl_pomdp.sweeps.driver import Driver, given_up
-from vd4rl_pomdp.sweeps.folder import SweepFolder
+from vd4rl_pomdp.sweeps.driver import Driver
+from vd4rl_pomdp.sweeps.folder import TRIES, SweepFolder, is_finished
+from vd4rl_pomdp.sweeps.options import LocalOptions
 
 
 @pytest.fixture(autouse=True)
 def quick(monkeypatch):
-    monkeypatch.setattr(driver, "POLL_S", 0.0)
-    monkeypatch.setattr(driver, "PAUSE_S", 0.0)
-    monkeypatch.setattr(driver, "IN_USE_S", 0.0)
+    for name, seconds in {"POLL_S": 0.01, "PAUSE_S": 0.0, "IN_USE_S": 0.1, "IDLE_S": 0.5}.items():
+        monkeypatch.setattr(driver, name, seconds)
 
 
-@pytest.fixture
-def jobs(tmp_path):
-    return [job(tmp_path, "set"), job(tmp_path, "a", "set"), job(tmp_path, "b", "set", "a"), job(tmp_path, "c", "set")]
+def sweep(out, *jobs, at_once=2, **options):
+    return Driver([keep_plan(out, *jobs)], LocalOptions(jobs=at_once), SweepFolder(out), **options).run()
 
 
-def carry_out(jobs, tmp_path, script=None, slots=2):
-    executor = Scripted(jobs, script, slots)
-    return Driver(jobs, executor, SweepFolder(tmp_path)).run(), executor
+def causes(out, job):
+    return [row["cause"] for row in SweepFolder(out).attempts([job])[job.name]]
 
 
-def names(executor):
-    return [name for name, _ in executor.started]
+@pytest.mark.parametrize("at_once", [1, 2])
+def test_every_job_runs_once_after_those_it_needs_so_many_at_a_time(tmp_path, at_once):
+    a, b, c = jobs = [job(tmp_path, "a"), job(tmp_path, "b", "a"), job(tmp_path, "c", "a")]
+    assert sweep(tmp_path, *jobs, at_once=at_once)
+    assert sweep(tmp_path, *jobs, at_once=at_once), "and not again"
+    spans = [(seen["time"], float((one.folder / "ended").read_text())) for one in jobs for seen in begun(one)]
+    assert len(spans) == 3
+    assert spans[0][1] < min(spans[1][0], spans[2][0])
+    if at_once == 1:
+        assert spans[1][1] < spans[2][0] or spans[2][1] < spans[1][0]
+    assert [causes(tmp_path, one) for one in (a, b, c)] == [["done"]] * 3
 
 
-def test_every_job_runs_once_after_those_it_needs(jobs, tmp_path):
-    finished, executor = carry_out(jobs, tmp_path)
-    assert finished
-    assert names(executor) == ["set", "a", "c", "b"]
-    assert executor.most == 2
+@pytest.mark.parametrize(("end", "cause", "attempts"), [
+    ("kill", "killed", TRIES), (TEMPORARY, "unavailable", TRIES), (1, "failed", 1), (2, "failed", 1),
+])  # fmt: skip
+def test_what_can_pass_is_tried_again_what_fails_is_told_and_the_rest_goes_on(tmp_path, capsys, end, cause, attempts):
+    bad, after, other = jobs = [
+        job(tmp_path, "bad", ends=(end,) * attempts), job(tmp_path, "after", "bad"), job(tmp_path, "other"),
+    ]  # fmt: skip
+    assert not sweep(tmp_path, *jobs)
+    assert (causes(tmp_path, bad), begun(after), other.finished) == ([cause] * attempts, [], True)
+    assert not sweep(tmp_path, *jobs), "it stays given up"
+    assert len(begun(bad)) == attempts
+    capsys.readouterr()
+    main(["sweep", "status", str(tmp_path), "--json"])
+    told = json.loads(capsys.readouterr().out)
+    assert told["states"] == {"bad": "failed", "after": "blocked", "other": "done"}
+    assert told["failures"]["bad"]["line"] == "its last line"
+    main(["sweep", "retry", str(tmp_path)])
+    assert capsys.readouterr().out == "all 3 jobs are finished\n"
+    assert (len(begun(bad)), len(begun(other))) == (attempts + 1, 1)
 
 
-def test_no_more_run_at_a_time_than_there_are_slots(jobs, tmp_path):
-    assert carry_out(jobs, tmp_path, slots=1)[1].most == 1
+def test_a_failed_sweep_ends_with_each_failure_in_a_line_and_what_to_do(tmp_path, capsys):
+    keep_plan(tmp_path, job(tmp_path, "bad", ends=(2,)))
+    with pytest.raises(SystemExit, match="1"):
+        main(["sweep", "retry", str(tmp_path)])
+    told = capsys.readouterr()
+    assert told.err.splitlines()[-1] == "failed: bad: its last line"
+    program = tmp_path / "program.py"
+    line = f"1 of 1 jobs are not finished, 1 failed; `python {program} sweep retry {tmp_path}` takes those up again\n"
+    assert told.out == line
+    main(["sweep", "status", str(tmp_path)])
+    assert "1 jobs: 1 failed\n" in capsys.readouterr().out
 
 
-def test_what_is_finished_is_not_run_again(jobs, tmp_path):
-    carry_out(jobs, tmp_path)
-    assert carry_out(jobs, tmp_path)[1].started == []
+def test_a_corrected_command_and_one_that_passes_in_time_go_on(tmp_path):
+    bad, flaky = job(tmp_path, "bad", ends=(2,)), job(tmp_path, "flaky", ends=("kill",) * (TRIES - 1))
+    assert not sweep(tmp_path, bad, flaky)
+    assert flaky.finished
+    assert sweep(tmp_path, replace(bad, words=[*bad.words, "--corrected"]), flaky)
 
 
-@pytest.mark.parametrize(
-    ("cause", "attempts"),
-    [
-        *[("killed", 5), ("out of memory", 5), ("disk full", 5), ("unavailable", 5)],
-        *[("failed", 1), ("refused", 1), ("diverged", 1)],
-    ],
-)
-def test_a_cause_decides_how_often_a_job_is_tried(jobs, tmp_path, cause, attempts):
-    finished, executor = carry_out(jobs, tmp_path, {"a": [cause] * 99})
-    assert not finished
-    assert names(executor).count("a") == attempts
-    assert "c" in names(executor), "the others go on"
-    assert "b" not in names(executor), "what needs it does not"
+def test_what_ends_well_and_leaves_nothing_of_its_own_has_failed(tmp_path):
+    nothing, another = job(tmp_path, "nothing", ends=(0,)), replace(job(tmp_path, "another"), recipe="of another run")
+    assert not sweep(tmp_path, nothing, another)
+    for one in (nothing, another):
+        (row,) = SweepFolder(tmp_path).attempts([one])[one.name]
+        assert row["line"] == f"{one.folder}: holds nothing finished, though the command ended well"
 
 
-def test_a_killed_job_that_gets_further_is_tried_as_often_as_it_takes(jobs, tmp_path, monkeypatch):
-    steps = iter(range(100))
-    monkeypatch.setattr(driver, "progress_of", lambda job: next(steps))
-    finished, executor = carry_out(jobs, tmp_path, {"a": ["killed"] * 30})
-    assert finished
-    assert names(executor).count("a") == 31
+def test_what_was_done_once_and_is_gone_is_done_again(tmp_path):
+    one = job(tmp_path, "one")
+    sweep(tmp_path, one)
+    shutil.rmtree(one.folder)
+    assert sweep(tmp_path, one)
 
 
-@pytest.mark.parametrize("cause", ["out of memory", "killed"])
-def test_a_job_that_the_memory_may_not_have_sufficed_for_has_half_as_many_beside_it(jobs, tmp_path, cause):
-    """The kernel kills without saying why."""
-    finished, executor = carry_out(jobs, tmp_path, {"a": [cause] * 3}, slots=4)
-    assert finished
-    assert [slots for name, slots in executor.started if name == "a"] == [1, 2, 4, 4]
+def command(*words):
+    """A process of its own, which need not import what this one has."""
+    process = get_context("fork").Process(target=main, args=(["sweep", *map(str, words)],))
+    process.start()
+    return process
 
 
-def test_what_another_driver_has_given_up_is_not_tried_here(jobs, tmp_path, monkeypatch):
-    executor, other = Scripted(jobs), SweepFolder(tmp_path)
-    start = executor.start
-
-    def meanwhile(work):
-        start(work)
-        if work.name == "set":
-            other.add({"job": "a", "cause": "refused", "line": "", "step": 0, "ended": 0.0})
-
-    monkeypatch.setattr(executor, "start", meanwhile)
-    assert not Driver(jobs, executor, SweepFolder(tmp_path)).run()
-    assert names(executor) == ["set", "c"]
+def code(process):
+    process.join(60)
+    return process.exitcode
 
 
-def test_a_pause_is_kept_whoever_made_the_last_attempt(jobs, tmp_path, monkeypatch):
+def test_a_killed_driver_is_followed_by_several_that_share_what_is_left(tmp_path):
+    """The jobs that it had begun go on, and are waited for."""
+    jobs = [job(tmp_path, name, ends=("wait",)) for name in "abcdef"]
+    keep_plan(tmp_path, *jobs)
+    first = command("retry", tmp_path, "--jobs", "2")
+    until(lambda: sum(map(len, map(begun, jobs))) == 2)
+    first.kill()
+    first.join()
+    others = [command("retry", tmp_path, "--jobs", "1"), command("join", tmp_path, "--jobs", "1")]
+    until(lambda: sum(map(len, map(begun, jobs))) == 4)
+    (tmp_path / "go").touch()
+    assert code(others[0]) == 0
+    others[1].kill()
+    others[1].join()
+    assert [len(begun(one)) for one in jobs] == [1] * 6
+    assert all(map(is_finished, jobs))
+
+
+def test_a_signal_ends_the_jobs_where_nothing_is_lost_and_is_no_attempt(tmp_path):
+    one = job(tmp_path, "one", ends=("wait",) * 9)
+    keep_plan(tmp_path, one)
+    process = command("retry", tmp_path)
+    until(lambda: begun(one))
+    process.terminate()
+    assert code(process) == 143
+    assert causes(tmp_path, one) == ["interrupted"]
+    (tmp_path / "go").touch()
+    main(["sweep", "retry", str(tmp_path)])
+
+
+def test_a_driver_that_helps_ends_when_others_have_all_that_could_start(tmp_path):
+    one, _ = jobs = [job(tmp_path, "one", ends=("wait",)), job(tmp_path, "after", "one")]
+    keep_plan(tmp_path, *jobs)
+    process = command("retry", tmp_path)
+    until(lambda: begun(one))
+    assert not sweep(tmp_path, *jobs, helps=True)
+    (tmp_path / "go").touch()
+    assert code(process) == 0
+    assert [len(begun(one)) for one in jobs] == [1, 1]
+
+
+def test_after_what_can_pass_every_driver_pauses(tmp_path, monkeypatch):
+    one = job(tmp_path, "one", ends=(TEMPORARY,))
+    monkeypatch.setattr(driver, "PAUSE_S", 1.0)
+    assert sweep(tmp_path, one)
+    first, second = (seen["time"] for seen in begun(one))
+    assert second - first > 1
     monkeypatch.setattr(driver, "PAUSE_S", 3600.0)
-    monkeypatch.setattr(driver, "IDLE_S", 0.2)
-    SweepFolder(tmp_path).add({"job": "set", "cause": "disk full", "line": "", "step": 0, "ended": time.time()})
-    executor = Scripted(jobs)
-    assert not Driver(jobs, executor, SweepFolder(tmp_path), helps=True).run()
-    assert executor.started == []
+    two = job(tmp_path, "two")
+    told = {"job": "two", "cause": "killed", "line": "", "seconds": 1.0, "words": two.words}
+    SweepFolder(tmp_path).add(told | {"ended": time.time()})
+    assert not sweep(tmp_path, two, helps=True)
+    assert begun(two) == []
 
 
-def test_a_driver_that_helps_ends_when_others_have_all_that_could_start(jobs, tmp_path, monkeypatch):
-    monkeypatch.setattr(driver, "IDLE_S", 0.2)
-    monkeypatch.setattr(driver, "in_use", lambda folder: folder.name == "a")
-    executor = Scripted(jobs)
-    assert not Driver(jobs, executor, SweepFolder(tmp_path), helps=True).run()
-    assert sorted(names(executor)) == ["c", "set"]
+def test_a_log_that_cannot_be_written_costs_its_own_job_an_attempt(tmp_path):
+    (tmp_path / "sweep" / "logs").mkdir(parents=True)
+    (tmp_path / "sweep" / "logs" / "a.log").mkdir()
+    a, b = jobs = [job(tmp_path, "a"), job(tmp_path, "b")]
+    assert not sweep(tmp_path, *jobs)
+    assert causes(tmp_path, a) == ["unavailable"] * TRIES
+    assert b.finished
 
 
-def test_a_job_that_another_driver_began_first_costs_no_attempt(jobs, tmp_path):
-    assert carry_out(jobs, tmp_path, {"a": ["in use"] * 9})[0]
-    assert [row["cause"] for row in SweepFolder(tmp_path).attempts()["a"]] == ["done"]
+def test_jobs_share_out_the_cores_and_the_gpus(tmp_path, monkeypatch):
+    monkeypatch.setattr(driver, "visible_gpus", list)
+    monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(8)))
+    assert [place.cores for place in driver.places(LocalOptions(jobs=3))] == [(0, 1), (2, 3, 4), (5, 6, 7)]
+    assert [place.cores for place in driver.places(LocalOptions(jobs=16))] == [(n // 2,) for n in range(16)]
+    assert len(driver.places(LocalOptions())) == 1, "as many as there are GPUs, or one"
+    monkeypatch.undo()
+    monkeypatch.setattr(driver, "visible_gpus", lambda: ["2", "5"])
+    assert sorted(place.gpu for place in driver.places(LocalOptions(jobs_per_gpu=3))) == ["2"] * 3 + ["5"] * 3
+    with pytest.raises(UserError, match="is more than 2 GPUs take"):
+        driver.places(LocalOptions(jobs=3))
+    one, before = job(tmp_path, "one"), os.sched_getaffinity(0)
+    sweep(tmp_path, one)
+    (seen,) = begun(one)
+    share = max(1, len(before) // 2)
+    assert (seen["CUDA_VISIBLE_DEVICES"], seen["OMP_NUM_THREADS"], seen["cores"]) == ("2", str(share), share)
+    assert os.sched_getaffinity(0) == before
 
 
-def test_a_job_of_another_command_has_not_been_tried(jobs, tmp_path):
-    carry_out(jobs, tmp_path, {"a": ["refused"]})
-    corrected = [replace(one, words=("list", "--device", "cpu")) if one.name == "a" else one for one in jobs]
-    finished, executor = carry_out(corrected, tmp_path)
-    assert finished
-    assert names(executor) == ["a", "b"]
+def test_the_row_after_one_that_a_full_disk_cut_is_whole(tmp_path, monkeypatch):
+    folder, one = SweepFolder(tmp_path), job(tmp_path, "one")
+    row = {"job": "one", "cause": "killed", "line": "", "seconds": 1.0, "ended": 2.0, "words": one.words}
+    folder.add(row)
+    path = tmp_path / "sweep" / "attempts.jsonl"
+    path.write_bytes(path.read_bytes() + b'{"job": "one", "cau')
+    folder.add(row)
+    assert folder.attempts([one])["one"] == [row, row]
+    os.symlink("/dev/full", tmp_path / "full")
+    monkeypatch.setattr(folder, "_attempts", tmp_path / "full")
+    with pytest.raises(DiskFullError):
+        folder.add(row)
 
 
-def test_a_job_whose_own_part_was_mended_has_not_been_tried(jobs, tmp_path, monkeypatch):
-    of_files = {"sources": {"method mine": "mine.py 1"}}
-    monkeypatch.setattr("vd4rl_pomdp.sweeps.driver.sources", lambda settings: of_files["sources"])
-    monkeypatch.setattr("vd4rl_pomdp.core.registry.sources", lambda settings: of_files["sources"])
-    carry_out(jobs, tmp_path, {"a": ["refused"]})
-    assert "a" not in names(carry_out(jobs, tmp_path)[1])
-    of_files["sources"] = {"method mine": "mine.py 2"}
-    finished, executor = carry_out(jobs, tmp_path)
-    assert finished
-    assert names(executor) == ["a", "b"]
+def test_a_plan_is_read_from_elsewhere_and_not_carried_out_where_it_was_moved(tmp_path, monkeypatch, capsys):
+    (tmp_path / "made").mkdir()
+    monkeypatch.chdir(tmp_path / "made")
+    out = tmp_path / "made" / "runs"
+    one = job(out, "one")
+    plan = keep_plan(out, replace(one, folder=one.folder.relative_to(tmp_path / "made"), words=["runs/one"]))
+    SweepFolder(out.relative_to(tmp_path / "made")).keep_plan("plan", plan.jobs, plan.program)
+    monkeypatch.chdir(tmp_path)
+    main(["sweep", "retry", "made/runs"])
+    assert one.finished, "its process ran where the plan was made"
+    (tmp_path / "made" / "runs").rename(tmp_path / "moved")
+    capsys.readouterr()
+    main(["sweep", "status", "moved"])
+    assert "1 jobs: 1 done" in capsys.readouterr().out
+    with pytest.raises(SystemExit, match="2"):
+        main(["sweep", "retry", "moved"])
+    assert "error: moved: was planned as " in capsys.readouterr().err
 
 
-def test_a_disk_that_does_not_answer_costs_one_attempt_and_no_other_job(jobs, tmp_path, monkeypatch):
-    silent, progress_of = [errno.ESTALE, errno.EIO], driver.progress_of
-
-    def ask(job):
-        if job.name == "a" and silent:
-            raise OSError(silent.pop(), "it does not answer")
-        return progress_of(job)
-
-    monkeypatch.setattr(driver, "progress_of", ask)
-    finished, executor = carry_out(jobs, tmp_path, {"a": ["killed"]})
-    assert finished
-    assert not executor.stopped
-    assert [row["cause"] for row in SweepFolder(tmp_path).attempts()["a"]] == ["unavailable", "unavailable"]
-
-
-@pytest.mark.parametrize("where", ["in_use", "progress_of"])
-def test_a_folder_that_may_not_be_used_costs_its_own_job_alone(jobs, tmp_path, monkeypatch, where):
-    """As one that another user's driver made: before the job begins, or after it has ended."""
-    done = getattr(driver, where)
-
-    def ask(asked):
-        folder = asked if where == "in_use" else asked.folder
-        if folder.name == "c":
-            raise PermissionError(errno.EACCES, "Permission denied")
-        return done(asked)
-
-    monkeypatch.setattr(driver, where, ask)
-    finished, executor = carry_out(jobs, tmp_path)
-    assert finished == (where == "progress_of"), "its folder tells it in the end"
-    assert [name for name in names(executor) if name != "c"] == ["set", "a", "b"]
-    (row,) = SweepFolder(tmp_path).attempts()["c"]
-    assert row["cause"] == "refused"
-    assert "may not be used" in row["line"]
-
-
-def test_a_job_that_cannot_be_started_costs_itself_alone(jobs, tmp_path, monkeypatch):
-    executor = Scripted(jobs)
-    start = executor.start
-
-    def refused(work):
-        if work.name == "c":
-            raise OSError(errno.ENAMETOOLONG, "File name too long")
-        start(work)
-
-    monkeypatch.setattr(executor, "start", refused)
-    assert not Driver(jobs, executor, SweepFolder(tmp_path)).run()
-    assert names(executor) == ["set", "a", "b"]
-    assert SweepFolder(tmp_path).attempts()["c"][-1]["cause"] == "refused"
-
-
-def test_what_a_network_disk_shows_late_is_looked_for_anew(jobs, tmp_path, monkeypatch):
-    """NFS may remember that a file was not there, until its folder is listed."""
-    listed, is_file, listdir = set(), Path.is_file, os.listdir
-    monkeypatch.setattr(
-        Path, "is_file", lambda path: (path.name == "attempts.jsonl" or str(path.parent) in listed) and is_file(path)
-    )
-    monkeypatch.setattr(os, "listdir", lambda folder: listed.add(str(folder)) or listdir(folder))
-    finished, executor = carry_out(jobs, tmp_path)
-    assert finished
-    assert names(executor) == ["set", "a", "c", "b"], "once each"
-
-
-def test_failures_stay_until_they_are_taken_up_again(jobs, tmp_path):
-    carry_out(jobs, tmp_path, {"a": ["diverged"]})
-    assert "a" not in names(carry_out(jobs, tmp_path)[1])
-    SweepFolder(tmp_path).forget("a")
-    finished, executor = carry_out(jobs, tmp_path)
-    assert finished
-    assert names(executor) == ["a", "b"]
-
-
-def test_a_job_that_was_given_up_here_and_finished_elsewhere_is_finished(jobs, tmp_path, monkeypatch):
-    executor = Scripted(jobs, {"c": ["diverged"]})
-    worker, collect = Driver(jobs, executor, SweepFolder(tmp_path)), Driver._collect
-
-    def meanwhile(own):
-        collect(own)
-        if "c" in own._lost:
-            finish(jobs[3].folder)
-
-    monkeypatch.setattr(Driver, "_collect", meanwhile)
-    assert worker.run()
-    assert names(executor).count("c") == 1
-
-
-def test_a_job_that_another_driver_finished_meanwhile_is_left_alone(jobs, tmp_path):
-    executor = Scripted(jobs)
-    worker = Driver(jobs, executor, SweepFolder(tmp_path))
-    for other in jobs[:2]:
-        finish(other.folder)
-    assert worker.run()
-    assert sorted(names(executor)) == ["b", "c"]
-
-
-def test_a_job_that_another_process_is_at_is_waited_for(jobs, tmp_path, monkeypatch):
-    asked = []
-
-    def busy(folder):
-        asked.append(folder.name)
-        return asked.count("a") < 5 and folder.name == "a"
-
-    monkeypatch.setattr(driver, "in_use", busy)
-    finished, executor = carry_out(jobs, tmp_path)
-    assert finished
-    assert names(executor).count("a") == 1
-    assert asked.count("a") == 5
-
-
-@pytest.mark.parametrize("other", [{"seed": 1}, {"content": "another set"}])
-def test_another_run_that_came_into_a_jobs_folder_does_not_finish_it(jobs, tmp_path, other):
-    finish(jobs[0].folder, **other)
-    _, executor = carry_out(jobs, tmp_path)
-    assert names(executor)[0] == "set"
-
-
-def test_what_was_done_once_and_is_gone_is_done_again(jobs, tmp_path):
-    carry_out(jobs, tmp_path)
-    shutil.rmtree(tmp_path / "a")
-    finished, executor = carry_out(jobs, tmp_path)
-    assert finished
-    assert names(executor) == ["a"]
-
-
-def test_a_job_that_ends_well_and_leaves_nothing_has_failed(jobs, tmp_path):
-    executor = Scripted(jobs)
-    executor.folders["c"] = tmp_path / "elsewhere"
-    assert not Driver(jobs, executor, SweepFolder(tmp_path)).run()
-    assert names(executor).count("c") == 1
-    row = SweepFolder(tmp_path).attempts()["c"][-1]
-    assert row["cause"] == "failed"
-    assert "holds nothing finished" in row["line"]
-
-
-def test_an_interruption_stops_the_jobs_and_is_told(jobs, tmp_path, monkeypatch):
-    executor = Scripted(jobs)
-
-    def interrupted(*_):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(driver.interrupt, "check", interrupted)
-    with pytest.raises(KeyboardInterrupt):
-        Driver(jobs, executor, SweepFolder(tmp_path)).run()
-    assert executor.stopped
-
-
-@pytest.mark.parametrize(
-    ("number", "cause"), [(errno.ENOSPC, "disk full"), (errno.EAGAIN, "unavailable"), (errno.ENOMEM, "out of memory")]
-)
-def test_what_passes_at_the_start_of_a_job_is_tried_again(jobs, tmp_path, monkeypatch, number, cause):
-    executor = Scripted(jobs)
-    start, refused = executor.start, [True]
-
-    def refused_once(work):
-        if refused and refused.pop():
-            raise OSError(number, os.strerror(number))
-        start(work)
-
-    monkeypatch.setattr(executor, "start", refused_once)
-    assert Driver(jobs, executor, SweepFolder(tmp_path)).run()
-    assert [row["cause"] for row in SweepFolder(tmp_path).attempts()["set"]] == [cause, "done"]
-
-
-def test_rows_tell_every_attempt(jobs, tmp_path):
-    carry_out(jobs, tmp_path, {"a": ["killed"]})
-    rows = SweepFolder(tmp_path).attempts()["a"]
-    assert [(row["cause"], row["line"]) for row in rows] == [("killed", "its killed line"), ("done", "")]
-
-
-def test_a_row_that_a_full_disk_cut_is_left_out(tmp_path):
-    history = SweepFolder(tmp_path)
-    history.add({"job": "a", "cause": "killed", "step": 0})
-    with (tmp_path / "sweep" / "attempts.jsonl").open("a") as file:
-        file.write('{"job": "a", "cau\n')
-    history.add({"job": "a", "cause": "killed", "step": 0})
-    assert len(history.attempts()["a"]) == 2
-
-
-def test_attempts_count_from_the_last_checkpoint_or_interruption():
-    killed, interrupted = {"cause": "killed", "step": 0}, {"cause": "interrupted", "step": 0}
-    assert given_up([killed] * 5) == "killed"
-    assert given_up([killed] * 4) == given_up([*[killed] * 4, interrupted, *[killed] * 4]) == ""
-    assert given_up([*[killed] * 4, killed | {"step": 5}]) == ""
-    assert given_up([killed | {"cause": "abducted"}]) == "abducted", "of another version"
+@pytest.mark.parametrize("text", ["[{", "{}", "[3]", '{"made_in": "/", "out": "runs", "program": [], "jobs": [{}]}'])
+def test_a_damaged_plan_is_one_line(tmp_path, capsys, text):
+    keep_plan(tmp_path, job(tmp_path, "one"))
+    (tmp_path / "sweep" / "plans" / "plan.json").write_text(text)
+    with pytest.raises(SystemExit, match="2"):
+        main(["sweep", "status", str(tmp_path)])
+    assert "plan.json: is damaged" in capsys.readouterr().err

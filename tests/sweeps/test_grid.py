@@ -6,12 +6,10 @@ from pathlib import Path
 import pytest
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.tasks import TASKS, GymnasiumTask
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 from vd4rl_pomdp.studies.navigation.measures import condition_of, paper_rows
-from vd4rl_pomdp.sweeps.grid import GridCell, narrow
-from vd4rl_pomdp.sweeps.grid_file import load_grid, names
-from vd4rl_pomdp.sweeps.stages import check_cell, check_cells
+from vd4rl_pomdp.sweeps.grid import load_grid, names, narrow
+from vd4rl_pomdp.sweeps.stages import check_cells
 
 PAGE = Path(__file__).parents[2] / "docs" / "sweeps.md"
 TOML = """
@@ -46,37 +44,25 @@ def file(tmp_path):
     return write
 
 
-def test_lists_are_axes_and_first_seeds_come_first(file):
-    cells = load_grid(file(TOML)).cells()
-    assert len(cells) == 2 * 2 * 2
-    assert [cell.seed for cell in cells] == [0] * 4 + [1] * 4
-    assert cells[0].sections["collect"] == {"task": "walker_walk", "quality": "expert"}
-    assert {cell.value("method") for cell in cells} == {"mik+a", "acro"}
-    assert cells[0].chain == ("collect", "pretrain", "finetune")
-
-
-def test_a_block_replaces_what_stands_above_it(file):
+def test_lists_are_axes_a_block_replaces_what_stands_above_it_and_first_seeds_come_first(file):
     cells = load_grid(file(TOML + BLOCKS)).cells()
-    assert len(cells) == 8 + 4
+    assert len(cells) == 2 * 2 * 2 + 4
+    assert [cell.seed for cell in cells] == [0] * 6 + [1] * 6
+    assert cells[0].sections["collect"] == {"task": "walker_walk", "quality": "expert"}
+    assert cells[0].chain == ("collect", "pretrain", "finetune")
     own = [cell for cell in cells if cell.value("history") == "gru"]
-    assert {cell.value("method") for cell in own} == {"acro"}
-    assert all(cell.value("corruption") == "patch" for cell in own)
-
-
-def test_cells_that_two_blocks_share_are_one(file):
+    assert {(cell.value("method"), cell.value("corruption")) for cell in own} == {("acro", "patch")}
     same = '[[block]]\n[[block]]\npretrain = { method = "acro" }\n'
-    assert len(load_grid(file(TOML + same)).cells()) == 8
+    assert len(load_grid(file(TOML + same)).cells()) == 8, "cells that two blocks share are one"
 
 
-def test_the_testing_subset_replaces_everything(file):
-    cells = load_grid(file(TOML + BLOCKS), testing=True).cells()
+def test_the_testing_subset_replaces_everything_and_changes_come_last_with_the_types_of_toml(file):
+    path = file(TOML + BLOCKS)
+    cells = load_grid(path, testing=True).cells()
     assert {(cell.seed, cell.value("task"), cell.value("preset")) for cell in cells} == {(7, "walker_walk", "smoke")}
     assert len(cells) == 3
-
-
-def test_changes_come_last_and_have_the_types_of_toml(file):
-    changes = ["seed=3,4", "pretrain.steps=10", "finetune.learning_rate=1e-3", "pretrain.method=mik"]
-    cells = load_grid(file(TOML + BLOCKS), changes, testing=True).cells()
+    changes = ["seed = 3, 4", "pretrain.steps=10", "finetune.learning_rate=1e-3", "pretrain.method = mik"]
+    cells = load_grid(path, changes, testing=True).cells()
     assert {cell.seed for cell in cells} == {3, 4}
     assert {(cell.value("steps"), cell.value("learning_rate"), cell.value("method")) for cell in cells} == {
         (10, 1e-3, "mik")
@@ -89,15 +75,13 @@ def test_a_python_file_defines_the_same(file):
     assert (grid.name, [cell.seed for cell in grid.cells()]) == ("mine", [0, 1, 2])
 
 
-def test_only_keeps_cells_by_value(file):
+def test_only_keeps_cells_by_value_and_names_what_there_is(file):
     cells = load_grid(file(TOML)).cells()
-    kept = narrow(cells, ["task=walker_walk", "method=acro,mik+a", "seed=1"])
+    kept = narrow(cells, ["task=walker_walk", "method = acro, mik+a", "seed=1"])
     assert [(cell.value("task"), cell.seed) for cell in kept] == [("walker_walk", 1)] * 2
-
-
-def test_blanks_around_conditions_and_changes_mean_nothing(file):
-    cells = load_grid(file(TOML), ["seed = 3, 4", "pretrain.method = mik"]).cells()
-    assert {(cell.seed, cell.value("method")) for cell in narrow(cells, ["seed = 4, 3"])} == {(3, "mik"), (4, "mik")}
+    for only in ("method", "method=curl", "colour=red"):
+        with pytest.raises(UserError, match=f"'{only}'"):
+            narrow(cells, [only])
 
 
 @pytest.mark.parametrize(
@@ -115,8 +99,11 @@ def test_blanks_around_conditions_and_changes_mean_nothing(file):
         ("seed = [0, false]\n[collect]", r"seed is \[0, False\]: write a number"),
         ("[collect]\nseed = true", r"collect\.seed is True: write a number"),
         ("[collect]\n[pretrain]\nhelp = true", r"pretrain\.help: is no setting of a stage"),
-        ("[pretrain]\nmethod = []", r"pretrain\.method is \[\]"),
-        ("[pretrain]\nmethod = [[1]]", r"pretrain\.method is \[\[1\]\]"),
+        ("[collect]\n[pretrain]\nmax-k = 3", r"pretrain\.max-k: is no setting of a stage; they are called like max_k"),
+        ("[collect]\n[pretrain]\nlog_every = [10, 20]", r"pretrain\.log_every: changes no result"),
+        ("[pretrain]\nmethod = 'acro'", "a block trains on no set: add a section collect"),
+        ("[collect]\n[pretrain]\nmethod = []", r"pretrain\.method is \[\]"),
+        ("[collect]\n[pretrain]\nmethod = [[1]]", r"pretrain\.method is \[\[1\]\]"),
         ("block = 3", "its blocks are no list of tables"),
         ("where = 3", "its wheres are no list of tables"),
         ("title = ", r"is no grid \(TOMLDecodeError"),
@@ -138,12 +125,6 @@ def test_a_name_of_two_sections_is_told_by_its_section(file):
         narrow(cells, ["learning_rate=0.001"])
     with pytest.raises(UserError, match="sets nothing of that name"):
         narrow(cells, ["collect.learning_rate=0.001"])
-
-
-def test_what_changes_no_result_is_no_axis(file):
-    assert len(load_grid(file("[collect]\n[pretrain]\nlog_every = 10")).cells()) == 1
-    with pytest.raises(UserError, match=r"pretrain\.log_every: changes no result"):
-        load_grid(file("[collect]\n[pretrain]\nlog_every = [10, 20]"))
 
 
 @pytest.mark.parametrize(
@@ -170,18 +151,16 @@ finetune = { updates = 80 }
 """
 
 
-def test_where_sets_what_the_cells_that_meet_all_conditions_have(file):
-    cells = load_grid(file(TOML + WHERE)).cells()
+def test_where_sets_what_the_cells_that_meet_all_conditions_have_and_yields_to_changes(file):
+    path = file(TOML + WHERE + '[testing]\npreset = "cpu"\n')
+    cells = load_grid(path).cells()
     assert len(cells) == 8
     for cell in cells:
         meets = (cell.value("task"), cell.value("method")) == ("cheetah_run", "acro")
         assert (cell.value("updates"), cell.value("preset")) == ((80, "smoke") if meets else (40, None))
-
-
-def test_where_yields_to_the_testing_subset_and_to_changes(file):
-    path = file(TOML + WHERE + '[testing]\npreset = "cpu"\n')
-    cells = load_grid(path, ["finetune.updates=20"], testing=True).cells()
+    cells = load_grid(path, ["finetune.updates=20", "seed=0,1"], testing=True).cells()
     assert {(cell.value("updates"), cell.value("preset")) for cell in cells} == {(20, "cpu")}
+    assert len(cells) == 8
 
 
 @pytest.mark.parametrize(
@@ -213,100 +192,15 @@ def test_a_condition_means_a_number_however_it_is_written(file):
     assert [cell.value("updates") for cell in load_grid(file(told + where)).cells()].count(7) == len(cells) / 2
 
 
-@pytest.mark.parametrize("only", ["method", "method=curl", "colour=red"])
-def test_only_names_what_there_is(file, only):
-    with pytest.raises(UserError, match=f"'{only}'"):
-        narrow(load_grid(file(TOML)).cells(), [only])
-
-
 @pytest.mark.parametrize("testing", [False, True])
 @pytest.mark.parametrize("name", names())
 def test_every_shipped_cell_is_one_that_its_stages_take(name, testing):
     cells = load_grid(name, testing=testing).cells()
     assert len(cells) == len({repr((cell.shared, cell.sections)) for cell in cells}) > 0
-    for cell in cells:
-        check_cell(cell)
+    check_cells(cells, name)
     if testing:
         assert len(cells) <= 33
         assert {cell.value("preset") for cell in cells} == {"smoke"}
-
-
-@pytest.mark.parametrize(
-    "section", ['[collect]\nquality = "expert"\ntask = "nope"', '[navigation_collect]\nmaze = "nope"']
-)
-def test_a_set_that_cannot_be_collected_is_refused_before_anything_is_run(file, section):
-    cells = load_grid(file(section)).cells()
-    with pytest.raises(UserError, match=r"^mine\.toml: .*'nope'"):
-        check_cells(cells, "mine.toml")
-
-
-CELL = {
-    "collect": {"task": "walker_walk", "quality": "expert", "frame_size": 48},
-    "pretrain": {"frame_encoder": "nature", "steps": 10},
-    "finetune": {},
-}
-NOISE = {"exogenous": "textures"}
-MAZE_CELL = {
-    "navigation_collect": {"maze": "no_curtain", "trajectories": 2, "trajectory_rows": 64},
-    "navigation_train": {},
-}
-
-
-@pytest.mark.parametrize(
-    ("cell", "section", "changes", "message"),
-    [
-        (CELL, "pretrain", {"shift": 48}, "--shift is 48; it must be at least 0 and at most 47"),
-        (CELL, "pretrain", {"corruption": "patch", "patch_size": 49}, r"patch size 49 exceeds the image \(48x48\)"),
-        (CELL, "pretrain", {"window": 502}, "--window 502 is longer than an episode of the set, of 501 rows"),
-        (CELL, "pretrain", {"frame_encoder": "mixer"}, "48 is no multiple"),
-        (CELL, "finetune", {"shift": 48}, "--shift is 48; it must be at least 0 and at most 47"),
-        (CELL, "finetune", {"n_step": 501}, "--n-step is 501; it must be at least 1 and at most 500"),
-        (CELL, "collect", {"frame_size": 16}, "'nature' cannot read pictures of 16x16 pixels"),
-        (MAZE_CELL, "navigation_train", {"method": "curl"}, "curl predicts no actions"),
-        (
-            MAZE_CELL,
-            "navigation_train",
-            NOISE | {"exogenous_weight": 2},
-            "--exogenous-weight is 2.0; it must be",
-        ),
-        (MAZE_CELL, "navigation_train", NOISE | {"exogenous_weight": 0}, "--exogenous-weight is 0, which adds nothing"),
-        (MAZE_CELL, "navigation_train", {"exogenous": "nowhere"}, "nowhere: no such folder; name one with images"),
-        (MAZE_CELL, "navigation_train", {"window": 65}, "--window 65 is longer than an episode of the set, of 64 rows"),
-        (MAZE_CELL, "navigation_collect", {"trajectories": 1}, "--trajectories is 1: a single trajectory leaves none"),
-    ],
-)
-def test_a_training_that_cannot_read_the_set_of_its_cell_is_refused_before_the_set_is_collected(
-    cell, section, changes, message
-):
-    check_cell(GridCell({}, cell, {}))
-    with pytest.raises(UserError, match=message):
-        check_cell(GridCell({}, cell | {section: cell[section] | changes}, {}))
-
-
-@pytest.mark.parametrize("method", ["state", "supervised"])
-def test_a_method_that_reads_states_is_refused_on_a_task_that_has_none(method):
-    with TASKS.isolated():
-        TASKS.register("pictures", GymnasiumTask("MountainCarContinuous-v0"))
-        cell = {"collect": {"task": "pictures", "quality": "random"}, "pretrain": {"method": "acro"}}
-        check_cell(GridCell({}, cell, {}))
-        with pytest.raises(UserError, match=f"{method} needs the simulator's states, and pictures has none"):
-            check_cell(GridCell({}, cell | {"pretrain": {"method": method}}, {}))
-
-
-def test_a_set_that_is_there_need_not_be_one_that_can_be_collected():
-    with TASKS.isolated():
-        TASKS.register("pictures", GymnasiumTask("MountainCarContinuous-v0"))
-        cell = GridCell({}, {"collect": {"task": "pictures", "quality": "expert"}, "pretrain": {"method": "acro"}}, {})
-        with pytest.raises(UserError, match="mine: pictures has no states for an actor to read"):
-            check_cells([cell], "mine")
-        check_cells([cell], "mine", collects=lambda _: False)
-
-
-@pytest.mark.parametrize("changes", [[], ["pretrain.max-k=3"]])
-def test_a_flags_name_is_no_settings(file, changes):
-    text = '[collect]\ntask = "walker_walk"\nquality = "expert"\n[pretrain]\nmax' + "_-"[not changes] + "k = 1"
-    with pytest.raises(UserError, match=r"pretrain\.max-k: is the flag's name, the setting's is max_k"):
-        load_grid(file(text), changes)
 
 
 def test_the_papers_grids_are_its_figures_over_twelve_methods():
@@ -338,7 +232,25 @@ def test_the_pages_grid_is_one(file):
     block, _ = re.findall(r"^```toml\n(.*?)^```", PAGE.read_text(), re.DOTALL | re.MULTILINE)
     cells = load_grid(file(block)).cells()
     assert len(cells) == 3 * 2 * 2 * 2 + 3 * 2 * 2
-    for cell in (*cells, *load_grid(file(block), testing=True).cells()):
-        check_cell(cell)
+    check_cells([*cells, *load_grid(file(block), testing=True).cells()], "the page's")
     table = {name for line in PAGE.read_text().splitlines() if line.startswith("| `") for name in line.split("`")[1::2]}
     assert set(names()) <= table
+
+
+SET = '[collect]\ntask = "walker_walk"\nquality = "expert"\n[pretrain]\n'
+
+
+@pytest.mark.parametrize(
+    ("section", "message"),
+    [
+        ('[collect]\ntask = "walker_walk"', "mine.toml: collect: .*--quality"),
+        ('[collect]\ntask = "walker_walk"\nquality = "expert"\nepisode = 3', "mine.toml: collect: .*--episode"),
+        ('[navigation_collect]\nmaze = "no_curtain"\npreset = "huge"', "navigation_collect: unknown preset 'huge'"),
+        (SET + 'method = "acor"', "mine.toml: pretrain: unknown method 'acor'"),
+        (SET + 'steps = "many"', "mine.toml: pretrain: .*--steps.*many"),
+    ],
+)
+def test_a_setting_that_no_stage_takes_is_told_with_its_place(file, section, message):
+    path = file(section)
+    with pytest.raises(UserError, match=message):
+        check_cells(load_grid(path).cells(), "mine.toml")

@@ -15,7 +15,7 @@ from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.results import read_results, write_results
-from vd4rl_pomdp.sweeps.grid_file import load_grid
+from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
 from vd4rl_pomdp.sweeps.stages import collection_of, recorded
 

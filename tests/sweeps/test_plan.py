@@ -5,27 +5,25 @@ import shutil
 from dataclasses import replace
 from pathlib import Path
 
+import h5py
 import pytest
 from PIL import Image
 
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.cli.parsing import parse_stage
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.data.collect import CollectConfig, collection
-from vd4rl_pomdp.runs.files import jsonable, read_json, write_json
+from vd4rl_pomdp.runs.files import read_json, write_json
+from vd4rl_pomdp.runs.results import find_results
 from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
 from vd4rl_pomdp.sweeps import plan as module
-from vd4rl_pomdp.sweeps.estimate import Estimates
 from vd4rl_pomdp.sweeps.folder import SweepFolder
-from vd4rl_pomdp.sweeps.found import FoundRun, FoundRuns, runs_below, runs_kept
-from vd4rl_pomdp.sweeps.grid_file import load_grid
-from vd4rl_pomdp.sweeps.plan import DATA, JobPlanner
+from vd4rl_pomdp.sweeps.grid import load_grid
+from vd4rl_pomdp.sweeps.members import GridMembers
+from vd4rl_pomdp.sweeps.plan import DATA, FoundRun, plan_jobs, runs_below, runs_kept
 from vd4rl_pomdp.sweeps.stages import recorded
 
-ROOT = Path(__file__).parents[2]
 GRID = """
 seed = 0
 preset = "smoke"
@@ -36,8 +34,10 @@ quality = "expert"
 corruption = "patch"
 [finetune]
 eval_episodes = 1
+workers = 1
+eval_clean = false
 [[block]]
-pretrain = { method = ["mik+a", "acro", "bc"] }
+pretrain = { method = ["acro", "bc"] }
 [[block]]
 pretrain = { method = "random", history = "gru" }
 finetune = { random_histories = 0.5, algorithm = ["td3_bc", "bc"] }
@@ -65,10 +65,15 @@ def copy(swept, tmp_path, monkeypatch):
     return tmp_path / "copy"
 
 
-def plan(folder: Path, changes=(), kept=None, data=None, others=(), out=None):
+def plan(folder: Path, changes=(), kept=(), data=None, others=(), out=None):
     """Jobs of a folder's grid, in the folder itself unless `out` names another."""
+    return planned(folder, changes, kept, data, others, out)[0]
+
+
+def planned(folder: Path, changes=(), kept=(), data=None, others=(), out=None):
+    """Jobs and warnings, likewise."""
     cells, out = load_grid(str(folder / "grid.toml"), changes).cells(), out or folder
-    return JobPlanner(out, data or out / DATA, kept or FoundRuns([]), FoundRuns(runs_below(out)), others).plan(cells)
+    return plan_jobs(cells, out, data or out / DATA, kept, others)
 
 
 def left(jobs):
@@ -80,8 +85,6 @@ def test_what_was_run_is_finished_whatever_its_parts(swept):
     assert left(jobs) == []
     assert [job.name.removeprefix("walker_walk/expert/patch/") for job in jobs] == [
         "data/walker_walk/expert",
-        "mik+a/seed0/pretrain",
-        "mik+a/seed0/finetune-td3_bc",
         "acro/seed0/pretrain",
         "acro/seed0/finetune-td3_bc",
         "bc/seed0/pretrain",
@@ -104,7 +107,7 @@ def test_a_run_is_found_by_what_it_computed_not_by_its_name(copy):
 
 def test_a_name_that_another_run_has_is_left_to_it(copy):
     names = left(plan(copy, ["finetune.updates=20"]))
-    assert len(names) == 5
+    assert len(names) == 4
     assert all("~" in name for name in names)
     assert left(plan(copy)) == []
 
@@ -165,42 +168,15 @@ def test_an_encoder_is_trained_once_for_all_its_policies(copy):
 
 
 def test_an_encoder_whose_policies_are_finished_is_not_missed(copy):
-    shutil.rmtree(copy / "walker_walk" / "expert" / "patch" / "mik+a" / "seed0" / "pretrain")
+    shutil.rmtree(copy / "walker_walk" / "expert" / "patch" / "acro" / "seed0" / "pretrain")
     assert left(plan(copy)) == []
-    assert len(left(plan(copy, ["seed=0,1"]))) == 9
+    assert len(left(plan(copy, ["seed=0,1"]))) == 7
 
 
 def test_a_run_on_other_data_is_not_the_same(copy):
     shutil.rmtree(copy / "data" / "walker_walk")
     write_fake_set(copy / "data" / "walker_walk" / "expert", [20, 25, 31])
-    assert len(left(plan(copy))) == 9
-
-
-def test_a_run_of_another_driver_on_another_set_finishes_nothing(copy, tmp_path):
-    """Two drivers plan into one empty folder, each for data of its own."""
-    out, other = tmp_path / "out", tmp_path / "other"
-    write_fake_set(other / "walker_walk" / "expert", [20, 25, 31])
-    first, second = ({job.name: job for job in plan(copy, out=out, data=data)} for data in (copy / "data", other))
-    name = "walker_walk/expert/patch/bc/seed0/pretrain"
-    main(list(first[name].words))
-    assert first[name].finished
-    assert not second[name].finished
-    with pytest.raises(SystemExit, match="2"):
-        main(list(second[name].words))
-    again = plan(copy, out=out, data=other)
-    assert name not in {job.name for job in again}, "planned anew it has a folder of its own"
-
-
-def test_a_run_of_another_driver_on_the_same_set_counts_whatever_it_calls_it(copy, tmp_path, monkeypatch):
-    """Two drivers plan into one empty folder: one names the set by its path from here, one has a copy of it."""
-    monkeypatch.chdir(copy)
-    shutil.copytree(copy / "data", tmp_path / "elsewhere")
-    places = copy / "data", Path("data"), tmp_path / "elsewhere"
-    first, *others = ({job.name: job for job in plan(copy, out=tmp_path / "out", data=data)} for data in places)
-    name = "walker_walk/expert/patch/bc/seed0/pretrain"
-    assert not any(other[name].finished for other in others)
-    main(list(first[name].words))
-    assert all(other[name].finished for other in others)
+    assert len(left(plan(copy))) == 7
 
 
 def test_a_run_goes_on_in_its_own_folder(copy):
@@ -211,82 +187,64 @@ def test_a_run_goes_on_in_its_own_folder(copy):
     assert (job.name, job.folder, job.begun) == ("moved", folder, True)
 
 
-def test_what_is_removed_after_the_plan_was_made_is_to_be_done_again(copy):
-    jobs = plan(copy)
-    shutil.rmtree(jobs[-1].folder)
-    assert left(jobs) == [jobs[-1].name]
-
-
 def test_rows_that_were_kept_are_finished_runs(copy, tmp_path):
     policies = [str(path) for path in sorted(copy.rglob("finetune-*"))]
     main(["results", "add", *policies, "--out", str(tmp_path / "rows")])
-    kept = FoundRuns(runs_kept([tmp_path / "rows"]))
+    kept = runs_kept([tmp_path / "rows"])
     new = tmp_path / "new"
     shutil.copytree(copy / "data", new / "data")
     shutil.copy(copy / "grid.toml", new)
-    missing = plan(new)
-    assert len(left(missing)) == 9
+    assert len(left(plan(new))) == 7
     assert left(plan(new, kept=kept)) == []
-    estimates, encoder = Estimates(kept.runs), next(job for job in missing if job.section == "pretrain")
-    assert estimates.seconds(encoder) == read_json(copy / encoder.name / "timing.json")["seconds"]
-    assert len(left(plan(new, ["seed=0,1"], kept=kept))) == 9, "the other seed's"
+    assert len(left(plan(new, ["seed=0,1"], kept=kept))) == 7, "the other seed's"
 
 
 def test_a_kept_row_whose_part_has_changed_counts_and_is_told(copy, tmp_path, monkeypatch):
     main(["results", "add", *map(str, sorted(copy.rglob("finetune-*"))), "--out", str(tmp_path / "rows")])
-    kept = FoundRuns(runs_kept([tmp_path / "rows"]))
+    kept = runs_kept([tmp_path / "rows"])
     monkeypatch.setattr(module, "of_other_code", lambda record, settings: ["method mine"])
     shutil.copytree(copy / "data", tmp_path / "new" / "data")
-    planner = JobPlanner(tmp_path / "new", tmp_path / "new" / DATA, kept, FoundRuns([]))
-    assert left(planner.plan(load_grid(str(copy / "grid.toml")).cells())) == []
-    assert planner.changed_since == {"method mine": len(kept.runs) + 1}, "and their set"
+    jobs, warnings = planned(copy, kept=kept, out=tmp_path / "new")
+    assert left(jobs) == []
+    number = len(kept) + 1  # and their set
+    assert warnings == [f"method mine: {number} sets or runs count, though its code has changed since they began"]
 
 
 def test_policies_on_an_encoder_that_was_made_anew_count_and_are_told(copy):
-    cells = load_grid(str(copy / "grid.toml")).cells()
-
-    def told():
-        planner = JobPlanner(copy, copy / DATA, FoundRuns([]), FoundRuns(runs_below(copy)))
-        assert left(planner.plan(cells)) == []
-        return planner.on_other_encoders
-
-    assert told() == 0
+    assert planned(copy)[1] == []
     config = next(copy.rglob("pretrain/encoder/config.json"))
-    write_json(config, read_json(config) | {"changed": True})
-    assert told() == len(list(config.parents[2].glob("finetune-*/config.json")))
+    told = read_json(config)
+    write_json(config, told | {"pretrain": told["pretrain"] | {"seed": 7}})
+    jobs, warnings = planned(copy)
+    assert left(jobs) == []
+    number = len(list(config.parents[2].glob("finetune-*/config.json")))
+    assert [line.partition(" that")[0] for line in warnings] == [f"{number} policies count"]
     shutil.rmtree(config.parents[1])
-    assert told() == 0
-
-
-def test_rows_of_early_versions_finish_nothing(copy):
-    kept = FoundRuns(runs_kept([ROOT / "results" / "control" / "earlier"]))
-    assert [run.card for run in kept.runs] == [{}] * 10
-    assert left(plan(copy, ["seed=0,1"], kept=kept)) == left(plan(copy, ["seed=0,1"]))
+    assert planned(copy)[1] == []
 
 
 def test_an_encoder_whose_row_was_kept_is_made_again_for_a_new_policy(copy, tmp_path):
     main(["results", "add", str(copy), "--out", str(tmp_path / "rows")])
-    kept, new = FoundRuns(runs_kept([tmp_path / "rows"])), tmp_path / "new"
-    assert "pretrain" in {run.record["stage"] for run in kept.runs}
+    kept, new = runs_kept([tmp_path / "rows"]), tmp_path / "new"
+    assert "pretrain" in {run.record["stage"] for run in kept}
     shutil.copytree(copy / "data", new / "data")
     shutil.copy(copy / "grid.toml", new)
     assert left(plan(new, kept=kept)) == []
     jobs = plan(new, ["finetune.updates=7"], kept=kept)
     assert {job.section for job in jobs if not job.finished} == {"pretrain", "finetune"}
-    assert len(left(jobs)) == 9
+    assert len(left(jobs)) == 7
 
 
-@pytest.mark.parametrize("turned", [False, True])
-def test_an_encoder_that_is_asked_for_and_needed_is_made_whatever_the_order_of_blocks(copy, tmp_path, turned):
+def test_an_encoder_that_is_asked_for_and_needed_is_made(copy, tmp_path):
     blocks = ["[[block]]\n", "[[block]]\nfinetune = { updates = 7 }\n"]
     head = GRID.partition("[finetune]")[0] + 'method = "acro"\n'
-    (copy / "grid.toml").write_text(head + "".join(blocks[::-1] if turned else blocks))
+    (copy / "grid.toml").write_text(head + "".join(blocks[::-1]))
     new = tmp_path / "new"
     shutil.copytree(copy / "data", new / "data")
     shutil.copy(copy / "grid.toml", new)
 
     def stages(kept):
-        found = plan(new, kept=FoundRuns(runs_kept([kept])) if kept else None)
+        found = plan(new, kept=runs_kept([kept]) if kept else ())
         return {job.section for job in found if not job.finished}
 
     pretrained = [
@@ -313,11 +271,11 @@ def tell_collection(folder: Path) -> None:
 
 def test_without_their_set_kept_rows_count_by_how_it_was_collected(copy, tmp_path):
     tell_collection(copy)
-    kept, new = FoundRuns(runs_below(copy)), tmp_path / "new"
+    kept, new = list(runs_below(copy)), tmp_path / "new"
     new.mkdir()
     shutil.copy(copy / "grid.toml", new)
     assert left(plan(new, kept=kept)) == []
-    assert len(left(plan(new, ["collect.episodes=100"], kept=kept))) == 10
+    assert len(left(plan(new, ["collect.episodes=100"], kept=kept))) == 8
 
 
 def test_a_kept_row_that_does_not_say_how_its_set_was_collected_has_it_from_one_on_the_same_content(copy, tmp_path):
@@ -325,7 +283,7 @@ def test_a_kept_row_that_does_not_say_how_its_set_was_collected_has_it_from_one_
     early = next(copy.rglob("finetune-td3_bc/config.json"))
     write_json(early, {name: value for name, value in read_json(early).items() if name != "collection"})
     main(["results", "add", str(copy), "--out", str(tmp_path / "rows")])
-    kept, new = FoundRuns(runs_kept([tmp_path / "rows"])), tmp_path / "new"
+    kept, new = runs_kept([tmp_path / "rows"]), tmp_path / "new"
     new.mkdir()
     shutil.copy(copy / "grid.toml", new)
     assert left(plan(new, kept=kept)) == []
@@ -342,9 +300,9 @@ def test_kept_rows_of_a_set_collected_alike_with_other_content_are_told(copy, tm
     write_fake_set(new / "data" / "walker_walk" / "expert", lengths)
     main(["sweep", "run", str(copy / "grid.toml"), "--out", str(new), "--done", str(rows), "--dry-run"])
     shown = capsys.readouterr()
-    warning = "warning: walker_walk/expert: 5 kept runs are of a set collected alike, but with other content"
+    warning = "warning: walker_walk/expert: 4 kept runs are of a set collected alike, but with other content"
     assert (warning in shown.err) == told
-    assert f"{1 if told else 6} done" in shown.out
+    assert f"{1 if told else 5} done" in shown.out
 
 
 def collected(**settings):
@@ -405,13 +363,6 @@ def test_a_downloaded_set_is_found_below_its_size(copy, tmp_path):
     assert jobs[0].folder == copy / "data" / "walker_walk" / "expert" / "84px"
 
 
-@pytest.mark.parametrize("more", ["", "\n[finetune]\nalpha = 2.0"])
-def test_a_grid_without_a_set_is_refused(tmp_path, more):
-    (tmp_path / "grid.toml").write_text("[pretrain]\nmethod = 'acro'" + more)
-    with pytest.raises(UserError, match="trains on no set: add a section collect"):
-        plan(tmp_path)
-
-
 def test_a_run_that_added_other_images_is_another(tmp_path):
     class AnySet:
         def made(self, record):
@@ -420,21 +371,34 @@ def test_a_run_that_added_other_images_is_another(tmp_path):
     Image.new("RGB", (9, 9), "red").save(tmp_path / "one.png")
     config = {"seed": 0, "exogenous": str(tmp_path)}
     record = {"stage": "navigation", "config": config, "inputs": {"exogenous": source_fingerprint(str(tmp_path))}}
-    run = FoundRun(tmp_path / "run", record, {}, 1.0)
-    assert FoundRuns([run]).of(run.recipe, AnySet()) is run
+    run = FoundRun(tmp_path / "run", record, {}, True)
+    assert module._found({run.recipe: [run]}, run.recipe, AnySet()) is run
     Image.new("RGB", (9, 9), "blue").save(tmp_path / "one.png")
-    assert FoundRuns([run]).of(run.recipe, AnySet()) is None
+    module._images_in.cache_clear()
+    assert module._found({run.recipe: [run]}, run.recipe, AnySet()) is None
 
 
-def test_a_navigation_run_is_planned_as_it_is_recorded():
-    from vd4rl_pomdp.studies.navigation.config import NavigationConfig
+def test_a_set_of_ones_own_quality_is_taken_where_it_is_there_and_its_runs_are_the_grids(tmp_path, capsys, own_cache):
+    text = GRID.partition("[finetune]")[0].replace('"expert"', '"mine"') + "method = 'random'"
+    (tmp_path / "grid.toml").write_text(text)
+    words = [str(tmp_path / "grid.toml"), "--out", str(tmp_path / "out")]
+    with pytest.raises(SystemExit, match="2"):
+        main(["sweep", "run", *words])
+    assert "mine: holds no set, and the quality 'mine' cannot be collected" in capsys.readouterr().err
+    write_fake_set(tmp_path / "out" / "data" / "walker_walk" / "mine", [20, 25, 30])
+    main(["sweep", "run", *words])
+    assert capsys.readouterr().out == "all 2 jobs are finished\n"
+    cells = load_grid(words[0]).cells()
+    (run,) = find_results([tmp_path / "out"])
+    assert run.labels["quality"] == "mine"
+    assert GridMembers("grid", cells).among([run]) == [run]
 
-    for cell in load_grid("navigation").cells()[::7]:
-        words = ["--preset", "cpu", "--seed", str(cell.seed), "--data", "d", "--out", "o"]
-        for name, value in cell.sections["navigation_train"].items():
-            words += [f"--{name.replace('_', '-')}"] + ([] if value is True else [str(value)])
-        config = jsonable(flat(parse_stage(NavigationConfig, words, "x")))
-        planned = recorded(cell, "navigation_train")
-        assert {k: v for k, v in planned.items() if k not in ("data", "out")} == {
-            k: v for k, v in config.items() if k not in ("data", "out")
-        }
+
+def test_a_set_of_another_task_is_refused(tmp_path):
+    (tmp_path / "grid.toml").write_text(GRID)
+    write_fake_set(tmp_path / "data" / "walker_walk" / "expert", [20, 25])
+    shard = min((tmp_path / "data" / "walker_walk" / "expert").glob("*.hdf5"))
+    with h5py.File(shard, "a") as file:
+        file.attrs["vd4rl_pomdp"] = '{"task": "cheetah_run"}'
+    with pytest.raises(UserError, match="expert: holds a set of cheetah_run, the grid says walker_walk"):
+        plan(tmp_path)

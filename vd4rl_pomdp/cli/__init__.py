@@ -5,6 +5,7 @@ from __future__ import annotations
 import importlib
 import io
 import multiprocessing
+import os
 import re
 import signal
 import sys
@@ -12,8 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from vd4rl_pomdp import __version__
-from vd4rl_pomdp.core.errors import DIVERGED, DONE, INTERRUPTED, OutOfMemoryError, UserError, disk_error, in_one_line
+from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError, disk_error, in_one_line
 from vd4rl_pomdp.runs import interrupt
+from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE
 
 PROGRAM = "vd4rl-pomdp"
 COMMANDS = {
@@ -55,8 +57,6 @@ class End:
     """What is left of a command."""
 
     code: int = 0
-    cause: str = DONE
-    """done, diverged, interrupted, or the `cause` of a UserError."""
     line: str = ""
     """What the user is told, empty if nothing is."""
 
@@ -75,7 +75,8 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # \u2028 and the like for what a terminal cannot show
-    end = run_to_end(sys.argv[1:] if arguments is None else arguments)
+    second = signal.SIG_IGN if JOB_VARIABLE in os.environ else signal.SIG_DFL
+    end = run_to_end(sys.argv[1:] if arguments is None else arguments, second)
     if end.line:
         print(end.line, file=sys.stderr)
     if end.code:
@@ -101,25 +102,25 @@ def run_to_end(words: Sequence[str], second: signal.Handlers = signal.SIG_DFL) -
                 command = getattr(importlib.import_module(f"{__name__}.{module}"), function)
                 command(list(words[len(name.split()) :]), f"{PROGRAM} {name}")
     except UserError as error:
-        return End(2, error.cause, f"error: {in_one_line(error)}")
+        return End(error.code, f"error: {in_one_line(error)}")
     except UnicodeEncodeError as error:
-        return End(2, UserError.cause, f"error: {error.object!a} is not UTF-8: use another name")
+        return End(2, f"error: {error.object!a} is not UTF-8: use another name")
     except FloatingPointError as error:
-        return End(1, DIVERGED, f"error: training diverged, {error}; lower --learning-rate or use fp32")
+        return End(1, f"error: training diverged, {error}; lower --learning-rate or use fp32")
     except KeyboardInterrupt as error:
-        return End(130, INTERRUPTED, _resume("interrupted", str(error)))
+        return End(130, _resume("interrupted", str(error)))
     except interrupt.Terminated as error:
-        return End(143, INTERRUPTED, _resume("terminated", error.reason))
+        return End(143, _resume("terminated", error.reason))
     except BrokenPipeError:  # what read the output is gone, as `head` goes
-        return End(141, INTERRUPTED)
+        return End(141)
     except (MemoryError, RuntimeError) as error:
         if not isinstance(error, MemoryError) and not _NO_MEMORY.search(str(error)):
             raise
         line = f"error: out of memory ({in_one_line(error)[:200]}); lower --batch-size, or what else sets the size"
-        return End(2, OutOfMemoryError.cause, line)
+        return End(OutOfMemoryError.code, line)
     except OSError as error:
         told = disk_error(error.filename, error)
-        return End(2, told.cause, f"error: {told}")
+        return End(told.code, f"error: {told}")
     return End()
 
 

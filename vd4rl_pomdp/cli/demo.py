@@ -24,11 +24,11 @@ from vd4rl_pomdp.runs.workers import count_workers
 from vd4rl_pomdp.studies.navigation.figures import write_film
 from vd4rl_pomdp.studies.navigation.measures import refitted_error
 from vd4rl_pomdp.studies.navigation.runs import find_navigation, load_runs
-from vd4rl_pomdp.sweeps.executors.local import LocalOptions, visible_gpus
-from vd4rl_pomdp.sweeps.folder import SweepFolder
-from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below
-from vd4rl_pomdp.sweeps.grid_file import load_grid
-from vd4rl_pomdp.sweeps.plan import Job, JobPlanner
+from vd4rl_pomdp.sweeps.driver import visible_gpus
+from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder
+from vd4rl_pomdp.sweeps.grid import load_grid
+from vd4rl_pomdp.sweeps.options import LocalOptions
+from vd4rl_pomdp.sweeps.plan import Job, plan_jobs
 
 GRIDS = {"runs": "quick", "navigation": "quick_navigation"}
 """What is carried out, by the folder that it goes to."""
@@ -45,7 +45,7 @@ def demo_jobs(out: Path, preset: str = "cpu") -> list[Job]:
     jobs = []
     for folder, grid in GRIDS.items():
         runs, cells = out / folder, load_grid(grid, testing=PRESETS[preset]).cells()
-        jobs += JobPlanner(runs, out / "data", FoundRuns([]), FoundRuns(runs_below(runs))).plan(cells)
+        jobs += plan_jobs(cells, runs, out / "data")[0]
     return jobs
 
 
@@ -53,7 +53,7 @@ def demo(
     out: Path,
     at_once: int,
     preset: str,
-    carry_out: Callable[[list[Job], SweepFolder, str, Options], None],
+    carry_out: Callable[[list[Plan], SweepFolder, str, Options], None],
     run: Callable[[list[str]], None],
 ) -> None:
     """Run every command of the demo, after printing them so that they can be run by hand.
@@ -62,7 +62,7 @@ def demo(
         out: folder of data, runs and report.
         at_once: jobs at a time, 0 for what the machine takes.
         preset: how long the stages take, one of PRESETS.
-        carry_out: what runs jobs on an executor of a kind with options.
+        carry_out: what runs plans on an executor of a kind with options.
         run: what carries out one command line.
 
     Raises:
@@ -78,8 +78,7 @@ def demo(
     for words in (*(job.words for job in jobs if not job.finished), report):
         print(f"$ vd4rl-pomdp {shlex.join(words)}", file=sys.stderr)
     print(f"Where this stands: vd4rl-pomdp sweep status {out}; what it prints: {folder.path / 'logs'}", file=sys.stderr)
-    folder.keep_plan("demo", jobs)
-    carry_out(jobs, folder, "local", options)
+    carry_out([folder.keep_plan("demo", jobs)], folder, "local", options)
     run(list(report))
     print("\n".join([*conclusion(jobs), *show_navigation(jobs, out / FILM)]))
     print(f"demo finished in {(time.monotonic() - started) / 60:.1f} minutes")
@@ -92,7 +91,7 @@ def _jobs_at_once() -> int:
 
 def conclusion(jobs: list[Job]) -> Iterator[str]:
     """What the demo's methods know and return, and how sure it is: lines of text."""
-    policies = [(dict(job.settings), job.folder) for job in jobs if job.section == "finetune"]
+    policies = [(job.settings, job.folder) for job in jobs if job.section == "finetune"]
     corruption = policies[0][0]["corruption"]
     yield f"Under {corruption}, what is not known of pose and velocity (error of a"
     yield "linear probe in % of a standard deviation; 60 to 80 knows nothing), and the"

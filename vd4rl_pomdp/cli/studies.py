@@ -35,8 +35,7 @@ def report(
 
     choice = ALL
     if grid:
-        from vd4rl_pomdp.sweeps.grid import narrow
-        from vd4rl_pomdp.sweeps.grid_file import load_grid
+        from vd4rl_pomdp.sweeps.grid import load_grid, narrow
         from vd4rl_pomdp.sweeps.members import GridMembers
 
         choice = GridMembers(grid, narrow(load_grid(grid, list(change)).cells(), list(only)))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import shlex
 import sys
 from collections import Counter
@@ -15,12 +16,11 @@ import tyro
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
-from vd4rl_pomdp.sweeps.executors import CLUSTERS, executor_options
-from vd4rl_pomdp.sweeps.executors.local import LocalExecutor, LocalOptions
-from vd4rl_pomdp.sweeps.own_file import program_here, refuse_unknown_to_jobs, refuse_while_loading
+from vd4rl_pomdp.sweeps.options import LocalOptions, executor_options
+from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE, in_words, own_program, program_here, refuse_unknown_to_jobs
 
 if TYPE_CHECKING:
-    from vd4rl_pomdp.sweeps.folder import SweepFolder
+    from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder
     from vd4rl_pomdp.sweeps.plan import Job
 
 
@@ -46,7 +46,7 @@ class _ExecutorConfig(StageConfig):
 class RunCommand(_ExecutorConfig):
     """Carry out a grid: collect its sets, pretrain its encoders, once each, and fine-tune its policies.
 
-    The same command goes on with what is left. Exit code 0: all is finished; 1: some is not.
+    Re-run the same command to resume. Exit code 0: all is finished; 1: some is not.
     """
 
     grid: tyro.conf.Positional[str] = ""
@@ -64,18 +64,15 @@ class RunCommand(_ExecutorConfig):
     done: list[Path] = field(default_factory=list)
     """Results folders whose runs count as finished."""
     dry_run: bool = False
-    """Print every job, what is finished, what is shared, and an estimate of time; run nothing."""
+    """Print every job, what is finished and what is shared; run nothing."""
 
 
 def run(words: list[str], program: str) -> None:
     """Carry out a grid, or resume it."""
     from vd4rl_pomdp.runs.outputs import refuse_kept
     from vd4rl_pomdp.sweeps.folder import SweepFolder, plan_name
-    from vd4rl_pomdp.sweeps.found import FoundRuns, runs_below, runs_kept
-    from vd4rl_pomdp.sweeps.grid import SHARED, narrow
-    from vd4rl_pomdp.sweeps.grid_file import load_grid, names
-    from vd4rl_pomdp.sweeps.plan import DATA, JobPlanner
-    from vd4rl_pomdp.sweeps.sets import set_of
+    from vd4rl_pomdp.sweeps.grid import SHARED, load_grid, names, narrow
+    from vd4rl_pomdp.sweeps.plan import DATA, plan_jobs, runs_kept
     from vd4rl_pomdp.sweeps.stages import check_cells
 
     for name in SHARED:
@@ -84,96 +81,76 @@ def run(words: list[str], program: str) -> None:
     command = parse_stage(RunCommand, words, program)
     grid = load_grid(command.grid, command.change, command.testing)
     cells = narrow(grid.cells(), command.only)
+    check_cells(cells, command.grid)
     for place in (command.out, command.data or command.out):
         refuse_no_folder(place)
-    sets = command.data or command.out / DATA
-    check_cells(cells, command.grid, lambda cell: not set_of(cell, sets).foreign)
     refuse_kept(command.out)
-    here, kept = FoundRuns(runs_below(command.out)), FoundRuns(runs_kept(command.done))
     folder = SweepFolder(command.out)
     own = [str(Path(command.grid).resolve())] * (command.grid not in names())  # another file is another grid
-    plan = plan_name(grid.name, [*own, *command.only, *command.change, *["testing"] * command.testing])
-    planner = JobPlanner(command.out, sets, kept, here, folder.jobs_of_others(plan))
-    jobs = planner.plan(cells)
-    refuse_unknown_to_jobs(jobs)
-    for name, number in planner.of_other_content.items():
-        line = f"{number} kept runs are of a set collected alike, but with other content (from another machine?)"
-        print(f"warning: {name}: {line}: they do not count", file=sys.stderr)
-    for part, number in planner.changed_since.items():
-        print(
-            f"warning: {part}: {number} sets or runs count, though its code has changed since they began",
-            file=sys.stderr,
-        )
-    if number := planner.on_other_encoders:
-        line = f"{number} policies count that began with other encoders than their pretrainings' folders now hold"
-        print(f"warning: {line}", file=sys.stderr)
-    if command.dry_run:
-        _print_plan(jobs, [*here.runs, *kept.runs])
-        return
-    folder.keep_plan(plan, jobs)
-    _carry_out(jobs, command, folder, plan)
-
-
-def _print_plan(jobs: list[Job], past: list[Any]) -> None:
-    """Every job as one line of shell, then what is shared, and how long it takes."""
-    from vd4rl_pomdp.sweeps.estimate import Estimates
-    from vd4rl_pomdp.sweeps.work import told_seconds
-
-    estimates, users = Estimates(past, jobs), Counter(name for job in jobs for name in job.needs)
-    known, unknown, left = 0.0, 0, 0
+    name = plan_name(grid.name, [*own, *command.only, *command.change, *["testing"] * command.testing])
+    kept, sets = runs_kept(command.done), command.data or command.out / DATA
+    jobs, warnings = plan_jobs(cells, command.out, sets, kept, folder.jobs_of_others(name))
     for job in jobs:
-        seconds, done = estimates.seconds(job), job.finished
-        state = "done" if done else "goes on" if job.begun else "new"
-        took = "" if done or seconds is None else f", about {told_seconds(seconds)}"
+        refuse_unknown_to_jobs(job.settings)
+    for warning in warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+    if command.dry_run:
+        _print_plan(jobs)
+        return
+    plan = folder.keep_plan(name, jobs, own_program())
+    carry_out([plan], folder, command.executor, command.options, name)
+
+
+def _print_plan(jobs: list[Job]) -> None:
+    """Every job as one line of shell, and what is shared."""
+    users = Counter(name for job in jobs for name in job.needs)
+    left = 0
+    for job in jobs:
+        done = job.finished
         shared = f", for {users[job.name]} jobs" if users[job.name] > 1 else ""
-        print(f"# {job.name}: {state}{shared}{took}")
+        print(f"# {job.name}: {'done' if done else 'goes on' if job.begun else 'new'}{shared}")
         if not done:
             print(f"{program_here()} {shlex.join(job.words)}")
-            known, unknown, left = known + (seconds or 0.0), unknown + (seconds is None), left + 1
-    told = f"{told_seconds(known)} of work by past runs" + f", {unknown} jobs of unknown length" * (unknown > 0)
-    print(f"# {len(jobs)} jobs, {len(jobs) - left} done, {left} to do: {told}")
+            left += 1
+    print(f"# {len(jobs)} jobs, {len(jobs) - left} done, {left} to do")
 
 
-def _carry_out(jobs: list[Job], command: _ExecutorConfig, folder: SweepFolder, plan: str | None = None) -> None:
-    carry_out(jobs, folder, command.executor, command.options, plan)
-    print(f"all {len(jobs)} jobs are finished")
-
-
-def carry_out(jobs: list[Job], folder: SweepFolder, kind: str, options: Any, plan: str | None = None) -> None:
-    """Run jobs to their end on an executor of a kind; SystemExit 1 if some are not finished.
+def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, name: str = "") -> None:
+    """Run plans to their end on an executor of a kind; SystemExit 1 if some jobs are not finished.
 
     Args:
-        jobs: each after those it needs.
+        plans: their jobs each come after those they need.
         folder: the sweep's.
         kind: name of the executor.
         options: its options.
-        plan: name of the plan that the jobs are of; None: of several.
+        name: of the plan; empty: several are all that the folder has.
     """
-    from vd4rl_pomdp.sweeps.cluster import watch
+    from vd4rl_pomdp.sweeps.clusters import cluster_of, watch
     from vd4rl_pomdp.sweeps.driver import Driver
+    from vd4rl_pomdp.sweeps.folder import status
 
-    refuse_while_loading()
-    if kind in CLUSTERS:
-        finished = watch(jobs, CLUSTERS[kind](options, folder.of_executor(kind)), folder, plan)
+    if JOB_VARIABLE in os.environ:
+        raise UserError("a job cannot start a sweep: end the file in `main()`, which reads the job's own command line")
+    if kind == "local":
+        finished = Driver(plans, options, folder).run()
     else:
-        finished = Driver(jobs, LocalExecutor(options), folder).run()
+        finished = watch(plans, cluster_of(kind, options, folder), folder, name)
+    jobs = _jobs_of(plans)
     if not finished:
-        failures = _status(folder, jobs).failures
-        for name, row in failures.items():
-            print(f"{row['cause']}: {name}: {row['line']}", file=sys.stderr)
-        left = f"{sum(not job.finished for job in jobs)} of {len(jobs)} jobs are not finished"
+        found = status(jobs, folder.attempts(jobs))
+        for job, row in found["failures"].items():
+            print(f"failed: {job}: {row['line']}", file=sys.stderr)
+        left = f"{len(jobs) - found['counts'].get('done', 0)} of {len(jobs)} jobs are not finished"
         retry = f"sweep retry {shlex.quote(str(folder.out))}" + (f" --executor {kind}" if kind != "local" else "")
         same = "" if kind == "local" else ", given this command's flags,"
-        print(f"{left}, {len(failures)} failed; `{program_here()} {retry}`{same} takes those up again")
+        failures = f"{len(found['failures'])} failed; `{in_words(plans[0].program)} {retry}`"
+        print(f"{left}, {failures}{same} takes those up again")
         sys.exit(1)
+    print(f"all {len(jobs)} jobs are finished")
 
 
-def _status(folder: SweepFolder, jobs: list[Job]) -> Any:
-    from vd4rl_pomdp.sweeps.estimate import Estimates
-    from vd4rl_pomdp.sweeps.found import runs_below
-    from vd4rl_pomdp.sweeps.status import status
-
-    return status(jobs, folder.attempts(), Estimates(runs_below(folder.out), jobs))
+def _jobs_of(plans: list[Plan]) -> list[Job]:
+    return list({job.name: job for plan in plans for job in plan.jobs}.values())
 
 
 @dataclass(frozen=True)
@@ -188,17 +165,16 @@ class StatusCommand:
 
 def show_status(words: list[str], program: str) -> None:
     """Show where a sweep stands."""
-    from vd4rl_pomdp.sweeps.folder import SweepFolder
-    from vd4rl_pomdp.sweeps.status import lines
+    from vd4rl_pomdp.sweeps.folder import SweepFolder, in_lines, status
 
     command = parse(StatusCommand, words, program)
     folder = SweepFolder(command.out)
-    found = _status(folder, folder.jobs())
+    jobs = _jobs_of(folder.plans())
+    found = status(jobs, folder.attempts(jobs))
     if command.json:
-        numbers = {"per_hour": found.per_hour, "seconds_left": found.seconds_left, "finished": found.finished}
-        show({"counts": dict(found.counts)} | numbers | {"states": found.states, "failures": found.failures}, True)
+        show(found, True)
     else:
-        print(*lines(found), sep="\n")
+        print(*in_lines(found), sep="\n")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -211,14 +187,15 @@ class RetryCommand(_ExecutorConfig):
 
 def retry(words: list[str], program: str) -> None:
     """Run failures again."""
-    from vd4rl_pomdp.sweeps.folder import SweepFolder
+    from vd4rl_pomdp.sweeps.folder import SweepFolder, failed
 
     command = parse_stage(RetryCommand, words, program)
     folder = SweepFolder(command.out)
-    jobs = folder.own_jobs()
-    for name in _status(folder, jobs).failures:
-        folder.forget(name)
-    _carry_out(jobs, command, folder)
+    plans = folder.plans_to_do()
+    for name, rows in folder.attempts(_jobs_of(plans)).items():
+        if failed(rows):
+            folder.forget(name)
+    carry_out(plans, folder, command.executor, command.options)
 
 
 @dataclass(frozen=True)
@@ -245,12 +222,11 @@ def join(words: list[str], program: str) -> None:
     from vd4rl_pomdp.sweeps.driver import Driver
     from vd4rl_pomdp.sweeps.folder import SweepFolder
 
-    refuse_while_loading()
     command = parse(JoinCommand, words, program)
     options = LocalOptions(command.jobs, command.jobs_per_gpu, command.threads)
     options.check()
     folder = SweepFolder(command.out)
-    finished = Driver(folder.own_jobs(command.plan), LocalExecutor(options), folder, helps=True).run()
+    finished = Driver(folder.plans_to_do(command.plan), options, folder, helps=True).run()
     print("all is finished" if finished else "there is nothing to take now; `sweep status` tells what is left")
 
 
@@ -261,7 +237,7 @@ class GridsCommand:
 
 def list_grids(words: list[str], program: str) -> None:
     """List the grids that ship."""
-    from vd4rl_pomdp.sweeps.grid_file import load_grid, names
+    from vd4rl_pomdp.sweeps.grid import load_grid, names
 
     parse(GridsCommand, words, program)
     for name in names():

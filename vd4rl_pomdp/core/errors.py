@@ -15,8 +15,8 @@ from pathlib import Path
 from stat import S_ISDIR
 from typing import Any
 
-DONE, DIVERGED, INTERRUPTED = "done", "diverged", "interrupted"
-"""Why a command ended that raised no UserError, which has a `cause` of its own."""
+TEMPORARY = 75
+"""Exit code of what the same command may not meet again, EX_TEMPFAIL of sysexits.h: a sweep tries it again."""
 
 
 class UserError(ValueError):
@@ -25,38 +25,32 @@ class UserError(ValueError):
     The command line prints the message and exits with code 2; a library caller catches a ValueError.
     """
 
-    cause = "refused"
-    """In one word why it ended: a sweep tries some causes again."""
+    code = 2
+    """Exit code of the command."""
 
 
 class OutOfMemoryError(UserError):
     """The memory of the machine or its GPU did not suffice."""
 
-    cause = "out of memory"
-
 
 class UnavailableError(UserError):
     """The system could not do now what it may do later: a disk that does not answer, too many open files."""
 
-    cause = "unavailable"
+    code = TEMPORARY
 
 
 class DiskFullError(UnavailableError):
     """No space was left where something was to be written."""
 
-    cause = "disk full"
-
 
 class InUseError(UserError):
     """Another process owns the folder."""
-
-    cause = "in use"
 
 
 class WorkerDiedError(UserError):
     """A process that helped was ended from outside."""
 
-    cause = "killed"
+    code = TEMPORARY
 
 
 _PASSING = (

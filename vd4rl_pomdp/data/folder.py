@@ -171,8 +171,12 @@ def _refuse_part(path: Path, shards: Sequence[Path]) -> None:
 
 
 def task_and_quality(path: Path, attributes: list[dict[str, Any]]) -> tuple[str | None, str | None]:
-    """Task and quality of a set: as the attributes of all its shards say, else as its folders are named."""
-    return _name(path, attributes, "task", tuple(TASKS)), _name(path, attributes, "set", SET_QUALITIES)
+    """Task and quality of a set: as the attributes of all its shards say, else as its folders are named.
+
+    A quality of one's own is the name of a folder within its task's.
+    """
+    task, quality = _name(path, attributes, "task", tuple(TASKS)), _name(path, attributes, "set", SET_QUALITIES)
+    return task, quality or (path.name if path.parent.name in TASKS else None)
 
 
 def _name(path: Path, attributes: list[dict[str, Any]], attribute: str, choices: tuple[str, ...]) -> str | None:

@@ -8,8 +8,6 @@ from typing import NamedTuple
 import numpy as np
 import pandas as pd
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.text import write_text
@@ -17,8 +15,7 @@ from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.figures import seeds_note, write_table
 from vd4rl_pomdp.report.load import CONDITION, Run, groups, label, load_runs, setting
 from vd4rl_pomdp.report.page import made_with
-from vd4rl_pomdp.report.render import Columns, block, render, texts, write_latex
-from vd4rl_pomdp.report.stats import interval, with_interval
+from vd4rl_pomdp.report.render import Columns, block, render, terminal, texts, write_latex
 from vd4rl_pomdp.report.tables import SCORE, mean_and_ends
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.outputs import refuse_foreign
@@ -132,33 +129,23 @@ _COLUMNS: Columns = {
     "setting": setting,
     "method": label,
     "settings, A → B": _told,
-    "A": lambda row: with_interval(row["score_a"], row["low_a"], row["high_a"]),
-    "B": lambda row: with_interval(row["score_b"], row["low_b"], row["high_b"]),
-    "B – A": lambda row: "–" if pd.isna(row["difference"]) else f"{row['difference']:+.1f}",
-    "95% interval": lambda row: interval(row["low"], row["high"]),
+    "A": ("score_a", "low_a", "high_a", 1),
+    "B": ("score_b", "low_b", "high_b", 1),
+    "B – A": ("difference", "low", "high", 1),
     "seeds": lambda row: f"{row['seeds_a']} | {row['seeds_b']}",
 }
 
 
 def print_comparison(comparison: SideBySide, console: Console | None = None) -> None:
-    """The comparison on the terminal, one table a setting, narrow enough for 80 columns.
-
-    Settings stand under the method's label, intervals under their numbers.
-    """
+    """The comparison on the terminal, one table a setting; what differs stands under the method's label."""
     console = console or Console()
     for name, side in zip("AB", comparison.sides, strict=True):
         others = f", {side.others} unfinished or diverged" if side.others else ""
         console.print(f"{name}: {side.path}, {side.finished} finished runs{others}", markup=False, highlight=False)
-    for place, rows in groups(comparison.rows, setting).items():
-        table = Table(title=Text(place), title_justify="left")
-        for number, name in enumerate(("method\n  settings, A → B", "A", "B", "B – A\n95% interval", "seeds")):
-            table.add_column(name, overflow="fold", justify="right" if number else "left", no_wrap=number > 0)
-        for row in rows:
-            name, told, *scores, difference, between, seeds = [text(row) for text in list(_COLUMNS.values())[1:]]
-            apart = f"{difference}\n{between}".removesuffix("\n–")
-            stacked = [f"{name}\n  {told}", *(score.replace(" [", "\n[") for score in scores), apart, seeds]
-            table.add_row(*map(Text, stacked))
-        console.print(table)
+    shown = texts(pd.DataFrame(comparison.rows), _COLUMNS)
+    method = shown["method"] + "\n  " + shown.pop("settings, A → B")
+    for place, part in shown.assign(method=method).groupby("setting", sort=False):
+        console.print(terminal(str(place), part.drop(columns="setting").replace(r" \[", "\n[", regex=True)))
 
 
 def check_out(out: Path) -> None:

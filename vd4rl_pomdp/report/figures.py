@@ -6,6 +6,7 @@ import io
 import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
+from math import ceil
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -38,12 +39,10 @@ FORMATS: dict[str, dict[str, Any]] = {"png": {"dpi": 150}, "pdf": {"metadata": {
 """Files of a figure, beside the SVG in the page."""
 WIDTH = 10.0
 """Of a figure, in inches."""
-NAME_WIDTH = 34
+NAME_WIDTH = 28
 """Characters of a method's name in a figure before it is wrapped."""
 MANY = 300
 """Dots of a figure, above which they are one picture within it."""
-PUBLISHED = {"bc": (":", "BC"), "drq_bc": ("--", "DrQ+BC")}
-"""Published methods that are drawn as lines: their dashes and their names."""
 Draw = Callable[[Axes, pd.DataFrame], None]
 
 
@@ -87,7 +86,8 @@ def sheet(panels: Sequence[tuple[str, pd.DataFrame, Draw]], columns: int = 3, he
         heights: of each panel, in inches.
     """
     columns = min(columns, len(panels))
-    height = [max(part) for part in _parts(heights or [2.1] * len(panels), columns)]
+    sizes = list(heights) or [2.1] * len(panels)
+    height = [max(sizes[i : i + columns]) for i in range(0, len(panels), columns)]
     figure = Figure(figsize=(WIDTH if columns > 1 else 0.66 * WIDTH, sum(height) + 0.6 * len(height)))
     figure.set_layout_engine("constrained")
     grid = figure.subplots(len(height), columns, squeeze=False, height_ratios=height)
@@ -103,25 +103,18 @@ def sheet(panels: Sequence[tuple[str, pd.DataFrame, Draw]], columns: int = 3, he
         axes.yaxis.label.set_size(8)
     for axes in grid.flat[len(panels) :]:
         axes.remove()
-    entries = {
-        name: handle for axes in figure.axes for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
+    entries: dict[str, Any] = {}
+    for axes in figure.axes:
+        entries |= {name: handle for handle, name in zip(*axes.get_legend_handles_labels(), strict=True)}
     if entries:
-        longest = max(len(line) for name in entries for line in name.split("\n"))
-        count = max(1, min(len(entries), int(figure.get_figwidth() / (0.55 + 0.08 * longest))))
-        extra = 0.2 * sum(1 + name.count("\n") for name in entries) / count + 0.2
-        figure.set_figheight(figure.get_figheight() + extra)
-        order = sorted(entries)
+        names = sorted(entries)
+        figure.set_figheight(figure.get_figheight() + 0.24 * ceil(len(names) / 4) + 0.2)
         figure.legend(
-            [entries[name] for name in order], order, loc="outside lower center", ncols=count, frameon=False, fontsize=8
+            [entries[name] for name in names], names, loc="outside lower center", ncols=4, frameon=False, fontsize=8
         )
     figure.draw_without_rendering()
     figure.set_layout_engine("none")  # places are final: each of the files would find them again
     return figure
-
-
-def _parts(values: Sequence[float], size: int) -> list[Sequence[float]]:
-    return [values[i : i + size] for i in range(0, len(values), size)]
 
 
 def _figures(rows: pd.DataFrame) -> Iterator[tuple[str, pd.DataFrame, list[tuple[str, pd.DataFrame]]]]:
@@ -146,11 +139,7 @@ def _told(places: Iterable[tuple[str, pd.DataFrame]], value: str, digits: int = 
 
 
 def bar_plots(
-    summary: pd.DataFrame,
-    runs: pd.DataFrame,
-    data: dict[tuple[str, str], float],
-    looks: dict[str, int],
-    published: Sequence[dict[str, str]],
+    summary: pd.DataFrame, runs: pd.DataFrame, data: dict[tuple[str, str], float], looks: dict[str, int]
 ) -> list[Plot]:
     """Final scores: one figure a corruption, a panel for each task and quality, a bar for each method.
 
@@ -159,96 +148,93 @@ def bar_plots(
         runs: table of runs, whose final scores are the dots.
         data: the data's return by task and quality, which stands beside their names.
         looks: numbers of all labels in `style`.
-        published: scores by `env` and `dataset` that were reached on V-D4RL's own sets; drawn where nothing is hidden.
     """
+    seeds = runs[runs["score"].notna()].assign(label=lambda table: labels(table), kind="seed")
+    dots = seeds.groupby([*SETTING, "label"])["score"].agg(list).to_dict()
+
+    def draw(axes: Axes, rows: pd.DataFrame) -> None:
+        names = []
+        for place, row in enumerate(rows.to_dict("records")):
+            look = looks[row["label"]]
+            colour, hatch = COLOURS[look % len(COLOURS)], HATCHES[look // len(COLOURS) % len(HATCHES)]
+            axes.barh(place, row["score"], 0.75, color=colour, hatch=hatch, edgecolor="white", linewidth=0, alpha=0.55)
+            axes.hlines(place, row["low"], row["high"], color="black", lw=1.4, zorder=3)
+            mine = dots[(*(row[name] for name in SETTING), row["label"])]
+            spread = np.linspace(-0.2, 0.2, len(mine)) if len(mine) > 1 else np.zeros(1)
+            axes.scatter(mine, place + spread, 7, color=colour, ec="black", lw=0.4, zorder=4)
+            if row["best_score"] > row["score"]:
+                axes.scatter(row["best_score"], place, 16, marker="D", fc="none", ec="black", lw=0.7, zorder=4)
+            names.append(plain(row["label"] + (f" (×{row['absent']})" if row["absent"] else ""), NAME_WIDTH))
+        axes.set_yticks(range(len(rows)), names, fontsize=7)
+        axes.set_ylim(max(len(rows), 4) - 0.4, -0.6)
+        axes.grid(axis="y", visible=False)
+        axes.set_xlabel("score")
+        if axes.dataLim.x0 >= 0:
+            axes.set_xlim(left=0)
+
     plots = []
-    scored = summary[summary["score"].notna()]
-    seeds = runs[runs["score"].notna()].assign(label=lambda table: labels(table))
-    for corruption, rows, places in _figures(scored):
-        lines = published if corruption == "none" else []
-
-        def draw(axes: Axes, mine: pd.DataFrame, lines: Sequence[dict[str, str]] = lines) -> None:
-            place = mine[list(SETTING)].iloc[0].tolist()
-            here = seeds[(seeds[list(SETTING)] == place).all(axis=1)]
-            _bars(axes, mine, here.groupby("label")["score"].agg(list).to_dict(), looks)
-            for row in lines:
-                if [row["env"], row["dataset"]] == place[:2]:
-                    _published(axes, row)
-
-        panels = [(_title(title, members, data), members, draw) for title, members in places]
+    for corruption, rows, places in _figures(summary[summary["score"].notna()]):
+        panels = []
+        for title, members in places:
+            known = data.get((members["task"].iloc[0], members["quality"].iloc[0]))
+            panels.append((title if known is None else f"{title} (data return {known:.0f})", members, draw))
         figure = sheet(panels, 2, [0.3 + 0.2 * max(len(members), 4) for _, members in places])
-        dots = seeds[seeds["corruption"] == corruption].assign(kind="seed")
-        shown = pd.concat([rows.assign(kind="mean"), dots])
+        shown = pd.concat([rows.assign(kind="mean"), seeds[seeds["corruption"] == corruption]])
         columns = ["kind", *SETTING, "label", "seed", "score", "low", "high", "seeds", "best_score", "missing"]
         caption = (
             f"Final scores under {corruption}. Bars: mean over seeds at the last evaluation; lines: 95% t intervals "
             "over seeds and episodes; dots: seeds; open diamonds: mean at the best evaluation, where the last is not "
             f"the best; ×2: two seeds are missing, unfinished or diverged. {seeds_note(rows['seeds'])}"
         )
-        if lines:
-            caption += " Lines: V-D4RL's published scores, on its own sets of these names, with nothing hidden."
-        table = shown.reindex(columns=columns).rename(columns={"label": "method"}).astype({"seed": "Int64"})
+        table = shown.reindex(columns=columns).rename(columns={"label": "method"})
         plots.append(Plot(file_name("scores", corruption), caption, _told(places, "score"), figure, table))
     return plots
 
 
-def _title(title: str, rows: pd.DataFrame, data: dict[tuple[str, str], float]) -> str:
-    known = data.get((rows["task"].iloc[0], rows["quality"].iloc[0]))
-    return title if known is None else f"{title} (data return {known:.0f})"
-
-
-def _bars(axes: Axes, rows: pd.DataFrame, seeds: dict[str, list[float]], looks: dict[str, int]) -> None:
-    """Bars from top to bottom in the order of the rows, with intervals, seeds and best evaluations."""
-    for place, row in enumerate(rows.to_dict("records")):
-        look = looks[row["label"]]
-        turn = HATCHES[look // len(COLOURS) % len(HATCHES)]
-        colour = COLOURS[look % len(COLOURS)]
-        axes.barh(place, row["score"], 0.75, color=colour, hatch=turn, edgecolor="white", linewidth=0, alpha=0.55)
-        axes.hlines(place, row["low"], row["high"], color="black", lw=1.4, zorder=3)
-        dots = seeds.get(row["label"], [])
-        spread = np.linspace(-0.2, 0.2, len(dots)) if len(dots) > 1 else 0.0
-        axes.scatter(dots, np.full(len(dots), place) + spread, 7, color=colour, ec="black", lw=0.4, zorder=4)
-        if row["best_score"] > row["score"]:
-            axes.scatter(row["best_score"], place, 16, marker="D", fc="none", ec="black", lw=0.7, zorder=4)
-    names = [
-        plain(f"{name} (×{absent})" if absent else name, NAME_WIDTH)
-        for name, absent in zip(rows["label"], rows["absent"], strict=True)
-    ]
-    axes.set_yticks(range(len(rows)), names, fontsize=7)
-    axes.set_ylim(max(len(rows), 4) - 0.4, -0.6)
-    axes.grid(axis="y", visible=False)
-    axes.set_xlabel("score")
-    if axes.dataLim.x0 >= 0:
-        axes.set_xlim(left=0)
-
-
-def _published(axes: Axes, row: dict[str, str]) -> None:
-    """Published scores as lines, named at their upper end."""
-    for name, (dashes, shown) in PUBLISHED.items():
-        value = float(row[name])
-        axes.axvline(value, color="black", lw=0.9, linestyle=dashes, zorder=1)
-        axes.text(value, 1.0, shown, transform=axes.get_xaxis_transform(), fontsize=6, ha="right", va="bottom")
+def _lines(axes: Axes, rows: pd.DataFrame, looks: dict[str, int], x: str, y: str, **more: Any) -> None:
+    """A line for each label, with a band where the rows have one."""
+    for name, mine in _by_label(rows):
+        look = style(looks[name]) | more
+        draw, fill = (axes.step, {"step": more["where"]}) if "where" in more else (axes.plot, {})
+        draw(mine[x], mine[y], lw=1.3, label=plain(name, NAME_WIDTH), **look)
+        if "low" in mine:
+            band = mine["low"].astype(float), mine["high"].astype(float)
+            axes.fill_between(mine[x], *band, color=look["color"], alpha=0.1, lw=0, **fill)
+    axes.set(xlabel=x, ylabel=y)
 
 
 def curve_plots(curves: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
     """Score against updates, one figure a corruption, one line a method."""
 
     def draw(axes: Axes, rows: pd.DataFrame) -> None:
-        for name, mine in _by_label(rows):
-            look = style(looks[name])
-            axes.plot(mine["step"], mine["score"], lw=1.3, label=plain(name, NAME_WIDTH), **look)
-            axes.fill_between(mine["step"], mine["low"], mine["high"], color=look["color"], alpha=0.08, lw=0)
-        axes.set(xlabel="gradient updates", ylabel="score", xlim=(0, None))
+        _lines(axes, rows, looks, "step", "score")
+        axes.set(xlabel="gradient updates", xlim=(0, None))
         axes.set_ylim(1.05 * min(0.0, rows["low"].min()), 1.05 * max(rows["high"].max(), 0.0) or 1.0)
 
+    caption = "Learning curves under {}: mean over the seeds that have got there, bands from the lowest to the highest "
+    caption += "seed, unfinished runs among them."
+    return _plots(curves, "curves", caption, draw, "score")
+
+
+def loss_plots(losses: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
+    """Action loss of pretraining against steps, one figure a corruption, one line a method."""
+
+    def draw(axes: Axes, rows: pd.DataFrame) -> None:
+        _lines(axes, rows, looks, "step", "action_loss", marker=None)
+        axes.set(xlabel="gradient steps", ylabel="action loss")
+
+    return _plots(
+        losses, "losses", "Action loss of pretraining under {}, mean over finished runs.", draw, "action_loss"
+    )
+
+
+def _plots(table: pd.DataFrame, name: str, caption: str, draw: Draw, value: str) -> list[Plot]:
+    """One figure a corruption, one panel a task and quality."""
     plots = []
-    for corruption, rows, places in _figures(curves):
-        caption = (
-            f"Learning curves under {corruption}: mean over the seeds that have got there, bands from the lowest "
-            f"to the highest seed, unfinished runs among them. {seeds_note(rows['seeds'])}"
-        )
+    for corruption, rows, places in _figures(table):
         figure = sheet([(title, members, draw) for title, members in places])
-        plots.append(Plot(file_name("curves", corruption), caption, _told(places, "score"), figure, rows))
+        told = f"{caption.format(corruption or 'any corruption')} {seeds_note(rows['seeds'])}"
+        plots.append(Plot(file_name(name, corruption), told, _told(places, value), figure, rows))
     return plots
 
 
@@ -258,17 +244,12 @@ def profile_plots(profiles: pd.DataFrame, aggregate: pd.DataFrame, looks: dict[s
         return []
 
     def draw(axes: Axes, rows: pd.DataFrame) -> None:
-        for name, mine in rows.groupby("method", sort=False):
-            look = style(looks[str(name)]) | {"marker": None}
-            axes.step(
-                mine["threshold"], mine["share"], where="post", lw=1.3, label=plain(str(name), NAME_WIDTH), **look
-            )
-            band = mine["low"].astype(float), mine["high"].astype(float)
-            axes.fill_between(mine["threshold"], *band, step="post", color=look["color"], alpha=0.12, lw=0)
+        _lines(axes, rows, looks, "threshold", "share", marker=None, where="post")
         axes.set(xlabel="score", ylabel="share of runs above it", ylim=(0, 1.02))
         axes.set_xlim(rows["threshold"].min(), rows["threshold"].max())
 
-    panels = [(str(corruption), members, draw) for corruption, members in profiles.groupby("corruption", sort=False)]
+    shown = profiles.assign(label=profiles["method"])
+    panels = [(str(corruption), members) for corruption, members in shown.groupby("corruption", sort=False)]
     lacking = aggregate[(aggregate["tasks"] < aggregate["of_tasks"]) & (aggregate["tasks"] > 0)]
     partial = zip(lacking["corruption"], labels(lacking), lacking["tasks"], lacking["of_tasks"], strict=True)
     caption = (
@@ -276,49 +257,31 @@ def profile_plots(profiles: pd.DataFrame, aggregate: pd.DataFrame, looks: dict[s
         f"pointwise 95% bands. {seeds_note(aggregate['seeds'])} "
         + "; ".join(f"{name} under {corruption}: {tasks} of {of} tasks" for corruption, name, tasks, of in partial)
     ).strip()
-    middle = profiles.groupby(["corruption", "method"], sort=False).nth(50)
-    words = "; ".join(
-        f"{row['corruption']}: {row['method']} {row['share']:.2f} above {row['threshold']:g}"
-        for row in middle.to_dict("records")
-    )
-    return [Plot("profiles", caption, words, sheet(panels, 2), profiles)]
+    middle = [(title, members[members["threshold"] <= 50]) for title, members in panels]
+    words = f"Share of runs above 50: {_told(middle, 'share', 2)}"
+    figure = sheet([(title, members, draw) for title, members in panels], 2)
+    return [Plot("profiles", caption, words, figure, shown)]
 
 
-def dot_plots(runs: pd.DataFrame, looks: dict[str, int]) -> dict[str, list[Plot]]:
-    """Return against what probes read from representations, and against how actions err: a dot a run."""
-    return {
-        "probes": _dots(
-            runs,
-            looks,
-            "probes",
-            dict(zip(PROBES, ("pose", "velocity"), strict=True)),
-            "error, %",
-            "the error of a linear probe of pose and of velocity, in percent of a standard deviation",
-        ),
-        "errors": _dots(
-            runs,
-            looks,
-            "errors",
-            dict(zip(ACTION_ERRORS, ("actions on the data", "actions in closed loop"), strict=True)),
-            "mean squared error",
-            "the mean squared difference of its actions from the data's actor's, on the data and in closed loop",
-        ),
-    }
+DOTS = {
+    "probes": (
+        dict(zip(PROBES, ("pose", "velocity"), strict=True)),
+        "error, %",
+        "the error of a linear probe of pose and of velocity, in percent of a standard deviation",
+    ),
+    "errors": (
+        dict(zip(ACTION_ERRORS, ("actions on the data", "actions in closed loop"), strict=True)),
+        "mean squared error",
+        "the mean squared difference of its actions from the data's actor's, on the data and in closed loop",
+    ),
+}
+"""What returns are drawn against, by the names of the files: titles of two panels by the measures' columns, what the
+measures are in short, and at length."""
 
 
-def _dots(
-    runs: pd.DataFrame, looks: dict[str, int], name: str, measures: dict[str, str], axis: str, words: str
-) -> list[Plot]:
-    """One figure a corruption, two panels a setting.
-
-    Args:
-        runs: table of runs.
-        looks: numbers of all labels in `style`.
-        name: of the files.
-        measures: titles of the panels, by the measures' columns.
-        axis: what the measures are, in short.
-        words: the same at length.
-    """
+def dot_plots(runs: pd.DataFrame, looks: dict[str, int], name: str) -> list[Plot]:
+    """Return against what probes read from representations, or how actions err: a dot a run, two panels a setting."""
+    measures, axis, words = DOTS[name]
 
     def draw_against(column: str, many: bool) -> Draw:
         def draw(axes: Axes, rows: pd.DataFrame) -> None:
@@ -340,20 +303,12 @@ def _dots(
             for title, members in places
             for column in measures
         ]
-        caption = (
-            f"Final return under {corruption} against {words}; further left is better. One dot a run, n = {len(rows)} "
-            "runs."
-        )
+        caption = f"Final return under {corruption} against {words}; further left is better. One dot a run, "
+        caption += f"n = {len(rows)} runs."
         shown = rows[[*SETTING, "label", "seed", *measures, "return"]].rename(columns={"label": "method"})
-        best = rows.sort_values("return", ascending=False).head(20).to_dict("records")
-        told = "; ".join(
-            f"{row['task']} {row['quality']}, {row['label']}, seed {row['seed']}: return {row['return']:.0f}, "
-            + ", ".join(f"{title} {row[column]:.3g}" for column, title in measures.items() if not np.isnan(row[column]))
-            for row in best
-        )
         figure = sheet(panels, 4 if len(places) > 1 else 2)
         plots.append(
-            Plot(file_name(name, corruption), caption, f"The runs of the highest returns: {told}.", figure, shown)
+            Plot(file_name(name, corruption), caption, f"Returns: {_told(places, 'return', 0)}", figure, shown)
         )
     return plots
 
@@ -365,45 +320,18 @@ def cost_plots(costs: pd.DataFrame) -> list[Plot]:
         return []
 
     def draw(axes: Axes, rows: pd.DataFrame) -> None:
-        left = np.zeros(len(rows))
-        for cost, stage, colour in zip(COSTS, ("pretraining", "fine-tuning"), COLOURS, strict=False):
-            minutes = rows[cost].fillna(0).to_numpy() / 60
-            axes.barh(np.arange(len(rows)), minutes, 0.7, left=left, color=colour, label=stage)
-            left = left + minutes
-        axes.set_yticks(range(len(rows)), [plain(name, 2 * NAME_WIDTH) for name in rows["method"]])
+        minutes = (rows.set_index("method")[list(COSTS)] / 60).set_axis(["pretraining", "fine-tuning"], axis=1)
+        minutes.rename(index=plain).plot.barh(ax=axes, stacked=True, width=0.7, color=COLOURS[:2], legend=False)
         axes.invert_yaxis()
-        axes.grid(axis="y", visible=False)
+        axes.set_ylabel("")
 
     caption = (
         "Cost of pretraining and fine-tuning: mean wall-clock time over a method's finished runs of all settings, on "
         f"the machines of the table. {seeds_note(rows['runs'], 'run')}"
     )
-    words = "; ".join(
-        f"{row['method']} {' and '.join(stats.number(row[cost], 0) for cost in COSTS)} seconds"
-        for row in rows.to_dict("records")
-    )
+    words = _told([("seconds of fine-tuning", rows.assign(label=rows["method"]))], "finetune_seconds", 0)
     figure = sheet([("mean minutes of a run", rows, draw)], 1, [0.4 + 0.2 * len(rows)])
     return [Plot("costs", caption, words, figure, rows)]
-
-
-def loss_plots(losses: pd.DataFrame, looks: dict[str, int]) -> list[Plot]:
-    """Action loss of pretraining against steps, one figure a corruption, one line a method."""
-
-    def draw(axes: Axes, rows: pd.DataFrame) -> None:
-        for name, mine in _by_label(rows):
-            look = style(looks[name]) | {"marker": None}
-            axes.plot(mine["step"], mine["action_loss"], lw=1.3, label=plain(name, NAME_WIDTH), **look)
-        axes.set(xlabel="gradient steps", ylabel="action loss")
-
-    plots = []
-    for corruption, rows, places in _figures(losses):
-        caption = (
-            f"Action loss of pretraining under {corruption or 'any corruption'}, mean over finished runs. "
-            f"{seeds_note(rows['seeds'])}"
-        )
-        figure = sheet([(title, members, draw) for title, members in places])
-        plots.append(Plot(file_name("losses", corruption), caption, _told(places, "action_loss", 3), figure, rows))
-    return plots
 
 
 def seeds_note(counts: pd.Series, noun: str = "seed") -> str:

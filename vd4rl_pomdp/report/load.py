@@ -225,7 +225,7 @@ def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choi
     runs = [replace(run, of_set=own) for run, own in zip(runs, _of_sets(runs), strict=True)]
     corruptions = _corruptions(runs)
     runs = [replace(run, labels=run.labels | {"corruption": c}) for run, c in zip(runs, corruptions, strict=True)]
-    runs = [replace(run, parts=parts) for run, parts in zip(runs, variants(runs), strict=True)]
+    runs = [replace(run, parts=parts) for run, parts in zip(runs, _variants(runs), strict=True)]
     seen: dict[tuple[Any, ...], Path] = {}
     for run in runs:
         other = seen.setdefault(run.of(IDENTITY), run.path) if run.rows else run.path
@@ -275,11 +275,11 @@ def _corruptions(runs: list[Run]) -> list[str]:
     return [name if name == "none" else ", ".join(filter(None, (name, options))) for name, options in told]
 
 
-def variants(runs: list[Run], brief: bool = True) -> list[Parts]:
+def _variants(runs: list[Run]) -> list[Parts]:
     """The settings in which each run differs from others of its stage, method and algorithm, and their data."""
     methods = [without(own, {*of_corruption(own), *DATA}) for own in _own(runs)]
     data = [{name: own[name] for name in DATA if name in own} for own in _own(runs)]
-    of_methods = _differences(runs, methods, _method, brief)
+    of_methods = _differences(runs, methods, _method)
     of_data = _differences(runs, data, lambda run: (*_method(run), run.set_name, run.labels["corruption"]))
     return list(zip(of_methods, of_data, strict=True))
 
@@ -293,14 +293,12 @@ def _own(runs: list[Run]) -> list[Settings]:
     return [without(run.settings, run.of_set) for run in runs]
 
 
-def _differences(
-    runs: list[Run], settings: list[Settings], alike: Callable[[Run], Hashable], brief: bool = True
-) -> list[str]:
+def _differences(runs: list[Run], settings: list[Settings], alike: Callable[[Run], Hashable]) -> list[str]:
     """What differs of some settings among the runs that are alike, run by run; nothing where none are recorded."""
     words = [""] * len(runs)
     recorded = [i for i, own in enumerate(settings) if own]
     for places in groups(recorded, lambda i: alike(runs[i])).values():
-        for i, told in zip(places, differences([settings[i] for i in places], brief), strict=True):
+        for i, told in zip(places, differences([settings[i] for i in places]), strict=True):
             words[i] = told
     return words
 

@@ -9,14 +9,12 @@ runs.jsonl, episodes.csv         the raw rows that everything is made of, see `v
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import pandas as pd
 from rich.console import Console
-from rich.table import Table
-from rich.text import Text
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.settings import settings_of
@@ -26,7 +24,7 @@ from vd4rl_pomdp.report import figures, tables
 from vd4rl_pomdp.report.claims import judge_claims, tally
 from vd4rl_pomdp.report.figures import Plot, seeds_note, to_svg, write_table
 from vd4rl_pomdp.report.films import shown_films
-from vd4rl_pomdp.report.gaps import MISSING, find_gaps
+from vd4rl_pomdp.report.gaps import find_gaps
 from vd4rl_pomdp.report.gates import gates, unranked
 from vd4rl_pomdp.report.load import (
     ALL,
@@ -45,10 +43,9 @@ from vd4rl_pomdp.report.load import (
     runs_frame,
     setting,
     title,
-    variants,
 )
-from vd4rl_pomdp.report.render import Block, Columns, block, render, texts, write_latex
-from vd4rl_pomdp.report.stats import FEW_SEEDS, interval, number, with_interval
+from vd4rl_pomdp.report.render import Block, Columns, block, render, terminal, texts, write_latex
+from vd4rl_pomdp.report.stats import FEW_SEEDS, number, with_interval
 from vd4rl_pomdp.report.theory import load_section
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.outputs import refuse_foreign
@@ -144,31 +141,22 @@ def _tables(runs: list[Run], choice: Choice) -> tuple[dict[str, pd.DataFrame], l
     return made, judged, claimed
 
 
-def _values(name: str, ends: str = "", digits: int = 1) -> Callable[[Row], str]:
-    """A number and its interval, whose ends' columns have a prefix, or as suffixes of its own name."""
-    low, high = (f"{name}_low", f"{name}_high") if ends == "own" else (f"{ends}low", f"{ends}high")
-    return lambda row: with_interval(row[name], row[low], row[high], digits)
-
-
-def _numbers(digits: int, **names: str) -> Columns:
-    """Columns of numbers by their titles."""
-    return {shown: lambda row, name=name: number(row[name], digits) for shown, name in names.items()}  # type: ignore[misc]
+def with_algorithm(row: Row) -> str:
+    """A setting in words, with the algorithm where it is not TD3+BC."""
+    return setting(row) + ("" if row["algorithm"] == "td3_bc" else f", {row['algorithm']}")
 
 
 def _count(row: Row) -> str:
     return f"{int(row['seeds'])}†" if row["seeds"] < FEW_SEEDS else str(int(row["seeds"]))
 
 
-def with_algorithm(row: Row) -> str:
-    """A setting in words, with the algorithm where it is not TD3+BC."""
-    return setting(row) + ("" if row["algorithm"] == "td3_bc" else f", {row['algorithm']}")
-
-
 def _side(side: str) -> Callable[[Row], str]:
     return lambda row: f"{row[side]}: {row[f'{side}_return']:.0f} (n = {row[f'{side}_seeds']})"
 
 
-def _seconds(cost: str) -> Callable[[Row], str]:
+def _span(cost: str) -> Callable[[Row], str]:
+    """Mean, least and most seconds."""
+
     def told(row: Row) -> str:
         low, high = row[f"{cost}_min"], row[f"{cost}_max"]
         return number(row[cost], 0) + (f" ({low:.0f} – {high:.0f})" if low < high else "")
@@ -184,31 +172,29 @@ def _chance(row: Row) -> str:
     return with_interval(row["probability"], row["low"], row["high"], 2) + few
 
 
-def _tasks(row: Row) -> str:
-    return str(row["tasks"]) if row["tasks"] == row["of_tasks"] else f"{row['tasks']} of {row['of_tasks']}"
-
-
 SHOWN: dict[str, tuple[int, Columns]] = {
     "gates": (
         2,
         {
             "setting": with_algorithm,
-            "verdict": lambda row: row["verdict"],
-            **_numbers(0, **{"data's return": "data_return"}),
-            **_numbers(2, **{"state": "state_share", "acro, none": "acro_share", "best": "best_share"}),
-            "best – random": _values("above_random", digits=0),
+            "verdict": "verdict",
+            "data's return": ("data_return", 0),
+            "state": ("state_share", 2),
+            "acro, none": ("acro_share", 2),
+            "best": ("best_share", 2),
+            "best – random": ("above_random", "low", "high", 0),
         },
     ),
     "claims": (
         4,
         {
-            "claim": lambda row: row["claim"],
+            "claim": "claim",
             "setting": setting,
             "verdict": lambda row: row["verdict"] or "–",
             "left": _side("left"),
             "right": _side("right"),
-            "difference": _values("difference", digits=0),
-            "played clean": _values("clean_difference", "clean_", 0),
+            "difference": ("difference", "low", "high", 0),
+            "played clean": ("clean_difference", "clean_low", "clean_high", 0),
         },
     ),
     MARK: (
@@ -216,46 +202,40 @@ SHOWN: dict[str, tuple[int, Columns]] = {
         {
             "setting": setting,
             "method": label,
-            "last evaluation": _values("score"),
-            **_numbers(0, **{"at update": "step"}),
-            "best evaluation": _values("best_score", "best_"),
-            **_numbers(0, **{"its update": "best_step"}),
+            "last evaluation": ("score", "low", "high", 1),
+            "at update": ("step", 0),
+            "best evaluation": ("best_score", "best_low", "best_high", 1),
+            "its update": ("best_step", 0),
             "seeds": _count,
-            "episodes": lambda row: str(row["episodes"]),
-            "not there": lambda row: row["missing"],
+            "episodes": "episodes",
+            "not there": "missing",
         },
     ),
     "aggregate": (
         1,
         {
-            "corruption": lambda row: row["corruption"],
+            "corruption": "corruption",
             "method": label,
-            "IQM": _values("iqm", "own"),
-            "median": _values("median", "own"),
-            "mean": _values("mean", "own"),
-            "optimality gap": _values("optimality_gap", "own"),
-            "tasks": _tasks,
+            **{name.replace("_", " "): (name, f"{name}_low", f"{name}_high", 1) for name in tables.AGGREGATES},
+            "tasks": lambda row: f"{row['tasks']} of {row['of_tasks']}",
             "seeds": _count,
         },
     ),
     "improvement": (
         1,
-        {
-            "corruption": lambda row: row["corruption"],
-            "row beats column": lambda row: row["method"],
-            "other": lambda row: row["other"],
-            "chance": _chance,
-        },
+        {"corruption": "corruption", "row beats column": "method", "other": "other", "chance": _chance},
     ),
     "representations": (
         1,
         {
             "setting": setting,
             "method": label,
-            **_numbers(3, **{"action loss": "action_loss"}),
-            **_numbers(1, **{"pose, %": PROBES[0], "velocity, %": PROBES[1]}),
-            **_numbers(0, **{"return": "return", "seeds": "seeds"}),
-            "not there": lambda row: row["missing"],
+            "action loss": ("action_loss", 3),
+            "pose, %": (PROBES[0], 1),
+            "velocity, %": (PROBES[1], 1),
+            "return": ("return", 0),
+            "seeds": ("seeds", 0),
+            "not there": "missing",
         },
     ),
     "control": (
@@ -263,28 +243,31 @@ SHOWN: dict[str, tuple[int, Columns]] = {
         {
             "setting": setting,
             "method": label,
-            **_numbers(0, **{"data's return": "data_return", "return": "return", "return, clean": "clean_return"}),
-            **_numbers(2, **{"above 80%": "share_above_80", "above 80%, clean": "clean_share_above_80"}),
-            **_numbers(4, **{"error on path": "path_error", "in loop": "action_error"}),
-            **_numbers(4, **{"in loop, clean": "clean_action_error"}),
-            **_numbers(0, seeds="seeds"),
+            "data's return": ("data_return", 0),
+            "return": ("return", 0),
+            "return, clean": ("clean_return", 0),
+            "above 80%": ("share_above_80", 2),
+            "above 80%, clean": ("clean_share_above_80", 2),
+            "error on path": ("path_error", 4),
+            "in loop": ("action_error", 4),
+            "in loop, clean": ("clean_action_error", 4),
+            "seeds": ("seeds", 0),
         },
     ),
     "costs": (
         2,
         {
-            "method": lambda row: row["method"],
+            "method": "method",
             "machines": lambda row: row["machines"] or "not recorded",
-            "pretraining, s": _seconds(COSTS[0]),
-            "fine-tuning, s": _seconds(COSTS[1]),
-            "runs": lambda row: str(row["runs"]),
+            "pretraining, s": _span(COSTS[0]),
+            "fine-tuning, s": _span(COSTS[1]),
+            "runs": "runs",
         },
     ),
 }
-"""Tables that the page shows: columns of words, and all columns. The first tells one table from the next, but where
-all rows are one table."""
+"""Tables that the page shows: how many columns of words they have at the left, and all columns. All but those of WHOLE
+are cut into one table for each value of the first column."""
 WHOLE = ("gates", "costs")
-"""Tables that are not cut by their first column."""
 
 
 def _shown(made: dict[str, pd.DataFrame]) -> dict[str, Shown]:
@@ -345,17 +328,11 @@ def _plots(runs: list[Run], made: dict[str, pd.DataFrame]) -> dict[str, list[Plo
     looks = figures.looks_of(name for table in (made[MARK], made["curves"], losses) for name in labels(table))
     judged = made["gates"].to_dict("records")
     data = {(row["task"], row["quality"]): row["data_return"] for row in judged if pd.notna(row["data_return"])}
-    theirs = {
-        (run.labels["task"], run.labels["quality"])
-        for run in runs
-        if run.labels["corruption"] == "none" and run.record.get("collection") == {}
-    }
-    published = [row for row in published_scores() if (row["env"], row["dataset"]) in theirs]
     return {
-        "scores": figures.bar_plots(made[MARK], made["runs"], data, looks, published),
+        "scores": figures.bar_plots(made[MARK], made["runs"], data, looks),
         "profiles": figures.profile_plots(made["profiles"], made["aggregate"], looks),
         "curves": figures.curve_plots(made["curves"], looks),
-        **figures.dot_plots(made["runs"], looks),
+        **{name: figures.dot_plots(made["runs"], looks, name) for name in figures.DOTS},
         "costs": figures.cost_plots(made["costs"]),
         "losses": figures.loss_plots(losses, looks),
     }
@@ -384,7 +361,6 @@ def _page(
         few=FEW_SEEDS,
         tables={name: one.blocks for name, one in shown.items()},
         plots={name: [(plot, to_svg(plot.figure)) for plot in group] for name, group in plots.items()},
-        differing=differing(runs),
         unlike=mixed,
         films=films,
         left_out=left_out,
@@ -424,32 +400,19 @@ def _state(run: Run) -> str:
     return f"{run.progress}: {message}" if message else run.progress
 
 
-def differing(runs: list[Run]) -> list[tuple[str, str]]:
-    """Each set with settings of its own, then each variant with all its settings that differ, a preset's included."""
-    words: dict[str, dict[str, None]] = {}
-    named: dict[str, str] = {}
-    for run, parts in zip(runs, variants(runs, brief=False), strict=True):
-        if run.stage == "finetune":
-            words.setdefault(run.set_name, {}).update(dict.fromkeys(f"{k} {v}" for k, v in run.of_set.items()))
-            named |= {label(run.named): ", ".join(filter(None, parts))} if run.variant else {}
-    return [*((place, ", ".join(told)) for place, told in words.items() if told), *named.items()]
-
-
 def unlike(runs: list[Run]) -> list[str]:
     """What stands side by side and was not made of the same, in sentences: contents of a set, code of a part."""
-    told: list[tuple[str, str, str]] = []
-    policies = [run for run in runs if run.stage == "finetune" and run.rows]
-    for run in policies:
-        content = run.record.get("inputs", {}).get("data", "")[:12]
-        told += [(f"the set of {run.set_name} has {{}} contents", content, label(run.named))] if content else []
-    for run in policies:
-        told += [(f"{part} has {{}} states of its code", code, label(run.named)) for part, code in _code(run).items()]
+    told: dict[str, dict[str, set[str]]] = {}
+    for run in (run for run in runs if run.stage == "finetune" and run.rows):
+        states = {f"the set of {run.set_name} has {{}} contents": run.record.get("inputs", {}).get("data", "")[:12]}
+        states |= {f"{part} has {{}} states of its code": code for part, code in _code(run).items()}
+        for subject, state in states.items():
+            if state:
+                told.setdefault(subject, {}).setdefault(state, set()).add(label(run.named))
     sentences = []
-    for subject, members in groups(told, lambda one: one[0]).items():
-        by_value = groups(members, lambda one: one[1])
-        if len(by_value) > 1:
-            words = (f"{value} ({', '.join(sorted({one[2] for one in some}))})" for value, some in by_value.items())
-            sentences.append(f"{subject.replace('{}', str(len(by_value)))}: {'; '.join(words)}")
+    for subject, states in told.items():
+        words = "; ".join(f"{state} ({', '.join(sorted(methods))})" for state, methods in states.items())
+        sentences += [f"{subject.format(len(states))}: {words}"] if len(states) > 1 else []
     return sentences
 
 
@@ -458,17 +421,14 @@ def _code(run: Run) -> dict[str, str]:
 
     Of a method those of the pretraining, where they are recorded: nothing of it is used afterwards.
     """
-    before, own = _parts_of(run.result.origin), _parts_of(run.record)
-    after = {part: told for part, told in own.items() if not (part in before and part.startswith("method "))}
-    told = {part: [one[part] for one in (before, after) if part in one] for part in before | after}
-    return {part: " then ".join(dict.fromkeys(states)) for part, states in told.items()}
-
-
-def _parts_of(record: Mapping[str, Any]) -> dict[str, str]:
-    """Package and file of each part that a record tells of."""
-    told = [record.get(name, {}) for name in ("plugins", "sources")]
-    names = dict.fromkeys(name for one in told for name in one)
-    return {name: ", ".join(filter(None, (one.get(name) for one in told))) for name in names}
+    found: dict[str, list[str]] = {}
+    for record in (run.result.origin, run.record):
+        plugins, sources = record.get("plugins", {}), record.get("sources", {})
+        for part in dict.fromkeys((*plugins, *sources)):
+            state = ", ".join(filter(None, (plugins.get(part), sources.get(part))))
+            if not (part in found and part.startswith("method ")) and state not in found.get(part, ()):
+                found.setdefault(part, []).append(state)
+    return {part: " then ".join(states) for part, states in found.items()}
 
 
 def _facts(name: str, runs: list[Run]) -> dict[str, str]:
@@ -501,16 +461,13 @@ def print_summary(report: Report, console: Console | None = None) -> None:
     lines += [f"{claim}: {told}" for claim, told in tallies.items() if told]
     for line in (*lines, f"{tables.SCORE}; mean over seeds [95% t interval]"):
         console.print(line, markup=False, highlight=False)
-    for place, rows in groups(report.summary.to_dict("records"), setting).items():
-        table = Table(title=Text(place), title_justify="left")
-        table.add_column("method", overflow="fold")
-        for name in ("score", "interval", "seeds", "episodes"):
-            table.add_column(name, justify="right", no_wrap=True)
-        if gaps := any(row["missing"] for row in rows):
-            table.add_column("not there", overflow="fold")
-        for row in rows:
-            score = MISSING if pd.isna(row["score"]) else number(row["score"])
-            texts = (label(row), score, interval(row["low"], row["high"]), str(row["seeds"]), str(row["episodes"]))
-            gap = row["missing"].removesuffix(f" {MISSING}")  # its column's title says so, and labels need the room
-            table.add_row(*map(Text, (*texts, gap) if gaps else texts))
-        console.print(table)
+    shown = texts(report.summary, SHOWN[MARK][1])
+    for place, part in shown.groupby("setting", sort=False):
+        columns = [
+            "method",
+            "last evaluation",
+            "seeds",
+            "episodes",
+            *(["not there"] if part["not there"].any() else []),
+        ]
+        console.print(terminal(str(place), part[columns]))

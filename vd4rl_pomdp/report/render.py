@@ -1,23 +1,26 @@
-"""Tables of texts as HTML and LaTeX, and this package's HTML templates, which share one frame, base.html."""
+"""Tables of texts on the page, in LaTeX and on the terminal, and the HTML templates, which share base.html."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jinja2
 import pandas as pd
+from rich.table import Table
+from rich.text import Text
 
 from vd4rl_pomdp.core.text import one_line
-from vd4rl_pomdp.report.stats import FEW_SEEDS
+from vd4rl_pomdp.report.stats import FEW_SEEDS, number, with_interval
 from vd4rl_pomdp.runs.files import Row, write_bytes
 
 SENTENCE = 48
 """Letters from which on a cell does not fit on a page of LaTeX beside others."""
-_SYMBOLS = {"→": r"$\rightarrow$", "†": r"\dag{}", "–": "--", "×": r"$\times$"}
-Columns = dict[str, Callable[[Row], str]]
-"""Titles of a shown table's columns, and the text of each in a row."""
+SYMBOLS = {"→": r"$\rightarrow$", "†": r"\dag{}", "–": "--", "×": r"$\times$"}
+Columns = dict[str, str | tuple[str, int] | tuple[str, str, str, int] | Callable[[Row], str]]
+"""Titles of a shown table's columns, and what each shows of a row: a word, a number with so many digits, a number with
+the ends of its interval, or a text."""
 
 _TEMPLATES = jinja2.Environment(
     loader=jinja2.PackageLoader("vd4rl_pomdp.report", ""),
@@ -32,6 +35,21 @@ def render(template: str, **values: Any) -> str:
     return _TEMPLATES.get_template(template).render(**values)
 
 
+def texts(rows: pd.DataFrame, columns: Columns) -> pd.DataFrame:
+    """A table as a reader sees it, with the index of its rows."""
+    shown = [{title: _text(row, what) for title, what in columns.items()} for row in rows.to_dict("records")]
+    return pd.DataFrame(shown, rows.index, columns=list(columns))
+
+
+def _text(row: Row, what: Any) -> str:
+    if callable(what):
+        return one_line(what(row))
+    if isinstance(what, str):
+        return one_line(str(row[what]))
+    *names, digits = what
+    return (number if len(names) == 1 else with_interval)(*(row[name] for name in names), digits)
+
+
 class Block(NamedTuple):
     """A table as the page shows it."""
 
@@ -42,12 +60,6 @@ class Block(NamedTuple):
     """n of what it shows."""
 
 
-def texts(rows: pd.DataFrame, columns: Columns) -> pd.DataFrame:
-    """A table as a reader sees it, with the index of its rows."""
-    shown = [{name: one_line(text(row)) for name, text in columns.items()} for row in rows.to_dict("records")]
-    return pd.DataFrame(shown, rows.index, columns=list(columns))
-
-
 def block(title: str, table: pd.DataFrame, words: int, note: str = "") -> Block:
     """A table for the page; the first `words` columns hold words, the others numbers."""
     with pd.option_context("display.max_colwidth", None):
@@ -56,14 +68,22 @@ def block(title: str, table: pd.DataFrame, words: int, note: str = "") -> Block:
 
 def write_latex(path: Path, table: pd.DataFrame, words: int, note: str = "") -> None:
     """Write a table of texts in LaTeX, which needs booktabs and longtable; what UTF-8 cannot hold is spelt out."""
-    form = "".join(_words_column(table[name]) for name in table.columns[:words]) + "r" * (len(table.columns) - words)
+    wide = [max(map(len, table[name]), default=0) > SENTENCE for name in table.columns[:words]]
+    form = "".join(r"p{0.3\linewidth}" if sentences else "l" for sentences in wide)
+    form += "r" * (len(table.columns) - words)
     caption = f"{note} †: fewer than {FEW_SEEDS} seeds.".strip().replace("%", r"\%")
     text = table.to_latex(index=False, escape=True, column_format=form, caption=caption, longtable=True)
-    for symbol, command in _SYMBOLS.items():
+    for symbol, command in SYMBOLS.items():
         text = text.replace(symbol, command)
     write_bytes(path, f"% \\usepackage{{booktabs, longtable}}\n{text}".encode(errors="backslashreplace"))
 
 
-def _words_column(cells: Iterable[str]) -> str:
-    """Sentences are broken into lines."""
-    return r"p{0.3\linewidth}" if any(len(cell) > SENTENCE for cell in cells) else "l"
+def terminal(title: str, table: pd.DataFrame) -> Table:
+    """A table of texts for the terminal; the first column and that of gaps are folded, numbers are not."""
+    shown = Table(title=Text(title), title_justify="left")
+    for name in table.columns:
+        words = name in (table.columns[0], "not there")
+        shown.add_column(name, overflow="fold", justify="left" if words else "right", no_wrap=not words)
+    for row in table.itertuples(index=False):
+        shown.add_row(*map(Text, row))
+    return shown

@@ -107,14 +107,11 @@ def of_sets(settings: Sequence[Settings], sets: Sequence[str]) -> list[Settings]
     return [{name: one[name] for name in sorted(own) if name in one} for one in settings]
 
 
-def differences(settings: Sequence[Settings], brief: bool = True) -> list[str]:
+def differences(settings: Sequence[Settings]) -> list[str]:
     """What differs among some settings: "max_k 1, steps 20"; nothing for a value that adds nothing.
 
-    ENCODER_SEED is told even where it does not differ: no other name says that seeds share an encoder.
-
-    Args:
-        settings: those that count, without what goes by the set.
-        brief: whether a preset is named in place of the settings that it decides.
+    ENCODER_SEED is told even where it does not differ: no other name says that seeds share an encoder. A preset is
+    named in place of the settings that it decides.
     """
     names = [name for name in dict.fromkeys(name for one in settings for name in one) if name != ENCODER_SEED]
     columns = {name: [one.get(name, LATER.get(name, _UNSET)) for one in settings] for name in names}
@@ -123,7 +120,7 @@ def differences(settings: Sequence[Settings], brief: bool = True) -> list[str]:
     everywhere = [name for name, column in columns.items() if _UNSET not in column]
     columns = {name: column for name, column in columns.items() if not _decided(name, columns, everywhere)}
     presets: list[str] = []
-    for name in _PRESETS if brief else ():
+    for name in _PRESETS:
         if name in columns and not _decided(name, columns, presets):
             presets.append(name)
     columns = {name: column for name, column in columns.items() if not _decided(name, columns, presets)}

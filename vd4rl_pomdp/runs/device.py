@@ -32,8 +32,3 @@ def autocast(device: torch.device, precision: Precision) -> torch.autocast:
     bf16 products are of bf16 numbers, summed in fp32 and rounded; norms and the like stay in fp32.
     """
     return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16")
-
-
-def has_bf16_kernels() -> bool:
-    """Whether this CPU has instructions for bf16; without them torch computes it in loops, slower than fp32."""
-    return torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported()

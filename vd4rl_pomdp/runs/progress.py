@@ -73,10 +73,6 @@ class ProgressLine:
         left = timedelta(seconds=round(max(0, self._total - self._done) / speed))
         return f"{speed:.3g} {self._unit}/s  ETA {left}"
 
-    def reach(self, done: int, **numbers: float) -> None:
-        """Move on to `done`, showing `numbers`."""
-        self.advance(done - self._done, **numbers)
-
     def __enter__(self) -> Self:
         self._bar.start()
         return self

@@ -78,23 +78,19 @@ def machine(device: str = "auto") -> dict[str, Any]:
     """The hardware a run had on a device: processor, cores, memory and its GPU, if any, without host or user names."""
     import torch
 
-    from vd4rl_pomdp.runs.device import has_bf16_kernels, pick_device
+    from vd4rl_pomdp.runs.device import pick_device
 
     used = pick_device(device)
+    memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0  # not on Windows
     gpu = torch.cuda.get_device_name(used) if used.type == "cuda" else None
     return {
         "processor": _processor(),
         "cores": os.cpu_count(),
-        "bf16_kernels": has_bf16_kernels(),
-        "memory_gib": round(machine_memory() / 2**30, 1),
+        "bf16_kernels": torch.backends.mkldnn.is_available() and torch.ops.mkldnn._is_mkldnn_bf16_supported(),
+        "memory_gib": round(memory / 2**30, 1),
         "gpu": gpu,
         "system": platform.system(),
     }
-
-
-def machine_memory() -> int:
-    """Bytes of memory that the machine has; 0 where the system does not say, as Windows."""
-    return os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES") if hasattr(os, "sysconf") else 0
 
 
 def command() -> str:

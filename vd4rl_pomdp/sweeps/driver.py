@@ -1,4 +1,4 @@
-"""Carries out a plan: starts what can be started, tries again what is worth it, and lets the rest go on.
+"""Carries out plans on this machine: starts what can be started, retries what can pass, and lets the rest go on.
 
 Whether a job is done, its folder says; so a driver may be killed at any moment, several may work on one folder, and the
 next one goes on with whatever is left.
@@ -8,242 +8,275 @@ from __future__ import annotations
 
 import os
 import random
+import signal
 import socket
+import subprocess
 import sys
 import time
-from collections.abc import Iterable, Mapping
-from contextlib import suppress
-from itertools import takewhile
+from collections.abc import Iterable
+from dataclasses import dataclass
+from pathlib import Path
 
-from vd4rl_pomdp.core.errors import (
-    DONE,
-    INTERRUPTED,
-    DiskFullError,
-    InUseError,
-    OutOfMemoryError,
-    UnavailableError,
-    UserError,
-    disk_errors,
-)
-from vd4rl_pomdp.core.registry import of_other_code, sources
+from vd4rl_pomdp.core.errors import TEMPORARY, UnavailableError, UserError, disk_errors
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.ownership import in_use
-from vd4rl_pomdp.sweeps.folder import SweepFolder
+from vd4rl_pomdp.sweeps.folder import (
+    DONE,
+    FAILED,
+    INTERRUPTED,
+    KILLED,
+    PASSING,
+    UNAVAILABLE,
+    Plan,
+    SweepFolder,
+    is_finished,
+    lost_among,
+)
+from vd4rl_pomdp.sweeps.options import LocalOptions
+from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE
 from vd4rl_pomdp.sweeps.plan import Job
-from vd4rl_pomdp.sweeps.progress import progress_of
-from vd4rl_pomdp.sweeps.work import FAILED, KILLED, Ended, Executor
 
-POLL_S = 0.1
-TRIES = 5
-"""Attempts at a job that end alike without a new checkpoint, before it has failed."""
+POLL_S = 0.5
 PAUSE_S = 60.0
 """Before another attempt, whoever made the last."""
 IN_USE_S = 10.0
 """Until a job that another driver has is looked at again."""
 IDLE_S = 90.0
 """A helping driver that finds nothing to start for so long ends."""
-SPREAD = 64
-"""Helping drivers choose among so many jobs by chance: all would otherwise start the same one."""
-PASSING = (KILLED, OutOfMemoryError.cause, DiskFullError.cause, UnavailableError.cause)
-"""Causes that another attempt may not meet. A refusal, a defect or a divergence would only come again."""
-_SHORT_OF_MEMORY = (OutOfMemoryError.cause, KILLED)
-"""The kernel kills a process when memory runs out, and does not say so."""
+PATIENCE_S = 120.0
+"""Seconds that a job has to end in after SIGTERM: it finishes a step and writes a checkpoint."""
+_ROOT = Path(__file__).parents[2]
 
 
-def attempts_at(job: Job, attempts: dict[str, list[Row]]) -> list[Row]:
-    """A job's attempts, oldest first: those at its present command, and with its parts as their files now have them.
+@dataclass(frozen=True)
+class Place:
+    """Room for one job."""
 
-    A corrected grid changes the one, a mended part of one's own the others.
-    """
-    words, settings = list(job.words), dict(job.settings)
-    rows = (row for row in attempts.get(job.name, []) if row.get("words", words) == words)
-    return [row for row in rows if not of_other_code(row, settings)]
-
-
-def given_up(rows: list[Row]) -> str:
-    """Why a job is not tried again, judging by its attempts since it was last taken up; empty if it is.
-
-    What was done once, and is there no more, is done again.
-    """
-    if not rows or rows[-1]["cause"] in (DONE, INTERRUPTED):
-        return ""
-    cause, step = rows[-1]["cause"], rows[-1]["step"]
-    here = takewhile(lambda row: row["step"] == step and row["cause"] != INTERRUPTED, reversed(rows))
-    return "" if cause in PASSING and len(list(here)) < TRIES else cause
+    cores: tuple[int, ...]
+    gpu: str | None
+    """What CUDA_VISIBLE_DEVICES is to be."""
 
 
-def lost_among(jobs: Iterable[Job], rows: Mapping[str, list[Row]]) -> set[str]:
-    """Of unfinished jobs, each after those it needs, the names of those given up, and of those that need such a one."""
-    lost: set[str] = set()
-    for job in jobs:
-        if given_up(rows[job.name]) or not lost.isdisjoint(job.needs):
-            lost.add(job.name)
-    return lost
-
-
-def _is_finished(job: Job) -> bool:
-    """Whether a job's folder says that it is finished, which one that cannot be read does not."""
-    try:
-        with disk_errors(job.folder):
-            return job.finished
-    except UserError:
-        return False
-
-
-def _finished_anew(job: Job) -> bool:
-    """Whether a job is finished, listing its folder first: NFS may remember for a minute that a file was not there."""
-    if job.folder.is_dir():
-        os.listdir(job.folder)
-    return job.finished
+@dataclass(frozen=True)
+class _Running:
+    job: Job
+    place: Place
+    process: subprocess.Popen
+    began: float
+    log: Path
+    log_size: int
+    """Bytes of the log before this attempt."""
 
 
 class Driver:
     """One process's part in a sweep."""
 
-    def __init__(self, jobs: Iterable[Job], executor: Executor, folder: SweepFolder, helps: bool = False) -> None:
+    def __init__(self, plans: Iterable[Plan], options: LocalOptions, folder: SweepFolder, helps: bool = False) -> None:
         """See the module.
 
         Args:
-            jobs: those of the sweep, each after those it needs.
-            executor: what runs them.
+            plans: of which the jobs are carried out, each after those it needs.
+            options: what this machine takes.
             folder: the sweep's.
-            helps: whether it is one of several on a cluster, which ends when there is nothing to start for IDLE_S.
+            helps: whether it is one of several, which ends when there is nothing to start for IDLE_S.
         """
-        self._jobs = {job.name: job for job in jobs}
-        self._executor, self._folder, self._helps = executor, folder, helps
-        self._left = {job.name: job for job in self._jobs.values() if not job.finished}
-        self._running: dict[str, float] = {}
-        """When each began."""
+        self._plans = {job.name: plan for plan in plans for job in plan.jobs}
+        self._jobs = {job.name: job for plan in plans for job in plan.jobs}
+        self._left = {name: job for name, job in self._jobs.items() if not is_finished(job)}
+        self._free, self._threads = places(options), options.threads
+        self._folder, self._helps = folder, helps
+        self._running: list[_Running] = []
         self._not_before: dict[str, float] = {}
-        """When to look again at what others have."""
+        """When to look again at what others have, or what has just failed."""
         self._busy = time.monotonic()
         """When something last ran."""
-        self._read = 0
-        self._learn(folder.attempts())
 
     def run(self) -> bool:
         """Work until nothing is left that can be done; whether all is finished."""
         try:
-            while len(self._left) > len(self._lost) and not self._idle():
-                self._look()
-                self._start()
+            while self._look():
                 time.sleep(POLL_S)
                 self._collect()
                 interrupt.check("the sweep's jobs have ended")
         except BaseException:
-            self._executor.stop()
-            self._collect()
+            self._stop()
             raise
-        return all(map(_is_finished, self._left.values()))  # others may have finished what was given up here
+        return all(map(is_finished, self._left.values()))  # others may have finished what was given up here
 
-    def _idle(self) -> bool:
+    def _look(self) -> bool:
+        """Start every job that can be; whether there is anything left to wait for."""
+        attempts = self._folder.attempts(self._jobs.values())  # other drivers', too
+        lost, running = lost_among(self._left.values(), attempts), {one.job.name for one in self._running}
+        ready = [
+            job
+            for job in self._left.values()
+            if job.name not in lost | running and not self._left.keys() & set(job.needs) and self._may(job, attempts)
+        ]
+        if self._helps:
+            random.shuffle(ready)  # or all drivers would start the same one
+        for job in ready:
+            if self._free and not self._is_anothers(job):
+                self._begin(job)
         if self._running:
             self._busy = time.monotonic()
-        return self._helps and time.monotonic() - self._busy > IDLE_S
+        idle = self._helps and time.monotonic() - self._busy > IDLE_S
+        return len(self._left) > len(lost) and not idle
 
-    def _look(self) -> None:
-        """Learn of all attempts, other drivers' too: what is given up is so for everybody."""
-        with suppress(UnavailableError):  # the next time, then
-            if (size := self._folder.attempts_size()) != self._read:
-                self._learn(self._folder.attempts())
-                self._read = size
+    def _may(self, job: Job, attempts: dict[str, list[Row]]) -> bool:
+        """Whether it is time to look at a job."""
+        last = (attempts[job.name] or [{"cause": DONE, "ended": 0.0}])[-1]
+        rests = last["cause"] in PASSING and time.time() < last["ended"] + PAUSE_S
+        return not rests and time.monotonic() >= self._not_before.get(job.name, 0)
 
-    def _learn(self, attempts: dict[str, list[Row]]) -> None:
-        self._rows = {name: attempts_at(job, attempts) for name, job in self._jobs.items()}
-        self._lost = lost_among(self._left.values(), self._rows)
-
-    def _start(self) -> None:
-        """Start every job that can be."""
-        ready = [job for job in self._left.values() if self._ready(job)]
-        if self._helps:
-            ready = random.sample(ready[:SPREAD], min(SPREAD, len(ready)))
-        for job in ready:
-            if not self._executor.fits(1):
-                break
-            if self._executor.fits(self._slots(job)) and not self._elsewhere(job):
-                self._begin(job)
-
-    def _begin(self, job: Job) -> None:
-        self._running[job.name] = time.monotonic()
-        try:
-            with disk_errors(job.folder):
-                self._executor.start(self._folder.work(job, self._slots(job)))
-        except UserError as error:
-            self._end(Ended(job.name, error.cause, str(error)))
-
-    def _ready(self, job: Job) -> bool:
-        free = job.name not in self._running and time.monotonic() >= self._not_before.get(job.name, 0)
-        last = (self._rows[job.name] or [{"cause": DONE}])[-1]
-        free = free and not (last["cause"] in PASSING and time.time() < last.get("ended", 0) + PAUSE_S)
-        return free and job.name not in self._lost and not any(name in self._left for name in job.needs)
-
-    def _elsewhere(self, job: Job) -> bool:
-        """Whether another process has finished a job, or is at it, or its folder does not tell, now or ever."""
-        try:
-            with disk_errors(job.folder):
-                if job.finished:
-                    del self._left[job.name]
-                    return True
-                if not in_use(job.folder):
-                    return False
-        except UnavailableError:
-            pass
-        except UserError as error:
-            self._running[job.name] = time.monotonic()
-            self._end(Ended(job.name, error.cause, str(error)))
-            return True
-        self._not_before[job.name] = time.monotonic() + IN_USE_S
+    def _is_anothers(self, job: Job) -> bool:
+        """Whether another process is at a job, or has finished it; asked in this order, it cannot end in between."""
+        if in_use(job.folder):
+            self._not_before[job.name] = time.monotonic() + IN_USE_S
+        elif is_finished(job):
+            del self._left[job.name]
+        else:
+            return False
         return True
 
-    def _slots(self, job: Job) -> int:
-        """One, and twice as many after every attempt that the memory may not have sufficed for."""
-        short = sum(row["cause"] in _SHORT_OF_MEMORY for row in self._rows[job.name])
-        return min(2**short, self._executor.largest)
+    def _begin(self, job: Job) -> None:
+        log, place = self._folder.path / "logs" / f"{job.name}.log", self._free[0]
+        try:
+            with disk_errors(log):
+                log.parent.mkdir(parents=True, exist_ok=True)
+                size = log.stat().st_size if log.exists() else 0
+                process = start(job.words, self._plans[job.name], log, place, self._threads)
+        except UserError as error:
+            self._end(job, UNAVAILABLE, 0.0, str(error))
+            return
+        self._free.remove(place)
+        self._running.append(_Running(job, place, process, time.monotonic(), log, size))
 
     def _collect(self) -> None:
-        for ended in self._executor.ended():
-            self._end(ended)
+        for one in [one for one in self._running if one.process.poll() is not None]:
+            self._running.remove(one)
+            self._free.append(one.place)
+            cause = cause_of(one.process.returncode)
+            line = "" if cause == DONE else _last_line(one.log, one.log_size)
+            self._end(one.job, cause, time.monotonic() - one.began, line)
 
-    def _end(self, ended: Ended) -> None:
-        seconds = time.monotonic() - self._running.pop(ended.name)
-        if ended.cause == InUseError.cause:  # another driver was faster: no attempt at the job
-            self._not_before[ended.name] = time.monotonic() + IN_USE_S
+    def _end(self, job: Job, cause: str, seconds: float, line: str) -> None:
+        """Keep the row of an attempt, and tell it."""
+        finished = is_finished(job)
+        if not finished and cause == FAILED and in_use(job.folder):  # another driver was faster: no attempt
+            self._not_before[job.name] = time.monotonic() + IN_USE_S
             return
-        ended, finished, step = self._outcome(ended)
-        self._note(ended, {"seconds": round(seconds, 1), "step": step})
         if finished:
-            del self._left[ended.name]
-        else:
-            self._lost = lost_among(self._left.values(), self._rows)
-        say(ended.name, ended.cause, seconds, ended.line, len(self._jobs) - len(self._left), len(self._jobs))
-
-    def _outcome(self, ended: Ended) -> tuple[Ended, bool, int]:
-        """How an attempt ended, whether its job is finished, and how far it is, as far as the disk tells now."""
-        job = self._jobs[ended.name]
-        try:
-            with disk_errors(job.folder):
-                finished, step = job.finished or (ended.cause == DONE and _finished_anew(job)), progress_of(job)
-        except UserError as error:
-            before = [row.get("step") or 0 for row in self._rows[job.name]]
-            return Ended(job.name, error.cause, str(error)), False, max(before, default=0)
-        if ended.cause == DONE and not finished:
-            ended = Ended(job.name, FAILED, f"{job.folder}: holds nothing finished, though the command ended well")
-        return ended, finished, step
-
-    def _note(self, ended: Ended, took: Row) -> None:
-        """Keep the row of an attempt, here and on the disk, unless that takes nothing now."""
-        job = self._jobs[ended.name]
-        row: Row = {"job": ended.name, "cause": ended.cause, "line": ended.line, "ended": round(time.time(), 1)} | took
-        row |= {"host": socket.gethostname(), "words": list(job.words), "sources": sources(dict(job.settings))}
-        self._rows[ended.name].append(row)
+            self._left.pop(job.name, None)
+        elif cause == DONE:
+            cause, line = FAILED, f"{job.folder}: holds nothing finished, though the command ended well"
+        if cause in PASSING:
+            self._not_before[job.name] = time.monotonic() + PAUSE_S
+        row: Row = {"job": job.name, "cause": cause, "line": line, "ended": round(time.time(), 1)}
+        row |= {"seconds": round(seconds, 1), "host": socket.gethostname(), "words": job.words}
         try:
             self._folder.add(row)
         except UnavailableError as error:
             print(f"warning: {error}", file=sys.stderr)
+        say(row, len(self._jobs) - len(self._left), len(self._jobs))
+
+    def _stop(self) -> None:
+        """Ask every job to end where nothing is lost, and wait for it."""
+        for one in self._running:
+            one.process.terminate()
+        until = time.monotonic() + PATIENCE_S
+        for one in self._running:
+            try:
+                one.process.wait(max(0.0, until - time.monotonic()))
+            except subprocess.TimeoutExpired:
+                one.process.kill()
+                one.process.wait()
+        self._collect()
 
 
-def say(name: str, cause: str, seconds: float, told: str, done: int, of: int) -> None:
+def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -> subprocess.Popen:
+    """Start a job's process, which is the command that one would type, in the plan's working directory.
+
+    Args:
+        words: the command, after `vd4rl-pomdp`.
+        plan: the job's.
+        log: what it prints is appended to this file.
+        place: the cores and the GPU that it may use.
+        threads: its CPU threads; 0: one a core.
+    """
+    imports = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
+    told = {JOB_VARIABLE: "1", "PYTHONPATH": imports, "OMP_NUM_THREADS": str(threads or max(1, len(place.cores)))}
+    if place.gpu is not None:
+        told["CUDA_VISIBLE_DEVICES"] = place.gpu
+    program = plan.program or ["-P", "-m", "vd4rl_pomdp"]  # -P: not what the working directory calls so
+    mine = os.sched_getaffinity(0) if place.cores else set()
+    # What a thread may use, and the signals that it blocks, a process has from the one that starts it. Slurm sends its
+    # warning before a time limit to every process; a task answers it, and asks its jobs to end.
+    blocked = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGUSR2})
+    try:
+        if place.cores:
+            os.sched_setaffinity(0, place.cores)
+        with log.open("ab") as file:
+            return subprocess.Popen(
+                [sys.executable, *program, *words],
+                env=os.environ | told,
+                cwd=plan.made_in,
+                stdin=subprocess.DEVNULL,
+                stdout=file,
+                stderr=file,
+                start_new_session=True,  # Ctrl-C is the driver's business
+            )
+    finally:
+        if place.cores:
+            os.sched_setaffinity(0, mine)
+        signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
+
+
+def cause_of(code: int) -> str:
+    """How a job's process ended, by its exit code, negative for a signal, as `subprocess` has it."""
+    if code in (-signal.SIGINT, -signal.SIGTERM, 128 + signal.SIGINT, 128 + signal.SIGTERM):
+        return INTERRUPTED
+    return KILLED if code < 0 else {0: DONE, TEMPORARY: UNAVAILABLE}.get(code, FAILED)
+
+
+def _last_line(log: Path, start: int) -> str:
+    """The last line that is not empty in a log, behind so many bytes of it."""
+    try:
+        text = log.read_bytes()[start:].decode(errors="replace")
+    except OSError:
+        return ""
+    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
+
+
+def say(row: Row, done: int, of: int) -> None:
     """Print how an attempt at a job ended."""
-    line = f"[{done}/{of}] {cause:<13} {seconds:6.0f} s  {name}" + (f": {told}" if told else "")
-    print(line, file=sys.stderr, flush=True)
+    line = f"[{done}/{of}] {row['cause']:<11} {row['seconds']:6.0f} s  {row['job']}"
+    print(line + (f": {row['line']}" if row["line"] else ""), file=sys.stderr, flush=True)
+
+
+def places(options: LocalOptions) -> list[Place]:
+    """The machine's cores and GPUs, shared out among the jobs."""
+    gpus = visible_gpus()
+    jobs = options.jobs or max(1, len(gpus) * options.jobs_per_gpu)
+    if gpus and jobs > len(gpus) * options.jobs_per_gpu:
+        raise UserError(
+            f"--jobs {jobs} is more than {len(gpus)} GPUs take with --jobs-per-gpu {options.jobs_per_gpu}: "
+            "raise that, or set CUDA_VISIBLE_DEVICES to nothing to run on the CPU"
+        )
+    cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
+    return [Place(_share(cores, number, jobs), gpus[number % len(gpus)] if gpus else None) for number in range(jobs)]
+
+
+def _share(cores: list[int], number: int, jobs: int) -> tuple[int, ...]:
+    """The cores of one of several jobs: at least one, unless the system does not tell what there is."""
+    first, end = (place * len(cores) // jobs for place in (number, number + 1))
+    return tuple(cores[first : max(end, first + 1)])
+
+
+def visible_gpus() -> list[str]:
+    """Names of the GPUs that this process may use, as CUDA_VISIBLE_DEVICES has them."""
+    import torch
+
+    count = torch.cuda.device_count()  # opens none of them
+    shown = os.environ.get("CUDA_VISIBLE_DEVICES")
+    return shown.split(",")[:count] if shown else [str(number) for number in range(count)]

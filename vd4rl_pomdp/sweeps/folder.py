@@ -1,13 +1,13 @@
 """What a sweep keeps beside its runs: its plans, one row for every attempt at a job, and what the jobs printed.
 
-    OUT/sweep/plans/GRID.json    from (the working directory), out, own_file (the file of one's own that registers parts
-                                 of its jobs, if one does), and the jobs of a grid: name, stage, folder, command, needs;
+    OUT/sweep/plans/GRID.json    made_in (the working directory), out, program (a file of one's own that the sweep
+                                 was started from), and the jobs of a grid: name, stage, folder, command, needs;
                                  GRID~*.json those of a grid of one's own, of a part of one, or of one with other
                                  settings
-    OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, step, host, words (of
-                                 its command), sources (files of its parts that are one's own)
+    OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, host, words (of its
+                                 command)
     OUT/sweep/logs/JOB.log
-    OUT/sweep/slurm/, ray/       what the tasks of a cluster print
+    OUT/sweep/slurm/             what the tasks of a cluster print
 
 Rows are appended whole, so that several drivers may share a folder. Whether a job is finished is never read here: its
 own folder says it.
@@ -15,29 +15,33 @@ own folder says it.
 
 from __future__ import annotations
 
-import errno
 import hashlib
 import json
 import os
-import shlex
-import sys
-from collections.abc import Iterable
-from contextlib import suppress
+import time
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.errors import DiskFullError, UserError, disk_errors
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
-from vd4rl_pomdp.core.registry import sources
 from vd4rl_pomdp.runs.files import Row, jsonable, write_json
-from vd4rl_pomdp.sweeps.own_file import OwnFile, own_file, parts_by_call, program_of, same_file
+from vd4rl_pomdp.runs.ownership import in_use
 from vd4rl_pomdp.sweeps.plan import Job
-from vd4rl_pomdp.sweeps.work import Work
 
-FOLDER = "sweep"
-RETRIED = "retried"
+DONE, INTERRUPTED, KILLED, UNAVAILABLE, FAILED = "done", "interrupted", "killed", "unavailable", "failed"
+"""How an attempt at a job ended."""
+PASSING = (KILLED, UNAVAILABLE)
+"""What another attempt may not meet. A refusal, a defect or a divergence would only come again."""
+TRIES = 5
+"""Attempts in a row that end so before a job has failed."""
+_RETRIED = "retried"
 """Cause of a row that says: forget this job's failures."""
+RUNNING, WAITING, BLOCKED = "running", "waiting", "blocked"
+_RATE_S = 3600.0
+"""A rate is that of the jobs that ended within so many seconds."""
 
 
 def plan_name(grid: str, words: Iterable[str]) -> str:
@@ -46,172 +50,181 @@ def plan_name(grid: str, words: Iterable[str]) -> str:
     return f"{grid}~{hashlib.blake2b(json.dumps(told).encode(), digest_size=4).hexdigest()}" if told else grid
 
 
+@dataclass(frozen=True)
+class Plan:
+    """Jobs, and how their processes are started."""
+
+    jobs: list[Job]
+    made_in: Path
+    """The working directory of every job, which relative paths begin at."""
+    out: Path
+    """The sweep's folder, as its jobs' commands name it."""
+    program: list[str]
+    """What stands behind `python` in place of `-m vd4rl_pomdp`: a file of one's own that registers parts."""
+
+
 class SweepFolder:
     """The files of a sweep below its folder."""
 
     def __init__(self, out: Path) -> None:
         """Nothing is written."""
         self.out = out
-        self.path = out / FOLDER
+        self.path = out / "sweep"
         """Where they lie."""
         self._attempts = self.path / "attempts.jsonl"
 
-    def keep_plan(self, name: str, jobs: Iterable[Job]) -> None:
-        """Write the jobs of a plan, in place of what was written of it before; other drivers may do so at once."""
+    def keep_plan(self, name: str, jobs: Iterable[Job], program: Iterable[str] = ()) -> Plan:
+        """Write a plan, in place of what was written of it before; other drivers may do so at once."""
+        plan = Plan(list(jobs), Path.cwd(), self.out, list(program))
         with disk_errors(self.path):
             (self.path / "plans").mkdir(parents=True, exist_ok=True)
-        jobs, here = list(jobs), own_file()
-        needed = here if here and any(parts_by_call(jobs)) else {}
-        plan = {"from": str(Path.cwd()), "out": str(self.out), "own_file": needed}
-        plan |= {"jobs": [jsonable(asdict(job)) for job in jobs]}
-        write_json(self.path / "plans" / f"{name}.json", plan, shared=True)
+        write_json(self.path / "plans" / f"{name}.json", jsonable(asdict(plan)), shared=True)
+        return plan
 
-    def jobs(self) -> list[Job]:
-        """The jobs of all plans, their folders as seen from here; UserError if there is none."""
-        return self._jobs_of(self._plans())
-
-    def _jobs_of(self, plans: list[_Plan]) -> list[Job]:
-        jobs = [replace(job, folder=plan.place(job.folder, self.out)) for plan in plans for job in plan.jobs]
-        return list({job.name: job for job in jobs}.values())
-
-    def own_jobs(self, name: str = "") -> list[Job]:
-        """The jobs of the plans that this process can carry out: of the program itself, or its own file's.
-
-        Those of other files are told of in a warning each.
-
-        Args:
-            name: of the plan; empty: all of them.
+    def plans(self, name: str = "") -> list[Plan]:
+        """The plan of a name, or all; the jobs' folders as seen from here.
 
         Raises:
-            UserError: there is none, or the commands of one name other folders here than where it was made.
+            UserError: there is none, or one is damaged.
         """
-        plans, here = self._plans(name), own_file()
-        own = [plan for plan in plans if not plan.own_file or same_file(plan.own_file, here)]
-        others = dict.fromkeys(program_of(plan.own_file) for plan in plans if plan not in own)
-        told = [f"`{program} sweep retry {shlex.quote(str(self.out))}`" for program in others]
-        if not own:
-            raise UserError(f"{self.out}: was planned with parts that this process has not: start {' and '.join(told)}")
-        for command in told:
-            print(f"warning: {self.out}: jobs with parts of another file are left to {command}", file=sys.stderr)
-        self._refuse_elsewhere(own)
-        return self._jobs_of(own)
+        paths = [path for path in sorted((self.path / "plans").glob("*.json")) if name in ("", path.stem)]
+        if not paths:
+            raise UserError(f"{self.out}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one")
+        return [self._seen_from_here(read_plan(path)) for path in paths]
+
+    def _seen_from_here(self, plan: Plan) -> Plan:
+        def place(folder: Path) -> Path:
+            below = folder.is_relative_to(plan.out)
+            return self.out / folder.relative_to(plan.out) if below else plan.made_in / folder
+
+        return replace(plan, jobs=[replace(job, folder=place(job.folder)) for job in plan.jobs])
+
+    def plans_to_do(self, name: str = "") -> list[Plan]:
+        """As `plans`; UserError if the folder was moved, so that their commands name another one."""
+        plans = self.plans(name)
+        for plan in plans:
+            if (plan.made_in / plan.out).resolve() != self.out.resolve():
+                raise UserError(
+                    f"{self.out}: was planned as {plan.made_in / plan.out}: move it back, or plan it anew by `sweep "
+                    f"run GRID --out {self.out}`"
+                )
+        return plans
 
     def jobs_of_others(self, name: str) -> list[Job]:
         """The jobs of all plans but one, as they were written."""
-        return [job for path in self._plan_files() if path.stem != name for job in _read_plan(path).jobs]
-
-    def _refuse_elsewhere(self, plans: list[_Plan]) -> None:
-        """Raise UserError if the commands of a plan name other folders here than where it was made."""
-        for plan in plans:
-            if plan.out_there.resolve() != self.out.resolve() or not (plan.absolute or plan.made_in == Path.cwd()):
-                raise UserError(
-                    f"{self.out}: was planned in {plan.made_in} as {plan.out}: `sweep retry` it there, or plan it "
-                    f"anew by `sweep run GRID --out {self.out}`"
-                )
-
-    def _plans(self, name: str = "") -> list[_Plan]:
-        if not (paths := [path for path in self._plan_files() if name in ("", path.stem)]):
-            raise UserError(f"{self.out}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one")
-        return [_read_plan(path) for path in paths]
-
-    def _plan_files(self) -> list[Path]:
-        return sorted((self.path / "plans").glob("*.json"))
-
-    def work(self, job: Job, slots: int) -> Work:
-        """A job as an executor takes it."""
-        log = self.path / "logs" / f"{job.name}.log"
-        return Work(job.name, job.words, log, slots, own_file(), sources(dict(job.settings)))
-
-    def of_executor(self, name: str) -> Path:
-        """Folder of what an executor keeps."""
-        return self.path / name
+        paths = sorted((self.path / "plans").glob("*.json"))
+        return [job for path in paths if path.stem != name for job in read_plan(path).jobs]
 
     def add(self, row: Row) -> None:
-        """Append the row of an attempt."""
+        """Append the row of an attempt; DiskFullError if the disk takes a part of it at most."""
         line = (json.dumps(row) + "\n").encode()
         with disk_errors(self._attempts):
             self.path.mkdir(parents=True, exist_ok=True)
-            handle = os.open(self._attempts, os.O_RDWR | os.O_APPEND | os.O_CREAT, 0o666)
-            try:
-                end = os.lseek(handle, 0, os.SEEK_END)
-                if end and os.pread(handle, 1, end - 1) != b"\n":  # a full disk cut the row before
+            with self._attempts.open("ab+", buffering=0) as file:
+                end = file.seek(0, os.SEEK_END)
+                if end and os.pread(file.fileno(), 1, end - 1) != b"\n":  # a full disk cut the row before
                     line = b"\n" + line
-                if os.write(handle, line) < len(line):
-                    raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
-            finally:
-                os.close(handle)
-
-    def attempts_size(self) -> int:
-        """Bytes of the attempts' file: another number, further attempts."""
-        with suppress(OSError):
-            return self._attempts.stat().st_size
-        return 0
+                if file.write(line) < len(line):
+                    raise DiskFullError(f"{self._attempts}: the disk is full")
 
     def forget(self, job: str) -> None:
         """Have the job taken up as if it had never been tried."""
-        self.add({"job": job, "cause": RETRIED})
+        self.add({"job": job, "cause": _RETRIED})
 
-    def attempts(self) -> dict[str, list[Row]]:
-        """By job, its attempts since it was last taken up again; a line that a full disk cut is left out."""
-        found: dict[str, list[Row]] = {}
-        if self._attempts.exists():
-            for line in read_bytes(self._attempts).decode(errors="replace").splitlines():
-                row = _row(line)
-                if row.get("cause") == RETRIED:
-                    found.pop(row["job"], None)
-                elif "job" in row:
-                    found.setdefault(row["job"], []).append(row)
+    def attempts(self, jobs: Iterable[Job]) -> dict[str, list[Row]]:
+        """By job, attempts at its present command since it was last taken up again; a line that was cut is left out."""
+        found: dict[str, list[Row]] = {job.name: [] for job in jobs}
+        words = {job.name: job.words for job in jobs}
+        content = read_bytes(self._attempts) if self._attempts.exists() else b""
+        for line in content.decode(errors="replace").splitlines():
+            try:
+                row = parse_json(line)
+                rows = found[row["job"]]
+                if row["cause"] == _RETRIED:
+                    rows.clear()
+                elif row["words"] == words[row["job"]] and row.keys() >= {"ended", "seconds", "line"}:
+                    rows.append(row)
+            except (ValueError, TypeError, KeyError):
+                continue
         return found
 
 
-def _row(line: str) -> Row:
+def read_plan(path: Path) -> Plan:
+    """A plan as it was written; UserError if it is damaged."""
     try:
-        row = parse_json(line)
-    except ValueError:
-        return {}
-    return row if isinstance(row, dict) and {"job", "cause"} <= row.keys() else {}
-
-
-@dataclass(frozen=True)
-class _Plan:
-    """A plan that was kept, with paths as they were told."""
-
-    made_in: Path
-    """The working directory, which relative paths begin at."""
-    out: Path
-    jobs: list[Job]
-    own_file: OwnFile
-    """Empty for a plan of the program itself, and of an earlier version."""
-
-    @property
-    def out_there(self) -> Path:
-        """The sweep's folder when the plan was made."""
-        return self.made_in / self.out
-
-    @property
-    def absolute(self) -> bool:
-        """Whether its commands mean the same from every working directory."""
-        return self.out.is_absolute() and all(job.folder.is_absolute() for job in self.jobs)
-
-    def place(self, folder: Path, out: Path) -> Path:
-        """Where a job's folder is if the sweep's is now `out`."""
-        return out / folder.relative_to(self.out) if folder.is_relative_to(self.out) else self.made_in / folder
-
-
-def _read_plan(path: Path) -> _Plan:
-    try:
-        told = parse_json(read_bytes(path).decode())
-        if not isinstance(told, dict) or not told["jobs"]:
-            raise TypeError("it does not tell its jobs and where they were planned")
-        jobs = [_job(one) for one in told["jobs"]]
-        return _Plan(Path(told["from"]), Path(told["out"]), jobs, dict(told.get("own_file", {})))
+        told = parse_json(read_bytes(path))
+        jobs = [Job(**job | {"folder": Path(job["folder"])}) for job in told["jobs"]]
+        return Plan(jobs, Path(told["made_in"]), Path(told["out"]), list(told["program"]))
     except UserError:
         raise
     except (ValueError, TypeError, KeyError) as error:
         raise UserError(f"{path}: is damaged ({error}); remove it and start `sweep run` again") from error
 
 
-def _job(told: dict[str, Any]) -> Job:
-    listed = {name: tuple(told[name]) for name in ("words", "needs")}
-    settings = tuple((name, value) for name, value in told["settings"])
-    return Job(**(told | listed | {"folder": Path(told["folder"]), "settings": settings}))
+def failed(rows: list[Row]) -> bool:
+    """Whether a job is not tried again, judging by its attempts: one failed, or too many in a row were of no use."""
+    causes = [row["cause"] for row in rows[-TRIES:]]
+    return causes[-1:] == [FAILED] or (len(causes) == TRIES and set(causes) <= {*PASSING})
+
+
+def lost_among(jobs: Iterable[Job], rows: Mapping[str, list[Row]]) -> set[str]:
+    """Of unfinished jobs, each after those it needs, the names of those that failed or need such a one."""
+    lost: set[str] = set()
+    for job in jobs:
+        if failed(rows[job.name]) or not lost.isdisjoint(job.needs):
+            lost.add(job.name)
+    return lost
+
+
+def is_finished(job: Job) -> bool:
+    """Whether a job's folder says that it is finished, which one that cannot be read does not."""
+    try:
+        with disk_errors(job.folder):
+            return job.finished
+    except UserError:
+        return False
+
+
+def status(jobs: list[Job], attempts: Mapping[str, list[Row]]) -> dict[str, Any]:
+    """Where a sweep stands.
+
+    Returns:
+        counts of jobs by state; per_hour: jobs that ended in the last hour, or since the sweep began, as a rate;
+        seconds_left at that rate, None without one; finished: whether nothing is left; states by job: done, running,
+        waiting, failed, or blocked by a failure before it; failures: the last attempt at every failed job.
+    """
+    left = [job for job in jobs if not is_finished(job)]
+    lost = lost_among(left, attempts)
+    states = dict.fromkeys((job.name for job in jobs), DONE)
+    for job in left:
+        here = RUNNING if in_use(job.folder) else FAILED if failed(attempts[job.name]) else WAITING
+        states[job.name] = BLOCKED if here == WAITING and job.name in lost else here
+    to_do = sum(state in (RUNNING, WAITING) for state in states.values())
+    per_hour = _per_hour([row for rows in attempts.values() for row in rows])
+    return {
+        "counts": dict(Counter(states.values())),
+        "per_hour": per_hour,
+        "seconds_left": to_do * 3600 / per_hour if per_hour else None if to_do else 0.0,
+        "finished": not left,
+        "states": states,
+        "failures": {name: attempts[name][-1] for name, state in states.items() if state == FAILED},
+    }
+
+
+def _per_hour(rows: list[Row]) -> float:
+    now = time.time()
+    began = min((row["ended"] - row["seconds"] for row in rows), default=now)
+    span = min(_RATE_S, max(now - began, 1.0))
+    return sum(row["cause"] == DONE and now - row["ended"] <= span for row in rows) * 3600 / span
+
+
+def in_lines(found: Mapping[str, Any]) -> list[str]:
+    """A status as text."""
+    counts = ", ".join(f"{number} {state}" for state, number in sorted(found["counts"].items()))
+    left = "unknown" if found["seconds_left"] is None else f"{found['seconds_left'] / 3600:.1f} h"
+    shown = [
+        f"{len(found['states'])} jobs: {counts}",
+        f"{found['per_hour']:.1f} jobs an hour, {left} left at this rate",
+    ]
+    shown += [f"failed: {name}: {row['line']}" for name, row in found["failures"].items()]
+    return shown + [f"running: {name}" for name, state in found["states"].items() if state == RUNNING]

@@ -1,23 +1,60 @@
-"""A grid: sections of settings for every stage, where a list is an axis, and the cells that it means."""
+"""A grid is data: sections of settings for every stage, where a list is an axis, in TOML or in a Python file.
+
+    seed = [0, 1, 2]                      # what stands outside the sections is told to every training
+    preset = "cpu"
+
+    [collect]
+    task = ["walker_walk", "cheetah_run"]
+    quality = "expert_noisy"
+
+    [pretrain]
+    method = ["mik+a", "acro"]
+    corruption = "patch+zero_frames"
+
+    [finetune]
+    updates = 20000
+
+    [[block]]                             # a part of the grid: its settings replace those above
+    pretrain = { method = "acro", history = "gru" }
+
+    [[where]]                             # settings of the cells that have others: no axes here
+    only = ["task=cheetah_run"]
+    finetune = { updates = 60000 }
+
+    [testing]                             # what `--testing` runs: its settings replace those of every block
+    preset = "smoke"
+
+A grid without blocks is one. A Python file defines the same as a dict called GRID.
+"""
 
 from __future__ import annotations
 
 import itertools
+import runpy
 import tomllib
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.reading import read_bytes
+from vd4rl_pomdp.core.settings import RUNTIME_FIELDS
+from vd4rl_pomdp.runs.interrupt import Terminated
 
+GRIDS = Path(__file__).with_name("grids")
+"""The grids that ship with the package."""
 PIXELS = ("collect", "pretrain", "finetune")
 MAZES = ("navigation_collect", "navigation_train")
 SECTIONS = (*PIXELS, *MAZES)
-TRAININGS = ("pretrain", "finetune", "navigation_train")
 SHARED = ("seed", "preset")
 """Settings outside the sections."""
+_TRAININGS = ("pretrain", "finetune", "navigation_train")
+_FOLDERS = {"out", "data", "encoder"}
+"""Settings of the stages that a sweep sets."""
 Values = dict[str, Any]
 Sections = dict[str, Values]
+"""Settings by section; those of SHARED under the name ""."""
 
 
 @dataclass(frozen=True)
@@ -47,18 +84,7 @@ class GridCell:
         Raises:
             UserError: sections set that name to different values.
         """
-        return value_of({"": self.shared} | self.sections, name)
-
-
-def value_of(sections: Sections, name: str) -> Any:
-    """What some sections, of which "" are the settings outside of all, set a name to; as `GridCell.value`."""
-    section, _, own = name.rpartition(".")
-    if section or name in sections.get("", {}):
-        return sections.get(section, {}).get(own)
-    found = {f"{section}.{name}": values[name] for section, values in sections.items() if name in values}
-    if any(value != next(iter(found.values())) for value in found.values()):
-        raise UserError(f"{name!r} means {' and '.join(found)} here, which differ: write one of these")
-    return next(iter(found.values()), None)
+        return _value_of({"": self.shared} | self.sections, name)
 
 
 @dataclass(frozen=True)
@@ -71,13 +97,14 @@ class Where:
 
     def applied(self, cell: GridCell, last: Sections) -> GridCell:
         """The cell with these settings, if it meets all conditions; what stands in `last` stays."""
-        if not all(in_words(cell.value(name)) in values for name, values in map(condition, self.only)):
+        if not all(_in_words(cell.value(name)) in values for name, values in map(_condition, self.only)):
             return cell
-        shared, sections = dict(cell.shared), {name: dict(values) for name, values in cell.sections.items()}
-        for section, settings in self.sections.items():
-            into = sections[section] if section else shared
-            into |= {name: value for name, value in settings.items() if name not in last.get(section, {})}
-        return GridCell(shared, sections, cell.named)
+        own = {
+            section: {name: value for name, value in settings.items() if name not in last.get(section, {})}
+            for section, settings in self.sections.items()
+        }
+        merged = _merge({"": cell.shared} | cell.sections, own)
+        return GridCell(merged.pop(""), merged, cell.named)
 
 
 @dataclass(frozen=True)
@@ -86,10 +113,10 @@ class Grid:
 
     name: str
     title: str
+    common: Sections
+    """What all blocks begin with, axes as lists."""
     blocks: list[Sections]
-    """Settings by section of every block, axes as lists; those of SHARED under the name ""."""
-    block_says: list[dict[str, set[str]]]
-    """By block and section, the settings that stand in the block itself."""
+    """What each block says itself."""
     wheres: list[Where]
     last: Sections
     """Settings that replace all others: what `testing` and changes say."""
@@ -97,35 +124,43 @@ class Grid:
     def cells(self) -> list[GridCell]:
         """All cells, once each; the first seed of every condition comes before the second of any."""
         cells: dict[str, GridCell] = {}
-        for block, says in zip(self.blocks, self.block_says, strict=True):
-            for cell in _product(merge(block, self.last), says):
+        for block in self.blocks:
+            for cell in _product(_merge(self.common, block, self.last), block):
                 for where in self.wheres:
                     cell = where.applied(cell, self.last)
                 cells.setdefault(repr((cell.shared, cell.sections)), cell)
         return sorted(cells.values(), key=lambda cell: cell.seed)
 
 
-def _product(block: Sections, says: dict[str, set[str]]) -> Iterator[GridCell]:
-    axes = [(section, name) for section in block for name, value in block[section].items() if isinstance(value, list)]
-    named = {
-        section: [name for name in block[section] if (section, name) in axes or name in says.get(section, ())]
-        for section in block
-    }
-    for values in itertools.product(*(block[section][name] for section, name in axes)):
-        sections = {section: dict(settings) for section, settings in block.items()}
-        for (section, name), value in zip(axes, values, strict=True):
-            sections[section][name] = value
-        shared = sections.pop("")
-        yield GridCell(shared, sections, named)
+def names() -> list[str]:
+    """Grids that ship with the package."""
+    return sorted(path.stem for path in GRIDS.glob("*.toml"))
 
 
-def merge(*parts: Sections) -> Sections:
-    """Settings by section; of several for one name the last counts."""
-    merged: Sections = {}
-    for part in parts:
-        for section, settings in part.items():
-            merged[section] = merged.get(section, {}) | settings
-    return merged
+def load_grid(name: str, changes: Sequence[str] = (), testing: bool = False) -> Grid:
+    """Read a grid.
+
+    Args:
+        name: of one that ships, or the path of a TOML or Python file.
+        changes: settings that replace those of every block: "pretrain.steps=100", "seed=0,1".
+        testing: whether the grid's `testing` settings replace its own.
+
+    Raises:
+        UserError: there is no such grid, or its file is none.
+    """
+    path = GRIDS / f"{name}.toml" if name in names() else Path(name)
+    told = _read(path, name)
+    try:
+        title, tests = told.pop("title", path.stem), told.pop("testing", {})
+        blocks = [_sections(block) for block in _tables(told, "block") or [{}]]
+        wheres, common = _tables(told, "where"), _sections(told)
+        last = _merge({"": {}}, *([_sections(tests)] if testing else []), *map(_change, changes))
+        whole = [_merge(common, block) for block in blocks]
+        for block in whole:
+            _check_block(_merge(block, last))
+        return Grid(path.stem, str(title), common, blocks, [_where(table, whole) for table in wheres], last)
+    except UserError as error:
+        raise UserError(f"{name}: {error}") from error
 
 
 def narrow(cells: list[GridCell], only: Sequence[str]) -> list[GridCell]:
@@ -135,22 +170,157 @@ def narrow(cells: list[GridCell], only: Sequence[str]) -> list[GridCell]:
         UserError: a condition is none, or no cell has such a value.
     """
     for text in only:
-        name, wanted = condition(text)
-        found = [in_words(cell.value(name)) for cell in cells]
-        check_values(text, wanted, found)
+        name, wanted = _condition(text)
+        found = [_in_words(cell.value(name)) for cell in cells]
+        _check_values(text, wanted, found)
         cells = [cell for cell, value in zip(cells, found, strict=True) if value in wanted]
     return cells
 
 
-def condition(text: str) -> tuple[str, list[str]]:
+def _read(path: Path, name: str) -> Values:
+    if path.suffix not in (".toml", ".py"):
+        raise UserError(f"unknown grid {name!r}: choose one of {', '.join(names())}, or name a .toml or .py file")
+    try:
+        with disk_errors(path):
+            text = read_bytes(path).decode()
+            told = tomllib.loads(text) if path.suffix == ".toml" else runpy.run_path(str(path)).get("GRID")
+    except (UserError, Terminated):
+        raise
+    except (Exception, SystemExit) as error:  # a file of Python may raise anything
+        raise UserError(f"{path}: is no grid ({type(error).__name__}: {error}); mend it") from error
+    if not isinstance(told, dict):
+        raise UserError(f"{path}: defines no dict called GRID; see the grids that ship for its form")
+    return dict(told)
+
+
+def _tables(told: Values, name: str) -> list[Any]:
+    tables = told.pop(name, [])
+    if not isinstance(tables, list):
+        raise UserError(f"its {name}s are no list of tables: write [[{name}]]")
+    return tables
+
+
+def _sections(table: Any) -> Sections:
+    """Settings by section of a table of a grid's file."""
+    if not isinstance(table, dict):
+        raise UserError(f"{table!r} is no table of settings")
+    sections: Sections = {"": {}}
+    for name, value in table.items():
+        if name in SHARED:
+            sections[""][name] = value
+        elif name not in SECTIONS:
+            raise UserError(f"unknown section or setting {name!r}: choose one of {', '.join((*SHARED, *SECTIONS))}")
+        elif not isinstance(value, dict):
+            raise UserError(f"{name} is no table of settings")
+        else:
+            sections[name] = dict(value)
+    return sections
+
+
+def _where(table: Any, blocks: list[Sections]) -> Where:
+    """A [[where]] of a grid's file; its conditions have to speak of what stands in a block."""
+    table = dict(table) if isinstance(table, dict) else {}
+    only, sections = table.pop("only", None), _sections(table)
+    if not isinstance(only, list) or not only or not all(isinstance(text, str) for text in only):
+        raise UserError('a [[where]] has no conditions: write only = ["task=cheetah_run"], or several')
+    for text in only:
+        name, wanted = _condition(text)
+        values = [_value_of(block, name) for block in blocks]
+        found = [one for value in values for one in (value if isinstance(value, list) else [value])]
+        _check_values(text, wanted, [_in_words(value) for value in found])
+    for section, settings in sections.items():
+        _check_settings(section, settings, axes=False)
+        if section and not all(section in block for block in blocks):
+            raise UserError(f"a [[where]] sets {section}, which not every block has")
+    return Where(only, sections)
+
+
+def _change(text: str) -> Sections:
+    """A change as the command line tells it: "section.name=value", or "name=value" for one of SHARED."""
+    where, equals, value = (part.strip() for part in text.partition("="))
+    section, _, name = where.rpartition(".")
+    if not equals or not name:
+        raise UserError(f"{text!r} is no change: write section.name=value, such as pretrain.steps=100 or seed=0,1")
+    if name not in SHARED if not section else section not in SECTIONS:
+        raise UserError(f"{where!r} is no setting of a grid: write one of {', '.join(SHARED)}, or SECTION.NAME")
+    values = [_toml_value(part.strip()) for part in value.split(",")]
+    return {section: {name: values if len(values) > 1 else values[0]}}
+
+
+def _check_block(block: Sections) -> None:
+    chain = [name for name in SECTIONS if name in block]
+    if not chain or (set(chain) & set(PIXELS) and set(chain) & set(MAZES)):
+        raise UserError(f"a block needs sections of {', '.join(PIXELS)}, or of {', '.join(MAZES)}")
+    if "finetune" in chain and "pretrain" not in chain:
+        raise UserError("a block with finetune needs pretrain, whose encoder it takes")
+    if chain[0] not in ("collect", "navigation_collect"):
+        kind = "navigation_collect" if chain[0] in MAZES else "collect"
+        raise UserError(f"a block trains on no set: add a section {kind}")
+    for section, settings in block.items():
+        _check_settings(section, settings)
+
+
+def _check_settings(section: str, settings: Values, axes: bool = True) -> None:
+    for name, value in settings.items():
+        where = f"{section}.{name}".lstrip(".")
+        if not isinstance(name, str) or not name.isidentifier() or name == "help":
+            raise UserError(f"{where}: is no setting of a stage; they are called like max_k, with underscores")
+        if name in _FOLDERS:
+            raise UserError(f"{where}: a sweep names its folders itself: leave it out, and give --out, --data")
+        if section in _TRAININGS and name == "seed":
+            raise UserError(f"{where}: a cell's trainings share one seed: write it outside the sections")
+        if isinstance(value, list) and axes and name in RUNTIME_FIELDS:
+            raise UserError(f"{where}: changes no result, so that cells of several would be one run; tell one")
+        values = value if isinstance(value, list) and axes else [value]
+        kinds = {int} if name == "seed" else {str, int, float, bool}
+        if not values or not {type(one) for one in values} <= kinds:
+            wanted = "a number" if name == "seed" else "a number, a word, true or false"
+            raise UserError(f"{where} is {value!r}: write {wanted}{', or a list of such' * axes}")
+
+
+def _product(block: Sections, own: Sections) -> Iterator[GridCell]:
+    """The cells of a block, of which `own` is what its own table says."""
+    axes = [(section, name) for section in block for name, value in block[section].items() if isinstance(value, list)]
+    named = {
+        section: [name for name in settings if (section, name) in axes or name in own.get(section, ())]
+        for section, settings in block.items()
+    }
+    for values in itertools.product(*(block[section][name] for section, name in axes)):
+        sections = {section: dict(settings) for section, settings in block.items()}
+        for (section, name), value in zip(axes, values, strict=True):
+            sections[section][name] = value
+        yield GridCell(sections.pop(""), sections, named)
+
+
+def _merge(*parts: Sections) -> Sections:
+    """Settings by section; of several for one name the last counts."""
+    merged: Sections = {}
+    for part in parts:
+        for section, settings in part.items():
+            merged[section] = merged.get(section, {}) | settings
+    return merged
+
+
+def _value_of(sections: Sections, name: str) -> Any:
+    """What some sections set a name to; as `GridCell.value`."""
+    section, _, own = name.rpartition(".")
+    if section or name in sections.get("", {}):
+        return sections.get(section, {}).get(own)
+    found = {f"{section}.{name}": values[name] for section, values in sections.items() if name in values}
+    if any(value != next(iter(found.values())) for value in found.values()):
+        raise UserError(f"{name!r} means {' and '.join(found)} here, which differ: write one of these")
+    return next(iter(found.values()), None)
+
+
+def _condition(text: str) -> tuple[str, list[str]]:
     """Name and values of a condition: "method=mik+a,acro"."""
     name, equals, values = (part.strip() for part in text.partition("="))
-    if not equals or not name:
-        raise UserError(f"{text!r} is no condition: write name=value,value, such as method=mik+a,acro")
-    return name, [in_words(toml_value(value.strip())) for value in values.split(",")]
+    if not (name and equals):
+        raise UserError(f"{text!r} is no condition: write name=value, or name=value,value")
+    return name, [_in_words(_toml_value(value.strip())) for value in values.split(",")]
 
 
-def toml_value(text: str) -> Any:
+def _toml_value(text: str) -> Any:
     """A TOML value, or else the text itself: words need no quotation marks."""
     try:
         return tomllib.loads(f"value = {text}")["value"]
@@ -158,12 +328,12 @@ def toml_value(text: str) -> Any:
         return text
 
 
-def in_words(value: Any) -> str:
+def _in_words(value: Any) -> str:
     """A setting's value as conditions compare it: equal for equal numbers, however they are written."""
-    return str(toml_value(value) if isinstance(value, str) else value)
+    return str(_toml_value(value) if isinstance(value, str) else value)
 
 
-def check_values(text: str, wanted: list[str], found: list[str]) -> None:
+def _check_values(text: str, wanted: list[str], found: list[str]) -> None:
     """Raise UserError if a condition names a value that was not found."""
     if not set(wanted) <= set(found):
         has = f"has {', '.join(dict.fromkeys(found))}" if set(found) != {"None"} else "sets nothing of that name"

@@ -12,9 +12,8 @@ from vd4rl_pomdp.data.collect import set_quality
 from vd4rl_pomdp.report.load import Choice, without_options
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.results import Result
-from vd4rl_pomdp.sweeps.found import FoundRun, found_in
 from vd4rl_pomdp.sweeps.grid import GridCell
-from vd4rl_pomdp.sweeps.sets import DataSet, set_of
+from vd4rl_pomdp.sweeps.plan import DataSet, FoundRun, found_in, set_of
 from vd4rl_pomdp.sweeps.stages import check_cells, config_of, recipe_of, recorded
 
 _NOWHERE = Path()
@@ -37,7 +36,7 @@ class GridMembers(Choice):
         self._asked = f"one of the {len(cells)} cells of {name} that are asked for"
         self._sets: dict[str, list[DataSet]] = defaultdict(list)
         self._policies: set[tuple[Any, ...]] = set()
-        check_cells(cells, name, collects=lambda _: False)
+        check_cells(cells, name)
         for cell in cells:
             if "navigation_train" in cell.chain:
                 raise UserError(f"{name}: its cells are mazes; `vd4rl-pomdp navigation report` reports them")

@@ -1,11 +1,15 @@
-"""From a grid's cells to jobs: one for every set, encoder and policy, whoever shares it."""
+"""From a grid's cells to jobs: one for every set, encoder and policy, whoever shares it, and which of them are done.
+
+A run is known by what it computes (its recipe) and by the content of its set, wherever it lies and whoever made it.
+"""
 
 from __future__ import annotations
 
-from collections import Counter
-from collections.abc import Iterable, Mapping
-from dataclasses import dataclass, replace
-from itertools import chain, count, pairwise
+from collections import Counter, defaultdict
+from collections.abc import Iterable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
+from functools import cache, cached_property
+from itertools import chain, count
 from pathlib import Path
 from typing import Any
 
@@ -13,18 +17,170 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import words_of
 from vd4rl_pomdp.core.registry import of_other_code
 from vd4rl_pomdp.core.settings import settings_of
-from vd4rl_pomdp.data.folder import PLAN, PROVENANCE, read_plan
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, SET_QUALITIES, TASKS
+from vd4rl_pomdp.data.folder import PLAN, PROVENANCE, read_plan, shard_files, shard_paths, task_and_quality
+from vd4rl_pomdp.data.format import read_attributes, read_frame_size
 from vd4rl_pomdp.data.shards import differing
+from vd4rl_pomdp.data.store import open_store
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, encoder_hash
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
-from vd4rl_pomdp.sweeps.found import FoundRun, FoundRuns, run_at
+from vd4rl_pomdp.runs.files import Row, files_below, read_json
+from vd4rl_pomdp.runs.identity import content_hash, recipe
+from vd4rl_pomdp.runs.results import Result, read_results
 from vd4rl_pomdp.sweeps.grid import GridCell
-from vd4rl_pomdp.sweeps.naming import run_folder
-from vd4rl_pomdp.sweeps.sets import DataSet, content_of, set_of
-from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, recipe_of, recorded, told
+from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, collection_of, recipe_of, recorded, told
 
 DATA = "data"
 """Folder of the sets in a sweep's, unless another is named."""
+_DOWNLOADED = "84px"
+"""Folder in which a downloaded set has its shards."""
+_LONGEST = 160
+"""Bytes of settings in a folder's name, which has room for 255 in all."""
+_IN_NAMES = {
+    "collect": ("task", "quality"),
+    "pretrain": ("method", "corruption"),
+    "finetune": ("algorithm",),
+    "navigation_collect": ("maze",),
+    "navigation_train": ("method",),
+}
+"""Settings that have a place of their own in a folder's name."""
+
+
+@dataclass(frozen=True)
+class DataSet:
+    """A set that cells of a grid need: found below a folder, or to be collected there."""
+
+    name: str
+    folder: Path
+    section: str
+    """Which command collects it."""
+    wanted: Mapping[str, Any]
+    """How it is collected, by setting."""
+
+    @property
+    def foreign(self) -> bool:
+        """Whether shards are there that nothing here collected, such as a downloaded set."""
+        return not (self.folder / PLAN).exists() and bool(shard_files(self.folder))
+
+    @property
+    def there(self) -> bool:
+        """Whether nothing is left to collect."""
+        return (self.folder / PROVENANCE).is_file() or self.foreign
+
+    @cached_property
+    def fingerprint(self) -> str:
+        """Name of its content; a set that was never opened before is decoded first."""
+        return open_store(self.folder).fingerprint
+
+    def check(self) -> None:
+        """Raise UserError unless its folder holds the set, or the set can be collected there."""
+        if self.foreign:
+            self._check_foreign()
+        elif (self.folder / PLAN).exists():
+            stored = read_json(self.folder / PLAN)
+            for name in differing(stored, self.wanted)[:1]:
+                has, asked = (_in_words(name, values.get(name)) for values in (stored, self.wanted))
+                raise UserError(f"{self.folder}: holds a set of {has}, the grid says {asked}; choose another --data")
+        elif self.section == "collect":
+            TASKS.check(self.wanted["task"])
+            if self.wanted["quality"] not in SET_QUALITIES:
+                raise UserError(
+                    f"{self.folder}: holds no set, and the quality {self.wanted['quality']!r} cannot be collected: "
+                    f"put the set there, or choose one of {', '.join(SET_QUALITIES)}"
+                )
+
+    def _check_foreign(self) -> None:
+        """Raise UserError if shards that nothing here collected tell another task, or frames of another size."""
+        shards = shard_paths(self.folder)
+        if self.section != "collect":
+            return
+        task, _ = task_and_quality(self.folder, [read_attributes(shard) for shard in shards])
+        asked = self.wanted["task"], self.wanted.get("frame_size") or FRAME_SIZE
+        for has, wanted in zip((task, read_frame_size(shards)), asked, strict=True):
+            if has not in (None, wanted):
+                what = f"frames of {has}x{has} pixels" if isinstance(has, int) else f"a set of {has}"
+                raise UserError(f"{self.folder}: holds {what}, the grid says {wanted}; choose another --data")
+
+    def made(self, record: Mapping[str, Any]) -> bool:
+        """Whether a run, as its config.json tells it, was trained on this set."""
+        if self.there:
+            return record.get("inputs", {}).get("data") == self.fingerprint
+        return self.alike(record)
+
+    def alike(self, record: Mapping[str, Any]) -> bool:
+        """Whether a run was trained on a set that was collected as this one is, whatever came of it."""
+        collection = record.get("collection") or {}
+        return bool(collection) and not differing(collection, self.wanted)
+
+
+def set_of(cell: GridCell, root: Path) -> DataSet:
+    """The set of a cell, below `root`."""
+    section, wanted = cell.chain[0], collection_of(cell)
+    place = "/".join(wanted[name] for name in _IN_NAMES[section])
+    name = place + _extras(cell, section)
+    inner = root / name / _DOWNLOADED
+    return DataSet(name, inner if inner.is_dir() else root / name, section, wanted)
+
+
+@dataclass(frozen=True)
+class FoundRun:
+    """A run that is there: below a sweep's folder, or in a row that was kept."""
+
+    folder: Path
+    record: Row
+    """Its config.json."""
+    card: Row
+    """What its encoder says of its pretraining, empty where it has none."""
+    finished: bool
+
+    @cached_property
+    def recipe(self) -> str:
+        """What it computes, but for its data's content."""
+        return recipe(self.record, self.card if self.record["stage"] == "finetune" else {})
+
+    @property
+    def data(self) -> str:
+        """Fingerprint of its set, empty where it tells none."""
+        return self.record.get("inputs", {}).get("data", "")
+
+    @property
+    def on_one_set(self) -> bool:
+        """Whether its encoder, if it was given one, was pretrained on its own data, as a grid's are."""
+        return self.card.get("data") in (None, self.data)
+
+
+def runs_below(out: Path) -> Iterator[FoundRun]:
+    """Every run below a folder; UserError for a damaged record."""
+    for path in files_below(out, CONFIG_FILE):
+        record = read_json(path)
+        if "stage" in record and isinstance(record.get("config"), dict) and "seed" in record["config"]:
+            yield run_at(path.parent)
+
+
+def run_at(folder: Path) -> FoundRun:
+    """The run of a folder that holds one; UserError for a damaged record."""
+    encoder = folder / "encoder" / CONFIG
+    card = read_json(encoder).get("pretrain") if encoder.exists() else None
+    return FoundRun(folder, read_json(folder / CONFIG_FILE), _whole(card), (folder / TIMING_FILE).is_file())
+
+
+def runs_kept(folders: Iterable[Path]) -> list[FoundRun]:
+    """Every run of some results folders; UserError for a folder that is none."""
+    return found_in([run for folder in folders for run in read_results(folder)])
+
+
+def found_in(results: Iterable[Result]) -> list[FoundRun]:
+    """Some runs, in their order; how a set was collected may be told by another run on the same content."""
+    runs = [FoundRun(run.path, run.record, _whole(run.card), run.finished) for run in results]
+    told = {run.data: run.record["collection"] for run in runs if run.data and run.record.get("collection")}
+    return [
+        replace(run, record=run.record | {"collection": run.record.get("collection") or told.get(run.data)})
+        for run in runs
+    ]
+
+
+def _whole(card: Any) -> Row:
+    return card if isinstance(card, dict) and {"settings", "seed"} <= card.keys() else {}
 
 
 @dataclass(frozen=True)
@@ -36,14 +192,14 @@ class Job:
     section: str
     """Which stage it is."""
     folder: Path
-    words: tuple[str, ...]
+    words: list[str]
     """Its command line, after `vd4rl-pomdp`."""
-    needs: tuple[str, ...] = ()
+    needs: list[str] = field(default_factory=list)
     """Names of the jobs that come before it."""
     done: bool = False
     """Whether nothing is to do, although its folder does not tell: a kept row, or a set that was not collected here."""
-    settings: tuple[tuple[str, str], ...] = ()
-    """Settings that its cost depends on."""
+    settings: dict[str, str] = field(default_factory=dict)
+    """Its settings and those of the stages before it, as words."""
     recipe: str = ""
     """What a training computes; empty for a set."""
     content: str = ""
@@ -51,79 +207,66 @@ class Job:
 
     @property
     def finished(self) -> bool:
-        """Whether there is nothing left to do now.
-
-        A run of another recipe, or on another set, that came into the folder does not count.
-        """
+        """Whether there is nothing left to do now; a run of another recipe, or on another set, does not count."""
         if self.done or self.section not in STAGES:
             return self.done or (self.folder / PROVENANCE).is_file()
-        return (self.folder / TIMING_FILE).is_file() and self._made(run_at(self.folder))
-
-    def _made(self, run: FoundRun) -> bool:
-        """Whether a run is its own; on which set that of a folder that was free must be, the command tells.
-
-        Another driver may have called the set otherwise, or have a copy of it.
-        """
-        if run.recipe != self.recipe:
+        if not (self.folder / TIMING_FILE).is_file():
             return False
-        if self.content:
-            return run.data == self.content
-        told, own = run.record["config"].get("data"), dict(pairwise(self.words))["--data"]
-        return told == own or (run.data != "" and run.data == content_of(Path(own)))
+        run = run_at(self.folder)
+        return run.recipe == self.recipe and self.content in ("", run.data)
 
     @property
     def begun(self) -> bool:
         """Whether something of it is there."""
-        mark = CONFIG_FILE if self.section in STAGES else PLAN
-        return (self.folder / mark).is_file()
+        return (self.folder / (CONFIG_FILE if self.section in STAGES else PLAN)).is_file()
 
 
-class JobPlanner:
-    """Makes the jobs of a grid, looking at what is there."""
+def plan_jobs(
+    cells: Iterable[GridCell], out: Path, data: Path, kept: Iterable[FoundRun] = (), others: Iterable[Job] = ()
+) -> tuple[list[Job], list[str]]:
+    """The jobs of some cells, each after those it needs, and what one should know of those that are done.
 
-    def __init__(self, out: Path, data: Path, kept: FoundRuns, here: FoundRuns, others: Iterable[Job] = ()) -> None:
-        """Nothing is written.
+    What only finished jobs would need is left out. Nothing is written.
 
-        Args:
-            out: the sweep's folder.
-            data: folder of the sets.
-            kept: runs whose rows are kept, their folders being elsewhere.
-            here: runs below `out`.
-            others: jobs of other grids in `out`, begun or not.
-        """
-        self._out, self._data, self._kept, self._here = out, data, kept, here
+    Args:
+        cells: those that `check_cells` lets pass.
+        out: the sweep's folder.
+        data: folder of the sets.
+        kept: runs whose rows are kept, their folders being elsewhere.
+        others: jobs of other grids in `out`, begun or not.
+
+    Raises:
+        UserError: a folder holds another set, or cells want two sets in one.
+    """
+    planner = _Planner(out, data, kept, others)
+    for cell in cells:
+        planner.add(cell)
+    return planner.needed(), list(planner.warnings())
+
+
+class _Planner:
+    """Jobs by what they make."""
+
+    def __init__(self, out: Path, data: Path, kept: Iterable[FoundRun], others: Iterable[Job]) -> None:
+        self._out, self._data = out, data
+        here = list(runs_below(out))
+        self._here, self._kept = _by_recipe(here), _by_recipe(kept)
+        self._folders = {run.folder for run in here}
+        self._names = {job.name: job.recipe for job in others}
+        """What has a name, by that name."""
         self._jobs: dict[tuple[str, str, str], Job] = {}
         self._sets: dict[str, DataSet] = {}
-        self._taken: set[str] = set()
         self._asked: set[str] = set()
         """Names of the jobs that are the last of a cell."""
-        self._of_others = {job.name: job.recipe for job in others}
-        self.of_other_content: Counter[str] = Counter()
-        """Kept runs that do not count, by set: theirs was collected alike, and its content is another."""
+        self._of_other_code: Counter[str] = Counter()
+        self._of_other_content: Counter[str] = Counter()
+        self._on_other_encoders = 0
 
-        self.changed_since: Counter[str] = Counter()
-        """Runs that count, though the file of a part of one's own has changed since, by part."""
-
-        self.on_other_encoders = 0
-        """Policies that count, though the encoder that their pretraining's folder holds now is another than theirs."""
-
-    def plan(self, cells: Iterable[GridCell]) -> list[Job]:
-        """The jobs of some cells, each after those it needs; what only finished jobs would need is left out.
-
-        Args:
-            cells: those that `check_cells` lets pass.
-
-        Raises:
-            UserError: a folder holds another set, or cells want two sets in one.
-        """
-        for cell in cells:
-            self._add(cell)
-        return self._needed()
-
-    def _add(self, cell: GridCell) -> None:
+    def add(self, cell: GridCell) -> None:
+        """Want what a cell asks for."""
         data = self._set(cell)
-        values: dict[str, Any] = {}
         before = [self._collection(cell, data)]
+        values: dict[str, Any] = {}
         for section in cell.chain[1:]:
             values |= recorded(cell, section)
             before.append(self._training(cell, section, data, values, before))
@@ -133,53 +276,59 @@ class JobPlanner:
         found = set_of(cell, self._data)
         if found.name not in self._sets:
             found.check()
-            self.changed_since.update(of_other_code(read_plan(found.folder), found.wanted))
+            self._of_other_code.update(of_other_code(read_plan(found.folder), found.wanted))
         data = self._sets.setdefault(found.name, found)
         if others := differing(data.wanted, found.wanted):
             raise UserError(f"{found.name} is asked for with two values of {others[0]}: make it an axis or a block's")
         return data
 
     def _collection(self, cell: GridCell, data: DataSet) -> Job:
-        words = (*COMMANDS[data.section], *words_of(told(cell, data.section)), "--out", str(data.folder))
-        job = Job(
-            f"{DATA}/{data.name}", data.section, data.folder, words, done=data.foreign, settings=cost_of(data.wanted)
-        )
+        words = [*COMMANDS[data.section], *words_of(told(cell, data.section)), "--out", str(data.folder)]
+        settings = _words_by_name(data.wanted)
+        job = Job(f"{DATA}/{data.name}", data.section, data.folder, words, done=data.foreign, settings=settings)
         return self._jobs.setdefault((data.section, "", data.name), job)
 
     def _training(self, cell: GridCell, section: str, data: DataSet, values: dict[str, Any], before: list[Job]) -> Job:
-        recipe = recipe_of(cell, section)
-        key = (section, recipe, data.name)
+        own = recipe_of(cell, section)
+        key = (section, own, data.name)
         if key in self._jobs:
             return self._jobs[key]
-        run = self._here.of(recipe, data)
+        run = _found(self._here, own, data)
         if run is not None:
-            self.changed_since.update(of_other_code(run.record, values))
-            self.on_other_encoders += section == "finetune" and _is_on_another(run, before[-1].folder / "encoder")
+            self._of_other_code.update(of_other_code(run.record, values))
+            self._on_other_encoders += section == "finetune" and _is_on_another(run, before[-1].folder / "encoder")
             name, content = run.folder.relative_to(self._out).as_posix(), run.data
         else:
-            name, content = self._free(run_folder(cell, section, data.name, values), recipe), ""
-        self._taken.add(name)
+            name, content = self._free(_run_folder(cell, section, data.name, values), own), ""
+        self._names[name] = own
         folder = self._out / name
         places = {"data": data.folder} | ({"encoder": before[-1].folder / "encoder"} if section == "finetune" else {})
-        words = (*COMMANDS[section], *words_of(told(cell, section) | places | {"out": folder}))
-        needs = tuple(job.name for job in before)
-        costs = cost_of(values)
-        self._jobs[key] = Job(name, section, folder, words, needs, settings=costs, recipe=recipe, content=content)
+        words = [*COMMANDS[section], *words_of(told(cell, section) | places | {"out": folder})]
+        needs, settings = [job.name for job in before], _words_by_name(values)
+        self._jobs[key] = Job(name, section, folder, words, needs, False, settings, own, content)
         return self._jobs[key]
+
+    def _free(self, name: str, own: str) -> str:
+        """A name that no other run has, be it in the plan, in another grid's, or from an earlier sweep."""
+        further = f"{name}~{own[:6]}"  # a second run of one recipe is on a set of other content
+        candidates = chain([name, further], (f"{further}.{number}" for number in count(2)))
+        return next(
+            one for one in candidates if self._out / one not in self._folders and self._names.get(one, own) == own
+        )
 
     def _ask(self, job: Job, data: DataSet) -> None:
         """Want a job for itself, not for those that need it; a kept row is as good."""
         if job.name in self._asked:
             return
         self._asked.add(job.name)
-        kept = self._kept.of(job.recipe, data)
-        if kept is None and self._kept.alike(job.recipe, data):
-            self.of_other_content[data.name] += 1
-        if kept is not None and kept.seconds is not None:
-            self.changed_since.update(of_other_code(kept.record, dict(job.settings)))
+        run = _found(self._kept, job.recipe, data)
+        if run is None and any(data.alike(other.record) for other in self._kept.get(job.recipe, ())):
+            self._of_other_content[data.name] += 1
+        if run is not None and run.finished:
+            self._of_other_code.update(of_other_code(run.record, job.settings))
             self._jobs[job.section, job.recipe, data.name] = replace(job, done=True)
 
-    def _needed(self) -> list[Job]:
+    def needed(self) -> list[Job]:
         """The finished jobs, those that were asked for, and those that an unfinished one needs."""
         found: list[Job] = []
         needed: set[str] = set()
@@ -193,14 +342,41 @@ class JobPlanner:
             found.append(job)
         return found[::-1]
 
-    def _free(self, name: str, recipe: str) -> str:
-        """A name that no other run has, be it in the plan, in another grid's, or from an earlier sweep."""
-        own = f"{name}~{recipe[:6]}"  # further runs of one recipe are on sets of other content
-        names = chain([name, own], (f"{own}.{number}" for number in count(2)))
-        return next(name for name in names if name not in self._taken and not self._of_another(name, recipe))
+    def warnings(self) -> Iterator[str]:
+        """What counts, or does not, although one may think otherwise."""
+        for name, number in self._of_other_content.items():
+            line = f"{number} kept runs are of a set collected alike, but with other content (from another machine?)"
+            yield f"{name}: {line}: they do not count"
+        for part, number in self._of_other_code.items():
+            yield f"{part}: {number} sets or runs count, though its code has changed since they began"
+        if number := self._on_other_encoders:
+            yield f"{number} policies count that began with other encoders than their pretrainings' folders now hold"
 
-    def _of_another(self, name: str, recipe: str) -> bool:
-        return self._out / name in self._here or self._of_others.get(name, recipe) != recipe
+
+def _by_recipe(runs: Iterable[FoundRun]) -> dict[str, list[FoundRun]]:
+    found = defaultdict(list)
+    for run in runs:
+        found[run.recipe].append(run)
+    return dict(found)
+
+
+def _found(runs: Mapping[str, list[FoundRun]], own: str, data: DataSet) -> FoundRun | None:
+    """The run of a recipe on a set, a finished one if there is one; images that it adds are those of now."""
+    fitting = [run for run in runs.get(own, ()) if run.on_one_set and data.made(run.record) and _adds_the_same(run)]
+    return max(fitting, key=lambda run: run.finished, default=None)
+
+
+def _adds_the_same(run: FoundRun) -> bool:
+    """Whether the images that a run in a maze added, if it did, are still in their folder."""
+    images = run.record.get("inputs", {}).get("exogenous")
+    return images is None or images == _images_in(run.record["config"]["exogenous"])
+
+
+@cache
+def _images_in(source: str) -> str:
+    from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
+
+    return source_fingerprint(source)
 
 
 def _is_on_another(run: FoundRun, encoder: Path) -> bool:
@@ -208,6 +384,27 @@ def _is_on_another(run: FoundRun, encoder: Path) -> bool:
     return (encoder / CONFIG).is_file() and run.record.get("inputs", {}).get("encoder") != encoder_hash(encoder)
 
 
-def cost_of(values: Mapping[str, Any]) -> tuple[tuple[str, str], ...]:
-    """Settings that a job's cost depends on, in order, their values as words."""
-    return tuple(sorted((name, str(value)) for name, value in settings_of(values).items()))
+def _run_folder(cell: GridCell, section: str, data: str, values: dict[str, Any]) -> str:
+    """Where a run goes, below the sweep's folder: TASK/QUALITY/CORRUPTION/METHOD,what_else_tells_it/seedN/..."""
+    if section == "navigation_train":
+        return f"{data}/{values['method']}{_extras(cell, section)}/seed{cell.seed}"
+    shared = f"{data}/{values['corruption']}/{values['method']}{_extras(cell, 'pretrain')}/seed{cell.seed}"
+    if section == "pretrain":
+        return f"{shared}/pretrain"
+    return f"{shared}/finetune-{values['algorithm']}{_extras(cell, section)}"
+
+
+def _extras(cell: GridCell, section: str) -> str:
+    """The other settings of a section that tell a cell from others: ",history=gru,max_k=1"; or their hash."""
+    named = {name: cell.sections[section][name] for name in cell.named.get(section, ())}
+    words = (f",{name}={value}" for name, value in named.items() if name not in _IN_NAMES[section])
+    extras = "".join(words).replace("/", "_")
+    return extras if len(extras.encode()) <= _LONGEST else f",{content_hash(extras)}"
+
+
+def _in_words(name: str, value: Any) -> str:
+    return f"the default {name}" if value is None else f"{name} {value}"
+
+
+def _words_by_name(values: Mapping[str, Any]) -> dict[str, str]:
+    return {name: str(value) for name, value in settings_of(values).items()}

@@ -1,11 +1,8 @@
-"""What a sweep knows of each stage: its command, its settings, and how the settings of a run are recorded.
-
-Settings are parsed once for all seeds and folders, by the stage's own command line.
-"""
+"""What a sweep knows of each stage: its command, its settings, and how the settings of a run are recorded."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable
+from collections.abc import Sequence
 from dataclasses import replace
 from functools import cache
 from typing import Any
@@ -14,15 +11,12 @@ from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
 from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_number
 from vd4rl_pomdp.core.options import flat, words_of
 from vd4rl_pomdp.core.settings import settings_of
-from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.identity import recipe
-from vd4rl_pomdp.sweeps.fits import check_fit
 from vd4rl_pomdp.sweeps.grid import GridCell, Values
 
-_NOWHERE = "-"
-"""Stands for a path while settings are parsed."""
 COMMANDS = {
     "collect": ("data", "collect"),
     "pretrain": ("pretrain",),
@@ -33,7 +27,7 @@ COMMANDS = {
 """Words of every section's command."""
 STAGES = {"pretrain": "pretrain", "finetune": "finetune", "navigation_train": "navigation"}
 """What a training's record calls its stage, by section."""
-_READS = {"collect": (), "pretrain": ("data",), "finetune": ("data", "encoder"), "navigation_train": ("data",)}
+_READS = {"pretrain": ("data",), "finetune": ("data", "encoder"), "navigation_train": ("data",)}
 """Folders that a stage is given, beside the one it writes."""
 _TAKES = {"collect": (), "navigation_collect": ("preset",)}
 """What a stage takes of the shared settings, where that is not all of them."""
@@ -45,104 +39,59 @@ def told(cell: GridCell, section: str) -> Values:
     return {name: value for name, value in cell.shared.items() if name in takes} | cell.sections[section]
 
 
-def check_cells(cells: Iterable[GridCell], grid: str, collects: Callable[[GridCell], bool] = lambda _: True) -> None:
-    """`check_cell` for cells of a grid, whose name goes before what is wrong with one.
+def check_cells(cells: Sequence[GridCell], grid: str) -> None:
+    """Raise UserError, which begins with the grid's name, for settings that a stage does not have or take.
 
-    Args:
-        cells: the cells.
-        grid: the grid's name.
-        collects: whether a cell's set is one that this package collects, not one that somebody put there.
+    Whether they fit the set, the machine and one another the stage itself says: its job then fails by itself.
     """
     try:
         for cell in cells:
-            check_cell(cell, collects(cell))
+            refuse_number("seed", cell.seed, 0, MAX_SEED)
+        for cell in {repr((cell.shared | {"seed": 0}, cell.sections)): cell for cell in cells}.values():
+            config_of(cell, cell.chain[0])
+            for section in cell.chain[1:]:
+                recorded(cell, section)
     except UserError as error:
         raise type(error)(f"{grid}: {error}") from error
 
 
-def check_cell(cell: GridCell, collects: bool = True) -> None:
-    """Raise UserError for settings that a stage would refuse, by themselves or on the set that the cell collects."""
-    configs = {section: config_of(cell, section) for section in cell.chain}
-    if collects and (check := _CHECKS.get(cell.chain[0])):
-        check(configs[cell.chain[0]])
-    check_fit(configs)
-    if "finetune" in cell.chain:
-        _finetuning(cell)
-
-
 def config_of(cell: GridCell, section: str) -> Any:
-    """A stage's settings, its folders left open."""
+    """A stage's settings, as its own command line reads them, its folders left open."""
     settings = told(cell, section)
-    seed = settings.pop("seed", 0)
-    refuse_number("seed", seed, 0, MAX_SEED)
-    return replace(_parsed(section, tuple(words_of(settings))), seed=seed)
+    later = {"seed": settings.pop("seed", 0)}
+    if section == "collect" and settings.get("quality", "expert") not in SET_QUALITIES:
+        later |= {"quality": settings["quality"]}  # of a set of one's own, which no command collects
+        settings |= {"quality": "expert"}
+    try:
+        return replace(_parsed(section, tuple(words_of(settings))), **later)
+    except UserError as error:
+        raise type(error)(f"{section}: {error}") from error
 
 
 @cache
 def _parsed(section: str, words: tuple[str, ...]) -> Any:
-    command = " ".join(COMMANDS[section])
-    places = words_of(dict.fromkeys((*_READS.get(section, ()), "out"), _NOWHERE))
-    return _PARSERS[section]([*words, *places], f"vd4rl-pomdp {command}")
+    """The settings of a section, once for all seeds."""
+    program = " ".join(("vd4rl-pomdp", *COMMANDS[section]))
+    line = [*words, *words_of(dict.fromkeys((*_READS.get(section, ()), "out"), "-"))]
+    if section == "collect":
+        from vd4rl_pomdp.data.collect import CollectConfig
 
+        return parse(CollectConfig, line, program)
+    if section == "pretrain":
+        from pretrain.config import PretrainConfig
 
-def _collect(words: list[str], program: str) -> Any:
-    from vd4rl_pomdp.data.collect import CollectConfig
+        return parse_stage(PretrainConfig, line, program)
+    if section == "finetune":
+        from finetune.config import FinetuneConfig
 
-    return parse(CollectConfig, words, program)
+        return parse_stage(FinetuneConfig, line, program)
+    if section == "navigation_collect":
+        from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig
 
-
-@cache
-def _check_collection(config: Any) -> None:
-    from vd4rl_pomdp.data.collect import check_config
-
-    check_config(config)
-
-
-def _pretrain(words: list[str], program: str) -> Any:
-    from pretrain.config import PretrainConfig
-
-    config = parse_stage(PretrainConfig, words, program)
-    config.check()
-    return config
-
-
-def _finetune(words: list[str], program: str) -> Any:
-    from finetune.config import FinetuneConfig
-
-    return parse_stage(FinetuneConfig, words, program)
-
-
-def _navigation_collect(words: list[str], program: str) -> Any:
-    from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig
-
-    return with_presets(MazeCollectConfig, PRESETS, words, program)
-
-
-@cache
-def _check_maze_collection(config: Any) -> None:
-    from vd4rl_pomdp.studies.navigation.collect import check_config
-
-    check_config(config)
-
-
-def _navigation_train(words: list[str], program: str) -> Any:
+        return with_presets(MazeCollectConfig, PRESETS, line, program)
     from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 
-    return parse_stage(NavigationConfig, words, program)
-
-
-_PARSERS: dict[str, Callable[[list[str], str], Any]] = {
-    "collect": _collect,
-    "pretrain": _pretrain,
-    "finetune": _finetune,
-    "navigation_collect": _navigation_collect,
-    "navigation_train": _navigation_train,
-}
-_CHECKS: dict[str, Callable[[Any], None]] = {
-    "collect": _check_collection,
-    "navigation_collect": _check_maze_collection,
-}
-"""What refuses a set that cannot be collected, by section."""
+    return parse_stage(NavigationConfig, line, program)
 
 
 def collection_of(cell: GridCell) -> Values:
@@ -168,13 +117,15 @@ def recipe_of(cell: GridCell, section: str) -> str:
 
 def recorded(cell: GridCell, section: str) -> Values:
     """The config that a training records, folders aside."""
-    config = _finetuning(cell) if section == "finetune" else config_of(cell, section)
+    config = config_of(cell, section)
     if section == "pretrain":  # its set tells it the task
         config = replace(config, task=cell.value("task") or config.task)
+    if section == "finetune":
+        config = _as_trained(cell, config)
     return jsonable(flat(config))
 
 
-def _finetuning(cell: GridCell) -> Any:
+def _as_trained(cell: GridCell, config: Any) -> Any:
     """The config that a fine-tuning trains with: what its encoder's method cannot read is no part of it."""
     from finetune.settings import as_trained
     from pretrain.config import history_of
@@ -183,6 +134,5 @@ def _finetuning(cell: GridCell) -> Any:
     before = config_of(cell, "pretrain")
     method = METHODS.named(before.method)
     remembers = history_of(before.method, method, before.history) != "none"
-    task = TASKS.get(cell.value("task"))  # none in a cell that will be refused, for it has no set
-    decisions = task.decisions if task else 0
-    return as_trained(config_of(cell, "finetune"), before.method, method.end_to_end, remembers, decisions)
+    decisions = TASKS.named(cell.value("task")).decisions
+    return as_trained(config, before.method, method.end_to_end, remembers, decisions)

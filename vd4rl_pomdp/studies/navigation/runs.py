@@ -61,7 +61,7 @@ class NavigationRun:
     @property
     def command(self) -> str:
         """The command that trains it."""
-        return self.result.files["results"].get("command", self.result.record["command"])
+        return self.result.files["results"]["command"]
 
     @property
     def settings(self) -> dict[str, str]:
@@ -145,6 +145,8 @@ def _read_run(result: Result) -> NavigationRun:
     """A finished run from its files; raises UserError where they are damaged."""
     try:
         config, results, timing = result.record["config"], result.files["results"], result.files["timing"]
+        if missing := sorted({"maze", "set", "command", "rows"} - results.keys()):
+            raise ValueError(f"results.json has no {missing[0]}")
         for name, value, known in (("maze", results["maze"], MAZES), ("preset", config["preset"], PRESETS)):
             if value not in known:
                 raise ValueError(f"its {name} is {value!r}")
@@ -161,13 +163,12 @@ def _read_run(result: Result) -> NavigationRun:
             bool(config.get("literal_future", False)),
         )
         values = {measure_of(row): float(f"{row['value']:.6g}") for row in results["rows"]}
-        run = NavigationRun(result, condition, values)
-        assert run.settings, "a run without a set"
     except (KeyError, TypeError, ValueError) as error:
         raise UserError(f"{result.place}: its results are damaged ({error}); train it again") from error
     if wrong := {measure.measure: value for measure, value in values.items() if not math.isfinite(value)}:
         name, value = next(iter(wrong.items()))
         raise UserError(f"{result.place}: a {name} is {value}: the run has diverged; train it again or leave it out")
+    run = NavigationRun(result, condition, values)
     if result.folder and run.trajectory is None:
         raise UserError(f"{result.path / TRAJECTORY_FILE}: is missing or no file; train it again")
     return run

@@ -8,7 +8,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
-from tests.sweeps.executors.waiting import until
+from tests.helpers_sweeps import until
 
 CPUS = 8
 CONFIGURATION = """
