@@ -38,6 +38,7 @@ SLIPS = [
     (["finetune", "--encoder", "a", "--data", "b", "--out", "c", "--veiws", "3"], "Perhaps you meant: --views"),
     (["finetune", "--encoder", "nowhere", "--data", "nowhere", "--out", "x"], "nowhere"),
     (["data", "collect", "--task", "ant", "--quality", "random", "--out", "x"], "unknown task 'ant'"),
+    (["evaluate", "nowhere", "--out", "new.csv"], "nowhere: holds no evaluated run"),
     (["navigation", "collect"], "--maze"),
     (["report"], "no runs are named: name at least one"),
     (["report", "nowhere"], "nowhere: no such folder"),
