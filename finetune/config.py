@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, ClassVar
 
@@ -12,7 +12,7 @@ import tyro
 from finetune.algorithms import ALGORITHMS
 from finetune.histories import HistoryOptions
 from vd4rl_pomdp.core.errors import MAX_SEED, refuse_outside
-from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
+from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig, flat
 from vd4rl_pomdp.core.tasks import FRAME_SIZES, MOST_EPISODES
 from vd4rl_pomdp.runs.device import Precision
 from vd4rl_pomdp.runs.metrics import WandbMode
@@ -110,3 +110,21 @@ class FinetuneConfig(StageConfig):
             shift=(0, FRAME_SIZES[1] - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
             eval_length=1, log_every=1, checkpoint_every=1, workers=0,
         )  # fmt: skip
+
+
+def as_trained(config: FinetuneConfig, algorithm: str, remembers: bool, decisions: int) -> FinetuneConfig:
+    """The settings as an encoder's policy is trained with them: what the encoder decides, and only what it reads.
+
+    Args:
+        config: the settings that were told.
+        algorithm: the algorithm that the encoder's method brings along, if it has no frozen stage; else empty.
+        remembers: whether the encoder has a memory.
+        decisions: of an episode of the task; an evaluation of the default length is one of whole episodes.
+    """
+    if config.eval_length == FinetuneConfig.eval_length:
+        config = replace(config, eval_length=max(config.eval_length, decisions))
+    if algorithm:
+        told = config.defaults(config.preset) | flat(config)
+        options = ALGORITHMS.named(algorithm).options.fill(told)
+        config = replace(config, algorithm=algorithm, options=options, views=0)
+    return config if remembers and not algorithm else replace(config, memory=NO_OPTIONS)

@@ -21,14 +21,13 @@ from vd4rl_pomdp.data.reference import Reference, action_error
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn, Observation
 from vd4rl_pomdp.envs.make import layout_of
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.encoder_folder import CONFIG, WEIGHTS, load_encoder, read_record
+from vd4rl_pomdp.nn.encoder_folder import load_encoder, read_record
 from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
 from vd4rl_pomdp.policies.actor import Actor, read_actor
-from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, LABELS_FILE
+from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE
 from vd4rl_pomdp.runs.episodes import read_episodes
-from vd4rl_pomdp.runs.files import read_json, sha256
-from vd4rl_pomdp.runs.run import remedy
+from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.workers import run_jobs
 
 EVALUATION_SEED = 20_000
@@ -139,8 +138,11 @@ def episode_rows(episodes: list[Episode], labels: dict[str, Any]) -> list[dict[s
 
 
 def _run_episode(job: EpisodeJob) -> Episode:
-    agent = _agent(job.encoder, job.policy, _content(job.encoder, job.policy))
-    place = (job.task, job.corruption, "fast", job.length, agent.picture_size, _draws(agent, job))
+    written = tuple(folder.stat().st_mtime_ns for folder in (job.encoder, job.policy) if folder.exists())
+    agent = _agent(job.encoder, job.policy, written)
+    # a film shows all frames; else no frame is drawn that its agent does not see
+    draws: Drawn = "all" if job.film else "nothing" if agent.encoder.reads_state else "seen"
+    place = (job.task, job.corruption, "fast", job.length, agent.picture_size, draws)
     return _play(agent, _environment(*place), job)
 
 
@@ -151,22 +153,9 @@ def _environment(*place: Any) -> CorruptedEnv:
 
 
 @lru_cache(maxsize=1)
-def _agent(encoder: Path, policy: Path, content: tuple[str, ...]) -> Agent:
-    """The agent of two folders, read anew when another is asked for or they hold something else."""
+def _agent(encoder: Path, policy: Path, written: tuple[int, ...]) -> Agent:
+    """The agent of two folders, read anew when another is asked for or one was `written` again."""
     return Agent(load_encoder(encoder)[0], load_policy(policy))
-
-
-def _content(encoder: Path, policy: Path) -> tuple[str, ...]:
-    """Hashes of what the folders of an agent hold; files of both have the same names."""
-    files = (folder / name for folder in (encoder, policy) for name in (CONFIG, WEIGHTS))
-    return tuple(sha256(file) for file in files if file.exists())  # loading says what is missing
-
-
-def _draws(agent: Agent, job: EpisodeJob) -> Drawn:
-    """A film shows all frames; else no frame is drawn that its agent does not see."""
-    if job.film:
-        return "all"
-    return "nothing" if agent.encoder.reads_state else "seen"
 
 
 def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
@@ -227,88 +216,60 @@ def _mean(values: Iterable[Any]) -> float | None:
     return float(np.mean(found)) if found else None
 
 
-@dataclass(frozen=True)
-class EvaluatedRun:
-    """A policy played again."""
-
-    rows: list[dict[str, Any]]
-    """Of `episodes.csv`; `corruption` is that of training, `step` that of the policy that played."""
-    episodes: list[Episode]
-    """Their episodes, in the same order."""
+def own_and_none(corruption: CorruptionConfig) -> list[CorruptionConfig]:
+    """The corruptions that a policy trained under one is evaluated under: that one, and none at all."""
+    clean = CorruptionConfig.of("none")
+    return [corruption] if corruption.corruption == clean.corruption else [corruption, clean]
 
 
-def evaluations_of(run: Path) -> list[dict[str, Any]]:
-    """The rows of a fine-tuning run's own evaluations; UserError for a folder without any."""
-    if rows := read_episodes(run / EPISODES_FILE):
-        return rows
-    raise UserError(f"{run}: holds no evaluated run; name a folder that `vd4rl-pomdp finetune` wrote")
+def jobs_of(
+    run: Path, task: Task, under: list[CorruptionConfig], episodes: int, length: int, film: bool = False
+) -> list[EpisodeJob]:
+    """The episodes of an evaluation of a run's policy, under each corruption in turn; a film is of the very first."""
+    actor = Reference.read(run).actor_file
+    length = min(length, task.decisions)
+    return [
+        EpisodeJob(
+            run / "encoder", run / "policy", task, corruption, episode, film and corruption is under[0] and not episode,
+            length, actor,
+        )
+        for corruption in under
+        for episode in range(episodes)
+    ]  # fmt: skip
 
 
-def evaluate_run(run: Path, corruption: str | None, episodes: int, workers: int) -> EvaluatedRun:
-    """Evaluate a fine-tuning run's policy.
+def evaluate_run(
+    run: Path, corruption: str | None, episodes: int, workers: int
+) -> tuple[list[dict[str, Any]], list[Episode]]:
+    """Evaluate a fine-tuning run's policy again.
 
     Args:
         run: its folder.
         corruption: name of the corruption to evaluate under, with the run's own options where it reads them; None for
             the run's own, and for none at all, too.
-        episodes: how many.
+        episodes: how many under each corruption, as long as those of the run's own evaluations.
         workers: processes, 0 for every core.
 
     Returns:
-        `episodes` of them under each corruption, as long as those of the run's own evaluations.
+        Rows of `episodes.csv` (`corruption` is that of training, `step` that of the policy), and their episodes.
 
     Raises:
-        UserError: an unknown corruption, no episode, a folder without an evaluated run, or one whose policy changes
-            while it plays.
+        UserError: an unknown corruption, no episode, or a folder without an evaluated run.
     """
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
-    evaluated = evaluations_of(run)
-    labels = read_json(run / LABELS_FILE)
-    missing = [name for name in LABELS if not isinstance(labels.get(name), str | int)]
-    if missing:
-        raise UserError(f"{run / LABELS_FILE}: has no {missing[0]!r}; {remedy(run)}")
-    card = load_encoder(run / "encoder")[1]
+    evaluated = read_episodes(run / EPISODES_FILE)
+    if not evaluated:
+        raise UserError(f"{run}: holds no evaluated run; name a folder that `vd4rl-pomdp finetune` wrote")
+    card, record = load_encoder(run / "encoder")[1], read_json(run / CONFIG_FILE)
     what = "this policy was trained, and it plays by the new; take the earlier code, or train it again"
-    record = _record(run)
     warn_of_other_code(run, record, read_record(run / "encoder").parts, what)
-    task = TASKS.named(card.task)
-    chosen = own_and_none(CorruptionConfig.fill(card.corruption))
+    under = own_and_none(CorruptionConfig.fill(card.corruption))
     if corruption is not None:
-        chosen = [CorruptionConfig.fill(card.corruption | {"corruption": corruption})]
-    for one in chosen:
+        under = [CorruptionConfig.fill(card.corruption | {"corruption": corruption})]
+    for one in under:
         one.check()
-    actor = Reference.read(run).actor_file
-    encoder, policy, length = run / "encoder", run / "policy", _length(record, task)
-    jobs = [
-        EpisodeJob(encoder, policy, task, one, episode, film=False, length=length, actor=actor)
-        for one in chosen
-        for episode in range(episodes)
-    ]
-    content = _content(encoder, policy)
-    step = policy_step(policy)
-    if step is None:  # of an earlier version
-        step = max(row["step"] for row in evaluated)
+    labels = {name: evaluated[0][name] for name in LABELS} | {"step": policy_step(run / "policy")}
+    jobs = jobs_of(run, TASKS.named(card.task), under, episodes, record["config"]["eval_length"])
     played = evaluate(jobs, workers)
-    if _content(encoder, policy) != content:
-        raise UserError(f"{run}: wrote another policy while this one played; evaluate it when it is done")
-    return EvaluatedRun(episode_rows(played, labels | {"step": step}), played)
-
-
-def _length(record: dict[str, Any], task: Task) -> int:
-    """Most decisions in an episode of a run's evaluations; the task's where the run does not tell."""
-    config = record.get("config")
-    told = config.get("eval_length") if isinstance(config, dict) else None
-    return min(told, task.decisions) if isinstance(told, int) else task.decisions
-
-
-def _record(run: Path) -> dict[str, Any]:
-    """A run's config.json; nothing where an early version kept none."""
-    file = run / CONFIG_FILE
-    return read_json(file) if file.exists() else {}
-
-
-def own_and_none(corruption: CorruptionConfig) -> list[CorruptionConfig]:
-    """The corruptions that a policy trained under one is evaluated under: that one, and none at all."""
-    clean = CorruptionConfig.of("none")
-    return [corruption] if corruption.corruption == clean.corruption else [corruption, clean]
+    return episode_rows(played, labels), played

@@ -1,8 +1,10 @@
-"""Frozen means cacheable: encode the set once under several draws of corruption and shift, train on the features."""
+"""Frozen means cacheable: encode the set once under several draws of corruption and shift, train on the features.
+
+With `--views 0` every batch is encoded anew instead.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -15,16 +17,14 @@ from torch import Tensor
 from finetune.histories import Histories, HistoryOptions, draw_lengths, read_both_ends, read_whole
 from vd4rl_pomdp.core.errors import disk_errors
 from vd4rl_pomdp.core.options import Options
-from vd4rl_pomdp.core.reading import regular
 from vd4rl_pomdp.core.types import Batch
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.data import Dataset, StateView, View
 from vd4rl_pomdp.data.samplers import Sampler
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import StateFrame
-from vd4rl_pomdp.runs import PROBE_FILE
 from vd4rl_pomdp.runs.device import Precision, autocast
-from vd4rl_pomdp.runs.files import read_json, replacing_file, sha256, write_json
+from vd4rl_pomdp.runs.files import replacing_file
 from vd4rl_pomdp.runs.progress import ProgressLine
 
 CHUNK = 128
@@ -94,72 +94,34 @@ class FrozenEncoder:
         return self.rows(rows, key.expand(len(rows)), view)
 
 
-class FeatureFile:
-    """A run's features on disk, for its resumption; they count only if they were made of these inputs by this code."""
+def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: Path) -> Tensor:
+    """Encode the whole set under `views` draws, or read what this run encoded before.
 
-    def __init__(self, run: Path, made_of: Mapping[str, Any]) -> None:
-        self._path, self._origin = run / "features.npy", run / "features.json"
-        self._made_of, self._probed = made_of, run / PROBE_FILE
-
-    @property
-    def exists(self) -> bool:
-        """Whether there are features, be they made of these or not."""
-        return self._path.exists() and self._origin.exists()
-
-    def read(self) -> np.ndarray | None:
-        """What was written, None if that is missing or was made of something else."""
-        with disk_errors(self._path):
-            if not self.exists:
-                return None
-            return np.load(self._path) if read_json(self._origin) == self._description() else None
-
-    def write(self, features: np.ndarray) -> None:
-        """Keep the features; what was probed on others goes."""
-        self._probed.unlink(missing_ok=True)
-        with replacing_file(self._path) as fresh, fresh.open("wb") as file:
-            np.save(file, features)
-        write_json(self._origin, self._description())
-
-    def remove(self) -> None:
-        """The run needs them no more."""
-        self._origin.unlink(missing_ok=True)
-        self._path.unlink(missing_ok=True)
-
-    def _description(self) -> dict[str, Any]:
-        return {**self._made_of, "sha256": sha256(regular(self._path))}
-
-
-def feature_type(encoder: Encoder) -> type[np.floating]:
-    """What features are kept as: half precision, but for states, which may hardly differ and are then scaled up."""
-    return np.float32 if encoder.reads_state else np.float16
-
-
-def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: FeatureFile) -> Tensor:
-    """Encode the whole set under `views` draws, or read what was encoded before.
+    Args:
+        frozen: the encoder and its set.
+        histories: which features there are.
+        views: how many draws of corruption and shift.
+        kept: file that keeps the features for the run's resumption; the run refuses another set or encoder itself.
 
     Returns:
-        (views, features, D) on the data set's device, float16 of an encoder's and float32 of simulator states, numbered
-        as `Histories` says; `kept` keeps them for the run's resumption.
+        (views, features, D) on the data set's device, float16 of pixels and float32 of simulator states, which may
+        hardly differ and are then scaled up; numbered as `Histories` says.
     """
-    features = kept.read()
-    if features is None:
-        features = _encode_all(frozen, histories, views)
-        kept.write(features)
-    return torch.from_numpy(features).to(frozen.device)
-
-
-@torch.no_grad()
-def _encode_all(frozen: FrozenEncoder, histories: Histories, views: int) -> np.ndarray:
-    episodes = frozen.dataset.num_episodes
-    out = np.empty((views, histories.features, frozen.encoder.dim), feature_type(frozen.encoder))
-    with ProgressLine("encode", views * episodes, "episodes") as progress:
+    if kept.exists():
+        with disk_errors(kept):
+            return torch.from_numpy(np.load(kept)).to(frozen.device)
+    episodes, dtype = frozen.dataset.num_episodes, np.float32 if frozen.encoder.reads_state else np.float16
+    features = np.empty((views, histories.features, frozen.encoder.dim), dtype)
+    with torch.no_grad(), ProgressLine("encode", views * episodes, "episodes") as progress:
         for number in range(views):
             view, random = frozen.view(number), histories.of_view(number)
             for episode in range(episodes):
                 frames = frozen.frames(episode, view)
-                random.fill(torch.from_numpy(out[number]), frozen.encoder, frames, episode)
+                random.fill(torch.from_numpy(features[number]), frozen.encoder, frames, episode)
                 progress.advance()
-    return out
+    with replacing_file(kept) as fresh, fresh.open("wb") as file:
+        np.save(file, features)
+    return torch.from_numpy(features).to(frozen.device)
 
 
 class FeatureSampler:

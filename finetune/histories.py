@@ -15,7 +15,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.core.errors import UserError, flag_of
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.core.seeding import stream_generator
 from vd4rl_pomdp.data import Dataset
@@ -52,20 +52,6 @@ class HistoryOptions(Options):
                 f"--shortest-history is {self.shortest_history}, --longest-history {self.longest_history}: "
                 "choose a longest that is no shorter"
             )
-        for name, reason in self._unread().items():
-            if getattr(self, name) != getattr(HistoryOptions, name):
-                raise UserError(f"{flag_of(name)} is not read: {reason}; leave it out")
-
-    def _unread(self) -> dict[str, str]:
-        """Options that have no effect beside the others, and why."""
-        unread: dict[str, str] = {}
-        if not self.random_histories:
-            unread |= dict.fromkeys(("shortest_history", "longest_history"), "--random-histories is 0")
-        elif 0 < self.history_window <= self.shortest_history:
-            unread["random_histories"] = "--history-window is no longer than --shortest-history"
-        if self.readout == "frame":
-            unread |= dict.fromkeys(("history_window", "random_histories"), "--readout frame reads no history")
-        return unread
 
     @property
     def encoder_changes(self) -> dict[str, Any]:

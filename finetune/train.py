@@ -1,4 +1,4 @@
-"""The fine-tuning loop: frozen encoder, cached features, an algorithm, evaluation; resumable to the bit on a CPU."""
+"""`vd4rl-pomdp finetune`: a frozen encoder, features of the set, an algorithm, and its evaluations."""
 
 from __future__ import annotations
 
@@ -8,17 +8,18 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 import torch
 
 from finetune.algorithms import ALGORITHMS, Algorithm
-from finetune.config import FinetuneConfig
+from finetune.algorithms.algorithm import ReturnOptions
+from finetune.config import FinetuneConfig, as_trained
 from finetune.end_to_end import EndToEnd
-from finetune.evaluations import POLICY, Evaluations, labels
-from finetune.features import STAGE, ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
+from finetune.evaluation import episode_rows, evaluate, jobs_of, own_and_none
+from finetune.features import STAGE, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories, HistoryOptions
 from finetune.path import DataPath
-from finetune.settings import as_trained, check_n_step, return_options
-from vd4rl_pomdp.core.errors import refuse_number, refuse_outside
+from vd4rl_pomdp.core.errors import refuse_outside
 from vd4rl_pomdp.core.registry import warn_of_other_code
 from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.core.tasks import TASKS, UNKNOWN_QUALITY
@@ -35,57 +36,73 @@ from vd4rl_pomdp.nn.encoder_folder import (
     encoder_hash,
     load_encoder,
     read_record,
+    save_encoder,
     tell_probe,
 )
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.nn.probes import probe_state
 from vd4rl_pomdp.policies.actor import read_actor
-from vd4rl_pomdp.runs import LABELS_FILE, PRETRAIN_TIMING_FILE, PROBE_FILE, RENDER_FILE, TIMING_FILE
+from vd4rl_pomdp.runs import (
+    EPISODES_FILE,
+    FILM_FILE,
+    LABELS_FILE,
+    PRETRAIN_TIMING_FILE,
+    PROBE_FILE,
+    RENDER_FILE,
+    TIMING_FILE,
+    interrupt,
+)
 from vd4rl_pomdp.runs.device import pick_device
-from vd4rl_pomdp.runs.files import read_json, write_json
-from vd4rl_pomdp.runs.loop import training
+from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, read_episodes
+from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_json
+from vd4rl_pomdp.runs.loop import Loop, training
+from vd4rl_pomdp.runs.metrics import EVALUATION
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.run import RunFolder
 
-RESULTS = (*POLICY, *FILES_OF_RUN)
-"""What a finished run holds, beside the rows of its evaluations."""
+RESULTS = ("policy/config.json", "policy/model.safetensors", EPISODES_FILE, *FILES_OF_RUN)
+"""What a finished run holds."""
+FEATURES_FILE = "features.npy"
 STANDARDISED_BY = 1024
 """Least transitions whose representations give their means and deviations, where none are kept (`--views 0`)."""
 
 
 def finetune(config: FinetuneConfig) -> RunFolder:
-    """Run the stage, or go on with it; writes the policy and `episodes.csv` into the run's folder."""
+    """Run the stage, or resume it; writes the policy and `episodes.csv` into the run's folder."""
     config.check()
     refuse_inside(config.out)
-    device = pick_device(config.device)
     dataset = open_dataset(config.data)
     dataset.require_transitions()
     encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frame_size)
     refuse_outside(config, shift=(0, dataset.frame_size - 1))
-    decisions = TASKS.named(card.task).decisions
-    refuse_number("eval_length", config.eval_length, 1, max(decisions, FinetuneConfig.eval_length))
-    config = as_trained(config, card.method, card.end_to_end, encoder.memory is not None, decisions)
+    config = as_trained(config, card.end_to_end, encoder.memory is not None, TASKS.named(card.task).decisions)
     if isinstance(config.memory, HistoryOptions):
         encoder.config = replace(encoder.config, **config.memory.encoder_changes)
     if encoder.reads_state:
         dataset.require_states()
-    check_n_step(config, int((dataset.episode_end - dataset.episode_start).max()) - 1)
+    device = pick_device(config.device)
     untold = card.quality if card.data == dataset.fingerprint else UNKNOWN_QUALITY
     card = replace(card, quality=dataset.quality or untold)  # the policy's set names its rows
     inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
     before = read_record(config.encoder)
-    collection = read_plan(config.data)
-    run = RunFolder(config.out, STAGE, config, inputs, RESULTS, before.parts, collection)
-    if run.finished:
-        Evaluations(run.path, config, card, Reference()).require_all()
-    with run:
+    with RunFolder(config.out, STAGE, config, inputs, RESULTS, before.parts, read_plan(config.data)) as run:
         if not run.finished:
             warn_of_other_code(config.encoder, before.code, before.parts, "it was pretrained; pretrain it again")
-            write_json(run.path / LABELS_FILE, labels(config, card))
+            write_json(run.path / LABELS_FILE, labels_of(config, card))
             _keep_encoder(config, run.path)
             dataset.to(device)
             _trainer(config, dataset, encoder.to(device), card, run).run(run)
     return run
+
+
+def labels_of(config: FinetuneConfig, card: EncoderCard) -> dict[str, Any]:
+    """The columns that name a run's rows."""
+    labels = {name: getattr(card, name) for name in ("method", "task", "quality")}
+    return labels | {
+        "corruption": card.corruption["corruption"],
+        "algorithm": config.algorithm,
+        "seed": config.seed,
+    }
 
 
 def _trainer(
@@ -95,7 +112,8 @@ def _trainer(
     seed_networks(config.seed, STAGE)
     policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(dataset.t.device)
     generator = stream_generator(config.seed, STAGE, "batches")
-    corruption, returns = CorruptionConfig.fill(card.corruption), return_options(config)
+    corruption = CorruptionConfig.fill(card.corruption)
+    returns = config.options if isinstance(config.options, ReturnOptions) else ReturnOptions()
     frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed)
     encode = partial(frozen.episode, view=frozen.view(0))
     sampler: FeatureSampler | ExactSampler | TransitionSampler
@@ -104,7 +122,7 @@ def _trainer(
         sampler = TransitionSampler(view, config.batch_size, generator, returns.n_step, returns.gamma)
     elif config.views:
         histories = Histories(dataset, config.memory, returns.n_step, config.seed)
-        features = encode_views(frozen, histories, config.views, FeatureFile(run.path, run.inputs | run.code))
+        features = encode_views(frozen, histories, config.views, run.path / FEATURES_FILE)
         policy.standardise.fit(features)
         _probe(features, dataset, run)
         encode = partial(_cached, features, dataset)
@@ -158,20 +176,16 @@ class FinetuneTrainer:
         self.config, self.card = config, card
         self.reference, self.path = reference, path
         self.step = 0
-        self.evaluations: Evaluations | None = None
-        """Those of the run that it is part of."""
 
     def run(self, run: RunFolder) -> None:
         """Train to the end, from the newest checkpoint if there is one."""
-        config = self.config
+        config, labels = self.config, labels_of(self.config, self.card)
         title = f"finetune {config.algorithm} on {self.card.method}"
         self.reference.write(run.path)
-        told = {"labels": labels(config, self.card), "card": asdict(self.card)}
-        self.evaluations = Evaluations(run.path, config, self.card, self.reference)
-        with training(run, self, title, config.updates, "updates", **told) as loop:
-            self.evaluations.drop_after(self.step)
+        with training(run, self, title, config.updates, "updates", labels=labels, card=asdict(self.card)) as loop:
+            drop_episodes_after(run.path / EPISODES_FILE, self.step)  # of a checkpoint that is gone
             if self.step and loop.due(config.eval_every):
-                self.evaluations.carry_out(self.step, self.algorithm, loop)
+                self.evaluate(run, loop)
             for step in loop:
                 loop.add(self.algorithm.update(self.sampler.sample()))  # type: ignore[arg-type]
                 self.step = step
@@ -179,23 +193,62 @@ class FinetuneTrainer:
                     loop.log()
                 if loop.due(config.eval_every):
                     loop.save()
-                    self.evaluations.carry_out(self.step, self.algorithm, loop)
+                    self.evaluate(run, loop)
         if self.path:
             self.reference.with_path_error(self.path.action_error(self.algorithm.policy)).write(run.path)
-        FeatureFile(run.path, run.inputs).remove()
+        (run.path / FEATURES_FILE).unlink(missing_ok=True)
         write_json(run.path / RENDER_FILE, render_info(self.card.task))
         run.finish(updates=self.step)
 
+    def evaluate(self, run: RunFolder, loop: Loop) -> None:
+        """Keep this step's policy, play its episodes unless their rows are there, and log the scores.
+
+        The step's checkpoint is kept: while it plays, a signal need not wait.
+
+        Raises:
+            FloatingPointError: a weight is not finite.
+        """
+        own = CorruptionConfig.fill(self.card.corruption)
+        under = own_and_none(own) if self.config.eval_clean and self.step == self.config.updates else [own]
+        with interrupt.deferred(False):
+            loop.require_finite(self.algorithm.policy)
+            self.algorithm.policy.save(run.path / "policy", self.step)
+            if isinstance(self.algorithm, EndToEnd):
+                loop.require_finite(self.algorithm.encoder)
+                save_encoder(run.path / "encoder", self.algorithm.encoder, self.card)
+            rows = [row for row in read_episodes(run.path / EPISODES_FILE) if row["step"] == self.step]
+            if len(rows) < len(under) * self.config.eval_episodes:
+                rows = self._play(run, loop, under)
+        scores = {
+            f"{EVALUATION}{measure}/{name}": float(np.mean([r[measure] for r in rows if r["evaluated_under"] == name]))
+            for name in dict.fromkeys(row["evaluated_under"] for row in rows)
+            for measure in ("return", "score")
+        }
+        loop.log_evaluation(scores)
+        loop.show(score=scores[f"{EVALUATION}score/{own.corruption}"])
+
+    def _play(self, run: RunFolder, loop: Loop, under: list[CorruptionConfig]) -> list[Row]:
+        """Keep a film of the first episode, then append the rows of all; they are the result."""
+        config, task = self.config, TASKS.named(self.card.task)
+        drop_episodes_after(run.path / EPISODES_FILE, self.step - 1)
+        episodes = evaluate(
+            jobs_of(run.path, task, under, config.eval_episodes, config.eval_length, film=True), config.workers
+        )
+        rows = episode_rows(episodes, labels_of(config, self.card) | {"step": self.step})
+        if episodes[0].film is not None:
+            with replacing_file(run.path / FILM_FILE) as fresh, fresh.open("wb") as file:
+                np.savez_compressed(file, **episodes[0].film)  # type: ignore[arg-type]
+        append_episodes(run.path / EPISODES_FILE, rows)
+        return rows
+
     def state(self) -> dict[str, Any]:
-        """Everything needed to go on to the bit."""
+        """Everything needed to resume to the bit."""
         parts = {"algorithm": self.algorithm.state_dict(), "sampler": self.sampler.state_dict()}
         return {"step": self.step} | parts
 
     def restore(self, state: dict[str, Any]) -> None:
-        """Go on from `state`."""
+        """Continue from `state`."""
         self.step = state["step"]
-        if self.evaluations is not None:  # before anything of the run is changed
-            self.evaluations.require(self.step)
         self.algorithm.load_state_dict(state["algorithm"])
         self.sampler.load_state_dict(state["sampler"])
 

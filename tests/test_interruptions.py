@@ -12,9 +12,9 @@ import numpy as np
 import pytest
 import torch
 
-import finetune.evaluations
-import finetune.features
+import finetune.train
 from finetune.algorithms import bc, td3_bc
+from finetune.features import FrozenEncoder
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
 from pretrain.trainer import Trainer
@@ -24,7 +24,6 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.runs import run as run_module
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
@@ -298,27 +297,18 @@ def test_a_run_whose_checkpoints_are_gone_keeps_its_evaluations(encoder, finetun
     assert (config.out / "episodes.csv").read_bytes() == before
 
 
-@pytest.mark.parametrize("change", ["none", "damage", "code"])
-def test_features_are_kept_unless_they_are_damaged_or_of_other_code(
-    encoder, finetuned, data, tmp_path, monkeypatch, change
-):
+def test_features_are_encoded_once_however_often_a_run_is_cut(encoder, finetuned, data, tmp_path, monkeypatch):
     config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
-    encode, encoded = finetune.features._encode_all, []
-    monkeypatch.setattr(finetune.features, "_encode_all", lambda *words: (encoded.append(words), encode(*words))[1])
+    encode, encoded = FrozenEncoder.frames, []
+    monkeypatch.setattr(FrozenEncoder, "frames", lambda *words: (encoded.append(words), encode(*words))[1])
     with monkeypatch.context() as patch:
         fill_disk(patch, ".pt.tmp", 1)
         with pytest.raises(UserError):
             run_finetune(config)
-    features = config.out / "features.npy"
-    if change == "damage":
-        features.write_bytes(features.read_bytes()[:-100] + bytes(100))
-    if change == "code":
-        monkeypatch.setattr(run_module, "code_of", lambda parts: {"plugins": {}, "sources": {"corruption mine": "2"}})
     run_finetune(config)
-    assert len(encoded) == 1 + (change != "none")
-    assert not features.exists()
-    mine, whole = contents(config.out), contents(finetuned)
-    assert {name for name in mine if mine[name] != whole[name]} <= {"config.json"}
+    assert len(encoded) == 3, "episodes"
+    assert not (config.out / "features.npy").exists()
+    assert contents(config.out) == contents(finetuned)
 
 
 @pytest.mark.parametrize(("evaluation", "rows_written"), [(1, 1), (2, 2)])
@@ -327,7 +317,7 @@ def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
 ):
     """Also in the last one, where rows under the run's own corruption alone are not all."""
     config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
-    append, evaluations = finetune.evaluations.append_episodes, []
+    append, evaluations = finetune.train.append_episodes, []
 
     def cut(path: Path, rows: list[dict[str, Any]]) -> None:
         evaluations.append(rows)
@@ -338,7 +328,7 @@ def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(finetune.evaluations, "append_episodes", cut)
+        patch.setattr(finetune.train, "append_episodes", cut)
         with pytest.raises(KeyboardInterrupt):
             run_finetune(config)
     if evaluation == 2:

@@ -81,7 +81,7 @@ def test_tasks_of_both_kinds_and_any_size_go_through_every_stage(tasks, tmp_path
     run = stages(data, tmp_path / "runs")
     assert load_encoder(run / "encoder")[0].config.size == size
     assert {row["task"] for row in read_episodes(run / "episodes.csv")} == {name}
-    assert {row["task"] for row in evaluate_run(run, "patch", 1, 1).rows} == {name}
+    assert {row["task"] for row in evaluate_run(run, "patch", 1, 1)[0]} == {name}
     assert np.load(run / "film.npz")["corrupted"].shape[1:] == (9, size, size)
     assert (run / "probe.json").exists() == (name != "centre")
     write_report([tmp_path / "runs"], tmp_path / "report")
@@ -187,8 +187,6 @@ def test_an_evaluation_is_never_longer_than_the_task(tasks, tmp_path):
     config = finetune.config.FinetuneConfig.of("smoke", encoder=encoder / "encoder", data=data, workers=1)
     run = run_finetune(replace(config, out=tmp_path / "run", eval_length=500))
     assert {row["length"] for row in read_episodes(run.path / "episodes.csv")} == {9}
-    with pytest.raises(UserError, match="--eval-length is 501; it must be at least 1 and at most 500"):
-        run_finetune(replace(config, out=tmp_path / "other", eval_length=501))
 
 
 @pytest.mark.parametrize(("told", "length"), [(500, 510), (499, 499)])
@@ -208,7 +206,7 @@ def test_an_evaluation_is_of_whole_episodes_of_a_task_that_is_longer_than_the_be
     assert run_finetune(config).finished, "the same command finds it"
     assert {row["length"] for row in read_episodes(run.path / "episodes.csv")} == {length}
     assert json.loads((run.path / "config.json").read_text())["config"]["eval_length"] == length
-    assert {row["length"] for row in evaluate_run(run.path, None, 1, 1).rows} == {length}
+    assert {row["length"] for row in evaluate_run(run.path, None, 1, 1)[0]} == {length}
 
 
 def test_a_score_is_divided_by_the_tasks_own_number(tasks):

@@ -15,7 +15,6 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from finetune.features import FeatureFile
 from tests.helpers_data import write_fake_set
 from tests.nn.test_encoder import CARD, make
 from tests.studies.navigation.test_pictures import python_batch
@@ -34,7 +33,6 @@ from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import read_csv
 from vd4rl_pomdp.runs.outputs import kept_in
 from vd4rl_pomdp.runs.results import RUNS, read_lines
-from vd4rl_pomdp.studies.navigation.drivers import _refuse_other
 from vd4rl_pomdp.studies.navigation.pictures import _read_cifar, _read_image, load_pool, source_fingerprint
 from vd4rl_pomdp.studies.navigation.runs import read_trajectory
 from vd4rl_pomdp.sweeps.folder import read_plan
@@ -72,8 +70,6 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
     copyfile(ASSETS / "walker_walk_replay.safetensors", ladder)
     with (run / FILM_FILE).open("wb") as file:
         np.savez(file, **{name: np.zeros((1,) * axes) for name, axes in FILM.items()})
-    features = FeatureFile(run, {})
-    features.write(np.zeros(3))
     (run / "episodes.csv").write_text(",".join(COLUMNS) + "\n")
     (run / "trajectory.csv").write_text("x,y,estimated_x,estimated_y\n0,0,0,0\n")
     (run / RUNS).write_text("{}\n")
@@ -99,9 +95,7 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
         "checkpoint": lambda: Checkpoints(run).restore(lambda state: None),
         "actor": lambda: read_actor(actor),
         "ladder": lambda: read_ladder(ladder),
-        "what a policy replaces": lambda: _refuse_other(actor),
         "film": lambda: read_film(run / FILM_FILE),
-        "features": features.read,
         "episodes": lambda: read_episodes(run / "episodes.csv"),
         "episodes of a cut run": lambda: episodes_until(run / "episodes.csv", 1),
         "trajectory": lambda: read_trajectory(run / "trajectory.csv"),

@@ -26,7 +26,7 @@ class ReturnOptions(Options):
     n_step: int = 3
     """Steps of the n-step return."""
 
-    limits: ClassVar[Limits] = {"gamma": (0, 1), "n_step": 1}
+    limits: ClassVar[Limits] = {"gamma": (0, 1), "n_step": (1, 1000)}
 
 
 class Loss(NamedTuple):

@@ -32,7 +32,7 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
-from finetune.algorithms.critic import TwinCritic
+from finetune.algorithms.td3_bc import TwinCritic
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp, move_target

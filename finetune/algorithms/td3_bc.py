@@ -16,14 +16,13 @@ from typing import Any, ClassVar
 
 import torch
 import torch.nn.functional as F
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
-from finetune.algorithms.critic import TwinCritic
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
-from vd4rl_pomdp.nn.heads import move_target
+from vd4rl_pomdp.nn.heads import ExactLinear, mlp, move_target
 from vd4rl_pomdp.nn.policy import Policy
 
 TARGET_NOISE, NOISE_CLIP = 0.2, 0.5
@@ -37,6 +36,20 @@ class TD3BCOptions(ReturnOptions):
     """Weight of the critic against behaviour cloning."""
 
     limits: ClassVar[Limits] = {"alpha": 0}
+
+
+class TwinCritic(nn.Module):
+    """Two independent Q functions: (B, D), (B, A) -> two (B,)."""
+
+    def __init__(self, dim: int, action_dim: int, hidden: int) -> None:
+        super().__init__()
+        self.first = mlp(dim + action_dim, hidden, 1, last=ExactLinear)
+        self.second = mlp(dim + action_dim, hidden, 1, last=ExactLinear)
+
+    def forward(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
+        """Both values."""
+        both = torch.cat([z, action], dim=-1)
+        return self.first(both)[:, 0], self.second(both)[:, 0]
 
 
 class TD3BC(Algorithm):

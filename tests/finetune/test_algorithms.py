@@ -10,10 +10,9 @@ import torch.nn.functional as F
 
 from finetune.algorithms import ALGORITHMS, noise, td3_bc
 from finetune.algorithms.bc import BC
-from finetune.algorithms.critic import TwinCritic
 from finetune.algorithms.drqv2_bc import DrQv2BC
 from finetune.algorithms.iql import IQL, IQLOptions, expectile_loss
-from finetune.algorithms.td3_bc import TD3BC
+from finetune.algorithms.td3_bc import TD3BC, TwinCritic
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.policy import Policy
 

@@ -11,8 +11,6 @@ import torch
 
 from finetune import evaluation
 from finetune.evaluation import EVALUATION_SEED, Episode, EpisodeJob, by_part, episode_rows, evaluate, evaluate_run
-from finetune.train import finetune
-from tests.helpers_stages import smoke_finetune
 from tests.nn.test_encoder import CARD
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
@@ -23,7 +21,7 @@ from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.envs.corrupted import Observation
 from vd4rl_pomdp.envs.pixels import TimeStep
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, save_encoder
-from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
+from vd4rl_pomdp.nn.policy import Policy, load_policy
 from vd4rl_pomdp.policies.actor import ASSETS, load_actor
 from vd4rl_pomdp.runs.episodes import begin_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
@@ -161,11 +159,9 @@ def test_parts_of_episodes_tell_where_reward_and_errors_are():
     assert by_part([Episode("none", 0, [1.0], None)], 1) == {"0-0": {"reward": 1.0, "action_error": None}}
 
 
-def test_a_run_is_evaluated_as_it_was_trained_and_under_none_or_as_one_says(world, encoder, data, tmp_path, capsys):
-    config = smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2)
-    run = finetune(config).path
+def test_a_run_is_evaluated_as_it_was_trained_and_under_none_or_as_one_says(world, run, data, tmp_path, capsys):
     for asked, expected in ((None, ["patch+zero_frames", "none"]), ("patch", ["patch"])):
-        rows = evaluate_run(run, asked, 1, 1).rows
+        rows, _ = evaluate_run(run, asked, 1, 1)
         assert [row["evaluated_under"] for row in rows] == expected
         assert {row["corruption"] for row in rows} == {"patch+zero_frames"}, "what it was trained under"
     rest = ["--parts", "2", "--out", str(tmp_path / "rows.csv")]
@@ -184,9 +180,7 @@ def test_a_run_is_evaluated_as_it_was_trained_and_under_none_or_as_one_says(worl
     assert (only[0], only[1]["episodes"]) == ("none", written[1:])
 
 
-def test_another_corruption_is_played_with_the_runs_own_options(world, encoder, data, tmp_path, monkeypatch):
-    """Its patches were played at 16 pixels, whatever the run's size."""
-    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2)).path
+def test_another_corruption_is_played_with_the_runs_own_options_over_its_own_length(world, run, monkeypatch):
     card = read_json(run / "encoder" / "config.json")
     card["pretrain"]["corruption"] |= {"patch_size": 40, "corruption_mode": "emission"}
     write_json(run / "encoder" / "config.json", card)
@@ -194,65 +188,25 @@ def test_another_corruption_is_played_with_the_runs_own_options(world, encoder, 
     monkeypatch.setattr(evaluation, "evaluate", lambda given, workers: jobs.extend(given) or [])
     evaluate_run(run, "patch", 1, 1)
     assert [job.corruption for job in jobs] == [CorruptionConfig.of("patch", "emission", patch_size=40)]
+    assert [job.length for job in jobs] == [2]
 
 
-def test_an_evaluation_names_its_step_and_touches_no_other_file(world, encoder, data, tmp_path):
-    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2))
-    (run.path / "timing.json").unlink()  # an unfinished run has a step, too
-    with pytest.raises(UserError, match="--episodes is 0"):
-        evaluate_run(run.path, None, 0, 1)
-    with pytest.raises(UserError, match="unknown corruption 'fog'"):
-        evaluate_run(run.path, "fog", 1, 1)
-    with pytest.raises(UserError, match="holds no evaluated run"):
-        evaluate_run(encoder.parent, None, 1, 1)
-    with pytest.raises(SystemExit, match="2"):
-        main(["evaluate", str(encoder.parent), "--out", str(tmp_path / "new.csv")])
-    assert not (tmp_path / "new.csv").exists(), "nothing is left where nothing is played"
-    assert [row["step"] for row in evaluate_run(run.path, None, 1, 1).rows] == [2, 2]
-    (run.path / "labels.json").write_text("{}")
-    with pytest.raises(UserError, match=r"labels\.json: has no 'method'"):
-        evaluate_run(run.path, None, 1, 1)
+def test_an_evaluation_is_of_the_step_of_the_policy_and_not_of_the_newest_row(world, run):
+    """A run that was cut in its evaluation has a policy and no row of it yet."""
+    load_policy(run / "policy").save(run / "policy", step=7)
+    assert [row["step"] for row in evaluate_run(run, None, 1, 1)[0]] == [7, 7]
+
+
+def test_slips_are_one_line_and_touch_no_file(world, run, encoder, tmp_path):
+    for given, told in (
+        ((run, None, 0, 1), "--episodes is 0"),
+        ((run, "fog", 1, 1), "unknown corruption 'fog'"),
+        ((encoder.parent, None, 1, 1), "holds no evaluated run"),
+    ):
+        with pytest.raises(UserError, match=told):
+            evaluate_run(*given)
     thesis = tmp_path / "thesis.csv"
     thesis.write_text("a,b\n1,2\n")
     with pytest.raises(UserError, match="has no column 'method'"):
         begin_episodes(thesis)
     assert thesis.read_text() == "a,b\n1,2\n"
-
-
-def test_an_evaluation_is_of_the_step_of_the_policy_and_not_of_the_newest_row(world, encoder, data, tmp_path):
-    """A run that was cut in its evaluation has a policy and no row of it yet."""
-    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2)).path
-    assert policy_step(run / "policy") == 2
-    policy = load_policy(run / "policy")
-    policy.save(run / "policy", step=7)
-    assert [row["step"] for row in evaluate_run(run, None, 1, 1).rows] == [7, 7]
-    policy.save(run / "policy")  # as earlier versions did
-    assert [row["step"] for row in evaluate_run(run, None, 1, 1).rows] == [2, 2]
-
-
-@pytest.mark.parametrize("part", ["policy", "encoder"])
-def test_a_policy_that_changes_while_it_plays_is_told(world, encoder, data, tmp_path, monkeypatch, part):
-    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=2)).path
-    play_all = evaluation.evaluate
-
-    def train_on(jobs, workers):
-        episodes = play_all(jobs, workers)
-        card = read_json(run / part / "config.json")
-        write_json(run / part / "config.json", card | {"later": 1})
-        return episodes
-
-    monkeypatch.setattr(evaluation, "evaluate", train_on)
-    with pytest.raises(UserError, match="run: wrote another policy while this one played; evaluate it"):
-        evaluate_run(run, None, 1, 1)
-
-
-@pytest.mark.parametrize(("record", "length"), [({"config": {"eval_length": 2}}, 2), ({}, 500), (None, 500)])
-def test_a_run_is_evaluated_again_over_its_own_length(world, encoder, data, tmp_path, monkeypatch, record, length):
-    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", updates=2, batch_size=4, eval_length=3)).path
-    (run / "config.json").unlink()
-    if record is not None:
-        write_json(run / "config.json", record)
-    jobs = []
-    monkeypatch.setattr(evaluation, "evaluate", lambda given, workers: jobs.extend(given) or [])
-    evaluate_run(run, "patch", 1, 1)
-    assert [job.length for job in jobs] == [length]

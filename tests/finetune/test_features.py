@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from finetune.features import ExactSampler, FeatureFile, FeatureSampler, FrozenEncoder, encode_views
+from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories
 from tests.helpers_data import fake_action, fake_reward, fake_rows, write_fake_set
 from vd4rl_pomdp.core.options import NO_OPTIONS
@@ -59,7 +59,7 @@ def frozen(dataset: Dataset, corruption: CorruptionConfig, shift: int) -> Frozen
 
 def views_of(tmp_path, corruption: str, mode: str, shift: int) -> torch.Tensor:
     made = frozen(noise_set(tmp_path / "set"), CorruptionConfig.of(corruption, mode), shift)
-    return encode_views(made, Histories(made.dataset, NO_OPTIONS, N, 0), 2, FeatureFile(tmp_path, {}))
+    return encode_views(made, Histories(made.dataset, NO_OPTIONS, N, 0), 2, tmp_path / "features.npy")
 
 
 @pytest.mark.parametrize(

@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from finetune.evaluation import EVALUATION_SEED, Agent, EpisodeJob, evaluate
-from finetune.features import ExactSampler, FeatureFile, FrozenEncoder, encode_views
+from finetune.features import ExactSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
@@ -184,5 +184,5 @@ def test_states_are_kept_in_full_precision(with_states, tmp_path):
     encoder, dataset = pretrained(with_states, tmp_path / "exact"), open_dataset(with_states)
     dataset.physics[:, 3] = 1.3
     seen, config = frozen(encoder, dataset), smoke_finetune(encoder, with_states, tmp_path / "out")
-    features = encode_views(seen, Histories(dataset, config.memory, 1, 0), 1, FeatureFile(tmp_path, {}))
+    features = encode_views(seen, Histories(dataset, config.memory, 1, 0), 1, tmp_path / "features.npy")
     assert torch.equal(features[0], dataset.states())

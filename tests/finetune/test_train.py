@@ -2,23 +2,20 @@
 
 import csv
 import json
-import os
 import shutil
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from finetune import train
-from finetune.evaluation import evaluate_run
 from finetune.features import FrozenEncoder
 from finetune.train import RESULTS
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
+from tests.finetune.conftest import BRIEF
 from tests.helpers_data import write_fake_set
-from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_finetune, smoke_pretrain
-from vd4rl_pomdp.core import registry
+from tests.helpers_stages import CutError, contents, cut_at, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
@@ -75,9 +72,6 @@ def test_references_resume_to_the_bit(with_states, tmp_path, monkeypatch, method
     rows = list(csv.DictReader((whole / "episodes.csv").open()))
     own = {"bc": "bc", "drq_bc": "drqv2_bc", "state": "td3_bc"}[method]
     assert {row["algorithm"] for row in rows} == {own}
-    if method != "state":
-        with pytest.raises(UserError, match=f"--algorithm iql is not read: the encoder is trained by {own}; leave"):
-            run_finetune(smoke_finetune(made, with_states, tmp_path / "other", algorithm="iql"))
 
 
 def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_them(with_states, data, tmp_path):
@@ -98,82 +92,51 @@ def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_th
         run_pretrain(smoke_pretrain(data, tmp_path / "gru", method="drq_bc", history="gru"))
 
 
-def test_code_that_has_changed_since_is_told(data, tmp_path, monkeypatch, capsys):
-    code = {"frame_encoder tiny": "tiny.py 1"}
-    monkeypatch.setattr(registry, "sources", lambda settings: code)
-    encoder = run_pretrain(smoke_pretrain(data, tmp_path / "made", method="random")).path / "encoder"
-    brief = {"updates": 2, "batch_size": 4, "eval_length": 2}
-    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "alike", **brief)).path
-    evaluate_run(run, "none", 1, 1)
-    assert "warning" not in capsys.readouterr().err
-    code = {"frame_encoder tiny": "tiny.py 2"}
-    run_finetune(smoke_finetune(encoder, data, tmp_path / "changed", **brief))
-    told = "the code of frame_encoder tiny has changed since"
-    assert f"warning: {encoder}: {told} it was pretrained; pretrain it again" in capsys.readouterr().err
-    evaluate_run(run, "none", 1, 1)
-    assert f"warning: {run}: {told} this policy was trained" in capsys.readouterr().err
-
-
-def test_a_set_of_one_episode_is_learned_from_without_a_probe(encoder, tmp_path):
-    one = write_fake_set(tmp_path / "one" / "walker_walk" / "expert", [20], physics_dim=18)
-    run = run_finetune(smoke_finetune(encoder, one, tmp_path / "out", updates=2, batch_size=4, eval_length=2))
-    assert run.finished
-    assert not (run.path / "probe.json").exists()
-
-
 @pytest.mark.parametrize(
     ("settings", "told"),
     [
-        ({"precision": "fp16"}, "--precision is 'fp16': choose one of fp32, bf16"),
-        ({"batch_size": "8"}, "--batch-size is '8': it must be an integer"),
-        ({"learning_rate": "1e-3"}, "--learning-rate is '1e-3': it must be a number"),
-        ({"seed": np.int64(3)}, "--seed is .*3.*: it must be an integer"),
-        ({"shift": True}, "--shift is True: it must be an integer"),
+        ({"updates": 0}, "--updates is 0; it must be at least 1"),
+        ({"gamma": 1.5}, "--gamma is 1.5; it must be at least 0 and at most 1"),
+        ({"n_step": 0}, "--n-step is 0"),
+        ({"learning_rate": float("nan")}, "--learning-rate is nan"),
+        ({"device": "cuda:99"}, "no such GPU"),
     ],
 )
-def test_settings_of_another_type_are_one_line(data, encoder, tmp_path, settings, told):
-    for make, words in ((smoke_pretrain, [data]), (smoke_finetune, [encoder, data])):
-        config = make(*words, tmp_path / "out", **settings)
-        with pytest.raises(UserError, match=told):
-            (run_pretrain if make is smoke_pretrain else run_finetune)(config)
+def test_wrong_settings_are_one_line_and_leave_no_run_behind(data, encoder, tmp_path, settings, told):
+    with pytest.raises(UserError, match=told):
+        run_finetune(smoke_finetune(encoder, data, tmp_path / "out", **settings))
     assert not (tmp_path / "out").exists()
-    assert smoke_pretrain(str(data), str(tmp_path / "out")) == smoke_pretrain(data, tmp_path / "out"), "words are paths"
 
 
-def test_user_slips_are_one_line(data, encoder, tmp_path):
-    with pytest.raises(UserError, match="unknown algorithm"):
-        run_finetune(smoke_finetune(encoder, data, tmp_path / "c", algorithm="ppo"))
+def test_sets_that_an_encoder_cannot_read_are_one_line(encoder, data, tmp_path):
     other = write_fake_set(tmp_path / "humanoid_walk" / "expert", [20, 20], action_dim=21)
-    with pytest.raises(UserError, match="6 action dimensions"):
-        run_finetune(smoke_finetune(encoder, other, tmp_path / "d"))
-    assert not any((tmp_path / name).exists() for name in "cd")
-
-
-BELOW_IN_FINETUNING = {
-    **{"updates": 0, "gamma": 1.5, "n_step": 0, "alpha": -1.0, "views": -1, "eval_every": 0, "eval_episodes": 0},
-    **{"eval_length": -1, "hidden_dim": 0, "expectile": 1.1, "temperature": -1.0},
-}
-
-
-@pytest.mark.parametrize(("field", "value"), [*BELOW_IN_FINETUNING.items(), *BELOW_IN_BOTH.items()])
-def test_numbers_out_of_range_stop_finetuning_before_it_begins(data, tmp_path, field, value):
-    reader = {"algorithm": "iql"} if field in ("expectile", "temperature") else {}
-    with pytest.raises(UserError, match=f"--{field.replace('_', '-')} is {value}; it must be at least"):
-        run_finetune(smoke_finetune(tmp_path / "encoder", data, tmp_path / "out", **{field: value}, **reader))
+    single = write_fake_set(tmp_path / "single" / "walker_walk", [1, 1])
+    for given, told in ((other, "6 action dimensions"), (single, "holds no transition")):
+        with pytest.raises(UserError, match=told):
+            run_finetune(smoke_finetune(encoder, given, tmp_path / "out"))
+    shutil.copytree(encoder, tmp_path / "small")
+    config = json.loads((tmp_path / "small" / "config.json").read_text())
+    config["encoder"]["size"] = 64
+    (tmp_path / "small" / "config.json").write_text(json.dumps(config))
+    with pytest.raises(UserError, match=r"small: this encoder reads pictures of 64x64 pixels, the data set has 84x84"):
+        run_finetune(smoke_finetune(tmp_path / "small", data, tmp_path / "out"))
     assert not (tmp_path / "out").exists()
 
 
-def test_a_set_without_transitions_and_a_missing_gpu_leave_no_finetuning_behind(encoder, data, tmp_path):
-    single = write_fake_set(tmp_path / "single" / "walker_walk", [1, 1])
-    for given, change in ((single, {}), (data, {"device": "cuda:99"})):
-        with pytest.raises(UserError, match=r"holds no transition|no such GPU"):
-            run_finetune(smoke_finetune(encoder, given, tmp_path / "out", **change))
-        assert not (tmp_path / "out").exists()
+@pytest.mark.parametrize("name", RESULTS)
+def test_a_finished_run_that_lost_a_result_says_so_and_writes_it_anew(run, encoder, data, name):
+    (run / name).unlink()
+    before, config = contents(run), smoke_finetune(encoder, data, run, **BRIEF)
+    with pytest.raises(UserError, match=r"or remove .*timing\.json and re-run its command"):
+        run_finetune(config)
+    assert contents(run) == before
+    (run / "timing.json").unlink()
+    assert contents(run_finetune(config).path) == contents(encoder.parents[1] / "run")
 
 
 def test_rows_are_named_after_the_set_that_the_policy_learned_from(encoder, data, tmp_path):
     other = write_fake_set(tmp_path / "walker_walk" / "medium", [20, 25])
-    run = run_finetune(smoke_finetune(encoder, other, tmp_path / "out", updates=2, batch_size=4, eval_length=2))
+    run = run_finetune(smoke_finetune(encoder, other, tmp_path / "out", **BRIEF))
     assert {row["quality"] for row in csv.DictReader((run.path / "episodes.csv").open())} == {"medium"}
 
 
@@ -182,7 +145,7 @@ def test_rows_on_a_set_of_unknown_quality_have_the_encoders_only_if_it_is_the_sa
     encoder, data, tmp_path, lengths, quality
 ):
     other = write_fake_set(tmp_path / "walker_walk" / "mine", lengths)
-    run = run_finetune(smoke_finetune(encoder, other, tmp_path / "out", updates=2, batch_size=4, eval_length=2))
+    run = run_finetune(smoke_finetune(encoder, other, tmp_path / "out", **BRIEF))
     assert json.loads((run.path / "labels.json").read_text())["quality"] == quality
 
 
@@ -212,15 +175,6 @@ def test_a_checkpoint_of_another_config_is_one_line(encoder, data, tmp_path):
     assert "\n" not in str(caught.value)
 
 
-def test_a_row_lacks_what_no_step_since_the_row_before_gave(encoder, data, tmp_path, monkeypatch):
-    """The actor learns at every other update only; also where a run is cut in between."""
-    changes = {"updates": 6, "log_every": 1, "checkpoint_every": 1, "eval_every": 6, "batch_size": 4, "eval_length": 2}
-    whole = finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
-    rows = read_metrics(whole / "metrics.jsonl")
-    assert ["actor_loss" in row for row in rows[:-1]] == [False, True] * 3
-    assert set(rows[-1]) == {"step", *(f"eval/{m}/{u}" for m in ("return", "score") for u in (CORRUPTION, "none"))}
-
-
 def test_scores_are_rows_of_metrics_by_what_was_evaluated_under(encoder, data, tmp_path):
     changes = {"updates": 4, "eval_every": 2, "eval_episodes": 2, "batch_size": 4, "eval_length": 2}
     run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", **changes))
@@ -237,7 +191,7 @@ def test_scores_are_rows_of_metrics_by_what_was_evaluated_under(encoder, data, t
     assert "eval/score/none" not in rows[0]
 
 
-@pytest.mark.parametrize("place", ["append_episodes", "scores_by_corruption", "after the row"])
+@pytest.mark.parametrize("place", ["append_episodes", "after the row"])
 def test_a_run_cut_around_an_evaluation_has_the_metrics_of_a_whole_one(encoder, data, tmp_path, monkeypatch, place):
     changes = {"updates": 4, "eval_every": 2, "checkpoint_every": 2, "batch_size": 4, "eval_length": 2, "log_every": 1}
     whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **changes))
@@ -250,72 +204,11 @@ def test_a_run_cut_around_an_evaluation_has_the_metrics_of_a_whole_one(encoder, 
         if place == "after the row":
             patch.setattr("vd4rl_pomdp.runs.loop.Loop.show", lambda self, **shown: end() if "score" in shown else None)
         else:
-            patch.setattr(f"finetune.evaluations.{place}", end)
+            patch.setattr(f"finetune.train.{place}", end)
         with pytest.raises(CutError):
             run_finetune(cut)
     run_finetune(cut)
     assert contents(cut.out) == contents(whole.path)
-
-
-def test_features_that_are_a_pipe_are_refused(encoder, data, tmp_path, monkeypatch):
-    config = smoke_finetune(encoder, data, tmp_path / "out")
-    with monkeypatch.context() as patch:
-        cut_at(patch, 1)
-        with pytest.raises(CutError):
-            run_finetune(config)
-    path = config.out / "features.npy"
-    path.unlink()
-    os.mkfifo(path)
-    with pytest.raises(UserError, match=r"features\.npy: is no regular file .* remove it"):
-        run_finetune(config)
-
-
-def test_a_cut_run_whose_evaluations_are_gone_does_not_go_on(encoder, data, tmp_path, monkeypatch):
-    config = smoke_finetune(encoder, data, tmp_path / "out", eval_every=10, checkpoint_every=10, eval_length=2)
-    with monkeypatch.context() as patch:
-        cut_at(patch, 3)
-        with pytest.raises(CutError):
-            run_finetune(config)
-    rows = (config.out / "episodes.csv").read_text().splitlines(keepends=True)
-    (config.out / "episodes.csv").write_text(rows[0] + rows[2])
-    with pytest.raises(UserError, match=r"episodes\.csv: lacks the evaluation at update 10.*another run$"):
-        run_finetune(config)
-    (config.out / "episodes.csv").write_text("".join(rows))
-    assert run_finetune(config).finished
-
-
-@pytest.fixture(params=["mik+a", "bc"])
-def finished(with_states, tmp_path, request):
-    """A finished run that was evaluated twice, and its config: of a frozen encoder, and of one trained along."""
-    made = run_pretrain(smoke_pretrain(with_states, tmp_path / "made", method=request.param)).path / "encoder"
-    config = smoke_finetune(
-        made, with_states, tmp_path / "finished", eval_every=10, updates=20, batch_size=4, eval_length=2
-    )
-    return run_finetune(config).path, config
-
-
-@pytest.mark.parametrize("name", [*RESULTS, "episodes.csv"])
-def test_a_finished_run_that_lost_a_result_says_so_and_writes_it_anew(finished, tmp_path, name):
-    run = shutil.copytree(finished[0], tmp_path / "run")
-    config = replace(finished[1], out=run)
-    if name == "episodes.csv":
-        rows = (run / name).read_text().splitlines(keepends=True)
-        (run / name).write_text("".join(rows[:2]))  # of the first evaluation
-    else:
-        (run / name).unlink()
-    before = contents(run)
-    with pytest.raises(UserError, match=r"or remove .*timing\.json and re-run its command"):
-        run_finetune(config)
-    assert contents(run) == before
-    (run / "timing.json").unlink()
-    assert contents(run_finetune(config).path) == contents(finished[0])
-
-
-def test_a_finished_run_without_its_earlier_evaluations_cannot_get_them_back(finished, tmp_path):
-    run = shutil.copytree(finished[0], tmp_path / "run")
-    (run / "episodes.csv").unlink()
-    with pytest.raises(UserError, match=r"episodes\.csv: lacks the evaluation at update 10; restore it"):
-        run_finetune(replace(finished[1], out=run))
 
 
 def test_the_clean_evaluation_can_be_left_out(encoder, data, tmp_path):
@@ -323,13 +216,3 @@ def test_the_clean_evaluation_can_be_left_out(encoder, data, tmp_path):
     run = run_finetune(smoke_finetune(encoder, data, tmp_path / "out", **changes))
     rows = list(csv.DictReader((run.path / "episodes.csv").open()))
     assert [row["evaluated_under"] for row in rows] == ["patch+zero_frames"]
-
-
-def test_an_encoder_of_another_image_size_is_refused(data, encoder, tmp_path):
-    shutil.copytree(encoder, tmp_path / "small")
-    config = json.loads((tmp_path / "small" / "config.json").read_text())
-    config["encoder"]["size"] = 64
-    (tmp_path / "small" / "config.json").write_text(json.dumps(config))
-    with pytest.raises(UserError, match=r"small: this encoder reads pictures of 64x64 pixels, the data set has 84x84"):
-        run_finetune(smoke_finetune(tmp_path / "small", data, tmp_path / "run"))
-    assert not (tmp_path / "run").exists()

@@ -2,12 +2,11 @@
 
 import pytest
 
-from finetune.config import FinetuneConfig
-from finetune.settings import as_trained
+from finetune.config import FinetuneConfig, as_trained
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.options import flat, option_names
+from vd4rl_pomdp.core.options import NO_OPTIONS, flat, option_names
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 
 
@@ -155,19 +154,6 @@ def test_the_grids_settings_are_read(method):
     NavigationConfig.of("smoke", method=method, max_k=15).check()
 
 
-@pytest.mark.parametrize("name", ["alpha", "gamma", "n_step"])
-def test_cloning_reads_no_option_of_the_critic(name):
-    given = {name: 1}
-    config = FinetuneConfig.of("smoke", **given)
-    config.check()
-    for refused in (
-        lambda: FinetuneConfig.of("smoke", algorithm="bc", **given),
-        lambda: as_trained(config, "bc", "bc", False, 500),
-    ):
-        with pytest.raises(UserError, match=f"--{name.replace('_', '-')} is not read by the algorithm bc"):
-            refused()
-
-
 @pytest.mark.parametrize(
     ("algorithm", "reads"),
     [("td3_bc", ["alpha"]), ("drqv2_bc", ["alpha"]), ("iql", ["expectile", "temperature"]), ("bc", [])],
@@ -182,6 +168,12 @@ def test_an_algorithm_reads_its_own_options_only(algorithm, reads):
                 FinetuneConfig.of("smoke", **given)
 
 
-def test_an_encoder_that_is_trained_has_no_views():
-    with pytest.raises(UserError, match="--views is not read by the algorithm drqv2_bc"):
-        as_trained(FinetuneConfig.of("smoke", views=3), "drq_bc", "drqv2_bc", False, 500)
+def test_an_encoder_that_is_trained_brings_its_algorithm_and_has_no_views_and_no_memory():
+    told = FinetuneConfig.of("smoke", views=3, alpha=5.0, n_step=2)
+    trained = as_trained(told, "drqv2_bc", False, 1000)
+    assert trained == as_trained(
+        FinetuneConfig.of("smoke", algorithm="drqv2_bc", views=0, alpha=5.0, n_step=2), "", False, 1000
+    )
+    assert trained.memory == NO_OPTIONS
+    assert not {"alpha", "n_step"} & flat(as_trained(told, "bc", False, 500)).keys(), "nothing that is not read"
+    assert as_trained(FinetuneConfig.of("paper"), "", True, 1000).eval_length == 1000

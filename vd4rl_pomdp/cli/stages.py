@@ -55,7 +55,7 @@ def evaluate(
         out: Append the raw rows to this CSV file.
         json: Print one JSON object.
     """
-    from finetune.evaluation import by_part, evaluate_run, evaluations_of
+    from finetune.evaluation import by_part, evaluate_run
     from vd4rl_pomdp.data.reference import Reference, summarise
     from vd4rl_pomdp.runs.episodes import append_episodes, begin_episodes
     from vd4rl_pomdp.runs.files import flatten
@@ -64,10 +64,8 @@ def evaluate(
     refuse_number("parts", parts, 1)
     if out is not None:
         refuse_inside(out)
-        evaluations_of(run)
         begin_episodes(out)  # before any episode is played
-    played = evaluate_run(run, corruption, episodes, workers)
-    rows = played.rows
+    rows, played = evaluate_run(run, corruption, episodes, workers)
     if out is not None:
         append_episodes(out, rows)
     reference = Reference.read(run)
@@ -78,7 +76,7 @@ def evaluate(
         mine = [row for row in rows if row["evaluated_under"] == name]
         under[name] = summarise(mine, reference) | {"episodes": mine if json else len(mine)}
         if parts > 1:
-            under[name]["parts"] = by_part([e for e in played.episodes if e.evaluated_under == name], parts)
+            under[name]["parts"] = by_part([e for e in played if e.evaluated_under == name], parts)
     result = labels | known | {"under": under}
     told = {name: "unknown" if value is None else value for name, value in flatten(result).items()}
     show(result if json else told, json)

@@ -91,8 +91,10 @@ class Checkpoints:
     def steps(self) -> list[int]:
         """Steps that have a checkpoint, the newest first."""
         with disk_errors(self._folder):
-            names = [path.stem for path in self._folder.iterdir()] if self._folder.is_dir() else []
-        return sorted((int(name) for name in names if name.isdecimal()), reverse=True)
+            files = self._folder.iterdir() if self._folder.is_dir() else ()
+            return sorted(
+                (int(path.stem) for path in files if path.suffix == ".pt" and path.stem.isdecimal()), reverse=True
+            )
 
     def _path(self, step: int) -> Path:
         return self._folder / f"{step}.pt"

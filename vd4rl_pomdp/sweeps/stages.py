@@ -127,7 +127,7 @@ def recorded(cell: GridCell, section: str) -> Values:
 
 def _as_trained(cell: GridCell, config: Any) -> Any:
     """The config that a fine-tuning trains with: what its encoder's method cannot read is no part of it."""
-    from finetune.settings import as_trained
+    from finetune.config import as_trained
     from pretrain.config import history_of
     from pretrain.objectives import METHODS
 
@@ -135,4 +135,4 @@ def _as_trained(cell: GridCell, config: Any) -> Any:
     method = METHODS.named(before.method)
     remembers = history_of(before.method, method, before.history) != "none"
     decisions = TASKS.named(cell.value("task")).decisions
-    return as_trained(config, before.method, method.end_to_end, remembers, decisions)
+    return as_trained(config, method.end_to_end, remembers, decisions)

@@ -169,15 +169,10 @@ def test_ppo_training_ends_in_an_actor_that_acts_like_its_policy(tmp_path):
     assert np.std(spread, axis=0).min() > 0.1
 
 
-@pytest.mark.parametrize("kind", ["file", "folder", "dangling link", "link to itself"])
-def test_a_policy_replaces_nothing_but_a_policy(tmp_path, kind):
+@pytest.mark.parametrize("kind", ["file", "dangling link"])
+def test_a_policy_replaces_nothing(tmp_path, kind):
     out = tmp_path / "actor.safetensors"
-    if kind == "file":
-        out.write_text("mine\n")
-    elif kind == "folder":
-        out.mkdir()
-    else:
-        out.symlink_to("nothing" if kind == "dangling link" else out.name)
-    with pytest.raises(UserError, match=r"actor\.safetensors: is there already and holds no actor"):
+    out.write_text("mine\n") if kind == "file" else out.symlink_to("nothing")
+    with pytest.raises(UserError, match=r"actor\.safetensors: is there already"):
         train_first_person(FirstPersonConfig(out, decisions=1))
     assert kind != "file" or out.read_text() == "mine\n"

@@ -16,7 +16,7 @@ from typing import TYPE_CHECKING, Any
 import gymnasium
 import numpy as np
 
-from vd4rl_pomdp.core.errors import MAX_SEED, UnavailableError, UserError, refuse_no_folder, refuse_outside
+from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_no_folder, refuse_outside
 from vd4rl_pomdp.envs.maze import CELL_OFFSET, MazeEnv
 from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, HARD, MOST_STEPS, MazeSpec, get_maze
 from vd4rl_pomdp.policies.actor import Actor, read_actor
@@ -203,17 +203,6 @@ class FirstPersonEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         return features(self._env.state, self._planner.waypoint(self._env.state[:2], self._env.goal))
 
 
-def _refuse_other(path: Path) -> None:
-    """Raise UserError for a file to write that exists and holds anything but an earlier actor."""
-    if path.exists() or path.is_symlink():
-        try:
-            read_actor(path)
-        except UnavailableError:
-            raise
-        except UserError as error:
-            raise UserError(f"{path}: is there already and holds no actor; choose another --out") from error
-
-
 def train_first_person(config: FirstPersonConfig) -> Actor:
     """Train and write the actor; its card holds the number of goals that it reaches in 20 episodes."""
     if not get_maze(config.maze).first_person:
@@ -221,7 +210,8 @@ def train_first_person(config: FirstPersonConfig) -> Actor:
     refuse_outside(config, decisions=1, action_repeat=(1, MOST_STEPS), seed=(0, MAX_SEED))
     refuse_no_folder(config.out.parent)
     refuse_inside(config.out)
-    _refuse_other(config.out)
+    if config.out.exists() or config.out.is_symlink():
+        raise UserError(f"{config.out}: is there already; remove it, or choose another --out")
     try:
         from stable_baselines3 import PPO
         from stable_baselines3.common.callbacks import BaseCallback

@@ -175,34 +175,22 @@ def _read_image(path: Path) -> np.ndarray:
 
 
 def _read_cifar(path: Path) -> np.ndarray:
-    """(N, 32, 32, 3) uint8 of one CIFAR-10 file, POOL of them at most."""
-    data = _binary_records(path) if path.suffix == ".bin" else _python_records(path)
-    return data.reshape(-1, 3, _CIFAR_SIDE, _CIFAR_SIDE)[:POOL].transpose(0, 2, 3, 1)
+    """(N, 32, 32, 3) uint8 of one CIFAR-10 file, POOL of them at most.
 
-
-def _binary_records(path: Path) -> np.ndarray:
-    raw = np.frombuffer(read_bytes(path), np.uint8)
-    if not raw.size or raw.size % (_CIFAR_BYTES + 1):
-        raise UserError(f"{path}: its size is no multiple of {_CIFAR_BYTES + 1} bytes; download CIFAR-10 again")
-    records = raw.reshape(-1, _CIFAR_BYTES + 1)
-    if records[:, 0].max() >= _CIFAR_CLASSES:
-        raise UserError(f"{path}: holds labels above 9, so it is no CIFAR-10 file; download CIFAR-10 again")
-    return records[:, 1:]
-
-
-def _python_records(path: Path) -> np.ndarray:
-    """The pixels inside a pickled batch, found without running the pickle: its one long run of bytes."""
+    A binary file has a label before every image. In a pickled batch the pixels are the one long run of bytes, which is
+    found without running the pickle.
+    """
+    content, labels = read_bytes(path), int(path.suffix == ".bin")
     try:
-        runs = [a for _, a, _ in genops(read_bytes(path)) if isinstance(a, str | bytes)]
+        runs = [content] if labels else [a for _, a, _ in genops(content) if isinstance(a, str | bytes)]
         longest = max(runs, key=len, default=b"")
         raw = longest.encode("latin-1") if isinstance(longest, str) else longest
-    except UserError:
-        raise
+        images = np.frombuffer(raw, np.uint8).reshape(-1, labels + _CIFAR_BYTES)[:POOL]
+        if not len(images) or (labels and images[:, 0].max() >= _CIFAR_CLASSES):
+            raise ValueError("it holds no images, or labels above 9")
     except ValueError as error:
-        raise UserError(f"{path}: is damaged ({error}); download CIFAR-10 again") from error
-    if not raw or len(raw) % _CIFAR_BYTES:
-        raise UserError(f"{path}: holds no pixels of 32x32 images; download CIFAR-10 again")
-    return np.frombuffer(raw, np.uint8)
+        raise UserError(f"{path}: is no file of CIFAR-10's ({error}); download CIFAR-10 again") from error
+    return images[:, labels:].reshape(-1, 3, _CIFAR_SIDE, _CIFAR_SIDE).transpose(0, 2, 3, 1)
 
 
 def _to_size(images: np.ndarray) -> Tensor:

@@ -1,0 +1,45 @@
+"""One set, one encoder and one finished run for all tests of the stage: those that change a run copy it first."""
+
+import shutil
+from pathlib import Path
+
+import pytest
+
+from tests.helpers_data import write_fake_set
+
+BRIEF = {"updates": 2, "batch_size": 4, "eval_length": 2}
+
+
+@pytest.fixture(scope="session")
+def trained(tmp_path_factory) -> Path:
+    """Folder that holds a set, an encoder that was pretrained on it, and a policy on that."""
+    from finetune.train import finetune
+    from pretrain.train import pretrain
+    from tests.helpers_stages import smoke_finetune, smoke_pretrain  # not before: some tests train nothing
+
+    folder = tmp_path_factory.mktemp("trained")
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VD4RL_POMDP_CACHE", str(folder / "cache"))
+        patch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
+        data = write_fake_set(folder / "walker_walk" / "expert", [20, 25, 30])
+        encoder = pretrain(smoke_pretrain(data, folder / "pretrained")).path / "encoder"
+        finetune(smoke_finetune(encoder, data, folder / "run", **BRIEF))
+    return folder
+
+
+@pytest.fixture
+def data(trained) -> Path:
+    """A small expert set of walker_walk."""
+    return trained / "walker_walk" / "expert"
+
+
+@pytest.fixture
+def encoder(trained, own_cache) -> Path:
+    """Folder of an encoder that was pretrained on `data`."""
+    return trained / "pretrained" / "encoder"
+
+
+@pytest.fixture
+def run(trained, own_cache, tmp_path) -> Path:
+    """Copy of a finished run on `encoder` and `data`."""
+    return shutil.copytree(trained / "run", tmp_path / "run")
