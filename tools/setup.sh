@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Set up what `make demo` and `make test` need: a virtual environment with the package, and software rendering.
-# With the word `tests`, also Slurm, which the tests of sweeps start. A second run finds its stamp and does nothing. PYTHON=python3.12 chooses the interpreter: an environment of another
-# version is made anew. Without it an environment keeps its own.
+# With the word `tests`, also Slurm, which the tests of sweeps start. A second run finds its stamp and does nothing.
+# PYTHON=python3.12 chooses the interpreter: an environment of another version is made anew. Without it an environment
+# keeps its own.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
