@@ -19,6 +19,7 @@ from finetune.evaluation import Episode, episode_rows, evaluate_run
 from finetune.train import finetune as run_finetune
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import read_shard
+from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask
 from vd4rl_pomdp.data import View, open_dataset
@@ -46,7 +47,8 @@ def tasks():
         yield TASKS
 
 
-def test_the_example_runs_through_every_stage(tmp_path):
+def test_the_example_runs_through_every_stage(tasks, tmp_path):
+    """Worker processes, which import the file, meet the task in the commands that play."""
     script, data, runs = tmp_path / "my_task.py", tmp_path / "centre" / "random", tmp_path / "runs"
     script.write_text(CODE)
     for line in (
@@ -56,6 +58,9 @@ def test_the_example_runs_through_every_stage(tmp_path):
         f"finetune --encoder {runs}/pretrain/encoder --preset smoke --data {data} --out {runs}/finetune --workers 2",
         f"report {runs} --out {tmp_path}/report",
     ):
+        if "--workers" not in line:
+            main(line.split())
+            continue
         command = [sys.executable, str(script), *line.split()]
         done = subprocess.run(command, capture_output=True, text=True, env=os.environ, check=False)
         assert done.returncode == 0, done.stderr
@@ -71,19 +76,18 @@ def stages(data: Path, out: Path, method: str = "mik+a") -> Path:
     return run_finetune(finetune.config.FinetuneConfig.of("smoke", encoder=encoder, out=out / "run", **common)).path
 
 
-@pytest.mark.parametrize(("name", "size"), [("cartpole_swingup", 64), ("centre", 50)])
-def test_tasks_of_both_kinds_and_any_size_go_through_every_stage(tasks, tmp_path, name, size):
-    data = tmp_path / name / "random"
+def test_a_task_of_dm_control_of_another_size_goes_through_every_stage(tasks, tmp_path):
+    name, size, data = "cartpole_swingup", 64, tmp_path / "cartpole_swingup" / "random"
     collect(CollectConfig(name, "random", data, episodes=3, workers=1, frame_size=size), 8)
     checked = check_dataset(data)
     assert (checked["task"], checked["frame_size"]) == (name, size)
-    assert checked["replay_max_error"] == (None if name == "centre" else 0.0)
+    assert checked["replay_max_error"] == 0.0
     run = stages(data, tmp_path / "runs")
     assert load_encoder(run / "encoder")[0].config.size == size
     assert {row["task"] for row in read_episodes(run / "episodes.csv")} == {name}
     assert {row["task"] for row in evaluate_run(run, "patch", 1, 1)[0]} == {name}
     assert np.load(run / "film.npz")["corrupted"].shape[1:] == (9, size, size)
-    assert (run / "probe.json").exists() == (name != "centre")
+    assert (run / "probe.json").exists()
     write_report([tmp_path / "runs"], tmp_path / "report")
     assert (tmp_path / "report" / "index.html").exists()
 
@@ -189,11 +193,7 @@ def test_an_evaluation_is_never_longer_than_the_task(tasks, tmp_path):
     assert {row["length"] for row in read_episodes(run.path / "episodes.csv")} == {9}
 
 
-@pytest.mark.parametrize(("told", "length"), [(500, 510), (499, 499)])
-def test_an_evaluation_is_of_whole_episodes_of_a_task_that_is_longer_than_the_benchmarks(
-    tasks, tmp_path, monkeypatch, told, length
-):
-    """499 is what one says, 500 the default."""
+def test_an_evaluation_is_of_whole_episodes_of_a_task_that_is_longer_than_the_benchmarks(tasks, tmp_path):
     tasks.register("long", replace(tasks["centre"], arguments={"speed": 0.0}, decisions=510))
     data = tmp_path / "long"
     collect(CollectConfig("long", "random", data, episodes=2, workers=1, frame_size=50), 60)
@@ -201,12 +201,12 @@ def test_an_evaluation_is_of_whole_episodes_of_a_task_that_is_longer_than_the_be
     config = finetune.config.FinetuneConfig.of(
         "smoke", encoder=encoder / "encoder", data=data, workers=1, updates=2, eval_every=2, out=tmp_path / "run"
     )
-    config = replace(config, eval_length=told, eval_clean=False)
+    config = replace(config, eval_length=500, eval_clean=False)  # the default
     run = run_finetune(config)
     assert run_finetune(config).finished, "the same command finds it"
-    assert {row["length"] for row in read_episodes(run.path / "episodes.csv")} == {length}
-    assert json.loads((run.path / "config.json").read_text())["config"]["eval_length"] == length
-    assert {row["length"] for row in evaluate_run(run.path, None, 1, 1)[0]} == {length}
+    assert {row["length"] for row in read_episodes(run.path / "episodes.csv")} == {510}
+    assert json.loads((run.path / "config.json").read_text())["config"]["eval_length"] == 510
+    assert {row["length"] for row in evaluate_run(run.path, None, 1, 1)[0]} == {510}
 
 
 def test_a_score_is_divided_by_the_tasks_own_number(tasks):

@@ -66,9 +66,8 @@ def test_what_cannot_be_a_part_is_refused_however_it_comes(registry, monkeypatch
 
 def test_an_unknown_name_is_told_the_choices(registry):
     told = "unknown frame encoder 'owl': choose one of own, own\\+a, or run the file that registers it"
-    for look_up in (registry.named, registry.check):
-        with pytest.raises(UserError, match=told):
-            look_up("owl")
+    with pytest.raises(UserError, match=told):
+        registry.named("owl")
 
 
 def test_an_entry_point_offers_a_part_once_asked_for_and_its_package_is_its_origin(registry, monkeypatch):

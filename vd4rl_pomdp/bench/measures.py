@@ -176,8 +176,7 @@ def maze_pictures(frames: int) -> dict[str, float]:
     """Pictures per CPU-second of the mazes, against PointMaze's own `render()` at the same size."""
     import gymnasium
 
-    from vd4rl_pomdp.envs.maze import MazeEnv
-    from vd4rl_pomdp.envs.maze_model import gymnasium_robotics
+    from vd4rl_pomdp.envs.maze import MazeEnv, gymnasium_robotics
 
     gymnasium.register_envs(gymnasium_robotics)
     default: Any = gymnasium.make(

@@ -75,21 +75,16 @@ def main(arguments: Sequence[str] | None = None) -> None:
     for stream in (sys.stdout, sys.stderr):
         if isinstance(stream, io.TextIOWrapper):
             stream.reconfigure(errors="backslashreplace")  # \u2028 and the like for what a terminal cannot show
-    second = signal.SIG_IGN if JOB_VARIABLE in os.environ else signal.SIG_DFL
-    end = run_to_end(sys.argv[1:] if arguments is None else arguments, second)
+    end = run_to_end(sys.argv[1:] if arguments is None else arguments)
     if end.line:
         print(end.line, file=sys.stderr)
     if end.code:
         sys.exit(end.code)
 
 
-def run_to_end(words: Sequence[str], second: signal.Handlers = signal.SIG_DFL) -> End:
-    """Do what `vd4rl-pomdp WORDS` does; only a defect is raised.
-
-    Args:
-        words: the command line.
-        second: what a second signal does.
-    """
+def run_to_end(words: Sequence[str]) -> End:
+    """Do what `vd4rl-pomdp WORDS` does; only a defect is raised."""
+    second = signal.SIG_IGN if JOB_VARIABLE in os.environ else signal.SIG_DFL  # whoever starts jobs ends them, too
     try:
         for word in words:
             word.encode()  # names and paths go into files and pages, which are UTF-8

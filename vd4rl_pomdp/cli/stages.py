@@ -57,14 +57,15 @@ def evaluate(
     """
     from finetune.evaluation import by_part, evaluate_run
     from vd4rl_pomdp.data.reference import Reference, summarise
-    from vd4rl_pomdp.runs.episodes import append_episodes, begin_episodes
+    from vd4rl_pomdp.runs.episodes import append_episodes, begin_episodes, read_episodes
     from vd4rl_pomdp.runs.files import flatten
     from vd4rl_pomdp.runs.outputs import refuse_inside
 
     refuse_number("parts", parts, 1)
     if out is not None:
         refuse_inside(out)
-        begin_episodes(out)  # before any episode is played
+        if read_episodes(run / EPISODES_FILE):  # what is no run is refused below
+            begin_episodes(out)  # before any episode is played
     rows, played = evaluate_run(run, corruption, episodes, workers)
     if out is not None:
         append_episodes(out, rows)

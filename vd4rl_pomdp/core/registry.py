@@ -95,10 +95,6 @@ class Registry(Mapping[str, Part], Generic[Part]):
         refuse_unknown(self.kind, name, self._parts, OR_ONES_OWN)
         return self._parts[name]
 
-    def check(self, name: str) -> None:
-        """Raise UserError unless there is a part called `name` that can be loaded."""
-        self.named(name)
-
     def origin(self, name: str) -> str:
         """Where a part comes from: a package and its version, a call, or "" for this package's own."""
         self._load_offered()
@@ -165,20 +161,13 @@ def origins(settings: Mapping[str, Any]) -> dict[str, str]:
     return {part: origin for part, registry, name in _named(settings) if (origin := registry.origin(name))}
 
 
-def sources(settings: Mapping[str, Any]) -> dict[str, str]:
-    """Files of the parts that settings name and that are not this package's own, and hashes of them.
-
-    Such as {"method mine": "mine.py 0123456789ab"}.
-
-    Args:
-        settings: as `origins` takes them.
-    """
-    return {part: source for part, registry, name in _named(settings) if (source := registry.source(name))}
-
-
 def code_of(settings: Mapping[str, Any]) -> dict[str, dict[str, str]]:
-    """What a record keeps of the parts that settings name and that are not this package's own."""
-    return {"plugins": origins(settings), "sources": sources(settings)}
+    """What a record keeps of the parts that settings name and that are not this package's own.
+
+    `plugins` are their `origins`; `sources` their files and hashes of them: {"method mine": "mine.py 0123456789ab"}.
+    """
+    files = {part: registry.source(name) for part, registry, name in _named(settings)}
+    return {"plugins": origins(settings), "sources": {part: file for part, file in files.items() if file}}
 
 
 def of_other_code(record: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
@@ -199,16 +188,6 @@ def warn_of_other_code(place: object, record: Mapping[str, Any], settings: Mappi
     """
     for part in of_other_code(record, settings):
         print(f"warning: {place}: the code of {part} has changed since {what}", file=sys.stderr)
-
-
-def changed_since(told: Mapping[str, str]) -> list[str]:
-    """The parts, of some that `sources` told of in another process, that this one has from another file."""
-    parts = [(part, then, *part.split(" ", 1)) for part, then in told.items()]
-    return [
-        part
-        for part, then, kind, name in parts
-        if kind in REGISTRIES and REGISTRIES[kind].source(name) not in ("", then)
-    ]
 
 
 def _named(settings: Mapping[str, Any]) -> Iterator[tuple[str, Registry[Any], str]]:

@@ -88,7 +88,7 @@ def _check(tasks: Sequence[str], qualities: Sequence[str], timed_episodes: int) 
         refuse_unknown("quality", quality, SET_QUALITIES)
     refuse_number("timed_episodes", timed_episodes, 1, MOST_EPISODES)
     for task in tasks:
-        TASKS.check(task)
+        TASKS.named(task)
 
 
 def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:

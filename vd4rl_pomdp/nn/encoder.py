@@ -91,7 +91,7 @@ class EncoderRecord:
     plugins: dict[str, str] = field(default_factory=dict)
     """Where parts come from that are not this package's, as `registry.origins` tells."""
     sources: dict[str, str] = field(default_factory=dict)
-    """Their files, as `registry.sources` tells."""
+    """Their files, as `registry.code_of` tells."""
 
     @property
     def parts(self) -> dict[str, str]:

@@ -228,7 +228,7 @@ def ships(task: str, quality: str) -> bool:
 
 
 def _asset(task: str, name: str) -> Path:
-    TASKS.check(task)
+    TASKS.named(task)
     return ASSETS / f"{task}_{name}.safetensors"
 
 

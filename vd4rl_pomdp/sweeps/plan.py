@@ -82,7 +82,7 @@ class DataSet:
                 has, asked = (_in_words(name, values.get(name)) for values in (stored, self.wanted))
                 raise UserError(f"{self.folder}: holds a set of {has}, the grid says {asked}; choose another --data")
         elif self.section == "collect":
-            TASKS.check(self.wanted["task"])
+            TASKS.named(self.wanted["task"])
             if self.wanted["quality"] not in SET_QUALITIES:
                 raise UserError(
                     f"{self.folder}: holds no set, and the quality {self.wanted['quality']!r} cannot be collected: "

@@ -28,7 +28,7 @@ def check_task(name: str) -> None:
         AssertionError: a promise is broken; says which one, and by what.
         UserError: there is no such task, or its environment cannot be built, shows no pictures or pays no numbers.
     """
-    TASKS.check(name)
+    TASKS.named(name)
     run_checks("task", CHECKS, name)
 
 
