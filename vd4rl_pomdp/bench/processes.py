@@ -22,7 +22,7 @@ from vd4rl_pomdp.runs.workers import run_jobs
 
 if TYPE_CHECKING:
     from pretrain.config import PretrainConfig
-    from pretrain.trainer import Trainer
+    from pretrain.train import Trainer
 
 STEPS = 3
 _TRAIN = "import sys; from vd4rl_pomdp.bench.processes import train; train(float(sys.argv[1]))"
@@ -42,8 +42,7 @@ def memory(folder: Path, frame_bytes: int) -> dict[str, float]:
 def make_trainer(dataset: Dataset, config: PretrainConfig) -> Trainer:
     """A trainer of the config's objective, its codebook fitted on a few actions."""
     from pretrain.build import build_objective, build_target
-    from pretrain.train import make_batches
-    from pretrain.trainer import Trainer
+    from pretrain.train import Trainer, make_batches
 
     target = build_target(config, dataset.action[:2000].cpu().numpy())
     objective = build_objective(config, dataset.action_dim, target)
