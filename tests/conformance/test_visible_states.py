@@ -82,7 +82,7 @@ def test_a_readout_depends_on_the_frame_the_state_or_both(method: str):
         other = Encoder(replace(encoder.config, readout=readout)).double().eval()
         other.load_state_dict(encoder.state_dict())
         assert read_by(other) == [({t}, set()) if readout == "frame" else past(t, method, {}) for t in range(ROWS)]
-        parts = readout.split("+") if encoder.gru else ["frame"]
+        parts = readout.split("+") if encoder.memory else ["frame"]
         assert other.dim == sum(widths[part] for part in parts)
 
 

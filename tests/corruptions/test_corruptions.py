@@ -14,14 +14,12 @@ from vd4rl_pomdp.corruptions import (
     CorruptionConfig,
     KeyStream,
     Patch,
-    _shift,
+    augmentation,
     derive_keys,
     draw_integers,
     make_corruption,
 )
-from vd4rl_pomdp.corruptions._shift import shift_by_index, shift_by_lines
-from vd4rl_pomdp.corruptions.augmentation import random_shift
-from vd4rl_pomdp.corruptions.corruption import Corruption
+from vd4rl_pomdp.corruptions.augmentation import random_shift, shift_by_index, shift_by_lines
 from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.data.format import write_shard
 
@@ -39,12 +37,8 @@ def stacks(n: int = 64) -> torch.Tensor:
         ),
         (
             CorruptionConfig("patch", "emision", (Patch(),)),
-            "--corruption-mode is 'emision': choose one of resample, emission",
+            "unknown corruption mode 'emision': choose one of resample, emission",
         ),
-        (CorruptionConfig.of("patch", patch_size=16.0), "--patch-size is 16.0: it must be an integer"),
-        (CorruptionConfig.of("patch", patch_size="16"), "--patch-size is '16': it must be an integer"),
-        (CorruptionConfig.of("patch", patch_shared="no"), "--patch-shared is 'no': it must be True or False"),
-        (CorruptionConfig.of("patch", patch_count=True), "--patch-count is True: it must be an integer"),
     ],
 )
 def test_a_config_that_would_do_other_things_is_refused(dataset, config, message):
@@ -163,16 +157,14 @@ def test_a_key_stream_goes_on_from_its_position():
     assert not torch.equal(KeyStream(2).take((10,)), whole)
 
 
-def test_a_stage_that_returns_frames_is_refused():
-    with pytest.raises(UserError, match="function returns frames, which nobody reads: a stage changes them in place"):
-        Corruption([lambda frames, key, number: torch.zeros_like(frames)])(stacks(1), torch.zeros(1, dtype=torch.int64))
-
-
 def test_unknown_and_impossible_corruptions_are_refused():
-    with pytest.raises(UserError, match=r"unknown corruption 'fog'.*patch\+zero_frames"):
+    with pytest.raises(UserError, match="unknown corruption 'fog': choose one of patch, zero_frames"):
         make_corruption("fog")
-    with pytest.raises(UserError, match=r"'zero_frames\+patch': zero_frames may only end a name: patch\+zero_frames$"):
-        make_corruption("zero_frames+patch")
+    for name in ("zero_frames+patch", "patch+patch", "zero_frames+zero_frames"):
+        with pytest.raises(
+            UserError, match=r"unknown corruption .*: a name joins stages by \+, each once, and zero_frames"
+        ):
+            CorruptionConfig.of(name)
     with pytest.raises(UserError, match="--patch-size"):
         make_corruption(CorruptionConfig.of("patch", patch_size=85))(stacks(1), torch.zeros(1, dtype=torch.int64))
     with pytest.raises(UserError, match="--zeroed-frames"):
@@ -226,13 +218,6 @@ def test_shifting_some_of_the_images_by_lines_leaves_out_the_others():
     assert torch.equal(out, shift_by_index(obs[some], offset))
 
 
-@pytest.mark.parametrize("name", ["patch+patch", "patch+patch+zero_frames", "zero_frames+zero_frames"])
-def test_a_stage_that_is_named_twice_is_refused(name):
-    twice = name.split("+")[0]
-    with pytest.raises(UserError, match=re.escape(f"corruption '{name}' names {twice} twice, and its options are one")):
-        CorruptionConfig.of(name)
-
-
 @pytest.mark.parametrize("name", ["none", "bars+wide", "patch+"])
 def test_a_stage_is_not_called_as_none_or_several_are(name):
     with (
@@ -262,6 +247,6 @@ def test_a_device_that_shifts_otherwise_makes_the_same_observations(dataset, mon
     rows, seen = torch.arange(dataset.num_rows).view(2, -1), []
     for by_lines in (True, False):
         if not by_lines:
-            monkeypatch.setattr(_shift, "by_lines", lambda images, pad: False)
+            monkeypatch.setattr(augmentation, "by_lines", lambda images, pad: False)
         seen.append(View(dataset, CorruptionConfig.of(name), 4).observe(rows).clone())
     assert torch.equal(*seen)

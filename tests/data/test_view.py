@@ -6,7 +6,7 @@ import torch
 from tests.helpers_data import fake_action, write_fake_set
 from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.core.types import row_key, unpack_row_key
-from vd4rl_pomdp.corruptions import CorruptionConfig, KeyStream, _shift
+from vd4rl_pomdp.corruptions import CorruptionConfig, KeyStream, augmentation
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, WindowSampler, open_dataset
 
 LENGTHS = (9, 5)
@@ -67,7 +67,7 @@ def test_observations_of_a_window_can_be_shifted_each_by_itself(dataset, monkeyp
     """The frames of one observation still share a shift, and the two ways to shift agree."""
     dataset.frames = torch.randint(0, 256, dataset.frames.shape, dtype=torch.uint8, generator=generator())
     if not by_lines:
-        monkeypatch.setattr(_shift, "by_lines", lambda images, pad: False)
+        monkeypatch.setattr(augmentation, "by_lines", lambda images, pad: False)
     view = View(dataset, CorruptionConfig.of(corruption), 4, shared="observation")
     rows = torch.tensor([[2, 2, 2], [2, 3, 2]])
     seen = view.observe(rows).clone()

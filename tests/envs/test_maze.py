@@ -9,9 +9,8 @@ from gymnasium.utils.env_checker import check_env
 
 import vd4rl_pomdp.envs
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.envs.maze import MazeEnv
-from vd4rl_pomdp.envs.maze_model import build_simulator
-from vd4rl_pomdp.envs.maze_sky import panorama, sky_texture
+from vd4rl_pomdp.envs.maze import MazeEnv, build_simulator
+from vd4rl_pomdp.envs.maze_renderers import panorama, sky_texture
 from vd4rl_pomdp.envs.mazes import HARD, MAZES, get_maze
 
 CURTAINED = [name for name, spec in MAZES.items() if spec.curtains]

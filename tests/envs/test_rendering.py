@@ -16,15 +16,12 @@ from vd4rl_pomdp.envs.maze import MazeEnv
 from vd4rl_pomdp.envs.rendering import suite
 
 
-@pytest.mark.parametrize("version", ["3.1.6", "3.2.7", "3.12.0", "4.0.0"])
-def test_a_mujoco_that_was_not_tried_is_refused_with_what_to_install(version):
-    with pytest.raises(UserError, match=r"pip install .*mujoco==3\.11\.0"):
+def test_a_mujoco_that_was_not_tried_is_refused_with_what_to_install():
+    for version in ("3.3.0", "3.11.0", "3.11.2"):
         rendering.check_mujoco(version)
-
-
-@pytest.mark.parametrize("version", ["3.3.0", "3.11.0", "3.11.2"])
-def test_tried_versions_pass(version):
-    rendering.check_mujoco(version)
+    for version in ("3.1.6", "3.2.7", "3.12.0", "4.0.0"):
+        with pytest.raises(UserError, match=r"pip install .*mujoco==3\.11\.0"):
+            rendering.check_mujoco(version)
 
 
 def last_line(code: str) -> str:
@@ -32,14 +29,13 @@ def last_line(code: str) -> str:
     return subprocess.run(command, capture_output=True, text=True, check=False).stderr.splitlines()[-1]
 
 
-def test_a_machine_without_opengl_gets_a_sentence(tmp_path):
+def test_a_machine_without_opengl_or_dm_control_gets_a_sentence():
     line = last_line("import os; os.environ['MUJOCO_GL'] = 'nothing'")
-    assert "UserError: cannot render with MUJOCO_GL=nothing" in line
+    assert "UserError: cannot render with " in line
+    assert "MUJOCO_GL=nothing" in line
     assert "libegl1" in line
-    (tmp_path / "mujoco.py").write_text("import ctypes\nraise ctypes.ArgumentError('no glGetError')")  # without libgl1
-    line = last_line(f"import sys; sys.path.insert(0, {str(tmp_path)!r})")
-    assert "UserError: cannot render with MUJOCO_GL=" in line
-    assert "libgl1 " in line
+    line = last_line("import sys; sys.modules['dm_control'] = None")
+    assert line.endswith("UserError: dm-control is not installed: `pip install --no-deps dm-control==1.0.44`")
 
 
 PLAY = """
@@ -68,65 +64,22 @@ def collected(folder, command, variables):
     return done.returncode, done.stderr.splitlines()
 
 
-DEVICE, SCREEN = {"MUJOCO_EGL_DEVICE_ID": "0,1"}, {"MUJOCO_GL": "glfw"}
-
-
-@pytest.mark.parametrize(
-    ("command", "variables"), [(name, DEVICE) for name in COMMANDS] + [("dm_control", SCREEN), ("gymnasium", SCREEN)]
-)
-def test_a_variable_that_opengl_cannot_use_is_one_line_for_every_kind_of_task(tmp_path, command, variables):
-    code, lines = collected(tmp_path, command, variables)
+@pytest.mark.parametrize("command", COMMANDS)
+def test_a_variable_that_opengl_cannot_use_is_one_line_for_every_kind_of_task(tmp_path, command):
+    code, lines = collected(tmp_path, command, {"MUJOCO_EGL_DEVICE_ID": "0,1"})
     assert (code, len(lines)) == (2, 1), lines
-    remedy = r"set MUJOCO_GL=egl, .*glfw needs a screen" if variables == SCREEN else "correct or unset MUJOCO_EGL_DEV"
-    ((name, value),) = variables.items()
-    assert re.match(rf"error: cannot render with .*{name}={value} \(.*\): {remedy}", lines[0])
+    assert re.match(r"error: cannot render with .*MUJOCO_EGL_DEVICE_ID=0,1.* \(.*\): correct or unset", lines[0])
 
 
-@pytest.mark.parametrize(
-    ("name", "value", "told"),
-    [
-        (
-            "MUJOCO_EGL_DEVICE_ID",
-            "",
-            "MUJOCO_EGL_DEVICE_ID='' .*: correct or unset MUJOCO_EGL_DEVICE_ID, which numbers",
-        ),
-        (
-            "MUJOCO_EGL_DEVICE_ID",
-            "99",
-            "MUJOCO_EGL_DEVICE_ID=99 .*: correct or unset MUJOCO_EGL_DEVICE_ID, which numbers",
-        ),
-        ("PYOPENGL_PLATFORM", "glx", "PYOPENGL_PLATFORM=glx .*: correct or unset PYOPENGL_PLATFORM;"),
-        (
-            "PYOPENGL_ERROR_ON_COPY",
-            "1",
-            "PYOPENGL_ERROR_ON_COPY=1 .*: correct or unset PYOPENGL_ERROR_ON_COPY, or set M",
-        ),
-        ("MUJOCO_GL", "EGL", "MUJOCO_GL=EGL .*: set MUJOCO_GL=egl"),
-    ],
-)
-def test_variables_that_any_library_below_reads_are_named(tmp_path, name, value, told):
-    code, lines = collected(tmp_path, "dm_control", {name: value})
-    assert (code, len(lines)) == (2, 1), lines
-    assert re.match(f"error: cannot render with .*{told}", lines[0])
-    assert ("libegl1" in lines[0]) == ("set MUJOCO_GL=egl" in lines[0])
-
-
-@pytest.mark.parametrize(
-    "order", [("HalfCheetah-v5",), ("HalfCheetah-v5", "walker_walk"), ("walker_walk", "HalfCheetah-v5")]
-)
-def test_a_process_that_has_drawn_ends_without_a_word(order):
+def test_a_process_that_has_drawn_ends_without_a_word():
     code = (
         "from vd4rl_pomdp.envs.make import make_env; from vd4rl_pomdp.core.tasks import TASKS, GymnasiumTask\n"
-        f"envs = [make_env(TASKS.get(name) or GymnasiumTask(name), size=16) for name in {order}]\n"
+        "names = 'HalfCheetah-v5', 'walker_walk'\n"
+        "envs = [make_env(TASKS.get(name) or GymnasiumTask(name), size=16) for name in names]\n"
         "print(*(env.reset(0).frame.any() for env in envs))"
     )
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
-    assert (done.stdout.split(), done.stderr) == (["True"] * len(order), "")
-
-
-def test_a_machine_without_dm_control_is_told_how_to_install_it():
-    line = last_line("import sys; sys.modules['dm_control'] = None")
-    assert line.endswith("UserError: dm-control is not installed: `pip install --no-deps dm-control==1.0.44`")
+    assert (done.stdout.split(), done.stderr) == (["True", "True"], "")
 
 
 @pytest.mark.parametrize("task", TASKS)

@@ -85,6 +85,8 @@ def test_references_with_their_own_algorithm_stand_in_the_same_table(tmp_path):
     chances = [(row["method"], row["probability"], row["wins"]) for row in table(tmp_path / "out" / "improvement.csv")]
     assert chances == [("acro", "", "1.0"), ("bc", "", "0.0")], "one pair of runs tells no probability"
     assert cells(page, "Probability of improvement</h2>") == [["acro", "", "1 of 1"], ["bc", "0 of 1", ""]]
+    heads = re.findall(r"<th>(.*?)</th>", page.read_text().partition("Probability of improvement</h2>")[2])
+    assert heads[:3] == ["row beats column", "acro", "bc"]
 
 
 @pytest.mark.parametrize(("method", "noted"), [("supervised+a", True), ("acro", False)])
@@ -117,7 +119,7 @@ def test_missing_cells_and_seeds_are_shown_as_missing(tmp_path):
         ("medium", "acro"): [9.0, ""],
         ("medium", "mik+a"): [-1.0, "seed 0 missing"],
     }
-    assert cells(page, "<h3>walker_walk medium")[1] == ["mik+a", "–", "–", "–", "–", "0†", "0", "seed 0 missing"]
+    assert cells(page, "<h3>walker_walk medium")[1] == ["mik+a", "–", "–", "–", "–", "0", "0", "seed 0 missing"]
     missing = [(row["quality"], row["seed"], row["state"]) for row in table(tmp_path / "out" / "missing.csv")]
     assert missing == [("expert", "2", "missing"), ("medium", "0", "missing")]
     states = {

@@ -1,14 +1,21 @@
-"""Random shift (Kostrikov et al. 2020, arXiv 2004.13649): pad by repeating the border, crop at a random place."""
+"""Random shift (Kostrikov et al. 2020, arXiv 2004.13649): pad by repeating the border, crop at a random place.
+
+Images are shifted by whole pixels: by an index on a GPU, by lines of memory on a CPU. DrQ interpolates at the same
+places with weights that are 0 and 1 but for float32's rounding: of random pixels 59% come out the same to the last bit,
+the others within 0.004 of 255.
+"""
 
 from __future__ import annotations
 
+import math
 from typing import Literal
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from vd4rl_pomdp.core.buffers import BUFFERS
-from vd4rl_pomdp.corruptions import _shift
+from vd4rl_pomdp.corruptions.keys import draw_integers
 
 Sharing = Literal["window", "observation"]
 """What of a batch of windows one random shift is shared by: all observations of a window, or the frames of one."""
@@ -27,10 +34,61 @@ def random_shift(obs: Tensor, key: Tensor, pad: int = 4) -> Tensor:
     """
     if pad == 0:
         return obs
-    offset = _shift.draw_offset(key, pad)
-    if not _shift.by_lines(obs, pad):
-        return _shift.shift_by_index(obs, offset)
+    offset = draw_offset(key, pad)
+    if not by_lines(obs, pad):
+        return shift_by_index(obs, offset)
     out = BUFFERS.take(obs.shape)
     images, shifted = (x.view(len(obs), -1, *obs.shape[-2:]) for x in (obs, out))
-    _shift.shift_by_lines(images, torch.arange(len(obs)), offset, shifted)
+    shift_by_lines(images, torch.arange(len(obs)), offset, shifted)
     return out
+
+
+def draw_offset(key: Tensor, pad: int) -> Tensor:
+    """Shifts (N, 2) int64, rows and columns, in -pad..pad, from (N,) int64 keys."""
+    return draw_integers(key, 2 * pad + 1, 2) - pad
+
+
+def by_lines(images: Tensor, pad: int) -> bool:
+    """Whether images (N, ..., H, W) can be shifted by `shift_by_lines`."""
+    sizes = len(images) > 2 and 0 < pad < min(images.shape[-2:])
+    return sizes and images.device.type == "cpu" and images.is_contiguous()
+
+
+def shift_by_index(obs: Tensor, offset: Tensor) -> Tensor:
+    """(N, ..., H, W) images shifted by (N, 2), by one gather of single pixels: right for a GPU, slow on a CPU."""
+    n, height, width = obs.shape[0], obs.shape[-2], obs.shape[-1]
+    y = (offset[:, :1] + torch.arange(height, device=obs.device)).clamp_(0, height - 1)
+    x = (offset[:, 1:] + torch.arange(width, device=obs.device)).clamp_(0, width - 1)
+    pixel = (y[:, :, None] * width + x[:, None, :]).view(n, 1, height * width)
+    images = obs.reshape(n, math.prod(obs.shape[1:-2]), height * width)
+    return images.gather(2, pixel.expand_as(images)).view(obs.shape)
+
+
+def shift_by_lines(images: Tensor, chosen: Tensor, offset: Tensor, out: Tensor) -> None:
+    """Write the (M,) `chosen` ones of (N > 2, planes, H, W) images, shifted, into `out`: many times as fast on a CPU.
+
+    A shifted line is a run of bytes in memory that begins dx further on; only what the run holds of the line beside it
+    must then be overwritten by the border.
+    """
+    n, planes, height, width = images.shape
+    runs = images.as_strided((images.numel() - width + 1, width), (1, 1))
+    inner = chosen.clamp(1, n - 2)
+    dy, dx = offset.unbind(1)
+    line = (dy[:, None] + torch.arange(height)).clamp_(0, height - 1)
+    start = (inner[:, None] * planes * height + line) * width + dx[:, None]
+    start = start[:, None] + torch.arange(planes)[:, None] * (height * width)
+    torch.index_select(runs, 0, start.flatten(), out=out.view(start.numel(), width))
+    _repeat_borders(out.view(len(out), planes * height, width).numpy(), dx.numpy())
+    ends = (chosen != inner).nonzero()[:, 0]  # whose runs may reach beyond the images' memory
+    out[ends] = shift_by_index(images[chosen[ends]], offset[ends])
+
+
+def _repeat_borders(images: np.ndarray, shift: np.ndarray) -> None:
+    """Overwrite the columns of (M, lines, W) images that an (M,) shift brought in by the outermost true one."""
+    width = images.shape[-1]
+    for size in np.unique(shift[shift != 0]).tolist():
+        moved = np.flatnonzero(shift == size)
+        edge = width - 1 - size if size > 0 else -size
+        border = images[moved, :, edge]
+        for column in range(edge + 1, width) if size > 0 else range(edge):
+            images[moved, :, column] = border

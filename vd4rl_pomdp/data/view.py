@@ -13,8 +13,8 @@ from vd4rl_pomdp.core.errors import refuse_unknown
 from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.core.tasks import FRAME_STACK
 from vd4rl_pomdp.core.types import Transitions, Windows
-from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, _shift
-from vd4rl_pomdp.corruptions.augmentation import Sharing, random_shift
+from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, augmentation
+from vd4rl_pomdp.corruptions.augmentation import Sharing
 from vd4rl_pomdp.data.dataset import Dataset, Index, require_positive
 
 
@@ -64,11 +64,11 @@ class View:
             shifts = len(rows) if self._shared == "window" else rows.numel()
             shift_key = self.shifts.take((shifts,), rows.device)
         keys = self.corruption.keys(self.dataset.keys(rows))
-        if _shift.by_lines(self.dataset.frames, self._pad):
+        if augmentation.by_lines(self.dataset.frames, self._pad):
             return self._observe_by_lines(rows, shift_key, keys)
         stacks = self.stacks(rows)
         shifted_alike = stacks if len(shift_key) == len(rows) else stacks.flatten(0, rows.ndim - 1)
-        shifted = random_shift(shifted_alike, shift_key, self._pad).view(stacks.shape)
+        shifted = augmentation.random_shift(shifted_alike, shift_key, self._pad).view(stacks.shape)
         return self.corruption.corruption.apply_(shifted, keys)
 
     def stacks(self, rows: Tensor) -> Tensor:
@@ -137,8 +137,10 @@ class View:
         kept = corruption.kept(keys, stack)
         chosen = self.dataset.stack_rows(rows, stack).view(-1, stack).gather(1, kept)
         images = BUFFERS.take((chosen.numel() + 1, *frames.shape[1:]))
-        offset = _shift.draw_offset(shift_key, self._pad).repeat_interleave(chosen.numel() // max(1, len(shift_key)), 0)
-        _shift.shift_by_lines(frames, chosen.flatten(), offset, images[:-1])
+        offset = augmentation.draw_offset(shift_key, self._pad).repeat_interleave(
+            chosen.numel() // max(1, len(shift_key)), 0
+        )
+        augmentation.shift_by_lines(frames, chosen.flatten(), offset, images[:-1])
         corruption.change_(images[:-1].view(*chosen.shape, *images.shape[1:]), keys, kept)
         obs = images[:-1] if kept.shape[1] == stack else _spread(images, kept, stack)
         return obs.view(*rows.shape, stack * images.shape[1], *images.shape[2:])

@@ -44,7 +44,7 @@ def _register(name: str, entry_point: str, arguments: dict[str, Any], steps: int
         entry_point=f"vd4rl_pomdp.{entry_point}",
         kwargs=arguments,
         max_episode_steps=steps,
-        additional_wrappers=(WrapperSpec("ResetAfterEnd", "vd4rl_pomdp.envs.ended:ResetAfterEnd", {}),),
+        additional_wrappers=(WrapperSpec("ResetAfterEnd", "vd4rl_pomdp.envs.pixels:ResetAfterEnd", {}),),
     )
 
 

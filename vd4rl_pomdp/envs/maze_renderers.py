@@ -6,15 +6,14 @@ is nearer than what MuJoCo drew. A ball that is wholly behind a curtain therefor
 
 In first person a ray for each column finds the nearest wall. The light shines where the camera looks, so a wall's face
 has one shade, the floor none but the ambient one, and the picture is made of five colours and the sky's, which are
-looked up by azimuth, averaged over 2x2 rays.
+looked up by azimuth in a panorama of the cube texture that MuJoCo draws, averaged over 2x2 rays.
 """
 
 from __future__ import annotations
 
 import numpy as np
 
-from vd4rl_pomdp.envs.maze_sky import BINS, panorama, sky_texture
-from vd4rl_pomdp.envs.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, PICTURE_SIZE, MazeSpec, Style
+from vd4rl_pomdp.envs.mazes import BALL_RADIUS, FREE_CELLS, HALF_SIZE, PICTURE_SIZE, MazeSpec, Sky, Style
 from vd4rl_pomdp.envs.opengl import close_at_exit, gl_errors, refuse_after_fork, undisturbed
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.envs.rendering import mujoco
@@ -205,6 +204,74 @@ class FirstPersonRenderer:
         parts = [kinds[i :: self._FINE, j :: self._FINE] for i in range(self._FINE) for j in range(self._FINE)]
         sums = [sum(shade[part] for part in parts) for shade in palette.T]
         return ((np.stack(sums) + self._FINE) // self._FINE**2).astype(np.uint8)
+
+
+FACE = 400
+"""Texels along an edge of the cube."""
+BINS = 2048
+"""Columns of a panorama: azimuths from -pi on, counterclockwise."""
+_TOP, _STARS, _TWINKLE = np.array([0.4, 0.6, 0.8]), 0.01, 2
+"""PointMaze's sky: the colour straight up (black is straight down), the share of white texels, their fineness."""
+_ACROSS = (np.arange(FACE) + 0.5) / FACE * 2 - 1
+_ROW, _COLUMN = (axis.ravel() for axis in np.meshgrid(_ACROSS, _ACROSS, indexing="ij"))
+_ONE = np.ones(FACE * FACE)
+_FACES = (
+    (_ONE, _COLUMN, -_ROW),
+    (-_ONE, -_COLUMN, -_ROW),
+    (_COLUMN, -_ROW, _ONE),
+    (_COLUMN, _ROW, -_ONE),
+    (_COLUMN, -_ONE, -_ROW),
+    (-_COLUMN, _ONE, -_ROW),
+)
+"""Where MuJoCo shows a face's texels: x, y and z of their directions."""
+
+
+def sky_texture(sky: Sky) -> np.ndarray:
+    """(6 * FACE * FACE * 3,) uint8, as in `tex_data` of a skybox of that size."""
+    if sky == "none":
+        return np.zeros(6 * FACE * FACE * 3, np.uint8)
+    x, y, z = np.concatenate([np.stack(face) for face in _FACES], 1)
+    if sky == "compass":
+        return _bytes(_compass(np.arctan2(y, x)))
+    colors = _gradient(np.arctan2(z, np.hypot(x, y)))
+    return _bytes(colors + _star_light()[:, None] * (1 - colors))
+
+
+def panorama(texture: np.ndarray, elevations: np.ndarray) -> np.ndarray:
+    """Colours (BINS, E, 3) uint8 of a `sky_texture` by azimuth and by (E,) elevations in radians."""
+    azimuth = (np.arange(BINS)[:, None] + 0.5) / BINS * 2 * np.pi - np.pi
+    level = np.cos(elevations)
+    x, y, z = np.broadcast_arrays(np.cos(azimuth) * level, np.sin(azimuth) * level, np.sin(elevations))
+    largest = np.maximum(np.maximum(np.abs(x), np.abs(y)), np.abs(z))
+    found = np.zeros((*x.shape, 3), np.uint8)
+    x, y, z = (side / largest for side in (x, y, z))
+    places = ((x == 1, y, -z), (x == -1, -y, -z), (z == 1, x, -y), (z == -1, x, y), (y == -1, x, -z), (y == 1, -x, -z))
+    for face, (there, column, row) in zip(texture.reshape(6, FACE, FACE, 3), places, strict=True):
+        at = [np.minimum(((side[there] + 1) / 2 * FACE).astype(int), FACE - 1) for side in (row, column)]
+        found[there] = face[at[0], at[1]]
+    return found
+
+
+def _bytes(colors: np.ndarray) -> np.ndarray:
+    return (colors * 255 + 0.5).astype(np.uint8).ravel()
+
+
+def _gradient(elevation: np.ndarray) -> np.ndarray:
+    """(N, 3) colours in 0..1 by elevation: MuJoCo's builtin gradient."""
+    share = elevation / (np.pi / 2)
+    return (1 + share / np.sqrt(1 + share**2) * np.sqrt(2))[:, None] / 2 * _TOP
+
+
+def _star_light() -> np.ndarray:
+    """(6 * FACE * FACE,) shares of each texel that stars cover: the same stars always."""
+    side = FACE * _TWINKLE
+    stars = np.random.default_rng(0).random((6, side, side), np.float32) < _STARS
+    return stars.reshape(6, FACE, _TWINKLE, FACE, _TWINKLE).mean((2, 4)).ravel()
+
+
+def _compass(azimuth: np.ndarray) -> np.ndarray:
+    """(N, 3) colours in 0..1: the colour circle once around the horizon, whose luminance rises and falls once, too."""
+    return 0.5 + 0.5 * np.cos(azimuth[:, None] - np.array([0, 2, 4]) * np.pi / 3)
 
 
 class _SkyTable:

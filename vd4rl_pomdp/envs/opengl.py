@@ -35,26 +35,13 @@ _VARIABLES = ("MUJOCO_", "PYOPENGL_", "PYGLFW_", "EGL_", "__EGL_", "LIBGL_", "ME
 
 def gl_error(error: BaseException) -> UserError:
     """A sentence for a machine on which no OpenGL context can be made, with the variables that decide about it."""
-    backend, said = os.environ["MUJOCO_GL"], first_line(error)
-    others = {name: value for name, value in sorted(os.environ.items()) if name.startswith(_VARIABLES)}
-    del others["MUJOCO_GL"]
-    if others.get("PYOPENGL_PLATFORM") == backend.lower():
-        del others["PYOPENGL_PLATFORM"]  # dm_control and mujoco set it themselves
-    told = ", ".join(f"{name}={shlex.quote(value)}" for name, value in {"MUJOCO_GL": backend, **others}.items())
-    device = "MUJOCO_EGL_DEVICE_ID"
-    at_fault = [name for name in others if name in said or (name == device and isinstance(error, ValueError))]
-    install = "set MUJOCO_GL=glfw"
-    if sys.platform == "linux":
-        install = (
-            "set MUJOCO_GL=egl, for which Debian's libegl1, libgl1 and libgl1-mesa-dri must be installed, or osmesa, "
-            "for which libosmesa6 must be; glfw needs a screen"
-        )
-    remedy = f"correct or unset {' and '.join(at_fault or others)}" if others else install
-    if others and not at_fault:
-        remedy += f", or {install}"
-    if device in at_fault:
-        remedy += ", which numbers one EGL device, from 0"
-    return UserError(f"cannot render with {told} ({said}): {remedy}; what draws nothing takes MUJOCO_GL=disable")
+    read = {name: value for name, value in sorted(os.environ.items()) if name.startswith(_VARIABLES)}
+    told = ", ".join(f"{name}={shlex.quote(value)}" for name, value in read.items())
+    return UserError(
+        f"cannot render with {told} ({first_line(error)}): correct or unset the variable at fault, or set MUJOCO_GL to "
+        "egl (Debian: libegl1, libgl1, libgl1-mesa-dri), osmesa (libosmesa6) or glfw (needs a screen); what draws "
+        "nothing, such as control-study, takes MUJOCO_GL=disable"
+    )
 
 
 @contextlib.contextmanager

@@ -6,7 +6,10 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 from typing import Any, Literal, get_args
 
+import gymnasium
 import numpy as np
+from gymnasium.error import ResetNeeded
+from gymnasium.utils import RecordConstructorArgs
 
 from vd4rl_pomdp.core.errors import MOST, UserError, refuse_unknown
 from vd4rl_pomdp.core.tasks import Layout, Task
@@ -144,3 +147,25 @@ class PixelEnv(ABC):
     @abstractmethod
     def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
         """The time step of the present state."""
+
+
+class ResetAfterEnd(gymnasium.Wrapper[np.ndarray, Any, np.ndarray, Any], RecordConstructorArgs):
+    """Raises Gymnasium's ResetNeeded for a step between the end of an episode and the next `reset`."""
+
+    def __init__(self, env: gymnasium.Env[np.ndarray, Any]) -> None:
+        RecordConstructorArgs.__init__(self)
+        gymnasium.Wrapper.__init__(self, env)
+        self._over = False
+
+    def reset(self, **options: Any) -> tuple[np.ndarray, dict[str, Any]]:
+        """Begin the next episode."""
+        self._over = False
+        return self.env.reset(**options)
+
+    def step(self, action: Any) -> tuple[np.ndarray, Any, bool, bool, dict[str, Any]]:
+        """Apply one action, unless the episode is over."""
+        if self._over:
+            raise ResetNeeded("the episode is over: call reset() before the next step()")
+        result = self.env.step(action)
+        self._over = result[2] or result[3]
+        return result

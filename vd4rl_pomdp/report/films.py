@@ -66,9 +66,9 @@ def shown_films(runs: Iterable[Run]) -> tuple[list[Shown], int]:
     for run in chosen.values():
         film = read_film(run.path / FILM_FILE)
         name = f"{title(run)}, seed {run.labels['seed']}"
-        images = [base64.b64encode(picture).decode() for picture in (strip(film), movie(film))]
+        still, moving = (base64.b64encode(picture).decode() for picture in (strip(film), movie(film)))
         share = min(1.0, len(film["clean"]) / STRIP_FRAMES)
-        made = Shown(name, *images, share, film["return"][-1])
+        made = Shown(name, still, moving, share, film["return"][-1])
         size += len(made.strip) + len(made.movie)
         if size > MOST_BYTES:
             break

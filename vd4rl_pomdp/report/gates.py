@@ -68,7 +68,7 @@ def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
     compared = sides(learned, floor)
     above, (low, high) = difference(compared)
     data = {value for run in here if (value := run.reference.data_return) is not None}
-    row = dict(zip(GATED, key, strict=True)) | {
+    row: Row = dict(zip(GATED, key, strict=True)) | {
         "data_return": float(np.mean(sorted(data))) if data else None,
         "state_share": _share(state),
         "state_seeds": len(state),

@@ -147,7 +147,7 @@ def with_algorithm(row: Row) -> str:
 
 
 def _count(row: Row) -> str:
-    return f"{int(row['seeds'])}†" if row["seeds"] < FEW_SEEDS else str(int(row["seeds"]))
+    return f"{int(row['seeds'])}" + "†" * (0 < row["seeds"] < FEW_SEEDS)
 
 
 def _side(side: str) -> Callable[[Row], str]:
@@ -216,7 +216,10 @@ SHOWN: dict[str, tuple[int, Columns]] = {
         {
             "corruption": "corruption",
             "method": label,
-            **{name.replace("_", " "): (name, f"{name}_low", f"{name}_high", 1) for name in tables.AGGREGATES},
+            **{
+                name.replace("_", " ").replace("iqm", "IQM"): (name, f"{name}_low", f"{name}_high", 1)
+                for name in tables.AGGREGATES
+            },
             "tasks": lambda row: f"{row['tasks']} of {row['of_tasks']}",
             "seeds": _count,
         },
@@ -299,7 +302,7 @@ def _blocks(name: str, table: pd.DataFrame, rows: pd.DataFrame, words: int) -> I
             for one in order:
                 matrix.loc[one, one] = ""
             for start in range(0, len(order), WIDEST):
-                columns = matrix.iloc[:, start : start + WIDEST].reset_index()
+                columns = matrix.iloc[:, start : start + WIDEST].reset_index().rename_axis(columns=None)
                 yield block(str(heading), columns, words, seeds_note(mine["seeds"]))
         else:
             note = seeds_note(mine["seeds"]) + (_told_note(mine["method"]) if name == "representations" else "")

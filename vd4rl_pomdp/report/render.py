@@ -47,7 +47,8 @@ def _text(row: Row, what: Any) -> str:
     if isinstance(what, str):
         return one_line(str(row[what]))
     *names, digits = what
-    return (number if len(names) == 1 else with_interval)(*(row[name] for name in names), digits)
+    in_words: Callable[..., str] = number if len(names) == 1 else with_interval
+    return in_words(*(row[name] for name in names), digits)
 
 
 class Block(NamedTuple):
