@@ -133,7 +133,6 @@ def _trainer(
         policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(batches)]))
     noise = stream_generator(config.seed, STAGE, "noise")
     algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
-    algorithm.precision = config.update_precision
     reference = Reference.of(dataset)
     actor = reference.actor_file
     path = DataPath(dataset, read_actor(actor), encode) if actor and dataset.physics is not None else None
@@ -176,6 +175,13 @@ class FinetuneTrainer:
         self.config, self.card = config, card
         self.reference, self.path = reference, path
         self.step = 0
+        self._precise = torch.autocast(
+            algorithm.policy.standardise.mean.device.type,
+            torch.bfloat16,
+            config.update_precision == "bf16",
+            cache_enabled=False,
+        )
+        """Not cached, because weights move between the losses of an update."""
 
     def run(self, run: RunFolder) -> None:
         """Train to the end, from the newest checkpoint if there is one."""
@@ -187,7 +193,10 @@ class FinetuneTrainer:
             if self.step and loop.due(config.eval_every):
                 self.evaluate(run, loop)
             for step in loop:
-                loop.add(self.algorithm.update(self.sampler.sample()))  # type: ignore[arg-type]
+                batch = self.sampler.sample()
+                with self._precise:
+                    logs = self.algorithm.update(batch)  # type: ignore[arg-type]
+                loop.add(logs)
                 self.step = step
                 if loop.due(config.log_every):
                     loop.log()

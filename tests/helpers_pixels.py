@@ -10,8 +10,7 @@ import torch
 
 from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
-from pretrain.train import make_batches
-from pretrain.trainer import Trainer
+from pretrain.train import Trainer, make_batches
 from vd4rl_pomdp.core.seeding import seed_networks
 from vd4rl_pomdp.core.tasks import FRAME_STACK
 from vd4rl_pomdp.core.types import StepType

@@ -16,8 +16,8 @@ import finetune.train
 from finetune.algorithms import bc, td3_bc
 from finetune.features import FrozenEncoder
 from finetune.train import finetune as run_finetune
+from pretrain.train import Trainer
 from pretrain.train import pretrain as run_pretrain
-from pretrain.trainer import Trainer
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import contents, smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -14,7 +13,6 @@ from torch.optim import Optimizer
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.nn.policy import Policy
-from vd4rl_pomdp.runs.device import Precision, autocast
 
 
 @dataclass(frozen=True)
@@ -45,8 +43,6 @@ class Algorithm(ABC):
     """Class of its options."""
     summary: str = ""
     """One line that says what it is."""
-    precision: Precision = "fp32"
-    """Of the matrix products that losses are computed by; gradients are taken outside."""
 
     def __init__(
         self, policy: Policy, options: Any, learning_rate: float, updates: int, generator: torch.Generator
@@ -67,7 +63,7 @@ class Algorithm(ABC):
 
     @abstractmethod
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
-        """Minimise each loss in turn, and count the update.
+        """Compute each loss in turn and `step` along it, and count the update.
 
         Args:
             batch: transitions of representations.
@@ -78,20 +74,15 @@ class Algorithm(ABC):
             Detached scalars of all losses by name.
         """
 
-    def minimise(
-        self, loss: Callable[[FeatureBatch], Loss], batch: FeatureBatch, *optimisers: Optimizer
-    ) -> dict[str, Tensor]:
-        """Step along the gradient of a loss; parameters of no other optimiser take any. Returns what it logs."""
-        with autocast(batch.z.device, self.precision):
-            value, logs = loss(batch)
+    def step(self, loss: Loss, *optimisers: Optimizer) -> None:
+        """Step along the gradient of a loss, which is taken in full precision; only the optimisers' parameters move."""
         for optimiser in optimisers:
             optimiser.zero_grad(set_to_none=True)
-        value.backward(
-            inputs=[p for optimiser in optimisers for group in optimiser.param_groups for p in group["params"]]
-        )
+        asked = [p for optimiser in optimisers for group in optimiser.param_groups for p in group["params"]]
+        with torch.autocast(loss.value.device.type, enabled=False):
+            loss.value.backward(inputs=asked)
         for optimiser in optimisers:
             optimiser.step()
-        return dict(logs)
 
     @abstractmethod
     def parts(self) -> dict[str, Any]:

@@ -43,9 +43,10 @@ class BC(Algorithm):
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
         """One step along the one loss."""
-        logs = self.minimise(self.cloning_loss, batch, self.optimiser, *encoder)
+        loss = self.cloning_loss(batch)
+        self.step(loss, self.optimiser, *encoder)
         self.updates += 1
-        return logs
+        return loss.logs
 
     def cloning_loss(self, batch: FeatureBatch) -> Loss:
         """Mean of (a~ - a)^2."""

@@ -23,7 +23,6 @@ from __future__ import annotations
 import copy
 import math
 from dataclasses import dataclass
-from functools import partial
 from typing import Any, ClassVar
 
 import torch
@@ -37,7 +36,6 @@ from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp, move_target
 from vd4rl_pomdp.nn.policy import Policy
-from vd4rl_pomdp.runs.device import autocast
 
 MOST_WEIGHT = 100.0
 LOG_STD_RANGE = -5.0, 2.0
@@ -92,16 +90,19 @@ class IQL(Algorithm):
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
         """A step of the critics and their targets, then of the value, then of the actor."""
-        logs = self.minimise(self.critic_loss, batch, self.critic_optimiser, *encoder)
+        critic = self.critic_loss(batch)
+        self.step(critic, self.critic_optimiser, *encoder)
         move_target(self.target_critic, self.critic, self.tau)
-        with torch.no_grad(), autocast(batch.z.device, self.precision):  # once, because two losses read it
+        with torch.no_grad():  # once, because two losses read it
             q = torch.minimum(*self.target_critic(self.policy.standardise(batch.z), batch.action))
-        logs |= self.minimise(partial(self.value_loss, q=q), batch, self.value_optimiser)
+        value = self.value_loss(batch, q)
+        self.step(value, self.value_optimiser)
         for group in self.policy_optimiser.param_groups:
             group["lr"] = self.policy_learning_rate
-        logs |= self.minimise(partial(self.actor_loss, q=q), batch, self.policy_optimiser)
+        actor = self.actor_loss(batch, q)
+        self.step(actor, self.policy_optimiser)
         self.updates += 1
-        return logs
+        return critic.logs | value.logs | actor.logs
 
     def critic_loss(self, batch: FeatureBatch) -> Loss:
         """Squared error of both critics, to the same target y."""

@@ -73,10 +73,14 @@ class TD3BC(Algorithm):
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
         """A step of the critics, and in every `policy_delay`-th update one of the actor and of the targets."""
-        logs = self.minimise(self.critic_loss, batch, self.critic_optimiser, *encoder)
+        loss = self.critic_loss(batch)
+        self.step(loss, self.critic_optimiser, *encoder)
+        logs = loss.logs
         if (self.updates + 1) % self.policy_delay == 0:
-            logs |= self.minimise(self.actor_loss, batch, self.policy_optimiser)
+            loss = self.actor_loss(batch)
+            self.step(loss, self.policy_optimiser)
             self.move_targets()
+            logs = logs | loss.logs
         self.updates += 1  # last, because DrQ-v2's noise of both losses is that of the updates made before
         return logs
 

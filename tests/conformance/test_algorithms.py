@@ -162,7 +162,7 @@ class Writing(BC):
 
 
 MUTANTS = [
-    (Idle, losses_are_finite_scalars, "an update minimises no loss"),
+    (Idle, losses_are_finite_scalars, "an update steps along no loss"),
     (Silent, losses_are_finite_scalars, "update 0 logs nothing"),
     (Attached, losses_are_finite_scalars, "bc_loss is logged with its graph"),
     (Numbering, losses_are_finite_scalars, "a log is called `step`"),

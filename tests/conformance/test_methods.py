@@ -7,7 +7,7 @@ import torch
 
 from pretrain.objectives import METHODS, Method
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.nn.objective import InverseObjective, InverseOptions, Objective, StateInverse
+from vd4rl_pomdp.nn.objective import InverseOptions, Objective, StateInverse
 from vd4rl_pomdp.testing import check_method
 from vd4rl_pomdp.testing.contract import run_check
 from vd4rl_pomdp.testing.methods import (
@@ -23,7 +23,6 @@ from vd4rl_pomdp.testing.methods import (
     predicts_actions,
     steps_lower_the_loss,
     streaming_equals_batch,
-    the_state_holds_all_that_a_loss_depends_on,
 )
 
 CASES = [(name, check) for name in METHODS for check in checks_of(name)]
@@ -164,12 +163,6 @@ class Broken(Mean):
         raise RuntimeError("a shape does not fit")
 
 
-class Silent(StateInverse):
-    """Forgets to declare what it sees, and is no class that can be made."""
-
-    visible = InverseObjective.visible
-
-
 MUTANTS = [
     (Vector, a_loss_is_a_finite_scalar, r"its shape is \(1,\)"),
     (Diverged, a_loss_is_a_finite_scalar, "it is inf"),
@@ -178,8 +171,8 @@ MUTANTS = [
     (Misreported, a_loss_is_a_finite_scalar, "is logged, the loss is"),
     (Frozen, a_loss_moves_the_whole_encoder, "none reaches frame.project.0.bias"),
     (Still, steps_lower_the_loss, "the mean of the first five is"),
-    (Counting, the_state_holds_all_that_a_loss_depends_on, "register what the loss reads"),
-    (Drawing, a_training_that_goes_on_elsewhere_takes_the_same_steps, "draw from vd4rl_pomdp.nn.draws.Draws"),
+    (Counting, a_training_that_goes_on_elsewhere_takes_the_same_steps, "keep what the loss reads as parameters"),
+    (Drawing, a_training_that_goes_on_elsewhere_takes_the_same_steps, "draw from nn.draws.Draws"),
     (Unmasked, padding_changes_no_loss, "leave out rows beyond `real`"),
     (Looking, streaming_equals_batch, "the two differ"),
     (Undeclared, predictions_depend_on_what_is_declared, "the prediction of a_0 from rows 0 and 1 has gradients to"),
@@ -199,8 +192,6 @@ def test_a_method_that_breaks_a_promise_is_told_which_and_how(methods, kind, che
     methods.register("mine", Method(kind, **options))
     with pytest.raises(AssertionError, match=f"method 'mine' breaks a promise(.|\n)*{reason}"):
         run_check("method", check, "mine")
-    with pytest.raises(AssertionError, match="method 'mine' breaks a promise"):
-        check_method("mine")
 
 
 def test_a_method_that_keeps_all_promises_passes_and_unknown_ones_and_settings_are_refused(methods):
@@ -211,16 +202,6 @@ def test_a_method_that_keeps_all_promises_passes_and_unknown_ones_and_settings_a
         check_method("mine", max_k=2)
     with pytest.raises(UserError, match="unknown method 'yours'"):
         check_method("yours")
-
-
-@pytest.mark.parametrize(
-    ("build", "reason"),
-    [(Silent, "TypeError: .* abstract method '?visible"), (lambda *parts: parts[0], "makes a Encoder")],
-)
-def test_a_method_that_makes_no_objective_breaks_a_promise(methods, build, reason):
-    methods.register("mine", Method(build, options=InverseOptions))
-    with pytest.raises(AssertionError, match=f"method 'mine' breaks a promise(.|\n)*makes an objective(.|\n)*{reason}"):
-        check_method("mine")
 
 
 @pytest.mark.parametrize(
@@ -235,7 +216,6 @@ def test_a_method_of_what_cannot_be_together_is_refused_where_it_is_made(parts, 
         Method(Mean, **parts)
 
 
-@pytest.mark.parametrize("word", [{"shift": "windows"}, {"history": "lstm"}])
-def test_a_method_that_asks_for_what_there_is_not_is_refused_where_it_is_made(word):
-    with pytest.raises(UserError, match=f"unknown {next(iter(word))} of a Method .*: choose one of .*"):
-        Method(Mean, **word)
+def test_a_method_that_asks_for_what_there_is_not_is_refused_where_it_is_made():
+    with pytest.raises(UserError, match=r"unknown shift of a Method .*: choose one of .*"):
+        Method(Mean, shift="windows")

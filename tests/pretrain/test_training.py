@@ -10,8 +10,7 @@ from baselines import CURL
 from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
-from pretrain.train import make_batches, make_objective, view_of
-from pretrain.trainer import Trainer
+from pretrain.train import Trainer, make_batches, make_objective, view_of
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.nn import Encoder, EncoderConfig

@@ -15,7 +15,7 @@ from vd4rl_pomdp.runs import interrupt
 
 SLOW_STEPS = """
 import sys, time
-from pretrain.trainer import Trainer
+from pretrain.train import Trainer
 from vd4rl_pomdp.cli import main
 update = Trainer.update
 def slow(self):

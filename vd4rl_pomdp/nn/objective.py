@@ -14,7 +14,6 @@ from typing import Any, ClassVar, Self
 import torch
 from torch import Tensor, nn
 
-from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import NO_OPTIONS, Limits, Options
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.action_target import ActionTarget, target_options
@@ -133,24 +132,13 @@ class InverseObjective(Objective):
 
     def action_logits(self, window: Windows) -> Tensor:
         """Predictions for every pair: (B, P, target.outputs)."""
-        past, future = self._states(window)
+        past, future = self.representations(window)
         return self.head(past, future, self.pairs(window.obs.shape[1]).to(past.device))
 
     def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean action loss over all real pairs, plus the optional terms; `loss_kNN` is the mean at each k."""
-        past, future = self._states(window)
+        past, future = self.representations(window)
         return self.loss_of(past, future, window, progress)
-
-    def _states(self, window: Windows) -> tuple[Tensor, Tensor]:
-        """`representations`; raises UserError unless they are what its contract says."""
-        given, rows = self.representations(window), window.obs.shape[:2]
-        match given:
-            case (Tensor() as past, Tensor() as future) if past.shape[:-1] == future.shape[:-1] == rows:
-                return past, future
-        raise UserError(
-            f"{type(self).__name__}.representations must give two tensors (B, T, D), of the past and of the future at "
-            f"every row: here of {rows[0]} windows of {rows[1]} rows"
-        )
 
     def loss_of(
         self, past: Tensor, future: Tensor, window: Windows, progress: float

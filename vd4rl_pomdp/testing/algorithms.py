@@ -76,27 +76,19 @@ def watched(algorithm: Algorithm, given: FeatureBatch) -> tuple[list[Step], dict
     """Make an update; its steps, and what it returns."""
     z = given.z.requires_grad_()
     steps: list[Step] = []
-    minimise = algorithm.minimise
+    step = algorithm.step
 
-    def watching(loss: Any, features: FeatureBatch, *optimisers: Optimizer) -> dict[str, Tensor]:
-        losses: list[Loss] = []
-
-        def kept(features: FeatureBatch) -> Loss:
-            losses.append(loss(features))
-            reached.extend(torch.autograd.grad(losses[0].value, [*optimised, z], retain_graph=True, allow_unused=True))
-            return losses[0]
-
-        optimised = _optimised(optimisers[0])
-        reached: list[Tensor | None] = []
+    def watching(loss: Loss, *optimisers: Optimizer) -> None:
+        asked = [*_optimised(optimisers[0]), z]
+        reached = torch.autograd.grad(loss.value, asked, retain_graph=True, allow_unused=True)
         before = _networks(algorithm)
-        logs = minimise(kept, features, *optimisers)
-        steps.append(Step(losses[0], optimisers[0], reached, before, _networks(algorithm)))
-        return logs
+        step(loss, *optimisers)
+        steps.append(Step(loss, optimisers[0], list(reached), before, _networks(algorithm)))
 
-    algorithm.minimise = watching  # type: ignore[method-assign]
+    algorithm.step = watching  # type: ignore[method-assign]
     logs = algorithm.update(given)
-    del algorithm.minimise
-    claim(steps, "an update minimises no loss")
+    del algorithm.step
+    claim(steps, "an update steps along no loss")
     return steps, logs
 
 
@@ -175,7 +167,7 @@ def the_first_loss_alone_reaches_the_representations(name: str, **options: Any) 
     scale = nn.Parameter(torch.ones(()))
     given = batch()
     algorithm.update(given.replace(z=given.z * scale), torch.optim.SGD([scale], lr=1e-3))
-    claim(scale.item() != 1, "the encoder's optimiser takes no step: hand it to `minimise` with the first loss")
+    claim(scale.item() != 1, "the encoder's optimiser takes no step: hand it to `step` with the first loss")
 
 
 def targets_creep_and_nothing_else_moves_by_itself(name: str, **options: Any) -> None:

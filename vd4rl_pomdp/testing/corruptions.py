@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import TYPE_CHECKING, Any, get_args
@@ -11,7 +10,6 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.core.types import StepType, row_key
@@ -168,13 +166,6 @@ def _random_set(folder: Path) -> Dataset:
     return open_dataset(folder, folder / "cache")
 
 
-def a_record_gives_back_the_corruption(name: str, **options: Any) -> None:
-    """Written as JSON, as an encoder's card has it, a corruption's settings give back the same corruption."""
-    config = CorruptionConfig.of(name, **options)
-    again = CorruptionConfig.fill(json.loads(json.dumps(flat(config))))
-    claim(again == config, f"{config} came back as {again}: options are numbers, words, truth values or None")
-
-
 CHECKS: tuple[Check, ...] = (
     pixels_stay_pixels,
     something_changes,
@@ -184,5 +175,4 @@ CHECKS: tuple[Check, ...] = (
     emission_never_changes_a_row,
     the_environment_shows_what_the_data_show,
     a_view_shows_shifted_then_corrupted_stacks,
-    a_record_gives_back_the_corruption,
 )

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import torch
 
-from pretrain.trainer import Trainer
+from pretrain.train import Trainer
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn import load_encoder

@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from pretrain.build import build_objective, build_target
-from pretrain.trainer import Trainer
+from pretrain.train import Trainer
 from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.encoder import Encoder
