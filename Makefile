@@ -25,4 +25,5 @@ types: setup ## Type checks
 	@$(BIN)/mypy
 
 unit: setup ## Tests, on two processes
+	@bash tools/setup.sh tests
 	@OMP_NUM_THREADS=1 $(BIN)/python -m pytest -q -n 2 --dist worksteal

@@ -1,7 +1,8 @@
 #!/usr/bin/env bash
 # Set up what `make demo` and `make test` need: a virtual environment with the package, and software rendering.
-# A second run finds its stamp and does nothing. PYTHON=python3.12 chooses the interpreter: an environment of another
-# version is made anew. Without it an environment keeps its own.
+# With the word `tests`, also Slurm, which the tests of sweeps start. A second run finds its stamp and does nothing.
+# PYTHON=python3.12 chooses the interpreter: an environment of another version is made anew. Without it an environment
+# keeps its own.
 set -euo pipefail
 cd "$(dirname "$0")/.."
 
@@ -34,9 +35,17 @@ install_debian() {
     $as_root env DEBIAN_FRONTEND=noninteractive apt-get install -y -qq "$@" >/dev/null
 }
 
+# The tests of sweeps start a Slurm of their own, as root; where it cannot be installed they are skipped.
+install_slurm() {
+    if [ "$(id -u)" -eq 0 ] && command -v apt-get >/dev/null && ! command -v slurmd >/dev/null; then
+        (install_debian --no-install-recommends slurmctld slurmd slurm-client munge) 2>/dev/null || say "setup: no Slurm"
+    fi
+}
+
 version() { "$1" -V 2>/dev/null || true; }
 
 wanted="$(cat pyproject.toml constraints.txt tools/setup.sh | sha256sum | cut -d' ' -f1) $(version "$PYTHON")"
+[ "${1:-}" != tests ] || install_slurm
 if [ -f "$STAMP" ] && [ "$(cat "$STAMP")" = "$wanted" ]; then
     exit 0
 fi

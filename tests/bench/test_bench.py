@@ -4,25 +4,25 @@ import pytest
 import torch
 
 from pretrain.objectives import METHODS
-from vd4rl_pomdp.bench import data, memory, sharing, suite, training
+from vd4rl_pomdp.bench import measures, processes, suite
 from vd4rl_pomdp.bench.suite import GOALS
 from vd4rl_pomdp.runs.files import flatten
 
 
 def test_a_set_smaller_than_the_usual_one_can_be_measured(tmp_path, monkeypatch):
-    dataset, opening = data.synthetic_set(tmp_path, 8)
-    sections = {"opening": opening, "sampling": data.sampling(dataset, 5)}
-    monkeypatch.setattr(training, "BATCH", 4)
-    sections["finetuning"] = training.finetuning(dataset, 1)
+    dataset, opening = measures.synthetic_set(tmp_path, 8)
+    sections = {"opening": opening, "sampling": measures.sampling(dataset, 5)}
+    monkeypatch.setattr(measures, "BATCH", 4)
+    sections["finetuning"] = measures.finetuning(dataset, 1)
     measured = flatten(sections)
-    assert opening["rows"] == dataset.num_rows == 8 * data.EPISODE_ROWS
+    assert opening["rows"] == dataset.num_rows == 8 * measures.EPISODE_ROWS
     assert all(value > 0 for value in measured.values())
     assert {name for name in GOALS if name.split(".")[0] in sections} <= set(measured)
 
 
 def test_every_method_that_random_pictures_can_train_is_measured(tmp_path):
-    dataset, _ = data.synthetic_set(tmp_path, 2)
-    measured = training.methods(dataset, tmp_path, 1)
+    dataset, _ = measures.synthetic_set(tmp_path, 2)
+    measured = measures.methods(dataset, tmp_path, 1)
     ratios = {"k_30_over_k_15", "half_over_whole_resolution"}
     assert measured.keys() - ratios == {name for name, method in METHODS.items() if method.trained} - {
         *("supervised", "supervised+a"),
@@ -31,12 +31,12 @@ def test_every_method_that_random_pictures_can_train_is_measured(tmp_path):
 
 
 def test_two_runs_side_by_side_are_measured_against_one(monkeypatch):
-    measured = {"sharing": sharing.sharing(0.05, rounds=1)}
+    measured = {"sharing": processes.sharing(0.05, rounds=1)}
     assert all(value > 0 for value in flatten(measured).values())
     assert {name for name in GOALS if name.startswith("sharing.")} <= set(flatten(measured))
     speeds = {(1, ""): [100.0], (2, ""): [60.0, 50.0], (1, "ACTIVE"): [125.0]}
-    monkeypatch.setattr(sharing, "_speeds", lambda seconds, count, OMP_WAIT_POLICY="": speeds[count, OMP_WAIT_POLICY])
-    assert sharing.sharing(1) == {"updates_per_s": 100, "of_two_over_alone": 0.5, "passive_over_active": 0.8}
+    monkeypatch.setattr(processes, "_speeds", lambda seconds, count, OMP_WAIT_POLICY="": speeds[count, OMP_WAIT_POLICY])
+    assert processes.sharing(1) == {"updates_per_s": 100, "of_two_over_alone": 0.5, "passive_over_active": 0.8}
 
 
 def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
@@ -50,7 +50,7 @@ def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
         monkeypatch.setattr(suite, name, section(name))
     for name in ("memory", "collection", "sharing", "maze_pictures", "maze_training"):
         monkeypatch.setattr(suite, name, lambda *_: {})
-    monkeypatch.setattr(suite, "synthetic_set", lambda folder, episodes: data.synthetic_set(folder, 1))
+    monkeypatch.setattr(suite, "synthetic_set", lambda folder, episodes: measures.synthetic_set(folder, 1))
     monkeypatch.setattr(suite, "pick_device", lambda name: torch.device("meta"))
     results = suite.bench()
     assert [results[name]["device"] for name in named] == ["cpu", "meta", "meta", "meta"]
@@ -58,23 +58,23 @@ def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
 
 @pytest.mark.gpu
 def test_a_set_on_a_gpu_can_be_measured(tmp_path, monkeypatch):
-    monkeypatch.setattr(training, "BATCH", 4)
-    dataset = data.synthetic_set(tmp_path, 8)[0].to("cuda")
-    assert training.pretraining(dataset, tmp_path, 1)["device"].startswith("cuda")
-    assert all(value > 0 for value in training.finetuning(dataset, 1).values())
+    monkeypatch.setattr(measures, "BATCH", 4)
+    dataset = measures.synthetic_set(tmp_path, 8)[0].to("cuda")
+    assert measures.pretraining(dataset, tmp_path, 1)["device"].startswith("cuda")
+    assert all(value > 0 for value in measures.finetuning(dataset, 1).values())
 
 
 def test_memory_is_told_where_linux_does_not_tell_it(tmp_path, monkeypatch):
     kibibytes = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-    monkeypatch.setattr(memory.sys, "platform", "linux")
-    peak, private = memory.resident(tmp_path / "none")
+    monkeypatch.setattr(processes.sys, "platform", "linux")
+    peak, private = processes.resident(tmp_path / "none")
     assert (peak // 1024, private) == (pytest.approx(kibibytes, rel=0.01), None)
-    monkeypatch.setattr(memory.sys, "platform", "darwin")
-    assert memory.resident(tmp_path / "none")[0] == pytest.approx(kibibytes, rel=0.01)
-    monkeypatch.setattr(memory, "run_jobs", lambda *_: [(300, None)])
-    assert memory.memory(tmp_path, 200) == {"frames_gib": 200 / 2**30, "peak_over_frames": 1.5}
+    monkeypatch.setattr(processes.sys, "platform", "darwin")
+    assert processes.resident(tmp_path / "none")[0] == pytest.approx(kibibytes, rel=0.01)
+    monkeypatch.setattr(processes, "run_jobs", lambda *_: [(300, None)])
+    assert processes.memory(tmp_path, 200) == {"frames_gib": 200 / 2**30, "peak_over_frames": 1.5}
     (tmp_path / "status").write_text("Name:\ta:b\nVmHWM:\t  2048 kB\nRssAnon:\t  1024 kB\n")
-    assert memory.resident(tmp_path / "status") == (2 << 20, 1 << 20)
+    assert processes.resident(tmp_path / "status") == (2 << 20, 1 << 20)
 
 
 def test_what_a_maze_step_spends_beside_the_network_is_timed_itself(monkeypatch):
@@ -83,5 +83,5 @@ def test_what_a_maze_step_spends_beside_the_network_is_timed_itself(monkeypatch)
             function()
         return [1.0, 0.1, 0.05]
 
-    monkeypatch.setattr(training, "alternating", in_turns)
-    assert training.maze_training() == {"training_steps_per_s": 1.0, "training_overhead_share": pytest.approx(0.15)}
+    monkeypatch.setattr(measures, "alternating", in_turns)
+    assert measures.maze_training() == {"training_steps_per_s": 1.0, "training_overhead_share": pytest.approx(0.15)}

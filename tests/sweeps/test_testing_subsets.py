@@ -11,7 +11,6 @@ from vd4rl_pomdp.runs.results import read_run
     ("grid", "only", "jobs", "last"),
     [
         ("quick", ["method=acro"], 3, "walker_walk/expert_noisy/patch+zero_frames/acro/seed0/finetune-td3_bc"),
-        ("navigation", ["method=ah", "self_prediction=1.0"], 2, "no_curtain/ah,max_k=3,self_prediction=1.0/seed0"),
         ("quick_navigation", ["method=no_history"], 2, "three_curtains/no_history/seed0"),
     ],
 )

@@ -10,11 +10,17 @@ import torch
 from rich.console import Console
 from rich.table import Table
 
-from vd4rl_pomdp.bench.data import sampling, synthetic_set
-from vd4rl_pomdp.bench.drawing import collection, maze_pictures
-from vd4rl_pomdp.bench.memory import memory
-from vd4rl_pomdp.bench.sharing import sharing
-from vd4rl_pomdp.bench.training import finetuning, maze_training, methods, pretraining
+from vd4rl_pomdp.bench.measures import (
+    collection,
+    finetuning,
+    maze_pictures,
+    maze_training,
+    methods,
+    pretraining,
+    sampling,
+    synthetic_set,
+)
+from vd4rl_pomdp.bench.processes import memory, sharing
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.files import flatten
 from vd4rl_pomdp.runs.provenance import machine, versions
