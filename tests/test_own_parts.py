@@ -33,24 +33,28 @@ EXAMPLES = {
     "corruption": ("bars", "bar_height", 24),
     "algorithm": ("filtered_bc", "cloned_share", 0.25),
     "frame_encoder": ("tiny", "tiny_channels", 12),
+    "history": ("linear", "slowest", 0.9),
 }
-"""Kind: name of the part on its page, an option of its own and a value that is not the default."""
+"""Setting that chooses a kind: name of its page's part, an option of its own and a value that is not the default."""
+KINDS = {kind: kind.replace("history", "memory") for kind in EXAMPLES}
+"""What pages, files and checks of a kind are called."""
 USED_IN = {
     "method": ["pretrain"],
     "corruption": ["pretrain", "finetune"],
     "algorithm": ["finetune"],
     "frame_encoder": ["pretrain", "finetune"],
+    "history": ["pretrain", "finetune"],
 }
 """Kind: the stages that run its code; the first is told of it by name."""
-PLAYED = ("corruption", "frame_encoder")
-"""Kinds that worker processes meet when they evaluate: they run the script's module level."""
+PLAYED = ("corruption",)
+"""Kinds that are met here by worker processes, too, which run the script's module level."""
 
 
 @pytest.fixture
 def load(tmp_path, monkeypatch):
     """Imports a page's file as a module; what it registers is forgotten at the end."""
     with isolated_registries():
-        yield lambda kind: load_example(f"my_{kind}.py", tmp_path, monkeypatch)
+        yield lambda kind: load_example(f"my_{KINDS[kind]}.py", tmp_path, monkeypatch)
 
 
 def run(script: Path, line: str, folder: Path) -> None:
@@ -73,14 +77,14 @@ def test_an_example_runs_through_every_stage_and_the_record_names_it(load, tmp_p
     main(f"pretrain {first} {common} --out {runs}/pretrain".split())
     finetune = f"finetune {second} --encoder {runs}/pretrain/encoder {common} --out {runs}/finetune --eval-episodes 2"
     if kind in PLAYED:
-        run(write_example(f"my_{kind}.py", tmp_path), f"{finetune} --workers 2", tmp_path)
+        run(write_example(f"my_{KINDS[kind]}.py", tmp_path), f"{finetune} --workers 2", tmp_path)
     else:
         main(f"{finetune} --workers 1".split())
     write_report([runs], tmp_path / "report")
     records = {stage: json.loads((runs / stage / "config.json").read_text()) for stage in ("pretrain", "finetune")}
     for stage in USED_IN[kind]:
         assert records[stage]["plugins"] == {f"{kind} {name}": BY_CALL}
-        assert records[stage]["sources"][f"{kind} {name}"].startswith(f"my_{kind}.py ")
+        assert records[stage]["sources"][f"{kind} {name}"].startswith(f"my_{KINDS[kind]}.py ")
     config = records[USED_IN[kind][0]]["config"]
     assert (config[kind], config[option]) == (name, value)
     (row,) = csv.DictReader((tmp_path / "report" / "summary.csv").open())
@@ -113,7 +117,7 @@ def test_help_shows_an_examples_flag_where_its_part_is_chosen_and_list_shows_the
 def test_an_example_keeps_the_promises_of_its_kind(load, kind):
     name, option, value = EXAMPLES[kind]
     load(kind)
-    check = getattr(testing, f"check_{kind}")
+    check = getattr(testing, f"check_{KINDS[kind]}")
     check(name)
     check(name, **{option: value})
 
@@ -148,7 +152,11 @@ def registries():
 @pytest.mark.parametrize(
     ("kind", "options", "told"),
     [
-        *((kind, str, "'mine': its options are .*: name a dataclass") for kind in EXAMPLES if kind != "corruption"),
+        *(
+            (kind, str, "'mine': its options are .*: name a dataclass")
+            for kind in EXAMPLES
+            if kind not in ("corruption", "history")
+        ),
         ("frame_encoder", Options, "name a dataclass that is derived from .*frame.FrameOptions"),
     ],
 )

@@ -75,7 +75,7 @@ def push(folder: Path, repository: str, private: bool = False, revision: str = "
         write_bytes(Path(staged) / CARD, card.encode())
         write_json(Path(staged) / LISTING, listing)
         message = f"{kind.split()[-1].capitalize()} of vd4rl-pomdp {__version__}"
-        commit: Any = api.upload_folder(
+        commit = api.upload_folder(
             **where, folder_path=staged, revision=revision, commit_message=message, delete_patterns=_PATTERNS[kind]
         )
     return str(commit.commit_url)
@@ -136,7 +136,7 @@ def _repository(text: str) -> tuple[str, str]:
 
 
 @contextmanager
-def _hub(repository: str) -> Iterator[tuple[HfApi, dict[str, str]]]:
+def _hub(repository: str) -> Iterator[tuple[HfApi, dict[str, Any]]]:
     """Client and the repository as its methods take it; what the Hub refuses, or its absence, is one sentence."""
     if not sys.stderr.isatty():
         disable_progress_bars()
@@ -159,12 +159,13 @@ def _read_listing(path: Path, kind: str, repository: str) -> dict[str, str]:
     """SHA-256 by name of the files that a repository lists; raises UserError if the listing is damaged."""
     listing = read_json(path)
     files = listing.get("sha256")
-    names = set(files) if isinstance(files, dict) else set()
+    files = files if isinstance(files, dict) else {}
+    names = set(files)
     fits = names == {CONFIG, WEIGHTS} if kind == ENCODER else any(map(is_shard_name, names))
     plain = all(Path(name).name == name and not name.startswith(".") and name != CARD for name in names)
     if (listing.get("format"), listing.get("kind")) != (_FORMAT, kind) or not (fits and plain):
         raise UserError(f"{repository}: its {LISTING} is of another version or damaged; ask its owner")
-    return dict(files)
+    return files
 
 
 def _wrong(folder: Path, listing: dict[str, str]) -> list[str]:

@@ -53,13 +53,6 @@ def test_every_stack_needs_a_key_of_its_own(key):
         make_corruption("patch")(stacks(12), key)
 
 
-def test_a_view_takes_a_corruption_by_name_and_only_shifts_that_there_are(dataset):
-    shown = View(dataset, "patch+zero_frames").windows([0], 3)
-    assert torch.equal(shown.obs, View(dataset, CorruptionConfig.of("patch+zero_frames")).windows([0], 3).obs)
-    with pytest.raises(UserError, match="unknown sharing 'windows': choose one of window, observation"):
-        View(dataset, shared="windows")
-
-
 @pytest.fixture(scope="module")
 def dataset(tmp_path_factory) -> Dataset:
     """Three short episodes of random pixels."""
@@ -201,7 +194,7 @@ def test_random_shift_is_drqs_interpolation_but_for_its_rounding():
     assert 0.5 < (difference == 0).float().mean() < 0.7
 
 
-@pytest.mark.parametrize("shape", [(1, 3, 20, 30), (7, 2, 3, 12, 12), (64, 9, 84, 84), (400, 3, 84, 84)])
+@pytest.mark.parametrize("shape", [(1, 3, 20, 30), (7, 2, 3, 12, 12), (64, 9, 84, 84)])
 @pytest.mark.parametrize("pad", [1, 4])
 def test_both_ways_to_shift_agree(shape, pad):
     obs = torch.randint(0, 256, shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0))
@@ -229,7 +222,7 @@ def test_a_stage_is_not_called_as_none_or_several_are(name):
 
 @pytest.mark.parametrize("name", CORRUPTIONS)
 @pytest.mark.parametrize("mode", ["resample", "emission"])
-@pytest.mark.parametrize("zeroed", [1, 2, 3])
+@pytest.mark.parametrize("zeroed", [1, 3])
 def test_observing_rows_equals_shifting_then_corrupting_their_stacks(dataset, name, mode, zeroed):
     chosen = {"corruption": name, "corruption_mode": mode, "patch_fill": 7, "patch_count": 2, "zeroed_frames": zeroed}
     config = CorruptionConfig.fill(chosen)

@@ -3,18 +3,15 @@ import re
 
 import numpy as np
 import pytest
-from matplotlib.axes import Axes
 from PIL import Image
 
-from tests.helpers_data import fake_reward, fake_rows, write_fake_set
+from tests.helpers_data import fake_reward, write_fake_set
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import QUALITIES, SET_QUALITIES, TASKS
 from vd4rl_pomdp.core.text import markdown
 from vd4rl_pomdp.data import card as module
-from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.card import write_card
 from vd4rl_pomdp.data.folder import published_scores
-from vd4rl_pomdp.data.format import write_shard
 
 MADE = {"task": "cheetah_run", "set": "medium_replay", "policy": "medium_replay", "seed": 7, "render": "fast"}
 
@@ -65,12 +62,6 @@ def test_one_shard_of_a_set_gets_no_card(tmp_path):
     assert not list(folder.glob("card.*"))
 
 
-def test_what_is_no_set_gets_no_card(tmp_path):
-    with pytest.raises(UserError, match=r"holds no \.hdf5 shards"):
-        write_card(tmp_path)
-    assert not list(tmp_path.iterdir())
-
-
 def test_every_set_has_a_published_score():
     assert {(row["env"], row["dataset"]) for row in published_scores()} == {(t, q) for t in TASKS for q in QUALITIES}
     assert set(module.HOW) == set(SET_QUALITIES)
@@ -88,42 +79,3 @@ def test_a_card_shows_names_as_they_are_whatever_they_hold(tmp_path):
     assert "<b>" not in text
     assert "<img" not in re.sub("(`+) .*? \\1", "", text), "outside of the command, which is code"
     assert (folder / "card.png").stat().st_size > 5_000
-
-
-def test_every_episode_is_in_the_histogram_also_where_returns_are_negative(tmp_path, monkeypatch):
-    drawn = []
-    hist = Axes.hist
-
-    def watched(self, values, **options):
-        counts, edges, patches = hist(self, values, **options)
-        drawn.append((self, counts.sum(), edges))
-        return counts, edges, patches
-
-    monkeypatch.setattr(Axes, "hist", watched)
-    film = np.zeros((module.FILM_FRAMES, 3, 84, 84), np.uint8)
-    for returns in ([-200.0, -150.0], [-3.0, 8.0], [2.0, 8.0]):
-        module._picture((None, None), np.array(returns), None, film)
-        axes, shown, edges = drawn[-1]
-        assert shown == 2
-        assert edges[0] == min(0, *returns)
-        assert axes.get_xlim() == (edges[0], edges[-1])
-
-
-def test_a_card_tells_returns_as_the_set_has_them(tmp_path):
-    """Nothing is paid for an episode's first row, whatever it stores."""
-    rows = fake_rows((5, 3))
-    rows["reward"][[0, 5]] = 100.0
-    (tmp_path / "set").mkdir()
-    write_shard(tmp_path / "set" / "0_a.hdf5", rows, {})
-    returns = open_dataset(tmp_path / "set", tmp_path / "cache").returns
-    assert fields(write_card(tmp_path / "set"))["return, mean"] == f"{returns.mean():.3f}"
-
-
-@pytest.mark.parametrize("noisy", ["", "_noisy"])
-def test_the_halves_of_a_set_are_told_in_the_order_in_which_they_open(tmp_path, noisy):
-    qualities = ("medium", "expert")
-    for quality in qualities:
-        (tmp_path / f"0_walker_walk_{quality}{noisy}.hdf5").touch()
-    first = module.shard_paths(tmp_path)[0].stem.split("_")[3]
-    told = module.HOW[f"medium_expert{noisy}"]
-    assert sorted(qualities, key=lambda quality: told.index(f"the {quality} actor"))[0] == first

@@ -64,21 +64,6 @@ def test_a_replay_that_gives_no_number_is_not_exact(folder, tmp_path):
     assert np.isnan(check_dataset(folder, tmp_path / "cache", broken)["replay_max_error"])
 
 
-def test_without_physics_nothing_is_replayed(tmp_path):
-    report = check_dataset(write_fake_set(tmp_path / "set", (4,)), tmp_path / "cache", replay=None)
-    assert report["replay_max_error"] is None
-    assert report["dtypes"].keys() == {"observation", "action", "reward", "discount", "step_type"}
-
-
-def test_differing_dtypes_are_all_listed(tmp_path):
-    folder = write_fake_set(tmp_path / "set", (4, 4), cuts=(4,))
-    with h5py.File(folder / "1_fake.hdf5", "a") as file:
-        step_type = file["step_type"][()].astype(float)
-        del file["step_type"]
-        file["step_type"] = step_type
-    assert check_dataset(folder, tmp_path / "cache")["dtypes"]["step_type"] == ["float64", "int64"]
-
-
 @pytest.mark.parametrize(
     ("row", "key", "value", "told"),
     [
@@ -95,11 +80,6 @@ def test_what_can_be_no_action_is_refused(tmp_path, row, key, value, told):
         file[key][row] = value
     with pytest.raises(UserError, match=told):
         check_dataset(folder, tmp_path / "cache")
-
-
-def test_physics_without_a_task_is_refused(tmp_path):
-    with pytest.raises(UserError, match="has physics but names no task"):
-        check_dataset(write_fake_set(tmp_path / "set", (4,), physics_dim=2), tmp_path / "cache", true_replay)
 
 
 @pytest.mark.parametrize(("action_dim", "physics"), [(6, 0.0), (4, 0.0), (6, 1e30)])

@@ -48,16 +48,6 @@ def whole(tmp_path_factory):
     return out
 
 
-def test_every_episode_has_its_own_start_and_its_own_actions(whole):
-    shards = [read_shard(path) for path in shard_paths(whole)]
-    states, actions = (
-        np.concatenate([shard[key] for shard in shards]).reshape(3, LENGTH + 1, -1) for key in ("physics", "action")
-    )
-    for one, other in ((0, 1), (1, 2), (0, 2)):
-        assert np.abs(states[one, 0] - states[other, 0]).max() > 0.01
-        assert np.abs(actions[one, 1:] - actions[other, 1:]).min() > 0
-
-
 def test_shards_hold_v_d4rls_keys_and_the_simulator_state(whole):
     assert sorted(p.name for p in whole.glob("*.hdf5")) == ["0_walker_walk_random.hdf5", "1_walker_walk_random.hdf5"]
     with h5py.File(whole / "0_walker_walk_random.hdf5") as file:
@@ -84,22 +74,6 @@ def test_stored_actions_replay_to_stored_rewards(whole):
         np.testing.assert_array_equal(replay_rewards("walker_walk", shard["physics"][rows][0], action[1:]), reward[1:])
 
 
-def test_the_set_opens_with_its_task_and_quality(whole, tmp_path):
-    dataset = open_dataset(whole, cache=tmp_path)
-    assert (dataset.task, dataset.quality) == ("walker_walk", "random")
-    assert (dataset.num_episodes, dataset.num_rows) == (3, 3 * (LENGTH + 1))
-    assert dataset.incomplete_episodes == 0
-
-
-def test_an_episode_does_not_depend_on_how_the_set_is_cut(whole, tmp_path):
-    collect(config(tmp_path / "set", episodes=2, episodes_per_shard=1), LENGTH)
-    second = read_shard(tmp_path / "set" / "1_walker_walk_random.hdf5")
-    both = read_shard(whole / "0_walker_walk_random.hdf5")
-    for key, value in second.items():
-        np.testing.assert_array_equal(value, both[key][LENGTH + 1 :])
-    assert not np.array_equal(both["physics"][0], second["physics"][0])
-
-
 def test_a_set_is_drawn_by_one_renderer(tmp_path, monkeypatch):
     out, info = tmp_path / "set", render_info("walker_walk")
     collect(config(out, episodes=2, episodes_per_shard=1), LENGTH)
@@ -114,19 +88,18 @@ def test_a_set_is_drawn_by_one_renderer(tmp_path, monkeypatch):
     assert json.loads((out / "provenance.json").read_text())["render"] == info
 
 
-@pytest.mark.parametrize("error", [KeyboardInterrupt(), RuntimeError("killed")])
-def test_an_interrupted_collection_ends_in_the_same_files(whole, tmp_path, monkeypatch, error):
+def test_an_interrupted_collection_ends_in_the_same_files(whole, tmp_path, monkeypatch):
     out = tmp_path / "set"
     roll_out = module._roll_out
 
     def fail_in_the_second_shard(job):
         if job.episode == 2:
-            raise error
+            raise KeyboardInterrupt
         return roll_out(job)
 
     with monkeypatch.context() as patch:
         patch.setattr(module, "_roll_out", fail_in_the_second_shard)
-        with pytest.raises(type(error)):
+        with pytest.raises(KeyboardInterrupt):
             collect(config(out), LENGTH)
     seen = sorted(p.name for p in out.iterdir() if not p.name.startswith("."))
     assert seen == ["0_walker_walk_random.hdf5", "collection.json"]
@@ -141,12 +114,6 @@ def test_an_interrupted_collection_ends_in_the_same_files(whole, tmp_path, monke
     (out / "1_walker_walk_random.hdf5").unlink()
     collect(config(out), LENGTH)
     assert contents(out) == contents(whole), "a shard that was lost is collected again"
-
-
-def test_an_interrupt_before_the_config_was_written_does_not_block_the_folder(whole, tmp_path):
-    (tmp_path / ".collection.json.tmp").write_text("{")
-    collect(config(tmp_path), LENGTH)
-    assert contents(tmp_path) == contents(whole)
 
 
 def test_the_number_of_workers_changes_nothing(tmp_path, monkeypatch):
@@ -186,7 +153,7 @@ def test_medium_replay_follows_the_run_from_random_actions_to_the_medium_actor(t
     assert "regenerated from actors saved along the training run" in (tmp_path / "card.md").read_text()
 
 
-@pytest.mark.parametrize("quality", ["medium_replay", "medium", "medium_expert", "expert"])
+@pytest.mark.parametrize("quality", ["medium_replay", "medium_expert"])
 def test_a_quality_without_an_actor_is_one_sentence(tmp_path, monkeypatch, quality):
     from vd4rl_pomdp.policies import actor as actors
 
@@ -253,21 +220,10 @@ def test_a_full_disk_leaves_nothing_half_written_and_the_collection_goes_on(whol
     assert contents(tmp_path) == contents(whole)
 
 
-def test_a_full_disk_at_the_start_is_a_sentence(tmp_path, monkeypatch):
-    def full(path, data, **options):
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    monkeypatch.setattr(Path, "write_text", full)
-    with pytest.raises(UserError, match="disk is full"):
-        collect(config(tmp_path / "set"), LENGTH)
-
-
 @pytest.mark.parametrize(
     ("changes", "name", "std"),
     [
         ({"quality": "expert_noisy"}, "expert_noisy", 0.5),
-        ({"quality": "medium_noisy"}, "medium_noisy", 0.5),
-        ({"quality": "medium_expert_noisy"}, "medium_expert_noisy", 0.5),
         ({"quality": "expert", "action_noise": 0.25}, "expert_noise0.25", 0.25),
     ],
 )

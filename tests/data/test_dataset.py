@@ -47,13 +47,6 @@ def test_frames_that_fit_into_no_memory_are_told_as_the_sets_not_as_a_batchs(dat
         dataset.to("cuda")
 
 
-def test_row_tensors_have_the_documented_types(dataset):
-    kinds = {"frames": torch.uint8, "action": torch.float32, "reward": torch.float32, "discount": torch.float32}
-    kinds |= {"step_type": torch.uint8, "episode": torch.int64, "t": torch.int64, "returns": torch.float64}
-    assert {name: getattr(dataset, name).dtype for name in kinds} == kinds
-    assert dataset.frames.shape == (268, 3, 84, 84)
-
-
 def test_every_field_of_every_transition_is_aligned(dataset):
     batch = View(dataset).transitions(range(dataset.num_transitions))
     assert batch.obs.shape == batch.next_obs.shape == (265, 9, 84, 84)
@@ -193,34 +186,9 @@ def test_counts_below_one_are_refused(dataset):
         View(dataset, frame_stack=0)
 
 
-@pytest.mark.parametrize("batch_size", [0, -1])
-def test_samplers_need_a_batch(dataset, batch_size):
-    with pytest.raises(UserError, match=f"batch_size is {batch_size}"):
-        TransitionSampler(dataset, batch_size, torch.Generator())
-    with pytest.raises(UserError, match=f"batch_size is {batch_size}"):
-        WindowSampler(dataset, batch_size, 2, torch.Generator())
-
-
-def test_a_batch_can_be_asked_for_its_tensors(dataset):
-    batch = View(dataset).transitions(0)
-    assert "obs" in batch
-    assert "observation" not in batch
-    assert tuple(batch) == batch.keys()
-
-
 def test_gathered_frames_do_not_share_the_map(dataset):
     View(dataset, frame_stack=1).stacks(torch.tensor([0])).fill_(255)
     assert dataset.frames[0].max() == 0
-
-
-def test_an_episode_of_one_row_has_no_transition(tmp_path):
-    folder = write_fake_set(tmp_path / "set", (1, 3, 1), cuts=(1,))
-    dataset = open_dataset(folder, tmp_path / "cache")
-    assert (dataset.num_rows, dataset.num_episodes, dataset.num_transitions) == (5, 3, 2)
-    assert View(dataset).transitions([0, 1]).key.tolist() == [(1 << 20), (1 << 20) + 1]
-    lonely = open_dataset(write_fake_set(tmp_path / "lonely", (1,)), tmp_path / "cache")
-    with pytest.raises(UserError, match="holds no transition"):
-        TransitionSampler(lonely, 4, torch.Generator())
 
 
 def test_names_come_from_the_shards_before_the_folders(tmp_path):
@@ -251,12 +219,6 @@ def test_samplers_repeat_with_their_generator_and_cover_the_set(dataset):
         assert first != draws(make(1), 30)
         keys = {tuple(np.atleast_1d(key)) for batch in first for key in batch}
         assert {key[0] for key in keys} == {(e << 20) + t for e, t in STARTS}
-
-
-def test_samplers_draw_uniformly_over_transitions(dataset):
-    sampler = TransitionSampler(View(dataset, frame_stack=1), 2000, torch.Generator().manual_seed(0))
-    short = np.mean([key < (2 << 20) for key in sampler.sample().key.tolist()])
-    assert short == pytest.approx(6 / 265, abs=0.012)
 
 
 @pytest.mark.gpu

@@ -1,6 +1,4 @@
 import errno
-import hashlib
-import json
 import multiprocessing
 import os
 import signal
@@ -79,15 +77,6 @@ def test_decoded_arrays_are_the_concatenated_rows(tmp_path, cache):
     assert store.meta["shards"] == ["0_fake.hdf5", "1_fake.hdf5", "2_fake.hdf5"]
 
 
-def test_a_set_is_decoded_once(tmp_path, cache, monkeypatch):
-    folder = write_fake_set(tmp_path / "set")
-    log = tmp_path / "log"
-    monkeypatch.setattr(store_module, "read_frames", slow_frames(log, 0))
-    first, second = open_store(folder, cache), open_store(folder, cache)
-    assert first == second
-    assert log.read_text() == "0_fake.hdf5\n"
-
-
 def test_a_changed_set_is_decoded_anew(tmp_path, cache):
     folder = write_fake_set(tmp_path / "set", (4,))
     before = open_store(folder, cache)
@@ -115,16 +104,6 @@ def test_the_fingerprint_reads_rewards_as_training_does(tmp_path, cache):
     assert name("three", np.nextafter(reward.astype(np.float32), np.inf, dtype=np.float32)) != name("four", reward)
 
 
-def test_rewards_that_float32_holds_are_named_as_they_are_stored(tmp_path, cache):
-    (tmp_path / "set").mkdir()
-    rows = fake_rows((4,))
-    write_shard(tmp_path / "set" / "0_fake.hdf5", rows | {"reward": np.rint(rows["reward"] * 1000)}, {})
-    store = open_store(tmp_path / "set", cache)
-    checksums = {name: file["blake2b"] for name, file in store.meta["files"].items()}
-    stored = hashlib.blake2b(json.dumps(checksums, sort_keys=True).encode(), digest_size=12).hexdigest()
-    assert store.fingerprint == stored
-
-
 def test_the_cache_folder_follows_the_environment(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "xdg"))
     monkeypatch.delenv("VD4RL_POMDP_CACHE", raising=False)
@@ -145,22 +124,6 @@ def test_verify_finds_a_flipped_byte_and_open_a_short_file(tmp_path, cache, name
         verify_store(store)
     (store.folder / name).write_bytes(content[:-1])
     verify_store(open_store(folder, cache))  # decoded anew
-
-
-@pytest.mark.parametrize("content", ["", "{"])
-def test_a_broken_description_is_decoded_anew(tmp_path, cache, content):
-    folder = write_fake_set(tmp_path / "set")
-    store = open_store(folder, cache)
-    (store.folder / "meta.json").write_text(content)
-    assert open_store(folder, cache).meta == store.meta
-
-
-def test_an_unreadable_array_is_one_line(tmp_path, cache):
-    store = open_store(write_fake_set(tmp_path / "set"), cache)
-    file = store.folder / "action.npy"
-    file.write_bytes(bytes(file.stat().st_size))
-    with pytest.raises(UserError, match=r"action\.npy: is damaged; delete"):
-        store.array("action")
 
 
 def test_two_processes_decode_once_and_agree(tmp_path, cache, monkeypatch):
@@ -213,12 +176,6 @@ def test_too_little_space_is_told_before_decoding(tmp_path, cache, monkeypatch):
     assert visible(cache) == []
 
 
-def test_an_unusable_cache_is_told(tmp_path):
-    (tmp_path / "file").write_text("")
-    with pytest.raises(UserError, match=r"file: cannot be used"):
-        open_store(write_fake_set(tmp_path / "set"), tmp_path / "file")
-
-
 def test_a_cache_on_a_disk_that_locks_no_files_is_told(tmp_path, cache, monkeypatch):
     def refuse(*arguments):
         raise OSError(38, "Function not implemented")
@@ -248,14 +205,6 @@ def test_a_shard_missing_inside_an_episode_is_found(tmp_path, cache):
     folder = write_fake_set(tmp_path / "set", (9,), cuts=(3, 6), names=["0_a.hdf5", "1_a.hdf5", "0_b.hdf5"])
     (folder / "1_a.hdf5").unlink()
     with pytest.raises(UserError, match=r"0_b\.hdf5: row 0 continues an episode, but not that of 0_a\.hdf5"):
-        open_store(folder, cache)
-
-
-@pytest.mark.parametrize("lacking", [0, 2])
-def test_a_shard_of_whole_episodes_that_is_missing_is_found_by_its_number(tmp_path, cache, lacking):
-    folder = write_fake_set(tmp_path / "set", (3, 3, 3, 3), cuts=(3, 6, 9))
-    (folder / f"{lacking}_fake.hdf5").unlink()
-    with pytest.raises(UserError, match=f"set: has the shard 3_fake, but none called {lacking}_fake; download or"):
         open_store(folder, cache)
 
 

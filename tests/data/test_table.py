@@ -6,10 +6,8 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data import table as module
 from vd4rl_pomdp.data.collect import CollectConfig, _job, _plan, _roll_out, actor_hashes, replay_returns
-from vd4rl_pomdp.runs.ownership import owned
 
 
 @pytest.fixture
@@ -55,19 +53,6 @@ def test_a_set_whose_actor_has_changed_is_played_again(played, tmp_path, monkeyp
     ]
 
 
-def test_a_folder_has_one_owner(played, tmp_path):
-    with owned(tmp_path), pytest.raises(UserError, match="is in use by process"):
-        module.tabulate(tmp_path, ["walker_walk"], ["random"], 2, 1)
-
-
-def test_a_foreign_file_is_not_taken_for_a_table(played, tmp_path):
-    (tmp_path / "returns.csv").write_text("foo\n1\n")
-    with pytest.raises(UserError, match=r"returns\.csv: has other columns"):
-        module.tabulate(tmp_path, ["walker_walk"], ["random"], 2, 1)
-    assert (tmp_path / "returns.csv").read_text() == "foo\n1\n"
-    assert not played
-
-
 def test_the_published_table_is_by_the_actors_that_ship():
     table = Path(__file__).parents[2] / "results" / "datasets"
     recorded = json.loads((table / "actors.json").read_text())
@@ -76,16 +61,6 @@ def test_the_published_table_is_by_the_actors_that_ship():
     assert set(recorded) == {" ".join(names) for names in sets}
     shipped = {" ".join(names): actor_hashes(CollectConfig(*names, Path(), 200)) for names in sets}
     assert recorded == shipped
-
-
-def test_a_slip_is_a_sentence(played, tmp_path):
-    with pytest.raises(UserError, match="--timed-episodes is 0; it must be at least 1"):
-        module.tabulate(tmp_path, ["walker_walk"], ["random"], 0, 1)
-    assert not played
-    with pytest.raises(UserError, match="unknown quality 'good'"):
-        module.tabulate(tmp_path, ["walker_walk"], ["good"], 2, 1)
-    with pytest.raises(UserError, match="unknown task"):
-        module.tabulate(tmp_path, ["ant"], ["random"], 2, 1)
 
 
 def test_physics_alone_gives_the_rewards_of_the_rendered_episodes(tmp_path):

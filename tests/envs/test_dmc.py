@@ -4,9 +4,7 @@ import sys
 import numpy as np
 import pytest
 
-from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import EPISODE_TRANSITIONS, TASKS
-from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.envs.dmc import DMCEnv, observed_states, replay_rewards
 
 
@@ -57,16 +55,6 @@ def test_the_first_state_depends_on_the_seed_alone(blind):
     assert not np.array_equal(first.physics, other.physics)
 
 
-def test_rows_have_the_declared_shapes(blind):
-    rows, _ = roll(blind, 0, 2)
-    assert [row.step_type for row in rows] == [StepType.FIRST, StepType.MID, StepType.MID]
-    assert rows[0].reward == 0.0
-    for row in rows:
-        assert row.frame is None
-        assert (row.state.shape, row.state.dtype) == ((blind.layout.state_dim,), np.float32)
-        assert (row.physics.ndim, row.physics.dtype, row.discount) == (1, np.float64, 1.0)
-
-
 def test_an_action_is_applied_twice_and_its_rewards_summed(blind):
     start = blind.reset(0).physics
     action = np.full(blind.action_dim, 0.5, np.float32)
@@ -84,11 +72,6 @@ def test_only_the_time_limit_ends_an_episode_and_its_discount_stays_one():
     rows, _ = roll(env, 0, EPISODE_TRANSITIONS)
     assert [row.last for row in rows] == [False] * EPISODE_TRANSITIONS + [True]
     assert rows[-1].discount == 1.0
-
-
-def test_an_unknown_task_is_refused():
-    with pytest.raises(UserError, match="walker_walk, cheetah_run, humanoid_walk"):
-        replay_rewards("walker_run", np.zeros(18), np.zeros((1, 6)))
 
 
 def test_another_process_renders_the_same_bytes():

@@ -1,9 +1,6 @@
-from functools import partial
-
 import gymnasium
 import numpy as np
 import pytest
-from PIL import Image
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS, DMCTask, GymnasiumTask
@@ -76,36 +73,6 @@ NOT_WHOLE = [(120, 120), (480, 480), (100, 100), (85, 85), (168, 120), (90, 168)
 def test_pixels_of_a_frame_are_means_of_the_areas_that_they_cover(shape):
     picture = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
     assert np.array_equal(area_means(picture, 84), exact_means(picture, 84))
-
-
-@pytest.mark.parametrize("shape", [(120, 120), (480, 480)], ids=str)
-def test_a_line_between_black_and_white_is_grey_by_its_place(shape):
-    """By hand: 120 / 84 = 10 / 7, so the third new pixel covers 2 6/7 to 4 2/7."""
-    picture = np.zeros((*shape, 3), np.uint8)
-    picture[:, shape[1] // 40 :] = 255
-    frame = area_means(picture, 84)
-    assert (frame[:, :2] == 0).all()
-    assert (frame[:, 2] == round(255 * (1 - 1 / 10 if shape[1] == 120 else 36 / 40))).all()
-    assert (frame[:, 3:] == 255).all()
-
-
-@pytest.mark.parametrize("shape", [(168, 168), (252, 168), (480, 480), (84, 420)], ids=str)
-def test_whole_ratios_are_as_they_were(shape):
-    size = 96 if shape[0] == 480 else 84
-    picture = np.random.default_rng(0).integers(0, 256, (*shape, 3), np.uint8)
-    was = Image.fromarray(picture).resize((size, size), Image.Resampling.BOX)
-    assert np.array_equal(area_means(picture, size), np.asarray(was))
-
-
-def test_what_an_environment_draws_is_shrunk_by_areas():
-    class Noise(Counter):
-        def picture(self):
-            return np.random.default_rng(self.steps).integers(0, 256, (90, 120, 3), np.uint8)
-
-    env, rows = play(GymnasiumTask(Noise), 2, size=84)
-    for t, row in enumerate(rows):
-        env.env.steps = t
-        assert np.array_equal(row.frame, exact_means(env.env.picture(), 84).transpose(2, 0, 1))
 
 
 class OneBuffer(Counter):
@@ -190,12 +157,6 @@ def test_an_environment_is_made_by_its_id_with_its_arguments():
         assert (rows[4].last, rows[4].discount) == (True, 1.0), "its own limit of time truncates"
     finally:
         gymnasium.registry.pop("vd4rl_pomdp_test/Counter-v0")
-
-
-def test_an_environment_of_bound_arguments_is_one_too():
-    task = GymnasiumTask(partial(Counter, end=9))
-    assert "Counter" in task.summary
-    play(task, 2)
 
 
 @pytest.mark.parametrize(
@@ -293,15 +254,6 @@ def test_an_environment_whose_reset_takes_no_seed_is_one_line():
 def test_a_task_is_as_fast_as_its_time_step_tells_before_its_metadata(told, rate):
     env = make_env(GymnasiumTask(type("Timed", (Counter,), told), action_repeat=2))
     assert env.rate == pytest.approx(rate)
-
-
-@pytest.mark.parametrize("told", [0.025, 0, -1, 2000, np.nan, None, "20"])
-def test_a_rate_that_cannot_be_is_one_line(told):
-    env = make_env(GymnasiumTask(type("Timed", (Counter,), {"metadata": {"render_fps": told}})))
-    with pytest.raises(
-        UserError, match=f"Timed has the render_fps {told!r} in its metadata: correct it to the steps a"
-    ):
-        _ = env.rate
 
 
 def test_gymnasiums_cheetah_is_drawn_one_simulator_step_late():
