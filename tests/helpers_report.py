@@ -1,5 +1,6 @@
 """Fine-tuning runs with given scores and settings, for reports."""
 
+import csv
 import json
 from collections import Counter
 from itertools import product
@@ -7,10 +8,12 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 
 from vd4rl_pomdp.data.reference import Reference
+from vd4rl_pomdp.report import page
 from vd4rl_pomdp.report.load import label, load_runs
-from vd4rl_pomdp.runs.episodes import append_episodes
+from vd4rl_pomdp.runs.episodes import COLUMNS
 from vd4rl_pomdp.runs.files import read_json, write_json
 from vd4rl_pomdp.runs.identity import identity
 from vd4rl_pomdp.runs.results import Result, write_results
@@ -37,15 +40,14 @@ def write_run(
     (folder / "metrics.jsonl").write_text('{"step": 10, "bc_loss": 0.5}\n')
     names = {"method": method, "task": "walker_walk", "quality": "expert", "corruption": "patch"}
     names |= {"algorithm": "td3_bc", "seed": seed} | (labels or {})
-    write_json(folder / "labels.json", names)
-    for step, values in scores.items():
-        rows = [
-            names
-            | {"step": step, "episode": i, "episode_seed": i}
-            | {"return": value * 10, "length": 500, "score": value, "evaluated_under": names["corruption"]}
-            for i, value in enumerate(values)
-        ]
-        append_episodes(folder / "episodes.csv", rows)
+    (folder / "labels.json").write_text(json.dumps(names))
+    with (folder / "episodes.csv").open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, COLUMNS, lineterminator="\n")
+        writer.writeheader()
+        for step, values in scores.items():
+            told = names | {"step": step, "length": 500, "evaluated_under": names["corruption"], "action_error": ""}
+            for i, value in enumerate(values):
+                writer.writerow(told | {"episode": i, "episode_seed": i, "return": value * 10, "score": value})
     (folder / "timing.json").write_text('{"seconds": 3.0}')
     if film:
         pictures = np.random.default_rng(0).integers(0, 256, (4, 12, 84, 84), dtype=np.uint8)
@@ -61,7 +63,7 @@ def describe(
     """Give a run of `write_run` settings: its own config, its encoder's card, and the fingerprint of its data."""
     record = read_json(run / "config.json")
     record["config"] |= {"updates": 10, "preset": "cpu", "batch_size": 256, "views": 4} | config
-    write_json(run / "config.json", record | ({"inputs": {"data": data}} if data else {}))
+    (run / "config.json").write_text(json.dumps(record | ({"inputs": {"data": data}} if data else {})))
     if card is not None:
         settings = {"max_k": 15, "batch_size": 8, "patch_size": 16, "preset": "cpu", "steps": 20, "task": "walker_walk"}
         settings |= {k: v for k, v in card.items() if k not in ("data",)}
@@ -69,9 +71,8 @@ def describe(
         facts = {"corruption": corruption, "steps": settings["steps"], "preset": settings["preset"]}
         facts |= {} if encoder_seed is None else {"seed": encoder_seed}
         (run / "encoder").mkdir()
-        write_json(
-            run / "encoder" / "config.json", {"pretrain": facts | {"settings": settings, "data": card.get("data", "")}}
-        )
+        told = facts | {"settings": settings, "data": card.get("data", "")}
+        (run / "encoder" / "config.json").write_text(json.dumps({"pretrain": told}))
     return run
 
 
@@ -98,6 +99,12 @@ def write_seeds(
             run = write_run(place, method, seed, {5: [99.0], 10: [score]}, labels=labels)
             Reference(data_return).write(describe(run, {"history": "method"} | settings, seed=seed))
     return folder
+
+
+def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Reports draw no figures, which takes most of their time."""
+    sections = ("scores", "profiles", "curves", "probes", "errors", "costs", "losses")
+    monkeypatch.setattr(page, "_plots", lambda runs, made: {name: [] for name in sections})
 
 
 def pretraining(place: Path) -> Path:

@@ -2,9 +2,8 @@
 
 import pytest
 
-from vd4rl_pomdp.report import figures, page
-
-SECTIONS = ("scores", "profiles", "curves", "probes", "errors", "costs", "losses")
+from tests.helpers_report import without_figures
+from vd4rl_pomdp.report import figures
 
 
 @pytest.fixture
@@ -18,9 +17,8 @@ def figure_files() -> None:
 
 
 @pytest.fixture(autouse=True)
-def _without_figures(monkeypatch, request):
-    if "figure_files" in request.fixturenames:
-        return
-    monkeypatch.setattr(figures, "FORMATS", {})
-    if "drawn" not in request.fixturenames:
-        monkeypatch.setattr(page, "_plots", lambda runs, made: {name: [] for name in SECTIONS})
+def _fewer_figures(monkeypatch, request):
+    if "figure_files" not in request.fixturenames:
+        monkeypatch.setattr(figures, "FORMATS", {})
+        if "drawn" not in request.fixturenames:
+            without_figures(monkeypatch)

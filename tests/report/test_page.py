@@ -186,7 +186,7 @@ def test_a_report_writes_over_nothing_but_an_earlier_report(tmp_path, capsys):
     assert set(before.items()) <= set(files().items())
 
 
-def test_a_report_is_made_again_from_its_own_folder(tmp_path, drawn):
+def test_a_report_is_made_again_from_its_own_folder(tmp_path):
     runs = grid(tmp_path)
     (runs / "acro1" / "timing.json").unlink()
     pretraining(runs / "pretrain")
@@ -285,7 +285,9 @@ def test_every_figure_has_its_files_its_words_and_n(tmp_path, figure_files):
     mine = [folder / name for name in ("mine.png", "my_scores.csv", "poster.pdf")]
     for file in (*mine, folder / "scores_old.png"):
         file.touch()
+    before = page.read_bytes()
     write_report([runs], tmp_path / "out")
+    assert page.read_bytes() == before, "figures are the same bytes every time"
     left = {path.name for path in folder.iterdir()} - {file.name for file in mine}
     assert left == found, "figures of an earlier report go, nobody else's"
     assert all(file.exists() for file in mine)

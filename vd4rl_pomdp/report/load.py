@@ -140,15 +140,14 @@ class Run:
         """Its settings that differ from those of other runs of its method: "max_k 1"; empty if none does."""
         return ", ".join(filter(None, self.parts))
 
-    @property
+    @cached_property
     def named(self) -> Row:
         """Values of IDENTITY."""
         return {name: self.variant if name == "variant" else self.labels[name] for name in IDENTITY}
 
     def of(self, names: Iterable[str]) -> tuple[Any, ...]:
         """Values of some columns of IDENTITY."""
-        named = self.named
-        return tuple(named[name] for name in names)
+        return tuple(self.named[name] for name in names)
 
     @property
     def end_to_end(self) -> bool:

@@ -1,7 +1,7 @@
 """Run folders, checkpoints, metrics, progress and provenance."""
 
 FORMAT = 3
-"""Version of the content of run folders and checkpoints and of the random streams; only runs of this one can go on."""
+"""Version of the content of run folders and checkpoints and of the random streams; only runs of this one resume."""
 
 CONFIG_FILE, METRICS_FILE, EPISODES_FILE = "config.json", "metrics.jsonl", "episodes.csv"
 LABELS_FILE, MACHINE_FILE, RENDER_FILE, PROBE_FILE = "labels.json", "machine.json", "render.json", "probe.json"

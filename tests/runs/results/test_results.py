@@ -5,11 +5,11 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers_report import describe, grid, pretraining, write_run
+from tests.helpers_report import describe, grid, pretraining, without_figures, write_run
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.reference import Reference
-from vd4rl_pomdp.report import page, write_report
+from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.runs import results
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
@@ -20,9 +20,8 @@ COMMITTED = Path(__file__).parents[3] / "results"
 
 
 @pytest.fixture(autouse=True)
-def _without_figures(monkeypatch):
-    sections = ("scores", "profiles", "curves", "probes", "errors", "costs", "losses")
-    monkeypatch.setattr(page, "_plots", lambda runs, made: {name: [] for name in sections})
+def _fewer_figures(monkeypatch):
+    without_figures(monkeypatch)
 
 
 def whole_run(place: Path, seed: int = 0, score: float = 2.0) -> Path:
