@@ -74,7 +74,8 @@ def build_objective(
 
 def _state_shape(config: TrainingConfig, states: StateScale) -> dict[str, Any]:
     """The encoder of simulator states: handed through, perhaps with noise, or standardised with coordinates hidden."""
-    options, told = config.options, {}
+    options = config.options
+    told: dict[str, Any] = {}
     if isinstance(options, StateOptions) and (options.pose_noise or options.velocity_noise):
         told = {"noise": states.noise(options.pose_noise, options.velocity_noise).tolist()}
     if isinstance(config.frame, HiddenOptions):

@@ -64,9 +64,3 @@ def smoke_pretrain(data: Path, out: Path, **changes: object) -> pretrain.config.
 
 def smoke_finetune(encoder: Path, data: Path, out: Path, **changes: object) -> finetune.config.FinetuneConfig:
     return finetune.config.FinetuneConfig.of("smoke", encoder=encoder, data=data, out=out, workers=1, **changes)
-
-
-BELOW_IN_BOTH = {
-    **{"seed": -1, "batch_size": 0, "learning_rate": float("nan"), "shift": -1, "log_every": 0, "checkpoint_every": 0},
-}
-"""Settings of both stages with a value below their range."""

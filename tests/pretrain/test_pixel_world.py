@@ -7,7 +7,7 @@ import pytest
 from tests.helpers_pixels import ball_world, position_error, trainer_on
 from vd4rl_pomdp.data import Dataset
 
-STEPS = {"acro": 250, "one_step_inverse": 250, "curl": 150, "driml": 150, "homer": 150}
+STEPS = {"acro": 100, "one_step_inverse": 100, "curl": 80, "driml": 60}
 INVERSE = {"action_target": "mse", "max_k": 3}
 
 

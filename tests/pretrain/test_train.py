@@ -9,7 +9,7 @@ import torch
 from pretrain.objectives import METHODS
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
-from tests.helpers_stages import BELOW_IN_BOTH, CutError, contents, cut_at, smoke_pretrain
+from tests.helpers_stages import CutError, contents, cut_at, smoke_pretrain
 from vd4rl_pomdp.cli import run_to_end
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn import load_encoder
@@ -17,8 +17,9 @@ from vd4rl_pomdp.nn import load_encoder
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 
-@pytest.mark.parametrize("method", [name for name, method in METHODS.items() if method.trained])
+@pytest.mark.parametrize("method", ["mik+a", "curl", "supervised+a"])
 def test_pretraining_resumes_to_the_bit(data, tmp_path, monkeypatch, method):
+    """An inverse model, one with a momentum encoder, and one that is told states; `check_method` proves it of all."""
     if METHODS.named(method).regresses_state:
         data = write_fake_set(tmp_path / "with_states" / "walker_walk" / "expert", [20, 25, 30], physics_dim=18)
     whole = run_pretrain(smoke_pretrain(data, tmp_path / "whole", method=method))
@@ -34,16 +35,12 @@ def test_pretraining_resumes_to_the_bit(data, tmp_path, monkeypatch, method):
     assert contents(again.path) == contents(whole.path)
 
 
-def test_an_encoder_tells_how_it_was_pretrained_and_an_older_one_still_loads(encoder, data):
+def test_an_encoder_tells_how_it_was_pretrained(encoder):
     settings = load_encoder(encoder)[1].settings
     assert (settings["method"], settings["max_k"], settings["corruption"], settings["task"]) == (
         *("mik+a", 3, "patch+zero_frames", "walker_walk"),
     )
     assert not {"seed", "data", "out", "device", "log_every", "checkpoint_every", "wandb"} & set(settings)
-    config = json.loads((encoder / "config.json").read_text())
-    del config["pretrain"]["settings"]
-    (encoder / "config.json").write_text(json.dumps(config))
-    assert load_encoder(encoder)[1].settings == {}
 
 
 def test_another_config_in_the_same_folder_is_refused_and_nothing_is_lost(data, tmp_path):
@@ -58,39 +55,15 @@ def test_another_config_in_the_same_folder_is_refused_and_nothing_is_lost(data, 
     assert contents(tmp_path / "run") == before
 
 
-@pytest.mark.parametrize("method", ["curl", "driml"])
-def test_a_loss_that_tells_windows_apart_wants_two_of_them(data, tmp_path, method):
-    with pytest.raises(UserError, match=f"--batch-size is 1; {method} tells windows apart: give it 2"):
-        run_pretrain(smoke_pretrain(data, tmp_path / "out", method=method, batch_size=1))
-    assert not (tmp_path / "out").exists()
-
-
-def test_user_slips_are_one_line(data, tmp_path):
-    with pytest.raises(UserError, match=r"unknown method 'mikado'.*mik\+a"):
-        run_pretrain(smoke_pretrain(data, tmp_path / "a", method="mikado"))
-    with pytest.raises(UserError, match=r"episode 0 .*20 rows"):
-        run_pretrain(smoke_pretrain(data, tmp_path / "b", window=21))
-    assert not any((tmp_path / name).exists() for name in "ab")
-
-
-BELOW = {
-    **{"m": -1, "n": -1, "max_k": 0, "homer_codes": -1, "steps": -1, "window": 1, "feature_dim": 0, "hidden_dim": 0},
-    **{"gru_layers": 0, "head_dim": 0, "self_prediction": -1.0, "l2_states": float("nan")},
-    **{"patch_size": 0, "patch_count": -1, "patch_fill": 256, "zeroed_frames": -1},
-}
-
-
-@pytest.mark.parametrize(("field", "value"), [*BELOW.items(), *BELOW_IN_BOTH.items()])
-def test_numbers_out_of_range_stop_pretraining_before_it_begins(data, tmp_path, field, value):
-    reader = {"homer_codes": {"method": "homer"}}.get(field, {})
-    with pytest.raises(UserError, match=f"--{field.replace('_', '-')} is {value}; it must be at least"):
-        run_pretrain(smoke_pretrain(data, tmp_path / "out", **{field: value}, **reader))
-    assert not (tmp_path / "out").exists()
-
-
 @pytest.mark.parametrize(
     ("change", "message"),
     [
+        ({"method": "mikado"}, r"unknown method 'mikado'.*mik\+a"),
+        ({"window": 21}, "episode 0 .*20 rows"),
+        ({"seed": -1}, "--seed is -1; it must be at least 0"),
+        ({"learning_rate": float("nan")}, "--learning-rate is nan"),
+        ({"patch_fill": 256}, "--patch-fill is 256; it must be at least 0 and at most 255"),
+        ({"method": "curl", "batch_size": 1}, "--batch-size is 1; curl tells windows apart: give it 2"),
         ({"patch_size": 85}, "exceeds the image"),
         ({"zeroed_frames": 4}, "cannot zero 4 of 3"),
         ({"device": "meta"}, "unknown device 'meta'"),
@@ -104,7 +77,7 @@ def test_what_does_not_fit_leaves_no_run_behind(data, tmp_path, change, message)
     assert not (tmp_path / "out").exists()
 
 
-@pytest.mark.parametrize("method", ["mik+a", "curl", "random"])
+@pytest.mark.parametrize("method", ["mik+a", "random"])
 def test_a_set_without_a_transition_is_refused_whatever_the_method(tmp_path, method):
     """Advice such as fewer codes or a shorter window leads nowhere there."""
     data = write_fake_set(tmp_path / "walker_walk" / "expert", (1, 1, 1), complete_last=False)
