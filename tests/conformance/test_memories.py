@@ -1,10 +1,16 @@
 """Every memory keeps the contract of memories, another one finds its way in, and what breaks it is caught."""
 
+import json
+
 import pytest
 import torch
 
+from finetune.train import finetune
+from pretrain.train import pretrain
 from tests.helpers_pages import isolated_registries, load_example
+from tests.helpers_stages import smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.memory import GRU, MEMORIES, GRUOptions, MemoryPart
 from vd4rl_pomdp.testing import check_memory, check_method
 from vd4rl_pomdp.testing.contract import run_check
@@ -36,6 +42,17 @@ def test_the_pages_memory_keeps_its_promises_and_those_of_the_methods_it_is_chos
     check_memory("linear", slowest=0.9)
     check_method("mik+a", history="linear")
     check_method("fj+a", history="linear")
+
+
+def test_mik_a_trains_with_another_memory_and_its_encoder_is_used_and_named(memories, data, own_cache, tmp_path):
+    chosen = {"method": "mik+a", "history": "linear", "slowest": 0.9, "steps": 1}
+    made = pretrain(smoke_pretrain(data, tmp_path / "pretrained", **chosen)).path
+    encoder, _ = load_encoder(made / "encoder")
+    assert (encoder.config.history, encoder.config.memory_options) == ("linear", {"slowest": 0.9})
+    record = json.loads((made / "config.json").read_text())
+    assert record["plugins"] == {"history linear": "registered by a call"}
+    brief = {"updates": 1, "batch_size": 4, "eval_length": 2}
+    assert finetune(smoke_finetune(made / "encoder", data, tmp_path / "finetuned", **brief)).finished
 
 
 class Averaged(GRU):

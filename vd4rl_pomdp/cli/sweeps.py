@@ -13,7 +13,7 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from vd4rl_pomdp.cli.parsing import parse, parse_stage, show
+from vd4rl_pomdp.cli.parsing import command, parse_stage, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
 from vd4rl_pomdp.sweeps.options import LocalOptions, executor_options
@@ -78,27 +78,27 @@ def run(words: list[str], program: str) -> None:
     for name in SHARED:
         if flag_of(name) in (word.partition("=")[0] for word in words):
             raise UserError(f"{flag_of(name)} is a setting of the grid's trainings: change it by --change {name}=VALUE")
-    command = parse_stage(RunCommand, words, program)
-    grid = load_grid(command.grid, command.change, command.testing)
-    cells = narrow(grid.cells(), command.only)
-    check_cells(cells, command.grid)
-    for place in (command.out, command.data or command.out):
+    asked = parse_stage(RunCommand, words, program)
+    grid = load_grid(asked.grid, asked.change, asked.testing)
+    cells = narrow(grid.cells(), asked.only)
+    check_cells(cells, asked.grid)
+    for place in (asked.out, asked.data or asked.out):
         refuse_no_folder(place)
-    refuse_kept(command.out)
-    folder = SweepFolder(command.out)
-    own = [str(Path(command.grid).resolve())] * (command.grid not in names())  # another file is another grid
-    name = plan_name(grid.name, [*own, *command.only, *command.change, *["testing"] * command.testing])
-    kept, sets = runs_kept(command.done), command.data or command.out / DATA
-    jobs, warnings = plan_jobs(cells, command.out, sets, kept, folder.jobs_of_others(name))
+    refuse_kept(asked.out)
+    folder = SweepFolder(asked.out)
+    own = [str(Path(asked.grid).resolve())] * (asked.grid not in names())  # another file is another grid
+    name = plan_name(grid.name, [*own, *asked.only, *asked.change, *["testing"] * asked.testing])
+    kept, sets = runs_kept(asked.done), asked.data or asked.out / DATA
+    jobs, warnings = plan_jobs(cells, asked.out, sets, kept, folder.jobs_of_others(name))
     for job in jobs:
         refuse_unknown_to_jobs(job.settings)
     for warning in warnings:
         print(f"warning: {warning}", file=sys.stderr)
-    if command.dry_run:
+    if asked.dry_run:
         _print_plan(jobs)
         return
     plan = folder.keep_plan(name, jobs, own_program())
-    carry_out([plan], folder, command.executor, command.options, name)
+    carry_out([plan], folder, asked.executor, asked.options, name)
 
 
 def _print_plan(jobs: list[Job]) -> None:
@@ -153,25 +153,20 @@ def _jobs_of(plans: list[Plan]) -> list[Job]:
     return list({job.name: job for plan in plans for job in plan.jobs}.values())
 
 
-@dataclass(frozen=True)
-class StatusCommand:
-    """Show where a sweep stands: counts, rate, time left, and failures with their last line."""
+@command
+def show_status(out: tyro.conf.Positional[Path], json: bool = False) -> None:
+    """Show where a sweep stands: counts, rate, time left, and failures with their last line.
 
-    out: tyro.conf.Positional[Path]
-    """Folder of the sweep."""
-    json: bool = False
-    """Print one JSON object."""
-
-
-def show_status(words: list[str], program: str) -> None:
-    """Show where a sweep stands."""
+    Args:
+        out: Folder of the sweep.
+        json: Print one JSON object.
+    """
     from vd4rl_pomdp.sweeps.folder import SweepFolder, in_lines, status
 
-    command = parse(StatusCommand, words, program)
-    folder = SweepFolder(command.out)
+    folder = SweepFolder(out)
     jobs = _jobs_of(folder.plans())
     found = status(jobs, folder.attempts(jobs))
-    if command.json:
+    if json:
         show(found, True)
     else:
         print(*in_lines(found), sep="\n")
@@ -189,57 +184,45 @@ def retry(words: list[str], program: str) -> None:
     """Run failures again."""
     from vd4rl_pomdp.sweeps.folder import SweepFolder, failed
 
-    command = parse_stage(RetryCommand, words, program)
-    folder = SweepFolder(command.out)
+    asked = parse_stage(RetryCommand, words, program)
+    folder = SweepFolder(asked.out)
     plans = folder.plans_to_do()
     for name, rows in folder.attempts(_jobs_of(plans)).items():
         if failed(rows):
             folder.forget(name)
-    carry_out(plans, folder, command.executor, command.options)
+    carry_out(plans, folder, asked.executor, asked.options)
 
 
-@dataclass(frozen=True)
-class JoinCommand:
+@command
+def join(
+    out: tyro.conf.Positional[Path], plan: str = "", jobs: int = 0, jobs_per_gpu: int = 1, threads: int = 0
+) -> None:
     """Help with a sweep on this machine: take jobs that nobody has, and end when there is none to take.
 
     What a task of Slurm or Ray does; on any other cluster, start it as often as you like.
+
+    Args:
+        out: Folder of the sweep.
+        plan: Jobs of this plan alone; default: all that lie in OUT/sweep/plans.
+        jobs: Jobs at a time on this machine; 0: as many as its GPUs take, or one without a GPU.
+        jobs_per_gpu: Jobs at a time on each GPU.
+        threads: CPU threads of a job; 0: its share of the machine's cores.
     """
-
-    out: tyro.conf.Positional[Path]
-    """Folder of the sweep."""
-    plan: str = ""
-    """Jobs of this plan alone; default: all that lie in OUT/sweep/plans."""
-    jobs: int = 0
-    """Jobs at a time on this machine; 0: as many as its GPUs take, or one without a GPU."""
-    jobs_per_gpu: int = 1
-    """Jobs at a time on each GPU."""
-    threads: int = 0
-    """CPU threads of a job; 0: its share of the machine's cores."""
-
-
-def join(words: list[str], program: str) -> None:
-    """Help with a sweep."""
     from vd4rl_pomdp.sweeps.driver import Driver
     from vd4rl_pomdp.sweeps.folder import SweepFolder
 
-    command = parse(JoinCommand, words, program)
-    options = LocalOptions(command.jobs, command.jobs_per_gpu, command.threads)
+    options = LocalOptions(jobs, jobs_per_gpu, threads)
     options.check()
-    folder = SweepFolder(command.out)
-    finished = Driver(folder.plans_to_do(command.plan), options, folder, helps=True).run()
+    folder = SweepFolder(out)
+    finished = Driver(folder.plans_to_do(plan), options, folder, helps=True).run()
     print("all is finished" if finished else "there is nothing to take now; `sweep status` tells what is left")
 
 
-@dataclass(frozen=True)
-class GridsCommand:
+@command
+def list_grids() -> None:
     """List the grids that ship with the package."""
-
-
-def list_grids(words: list[str], program: str) -> None:
-    """List the grids that ship."""
     from vd4rl_pomdp.sweeps.grid import load_grid, names
 
-    parse(GridsCommand, words, program)
     for name in names():
         grid = load_grid(name)
         print(f"{name:<18} {len(grid.cells()):>5} cells  {grid.title}")

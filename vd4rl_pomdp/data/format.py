@@ -78,7 +78,7 @@ def read_attributes(path: Path) -> dict[str, Any]:
 def read_dtypes(path: Path) -> dict[str, str]:
     """Stored dtype of every key of a shard."""
     with _open(path) as file:
-        return {key: str(file[key].dtype) for key in _present(path, file)}
+        return {key: str(file[key].dtype) for key in _keys(path, file)}
 
 
 def read_frame_size(shards: Sequence[Path]) -> int:
@@ -96,7 +96,7 @@ def read_frame_size(shards: Sequence[Path]) -> int:
 def _frame_size(path: Path) -> int:
     low, high = FRAME_SIZES
     with _open(path) as file:
-        _check_keys(path, file)
+        _keys(path, file)
         frames = file[FRAMES_KEY]
         shape = frames.shape
         square = shape == (*shape[:1], 3, *shape[-1:] * 2) and shape[0] and low <= shape[-1] <= high
@@ -123,7 +123,7 @@ def read_rows(path: Path) -> dict[str, np.ndarray]:
     """
     read_frame_size([path])
     with _open(path) as file:
-        keys = _present(path, file)
+        keys = _keys(path, file)
         rows = {key: file[key][()] for key in keys if key != FRAMES_KEY}
         count = len(file[FRAMES_KEY])
     for key, value in rows.items():
@@ -177,45 +177,20 @@ def _locked(path: Path, error: Exception) -> UserError | None:
     return None
 
 
-def _present(path: Path, file: h5py.File) -> list[str]:
-    """The format's keys in a file; a missing one is an error, apart from physics."""
-    _check_keys(path, file)
-    return _expected(file)
-
-
-def _expected(file: h5py.File) -> list[str]:
-    """Keys that a file must have: the format's, and physics if anything is called so."""
-    keys = [FRAMES_KEY, *_ROW_KEYS]
-    return [key for key in keys if key != _OPTIONAL or file.get(key, getlink=True) is not None]
-
-
-def _check_keys(path: Path, file: h5py.File) -> None:
-    """Raise UserError unless all keys that are expected are in the file itself."""
-    wanted = _expected(file)
-    elsewhere = [key for key in wanted if _is_elsewhere(file, key)]
-    if elsewhere:
-        raise UserError(f"{path}: {elsewhere[0]!r} lies in another file, which is not followed; {_REPAIR}")
-    missing = [key for key in wanted if not _holds_array(_stored(file, key))]
-    if missing:
-        raise UserError(f"{path}: has no {missing[0]!r}, so it is no V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
-
-
-def _stored(file: h5py.File, key: str) -> Any:
-    """What a key names, None if nothing; `file.get` says nothing, too, where the disk fails."""
-    return file[key] if key in file else None  # noqa: SIM401
-
-
-def _holds_array(stored: Any) -> bool:
-    """Whether this is a dataset with a shape; HDF5's null datasets have none."""
-    return isinstance(stored, h5py.Dataset) and stored.shape is not None
-
-
-def _is_elsewhere(file: h5py.File, key: str) -> bool:
-    """Whether a key's values are kept in other files, which could be any file of the machine."""
-    if isinstance(file.get(key, getlink=True), h5py.ExternalLink):
-        return True
-    stored = _stored(file, key)
-    return isinstance(stored, h5py.Dataset) and (stored.external is not None or stored.is_virtual)
+def _keys(path: Path, file: h5py.File) -> list[str]:
+    """The format's keys in a file, physics if anything is called so; UserError for one that is no array in the file."""
+    wanted = [FRAMES_KEY, *_ROW_KEYS]
+    keys = [key for key in wanted if key != _OPTIONAL or file.get(key, getlink=True) is not None]
+    for key in keys:
+        elsewhere = isinstance(file.get(key, getlink=True), h5py.ExternalLink)
+        stored = file[key] if not elsewhere and key in file else None  # `file.get` hides a failing disk
+        if isinstance(stored, h5py.Dataset):
+            elsewhere = stored.external is not None or stored.is_virtual
+        if elsewhere:
+            raise UserError(f"{path}: {key!r} lies in another file, which is not followed; {_REPAIR}")
+        if not isinstance(stored, h5py.Dataset) or stored.shape is None:  # HDF5's null datasets have no shape
+            raise UserError(f"{path}: has no {key!r}, so it is no V-D4RL shard (keys: {', '.join(file)}); {_REPAIR}")
+    return keys
 
 
 def _check_column(path: Path, key: str, value: np.ndarray, count: int) -> None:

@@ -7,7 +7,6 @@ from __future__ import annotations
 
 from collections.abc import Collection
 from itertools import combinations
-from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -100,15 +99,8 @@ def _ordered(table: pd.DataFrame, *keys: pd.Series) -> pd.DataFrame:
 
 def curves(evaluated: pd.DataFrame) -> pd.DataFrame:
     """Mean over seeds, and their range, at every evaluation."""
-    by_step = evaluated.groupby([*CONDITION, "step"], sort=False)["score"]
-    return by_step.agg(score="mean", low="min", high="max", seeds="size").reset_index().pipe(_by_condition, "step")
-
-
-def _by_condition(table: pd.DataFrame, *then: str) -> pd.DataFrame:
-    """Conditions in the order in which they first come, each ordered by some columns."""
-    place = table.groupby(list(CONDITION), sort=False).ngroup()
-    order = table.assign(_place=place).sort_values(["_place", *then], kind="stable").index
-    return table.loc[order].reset_index(drop=True)
+    by_step = evaluated.groupby([*CONDITION, "step"])["score"]
+    return by_step.agg(score="mean", low="min", high="max", seeds="size").reset_index()
 
 
 def final_scores(evaluated: pd.DataFrame) -> pd.DataFrame:
@@ -266,16 +258,11 @@ def losses(curves: list[tuple[Row, list[tuple[int, float]]]]) -> pd.DataFrame:
         curves: IDENTITY of each finished pretraining, and its losses by step.
     """
     rows = [named | {"step": step, "action_loss": loss} for named, told in curves for step, loss in told]
-    table = pd.DataFrame(rows, columns=[*IDENTITY, "step", "action_loss"])
-    by_step = table.groupby([*CONDITION, "step"], sort=False)["action_loss"].agg(action_loss="mean", seeds="size")
-    found = by_step.reset_index().pipe(_by_condition, "step")
-    seeds = table.groupby(list(CONDITION), sort=False)["seed"].transform("nunique")
-    runs = table.assign(seeds=seeds).drop_duplicates(list(CONDITION))[[*CONDITION, "seeds"]]
-    found = found.merge(runs, on=[*CONDITION, "seeds"])  # steps of which all runs tell
-    parts: list[Any] = [_thinned(part) for _, part in found.groupby(list(CONDITION), sort=False)]
-    return pd.concat(parts, ignore_index=True) if parts else found
-
-
-def _thinned(table: pd.DataFrame) -> pd.DataFrame:
-    """At most POINTS rows of a table, the first and the last among them."""
-    return table.iloc[np.linspace(0, len(table) - 1, min(len(table), POINTS)).round().astype(int)]
+    parts = [pd.DataFrame(columns=[*CONDITION, "step", "action_loss", "seeds"])]
+    for condition, part in pd.DataFrame(rows, columns=[*IDENTITY, "step", "action_loss"]).groupby(list(CONDITION)):
+        wide = part.pivot_table("action_loss", "step", "seed").dropna()
+        chosen = wide.iloc[np.linspace(0, len(wide) - 1, min(len(wide), POINTS)).round().astype(int)]
+        named = dict(zip(CONDITION, condition, strict=True))
+        means = {"step": chosen.index, "action_loss": chosen.mean(axis=1).to_numpy(), "seeds": wide.shape[1]}
+        parts.append(pd.DataFrame(named | means))
+    return pd.concat(parts[1:] or parts, ignore_index=True)

@@ -17,7 +17,7 @@ import sys
 import time
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, Protocol
+from typing import Any
 
 from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors, first_line
 from vd4rl_pomdp.runs import interrupt
@@ -57,39 +57,12 @@ class Task:
             Driver(folder.plans_to_do(self.plan), self.options, folder, helps=True).run()
 
 
-class Cluster(Protocol):
-    """Where tasks run. They see the folders of runs and sets at the same paths."""
-
-    folder: Path
-    """For what tasks print."""
-    local: LocalOptions
-    """What a task's driver is told."""
-
-    @property
-    def tasks(self) -> int:
-        """The most at a time."""
-
-    def live(self) -> int:
-        """How many tasks of this sweep wait or run; UnavailableError if the cluster does not answer."""
-
-    def submit(self, task: Task, number: int) -> None:
-        """Ask for tasks; UserError if they were refused."""
-
-    def stop(self) -> None:
-        """Take waiting tasks back, ask running ones to end where nothing is lost, and wait for them."""
-
-
-def cluster_of(kind: str, options: Any, folder: SweepFolder) -> Cluster:
-    """The cluster of an executor's name and options."""
-    return {"slurm": SlurmCluster, "ray": RayCluster}[kind](options, folder.path / kind)
-
-
-def watch(plans: list[Plan], cluster: Cluster, folder: SweepFolder, name: str) -> bool:
+def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFolder, name: str) -> bool:
     """Keep a sweep's tasks on a cluster until nothing is left that can be done; whether all is finished.
 
     Args:
         plans: of which the jobs are carried out.
-        cluster: where.
+        cluster: where; tasks see the folders of runs and sets at the same paths.
         folder: the sweep's.
         name: of its plan; empty: all plans in its folder.
 
@@ -97,17 +70,37 @@ def watch(plans: list[Plan], cluster: Cluster, folder: SweepFolder, name: str) -
         UserError: the cluster refuses the first tasks, or tasks end and nothing happens.
     """
     jobs = list({job.name: job for plan in plans for job in plan.jobs}.values())
-    task, front = Task(folder.out, name, cluster.local, os.getcwd()), _Front(folder.attempts(jobs))
+    task = Task(folder.out, name, cluster.local, os.getcwd())
+    said = {name: len(rows) for name, rows in folder.attempts(jobs).items()}
+    vain, heard = 0, False
     try:
         while True:
-            attempts = folder.attempts(jobs)
-            left = [job for job in jobs if not is_finished(job)]
-            front.tell(attempts, len(jobs) - len(left), len(jobs))
+            attempts, left = folder.attempts(jobs), [job for job in jobs if not is_finished(job)]
+            for job, rows in attempts.items():
+                for row in rows[said[job] :]:
+                    say(row, len(jobs) - len(left), len(jobs))
+                    vain = 0
+                said[job] = len(rows)
             lost, names = lost_among(left, attempts), {job.name for job in left}
-            open_jobs = [job for job in left if job.name not in lost and not names & set(job.needs)]
-            if not open_jobs:
+            could = [job for job in left if job.name not in lost and names.isdisjoint(job.needs)]
+            if not could:
                 return not left
-            front.ask(cluster, task, len(open_jobs), any(in_use(job.folder) for job in open_jobs))
+            if any(in_use(job.folder) for job in could):
+                vain = 0
+            try:
+                live = cluster.live()
+                wanted = min(cluster.tasks, -(-len(could) // cluster.local.jobs)) - live
+                if wanted > 0:
+                    vain += not live
+                    if vain > VAIN:
+                        raise UserError(f"tasks end before they begin a job: see {cluster.folder}")
+                    with interrupt.deferred():  # what is half asked for could not be taken back
+                        cluster.submit(task, wanted)
+                heard = True
+            except UnavailableError as error:
+                if not heard:  # what a cluster refuses at first ends the sweep, later it is asked again
+                    raise
+                print(f"warning: {error}; trying again", file=sys.stderr, flush=True)
             until = time.monotonic() + LOOK_S
             while time.monotonic() < until:
                 time.sleep(0.5)
@@ -115,42 +108,6 @@ def watch(plans: list[Plan], cluster: Cluster, folder: SweepFolder, name: str) -
     except BaseException:
         cluster.stop()
         raise
-
-
-class _Front:
-    """What was told of a sweep, and asked of its cluster."""
-
-    def __init__(self, attempts: dict[str, list[Any]]) -> None:
-        self._said = {name: len(rows) for name, rows in attempts.items()}
-        self._vain = 0
-        self._heard = False
-        """Whether the cluster has answered: at first what it refuses ends the sweep, later it is asked again."""
-
-    def tell(self, attempts: dict[str, list[Any]], done: int, of: int) -> None:
-        """Print the attempts that have ended since the last call."""
-        for name, rows in attempts.items():
-            for row in rows[self._said[name] :]:
-                say(row, done, of)
-                self._vain = 0
-            self._said[name] = len(rows)
-
-    def ask(self, cluster: Cluster, task: Task, jobs: int, running: bool) -> None:
-        """Ask for tasks where fewer than the jobs need wait or run."""
-        self._vain = 0 if running else self._vain
-        try:
-            live = cluster.live()
-            wanted = min(cluster.tasks, -(-jobs // max(1, cluster.local.jobs))) - live
-            if wanted > 0:
-                self._vain += not live
-                if self._vain > VAIN:
-                    raise UserError(f"tasks end before they begin a job: see {cluster.folder}")
-                with interrupt.deferred():  # what is half asked for could not be taken back
-                    cluster.submit(task, wanted)
-            self._heard = True
-        except UnavailableError as error:
-            if not self._heard:
-                raise
-            print(f"warning: {error}; trying again", file=sys.stderr, flush=True)
 
 
 class SlurmCluster:
@@ -308,3 +265,8 @@ class RayCluster:
 
 def _run(task: Task) -> None:
     task()
+
+
+def cluster_of(kind: str, options: Any, folder: SweepFolder) -> SlurmCluster | RayCluster:
+    """The cluster of an executor's name and options."""
+    return SlurmCluster(options, folder.path / kind) if kind == "slurm" else RayCluster(options, folder.path / kind)
