@@ -3,7 +3,6 @@
 import csv
 import json
 from collections import Counter
-from itertools import product
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +14,7 @@ from vd4rl_pomdp.report import page
 from vd4rl_pomdp.report.load import label, load_runs
 from vd4rl_pomdp.runs.episodes import COLUMNS
 from vd4rl_pomdp.runs.files import read_json, write_json
-from vd4rl_pomdp.runs.identity import identity
-from vd4rl_pomdp.runs.results import Result, write_results
+from vd4rl_pomdp.runs.results import Result
 
 
 def write_run(
@@ -133,98 +131,10 @@ def grid(tmp_path: Path) -> Path:
     return tmp_path / "runs"
 
 
-METHODS = (
-    "mik+a",
-    "mik",
-    "ah+a",
-    "ah",
-    "fj+a",
-    "fj",
-    "no_history",
-    "acro",
-    "one_step_inverse",
-    "curl",
-    "driml",
-    "random",
-)
-TASKS = ("walker_walk", "cheetah_run", "humanoid_walk")
-QUALITIES = ("expert", "medium_expert", "medium")
-CORRUPTIONS = ("patch", "patch+zero_frames")
-
-
-RECORDED = {
-    "settings": {
-        **{"preset": "paper", "steps": 50_000, "batch_size": 16, "window": 32, "learning_rate": 0.0003, "max_k": 15},
-        **{"frame_encoder": "drq", "precision": "bf16", "feature_dim": 256, "hidden_dim": 256, "gru_layers": 1},
-        **{"shift": 4, "history": "method", "head": "kmeans", "codes": 20, "k_embedding": True, "norm_weight": 0.0},
-    },
-    "corruption": {
-        **{"corruption_mode": "resample", "patch_size": 16, "patch_count": 1, "patch_fill": 0, "zeroed_frames": 2},
-    },
-    "config": {
-        **{"preset": "paper", "algorithm": "td3_bc", "batch_size": 256, "hidden_dim": 1024, "learning_rate": 0.0003},
-        **{"views": 4, "shift": 4, "precision": "bf16", "eval_every": 1000, "eval_episodes": 10, "eval_clean": True},
-        **{"workers": 4, "device": "auto", "log_every": 500, "gamma": 0.99, "n_step": 3, "alpha": 2.5},
-    },
-    "versions": dict.fromkeys(("python", "torch", "numpy", "mujoco", "dm-control", "h5py", "gymnasium"), "2.13.0+cpu"),
-    "encoder": {
-        **{"action_dim": 6, "frame_encoder": "drq", "feature_dim": 256, "history": "gru", "use_actions": True},
-        **{"hidden_dim": 256, "gru_layers": 1, "history_window": 0, "readout": "state", "channels": 9, "size": 84},
-    },
-}
-"""Of what a run records, that which is the same for all."""
-
-
-def write_grid(out: Path, seeds: int = 23, evaluations: int = 3, episodes: int = 10) -> int:
-    """A results folder of the paper's grid with made-up scores; returns the number of its runs."""
-    rng = np.random.default_rng(0)
-    runs = [
-        grid_run(out, labels, evaluations, episodes, rng)
-        for task, quality, corruption, method in product(TASKS, QUALITIES, CORRUPTIONS, METHODS)
-        for labels in (
-            {
-                "method": method,
-                "task": task,
-                "quality": quality,
-                "corruption": corruption,
-                "algorithm": "td3_bc",
-                "seed": seed,
-            }
-            for seed in range(seeds)
-        )
-    ]
-    write_results(out, runs)
-    return len(runs)
-
-
-def grid_run(out: Path, labels: dict[str, Any], evaluations: int, episodes: int, rng: np.random.Generator) -> Result:
-    """A finished run with scores around a level of its own method, task and quality."""
-    level = 75 - 5 * METHODS.index(labels["method"]) - 4 * QUALITIES.index(labels["quality"]) + rng.normal(0, 6)
-    rows = []
-    for number in range(1, evaluations + 1):
-        scores = np.clip(level * number / evaluations + rng.normal(0, 8, episodes), 0, 100).round(4).tolist()
-        rows += [
-            labels
-            | {"step": 1000 * number, "episode": i, "episode_seed": 20_000 + i, "return": 10 * score, "length": 500}
-            | {"score": score, "evaluated_under": labels["corruption"], "action_error": None}
-            for i, score in enumerate(scores)
-        ]
-    corruption = RECORDED["corruption"] | {"corruption": labels["corruption"]}
-    settings = RECORDED["settings"] | {"method": labels["method"]} | corruption
-    data = f"{labels['task']}-{labels['quality']}"
-    card = {"method": labels["method"], "seed": labels["seed"], "settings": settings, "data": data}
-    card |= {"corruption": corruption}
-    config = RECORDED["config"] | {"seed": labels["seed"], "updates": 1000 * evaluations, "out": f"runs/{labels}"}
-    record = {"format": 3, "stage": "finetune", "config": config, "inputs": {"data": data}, "git_commit": "0" * 40}
-    record |= {"versions": RECORDED["versions"], "command": f"vd4rl-pomdp finetune --preset paper {labels}"}
-    files = {
-        "config": record,
-        "labels": labels,
-        "timing": {"seconds": rng.uniform(100, 900)},
-        "machine": {"processor": "two cores", "cores": 2},
-        "pretrain_timing": {"seconds": rng.uniform(100, 900)},
-        "probe": {"probe_pose": rng.uniform(10, 60), "probe_velocity": rng.uniform(10, 60)},
-        "reference": {"data_return": 800.0, "actor": None, "path_error": 0.1},
-        "encoder": {"encoder": RECORDED["encoder"], "pretrain": card | {"action_loss": rng.uniform(1, 3)}},
-    }
-    return Result(identity(record, card), out, files, 1000 * evaluations, [], rows)
+def finished_result(path: Path, labels: dict[str, Any]) -> Result:
+    """A finished fine-tuning with one evaluation episode, as a results folder tells of it."""
+    record = {"stage": "finetune", "config": {"seed": labels["seed"]}, "versions": {}, "git_commit": "abc"}
+    row = labels | {"step": 10, "episode": 0, "episode_seed": 0, "return": 500.0, "length": 500, "score": 50.0}
+    row |= {"evaluated_under": labels["corruption"], "action_error": None}
+    files = {"config": record, "labels": labels, "timing": {"seconds": 3.0}, "machine": {"processor": "two cores"}}
+    return Result(f"{labels}", path, files, 10, [], [row])

@@ -16,7 +16,7 @@ import pytest
 from rich.console import Console
 
 import pretrain.objectives
-from tests.helpers_report import METHODS, describe, grid, pretraining, write_grid, write_run, write_seeds
+from tests.helpers_report import describe, grid, pretraining, write_run, write_seeds
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.reference import Reference
@@ -343,17 +343,6 @@ def test_a_film_is_read_once_and_those_beyond_the_pages_room_are_counted(tmp_pat
     page, *_ = write_report([tmp_path / "runs"], tmp_path / "other")
     assert page.read_text().count("data:image/webp") == 1
     assert "2 more films are left out" in page.read_text()
-
-
-def test_a_report_of_a_thousand_runs_drops_nothing_and_stays_small(tmp_path):
-    runs = write_grid(tmp_path / "grid", seeds=5, episodes=2)
-    page, summary, *_ = write_report([tmp_path / "grid"], tmp_path / "out")
-    assert runs > 1000
-    assert summary["seeds"].sum() == runs
-    assert len(summary) == 3 * 3 * 2 * len(METHODS)
-    assert page.stat().st_size < 2 * 2**20
-    assert [len(table(tmp_path / "out" / name)) for name in ("runs.csv", "episodes.csv")] == [runs, 6 * runs]
-    assert (tmp_path / "out" / "runs.jsonl").read_bytes() == (tmp_path / "grid" / "runs.jsonl").read_bytes()
 
 
 def test_runs_of_a_condition_share_one_entry(tmp_path):

@@ -5,10 +5,9 @@ import re
 from dataclasses import replace
 from pathlib import Path
 
-import numpy as np
 import pytest
 
-from tests.helpers_report import grid_run
+from tests.helpers_report import finished_result
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.settings import settings_of
@@ -48,7 +47,7 @@ def runs(grid):
     made = []
     for cell in load_grid(str(grid)).cells():
         labels = {name: cell.value(name) for name in ("method", "task", "quality", "corruption", "seed")}
-        run = grid_run(grid.parent, labels | {"algorithm": "td3_bc"}, 1, 1, np.random.default_rng(0))
+        run = finished_result(grid.parent, labels | {"algorithm": "td3_bc"})
         before = recorded(cell, "pretrain")
         card = {"settings": settings_of(before), "seed": cell.seed, "data": "here"}
         record = run.record | {"format": FORMAT, "config": recorded(cell, "finetune")}

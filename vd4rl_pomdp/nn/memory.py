@@ -160,7 +160,7 @@ def run_over_versions(memory: Memory, versions: Sequence[Tensor], length: Tensor
     last = len(versions) - 1
     batch, rows, _ = versions[0].shape
     state = memory.initial_state(batch)
-    states, outputs = [state] * (rows + last), []
+    states, outputs = [state] * (rows + last), list[Tensor]()
     if span is None:  # from row j+V-1 on all states read the same rows, so one pass over these serves them
         for j in reversed(range(rows)):
             output, ahead = run_memory(memory, versions[last][:, j, None], state)

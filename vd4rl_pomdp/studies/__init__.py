@@ -1,1 +1,1 @@
-"""Experiments beside the benchmark: mazes, exact theory, control from hidden coordinates."""
+"""Experiments beside the benchmark: mazes, exact theory."""
