@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, get_args
+from typing import Literal
 
 from baselines import ACRO, CURL, DRIML, HOMER, ACROOptions, DRIMLOptions, HOMEROptions, OneStepInverse
 from pretrain.objectives.all_history import AllHistory
@@ -12,11 +12,10 @@ from pretrain.objectives.forward_jump import ForwardJump
 from pretrain.objectives.masked_inverse import MaskedActionOptions, MaskedInverse, MaskedOptions
 from pretrain.objectives.supervised import Supervised, SupervisedOptions
 from pretrain.objectives.untrained import StateOptions, Untrained
-from vd4rl_pomdp.core.errors import UserError, refuse_unknown
 from vd4rl_pomdp.core.options import Options, refuse_options
 from vd4rl_pomdp.core.registry import Registry
 from vd4rl_pomdp.corruptions.augmentation import Sharing
-from vd4rl_pomdp.nn.objective import ActionOptions, InverseObjective, InverseOptions, Objective
+from vd4rl_pomdp.nn.objective import ActionOptions, InverseOptions, Objective
 
 
 @dataclass(frozen=True)
@@ -51,20 +50,6 @@ class Method:
     """Class of its options."""
     summary: str = ""
     """One line that says what it is."""
-
-    def __post_init__(self) -> None:
-        """Raise UserError for a word that this class does not know, and for what cannot be together."""
-        refuse_unknown("shift of a Method", self.shift, (*get_args(Sharing), "own"))
-        if self.end_to_end and self.history != "none":
-            raise UserError("a Method trained end to end has no memory: leave its history out")
-        if _is(self.build, InverseObjective) and not _is(self.options, ActionOptions):
-            raise UserError("a Method whose objective predicts actions has their options: say options=InverseOptions")
-        if self.reads_state and self.trained:
-            raise UserError("a Method that reads states is not trained: say trained=False")
-
-
-def _is(built: object, kind: type) -> bool:
-    return isinstance(built, type) and issubclass(built, kind)
 
 
 _OWN = {

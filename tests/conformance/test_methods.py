@@ -202,20 +202,3 @@ def test_a_method_that_keeps_all_promises_passes_and_unknown_ones_and_settings_a
         check_method("mine", max_k=2)
     with pytest.raises(UserError, match="unknown method 'yours'"):
         check_method("yours")
-
-
-@pytest.mark.parametrize(
-    ("parts", "message"),
-    [
-        ({"trained": False, "end_to_end": "bc", "history": "gru"}, "trained end to end has no memory"),
-        ({"reads_state": True}, "that reads states is not trained"),
-    ],
-)
-def test_a_method_of_what_cannot_be_together_is_refused_where_it_is_made(parts, message):
-    with pytest.raises(UserError, match=f"a Method {message}"):
-        Method(Mean, **parts)
-
-
-def test_a_method_that_asks_for_what_there_is_not_is_refused_where_it_is_made():
-    with pytest.raises(UserError, match=r"unknown shift of a Method .*: choose one of .*"):
-        Method(Mean, shift="windows")

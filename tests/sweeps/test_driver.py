@@ -3,6 +3,9 @@
 import json
 import os
 import shutil
+import signal
+import subprocess
+import sys
 import time
 from dataclasses import replace
 from multiprocessing import get_context
@@ -16,6 +19,7 @@ from vd4rl_pomdp.sweeps import driver
 from vd4rl_pomdp.sweeps.driver import Driver
 from vd4rl_pomdp.sweeps.folder import TRIES, SweepFolder, is_finished
 from vd4rl_pomdp.sweeps.options import LocalOptions
+from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE
 
 
 @pytest.fixture(autouse=True)
@@ -141,6 +145,34 @@ def test_a_signal_ends_the_jobs_where_nothing_is_lost_and_is_no_attempt(tmp_path
     assert causes(tmp_path, one) == ["interrupted"]
     (tmp_path / "go").touch()
     main(["sweep", "retry", str(tmp_path)])
+
+
+SIGNALLED = """
+import signal
+from vd4rl_pomdp.cli import main, studies
+from vd4rl_pomdp.runs import interrupt
+
+def bench(words, program):
+    with interrupt.deferred():
+        signal.raise_signal(signal.SIGTERM)
+        signal.raise_signal(signal.SIGTERM)
+        print("a checkpoint is written", flush=True)
+
+studies.bench = bench
+main(["bench"])
+"""
+
+
+def test_a_second_signal_ends_a_job_no_sooner(monkeypatch):
+    """As a cluster sends it to all processes of a task, whose driver then asks its jobs to end."""
+
+    def end():
+        done = subprocess.run([sys.executable, "-c", SIGNALLED], capture_output=True, text=True, check=False)
+        return done.returncode, done.stdout
+
+    assert end() == (-signal.SIGTERM, "")
+    monkeypatch.setenv(JOB_VARIABLE, "1")
+    assert end() == (143, "a checkpoint is written\n")
 
 
 def test_a_driver_that_helps_ends_when_others_have_all_that_could_start(tmp_path):

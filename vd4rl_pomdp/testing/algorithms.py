@@ -3,19 +3,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import torch
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
+from finetune.algorithms import ALGORITHMS, Algorithm, Loss
+from finetune.config import FinetuneConfig
+from finetune.features import FeatureBatch
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.runs.checkpoint import pack, unpack
 from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
-
-if TYPE_CHECKING:
-    from finetune.algorithms import Algorithm, Loss
-    from finetune.features import FeatureBatch
 
 DIM, ACTIONS, SIZE = 3, 2, 32
 UPDATES = 4
@@ -38,8 +37,6 @@ def check_algorithm(name: str, **options: Any) -> None:
 
 def batch(number: int = 0) -> FeatureBatch:
     """Transitions of which every other one ends its episode for good."""
-    from finetune.features import FeatureBatch
-
     g = torch.Generator().manual_seed(number)
     z, next_z = (5 + 3 * torch.randn(SIZE, DIM, generator=g) for _ in range(2))
     action = torch.rand(SIZE, ACTIONS, generator=g) * 2 - 1
@@ -48,9 +45,6 @@ def batch(number: int = 0) -> FeatureBatch:
 
 def make(name: str, seed: int = 0, **options: Any) -> Algorithm:
     """An algorithm with a small policy, the same for every seed."""
-    from finetune.algorithms import ALGORITHMS
-    from finetune.config import FinetuneConfig
-
     chosen = FinetuneConfig.of("smoke", algorithm=name, **options).options
     torch.manual_seed(seed)
     policy = Policy(DIM, ACTIONS, 16)
@@ -223,8 +217,6 @@ def actions_lie_within_their_bounds(name: str, **options: Any) -> None:
 
 def a_batch_is_left_as_it_was(name: str, **options: Any) -> None:
     """An update changes nothing in the batch that it is given."""
-    from finetune.features import FeatureBatch
-
     given = batch()
     make(name, **options).update(given)
     changed = [f.name for f in fields(FeatureBatch) if not torch.equal(given[f.name], batch()[f.name])]

@@ -4,21 +4,22 @@ from __future__ import annotations
 
 from pathlib import Path
 from tempfile import TemporaryDirectory
-from typing import TYPE_CHECKING, Any, get_args
+from typing import Any, get_args
 
 import numpy as np
 import torch
 from torch import Tensor
 
+from pretrain.config import PretrainConfig
 from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.core.types import StepType, row_key
 from vd4rl_pomdp.corruptions import BatchCorruption, Corruption, CorruptionConfig, derive_keys, make_corruption
+from vd4rl_pomdp.corruptions.augmentation import random_shift
 from vd4rl_pomdp.corruptions.corruption import ZERO_FRAMES, Mode
+from vd4rl_pomdp.data import Dataset, View, open_dataset
+from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.testing.contract import Check, claim, run_checks
-
-if TYPE_CHECKING:
-    from vd4rl_pomdp.data import Dataset
 
 STACKS = 8
 _MODES: tuple[Mode, ...] = get_args(Mode)
@@ -35,8 +36,6 @@ def check_corruption(name: str, **options: Any) -> None:
         AssertionError: a promise is broken; says which one, and by what.
         UserError: there is no such stage or option, or a setting of the training has an option's name.
     """
-    from pretrain.config import PretrainConfig
-
     CorruptionConfig.of(name, **options)
     PretrainConfig.of("smoke", corruption=name, **options)
     run_checks("corruption", CHECKS, name, **options)
@@ -137,9 +136,6 @@ def a_view_shows_shifted_then_corrupted_stacks(name: str, **options: Any) -> Non
 
 
 def _claim_view(dataset: Dataset, config: CorruptionConfig, shift: int) -> None:
-    from vd4rl_pomdp.corruptions.augmentation import random_shift
-    from vd4rl_pomdp.data import View
-
     rows, key = torch.arange(dataset.num_rows).view(2, -1), torch.tensor([5, 6])
     apart, together = BatchCorruption(config, 1, "a"), View(dataset, config, shift, 1, "a")
     for _ in range(2):
@@ -150,9 +146,6 @@ def _claim_view(dataset: Dataset, config: CorruptionConfig, shift: int) -> None:
 
 def _random_set(folder: Path) -> Dataset:
     """Two short episodes of random pixels."""
-    from vd4rl_pomdp.data import open_dataset
-    from vd4rl_pomdp.data.format import write_shard
-
     steps = [StepType.FIRST, *[StepType.MID] * 4, StepType.LAST] * 2
     shape = (len(steps), 3, FRAME_SIZE, FRAME_SIZE)
     rows: dict[str, np.ndarray] = {

@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pretrain.build import build_objective
+from pretrain.config import PretrainConfig
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import load_encoder, save_encoder
@@ -31,17 +33,12 @@ def check_frame_encoder(name: str, size: int = FRAME_SIZE, **options: Any) -> No
         UserError: there is no such frame encoder or option, it cannot read pictures of that size or makes no maps of
             them, or a setting of the training has an option's name.
     """
-    from pretrain.config import PretrainConfig
-
     PretrainConfig.of("smoke", frame_encoder=name, **options)
     run_checks("frame encoder", CHECKS, name, size=size, **options)
 
 
 def make(name: str, size: int = FRAME_SIZE, **options: Any) -> Encoder:
     """A memoryless encoder with the frame encoder, the same at every call."""
-    from pretrain.build import build_objective
-    from pretrain.config import PretrainConfig
-
     config = PretrainConfig.of("smoke", method="curl", frame_encoder=name, **options)
     torch.manual_seed(0)
     return build_objective(config, 2, None, observation=(CHANNELS, size)).encoder

@@ -9,6 +9,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from pretrain.build import build_objective, build_target
+from pretrain.config import PretrainConfig
 from vd4rl_pomdp.core.types import Windows, previous
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import load_encoder, save_encoder
@@ -32,8 +34,6 @@ def check_memory(name: str, **options: Any) -> None:
         AssertionError: a promise is broken; says which one, and by what.
         UserError: there is no such memory or option, or a setting of the training has an option's name.
     """
-    from pretrain.config import PretrainConfig
-
     PretrainConfig.of("smoke", history=name, **options)
     run_checks("memory", CHECKS, name, **options)
 
@@ -46,9 +46,6 @@ def make(name: str, **options: Any) -> Memory:
 
 def encoder_of(name: str, **settings: Any) -> Encoder:
     """An encoder of observations of three numbers with the memory; the same at every call."""
-    from pretrain.build import build_objective, build_target
-    from pretrain.config import PretrainConfig
-
     told = {"frame_encoder": "flat", "action_target": "mse", "hidden_dim": _WIDTH} | settings
     config = PretrainConfig.of("smoke", history=name, **told)
     torch.manual_seed(0)

@@ -9,6 +9,9 @@ from typing import Any, cast
 
 import torch
 
+from pretrain.build import build_objective, build_target
+from pretrain.config import PretrainConfig
+from pretrain.objectives import METHODS
 from vd4rl_pomdp.core.state_scale import StateScale
 from vd4rl_pomdp.core.types import StateWindows, Windows, previous
 from vd4rl_pomdp.corruptions import CORRUPTIONS
@@ -36,24 +39,18 @@ def check_method(name: str, **settings: Any) -> None:
         AssertionError: a promise is broken; says which one, and by what.
         UserError: there is no such method or setting, or something chosen beside it has a setting of the same name.
     """
-    from pretrain.config import PretrainConfig
-
     PretrainConfig.of("smoke", **({"method": name, "corruption": CORRUPTIONS[-1]} | settings))
     run_checks("method", checks_of(name, **settings), name, **settings)
 
 
 def checks_of(name: str, **settings: Any) -> tuple[Check, ...]:
     """The checks that a method has to pass: all encode, those that are trained have a loss, some predict actions."""
-    from pretrain.objectives import METHODS
-
     trained = TRAINED if METHODS.named(name).trained else ()
     return ENCODING + trained + (INVERSE if predicts_actions(name, **settings) else ())
 
 
 def predicts_actions(name: str, **settings: Any) -> bool:
     """Whether a method is trained as an inverse model."""
-    from pretrain.objectives import METHODS
-
     return METHODS.named(name).trained and isinstance(build(name, **settings), InverseObjective)
 
 
@@ -70,9 +67,6 @@ def build_inverse(name: str, **settings: Any) -> InverseObjective:
 
 
 def _build(name: str, small: dict[str, int], observation: tuple[int, int], settings: dict[str, Any]) -> Objective:
-    from pretrain.build import build_objective, build_target
-    from pretrain.config import PretrainConfig
-
     torch.manual_seed(0)
     config = PretrainConfig.of("smoke", method=name, **settings).with_known(**(small | settings))
     actions = torch.rand(50, ACTIONS) * 2 - 1
@@ -96,8 +90,6 @@ def batch(lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0, state: bool
 
 def windows(name: str, lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0) -> Windows:
     """The windows of `batch`, as the training of a method is given them: with random states if it regresses them."""
-    from pretrain.objectives import METHODS
-
     plain = batch(lengths, seed)
     if not METHODS.named(name).regresses_state:
         return plain
@@ -107,8 +99,6 @@ def windows(name: str, lengths: tuple[int, ...] = (ROWS, ROWS, 4), seed: int = 0
 
 def streaming_equals_batch(name: str, **settings: Any) -> None:
     """Row by row, as the environment delivers them, an encoder gives what it gives for whole windows."""
-    from pretrain.objectives import METHODS
-
     encoder = build(name, **settings).encoder.eval()
     window = batch((ROWS, ROWS), state=METHODS.named(name).reads_state)
     with torch.no_grad():
