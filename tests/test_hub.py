@@ -247,7 +247,7 @@ def test_where_nobody_is_nothing_is_left(encoder, tmp_path, monkeypatch):
     for act in (lambda: pull(ENCODER, tmp_path / "new"), lambda: push(encoder, ENCODER)):
         with pytest.raises(UserError, match=r"lab/encoder: the Hub refuses or does not answer .*and the network"):
             act()
-    assert "new" not in lists(tmp_path)
+    assert lists(tmp_path) == ["run"]
 
 
 def test_the_commands_of_the_program(hub, encoder, tmp_path, capsys):

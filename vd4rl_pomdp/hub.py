@@ -98,11 +98,10 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
     folder = Path(os.path.abspath(folder))
     refuse_inside(folder)
     staged = folder.with_name(f".{folder.name}.pull")
-    with _hub(repository) as (api, where):
-        api.hf_hub_download(**where, filename=LISTING, revision=revision, local_dir=staged)
-        listing = _read_listing(staged / LISTING, kind, repository)
+    with _hub(repository) as (api, where), tempfile.TemporaryDirectory() as scratch:
+        told = api.hf_hub_download(**where, filename=LISTING, revision=revision, local_dir=scratch)
+        listing, license = _read_listing(Path(told), kind, repository)
         if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
-            shutil.rmtree(staged)
             others = {shard.name for shard in shard_files(folder)} - listing.keys()  # would make it another set
             if folder.is_dir() and not others and not _wrong(folder, listing):
                 return False
@@ -114,7 +113,6 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
             raise UserError(
                 f"{repository}: {wrong[0]} has a wrong SHA-256 and was removed; pull again, or ask its owner"
             )
-        license = str(read_json(staged / LISTING).get("license", ""))
         for path in list(staged.iterdir()):
             if path.name not in listing:  # of huggingface_hub, or of a cut pull of another repository
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
@@ -155,8 +153,8 @@ def _hub(repository: str) -> Iterator[tuple[HfApi, dict[str, Any]]]:
         ) from error
 
 
-def _read_listing(path: Path, kind: str, repository: str) -> dict[str, str]:
-    """SHA-256 by name of the files that a repository lists; raises UserError if the listing is damaged."""
+def _read_listing(path: Path, kind: str, repository: str) -> tuple[dict[str, str], str]:
+    """SHA-256 by name of the files that a repository lists, and its licence; UserError if the listing is damaged."""
     listing = read_json(path)
     files = listing.get("sha256")
     files = files if isinstance(files, dict) else {}
@@ -165,7 +163,7 @@ def _read_listing(path: Path, kind: str, repository: str) -> dict[str, str]:
     plain = all(Path(name).name == name and not name.startswith(".") and name != CARD for name in names)
     if (listing.get("format"), listing.get("kind")) != (_FORMAT, kind) or not (fits and plain):
         raise UserError(f"{repository}: its {LISTING} is of another version or damaged; ask its owner")
-    return files
+    return files, str(listing.get("license", ""))
 
 
 def _wrong(folder: Path, listing: dict[str, str]) -> list[str]:
