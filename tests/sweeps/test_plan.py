@@ -329,19 +329,22 @@ def test_a_run_that_added_other_images_is_another(tmp_path):
     assert module._found({run.recipe: [run]}, run.recipe, AnySet()) is None
 
 
-def test_a_set_of_ones_own_quality_is_taken_where_it_is_there_and_its_runs_are_the_grids(tmp_path, capsys, own_cache):
-    text = GRID.partition("[finetune]")[0].replace('"expert"', '"mine"') + "method = 'random'"
+@pytest.mark.parametrize(("quality", "name"), [('"mine"', "mine"), ("2", "2")])
+def test_a_set_of_ones_own_quality_is_taken_where_it_is_there_and_its_runs_are_the_grids(
+    tmp_path, capsys, own_cache, quality, name
+):
+    text = GRID.partition("[finetune]")[0].replace('"expert"', quality) + "method = 'random'"
     (tmp_path / "grid.toml").write_text(text)
     words = [str(tmp_path / "grid.toml"), "--out", str(tmp_path / "out")]
     with pytest.raises(SystemExit, match="2"):
         main(["sweep", "run", *words])
-    assert "mine: holds no set, and the quality 'mine' cannot be collected" in capsys.readouterr().err
-    write_fake_set(tmp_path / "out" / "data" / "walker_walk" / "mine", [20, 25, 30])
+    assert f"{name}: holds no set, and the quality '{name}' cannot be collected" in capsys.readouterr().err
+    write_fake_set(tmp_path / "out" / "data" / "walker_walk" / name, [20, 25, 30])
     main(["sweep", "run", *words])
     assert capsys.readouterr().out == "all 2 jobs are finished\n"
     cells = load_grid(words[0]).cells()
     (run,) = find_results([tmp_path / "out"])
-    assert run.labels["quality"] == "mine"
+    assert run.labels["quality"] == name
     assert GridMembers("grid", cells).among([run]) == [run]
 
 

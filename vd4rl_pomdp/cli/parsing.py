@@ -11,6 +11,7 @@ import os
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import fields, replace
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -22,6 +23,7 @@ from vd4rl_pomdp.runs.files import flatten
 
 Command = Callable[[list[str], str], None]
 Stage = TypeVar("Stage", bound=StageConfig)
+_FOLDERS = ("--out", "--data", "--encoder", "--done")
 _LONGEST_LIST = 6
 
 
@@ -34,6 +36,10 @@ def parse(config: Any, words: list[str], program: str, default: Any = None) -> A
         program: what stands before them.
         default: an instance that has the defaults.
     """
+    for flag, word in pairwise(["", *words]):  # an empty path would be the working directory: a variable was not set
+        empty = flag if word == "" else word.removesuffix("=")
+        if (word == "" and not flag.startswith("--")) or (empty in _FOLDERS and word != empty):
+            raise UserError(f"{empty or 'a word'} is empty: name a folder (see `{program} --help`)")
     words = [re.sub("(?<==)~.*", lambda path: os.path.expanduser(path[0]), word, count=1) for word in words]
     options = {} if default is None else {"default": default}
     shown = io.StringIO()

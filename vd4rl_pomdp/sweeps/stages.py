@@ -60,7 +60,7 @@ def config_of(cell: GridCell, section: str) -> Any:
     settings = told(cell, section)
     later = {"seed": settings.pop("seed", 0)}
     if section == "collect" and settings.get("quality", "expert") not in SET_QUALITIES:
-        later |= {"quality": settings["quality"]}  # of a set of one's own, which no command collects
+        later |= {"quality": str(settings["quality"])}  # of a set of one's own, which no command collects
         settings |= {"quality": "expert"}
     try:
         return replace(_parsed(section, tuple(words_of(settings))), **later)
