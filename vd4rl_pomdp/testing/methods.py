@@ -55,8 +55,8 @@ def predicts_actions(name: str, **settings: Any) -> bool:
 
 
 def build(name: str, **settings: Any) -> Objective:
-    """A small objective of a method, the same at every call."""
-    return _build(name, _SMALL, _PICTURE, settings)
+    """A small objective of a method, the same at every call; without convolutions, which are no part of a method."""
+    return _build(name, _SMALL, _PICTURE, {"frame_encoder": "flat"} | settings)
 
 
 def build_inverse(name: str, **settings: Any) -> InverseObjective:
