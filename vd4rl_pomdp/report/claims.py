@@ -22,7 +22,8 @@ from vd4rl_pomdp.report.gates import (
     seen_under,
     sides,
 )
-from vd4rl_pomdp.report.load import REFERENCES, Run, groups, label
+from vd4rl_pomdp.report.load import REFERENCES, Run, label
+from vd4rl_pomdp.report.variants import groups
 from vd4rl_pomdp.runs.files import Row
 
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "not told apart", "too few seeds"

@@ -13,10 +13,11 @@ from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.text import write_text
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.figures import seeds_note, write_table
-from vd4rl_pomdp.report.load import CONDITION, Run, groups, label, load_runs, setting
+from vd4rl_pomdp.report.load import CONDITION, Run, label, load_runs, setting
 from vd4rl_pomdp.report.page import made_with
 from vd4rl_pomdp.report.render import Columns, block, render, terminal, texts, write_latex
 from vd4rl_pomdp.report.tables import SCORE, mean_and_ends
+from vd4rl_pomdp.report.variants import groups
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 

@@ -36,7 +36,6 @@ from vd4rl_pomdp.report.load import (
     Choice,
     Run,
     episodes_frame,
-    groups,
     label,
     labels,
     load_runs,
@@ -47,6 +46,7 @@ from vd4rl_pomdp.report.load import (
 from vd4rl_pomdp.report.render import Block, Columns, block, render, terminal, texts, write_latex
 from vd4rl_pomdp.report.stats import FEW_SEEDS, number, with_interval
 from vd4rl_pomdp.report.theory import load_section
+from vd4rl_pomdp.report.variants import groups
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.ownership import owned
