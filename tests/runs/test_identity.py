@@ -4,7 +4,7 @@ import copy
 
 import pytest
 
-from vd4rl_pomdp.runs.identity import identity, recipe
+from vd4rl_pomdp.runs.run import identity, recipe
 
 RECORD = {
     "format": 3,

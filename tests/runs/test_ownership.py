@@ -10,12 +10,12 @@ from pathlib import Path
 import pytest
 
 from vd4rl_pomdp.core.errors import InUseError, UserError
-from vd4rl_pomdp.runs.ownership import in_use, owned
+from vd4rl_pomdp.runs.outputs import in_use, owned
 
 HOLDER = """
 import sys, time
 from pathlib import Path
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.outputs import owned
 with owned(Path(sys.argv[1])):
     print("owned", flush=True)
     time.sleep(60)

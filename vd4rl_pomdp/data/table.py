@@ -21,8 +21,7 @@ from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, repla
 from vd4rl_pomdp.data.folder import PROVENANCE
 from vd4rl_pomdp.policies.actor import ships
 from vd4rl_pomdp.runs.files import Row, read_csv, read_json, write_csv, write_json
-from vd4rl_pomdp.runs.outputs import refuse_foreign
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 
 EPISODES = 200

@@ -23,8 +23,7 @@ from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig, EncoderRecord
 from vd4rl_pomdp.nn.frame import STATE
 from vd4rl_pomdp.nn.model_card import CARD, model_card
-from vd4rl_pomdp.runs.files import write_bytes, write_json
-from vd4rl_pomdp.runs.identity import content_hash
+from vd4rl_pomdp.runs.files import content_hash, write_bytes, write_json
 from vd4rl_pomdp.runs.provenance import git_commit
 
 WEIGHTS, CONFIG = "model.safetensors", "config.json"

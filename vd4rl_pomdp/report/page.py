@@ -48,8 +48,7 @@ from vd4rl_pomdp.report.stats import FEW_SEEDS, number, with_interval
 from vd4rl_pomdp.report.theory import load_section
 from vd4rl_pomdp.report.variants import groups
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.runs.outputs import refuse_foreign
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.results import RUNS, refuse_loss, write_results
 
 MARK = "summary"

@@ -46,12 +46,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_json(path: Path, value: Any, shared: bool = False) -> None:
     """Write a JSON file so that a reader sees it whole or not at all; `shared` as in `replacing_file`."""
     with replacing_file(path, shared) as fresh:
-        fresh.write_text(json_text(value), encoding="utf-8")
-
-
-def json_text(value: Any) -> str:
-    """A JSON file's content."""
-    return json.dumps(value, indent=2) + "\n"
+        fresh.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
@@ -87,6 +82,11 @@ def read_csv(path: Path, columns: Sequence[str], words: Collection[str]) -> list
     except (ValueError, TypeError, csv.Error) as error:
         raise UserError(f"{path}: is damaged ({error}); remove it or choose another --out") from error
     return rows
+
+
+def content_hash(told: Any) -> str:
+    """Name of what can be written as JSON, 24 characters."""
+    return hashlib.blake2b(json.dumps(told, sort_keys=True).encode(), digest_size=12).hexdigest()
 
 
 def sha256(path: Path) -> str:

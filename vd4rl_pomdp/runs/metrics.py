@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -22,10 +22,7 @@ from vd4rl_pomdp.core.errors import UserError, in_one_line
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs import METRICS_FILE
 from vd4rl_pomdp.runs.files import appending, write_bytes
-from vd4rl_pomdp.runs.identity import recipe
-
-if TYPE_CHECKING:
-    from vd4rl_pomdp.runs.run import RunFolder
+from vd4rl_pomdp.runs.run import RunFolder, recipe
 
 WandbMode = Literal["off", "offline", "online"]
 EVALUATION = "eval/"

@@ -13,8 +13,8 @@ from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.runs import results
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
-from vd4rl_pomdp.runs.identity import identity
 from vd4rl_pomdp.runs.results import Result, add_results, find_results, read_results, read_run
+from vd4rl_pomdp.runs.run import identity
 
 COMMITTED = Path(__file__).parents[3] / "results"
 
