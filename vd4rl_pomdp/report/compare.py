@@ -105,6 +105,7 @@ def _row(key: tuple, one: list[Run], other: list[Run]) -> Row:
     if one and other:
         a, b = scores
         same = {run.result.id for run in one} == {run.result.id for run in other} and np.array_equal(a, b)
+        # The same runs are no two samples: an interval about 0 would tell how sure a difference is that is none.
         row["low"], row["high"] = (None if same else stats.difference_interval(b, a)) or (None, None)
         row |= {"difference": float(b.mean() - a.mean()), "settings": _differing(one, other)}
     return row

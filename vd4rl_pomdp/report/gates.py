@@ -96,13 +96,14 @@ def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
         unknown.append("best and random need two seeds each that differ")
     elif row["low"] <= 0:
         missed.append(f"best minus random is {row['above_random']:.0f} {interval(row['low'], row['high'], 0)}")
-    if missed:
+    if missed:  # one is enough, whatever is not known of the others
         return row | {"verdict": f"{FAILED}: {'; '.join(missed)}"}
     return row | {"verdict": f"{UNKNOWN}: {'; '.join(dict.fromkeys(unknown))}" if unknown else PASSED}
 
 
 def seen_under(corruption: str, runs: Iterable[Run]) -> list[Run]:
     """Runs under a corruption, and seeds of `state` of others where it has none: nothing is hidden from it."""
+    # The setting's own first: a seed of `state` that ran under two corruptions is one seed, not two.
     found: dict[tuple[str, ...], Run] = {}
     for run in sorted(runs, key=lambda run: run.labels["corruption"] != corruption):
         if run.labels["corruption"] == corruption or run.method == STATE:
@@ -144,6 +145,7 @@ def seeds_by_variant(runs: Iterable[Run]) -> list[list[Run]]:
 
 def _preference(*compared: list[Run]) -> tuple[int, float]:
     """How many have more than one seed, and the sum of their mean returns."""
+    # Otherwise a single lucky seed would be the best method, and no interval could say how lucky.
     return sum(len(seeds) > 1 for seeds in compared), sum(float(returns_of(seeds).mean()) for seeds in compared)
 
 

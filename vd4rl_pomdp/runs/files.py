@@ -118,6 +118,7 @@ def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
     with disk_errors(path):
         try:
             yield fresh
+            # The content before the name: renamed first, a power cut could leave the name on an empty file.
             synchronise(fresh)
             fresh.replace(path)
         finally:

@@ -98,7 +98,12 @@ class MetricsLog:
             mirrors: by name, what opens a mirror, given the rows up to that step: it may lack any.
         """
         self._path = path
-        kept = [row for row in read_metrics(path) if row["step"] < step + (not _is_evaluation(row))]
+        # The checkpoint's own step is trained, but not evaluated: that follows it, and is done again.
+        kept = [
+            row
+            for row in read_metrics(path)
+            if row["step"] < step or (row["step"] == step and not any(name.startswith(EVALUATION) for name in row))
+        ]
         write_bytes(path, "".join(json.dumps(row) + "\n" for row in kept).encode())
         self._mirrors: dict[str, Mirror] = {}
         for name, opened in (mirrors or {}).items():
@@ -153,10 +158,6 @@ def _row(line: str) -> dict[str, float]:
     if not isinstance(row, dict) or "step" not in row or not all(isinstance(v, int | float) for v in row.values()):
         raise ValueError("it holds no numbers with their step")
     return row
-
-
-def _is_evaluation(row: Metrics) -> bool:
-    return any(name.startswith(EVALUATION) for name in row)
 
 
 def mirrors_of(

@@ -60,20 +60,17 @@ def kept_in(folder: Path) -> str | None:
             return "an encoder"
         if names & {"curve.csv", "snapshots"}:
             return "a policy"
-        if _is_run(folder / CONFIG_FILE):
+        # Other programs have a config.json, too: what has a stage is this package's.
+        try:
+            record = parse_json(read_bytes(folder / CONFIG_FILE))
+        except UnavailableError:
+            raise
+        except (FileNotFoundError, ValueError):
+            record = None
+        if isinstance(record, dict) and "stage" in record:
             return "a run"
     is_set = "collection.json" in names or any(name.lower().endswith((".hdf5", ".h5")) for name in names)
     return "a data set" if is_set else None
-
-
-def _is_run(config: Path) -> bool:
-    try:
-        record = parse_json(read_bytes(config))
-    except UnavailableError:
-        raise
-    except (FileNotFoundError, ValueError):
-        return False
-    return isinstance(record, dict) and "stage" in record
 
 
 def _names(folder: Path) -> list[str]:
@@ -111,7 +108,9 @@ def owned(folder: Path) -> Iterator[None]:
         with handled():
             yield
     finally:
-        (folder / LOCK).unlink(missing_ok=True)  # while it is held: whoever waits for it makes another one
+        # Deleted while it is still held, and never by anyone else: FileLock takes no lock on a name that is gone, so
+        # whoever waits makes a new file. Deleted after the release it could be another owner's, and there were two.
+        (folder / LOCK).unlink(missing_ok=True)
         lock.release()
 
 

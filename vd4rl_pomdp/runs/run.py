@@ -25,8 +25,6 @@ from vd4rl_pomdp.runs.files import content_hash, holds_anything, jsonable, read_
 from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.runs.provenance import CONTINUED, command, git_commit, machine, versions
 
-_CODE = ("versions", "git_commit", "plugins", "sources")
-"""What a record tells of the code."""
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -149,7 +147,7 @@ class RunFolder:
     def code(self) -> dict[str, Any]:
         """What the run began with, once it has: versions, commit, and where parts not of this package come from."""
         record = read_json(self.path / CONFIG_FILE)
-        return {name: record.get(name, {}) for name in _CODE}
+        return {name: record.get(name, {}) for name in ("versions", "git_commit", "plugins", "sources")}
 
     def _begin(self) -> None:
         """Write what the run begins with, or add to it where what it resumes with is something else."""
@@ -158,7 +156,7 @@ class RunFolder:
         if self._begins:
             record = {"format": FORMAT, "stage": self.stage, "config": self.config, "inputs": self.inputs}
             write_json(self.path / CONFIG_FILE, record | now | {"command": command(), "collection": self._collection})
-        if self._begins or not path.exists():
+        if self._begins or not path.exists():  # a start may have been killed between the two files
             write_json(path, hardware)
         else:
             told = read_json(path)
@@ -189,6 +187,7 @@ class RunFolder:
             UserError: it does not fit the run, or evaluations are there, which follow a checkpoint, and none is.
         """
         seconds = self._checkpoints.restore(take)
+        # Without this the run would begin again and append the same evaluations a second time.
         if seconds is None and read_episodes(self.path / EPISODES_FILE):
             raise UserError(
                 f"{self.path}: has evaluations, but the checkpoints that they were made after are gone: put them back, "
@@ -206,5 +205,5 @@ class RunFolder:
 
     def finish(self, **more: Any) -> None:
         """Mark the run as done, keeping its wall-clock seconds and the last checkpoint."""
-        self._checkpoints.prune(1)
+        self._checkpoints.prune(1)  # one stays: a result that is lost later is computed again from the end
         write_json(self.path / TIMING_FILE, {"seconds": round(self.seconds, 2)} | more)
