@@ -77,7 +77,6 @@ def commands(data: Path, run: Path) -> dict[str, list[str]]:
         "demo": ["demo"],
         "data collect": ["data", "collect", "--task", "walker_walk", "--quality", "random", "--episodes", "1"],
         "data download": ["data", "download", "--task", "walker_walk", "--quality", "random"],
-        "data table": ["data", "table", "--tasks", "walker_walk", "--qualities", "random"],
         "pretrain": ["pretrain", *preset, "--data", str(data)],
         "finetune": ["finetune", *preset, "--data", str(data), "--encoder", str(run / "encoder")],
         "evaluate": ["evaluate", str(run)],
