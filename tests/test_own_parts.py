@@ -14,7 +14,6 @@ from finetune.algorithms import BC
 from finetune.config import FinetuneConfig
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS, Method
-from pretrain.objectives.all_history import AllHistory
 from pretrain.train import pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_pages import isolated_registries, load_example, write_example
@@ -163,11 +162,6 @@ def registries():
 def test_what_is_no_class_of_options_is_refused(registries, kind, options, told):
     with pytest.raises(UserError, match=told):
         registries[kind].register("mine", part_with(kind, options))
-
-
-def test_a_method_that_predicts_actions_has_their_options(registries):
-    with pytest.raises(UserError, match="whose objective predicts actions has their options: say options="):
-        Method(AllHistory)
 
 
 @pytest.mark.parametrize(

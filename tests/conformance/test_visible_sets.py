@@ -3,7 +3,7 @@
 Twice: drawn by hand for single pairs, and as formulas for all pairs of all windows. What a prediction
 depends on is found by changing one input at a time, and by gradients; `visible`, which reads the code's own settings,
 must say the same. Of `mik+a` they are the table's in the reading that this project chose: its later view begins with
-o_{t+k} and the action taken there, not with the one before, which the option `literal` restores.
+o_{t+k} and the action taken there, not with the one before, which the option `literal_future` restores.
 
 The table's observations are stacks of three frames here, so each of them shows the two frames before it, those of
 masked steps among them: all pairs are counted in frames, too.

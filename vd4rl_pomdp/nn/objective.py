@@ -161,7 +161,7 @@ class InverseObjective(Objective):
         return total, logs
 
     def _means_by_k(self, losses: Tensor, real: Tensor, gaps: Tensor) -> Tensor:
-        """Mean loss at every k of 0..K, from (B, P) losses that are zero where `real` is, and (P,) gaps."""
+        """Mean loss at every k of 0..K, from (B, P) losses that are zero where `real` is zero, and (P,) gaps."""
         sums = losses.new_zeros(2, self.options.largest_gap + 1)
         sums.index_add_(1, gaps, torch.stack([losses.sum(0), real.sum(0)]))
         return sums[0] / sums[1].clamp(min=1)
