@@ -2,8 +2,8 @@
 
     P(a_t | f(o_0, a_0, ..., a_{t-1}, o_t), b(o_{t+k}, a_{t+k}, o_{t+k+1}, ...)),   k in 1..K
 
-A forward GRU f summarises the past, a backward GRU b the future from row t+k on. The k steps between are masked by never
-being read: a pair takes f's state of row t and b's of row t+k. The loss on them is `InverseObjective.loss_of`.
+A forward GRU f summarises the past, a backward GRU b the future from row t+k on. The k steps between are masked by
+never being read: a pair takes f's state of row t and b's of row t+k. The loss on them is `InverseObjective.loss_of`.
 Only f is kept. "+A" (actions in both) is the field `use_actions` of the encoder.
 
 Authors' code: not published.

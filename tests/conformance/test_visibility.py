@@ -1,8 +1,8 @@
 """What an action logit depends on is exactly what its objective declares, for options beyond the defaults.
 
 By gradients, and by changing one input at a time; and wrong objectives are caught. Every method's defaults are in
-`test_methods.py`, and the paper's own sets in `test_visible_sets.py`. Pictures are small and encoded without convolutions, but where frame
-encoders are the question.
+`test_methods.py`, and the paper's own sets in `test_visible_sets.py`. Pictures are small and encoded without
+convolutions, but where frame encoders are the question.
 """
 
 from collections.abc import Callable

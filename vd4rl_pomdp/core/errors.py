@@ -93,7 +93,7 @@ def told_apart(value: float, limit: float, decimals: int) -> tuple[str, str]:
     return shown(value), shown(limit)
 
 
-OR_ONES_OWN = ", or run the file that registers it"
+OR_ONES_OWN = ", or run or import the file that registers it"
 """What else to do about an unknown name of a kind that parts of one's own can be of."""
 
 

@@ -87,7 +87,9 @@ class ZeroFrames(Options):
     zeroed_frames: int = 2
     """Frames of a stack that are blanked."""
 
-    summary: ClassVar[str] = "frames of every stack, chosen uniformly, become 0; it may only end a name"
+    summary: ClassVar[str] = (
+        "frames of every stack, chosen uniformly, become 0; it must come last, as in patch+zero_frames"
+    )
     limits: ClassVar[Limits] = {"zeroed_frames": 1}
 
 
@@ -137,7 +139,7 @@ class CorruptionConfig(Options):
     """none, patch, zero_frames or patch+zero_frames."""
     corruption_mode: Mode = "resample"
     """resample: drawn anew whenever a row enters a batch, as in the paper (where features are cached: once a view);
-    emission: whatever reads a row, runs of one seed hide the same of it."""
+    emission: a row is hidden in the same way each time it is read, in all runs of one seed."""
     stages: tuple[Options, ...] = ()
     """One for every part of the name."""
 

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import io
 import json
-import math
 import os
 import secrets
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -55,33 +53,6 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
         writer = csv.DictWriter(file, columns, lineterminator="\n")
         writer.writeheader()
         writer.writerows(rows)
-
-
-def read_csv(path: Path, columns: Sequence[str], words: Collection[str]) -> list[Row]:
-    """Rows of a CSV file that `write_csv` wrote, its values as text; none if there is no file.
-
-    Args:
-        path: the file.
-        columns: all of its columns, in order.
-        words: columns that may hold any text; the others hold finite numbers.
-
-    Raises:
-        UserError: the file has other columns, or is damaged.
-    """
-    if not path.exists():
-        return []
-    try:
-        reader = csv.DictReader(io.StringIO(read_bytes(path).decode(), newline=""))
-        if tuple(reader.fieldnames or ()) != tuple(columns):
-            raise UserError(f"{path}: has other columns than {', '.join(columns)}; remove it or choose another --out")
-        rows = list(reader)
-        if not all(math.isfinite(float(row[name])) for row in rows for name in columns if name not in words):
-            raise ValueError("a number is not finite")
-    except UserError:
-        raise
-    except (ValueError, TypeError, csv.Error) as error:
-        raise UserError(f"{path}: is damaged ({error}); remove it or choose another --out") from error
-    return rows
 
 
 def content_hash(told: Any) -> str:

@@ -32,7 +32,7 @@ class Loop:
     """The steps that are left of a training; made by `training`.
 
     for step in loop:
-        loop.add(learner.update())  # which adds one to `learner.step`
+        loop.add(losses_of_one_step())  # the body does the step and counts it in `learner.step`
         if loop.due(config.log_every):
             loop.log("loss")
     """

@@ -193,7 +193,7 @@ def padding_changes_no_loss(name: str, **settings: Any) -> None:
     if isinstance(noisy, StateWindows):
         noisy = noisy.replace(state=noisy.state.index_fill(1, torch.arange(4, ROWS), 7.0))
     again = copy.deepcopy(objective)
-    claim_close(again.loss(noisy, 0.0)[0], objective.loss(window, 0.0)[0], "it does: leave out rows beyond `real`")
+    claim_close(again.loss(noisy, 0.0)[0], objective.loss(window, 0.0)[0], "leave out rows beyond `real`")
 
 
 def every_action_target_is_taken(name: str, **settings: Any) -> None:

@@ -147,24 +147,6 @@ def test_a_row_that_was_cut_with_its_run_is_left_out(tmp_path):
     assert "unfinished" in write_report([tmp_path / "runs"], tmp_path / "report").page.read_text()
 
 
-def test_results_can_be_read_while_others_are_added(tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    add_results([whole_run(tmp_path / "runs/0")], out)
-    later, read = whole_run(tmp_path / "runs/1", seed=1), results.read_episodes
-
-    def meanwhile(path):
-        rows = read(path)
-        with monkeypatch.context() as patch:
-            patch.setattr(results, "read_episodes", read)
-            add_results([later], out)
-        return rows
-
-    with monkeypatch.context() as patch:
-        patch.setattr(results, "read_episodes", meanwhile)
-        assert len(read_results(out)) == 1
-    assert len(read_results(out)) == 2
-
-
 def test_a_writing_that_is_killed_midway_leaves_what_was_there(tmp_path, monkeypatch):
     add_results([whole_run(tmp_path / "runs/0")], tmp_path / "out")
     before = [content(run) for run in read_results(tmp_path / "out")]
