@@ -9,6 +9,7 @@ rendering, on one core. A set that the table has by the same actors is not playe
 
 from __future__ import annotations
 
+import csv
 import tempfile
 import time
 from dataclasses import dataclass
@@ -23,14 +24,13 @@ from vd4rl_pomdp.core.tasks import MOST_EPISODES, SET_QUALITIES, TASKS
 from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, play
 from vd4rl_pomdp.data.folder import PROVENANCE
 from vd4rl_pomdp.policies.actor import ships
-from vd4rl_pomdp.runs.files import Row, read_csv, read_json, write_csv, write_json
+from vd4rl_pomdp.runs.files import Row, read_json, write_csv, write_json
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
 
 EPISODES = 200
 CORES = 2
 RETURNS = ("task", "quality", "episode", "return")
 COSTS = ("task", "episodes", "rows", "cpu_seconds", "commit")
-WORDS = ("task", "quality", "commit")
 SETS = ("task", "quality", "episodes", "mean", "min", "max", "seconds_100k")
 
 
@@ -57,7 +57,7 @@ def main(config: Config) -> None:
         TASKS.named(task)
         refuse_unknown("quality", quality, SET_QUALITIES)
     out = config.out
-    returns, costs = read_csv(out / "returns.csv", RETURNS, WORDS), read_csv(out / "costs.csv", COSTS, WORDS)
+    returns, costs = rows_of(out / "returns.csv"), rows_of(out / "costs.csv")
     actors = read_json(out / "actors.json") if (out / "actors.json").exists() else {}
     for task, quality in product(config.tasks, config.qualities):
         if not ships(task, quality):
@@ -77,6 +77,14 @@ def main(config: Config) -> None:
             write_csv(out / "costs.csv", COSTS, costs)
     write_csv(out / "sets.csv", SETS, summarise(returns, costs))
     write_json(out / "provenance.json", {"git_commit": git_commit(), "versions": versions(), "machine": machine()})
+
+
+def rows_of(path: Path) -> list[Row]:
+    """Rows of a table of before, none if there is none."""
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
 
 
 def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:

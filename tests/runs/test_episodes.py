@@ -1,5 +1,6 @@
 """The table of evaluation episodes: what is damaged is named, what is there stays."""
 
+import os
 import threading
 
 import pytest
@@ -91,3 +92,11 @@ def test_a_row_that_a_kill_or_a_full_disk_cut_is_not_read_and_nothing_is_glued_t
     assert path.read_text() == ROWS[:-2]
     drop_episodes_after(path, 2)
     assert read_episodes(path) == [row]
+
+
+def test_appended_lines_are_on_the_disk_when_the_block_ends(tmp_path, monkeypatch):
+    path, synchronised = tmp_path / "rows", []
+    monkeypatch.setattr("os.fsync", lambda handle: synchronised.append((os.fstat(handle).st_ino, path.read_text())))
+    with appending(path) as file:
+        file.write("one\n")
+    assert synchronised == [(path.stat().st_ino, "one\n")]

@@ -15,8 +15,7 @@ from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_
 from vd4rl_pomdp.core.tasks import QUALITIES
 from vd4rl_pomdp.data.folder import RemoteFile, manifest
 from vd4rl_pomdp.runs.files import sha256
-from vd4rl_pomdp.runs.outputs import refuse_kept
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.outputs import owned, refuse_kept
 
 HUB = "https://huggingface.co"
 REPOSITORY = "conglu/vd4rl"

@@ -15,7 +15,7 @@ from vd4rl_pomdp.core.registry import code_of, of_other_code
 from vd4rl_pomdp.data.folder import PLAN, PROVENANCE, read_plan
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.runs.files import holds_anything, write_json
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
 from vd4rl_pomdp.runs.workers import count_workers, run_jobs

@@ -31,7 +31,7 @@ from vd4rl_pomdp.core.reading import parse_json, read_bytes
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.folder import check_count, join_shards, shard_paths
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows
-from vd4rl_pomdp.runs.identity import content_hash
+from vd4rl_pomdp.runs.files import content_hash
 from vd4rl_pomdp.runs.progress import ProgressLine
 
 _VERSION = 2

@@ -24,8 +24,7 @@ from vd4rl_pomdp.core.text import code, code_block, one_line
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig, EncoderRecord
 from vd4rl_pomdp.nn.frame import STATE
-from vd4rl_pomdp.runs.files import write_bytes, write_json
-from vd4rl_pomdp.runs.identity import content_hash
+from vd4rl_pomdp.runs.files import content_hash, write_bytes, write_json
 from vd4rl_pomdp.runs.provenance import git_commit
 
 WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"

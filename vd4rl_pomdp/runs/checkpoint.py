@@ -38,7 +38,7 @@ class Checkpoints:
         with disk_errors(self._folder):
             self._folder.mkdir(parents=True, exist_ok=True)
             write_bytes(self._path(step), pack({"format": FORMAT, "seconds": round(seconds, 2), "state": state}))
-            synchronise(self._folder)
+            synchronise(self._folder)  # before the oldest goes: a power cut would else leave neither
             self.prune(KEPT)
 
     def restore(self, take: Callable[[State], None]) -> float | None:
@@ -47,6 +47,7 @@ class Checkpoints:
         Raises:
             UserError: there are some, but none is whole, or they are of another format or run, or not readable.
         """
+        # A disk may give back other bytes than it took: the one before is worth more than a run begun again.
         damaged: dict[Path, str] = {}
         for path in map(self._path, self.steps()):
             content = read_bytes(path)
