@@ -46,8 +46,7 @@ def save_encoder(folder: Path | str, encoder: Encoder, card: EncoderCard, frames
     """
     weights = {name: value.cpu().contiguous().clone() for name, value in encoder.state_dict().items()}
     record = EncoderRecord(encoder.config, card, __version__, git_commit(), frames)
-    code = code_of(record.parts)
-    _write(Path(folder), replace(record, plugins=code["plugins"], sources=code["sources"]), save(weights))
+    _write(Path(folder), replace(record, **code_of(record.parts)), save(weights))
 
 
 def _write(folder: Path, record: EncoderRecord, weights: bytes) -> None:
@@ -166,6 +165,9 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
     tags = dict.fromkeys([*TAGS, card.method, card.task, card.corruption["corruption"]])
     values: dict[str, Any] = {"license": license} if license else {}
     values |= {"library_name": "vd4rl-pomdp", "pipeline_tag": TAGS[0]}
+    hub = ["from huggingface_hub import snapshot_download", ""] if repository else []
+    place = f"snapshot_download({json.dumps(repository)}))" if repository else '".")  # this folder'
+    use = [f"encoder, card = load_encoder({place}", "print(card.method, card.task, encoder.dim)"]
     return "\n".join(
         [
             *front_matter(values | {"tags": [one_line(tag) for tag in tags]}),
@@ -181,7 +183,7 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
             "",
             "## Use it",
             "",
-            *code_block(_loading(repository), "python"),
+            *code_block([*hub, "from vd4rl_pomdp.nn import load_encoder", "", *use], "python"),
             "",
             "`encoder.encode` takes windows of rows, `encoder.step` single rows, corrupted as in its pretraining:",
             "`docs/use_an_encoder.md` of the package shows both.",
@@ -205,39 +207,18 @@ def _facts(record: EncoderRecord) -> Iterator[tuple[str, str]]:
     yield "task, quality", f"{code(card.task)}, {code(card.quality)}"
     yield "data", f"fingerprint {code(card.data)}" if card.data else "not recorded"
     yield "corruption", code(json.dumps(card.corruption))
-    yield "budget", _budget(record)
+    frames = f", {record.frames:,} frames" if record.frames else ""
+    if card.end_to_end:
+        yield "budget", f"no pretraining: {code(card.end_to_end)} trains it with the policy"
+    elif record.frames == 0:
+        yield "budget", "none: it is not trained"
+    else:
+        yield "budget", f"preset {code(card.preset)}, {card.steps:,} gradient steps{frames}"
     yield "seed", str(card.seed)
     yield "encoder", f"{code(shape.frame_encoder)}, {shape.feature_dim} features, memory: {code(shape.history)}"
-    yield "linear probe", _probe(record.probe)
+    told = ", ".join(f"{name.removeprefix('probe_')} {error:.1f}%" for name, error in record.probe.items())
+    yield "linear probe", f"error of {told} of a standard deviation, on held-out episodes" if told else "not measured"
     yield (
         "made by",
         f"vd4rl-pomdp {one_line(record.version)}" + (f", commit {code(record.commit)}" if record.commit else ""),
     )
-
-
-def _budget(record: EncoderRecord) -> str:
-    card, frames = record.pretrain, record.frames
-    if card.end_to_end:
-        return f"no pretraining: {code(card.end_to_end)} trains it with the policy"
-    if frames == 0:
-        return "none: it is not trained"
-    return f"preset {code(card.preset)}, {card.steps:,} gradient steps" + (f", {frames:,} frames" if frames else "")
-
-
-def _probe(errors: dict[str, float]) -> str:
-    """Errors of `vd4rl_pomdp.probes`, by what was probed."""
-    told = [f"{name.removeprefix('probe_')} {error:.1f}%" for name, error in errors.items()]
-    return f"error of {', '.join(told)} of a standard deviation, on held-out episodes" if told else "not measured"
-
-
-def _loading(repository: str) -> list[str]:
-    place = f"snapshot_download({json.dumps(repository)})" if repository else '"."'
-    hub = ["from huggingface_hub import snapshot_download", ""] if repository else []
-    note = "" if repository else "  # this folder"
-    return [
-        *hub,
-        "from vd4rl_pomdp.nn import load_encoder",
-        "",
-        f"encoder, card = load_encoder({place}){note}",
-        "print(card.method, card.task, encoder.dim)",
-    ]
