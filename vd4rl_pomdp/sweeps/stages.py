@@ -14,7 +14,7 @@ from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
-from vd4rl_pomdp.runs.identity import recipe
+from vd4rl_pomdp.runs.run import recipe
 from vd4rl_pomdp.sweeps.grid import GridCell, Values
 
 COMMANDS = {
