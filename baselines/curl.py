@@ -31,10 +31,9 @@ from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.corruptions.augmentation import random_shift
 from vd4rl_pomdp.nn.action_target import ActionTarget
-from vd4rl_pomdp.nn.contrastive import info_nce, share_found
 from vd4rl_pomdp.nn.draws import Draws
 from vd4rl_pomdp.nn.encoder import Encoder
-from vd4rl_pomdp.nn.heads import move_target
+from vd4rl_pomdp.nn.heads import info_nce, move_target, share_found
 from vd4rl_pomdp.nn.objective import Objective
 
 MOMENTUM = 0.05

@@ -34,11 +34,10 @@ from torch import Tensor, nn
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.action_target import ActionTarget
-from vd4rl_pomdp.nn.contrastive import info_nce
 from vd4rl_pomdp.nn.draws import Draws
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import FrameEncoder
-from vd4rl_pomdp.nn.heads import mlp
+from vd4rl_pomdp.nn.heads import info_nce, mlp
 from vd4rl_pomdp.nn.objective import Objective
 
 PLACES = 7

@@ -20,7 +20,7 @@ from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.core.types import Batch
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.data import Dataset, StateView, View
-from vd4rl_pomdp.data.samplers import Sampler
+from vd4rl_pomdp.data.view import Sampler
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.runs.device import Precision, autocast

@@ -28,7 +28,7 @@ from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.interrupt import Terminated
 from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.studies.navigation.collect import PRESETS
 from vd4rl_pomdp.studies.navigation.collect import collect as collect_maze
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig

@@ -26,8 +26,17 @@ from vd4rl_pomdp.core.reading import read_bytes
 from vd4rl_pomdp.core.text import code, code_block, one_line
 from vd4rl_pomdp.data.folder import is_shard_name, join_shards, shard_files, shard_paths, task_and_quality
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_rows
-from vd4rl_pomdp.nn.encoder_folder import CONFIG, WEIGHTS, load_encoder, read_record
-from vd4rl_pomdp.nn.model_card import CARD, LICENSE, TAGS, front_matter, model_card
+from vd4rl_pomdp.nn.encoder_folder import (
+    CARD,
+    CONFIG,
+    LICENSE,
+    TAGS,
+    WEIGHTS,
+    front_matter,
+    load_encoder,
+    model_card,
+    read_record,
+)
 from vd4rl_pomdp.runs.files import read_json, sha256, write_bytes, write_json
 from vd4rl_pomdp.runs.outputs import kept_in, refuse_inside
 

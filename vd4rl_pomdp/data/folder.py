@@ -200,24 +200,21 @@ def join_shards(path: Path, shards: Sequence[Path], parts: Sequence[Mapping[str,
         UserError: the shards differ in width or keys, an episode's beginning is missing, or a collected set has not
             as many episodes as its collection.json says.
     """
+    first, expected = shards[0], parts[0]
     for shard, part in zip(shards, parts, strict=True):
-        _agree(shards[0], parts[0], shard, part)
+        if expected.keys() != part.keys():
+            key = min(expected.keys() ^ part.keys())
+            having, lacking = (shard, first) if key in part else (first, shard)
+            raise UserError(f"{having}: has {key!r}, {lacking.name} has not; keep one set in a folder")
+        for key, value in part.items():
+            if value.shape[1:] != expected[key].shape[1:]:
+                widths = f"{value.shape[1]} dimensions, in {first.name} {expected[key].shape[1]}"
+                raise UserError(f"{shard}: {key!r} has {widths}; keep one set in a folder")
     starts = np.cumsum([0, *(len(part["reward"]) for part in parts)])
     rows = {key: np.concatenate([part[key] for part in parts]) for key in parts[0]}
     _check_order(shards, starts, rows["step_type"])
     check_count(path, int((rows["step_type"] == StepType.FIRST).sum()))
     return rows
-
-
-def _agree(first: Path, expected: Mapping[str, np.ndarray], shard: Path, part: Mapping[str, np.ndarray]) -> None:
-    if expected.keys() != part.keys():
-        key = min(expected.keys() ^ part.keys())
-        having, lacking = (shard, first) if key in part else (first, shard)
-        raise UserError(f"{having}: has {key!r}, {lacking.name} has not; keep one set in a folder")
-    for key, value in part.items():
-        if value.shape[1:] != expected[key].shape[1:]:
-            widths = f"{value.shape[1]} dimensions, in {first.name} {expected[key].shape[1]}"
-            raise UserError(f"{shard}: {key!r} has {widths}; keep one set in a folder")
 
 
 def check_count(path: Path, episodes: int) -> None:
@@ -245,14 +242,11 @@ def _check_order(shards: Sequence[Path], starts: np.ndarray, step_type: np.ndarr
     if len(astray):
         fail(int(astray[0]), f"follows an episode's last row without beginning a new one{missing}")
     for previous, shard, row in zip(shards[:-1], shards[1:], starts[1:-1], strict=True):
-        if step_type[row] != StepType.FIRST and not _adjacent(previous, shard):
+        (previous_rest, before), (rest, number) = _shard_number(previous), _shard_number(shard)
+        # unless both are numbered, their order is all we know
+        adjacent = before is None or number is None or (rest == previous_rest and number == before + 1)
+        if step_type[row] != StepType.FIRST and not adjacent:
             fail(int(row), f"continues an episode, but not that of {previous.name}{missing}")
-
-
-def _adjacent(previous: Path, shard: Path) -> bool:
-    """Whether a shard can be the one right after another: unless both are numbered, their order is all we know."""
-    (previous_rest, before), (rest, number) = _shard_number(previous), _shard_number(shard)
-    return before is None or number is None or (rest == previous_rest and number == before + 1)
 
 
 def episode_returns(reward: np.ndarray, starts: np.ndarray) -> np.ndarray:

@@ -193,7 +193,12 @@ class Encoder(nn.Module):
         """Representations from (B, T, F) frame features and (B, T, A) previous actions."""
         if not self.remembers:
             return features
-        return self._read(features, self._states(self._rows(features, prev_action)))
+        assert self.memory is not None
+        rows, span = self._rows(features, prev_action), self.config.history_window
+        if span == 0 or rows.shape[1] <= span:
+            return self._read(features, run_memory(self.memory, rows)[0])
+        states = torch.cat([run_memory(self.memory, rows[:, :span])[0], self._over_last_rows(rows, span)], dim=1)
+        return self._read(features, states)
 
     def initial_state(self, batch: int) -> StreamState:
         """State before an episode's first row."""
@@ -244,14 +249,6 @@ class Encoder(nn.Module):
     def _read(self, features: Tensor, states: Tensor) -> Tensor:
         """The representation, given e(o_t) (..., F) and s_t (..., H)."""
         return torch.cat([features, states], dim=-1) if self.config.readout == "frame+state" else states
-
-    def _states(self, rows: Tensor) -> Tensor:
-        """s_t (B, T, H) of the memory's (B, T, I) inputs."""
-        assert self.memory is not None
-        span = self.config.history_window
-        if span == 0 or rows.shape[1] <= span:
-            return run_memory(self.memory, rows)[0]
-        return torch.cat([run_memory(self.memory, rows[:, :span])[0], self._over_last_rows(rows, span)], dim=1)
 
     def _rows(self, features: Tensor, prev_action: Tensor) -> Tensor:
         return torch.cat([features, prev_action.to(features)], dim=-1) if self.config.use_actions else features

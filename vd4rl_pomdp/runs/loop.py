@@ -49,6 +49,7 @@ class Loop:
         while self._learner.step < self._total:
             yield self._learner.step + 1
             self._progress.advance()
+            # Here alone is a step whole: weights, optimiser and random streams are all of the same step.
             if self.due(self._run.config["checkpoint_every"]) or interrupt.asked():
                 self.save()
 

@@ -20,7 +20,7 @@ from pathlib import Path
 from vd4rl_pomdp.core.errors import TEMPORARY, UnavailableError, UserError, disk_errors
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.runs.ownership import in_use
+from vd4rl_pomdp.runs.outputs import in_use
 from vd4rl_pomdp.sweeps.folder import (
     DONE,
     FAILED,

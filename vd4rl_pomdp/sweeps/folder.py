@@ -28,7 +28,7 @@ from typing import Any
 from vd4rl_pomdp.core.errors import DiskFullError, UserError, disk_errors
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs.files import Row, jsonable, write_json
-from vd4rl_pomdp.runs.ownership import in_use
+from vd4rl_pomdp.runs.outputs import in_use
 from vd4rl_pomdp.sweeps.plan import Job
 
 DONE, INTERRUPTED, KILLED, UNAVAILABLE, FAILED = "done", "interrupted", "killed", "unavailable", "failed"

@@ -24,9 +24,9 @@ from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.data.store import open_store
 from vd4rl_pomdp.nn.encoder_folder import CONFIG, encoder_hash
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
-from vd4rl_pomdp.runs.files import Row, files_below, read_json
-from vd4rl_pomdp.runs.identity import content_hash, recipe
+from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json
 from vd4rl_pomdp.runs.results import Result, read_results
+from vd4rl_pomdp.runs.run import recipe
 from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, collection_of, recipe_of, recorded, told

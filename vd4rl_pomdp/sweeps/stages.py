@@ -18,7 +18,7 @@ from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
 from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
-from vd4rl_pomdp.runs.identity import recipe
+from vd4rl_pomdp.runs.run import recipe
 from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig
 from vd4rl_pomdp.studies.navigation.collect import collection as maze_collection
 from vd4rl_pomdp.studies.navigation.config import NavigationConfig

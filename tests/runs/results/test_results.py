@@ -13,8 +13,8 @@ from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.runs import results
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
-from vd4rl_pomdp.runs.identity import identity
 from vd4rl_pomdp.runs.results import Result, add_results, find_results, read_results, read_run
+from vd4rl_pomdp.runs.run import identity
 
 COMMITTED = Path(__file__).parents[3] / "results"
 
@@ -145,24 +145,6 @@ def test_a_row_that_was_cut_with_its_run_is_left_out(tmp_path):
     (run / "episodes.csv").write_text((run / "episodes.csv").read_text()[:-20])
     assert [row["step"] for row in read_run(run).rows] == [5]
     assert "unfinished" in write_report([tmp_path / "runs"], tmp_path / "report").page.read_text()
-
-
-def test_results_can_be_read_while_others_are_added(tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    add_results([whole_run(tmp_path / "runs/0")], out)
-    later, read = whole_run(tmp_path / "runs/1", seed=1), results.read_episodes
-
-    def meanwhile(path):
-        rows = read(path)
-        with monkeypatch.context() as patch:
-            patch.setattr(results, "read_episodes", read)
-            add_results([later], out)
-        return rows
-
-    with monkeypatch.context() as patch:
-        patch.setattr(results, "read_episodes", meanwhile)
-        assert len(read_results(out)) == 1
-    assert len(read_results(out)) == 2
 
 
 def test_a_writing_that_is_killed_midway_leaves_what_was_there(tmp_path, monkeypatch):
