@@ -147,6 +147,7 @@ def _refuse_part(path: Path, shards: Sequence[Path]) -> None:
     published: dict[tuple[str | None, str | None], dict[str, int]] = defaultdict(dict)
     for file in manifest():
         *_, of_task, of_quality, _, name = file.path.split("/")
+        # The same file may belong to several sets: medium_expert holds all of expert.
         published[of_task, of_quality][name] = file.size
     alike = [key for key, wanted in published.items() if sizes.keys() <= wanted.keys()]
     certain = [key for key in alike if sizes.items() & published[key].items()]
