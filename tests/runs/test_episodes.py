@@ -6,7 +6,7 @@ import threading
 import pytest
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.runs.episodes import COLUMNS, append_episodes, begin_episodes, drop_episodes_after, read_episodes
+from vd4rl_pomdp.runs.episodes import COLUMNS, append_episodes, drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import appending
 
 ROWS = (
@@ -44,13 +44,13 @@ def test_a_row_whose_end_is_missing_or_wrong_is_not_read(tmp_path, end):
 
 def test_a_table_of_episodes_is_begun_before_any_is_played_and_only_once(tmp_path):
     path = tmp_path / "episodes.csv"
-    begin_episodes(path)
+    append_episodes(path, [])
     header = path.read_text()
     assert header == ",".join(COLUMNS) + "\n"
-    begin_episodes(path)
+    append_episodes(path, [])
     assert path.read_text() == header
     with pytest.raises(UserError, match=r"nowhere/episodes\.csv: cannot be used"):
-        begin_episodes(tmp_path / "nowhere" / "episodes.csv")
+        append_episodes(tmp_path / "nowhere" / "episodes.csv", [])
 
 
 def test_who_finds_another_appending_waits_and_writes_no_second_header(tmp_path):

@@ -57,7 +57,7 @@ def evaluate(
     """
     from finetune.evaluation import by_part, evaluate_run
     from vd4rl_pomdp.data.reference import Reference, summarise
-    from vd4rl_pomdp.runs.episodes import append_episodes, begin_episodes, read_episodes
+    from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
     from vd4rl_pomdp.runs.files import flatten
     from vd4rl_pomdp.runs.outputs import refuse_inside
 
@@ -65,7 +65,7 @@ def evaluate(
     if out is not None:
         refuse_inside(out)
         if read_episodes(run / EPISODES_FILE):  # what is no run is refused below
-            begin_episodes(out)  # before any episode is played
+            append_episodes(out, [])  # a path that cannot be written is known before any episode is played
     rows, played = evaluate_run(run, corruption, episodes, workers)
     if out is not None:
         append_episodes(out, rows)

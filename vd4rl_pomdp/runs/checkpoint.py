@@ -58,7 +58,20 @@ class Checkpoints:
                 continue
             for other, problem in damaged.items():
                 print(f"warning: {other}: is damaged ({problem}); resuming from step {path.stem}", file=sys.stderr)
-            self._hand_over(path, found, take)
+            if (stored := found["format"]) != FORMAT:
+                raise UserError(
+                    f"{path}: is a checkpoint of format {stored}, this version writes format {FORMAT} and cannot "
+                    "resume from it; choose another --out"
+                )
+            try:
+                take(found["state"])
+            except (UserError, torch.OutOfMemoryError):
+                raise
+            except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
+                raise UserError(
+                    f"{path}: this checkpoint does not fit the run ({first_line(error)}); choose another --out, or "
+                    f"remove {self._folder} to start the run again"
+                ) from error
             return float(found["seconds"])
         for path, problem in damaged.items():
             raise UserError(
@@ -66,22 +79,6 @@ class Checkpoints:
                 "start the run again"
             )
         return None
-
-    def _hand_over(self, path: Path, found: State, take: Callable[[State], None]) -> None:
-        if (stored := found["format"]) != FORMAT:
-            raise UserError(
-                f"{path}: is a checkpoint of format {stored}, this version writes format {FORMAT} and cannot resume "
-                "from it; choose another --out"
-            )
-        try:
-            take(found["state"])
-        except (UserError, torch.OutOfMemoryError):
-            raise
-        except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
-            raise UserError(
-                f"{path}: this checkpoint does not fit the run ({first_line(error)}); choose another --out, or remove "
-                f"{self._folder} to start the run again"
-            ) from error
 
     def prune(self, kept: int) -> None:
         """Drop all but the newest `kept` checkpoints, and the remains of interrupted writes."""
