@@ -223,6 +223,7 @@ def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Collector]]:
 
 def _job(config: CollectConfig, collector: Collector, episode: int, length: int | None = None) -> _Job:
     """One episode; with a ladder, by who acted at the moment of training that the episode stands for."""
+    # The middle of the episode's share of the training run.
     actor = collector.actor_at((episode + 0.5) / config.episodes) if isinstance(collector, Ladder) else collector
     task, size = TASKS.named(config.task), config.frame_size
     return _Job(task, episode, config.seed, actor, config.render, size, length, _noise(config))
@@ -232,6 +233,7 @@ def _roll_out(job: _Job) -> Columns:
     """Rows of one episode, by key."""
     env = _environment(job.task, job.render, job.size, job.length)
     rng = np.random.default_rng([job.seed, job.episode])
+    # A stream of its own: an actor draws the same with and without noise on its actions.
     noise = np.random.default_rng(stream_seed(job.seed, "action noise", job.episode))
     now = env.reset(episode_seed(job.seed, job.episode))
     action = np.zeros(env.action_dim, np.float32)
