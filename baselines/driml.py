@@ -34,11 +34,10 @@ from torch import Tensor, nn
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.action_target import ActionTarget
-from vd4rl_pomdp.nn.contrastive import info_nce
 from vd4rl_pomdp.nn.draws import Draws
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import FrameEncoder
-from vd4rl_pomdp.nn.heads import mlp
+from vd4rl_pomdp.nn.heads import info_nce, mlp
 from vd4rl_pomdp.nn.objective import Objective
 
 PLACES = 7
@@ -104,4 +103,5 @@ class DRIML(Objective):
         both = torch.cat([now, action[:, None].expand(-1, now.shape[1], -1).to(now)], dim=-1)
         anchors, candidates = self.anchors[term](both), self.candidates[term](later)
         scores = anchors.transpose(0, 1) @ candidates.permute(1, 2, 0) / SCORE_DIM**0.5
+        # soft, because beyond a hard bound no gradient would bring a score back
         return LARGEST_SCORE * (scores.float() / LARGEST_SCORE).tanh()

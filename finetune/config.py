@@ -20,7 +20,7 @@ from vd4rl_pomdp.runs.metrics import WandbMode
 
 @dataclass(frozen=True, kw_only=True)
 class FinetuneConfig(StageConfig):
-    """Settings of `vd4rl-pomdp finetune`."""
+    """Settings of `vd4rl-pomdp finetune`. --algorithm decides which flags there are: name it before --help."""
 
     encoder: Path = Path()
     """Encoder folder, RUN/encoder of a pretraining run; it stays frozen but for the references bc and drq_bc. Its

@@ -87,7 +87,8 @@ class TrainingConfig(StageConfig):
 
 @dataclass(frozen=True, kw_only=True)
 class PretrainConfig(TrainingConfig):
-    """Settings of `vd4rl-pomdp pretrain`."""
+    """Settings of `vd4rl-pomdp pretrain`. What --method, --corruption, --frame-encoder, --action-target and --history
+    choose decides which flags there are: name them before --help."""
 
     task: str = ""
     """The set's task, where neither its shards nor its folder's name tell."""

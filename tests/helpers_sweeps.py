@@ -5,7 +5,7 @@ import time
 from collections.abc import Callable
 from pathlib import Path
 
-from vd4rl_pomdp.runs.identity import recipe
+from vd4rl_pomdp.runs.run import recipe
 from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder
 from vd4rl_pomdp.sweeps.plan import Job
 
@@ -13,7 +13,7 @@ RECORD = {"stage": "pretrain", "config": {"seed": 0}, "inputs": {"data": "its se
 PROGRAM = """
 import json, os, sys, time
 from pathlib import Path
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.outputs import owned
 folder, script = Path(sys.argv[1]), Path(sys.argv[1] + ".script")
 with owned(folder):
     if (folder / "timing.json").exists():  # another driver was faster

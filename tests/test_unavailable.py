@@ -30,7 +30,6 @@ from vd4rl_pomdp.report.films import FILM, read_film
 from vd4rl_pomdp.runs import FILM_FILE
 from vd4rl_pomdp.runs.checkpoint import Checkpoints
 from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
-from vd4rl_pomdp.runs.files import read_csv
 from vd4rl_pomdp.runs.outputs import kept_in
 from vd4rl_pomdp.runs.results import RUNS, read_lines
 from vd4rl_pomdp.studies.navigation.pictures import _read_cifar, _read_image, load_pool, source_fingerprint
@@ -73,7 +72,6 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
     (run / "episodes.csv").write_text(",".join(COLUMNS) + "\n")
     (run / "trajectory.csv").write_text("x,y,estimated_x,estimated_y\n0,0,0,0\n")
     (run / RUNS).write_text("{}\n")
-    (run / "table.csv").write_text("a\n1\n")
     (run / "plan.json").write_text('{"from": "/", "out": "/", "jobs": [1]}')
     (images := tmp_path / "images").mkdir()
     Image.fromarray(np.zeros((8, 8, 3), np.uint8)).save(images / "a.png")
@@ -100,7 +98,6 @@ def world(tmp_path) -> dict[str, Callable[[], object]]:
         "episodes of a cut run": lambda: episodes_until(run / "episodes.csv", 1),
         "trajectory": lambda: read_trajectory(run / "trajectory.csv"),
         "results": lambda: read_lines(run / RUNS),
-        "table": lambda: read_csv(run / "table.csv", ("a",), ()),
         "images": lambda: load_pool(str(images), 0),
         "image": lambda: _read_image(images / "a.png"),
         "CIFAR-10, binary": lambda: _read_cifar(images / "data_batch_1.bin"),

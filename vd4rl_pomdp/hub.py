@@ -26,8 +26,17 @@ from vd4rl_pomdp.core.reading import read_bytes
 from vd4rl_pomdp.core.text import code, code_block, one_line
 from vd4rl_pomdp.data.folder import is_shard_name, join_shards, shard_files, shard_paths, task_and_quality
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_rows
-from vd4rl_pomdp.nn.encoder_folder import CONFIG, WEIGHTS, load_encoder, read_record
-from vd4rl_pomdp.nn.model_card import CARD, LICENSE, TAGS, front_matter, model_card
+from vd4rl_pomdp.nn.encoder_folder import (
+    CARD,
+    CONFIG,
+    LICENSE,
+    TAGS,
+    WEIGHTS,
+    front_matter,
+    load_encoder,
+    model_card,
+    read_record,
+)
 from vd4rl_pomdp.runs.files import read_json, sha256, write_bytes, write_json
 from vd4rl_pomdp.runs.outputs import kept_in, refuse_inside
 
@@ -71,6 +80,7 @@ def push(folder: Path, repository: str, private: bool = False, revision: str = "
         if revision != "main":
             api.create_branch(**where, branch=revision, exist_ok=True)
         for file in files:
+            # A link: a set may be larger than what is free for temporary files.
             (Path(staged) / file.name).symlink_to(file.resolve())
         write_bytes(Path(staged) / CARD, card.encode())
         write_json(Path(staged) / LISTING, listing)
@@ -106,6 +116,7 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
             if folder.is_dir() and not others and not _wrong(folder, listing):
                 return False
             raise UserError(f"{folder}: is not empty and holds something else than {repository}; choose another folder")
+        # Beside the folder, so that the rename at the end is one step; its name tells the next pull what to resume.
         api.snapshot_download(**where, revision=revision, local_dir=staged, allow_patterns=[*listing])
     with disk_errors(folder):
         if wrong := _wrong(staged, listing):

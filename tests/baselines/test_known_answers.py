@@ -9,8 +9,8 @@ import torch
 from baselines import CURL, DRIML, HOMER, DRIMLOptions, HOMEROptions
 from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.core.types import Windows
-from vd4rl_pomdp.nn.contrastive import info_nce, share_found
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.nn.heads import info_nce, share_found
 
 STATES = 4
 

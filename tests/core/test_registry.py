@@ -65,7 +65,7 @@ def test_what_cannot_be_a_part_is_refused_however_it_comes(registry, monkeypatch
 
 
 def test_an_unknown_name_is_told_the_choices(registry):
-    told = "unknown frame encoder 'owl': choose one of own, own\\+a, or run the file that registers it"
+    told = "unknown frame encoder 'owl': choose one of own, own\\+a, or run or import the file that registers it"
     with pytest.raises(UserError, match=told):
         registry.named("owl")
 

@@ -260,3 +260,19 @@ def test_a_noisy_quality_keeps_its_own_noise(tmp_path):
     with pytest.raises(UserError, match="--action-noise is nan"):
         collect(config(tmp_path / "set", action_noise=float("nan")), LENGTH)
     assert not (tmp_path / "set").exists()
+
+
+def test_physics_alone_gives_the_rewards_of_the_rendered_episodes(tmp_path, monkeypatch):
+    settings = config(tmp_path / "set", quality="medium_replay", episodes=2)
+    rendered = [read_shard(path) for path in collect(replace(settings, out=tmp_path / "rendered"), LENGTH)]
+    played = list(module.play(settings, LENGTH))
+    for key in ("action", "reward", "physics", "step_type"):
+        np.testing.assert_array_equal(np.concatenate([one[key] for one in played]), rendered[0][key])
+    assert "observation" not in played[0]
+    assert not (tmp_path / "set").exists()
+
+
+def test_the_published_table_of_sets_is_by_the_actors_that_ship():
+    recorded = json.loads((Path(__file__).parents[2] / "results/datasets/actors.json").read_text())
+    for name, hashes in recorded.items():
+        assert module.actor_hashes(CollectConfig(*name.split(), Path(), 200)) == hashes

@@ -180,9 +180,9 @@ def test_a_row_before_the_first_is_refused(dataset):
 
 
 def test_counts_below_one_are_refused(dataset):
-    with pytest.raises(UserError, match="n_step is 0"):
+    with pytest.raises(UserError, match="--n-step is 0"):
         View(dataset).transitions(0, n_step=0)
-    with pytest.raises(UserError, match="frame_stack is 0"):
+    with pytest.raises(UserError, match="--frame-stack is 0"):
         View(dataset, frame_stack=0)
 
 

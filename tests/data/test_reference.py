@@ -64,7 +64,6 @@ def test_a_reference_is_kept_in_the_run_and_an_actor_that_ships_no_more_is_unkno
     "change",
     [
         {"data_return": "much"},
-        {"data_return": float("nan")},
         {"path_error": [1]},
         {"actor": "expert"},
         {"actor": {"task": "walker_walk"}},

@@ -10,10 +10,9 @@ import pytest
 
 from tests.helpers_data import fake_rows, frame_identity, write_fake_set
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.data import store as store_module
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.data.store import PlayedStore, default_cache, open_store, verify_store
+from vd4rl_pomdp.data.store import default_cache, open_store, verify_store
 from vd4rl_pomdp.runs.files import write_json
 
 fork = multiprocessing.get_context("fork")
@@ -22,24 +21,6 @@ fork = multiprocessing.get_context("fork")
 @pytest.fixture
 def cache(tmp_path):
     return tmp_path / "cache"
-
-
-def test_rows_in_memory_are_a_set_without_pixels(tmp_path):
-    rows = {key: value for key, value in fake_rows((5, 4), physics_dim=3).items() if key != "observation"}
-    stores = [
-        PlayedStore(tmp_path, {"attributes": []}, kept)
-        for kept in (rows, dict(rows), rows | {"action": -rows["action"]})
-    ]
-    dataset = Dataset(tmp_path, stores[0])
-    assert (dataset.frame_size, dataset.num_episodes, dataset.num_transitions) == (0, 2, 7)
-    np.testing.assert_array_equal(dataset.action, rows["action"])
-    np.testing.assert_array_equal(dataset.physics, rows["physics"])
-    dataset.action.zero_()
-    assert rows["action"].any(), "a set's rows are its own"
-    names = [store.fingerprint for store in stores]
-    assert names[0] == names[1] != names[2]
-    shaken = PlayedStore(tmp_path, {"attributes": []}, rows | {"reward": last_bits_changed(rows["reward"])})
-    assert shaken.fingerprint == names[0]
 
 
 def last_bits_changed(reward):

@@ -23,7 +23,7 @@ from vd4rl_pomdp.envs.pixels import TimeStep
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, save_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy
 from vd4rl_pomdp.policies.actor import ASSETS, load_actor
-from vd4rl_pomdp.runs.episodes import begin_episodes, read_episodes
+from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
 
 LENGTH, REWARDS = 5, (1.0, 0.5, 0.25, 2.0, 8.0)
@@ -208,5 +208,5 @@ def test_slips_are_one_line_and_touch_no_file(world, run, encoder, tmp_path):
     thesis = tmp_path / "thesis.csv"
     thesis.write_text("a,b\n1,2\n")
     with pytest.raises(UserError, match="has no column 'method'"):
-        begin_episodes(thesis)
+        append_episodes(thesis, [])
     assert thesis.read_text() == "a,b\n1,2\n"

@@ -132,7 +132,9 @@ def test_an_encoder_folder_gives_back_the_same_encoder(tmp_path):
 
 def test_an_encoder_of_a_corruption_whose_file_was_not_run_says_so(tmp_path):
     save_encoder(tmp_path, Encoder(EncoderConfig(action_dim=6)), replace(CARD, corruption={"corruption": "fog"}))
-    with pytest.raises(UserError, match=r"unknown corruption 'fog'.*, or run the file that registers it\); mend"):
+    with pytest.raises(
+        UserError, match=r"unknown corruption 'fog'.*, or run or import the file that registers it\); mend"
+    ):
         load_encoder(tmp_path)
 
 

@@ -9,8 +9,7 @@ import yaml
 from huggingface_hub import ModelCard
 
 from tests.nn.test_encoder import CARD, make
-from vd4rl_pomdp.nn.encoder_folder import copy_encoder, encoder_hash, read_record, save_encoder, tell_probe
-from vd4rl_pomdp.nn.model_card import model_card
+from vd4rl_pomdp.nn.encoder_folder import copy_encoder, encoder_hash, model_card, read_record, save_encoder, tell_probe
 
 
 def cells(text: str) -> dict[str, str]:

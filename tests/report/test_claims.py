@@ -8,7 +8,7 @@ import scipy.stats
 
 from tests.helpers_report import describe, write_run, write_seeds
 from vd4rl_pomdp.report import print_summary, write_report
-from vd4rl_pomdp.report.claims import CLAIMS, judge_claims, tally
+from vd4rl_pomdp.report.claims import CLAIMS, judge_claims
 from vd4rl_pomdp.report.load import load_runs
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
@@ -184,9 +184,3 @@ def test_the_page_and_the_terminal_tell_what_becomes_of_the_claims(tmp_path, cap
     assert f"{FIRST}: holds in 0 of 1 setting; too few seeds in 1" in shown, "mik returns more, with one seed"
     assert f"{ACTIONS}: holds in 0 of 1 setting; too few seeds in 1" in shown
     assert "told the states" not in shown
-
-
-def test_a_tally_counts_settings_by_verdict():
-    rows = [{"kind": "above", "verdict": verdict} for verdict in ("holds", "too few seeds", "holds", "not told apart")]
-    assert tally(rows) == "holds in 2 of 4 settings; too few seeds in 1; not told apart in 1"
-    assert tally([{"kind": "distance", "verdict": "not judged: other steps"}]) == ""

@@ -1,16 +1,14 @@
 """Two result sets side by side."""
 
 import csv
-import io
 from pathlib import Path
 
 import pytest
 import scipy.stats
-from rich.console import Console
 
 from tests.helpers_report import describe, write_run
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.report.compare import compare_results, print_comparison
+from vd4rl_pomdp.report.compare import compare_results
 from vd4rl_pomdp.runs.results import add_results
 
 
@@ -72,20 +70,6 @@ def test_equal_settings_are_compared_however_each_set_names_them(tmp_path):
     assert found == {"patch, patch_size 16": (0.0, 2, 2), "patch, patch_size 48": (None, 2, 0)}
     back = compare_results(tmp_path / "a" / "16", tmp_path / "a").rows
     assert [row["difference"] for row in back if row["corruption"] == "patch"] == [0.0]
-
-
-def test_no_word_is_broken_at_eighty_columns(tmp_path):
-    for seed in (0, 1):
-        for share in (0.2, 0.5):
-            for name, score in (("a", 50.0 + seed), ("b", 51.0 - seed)):
-                path = write_run(tmp_path / f"{name}/{share}{seed}", "mik+a", seed, {10: [score]})
-                describe(path, {}, random_histories=share)
-    shown = io.StringIO()
-    print_comparison(compare_results(tmp_path / "a", tmp_path / "b"), Console(file=shown, width=80))
-    text = shown.getvalue()
-    assert text.count("mik+a, random_histories") == 2
-    for words in ("[44.1,", "[-3.0,", "2 | 2"):
-        assert text.count(words) >= 2, words
 
 
 def test_the_command_prints_and_writes_a_page(tmp_path, capsys):

@@ -1,6 +1,5 @@
 """Checkpoints: what goes in comes out, and whatever cuts a writing, the newest whole one is found."""
 
-import errno
 import os
 import subprocess
 import sys
@@ -137,24 +136,6 @@ def test_whatever_moment_a_kill_takes_the_newest_whole_checkpoint_is_found(tmp_p
         assert names(run) == ["3.pt", "4.pt"]
     assert number > 6
     assert found == {2, 3}
-
-
-@pytest.mark.parametrize("left", [0, 400, 1500])
-def test_a_full_disk_is_one_sentence_and_takes_nothing(two, tmp_path, monkeypatch, left):
-    write = Path.write_bytes
-
-    def limited(path: Path, content: bytes) -> int:
-        write(path, content[:left])
-        raise OSError(errno.ENOSPC, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_bytes", limited)
-        with pytest.raises(UserError, match=r"the disk is full: free some space and re-run the same"):
-            two.add(3, at(3), 0.0)
-    assert names(tmp_path) == ["1.pt", "2.pt"]
-    assert newest(two)["step"] == 2
-    two.add(3, at(3), 0.0)
-    assert newest(two)["step"] == 3
 
 
 def test_a_disk_that_is_really_full(tmp_path):

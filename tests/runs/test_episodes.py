@@ -1,11 +1,12 @@
 """The table of evaluation episodes: what is damaged is named, what is there stays."""
 
+import os
 import threading
 
 import pytest
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.runs.episodes import COLUMNS, append_episodes, begin_episodes, drop_episodes_after, read_episodes
+from vd4rl_pomdp.runs.episodes import COLUMNS, append_episodes, drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import appending
 
 ROWS = (
@@ -43,13 +44,13 @@ def test_a_row_whose_end_is_missing_or_wrong_is_not_read(tmp_path, end):
 
 def test_a_table_of_episodes_is_begun_before_any_is_played_and_only_once(tmp_path):
     path = tmp_path / "episodes.csv"
-    begin_episodes(path)
+    append_episodes(path, [])
     header = path.read_text()
     assert header == ",".join(COLUMNS) + "\n"
-    begin_episodes(path)
+    append_episodes(path, [])
     assert path.read_text() == header
     with pytest.raises(UserError, match=r"nowhere/episodes\.csv: cannot be used"):
-        begin_episodes(tmp_path / "nowhere" / "episodes.csv")
+        append_episodes(tmp_path / "nowhere" / "episodes.csv", [])
 
 
 def test_who_finds_another_appending_waits_and_writes_no_second_header(tmp_path):
@@ -91,3 +92,11 @@ def test_a_row_that_a_kill_or_a_full_disk_cut_is_not_read_and_nothing_is_glued_t
     assert path.read_text() == ROWS[:-2]
     drop_episodes_after(path, 2)
     assert read_episodes(path) == [row]
+
+
+def test_appended_lines_are_on_the_disk_when_the_block_ends(tmp_path, monkeypatch):
+    path, synchronised = tmp_path / "rows", []
+    monkeypatch.setattr("os.fsync", lambda handle: synchronised.append((os.fstat(handle).st_ino, path.read_text())))
+    with appending(path) as file:
+        file.write("one\n")
+    assert synchronised == [(path.stat().st_ino, "one\n")]

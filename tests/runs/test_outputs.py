@@ -1,15 +1,20 @@
-"""No command writes over a run, a policy, an encoder or a data set, nor inside one."""
+"""No command writes over a run, a policy, an encoder or a data set, nor inside one, nor where another one writes."""
 
 import hashlib
 import json
+import os
+import signal
+import socket
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 from tests.helpers_data import write_fake_set
 from vd4rl_pomdp.cli import main
-from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.runs.outputs import kept_in, refuse_foreign, refuse_inside, refuse_kept
+from vd4rl_pomdp.core.errors import InUseError, UserError
+from vd4rl_pomdp.runs.outputs import in_use, kept_in, owned, refuse_foreign, refuse_inside, refuse_kept
 
 
 def fill(folder: Path, **files: str) -> Path:
@@ -36,16 +41,9 @@ def contents(folder: Path) -> dict[str, str]:
     return {str(p): hashlib.sha256(p.read_bytes()).hexdigest() for p in folder.rglob("*") if p.is_file()}
 
 
-def test_what_owns_a_folder_is_known_by_its_files(kept, tmp_path):
-    assert {name: kept_in(folder) for name, folder in kept.items()} == {name: name.strip() for name in kept}
-    others = {
-        "reports": {"summary.csv": "", "index.html": ""},
-        "package": {"config.json": "[1]"},
-        "broken": {"config.json": "{"},
-    }
-    for name, files in others.items():
-        folder = fill(tmp_path / name, **{file.replace(".", "__"): text for file, text in files.items()})
-        assert kept_in(folder) is None
+def test_what_another_program_left_is_no_run(tmp_path):
+    for name, text in {"package": "[1]", "broken": "{"}.items():
+        assert kept_in(fill(tmp_path / name, config__json=text)) is None
     assert kept_in(tmp_path / "nowhere") is None
 
 
@@ -77,7 +75,6 @@ def commands(data: Path, run: Path) -> dict[str, list[str]]:
         "demo": ["demo"],
         "data collect": ["data", "collect", "--task", "walker_walk", "--quality", "random", "--episodes", "1"],
         "data download": ["data", "download", "--task", "walker_walk", "--quality", "random"],
-        "data table": ["data", "table", "--tasks", "walker_walk", "--qualities", "random"],
         "pretrain": ["pretrain", *preset, "--data", str(data)],
         "finetune": ["finetune", *preset, "--data", str(data), "--encoder", str(run / "encoder")],
         "evaluate": ["evaluate", str(run)],
@@ -128,3 +125,31 @@ def test_every_command_with_an_out_is_tried(capsys):
         if "--out " in capsys.readouterr().out:
             with_out.add(name)
     assert with_out == set(NAMES)
+
+
+HOLDER = """
+import sys, time
+from pathlib import Path
+from vd4rl_pomdp.runs.outputs import owned
+with owned(Path(sys.argv[1])):
+    print("owned", flush=True)
+    time.sleep(60)
+"""
+
+
+def test_a_second_process_is_told_who_holds_a_folder_until_that_one_dies(tmp_path):
+    environment = os.environ | {"PYTHONPATH": os.getcwd()}
+    with subprocess.Popen(
+        [sys.executable, "-c", HOLDER, tmp_path / "run"], stdout=subprocess.PIPE, text=True, env=environment
+    ) as holder:
+        assert holder.stdout is not None
+        assert holder.stdout.readline() == "owned\n"
+        assert in_use(tmp_path / "run")
+        told = rf"run: is in use by process {holder.pid} on {socket.gethostname()} since \d{{4}}-\d\d-\d\d .* UTC; wait"
+        with pytest.raises(InUseError, match=told), owned(tmp_path / "run"):
+            pass
+        holder.send_signal(signal.SIGKILL)
+    assert not in_use(tmp_path / "run")
+    with owned(tmp_path / "run"):
+        assert in_use(tmp_path / "run")
+    assert not list((tmp_path / "run").iterdir())

@@ -19,12 +19,11 @@ from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE
 
 PROGRAM = "vd4rl-pomdp"
 COMMANDS = {
-    "demo": ("stages.demo", "every stage on a small set, in minutes"),
+    "demo": ("demo.demo", "every stage on a small set, in minutes"),
     "list": ("stages.list_parts", "all parts that have a name: methods, corruptions, algorithms and the like"),
     "data collect": ("data.collect", "render a set in V-D4RL's format from the shipped actors"),
     "data download": ("data.download", "fetch a published V-D4RL set"),
     "data card": ("data.card", "describe a set: returns, origin, film strip"),
-    "data table": ("data.table", "tabulate the returns and the cost of all sets"),
     "data check": ("data.check", "validate a set and replay its actions"),
     "data parity": ("data.parity", "compare rendered pixels with the data's"),
     "hub push": ("hub.push", "write an encoder or a data set to the Hugging Face Hub"),

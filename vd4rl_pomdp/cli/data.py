@@ -58,32 +58,6 @@ def card(path: tyro.conf.Positional[Path]) -> None:
 
 
 @command
-def table(
-    out: Path = Path("results/datasets"),
-    tasks: tuple[str, ...] = (),
-    qualities: tuple[str, ...] = (),
-    timed_episodes: int = 4,
-    workers: int = 0,
-) -> None:
-    """Tabulate all sets: returns of their 200 episodes, played by physics alone, and what collecting them costs.
-
-    Args:
-        out: Folder of the table; sets that are in it already, by the same actors, are not played again.
-        tasks: Tasks; default: all.
-        qualities: Qualities; default: all. One whose actor does not ship is left out.
-        timed_episodes: Episodes of the short rendered collection that is timed for each task.
-        workers: Processes that play; 0 uses every core.
-    """
-    from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
-    from vd4rl_pomdp.data.table import tabulate
-
-    rows = tabulate(out, [*(tasks or TASKS)], [*(qualities or SET_QUALITIES)], timed_episodes, workers)
-    for row in rows:
-        print("  ".join(f"{value!s:<14}" for value in row.values()).rstrip())
-    print(f"table: {out / 'sets.csv'}")
-
-
-@command
 def check(path: tyro.conf.Positional[Path], json: bool = False) -> None:
     """Validate a set: format, episodes, checksums, and that its actions replay to its rewards.
 

@@ -11,7 +11,6 @@ import os
 import re
 from collections.abc import Callable, Iterable
 from dataclasses import fields, replace
-from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -23,7 +22,6 @@ from vd4rl_pomdp.runs.files import flatten
 
 Command = Callable[[list[str], str], None]
 Stage = TypeVar("Stage", bound=StageConfig)
-_FOLDERS = ("--out", "--data", "--encoder", "--done")
 _LONGEST_LIST = 6
 
 
@@ -36,10 +34,11 @@ def parse(config: Any, words: list[str], program: str, default: Any = None) -> A
         program: what stands before them.
         default: an instance that has the defaults.
     """
-    for flag, word in pairwise(["", *words]):  # an empty path would be the working directory: a variable was not set
-        empty = flag if word == "" else word.removesuffix("=")
-        if (word == "" and not flag.startswith("--")) or (empty in _FOLDERS and word != empty):
-            raise UserError(f"{empty or 'a word'} is empty: name a folder (see `{program} --help`)")
+    for before, word in zip(["", *words], words, strict=False):
+        # As a Path an empty word would be the working directory: `--out "$UNSET"` would write there.
+        if not word or (word.startswith("--") and word.endswith("=")):
+            name = word.rstrip("=") or (before if before.startswith("--") else "a word")
+            raise UserError(f"{name} is empty: is a variable of the shell not set? (see `{program} --help`)")
     words = [re.sub("(?<==)~.*", lambda path: os.path.expanduser(path[0]), word, count=1) for word in words]
     options = {} if default is None else {"default": default}
     shown = io.StringIO()

@@ -16,7 +16,8 @@ from stat import S_ISDIR
 from typing import Any
 
 TEMPORARY = 75
-"""Exit code of what the same command may not meet again, EX_TEMPFAIL of sysexits.h: a sweep tries it again."""
+"""Exit code of what the same command may not meet again, EX_TEMPFAIL of sysexits.h: a sweep tries it again. It sees no
+more of a job than this code, and bad input, 2, would be refused every time."""
 
 
 class UserError(ValueError):
@@ -93,7 +94,7 @@ def told_apart(value: float, limit: float, decimals: int) -> tuple[str, str]:
     return shown(value), shown(limit)
 
 
-OR_ONES_OWN = ", or run the file that registers it"
+OR_ONES_OWN = ", or run or import the file that registers it"
 """What else to do about an unknown name of a kind that parts of one's own can be of."""
 
 

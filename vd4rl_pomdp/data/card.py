@@ -71,7 +71,9 @@ def write_card(path: Path) -> Path:
     starts = np.flatnonzero(rows["step_type"] == StepType.FIRST)
     returns = episode_returns(rows["reward"], starts)
     lengths = np.diff([*starts, len(rows["reward"])])
-    published = _published(*names)
+    scores = [row["bc"] for row in published_scores() if (row["env"], row["dataset"]) == names]
+    # of plain behaviour cloning: the published figure that is nearest to the set's own average
+    published = float(scores[0]) * SCORE_DIVISOR if scores else None
     film = _film(shards, [len(part["reward"]) for part in parts], starts, lengths, returns)
     text = _text(path, names, attributes, returns, lengths, published)
     try:
@@ -80,12 +82,6 @@ def write_card(path: Path) -> Path:
     except OSError as error:
         raise disk_error(path / "card.md", error) from error
     return path / "card.md"
-
-
-def _published(task: str | None, quality: str | None) -> float | None:
-    """Return of plain behaviour cloning on the published set of this name, the figure nearest to its average."""
-    scores = [row["bc"] for row in published_scores() if (row["env"], row["dataset"]) == (task, quality)]
-    return float(scores[0]) * SCORE_DIVISOR if scores else None
 
 
 def _film(
@@ -144,7 +140,7 @@ def _text(
     rows = {
         "episodes": len(returns),
         "rows": int(lengths.sum()),
-        "rows an episode": _span(lengths.min(), lengths.max()),
+        "rows an episode": " to ".join(str(length) for length in dict.fromkeys([lengths.min(), lengths.max()])),
         "return, mean": f"{returns.mean():.3f}",
         "return, standard deviation": f"{returns.std():.3f}",
         "return, lowest to highest": f"{returns.min():.3f} to {returns.max():.3f}",
@@ -157,10 +153,6 @@ def _text(
     return (
         f"# {markdown(_title(names))}\n\n{how}\n\n| | |\n|---|---|\n{table}\n\n![Returns and a film strip](card.png)\n"
     )
-
-
-def _span(low: Any, high: Any) -> str:
-    return f"{low}" if low == high else f"{low} to {high}"
 
 
 def _origin(path: Path, attributes: list[dict[str, Any]]) -> dict[str, str]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -40,13 +41,28 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
     """
     path = Path(path)
     dataset = open_dataset(path, cache)
-    attributes = dataset.store.meta["attributes"][0]
-    is_maze = attributes.get("task") in MAZES
     verify_store(dataset.store)
     _check_actions(dataset)
     returns = dataset.returns.numpy()
-    reason = _why_not_replayed(dataset, is_maze)
-    replayed = None if reason else _maze_error(dataset, attributes) if is_maze else _replay_error(dataset, replay)
+    attributes, states = dataset.store.meta["attributes"][0], dataset.physics
+    replayed, reason = None, "every episode, from its first simulator state"
+    if states is None:
+        reason = "impossible: the set stores no simulator states"
+    elif attributes.get("task") in MAZES:
+        from vd4rl_pomdp.envs.maze import replay_states
+
+        maze, repeat = attributes["task"], attributes["action_repeat"]
+        replayed = _replay_error(dataset, states, lambda state, action: replay_states(maze, state, action, repeat))
+    elif refusal := _why_not_replayed(dataset):
+        reason = refusal
+    else:
+        from vd4rl_pomdp.envs.dmc import replay_rewards
+
+        assert dataset.task is not None
+        played = partial(replay or replay_rewards, dataset.task)
+        replayed = _replay_error(dataset, dataset.store.array("reward"), played)
+    shards = [path] if path.is_file() else [path / name for name in dataset.store.meta["shards"]]
+    dtypes = [read_dtypes(shard) for shard in shards]
     return {
         "rows": dataset.num_rows,
         "episodes": dataset.num_episodes,
@@ -58,12 +74,12 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
         "return_min": float(returns.min()),
         "return_max": float(returns.max()),
         "replay_max_error": replayed,
-        "replay": reason or "every episode, from its first simulator state",
+        "replay": reason,
         "frame_size": dataset.frame_size,
         "task": dataset.task,
         "quality": dataset.quality,
         "shards": dataset.store.meta["shards"],
-        "dtypes": _dtypes([path] if path.is_file() else [path / name for name in dataset.store.meta["shards"]]),
+        "dtypes": {key: sorted({stored[key] for stored in dtypes}) for key in dtypes[0]},
         "store_ok": True,
     }
 
@@ -81,12 +97,8 @@ def _check_actions(dataset: Dataset) -> None:
         raise UserError(f"{dataset.path}: has actions of up to {most!s}: scale them to [-1, 1], as policies act")
 
 
-def _why_not_replayed(dataset: Dataset, is_maze: bool) -> str:
-    """Why a set's actions cannot be replayed to its rewards, "" if they can."""
-    if dataset.physics is None:
-        return "impossible: the set stores no simulator states"
-    if is_maze:
-        return ""
+def _why_not_replayed(dataset: Dataset) -> str:
+    """Why the actions of a set with states cannot be replayed to its rewards, "" if they can."""
     dataset.require_states()
     assert dataset.task is not None
     task = TASKS.named(dataset.task)
@@ -97,44 +109,23 @@ def _why_not_replayed(dataset: Dataset, is_maze: bool) -> str:
     return "" if replays(task) else f"impossible: {dataset.task} draws more than the simulator state for each episode"
 
 
-def _replay_error(dataset: Dataset, replay: ReplayFn | None) -> float:
+def _replay_error(
+    dataset: Dataset, stored: np.ndarray, replay: Callable[[np.ndarray, np.ndarray], np.ndarray]
+) -> float:
+    """Largest difference between what is stored with every row and its replay from (first state, actions)."""
     assert dataset.physics is not None
-    assert dataset.task is not None
-    if replay is None:
-        from vd4rl_pomdp.envs.dmc import replay_rewards
-
-        replay = replay_rewards
-    reward, action = dataset.store.array("reward"), dataset.store.array("action")
-    worst = 0.0
+    action, worst = dataset.store.array("action"), 0.0
     for start, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):
-        if end - start > 1:
-            try:
-                replayed = replay(dataset.task, dataset.physics[start], action[start + 1 : end])
-            except UserError:
-                raise
-            except (RuntimeError, ValueError) as error:  # dm_control's, also where the simulation diverges
-                raise UserError(
-                    f"{dataset.path}: the episode of row {start} cannot be replayed in {dataset.task} "
-                    f"({first_line(error)}); put the set in a folder called like its task, or collect it again"
-                ) from error
-            worst = np.maximum(worst, np.abs(replayed - reward[start + 1 : end]).max())  # passes NaN on
+        if end - start == 1:
+            continue
+        try:
+            replayed = replay(dataset.physics[start], action[start + 1 : end])
+        except UserError:
+            raise
+        except (RuntimeError, ValueError) as error:  # dm_control's, also where the simulation diverges
+            raise UserError(
+                f"{dataset.path}: the episode of row {start} cannot be replayed in {dataset.task} "
+                f"({first_line(error)}); put the set in a folder called like its task, or collect it again"
+            ) from error
+        worst = np.maximum(worst, np.abs(replayed - stored[start + 1 : end]).max())  # unlike max(), it passes NaN on
     return float(worst)
-
-
-def _maze_error(dataset: Dataset, attributes: dict[str, Any]) -> float:
-    assert dataset.physics is not None
-    from vd4rl_pomdp.envs.maze import replay_states
-
-    states, action = dataset.physics, dataset.store.array("action")
-    worst = 0.0
-    for start, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):
-        replayed = replay_states(
-            attributes["task"], states[start], action[start + 1 : end], attributes["action_repeat"]
-        )
-        worst = np.maximum(worst, np.abs(replayed - states[start + 1 : end]).max(initial=0.0))  # passes NaN on
-    return float(worst)
-
-
-def _dtypes(shards: list[Path]) -> dict[str, list[str]]:
-    stored = [read_dtypes(shard) for shard in shards]
-    return {key: sorted({dtypes[key] for dtypes in stored}) for key in stored[0]}

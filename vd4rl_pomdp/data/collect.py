@@ -6,7 +6,7 @@ command resumes an interrupted collection and ends in the same files.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from dataclasses import asdict, dataclass, replace
 from functools import cache
 from pathlib import Path
@@ -28,7 +28,7 @@ from vd4rl_pomdp.core.tasks import (
     Task,
 )
 from vd4rl_pomdp.data.shards import Columns, Shard, collect_set
-from vd4rl_pomdp.envs.make import layout_of
+from vd4rl_pomdp.envs.make import layout_of, make_env
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.files import jsonable
@@ -100,15 +100,25 @@ def collect(config: CollectConfig, length: int | None = None) -> list[Path]:
     check_config(config)
     refuse_inside(config.out)
     plan = list(_plan(config))
+    noise = _noise(config)
     shards = [
         Shard(
             path,
             [_job(config, collector, episode, length) for episode in episodes],
-            _attributes(config, path, collector),
+            {
+                "task": config.task,
+                "set": set_quality(config),
+                "policy": path.stem.split("_", 1)[1].removeprefix(f"{config.task}_"),
+                "seed": config.seed,
+                "render": config.render,
+                "actor_sha256": collector.sha256 if collector else None,
+                **({"action_noise": noise} if noise else {}),
+                "versions": {k: v for k, v in versions().items() if k in ("mujoco", "dm-control", "vd4rl-pomdp")},
+            },
         )
         for path, episodes, collector in plan
     ]
-    settings = collection(config) | {"actors": _hashes(plan)}
+    settings = collection(config) | {"actors": actor_hashes(config)}
     collect_set(config.out, settings, shards, _roll_out, config.workers, ("collect", "episodes"), config.task)
     from vd4rl_pomdp.data.card import write_card  # draws; the processes that render need it not
 
@@ -122,6 +132,11 @@ def collection(config: CollectConfig) -> dict[str, Any]:
     if config.frame_size == FRAME_SIZE:
         settings["frame_size"] = None  # as in the files that say nothing of it
     return settings
+
+
+def actor_hashes(config: CollectConfig) -> list[str]:
+    """SHA-256 of the files whose actors make the set, sorted."""
+    return sorted({collector.sha256 for _, _, collector in _plan(config) if collector is not None})
 
 
 def check_config(config: CollectConfig) -> None:
@@ -171,15 +186,6 @@ def set_quality(config: CollectConfig) -> str:
     return _base(config) + _suffix(config)
 
 
-def actor_hashes(config: CollectConfig) -> list[str]:
-    """SHA-256 of the files whose actors make the set, sorted."""
-    return _hashes(_plan(config))
-
-
-def _hashes(plan: Iterable[tuple[Path, range, Collector]]) -> list[str]:
-    return sorted({collector.sha256 for _, _, collector in plan if collector is not None})
-
-
 def play(config: CollectConfig, length: int | None = None) -> Iterator[Columns]:
     """Rows of all episodes that `collect` would render, by physics alone: the same seeds, actions and rewards.
 
@@ -198,36 +204,26 @@ def play(config: CollectConfig, length: int | None = None) -> Iterator[Columns]:
             yield rollout
 
 
-def replay_returns(config: CollectConfig) -> list[float]:
-    """Returns of all episodes that `collect` would render, played by physics alone."""
-    return [float(rollout["reward"].sum()) for rollout in play(config)]
-
-
 def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Collector]]:
     """Shards to write: file, episode numbers, collector. medium_expert is all medium shards, then all expert ones."""
     halves = ["medium", "expert"] if _base(config) == "medium_expert" else [_base(config)]
     first = 0
     for number, quality in enumerate(halves):
         stop = config.episodes * (number + 1) // len(halves)
-        collector = _collector(config, quality)
+        collector: Collector = None
+        if quality == "medium_replay":
+            collector = load_ladder(config.task)
+        elif quality != "random":
+            collector = read_actor(config.actor, config.task) if config.actor else load_actor(config.task, quality)
         for shard, start in enumerate(range(first, stop, config.episodes_per_shard)):
             episodes = range(start, min(start + config.episodes_per_shard, stop))
             yield config.out / f"{shard}_{config.task}_{quality}{_suffix(config)}.hdf5", episodes, collector
         first = stop
 
 
-def _collector(config: CollectConfig, quality: str) -> Collector:
-    if quality == "random":
-        return None
-    if quality == "medium_replay":
-        return load_ladder(config.task)
-    if config.actor is None:
-        return load_actor(config.task, quality)
-    return read_actor(config.actor, config.task)
-
-
 def _job(config: CollectConfig, collector: Collector, episode: int, length: int | None = None) -> _Job:
     """One episode; with a ladder, by who acted at the moment of training that the episode stands for."""
+    # The middle of the episode's share of the training run.
     actor = collector.actor_at((episode + 0.5) / config.episodes) if isinstance(collector, Ladder) else collector
     task, size = TASKS.named(config.task), config.frame_size
     return _Job(task, episode, config.seed, actor, config.render, size, length, _noise(config))
@@ -237,6 +233,7 @@ def _roll_out(job: _Job) -> Columns:
     """Rows of one episode, by key."""
     env = _environment(job.task, job.render, job.size, job.length)
     rng = np.random.default_rng([job.seed, job.episode])
+    # A stream of its own: an actor draws the same with and without noise on its actions.
     noise = np.random.default_rng(stream_seed(job.seed, "action noise", job.episode))
     now = env.reset(episode_seed(job.seed, job.episode))
     action = np.zeros(env.action_dim, np.float32)
@@ -265,19 +262,4 @@ def _roll_out(job: _Job) -> Columns:
 @cache
 def _environment(*arguments: Any) -> Any:
     """The process's environment for these arguments: one GL context serves all its episodes."""
-    from vd4rl_pomdp.envs.make import make_env
-
     return make_env(*arguments)
-
-
-def _attributes(config: CollectConfig, path: Path, collector: Collector) -> dict[str, Any]:
-    return {
-        "task": config.task,
-        "set": set_quality(config),
-        "policy": path.stem.split("_", 1)[1].removeprefix(f"{config.task}_"),
-        "seed": config.seed,
-        "render": config.render,
-        "actor_sha256": collector.sha256 if collector else None,
-        **({"action_noise": noise} if (noise := _noise(config)) else {}),
-        "versions": {k: v for k, v in versions().items() if k in ("mujoco", "dm-control", "vd4rl-pomdp")},
-    }

@@ -10,7 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError
+from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError, refuse_number
 from vd4rl_pomdp.core.state_scale import StateScale
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.core.types import StepType, row_key, unpack_row_key
@@ -53,7 +53,9 @@ class Dataset:
         self.task, self.quality = task_and_quality(path, store.meta["attributes"])
         """Names as in `tasks`, None where neither the shards nor the folders tell."""
         step_type, reward = store.array("step_type"), store.array("reward")
-        self.frames = _read_only_tensor(store.frames())
+        with warnings.catch_warnings():
+            warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # nor is it to be written
+            self.frames = torch.from_numpy(store.frames())
         """(N, 3, S, S) uint8; mapped memory: writing into it kills the process."""
         self.action = torch.from_numpy(store.array("action"))
         """(N, A) float32: row t holds a_{t-1}."""
@@ -172,6 +174,7 @@ class Dataset:
     def actions_before(self, rows: Tensor) -> Tensor:
         """a_{t-1} (..., T, A) float32 of (..., T) consecutive rows; zero in the first: a history begins without one."""
         actions = self.action[rows]
+        # The row stores an action, but it was taken before the history that is shown.
         actions[..., 0, :] = 0
         return actions
 
@@ -198,7 +201,8 @@ class Dataset:
         more (acme's convention), also where m is cut short: for n_step = 1 both are as stored. An episode's last row
         has no successor: there they are 0, 1 and the row itself.
         """
-        require_positive(n_step=n_step)
+        refuse_number("n_step", n_step, 1)
+        # Row t + 1 holds what step t paid: rows t + 1 .. t + m are summed, none behind the episode's last.
         last = (self.episode_end - 1)[self.episode[rows]]
         step = torch.arange(n_step, device=rows.device)
         inside = rows[:, None] + step < last[:, None]
@@ -231,6 +235,7 @@ class Dataset:
             IndexError: an index is out of range.
         """
         number, per_episode = self._index(index, self.num_windows(length)), self.windows_per_episode(length)
+        # Starts are numbered through the episodes; where their counts pass a number, its episode is found.
         ends = per_episode.cumsum(0)
         episode = torch.searchsorted(ends, number, right=True)
         start = self.episode_start[episode] + number - (ends - per_episode)[episode]
@@ -241,7 +246,7 @@ class Dataset:
 
         An episode of a single row has nothing to train on, whatever the window: `window_rows` leaves it out.
         """
-        require_positive(length=length)
+        refuse_number("length", length, 1)
         self.require_transitions()
         rows = self.episode_end - self.episode_start
         short = torch.nonzero((rows < length) & (rows > 1))[:, 0]
@@ -271,16 +276,3 @@ class Dataset:
         if low < 0 or high >= size:
             raise IndexError(f"index {low if low < 0 else high} is outside 0..{size - 1}")
         return number.to(self.t.device, non_blocking=True)
-
-
-def require_positive(**values: int) -> None:
-    """Raise UserError for a count below 1."""
-    for name, value in values.items():
-        if value < 1:
-            raise UserError(f"{name} is {value}; it must be at least 1")
-
-
-def _read_only_tensor(array: np.ndarray) -> Tensor:
-    with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # meant: see `Dataset.frames`
-        return torch.from_numpy(array)

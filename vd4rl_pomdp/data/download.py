@@ -11,13 +11,11 @@ from urllib.parse import urlsplit
 from huggingface_hub import hf_hub_download, hf_hub_url
 from huggingface_hub.errors import HTTPError
 
-from vd4rl_pomdp import __version__
 from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_unknown
 from vd4rl_pomdp.core.tasks import QUALITIES
 from vd4rl_pomdp.data.folder import RemoteFile, manifest
 from vd4rl_pomdp.runs.files import sha256
-from vd4rl_pomdp.runs.outputs import refuse_kept
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.outputs import owned, refuse_kept
 
 HUB = "https://huggingface.co"
 REPOSITORY = "conglu/vd4rl"
@@ -104,8 +102,7 @@ def _fetch(file: RemoteFile, folder: Path, endpoint: str) -> Path:
             local_dir=folder,
             endpoint=endpoint,
             token=None if endpoint == default_endpoint().rstrip("/") else False,  # a user's token is for their own Hub
-            library_name="vd4rl-pomdp",
-            library_version=__version__,
+            library_name="vd4rl-pomdp",  # what the Hub counts downloads by
         )
     except (HTTPError, OSError) as error:
         if isinstance(error, OSError) and error.errno:  # the disk's; those of huggingface_hub have no number

@@ -51,18 +51,15 @@ def write_shard(path: Path, rows: Mapping[str, np.ndarray], attributes: Mapping[
     """
     if (dtype := np.asarray(rows.get(FRAMES_KEY, np.uint8(0))).dtype) != np.uint8:
         raise UserError(f"{path}: {FRAMES_KEY} is of {dtype}; frames are of uint8, from 0 to 255")
-    write_bytes(path, _encode(rows, attributes))  # compressed in memory: HDF5 cannot close a file on a full disk
-
-
-def _encode(rows: Mapping[str, np.ndarray], attributes: Mapping[str, Any]) -> bytes:
-    buffer = io.BytesIO()
+    buffer = io.BytesIO()  # in memory: HDF5 cannot close a file on a full disk
     with h5py.File(buffer, "w") as file:
         file.attrs[_ATTRIBUTE] = json.dumps(dict(attributes), sort_keys=True)
         for key, value in rows.items():
             data = np.asarray(value, _WRITTEN.get(key, "float64"))
+            # 50 frames a chunk: decoding inflates few at once, and single rows are read without the whole shard
             chunks = (min(len(data), 50), *data.shape[1:]) if key == FRAMES_KEY else True
             file.create_dataset(key, data=data, chunks=chunks, compression="gzip", compression_opts=4)
-    return buffer.getvalue()
+    write_bytes(path, buffer.getvalue())
 
 
 def read_attributes(path: Path) -> dict[str, Any]:
@@ -128,7 +125,12 @@ def read_rows(path: Path) -> dict[str, np.ndarray]:
         count = len(file[FRAMES_KEY])
     for key, value in rows.items():
         _check_column(path, key, value, count)
-    _check_discounts(path, rows["discount"], rows["step_type"])
+    # an episode's first row, which no step led to, may store any discount
+    outside = ((rows["discount"] < 0) | (rows["discount"] > 1)) & (rows["step_type"] != StepType.FIRST)
+    if outside.any():
+        row = int(outside.argmax())
+        told = rows["discount"][row]
+        raise UserError(f"{path}: 'discount' is {told!s} in row {row}, not within 0 and 1; {_REPAIR}")
     dtypes = {"action": "float32", "step_type": "uint8"}
     return {key: value.astype(dtypes.get(key, "float64"), copy=False) for key, value in rows.items()}
 
@@ -204,14 +206,7 @@ def _check_column(path: Path, key: str, value: np.ndarray, count: int) -> None:
         return
     if value.dtype.kind != "f":
         raise UserError(f"{path}: {key!r} is {value.dtype}, expected floating point; {_REPAIR}")
+    # Not `> _LARGEST`, which NaN passes.
     bad = np.flatnonzero(~(np.abs(value.reshape(count, -1)) <= _LARGEST).all(1))
     if len(bad):
         raise UserError(f"{path}: {key!r} is not finite as float32 in row {bad[0]} ({len(bad)} such rows); {_REPAIR}")
-
-
-def _check_discounts(path: Path, discount: np.ndarray, step_type: np.ndarray) -> None:
-    """Refuse what discounts nothing; an episode's first row, which no step led to, may store anything."""
-    outside = np.flatnonzero(((discount < 0) | (discount > 1)) & (step_type != StepType.FIRST))
-    if len(outside):
-        row = outside[0]
-        raise UserError(f"{path}: 'discount' is {discount[row]!s} in row {row}, not within 0 and 1; {_REPAIR}")

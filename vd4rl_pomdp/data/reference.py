@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Self
 
 import numpy as np
 
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.reading import build
 from vd4rl_pomdp.data.dataset import Dataset
 from vd4rl_pomdp.policies.actor import shipped_file
 from vd4rl_pomdp.runs import REFERENCE_FILE
@@ -46,8 +46,10 @@ class Reference:
     def parse(cls, path: Path, stored: dict[str, Any]) -> Self:
         """What a file's content tells; raises UserError, naming the file, if it is damaged."""
         try:
-            numbers = {name: _number(stored[name]) for name in ("data_return", "path_error")}
-            return cls(actor=_names(stored["actor"]), **numbers)
+            made = build(cls, {field.name: stored[field.name] for field in fields(cls)})
+            if made.actor is not None and made.actor.keys() != {"task", "quality", "sha256"}:
+                raise ValueError(f"{made.actor!r} names no actor")
+            return made
         except (KeyError, TypeError, ValueError) as error:
             raise UserError(f"{path}: is damaged ({error}); remove it, and the run is compared with no data") from error
 
@@ -86,20 +88,6 @@ def _sole_actor(dataset: Dataset) -> dict[str, str] | None:
         if shipped_file(dataset.task, quality, sha256):
             return {"task": dataset.task, "quality": quality, "sha256": sha256}
     return None
-
-
-def _number(value: Any) -> float | None:
-    if value is not None and (isinstance(value, bool | str) or not math.isfinite(value)):
-        raise ValueError(f"{value!r} is no number")
-    return value
-
-
-def _names(actor: Any) -> dict[str, str] | None:
-    if actor is None:
-        return None
-    if not isinstance(actor, dict):
-        raise TypeError(f"{actor!r} names no actor")
-    return {name: str(actor[name]) for name in ("task", "quality", "sha256")}
 
 
 def summarise(rows: list[dict[str, Any]], reference: Reference) -> dict[str, float | None]:

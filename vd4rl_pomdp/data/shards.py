@@ -15,7 +15,7 @@ from vd4rl_pomdp.core.registry import code_of, of_other_code
 from vd4rl_pomdp.data.folder import PLAN, PROVENANCE, read_plan
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.runs.files import holds_anything, write_json
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
 from vd4rl_pomdp.runs.workers import count_workers, run_jobs
@@ -75,7 +75,8 @@ def collect_set(
                     frames += len(rollout["reward"])
                     speed = frames / (time.monotonic() - started)
                     progress.advance(1, ret=float(rollout["reward"].sum()), frames_per_s=speed)
-                write_shard(shard.path, join_rollouts(rollouts), shard.attributes)
+                rows = {key: np.concatenate([rollout[key] for rollout in rollouts]) for key in rollouts[0]}
+                write_shard(shard.path, rows, shard.attributes)
         spent = {"seconds": round(time.monotonic() - started, 1), "frames": frames} if missing else {}  # of this call
         origin = {"command": command(), "git_commit": git_commit(), "versions": versions(), "render": rendered}
         write_json(out / PROVENANCE, spent | {"workers": count_workers(workers)} | origin)
@@ -111,8 +112,3 @@ def _rendered_by(out: Path, task: str, stored: dict[str, Any]) -> dict[str, Any]
 def differing(stored: Mapping[str, Any], settings: Mapping[str, Any]) -> list[str]:
     """Names of the settings that a collection.json has otherwise."""
     return sorted(name for name, value in settings.items() if stored.get(name) != value)
-
-
-def join_rollouts(rollouts: list[Columns]) -> Columns:
-    """Rows of several episodes, in order."""
-    return {key: np.concatenate([rollout[key] for rollout in rollouts]) for key in rollouts[0]}

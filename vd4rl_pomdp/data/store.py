@@ -17,11 +17,12 @@ import math
 import os
 import shutil
 import sys
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, nullcontext
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import numpy as np
 
@@ -30,7 +31,7 @@ from vd4rl_pomdp.core.reading import parse_json, read_bytes
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.folder import check_count, join_shards, shard_paths
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_frames, read_rows
-from vd4rl_pomdp.runs.identity import content_hash
+from vd4rl_pomdp.runs.files import content_hash
 from vd4rl_pomdp.runs.progress import ProgressLine
 
 _VERSION = 2
@@ -54,7 +55,9 @@ class Store:
         dm_control's rewards call numpy's exp, which has code of its own where there is AVX-512.
         """
         checksums = {name: file["blake2b"] for name, file in self.meta["files"].items()}
-        checksums["reward.npy"] = _checksum_of(_trained(self.array("reward")))
+        reward, file = self.array("reward"), io.BytesIO()
+        np.save(file, reward.astype(np.float32).astype(reward.dtype))
+        checksums["reward.npy"] = hashlib.blake2b(file.getbuffer(), digest_size=16).hexdigest()
         return content_hash(checksums)
 
     @property
@@ -65,22 +68,15 @@ class Store:
     def frames(self) -> np.ndarray:
         """(N, 3, S, S) uint8, mapped read-only from the file."""
         shape = (self.meta["rows"], 3, self.frame_size, self.frame_size)
-        with self._reading(_FRAMES):
-            return np.memmap(self.folder / _FRAMES, np.uint8, "r", shape=shape)
+        return self._load(_FRAMES, lambda path: np.memmap(path, np.uint8, "r", shape=shape))
 
     def array(self, key: str) -> np.ndarray:
         """Rows of `action` (N, A) float32, `reward` or `discount` (N,) float64, or `step_type` (N,) uint8."""
-        return self._load(f"{key}.npy")
+        return self._load(f"{key}.npy", np.load)
 
-    def _load(self, name: str, mode: Literal["r"] | None = None) -> np.ndarray:
-        with self._reading(name):
-            return np.load(self.folder / name, mmap_mode=mode)
-
-    @contextmanager
-    def _reading(self, name: str) -> Iterator[None]:
-        """Turn what numpy raises about a file into one sentence."""
+    def _load(self, name: str, read: Callable[[Path], np.ndarray]) -> np.ndarray:
         try:
-            yield
+            return read(self.folder / name)
         except (OSError, ValueError, EOFError) as error:
             raise system_error(self.folder / name, error) or self.damaged(name) from error
 
@@ -90,40 +86,9 @@ class Store:
 
     def physics(self) -> np.ndarray | None:
         """(N, P) float64 simulator states, mapped read-only; None if the set has none."""
-        return self._load("physics.npy", "r") if "physics.npy" in self.meta["files"] else None
-
-
-@dataclass(frozen=True)
-class PlayedStore(Store):
-    """Rows that were played by physics alone, in memory: a set without pixels, in no folder."""
-
-    rows: Mapping[str, np.ndarray]
-    """`action`, `reward`, `discount`, `step_type` and perhaps `physics` by key, as `Store.array` has them."""
-
-    @property
-    def fingerprint(self) -> str:
-        """Name of the rows' content."""
-        digest = hashlib.blake2b(digest_size=12)
-        for _, value in sorted((dict(self.rows) | {"reward": _trained(self.rows["reward"])}).items()):
-            digest.update(np.ascontiguousarray(value).tobytes())
-        return digest.hexdigest()
-
-    @property
-    def frame_size(self) -> int:
-        """Nothing was drawn."""
-        return 0
-
-    def frames(self) -> np.ndarray:
-        """(N, 3, 0, 0) uint8."""
-        return np.zeros((len(self.rows["reward"]), 3, 0, 0), np.uint8)
-
-    def array(self, key: str) -> np.ndarray:
-        """A copy of rows, which is the caller's own."""
-        return self.rows[key].copy()
-
-    def physics(self) -> np.ndarray | None:
-        """(N, P) float64 simulator states, None if there are none."""
-        return self.rows.get("physics")
+        if "physics.npy" not in self.meta["files"]:
+            return None
+        return self._load("physics.npy", partial(np.load, mmap_mode="r"))
 
 
 def default_cache() -> Path:
@@ -141,7 +106,9 @@ def open_store(path: Path, cache: Path | None = None) -> Store:
     """
     with disk_errors(path):
         shards = shard_paths(path)
-        folder = (cache or default_cache()) / _key(shards)
+        stats = [(path.resolve().as_posix(), path.stat().st_size, path.stat().st_mtime_ns) for path in shards]
+    key = hashlib.blake2b(json.dumps([_VERSION, stats]).encode(), digest_size=12).hexdigest()
+    folder = (cache or default_cache()) / key
     meta = _read_meta(folder)
     if meta is None:
         with _locked(folder):
@@ -158,11 +125,6 @@ def verify_store(store: Store) -> None:
             checksum = _checksum(store.folder / name)
         if checksum != file["blake2b"]:
             raise store.damaged(name)
-
-
-def _key(shards: Sequence[Path]) -> str:
-    stats = [(path.resolve().as_posix(), path.stat().st_size, path.stat().st_mtime_ns) for path in shards]
-    return hashlib.blake2b(json.dumps([_VERSION, stats]).encode(), digest_size=12).hexdigest()
 
 
 def _read_meta(folder: Path) -> dict[str, Any] | None:
@@ -182,6 +144,7 @@ def _locked(folder: Path) -> Iterator[None]:
     """Let one process at a time decode into a folder; the others wait and find it done."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
+        # Never removed: two processes could then lock two files of one name.
         file = folder.with_suffix(".lock").open("w", encoding="utf-8")
     except OSError as error:
         raise disk_error(folder.parent, error) from error
@@ -204,29 +167,26 @@ def _decode(path: Path, shards: Sequence[Path], folder: Path) -> dict[str, Any]:
     shutil.rmtree(scratch, ignore_errors=True)
     try:
         scratch.mkdir()
-        _require_space(scratch, len(rows["reward"]) * 3 * frame_size**2)
+        needed, free = len(rows["reward"]) * 3 * frame_size**2, shutil.disk_usage(scratch).free
+        if needed > free:
+            wanted, there = told_apart(needed / 1e9, free / 1e9, 1)
+            raise DiskFullError(
+                f"{folder.parent}: decoding needs {wanted} GB, the disk has {there} GB; "
+                "free some space or set VD4RL_POMDP_CACHE to a folder on another disk"
+            )
         _write_frames(shards, scratch / _FRAMES, len(rows["reward"]))
         for key, value in rows.items():
             np.save(scratch / f"{key}.npy", value)
         meta = _describe(shards, scratch, len(rows["reward"]))
         (scratch / _META).write_text(json.dumps(meta, indent=1), encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)  # a damaged one
+        # The last step: whatever kills the process before it leaves no folder of that name.
         scratch.rename(folder)
     except OSError as error:
         raise disk_error(folder.parent, error) from error
     finally:
         shutil.rmtree(scratch, ignore_errors=True)
     return meta
-
-
-def _require_space(folder: Path, needed: int) -> None:
-    free = shutil.disk_usage(folder).free
-    if needed > free:
-        wanted, there = told_apart(needed / 1e9, free / 1e9, 1)
-        raise DiskFullError(
-            f"{folder.parent}: decoding needs {wanted} GB, the disk has {there} GB; "
-            "free some space or set VD4RL_POMDP_CACHE to a folder on another disk"
-        )
 
 
 def _write_frames(shards: Sequence[Path], path: Path, rows: int) -> None:
@@ -249,15 +209,3 @@ def _describe(shards: Sequence[Path], scratch: Path, rows: int) -> dict[str, Any
 def _checksum(path: Path) -> str:
     with path.open("rb") as file:
         return hashlib.file_digest(file, lambda: hashlib.blake2b(digest_size=16)).hexdigest()
-
-
-def _checksum_of(value: np.ndarray) -> str:
-    """Checksum of the file that `value` would be saved to."""
-    file = io.BytesIO()
-    np.save(file, value)
-    return hashlib.blake2b(file.getbuffer(), digest_size=16).hexdigest()
-
-
-def _trained(reward: np.ndarray) -> np.ndarray:
-    """Rewards in the precision of training, in the dtype they came in."""
-    return reward.astype(np.float32).astype(reward.dtype)

@@ -1,21 +1,21 @@
-"""A data set as an agent sees it: stacked frames, shifted at random, then corrupted."""
+"""A data set as an agent sees it: stacked frames, shifted at random, then corrupted; and batches of it."""
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, get_args
 
 import torch
 from torch import Tensor
 
 from vd4rl_pomdp.core.buffers import BUFFERS
-from vd4rl_pomdp.core.errors import refuse_unknown
+from vd4rl_pomdp.core.errors import refuse_number, refuse_unknown
 from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.core.tasks import FRAME_STACK
 from vd4rl_pomdp.core.types import Transitions, Windows
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, augmentation
 from vd4rl_pomdp.corruptions.augmentation import Sharing
-from vd4rl_pomdp.data.dataset import Dataset, Index, require_positive
+from vd4rl_pomdp.data.dataset import Dataset, Index
 
 
 class View:
@@ -43,7 +43,7 @@ class View:
             shared: what one shift is shared by.
         """
         refuse_unknown("sharing", shared, get_args(Sharing))
-        require_positive(frame_stack=frame_stack)
+        refuse_number("frame_stack", frame_stack, 1)
         self.dataset = dataset
         self.corruption = BatchCorruption(corruption or CorruptionConfig(), seed, *name)
         self.shifts = KeyStream(stream_seed(seed, "shift", *name))
@@ -63,6 +63,7 @@ class View:
         if shift_key is None:
             shifts = len(rows) if self._shared == "window" else rows.numel()
             shift_key = self.shifts.take((shifts,), rows.device)
+        # Keys are taken whichever way is gone: the streams stand alike on every device.
         keys = self.corruption.keys(self.dataset.keys(rows))
         if augmentation.by_lines(self.dataset.frames, self._pad):
             return self._observe_by_lines(rows, shift_key, keys)
@@ -87,6 +88,7 @@ class View:
         """
         data, rows = self.dataset, self.dataset.window_rows(index, length)
         has_action = rows + 1 < data.episode_end[data.episode[rows]]
+        # Without an action, row 0 stands in (it has one) and is multiplied away: no branch, no wait for a GPU.
         following = data.action_after(torch.where(has_action, rows, 0))
         return Windows(
             obs=self.observe(rows),
@@ -136,7 +138,9 @@ class View:
         keys = keys.flatten()
         kept = corruption.kept(keys, stack)
         chosen = self.dataset.stack_rows(rows, stack).view(-1, stack).gather(1, kept)
+        # One image more than are chosen: the frame of zeros that `_spread` reads.
         images = BUFFERS.take((chosen.numel() + 1, *frames.shape[1:]))
+        # All frames under one key lie one after the other.
         offset = augmentation.draw_offset(shift_key, self._pad).repeat_interleave(
             chosen.numel() // max(1, len(shift_key)), 0
         )
@@ -181,3 +185,68 @@ def _spread(images: Tensor, kept: Tensor, stack: int) -> Tensor:
     source.scatter_(1, kept, torch.arange(kept.numel()).view(kept.shape))
     out = BUFFERS.take((source.numel(), *images.shape[1:]))
     return torch.index_select(images, 0, source.flatten(), out=out)
+
+
+class Sampler:
+    """What samplers share: a view (of a set as it is stored, if a set is given), a batch size and a generator.
+
+    The generator lives on the CPU, so the draws do not depend on the set's device.
+    """
+
+    def __init__(self, source: Dataset | View, batch_size: int, generator: torch.Generator) -> None:
+        refuse_number("batch_size", batch_size, 1)
+        self.view = source if isinstance(source, View) else View(source)
+        self._batch_size, self._generator = batch_size, generator
+
+    def state_dict(self) -> dict[str, Any]:
+        """Everything needed to go on with the same batches."""
+        return {"batches": self._generator.get_state(), "view": self.view.state_dict()}
+
+    def load_state_dict(self, state: dict[str, Any]) -> None:
+        """Continue from `state_dict`."""
+        self._generator.set_state(state["batches"])
+        self.view.load_state_dict(state["view"])
+
+    def _draw(self, count: int) -> torch.Tensor:
+        return torch.randint(count, (self._batch_size,), generator=self._generator)
+
+
+class WindowSampler(Sampler):
+    """Windows whose starts are uniform over the set, drawn with replacement."""
+
+    def __init__(self, source: Dataset | View, batch_size: int, length: int, generator: torch.Generator) -> None:
+        super().__init__(source, batch_size, generator)
+        self._length, self._count = length, self.view.dataset.num_windows(length)
+
+    def sample(self) -> Windows:
+        """The next batch, on the data set's device."""
+        return self.view.windows(self._draw(self._count), self._length)
+
+    def __iter__(self) -> Iterator[Windows]:
+        while True:
+            yield self.sample()
+
+
+class TransitionSampler(Sampler):
+    """n-step transitions uniform over the set, drawn with replacement."""
+
+    def __init__(
+        self,
+        source: Dataset | View,
+        batch_size: int,
+        generator: torch.Generator,
+        n_step: int = 1,
+        gamma: float = 0.99,
+    ) -> None:
+        super().__init__(source, batch_size, generator)
+        refuse_number("n_step", n_step, 1)
+        self.view.dataset.require_transitions()
+        self._n_step, self._gamma = n_step, gamma
+
+    def sample(self) -> Transitions:
+        """The next batch, on the data set's device."""
+        return self.view.transitions(self._draw(self.view.dataset.num_transitions), self._n_step, self._gamma)
+
+    def __iter__(self) -> Iterator[Transitions]:
+        while True:
+            yield self.sample()

@@ -25,19 +25,16 @@ class DMCEnv(PixelEnv):
         self._random = np.random.RandomState(0)
         self.simulator = _load(task, self._random)
         """The dm_control environment."""
-        self._check_camera(task)
-        self._layout = task.layout or self._found_layout(task.camera)
-        if size is not None:
-            rendering.prepare(self.physics, render, size)
-            self._frame_camera = rendering.FrameCamera(self.physics, size, task.camera)
-
-    def _check_camera(self, task: DMCTask) -> None:
         cameras = self.physics.model.ncam
         if not 0 <= task.camera < cameras:
             raise UserError(
                 f"dm_control's {task.domain} {task.task} has no camera {task.camera}: register the task with one of 0 "
                 f"to {cameras - 1}"
             )
+        self._layout = task.layout or self._found_layout(task.camera)
+        if size is not None:
+            rendering.prepare(self.physics, render, size)
+            self._frame_camera = rendering.FrameCamera(self.physics, size, task.camera)
 
     @property
     def physics(self) -> Any:
@@ -71,6 +68,7 @@ class DMCEnv(PixelEnv):
     def _begin(self, seed: int) -> None:
         self._random.seed(seed)
         self.simulator.reset()
+        # As a replay begins: a reset leaves the solver's warm start of the episode before.
         start_from(self.simulator, self.physics.get_state())
 
     def _apply(self, action: np.ndarray) -> tuple[float, bool, float]:
@@ -97,12 +95,11 @@ def observed_states(task: DMCTask, physics: np.ndarray) -> np.ndarray:
     """What an actor reads in simulator states: (N, P) float64 -> (N, D) float32, as `TimeStep.state`."""
     env = _load(task, np.random.RandomState(0))
     env.reset()
-    return np.stack([_observed(env, state) for state in physics])
-
-
-def _observed(env: Any, state: np.ndarray) -> np.ndarray:
-    start_from(env, state)
-    return flat_state(env)
+    found = []
+    for state in physics:
+        start_from(env, state)
+        found.append(flat_state(env))
+    return np.stack(found)
 
 
 def start_from(env: Any, state: np.ndarray) -> None:
@@ -161,17 +158,13 @@ def _model_of_an_episode(env: Any, random: np.random.RandomState, seed: int) -> 
     return buffer.tobytes()
 
 
-def _tracks(model: Any, camera: int) -> bool:
-    return model.cam_mode[camera] in (mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM)
-
-
 def _ground_travel(model: Any, camera: int) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Positions along the ground of the body that a tracking camera follows, x and y of a free joint or level slides.
 
     Behind them, if it is free, the first positions of the other free bodies. What stands in the world and is followed
     all the same, such as a hand, shows all places.
     """
-    if not _tracks(model, camera):
+    if model.cam_mode[camera] not in (mujoco.mjtCamLight.mjCAMLIGHT_TRACK, mujoco.mjtCamLight.mjCAMLIGHT_TRACKCOM):
         return (), ()
     on_ground = [list(_ground_positions(model, joint)) for joint in range(model.njnt)]
     moving = {int(model.jnt_bodyid[joint]): kind for joint, kind in enumerate(model.jnt_type) if on_ground[joint]}

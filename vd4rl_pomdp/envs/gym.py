@@ -37,7 +37,9 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         **corruption_fields: Any,
     ) -> None:
         refuse_number("frame_size", frame_size, *FRAME_SIZES)
-        config = _config(corruption, corruption_fields, frame_size)
+        config = CorruptionConfig.of(corruption, **corruption_fields)
+        check_corruption_fits(config, frame_size)
+        # No limit of its own: Gymnasium's wrapper truncates, and tells so.
         self._env = CorruptedEnv(TASKS.named(task), config, render, sys.maxsize, frame_size)
         shape = (3 * FRAME_STACK, frame_size, frame_size)
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)
@@ -79,10 +81,3 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         clean = now.clean.numpy()
         self._frame = np.ascontiguousarray(clean[-3:].transpose(1, 2, 0))
         return now.obs.numpy(), {"clean": clean.copy(), "physics": now.time_step.physics}
-
-
-def _config(corruption: str, options: dict[str, Any], size: int) -> CorruptionConfig:
-    """The corruption that `gymnasium.make` was asked for."""
-    config = CorruptionConfig.of(corruption, **options)
-    check_corruption_fits(config, size)
-    return config

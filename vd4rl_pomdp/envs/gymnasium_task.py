@@ -54,9 +54,22 @@ class GymnasiumEnv(PixelEnv):
         super().__init__(task, size, length)
         self._name = task.name
         self._renders = task.pixels == "render"
-        self.env = self._make(task)
+        arguments = dict(task.arguments) | ({"render_mode": "rgb_array"} if self._renders else {})
+        with self._telling("cannot be made", (*_REFUSALS, TypeError, AttributeError, RuntimeError)):
+            if isinstance(task.environment, str):
+                self.env = gymnasium.make(task.environment, disable_env_checker=True, **arguments)
+            else:
+                self.env = task.environment(**arguments)
         """The Gymnasium environment."""
-        self._space = self._bounded_box(self.env.action_space)
+        space = self.env.action_space
+        floating = np.issubdtype(space.dtype, np.floating)
+        if not isinstance(space, gymnasium.spaces.Box) or not floating or not space.low.size:
+            raise UserError(
+                f"environment {self._name} has the actions {space}: only a bounded Box of floating point can be a "
+                "task; wrap the environment in one that translates them"
+            )
+        check_bounds(f"environment {self._name}", space.low, space.high)
+        self._space = space
         self._observation: Any = None
 
     @property
@@ -88,13 +101,6 @@ class GymnasiumEnv(PixelEnv):
         """Close the Gymnasium environment."""
         self.env.close()
 
-    def _make(self, task: GymnasiumTask) -> gymnasium.Env:
-        arguments = dict(task.arguments) | ({"render_mode": "rgb_array"} if self._renders else {})
-        with self._telling("cannot be made", (*_REFUSALS, TypeError, AttributeError, RuntimeError)):
-            if isinstance(task.environment, str):
-                return gymnasium.make(task.environment, disable_env_checker=True, **arguments)
-            return task.environment(**arguments)
-
     @contextmanager
     def _telling(self, what: str, refusals: tuple[type[Exception], ...] = _REFUSALS) -> Iterator[None]:
         """Turn what an environment itself refuses, such as a package or OpenGL that it misses, into a UserError."""
@@ -107,15 +113,6 @@ class GymnasiumEnv(PixelEnv):
                 f"environment {self._name} {what} ({reason}): mend the task's registration, or install what the "
                 "environment needs"
             ) from error
-
-    def _bounded_box(self, space: gymnasium.Space) -> gymnasium.spaces.Box:
-        if isinstance(space, gymnasium.spaces.Box) and np.issubdtype(space.dtype, np.floating) and space.low.size:
-            check_bounds(f"environment {self._name}", space.low, space.high)
-            return space
-        raise UserError(
-            f"environment {self._name} has the actions {space}: only a bounded Box of floating point can be a task; "
-            "wrap the environment in one that translates them"
-        )
 
     def _begin(self, seed: int) -> None:
         try:
@@ -163,15 +160,15 @@ class GymnasiumEnv(PixelEnv):
         low, high = self._space.low, self._space.high
         return between(np.reshape(action, low.shape), low, high)
 
-    def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
-        frame = self._frame(self.size) if self.size and self.drawing else None
-        return TimeStep(frame, NOTHING.astype(np.float32), NOTHING, reward, discount, step_type)
-
     def _frame(self, size: int) -> np.ndarray:
         """The present picture as (3, size, size) uint8, each pixel the mean of the area that it covers."""
         picture = self._picture()
         picture = picture if picture.shape[:2] == (size, size) else area_means(picture, size)
         return np.array(picture.transpose(2, 0, 1), order="C")  # a copy: the environment may draw into its buffer again
+
+    def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
+        frame = self._frame(self.size) if self.size and self.drawing else None
+        return TimeStep(frame, NOTHING.astype(np.float32), NOTHING, reward, discount, step_type)
 
     def _picture(self) -> np.ndarray:
         """The present picture as (H, W, 3) uint8: a grey one has three equal channels."""

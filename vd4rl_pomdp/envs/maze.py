@@ -19,7 +19,7 @@ import numpy as np
 from vd4rl_pomdp.core.errors import UserError, refuse_number
 from vd4rl_pomdp.envs import Info
 from vd4rl_pomdp.envs.maze_renderers import FACE, ExactRenderer, MazeRenderer, make_renderer, sky_texture
-from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, Curtain, MazeSpec, Sky, Style, get_maze
+from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MOST_STEPS, PICTURE_SIZE, MazeSpec, Style, get_maze
 from vd4rl_pomdp.envs.opengl import gl_errors
 from vd4rl_pomdp.envs.pixels import Render, check_render, checked_action
 from vd4rl_pomdp.envs.rendering import mujoco
@@ -111,11 +111,14 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
 
     def step(self, action: np.ndarray) -> tuple[np.ndarray, float, bool, bool, Info]:
         """Apply one action for the action repeat; UserError for one of another shape, or NaN."""
-        before = self.state[:2]
+        before, style = self.state[:2], self.maze_spec.style
         self._simulate(np.clip(np.asarray(checked_action(action, 2), np.float64), -1, 1))
-        reached = self._at_goal(before)
+        place = self.state[:2]
+        near = np.linalg.norm(place - self.goal) <= style.goal_radius
+        # a mass that passes a goal has not reached it: where the planner halts it must also have slowed down
+        reached = bool(near and np.linalg.norm(place - before) < style.goal_travel)
         self._decisions += 1
-        if reached or self._decisions == self.maze_spec.style.goal_decisions:
+        if reached or self._decisions == style.goal_decisions:
             self._draw_goal()
         observation, info = self._observation_and_info()
         return observation, float(reached), False, False, info
@@ -145,12 +148,6 @@ class MazeEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         if not self.maze_spec.style.goals_are_cells:
             return place
         return np.round(place - CELL_OFFSET) + CELL_OFFSET
-
-    def _at_goal(self, before: np.ndarray) -> bool:
-        """Whether the goal is reached by a mass that was at a (2,) position when the decision began."""
-        place, style = self.state[:2], self.maze_spec.style
-        near = np.linalg.norm(place - self.goal) <= style.goal_radius
-        return bool(near and np.linalg.norm(place - before) < style.goal_travel)
 
     def _draw_goal(self) -> None:
         self.goal, self._decisions = self.goal_point(self._free_place(self.maze_spec.style.goal_margin)), 0
@@ -222,7 +219,8 @@ def build_simulator(spec: MazeSpec) -> tuple[PointEnv, Maze]:
         point = PointEnv(xml_file=str(path))
     if spec.first_person:
         point.model.dof_damping[HEADING] = spec.style.heading_damping
-        _paint_sky(point.model, spec.style.sky)
+        start, texture = int(point.model.tex_adr[point.model.tex("skybox").id]), sky_texture(spec.style.sky)
+        point.model.tex_data[start : start + len(texture)] = texture
     return point, maze
 
 
@@ -233,28 +231,23 @@ def _change(spec: MazeSpec, model: mujoco.MjSpec) -> mujoco.MjSpec:
     for wall in model.geoms:
         if wall.type == mujoco.mjtGeom.mjGEOM_BOX:
             wall.pos[2] = sum(spec.style.walls) / 2
+    bottom, top = spec.style.curtains
     for number, curtain in enumerate(spec.curtains):
-        _hang(model, f"curtain_{number}", curtain, spec.style)
+        model.worldbody.add_geom(
+            name=f"curtain_{number}",
+            type=mujoco.mjtGeom.mjGEOM_BOX,
+            pos=[*curtain.center, (bottom + top) / 2],
+            size=[*curtain.half, (top - bottom) / 2],
+            rgba=[*spec.style.curtain_color, 1.0],
+            contype=0,  # no contacts: a curtain hides and never stops
+            conaffinity=0,
+            group=2,
+        )
     if spec.first_person:
         _open_eyes(model, spec.style)
     else:
         model.worldbody.add_camera(name="view", pos=[0, 0, spec.style.camera_height], fovy=spec.style.camera_fovy)
     return model
-
-
-def _hang(model: mujoco.MjSpec, name: str, curtain: Curtain, style: Style) -> None:
-    """Add a curtain, which does not collide."""
-    bottom, top = style.curtains
-    model.worldbody.add_geom(
-        name=name,
-        type=mujoco.mjtGeom.mjGEOM_BOX,
-        pos=[*curtain.center, (bottom + top) / 2],
-        size=[*curtain.half, (top - bottom) / 2],
-        rgba=[*style.curtain_color, 1.0],
-        contype=0,
-        conaffinity=0,
-        group=2,
-    )
 
 
 def _open_eyes(model: mujoco.MjSpec, style: Style) -> None:
@@ -267,10 +260,3 @@ def _open_eyes(model: mujoco.MjSpec, style: Style) -> None:
     sky = model.texture("skybox")
     sky.mark = mujoco.mjtMark.mjMARK_NONE
     sky.width, sky.height = FACE, 6 * FACE
-
-
-def _paint_sky(model: mujoco.MjModel, sky: Sky) -> None:
-    """Write the sky's texture into a compiled model."""
-    start = int(model.tex_adr[model.tex("skybox").id])
-    texture = sky_texture(sky)
-    model.tex_data[start : start + len(texture)] = texture

@@ -77,7 +77,13 @@ class TopRenderer:
     """The fast picture from the top."""
 
     def __init__(self, model: mujoco.MjModel, style: Style) -> None:
-        self._colors, self._depths = _static_picture(model)
+        ball, exact, data = model.site("particle_site"), ExactRenderer(model), mujoco.MjData(model)
+        color, ball.rgba[3] = ball.rgba.copy(), 0
+        mujoco.mj_forward(model, data)
+        self._colors, self._depths = exact.fine_picture(data)
+        """(H, H, 3) and (H, H): the maze without the ball."""
+        exact.close()
+        ball.rgba[:] = color
         self._picture = average(self._colors, _FINE)
         self._height = style.camera_height
         side, half = PICTURE_SIZE * _FINE, np.tan(np.radians(style.camera_fovy) / 2)
@@ -112,19 +118,6 @@ class TopRenderer:
         center = np.searchsorted(self._slope, sideways / self._height)
         first = (int(center) - self._window // 2) // _FINE * _FINE
         return min(max(first, 0), PICTURE_SIZE * _FINE - self._window)
-
-
-def _static_picture(model: mujoco.MjModel) -> tuple[np.ndarray, np.ndarray]:
-    """Colours and depths of the maze without the ball."""
-    color = model.site("particle_site").rgba.copy()
-    model.site("particle_site").rgba[3] = 0
-    exact = ExactRenderer(model)
-    data = mujoco.MjData(model)
-    mujoco.mj_forward(model, data)
-    picture = exact.fine_picture(data)
-    exact.close()
-    model.site("particle_site").rgba[:] = color
-    return picture
 
 
 def _hit_sphere(right: np.ndarray, up: np.ndarray, x: float, y: float, height: float) -> tuple[np.ndarray, np.ndarray]:
@@ -231,10 +224,16 @@ def sky_texture(sky: Sky) -> np.ndarray:
     if sky == "none":
         return np.zeros(6 * FACE * FACE * 3, np.uint8)
     x, y, z = np.concatenate([np.stack(face) for face in _FACES], 1)
-    if sky == "compass":
-        return _bytes(_compass(np.arctan2(y, x)))
-    colors = _gradient(np.arctan2(z, np.hypot(x, y)))
-    return _bytes(colors + _star_light()[:, None] * (1 - colors))
+    if sky == "compass":  # the colour circle once around the horizon; its luminance rises and falls once, too
+        colors = 0.5 + 0.5 * np.cos(np.arctan2(y, x)[:, None] - np.array([0, 2, 4]) * np.pi / 3)
+    else:
+        share = np.arctan2(z, np.hypot(x, y)) / (np.pi / 2)
+        colors = (1 + share / np.sqrt(1 + share**2) * np.sqrt(2))[:, None] / 2 * _TOP  # MuJoCo's builtin gradient
+        side = FACE * _TWINKLE
+        stars = np.random.default_rng(0).random((6, side, side), np.float32) < _STARS  # the same stars always
+        light = stars.reshape(6, FACE, _TWINKLE, FACE, _TWINKLE).mean((2, 4)).ravel()
+        colors = colors + light[:, None] * (1 - colors)
+    return (colors * 255 + 0.5).astype(np.uint8).ravel()
 
 
 def panorama(texture: np.ndarray, elevations: np.ndarray) -> np.ndarray:
@@ -250,28 +249,6 @@ def panorama(texture: np.ndarray, elevations: np.ndarray) -> np.ndarray:
         at = [np.minimum(((side[there] + 1) / 2 * FACE).astype(int), FACE - 1) for side in (row, column)]
         found[there] = face[at[0], at[1]]
     return found
-
-
-def _bytes(colors: np.ndarray) -> np.ndarray:
-    return (colors * 255 + 0.5).astype(np.uint8).ravel()
-
-
-def _gradient(elevation: np.ndarray) -> np.ndarray:
-    """(N, 3) colours in 0..1 by elevation: MuJoCo's builtin gradient."""
-    share = elevation / (np.pi / 2)
-    return (1 + share / np.sqrt(1 + share**2) * np.sqrt(2))[:, None] / 2 * _TOP
-
-
-def _star_light() -> np.ndarray:
-    """(6 * FACE * FACE,) shares of each texel that stars cover: the same stars always."""
-    side = FACE * _TWINKLE
-    stars = np.random.default_rng(0).random((6, side, side), np.float32) < _STARS
-    return stars.reshape(6, FACE, _TWINKLE, FACE, _TWINKLE).mean((2, 4)).ravel()
-
-
-def _compass(azimuth: np.ndarray) -> np.ndarray:
-    """(N, 3) colours in 0..1: the colour circle once around the horizon, whose luminance rises and falls once, too."""
-    return 0.5 + 0.5 * np.cos(azimuth[:, None] - np.array([0, 2, 4]) * np.pi / 3)
 
 
 class _SkyTable:

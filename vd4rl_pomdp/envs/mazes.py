@@ -197,8 +197,3 @@ def get_maze(name: str) -> MazeSpec:
     """The maze called `name`; raises UserError listing the choices for an unknown one."""
     refuse_unknown("maze", name, MAZES)
     return MAZES[name]
-
-
-def check_maze(name: str) -> None:
-    """Raise UserError unless a maze is called `name`."""
-    get_maze(name)

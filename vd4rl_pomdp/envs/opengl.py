@@ -33,17 +33,6 @@ _VARIABLES = ("MUJOCO_", "PYOPENGL_", "PYGLFW_", "EGL_", "__EGL_", "LIBGL_", "ME
 """What the environment variables begin with that these and the drivers below them read."""
 
 
-def gl_error(error: BaseException) -> UserError:
-    """A sentence for a machine on which no OpenGL context can be made, with the variables that decide about it."""
-    read = {name: value for name, value in sorted(os.environ.items()) if name.startswith(_VARIABLES)}
-    told = ", ".join(f"{name}={shlex.quote(value)}" for name, value in read.items())
-    return UserError(
-        f"cannot render with {told} ({first_line(error)}): correct or unset the variable at fault, or set MUJOCO_GL to "
-        "egl (Debian: libegl1, libgl1, libgl1-mesa-dri), osmesa (libosmesa6) or glfw (needs a screen); what draws "
-        "nothing, such as control-study, takes MUJOCO_GL=disable"
-    )
-
-
 @contextlib.contextmanager
 def gl_errors() -> Iterator[None]:
     """Turn whatever OpenGL's libraries raise within the block into one line, and let them print nothing beside it."""
@@ -54,7 +43,13 @@ def gl_errors() -> Iterator[None]:
         if not any(f"{name}.".startswith(_LIBRARIES) for name in modules):
             raise
         _drop_half_made(error)
-        raise gl_error(error) from error
+        read = {name: value for name, value in sorted(os.environ.items()) if name.startswith(_VARIABLES)}
+        told = ", ".join(f"{name}={shlex.quote(value)}" for name, value in read.items())
+        raise UserError(
+            f"cannot render with {told} ({first_line(error)}): correct or unset the variable at fault, or set "
+            "MUJOCO_GL to egl (Debian: libegl1, libgl1, libgl1-mesa-dri), osmesa (libosmesa6) or glfw (needs a "
+            "screen)"
+        ) from error
 
 
 def _drop_half_made(error: BaseException) -> None:

@@ -90,17 +90,13 @@ class FrameCamera:
         """The present state: (3, size, size) uint8."""
         refuse_after_fork()
         with gl_errors(), undisturbed():
-            image = self._drawn()
+            if self._camera is None:
+                self._camera = Camera(self._physics, self._size, self._size, self._number)
+            context = self._physics.contexts.gl
+            with context.make_current() as thread:  # dm_control skips this where no other of its own was current,
+                thread.call(context._platform_make_current)  # but mujoco's and Gymnasium's renderers have others
+            image = self._camera.render()
         return np.array(image.transpose(2, 0, 1), order="C")  # a copy: the camera draws into one buffer
-
-    def _drawn(self) -> np.ndarray:
-        """The camera's buffer, (size, size, 3) uint8."""
-        if self._camera is None:
-            self._camera = Camera(self._physics, self._size, self._size, self._number)
-        context = self._physics.contexts.gl
-        with context.make_current() as thread:  # dm_control skips this where no other context of its own was current,
-            thread.call(context._platform_make_current)  # but mujoco's and Gymnasium's renderers have others
-        return self._camera.render()
 
 
 @cache

@@ -193,7 +193,12 @@ class Encoder(nn.Module):
         """Representations from (B, T, F) frame features and (B, T, A) previous actions."""
         if not self.remembers:
             return features
-        return self._read(features, self._states(self._rows(features, prev_action)))
+        assert self.memory is not None
+        rows, span = self._rows(features, prev_action), self.config.history_window
+        if span == 0 or rows.shape[1] <= span:
+            return self._read(features, run_memory(self.memory, rows)[0])
+        states = torch.cat([run_memory(self.memory, rows[:, :span])[0], self._over_last_rows(rows, span)], dim=1)
+        return self._read(features, states)
 
     def initial_state(self, batch: int) -> StreamState:
         """State before an episode's first row."""
@@ -228,6 +233,7 @@ class Encoder(nn.Module):
         if span == 0:
             out, hidden = run_memory(self.memory, row, state.hidden)
             return self._read(features, out[:, 0]), state._replace(hidden=hidden)
+        # Under a window no hidden state is carried on: it would remember rows that have left the window.
         rows = torch.cat([state.rows, row], dim=1)[:, -span:]
         newest = run_memory(self.memory, self._forget_first_action(rows))[0][:, -1]
         return self._read(features, newest), state._replace(rows=rows)
@@ -245,20 +251,13 @@ class Encoder(nn.Module):
         """The representation, given e(o_t) (..., F) and s_t (..., H)."""
         return torch.cat([features, states], dim=-1) if self.config.readout == "frame+state" else states
 
-    def _states(self, rows: Tensor) -> Tensor:
-        """s_t (B, T, H) of the memory's (B, T, I) inputs."""
-        assert self.memory is not None
-        span = self.config.history_window
-        if span == 0 or rows.shape[1] <= span:
-            return run_memory(self.memory, rows)[0]
-        return torch.cat([run_memory(self.memory, rows[:, :span])[0], self._over_last_rows(rows, span)], dim=1)
-
     def _rows(self, features: Tensor, prev_action: Tensor) -> Tensor:
         return torch.cat([features, prev_action.to(features)], dim=-1) if self.config.use_actions else features
 
     def _over_last_rows(self, rows: Tensor, span: int) -> Tensor:
         """States of rows span.. of (B, T, I), each computed anew from the last `span` rows: (B, T - span, H)."""
         assert self.memory is not None
+        # The first of these windows ends in row span - 1, whose state the plain pass over the first rows gives.
         recent = rows.unfold(1, span, 1)[:, 1:].transpose(2, 3)
         states, _ = run_memory(self.memory, self._forget_first_action(recent.flatten(0, 1)))
         return states[:, -1].view(*recent.shape[:2], -1)

@@ -1,12 +1,13 @@
 """A pretrained encoder is a folder: config.json and model.safetensors, loadable without the code that trained it.
 
-README.md beside them says what config.json says, for readers.
+README.md beside them is a model card as the Hugging Face Hub reads it, told from config.json alone.
 """
 
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Mapping
+import json
+from collections.abc import Iterator, Mapping
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
@@ -19,17 +20,19 @@ from vd4rl_pomdp import __version__
 from vd4rl_pomdp.core.errors import UserError, disk_errors, first_line, in_one_line
 from vd4rl_pomdp.core.reading import build, parse_json, read_bytes, read_tensors
 from vd4rl_pomdp.core.registry import code_of
+from vd4rl_pomdp.core.text import code, code_block, one_line
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig, EncoderRecord
 from vd4rl_pomdp.nn.frame import STATE
-from vd4rl_pomdp.nn.model_card import CARD, model_card
-from vd4rl_pomdp.runs.files import write_bytes, write_json
-from vd4rl_pomdp.runs.identity import content_hash
+from vd4rl_pomdp.runs.files import content_hash, write_bytes, write_json
 from vd4rl_pomdp.runs.provenance import git_commit
 
-WEIGHTS, CONFIG = "model.safetensors", "config.json"
+WEIGHTS, CONFIG, CARD = "model.safetensors", "config.json", "README.md"
 FILES_OF_RUN = (f"encoder/{CONFIG}", f"encoder/{WEIGHTS}")
 """An encoder's files, below the folder of the run that made it."""
+LICENSE = "mit"
+"""What the package and V-D4RL's sets have."""
+TAGS = ("reinforcement-learning", "offline-reinforcement-learning", "partial-observability", "representation-learning")
 
 
 def save_encoder(folder: Path | str, encoder: Encoder, card: EncoderCard, frames: int | None = None) -> None:
@@ -43,8 +46,8 @@ def save_encoder(folder: Path | str, encoder: Encoder, card: EncoderCard, frames
     """
     weights = {name: value.cpu().contiguous().clone() for name, value in encoder.state_dict().items()}
     record = EncoderRecord(encoder.config, card, __version__, git_commit(), frames)
-    code = code_of(record.parts)
-    _write(Path(folder), replace(record, plugins=code["plugins"], sources=code["sources"]), save(weights))
+    told = code_of(record.parts)
+    _write(Path(folder), replace(record, plugins=told["plugins"], sources=told["sources"]), save(weights))
 
 
 def _write(folder: Path, record: EncoderRecord, weights: bytes) -> None:
@@ -149,3 +152,74 @@ def read_record(folder: Path) -> EncoderRecord:
         hint = f"name {inner}" if (inner / CONFIG).is_file() else "`vd4rl-pomdp pretrain` writes one as RUN/encoder"
         reason = f"no {error}" if isinstance(error, KeyError) else error
         raise UserError(f"{folder}: not an encoder folder (config.json: {reason}); {hint}") from error
+
+
+def model_card(record: EncoderRecord, repository: str = "", license: str = LICENSE) -> str:
+    """Text of the card.
+
+    Args:
+        record: an encoder folder's config.json.
+        repository: OWNER/NAME on the Hub from which the card's code loads it; empty: from the card's own folder.
+        license: the licence that its owner gives it, as the Hub spells it; empty: the card names none.
+    """
+    card = record.pretrain
+    tags = dict.fromkeys([*TAGS, card.method, card.task, card.corruption["corruption"]])
+    values: dict[str, Any] = {"license": license} if license else {}
+    values |= {"library_name": "vd4rl-pomdp", "pipeline_tag": TAGS[0]}
+    hub = ["from huggingface_hub import snapshot_download", ""] if repository else []
+    place = f"snapshot_download({json.dumps(repository)}))" if repository else '".")  # this folder'
+    use = [f"encoder, card = load_encoder({place}", "print(card.method, card.task, encoder.dim)"]
+    return "\n".join(
+        [
+            *front_matter(values | {"tags": [one_line(tag) for tag in tags]}),
+            "",
+            f"# {code(card.method)} on {code(card.task)}",
+            "",
+            "An encoder of observations that are seen in part only, pretrained offline by `vd4rl-pomdp`.",
+            "",
+            "| | |",
+            "|---|---|",
+            *(f"| {name} | {value} |" for name, value in _facts(record)),
+            *([f"| licence | {code(license)} |"] if license else []),
+            "",
+            "## Use it",
+            "",
+            *code_block([*hub, "from vd4rl_pomdp.nn import load_encoder", "", *use], "python"),
+            "",
+            "`encoder.encode` takes windows of rows, `encoder.step` single rows, corrupted as in its pretraining:",
+            "`docs/use_an_encoder.md` of the package shows both.",
+            "",
+            "## Settings",
+            "",
+            *code_block(json.dumps(asdict(card), indent=2).splitlines(), "json"),
+            "",
+        ]
+    )
+
+
+def front_matter(values: dict[str, Any]) -> list[str]:
+    """YAML, its texts as JSON has them, which is YAML, too."""
+    return ["---", *(f"{name}: {json.dumps(value)}" for name, value in values.items()), "---"]
+
+
+def _facts(record: EncoderRecord) -> Iterator[tuple[str, str]]:
+    card, shape = record.pretrain, record.encoder
+    yield "method", code(card.method)
+    yield "task, quality", f"{code(card.task)}, {code(card.quality)}"
+    yield "data", f"fingerprint {code(card.data)}" if card.data else "not recorded"
+    yield "corruption", code(json.dumps(card.corruption))
+    frames = f", {record.frames:,} frames" if record.frames else ""
+    if card.end_to_end:
+        yield "budget", f"no pretraining: {code(card.end_to_end)} trains it with the policy"
+    elif record.frames == 0:
+        yield "budget", "none: it is not trained"
+    else:
+        yield "budget", f"preset {code(card.preset)}, {card.steps:,} gradient steps{frames}"
+    yield "seed", str(card.seed)
+    yield "encoder", f"{code(shape.frame_encoder)}, {shape.feature_dim} features, memory: {code(shape.history)}"
+    told = ", ".join(f"{name.removeprefix('probe_')} {error:.1f}%" for name, error in record.probe.items())
+    yield "linear probe", f"error of {told} of a standard deviation, on held-out episodes" if told else "not measured"
+    yield (
+        "made by",
+        f"vd4rl-pomdp {one_line(record.version)}" + (f", commit {code(record.commit)}" if record.commit else ""),
+    )

@@ -72,21 +72,16 @@ class FrameEncoder(nn.Module):
     def maps(self, obs: Tensor) -> Tensor:
         """Feature maps (..., C', H', W') of every stack, the layer before `from_maps`."""
         dtype = next(self.project.parameters()).dtype
-        image = _as_image(obs.reshape(-1, *obs.shape[-3:]), dtype)
+        if torch.is_autocast_enabled(obs.device.type):
+            dtype = torch.get_autocast_dtype(obs.device.type)  # a float32 copy would be the largest tensor
+        pixels = obs.reshape(-1, *obs.shape[-3:]).contiguous(memory_format=torch.channels_last).to(dtype, copy=True)
+        image = pixels.mul_(1 / 255).sub_(0.5)
         return self.convolutions(image).view(*obs.shape[:-3], *self.map_shape)
 
     def from_maps(self, maps: Tensor) -> Tensor:
         """Features (..., feature_dim) float32 of feature maps."""
         dtype = next(self.project.parameters()).dtype
         return self.project(maps.flatten(-3).flatten(0, -2)).to(dtype).view(*maps.shape[:-3], -1)
-
-
-def _as_image(obs: Tensor, dtype: torch.dtype) -> Tensor:
-    """Pixels 0..255 as channels-last numbers in [-0.5, 0.5], straight in the precision that the convolutions use."""
-    if torch.is_autocast_enabled(obs.device.type):
-        dtype = torch.get_autocast_dtype(obs.device.type)
-    pixels = obs.contiguous(memory_format=torch.channels_last).to(dtype, copy=True)
-    return pixels.mul_(1 / 255).sub_(0.5)
 
 
 def _drq(channels: int, size: int, options: FrameOptions) -> nn.Sequential:

@@ -1,4 +1,4 @@
-"""Prediction heads on pairs of representations, multilayer perceptrons, and targets that creep behind networks."""
+"""Prediction heads on pairs of representations, perceptrons, InfoNCE, and targets that creep behind networks."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ from functools import cache
 from itertools import pairwise
 
 import torch
+import torch.nn.functional as F
 from torch import Tensor, nn
 
 
@@ -65,6 +66,36 @@ def all_pairs(rows: int, max_k: int) -> Tensor:
     """Every (t, k) with 1 <= k <= max_k and t + k < rows: (P, 2) int64, ordered by k, then t; not to be changed."""
     pairs = [(t, k) for k in range(1, min(max_k, rows - 1) + 1) for t in range(rows - k)]
     return torch.tensor(pairs, dtype=torch.int64).view(-1, 2)
+
+
+def info_nce(scores: Tensor, group: Tensor | None = None) -> Tensor:
+    """InfoNCE (van den Oord et al. 2018, arXiv 1807.03748): cross-entropy of telling each anchor's own candidate.
+
+    Args:
+        scores: (..., N, N), anchors by candidates; the diagonal holds the true pairs.
+        group: (N,) int64; the other candidates of an anchor's own group are no negatives. None: all others are.
+
+    Returns:
+        Mean over anchors and leading dimensions, in nats. It is log(candidates) when scores tell nothing.
+    """
+    logits = _logits(scores, group)
+    truth = torch.arange(scores.shape[-1], device=scores.device).expand(logits.shape[:-1])
+    return F.cross_entropy(logits.flatten(0, -2), truth.reshape(-1))
+
+
+def share_found(scores: Tensor, group: Tensor | None = None) -> Tensor:
+    """Share of anchors whose own candidate scores highest among those that `info_nce` counts; the same arguments."""
+    truth = torch.arange(scores.shape[-1], device=scores.device)
+    return (_logits(scores, group).argmax(-1) == truth).float().mean()
+
+
+def _logits(scores: Tensor, group: Tensor | None) -> Tensor:
+    """Scores in float32; -inf where a candidate is no negative."""
+    logits = scores.float()
+    if group is None:
+        return logits
+    own = torch.eye(len(group), dtype=torch.bool, device=scores.device)
+    return logits.masked_fill((group[:, None] == group[None, :]) & ~own, -torch.inf)
 
 
 @torch.no_grad()

@@ -149,7 +149,9 @@ class InverseObjective(Objective):
         losses = self.target.loss(self.head(past, future, pairs), window.action[:, pairs[:, 0]])
         real = window.real[:, pairs.sum(1)].to(losses)
         total = _mean_over(real, losses)
-        means = self._means_by_k(losses.detach() * real, real, pairs[:, 1])
+        sums = losses.new_zeros(2, self.options.largest_gap + 1)  # of losses and of real pairs at every k of 0..K
+        sums.index_add_(1, pairs[:, 1], torch.stack([(losses.detach() * real).sum(0), real.sum(0)]))
+        means = sums[0] / sums[1].clamp(min=1)
         logs = {"action_loss": total.detach()} | {f"loss_k{k:02d}": means[k] for k in scored[:, 1].unique().tolist()}
         if self.predictor is not None:
             term = self._self_prediction(past, pairs, real)
@@ -159,12 +161,6 @@ class InverseObjective(Objective):
             total, logs["l2_states"] = total + self.options.l2_states * (1 - progress) * term, term.detach()
         logs["loss"] = total.detach()
         return total, logs
-
-    def _means_by_k(self, losses: Tensor, real: Tensor, gaps: Tensor) -> Tensor:
-        """Mean loss at every k of 0..K, from (B, P) losses that are zero where `real` is zero, and (P,) gaps."""
-        sums = losses.new_zeros(2, self.options.largest_gap + 1)
-        sums.index_add_(1, gaps, torch.stack([losses.sum(0), real.sum(0)]))
-        return sums[0] / sums[1].clamp(min=1)
 
     def _self_prediction(self, past: Tensor, pairs: Tensor, real: Tensor) -> Tensor:
         assert self.predictor is not None

@@ -22,7 +22,8 @@ from vd4rl_pomdp.report.gates import (
     seen_under,
     sides,
 )
-from vd4rl_pomdp.report.load import REFERENCES, Run, groups, label
+from vd4rl_pomdp.report.load import REFERENCES, Run, label
+from vd4rl_pomdp.report.variants import groups
 from vd4rl_pomdp.runs.files import Row
 
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "not told apart", "too few seeds"
@@ -136,6 +137,7 @@ def _decisive(left: list[Run], others: list[Run]) -> Sides:
     alike = [pair for pair in pairs if not pair.unlike]
     refuted = [pair for pair in alike if _beyond(*difference(pair)[1]) == FAILS]
     doubted = [pair for pair in alike if _beyond(*difference(pair)[1]) != HOLDS]
+    # Comparing with the best other method alone would pass over a lesser one that a single seed leaves open.
     decisive = refuted or doubted or alike or pairs
     return max(decisive, key=lambda pair: returns_of(pair.right).mean(), default=Sides([], [], []))
 

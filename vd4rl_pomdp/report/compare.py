@@ -13,10 +13,11 @@ from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.text import write_text
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.figures import seeds_note, write_table
-from vd4rl_pomdp.report.load import CONDITION, Run, groups, label, load_runs, setting
+from vd4rl_pomdp.report.load import CONDITION, Run, label, load_runs, setting
 from vd4rl_pomdp.report.page import made_with
 from vd4rl_pomdp.report.render import Columns, block, render, terminal, texts, write_latex
 from vd4rl_pomdp.report.tables import SCORE, mean_and_ends
+from vd4rl_pomdp.report.variants import groups
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 
@@ -104,6 +105,7 @@ def _row(key: tuple, one: list[Run], other: list[Run]) -> Row:
     if one and other:
         a, b = scores
         same = {run.result.id for run in one} == {run.result.id for run in other} and np.array_equal(a, b)
+        # The same runs are no two samples: an interval about 0 would tell how sure a difference is that is none.
         row["low"], row["high"] = (None if same else stats.difference_interval(b, a)) or (None, None)
         row |= {"difference": float(b.mean() - a.mean()), "settings": _differing(one, other)}
     return row

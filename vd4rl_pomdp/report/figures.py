@@ -22,8 +22,8 @@ from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.load import ACTION_ERRORS, COSTS, PROBES, REFERENCES, SETTING, labels
 from vd4rl_pomdp.runs.files import replacing_file
 
-mpl.rcParams["svg.hashsalt"] = "vd4rl-pomdp"
-mpl.rcParams["pdf.fonttype"] = 42
+mpl.rcParams["svg.hashsalt"] = "vd4rl-pomdp"  # ids in an SVG are random otherwise, and no two pages are alike
+mpl.rcParams["pdf.fonttype"] = 42  # TrueType: publishers refuse Type 3
 COLOURS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#7f7f7f")
 """Okabe and Ito's palette, which colour-blind readers can tell apart."""
 DASHES, MARKERS, HATCHES = ("-", "--", ":", "-."), "osD^", ("", "////", "....", "xxxx")

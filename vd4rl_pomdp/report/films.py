@@ -69,7 +69,7 @@ def shown_films(runs: Iterable[Run]) -> tuple[list[Shown], int]:
         still, moving = (base64.b64encode(picture).decode() for picture in (strip(film), movie(film)))
         share = min(1.0, len(film["clean"]) / STRIP_FRAMES)
         made = Shown(name, still, moving, share, film["return"][-1])
-        size += len(made.strip) + len(made.movie)
+        size += len(made.strip) + len(made.movie)  # all of it is in the page, which has to open from disk
         if size > MOST_BYTES:
             break
         shown.append(made)

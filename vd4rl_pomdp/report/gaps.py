@@ -6,14 +6,13 @@ from collections.abc import Iterable, Iterator
 from operator import attrgetter
 
 from vd4rl_pomdp.core.settings import LABELS
-from vd4rl_pomdp.report.load import ALL, CONDITION, SETTING, Choice, Run, groups, without_options
-from vd4rl_pomdp.report.variants import ENCODER_SEED
+from vd4rl_pomdp.report.load import ALL, CONDITION, SETTING, Choice, Run, without_options
+from vd4rl_pomdp.report.variants import ENCODER_SEED, groups
 from vd4rl_pomdp.runs.files import Row
 
 MISSING = "missing"
 STATE = "state"
 """The method that sees the simulator's state, whatever a setting hides."""
-_METHOD = ("algorithm", "method")
 
 
 def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:
@@ -27,7 +26,7 @@ def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:
     for setting, here in groups(grid, lambda run: run.of(SETTING)).items():
         there = {run.of((*CONDITION, "seed")): run for run in sorted(here, key=attrgetter("evaluated"))}
         seeds = sorted({run.labels["seed"] for run in here})
-        for method, mine in groups(grid, lambda run: run.of(_METHOD)).items():
+        for method, mine in groups(grid, lambda run: run.of(("algorithm", "method"))).items():
             for variant in _expected(mine, setting):
                 # A seed on the encoder of its own is one of the method, not of the variant that shares it.
                 own = {seed for seed in seeds if f"{ENCODER_SEED} {seed}" in variant.split(", ")}

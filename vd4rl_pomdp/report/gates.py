@@ -18,17 +18,15 @@ from vd4rl_pomdp.core.errors import told_apart
 from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import STATE
-from vd4rl_pomdp.report.load import REFERENCES, SETTING, Run, groups
+from vd4rl_pomdp.report.load import REFERENCES, SETTING, Run
 from vd4rl_pomdp.report.stats import interval
-from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, is_plain, of_corruption, unlike
+from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, PLAIN, PRESETS, groups, of_corruption
 from vd4rl_pomdp.runs.files import Row
 
 STATE_SHARE, ACRO_SHARE = 0.9, 0.7
 """Least shares of the data's mean return, of `state` and of `acro` under `none`."""
 PASSED, FAILED, UNKNOWN = "discriminates", "undecided at this budget", "not known to discriminate"
 GATED = (*SETTING, "algorithm")
-_NOT_PRETRAINED = ("random", STATE)
-"""Methods of which no setting of pretraining counts."""
 
 
 class Sides(NamedTuple):
@@ -82,8 +80,11 @@ def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
         ("state_share", STATE_SHARE, "state", state),
         ("acro_share", ACRO_SHARE, "acro under none", acro),
     ):
-        if row[name] is None:
-            unknown.append(_no_share(words, reference))
+        if not reference:
+            unknown.append(f"{words} was not measured")
+        elif row[name] is None:
+            told = all(run.reference.data_return is not None for run in reference)
+            unknown.append(f"the data's return is {'not above 0' if told else 'not known'}")
         elif row[name] < least:
             share = told_apart(row[name], least, 2)[0]
             missed.append(f"{words} returns {share} of the data's return, less than {least}")
@@ -95,14 +96,14 @@ def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
         unknown.append("best and random need two seeds each that differ")
     elif row["low"] <= 0:
         missed.append(f"best minus random is {row['above_random']:.0f} {interval(row['low'], row['high'], 0)}")
-    if missed:
+    if missed:  # one is enough, whatever is not known of the others
         return row | {"verdict": f"{FAILED}: {'; '.join(missed)}"}
-    told = f"{UNKNOWN}: {'; '.join(dict.fromkeys(unknown))}" if unknown else PASSED
-    return row | {"verdict": told}
+    return row | {"verdict": f"{UNKNOWN}: {'; '.join(dict.fromkeys(unknown))}" if unknown else PASSED}
 
 
 def seen_under(corruption: str, runs: Iterable[Run]) -> list[Run]:
     """Runs under a corruption, and seeds of `state` of others where it has none: nothing is hidden from it."""
+    # The setting's own first: a seed of `state` that ran under two corruptions is one seed, not two.
     found: dict[tuple[str, ...], Run] = {}
     for run in sorted(runs, key=lambda run: run.labels["corruption"] != corruption):
         if run.labels["corruption"] == corruption or run.method == STATE:
@@ -111,8 +112,10 @@ def seen_under(corruption: str, runs: Iterable[Run]) -> list[Run]:
 
 
 def as_it_is(method: str, runs: Iterable[Run], history: str = "method") -> list[Run]:
-    """The runs of a method as it is: those that add nothing to it but a history."""
-    return [run for run in runs if run.method == method and is_plain(run.settings, history)]
+    """The runs of a method as it is: those that add nothing to it but a history. What is not recorded adds nothing."""
+    plain = (PLAIN | {"history": history}).items()
+    mine = [run for run in runs if run.method == method]
+    return [run for run in mine if all(run.settings.get(name, PLAIN[name]) == value for name, value in plain)]
 
 
 def best_of(runs: Iterable[Run]) -> list[Run]:
@@ -142,6 +145,7 @@ def seeds_by_variant(runs: Iterable[Run]) -> list[list[Run]]:
 
 def _preference(*compared: list[Run]) -> tuple[int, float]:
     """How many have more than one seed, and the sum of their mean returns."""
+    # Otherwise a single lucky seed would be the best method, and no interval could say how lucky.
     return sum(len(seeds) > 1 for seeds in compared), sum(float(returns_of(seeds).mean()) for seeds in compared)
 
 
@@ -150,11 +154,12 @@ def _unlike(one: Run, other: Run) -> list[str]:
 
     Of a method that is not pretrained, only settings of fine-tuning count.
     """
-    names = (one.settings.keys() & other.settings.keys()) - of_corruption(one.settings).keys()
+    names = (one.settings.keys() & other.settings.keys()) - PLAIN.keys() - of_corruption(one.settings).keys()
     for run in (one, other):
-        if run.method in _NOT_PRETRAINED:
+        if run.method in ("random", STATE):
             names &= settings_of(run.record["config"]).keys() | {DATA[0]}
-    return unlike(one.settings, other.settings, names)
+    found = [name for name in one.settings if name in names and one.settings[name] != other.settings[name]]
+    return [name for name in found if name in PRESETS] or found  # a preset stands for what it decides
 
 
 def returns_of(runs: list[Run]) -> np.ndarray:
@@ -185,11 +190,3 @@ def _share(runs: list[Run]) -> float | None:
     data = [run.reference.data_return for run in runs]
     known = [value for value in data if value is not None and value > 0]
     return float((returns_of(runs) / known).mean()) if runs and len(known) == len(runs) else None
-
-
-def _no_share(words: str, runs: list[Run]) -> str:
-    """Why the share of a reference is not known."""
-    if not runs:
-        return f"{words} was not measured"
-    told = all(run.reference.data_return is not None for run in runs)
-    return f"the data's return is {'not above 0' if told else 'not known'}"

@@ -6,11 +6,11 @@ A number of a table goes this way: rows of `episodes.csv` (`runs.results`), a `R
 
 from __future__ import annotations
 
-from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field, replace
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -23,10 +23,11 @@ from vd4rl_pomdp.report.variants import (
     Parts,
     Settings,
     differences,
+    groups,
     of_corruption,
-    of_sets,
     read_settings,
     without,
+    without_sets,
 )
 from vd4rl_pomdp.runs import REFERENCE_FILE
 from vd4rl_pomdp.runs.episodes import COLUMNS
@@ -52,17 +53,6 @@ TOLD_STATES = ("supervised", "supervised+a")
 """Methods whose encoders are trained on the simulator's states, those of the episodes that a probe holds out, too."""
 REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, "state")
 """Methods that are references, floors and ceilings: last in a table."""
-
-Member = TypeVar("Member")
-Key = TypeVar("Key", bound=Hashable)
-
-
-def groups(members: Iterable[Member], key: Callable[[Member], Key]) -> dict[Key, list[Member]]:
-    """Members by key, keys in the order in which they first come."""
-    found: dict[Key, list[Member]] = {}
-    for member in members:
-        found.setdefault(key(member), []).append(member)
-    return found
 
 
 class Choice:
@@ -105,8 +95,6 @@ class Run:
     """What its policy is held against."""
     measures: dict[str, float | None]
     """Of its encoder and costs: action_loss, PROBES, COSTS; None where it is not known."""
-    of_set: Settings = field(default_factory=dict)
-    """Its settings that go by the set, such as a budget; they make no variants."""
     parts: Parts = ("", "")
     """Its settings that differ from those of other runs of its method, by the runs it is compared with."""
 
@@ -220,11 +208,7 @@ def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choi
     Raises:
         UserError: there is no run, two have the same identity, or a file of one is damaged.
     """
-    runs = [_load(result) for result in choice.among(find_results(paths, but))]
-    runs = [replace(run, of_set=own) for run, own in zip(runs, _of_sets(runs), strict=True)]
-    corruptions = _corruptions(runs)
-    runs = [replace(run, labels=run.labels | {"corruption": c}) for run, c in zip(runs, corruptions, strict=True)]
-    runs = [replace(run, parts=parts) for run, parts in zip(runs, _variants(runs), strict=True)]
+    runs = _told_apart([_load(result) for result in choice.among(find_results(paths, but))])
     seen: dict[tuple[Any, ...], Path] = {}
     for run in runs:
         other = seen.setdefault(run.of(IDENTITY), run.path) if run.rows else run.path
@@ -249,57 +233,29 @@ def _load(result: Result) -> Run:
         return Run(result, result.labels, read_settings(result.record, result.card), reference, told)
 
 
-def _of_sets(runs: list[Run]) -> list[Settings]:
-    """Each run's settings that go by its set.
-
-    A corruption's options do if they do in all runs, since it has one name whatever learns under it; other settings if
-    they do in all runs of one stage and algorithm.
-    """
-    found = of_sets([of_corruption(run.settings) for run in runs], [run.set_name for run in runs])
-    for places in groups(range(len(runs)), lambda i: (runs[i].stage, runs[i].labels["algorithm"])).values():
-        others = [without(runs[i].settings, of_corruption(runs[i].settings)) for i in places]
-        for i, own in zip(places, of_sets(others, [runs[i].set_name for i in places]), strict=True):
-            found[i] = dict(sorted((found[i] | own).items()))
-    return found
-
-
-def _corruptions(runs: list[Run]) -> list[str]:
-    """What hides pixels from each run, in words: its name, and the options in which others of the name differ."""
-    settings = [
-        {name.removeprefix(OF_CORRUPTION): value for name, value in of_corruption(own).items()} for own in _own(runs)
+def _told_apart(runs: list[Run]) -> list[Run]:
+    """Runs with their `parts`, and with the options in which others of their corruption's name differ beside it."""
+    sets, names = [run.set_name for run in runs], [run.labels["corruption"] for run in runs]
+    stages = [(run.stage, run.labels["algorithm"]) for run in runs]
+    methods = [(*stage, run.method) for stage, run in zip(stages, runs, strict=True)]
+    # All runs are alike in what hides pixels: a corruption has one name, whatever learns under it.
+    hiding = without_sets([of_corruption(run.settings) for run in runs], sets, [""] * len(runs))
+    own = without_sets([without(run.settings, of_corruption(run.settings)) for run in runs], sets, stages)
+    options = differences(
+        [{name.removeprefix(OF_CORRUPTION): value for name, value in one.items()} for one in hiding], names
+    )
+    corruptions = [
+        name if name == "none" else ", ".join(filter(None, (name, told)))
+        for name, told in zip(names, options, strict=True)
     ]
-    words = _differences(runs, settings, lambda run: run.labels["corruption"])
-    names = [run.labels["corruption"] for run in runs]
-    told = zip(names, words, strict=True)
-    return [name if name == "none" else ", ".join(filter(None, (name, options))) for name, options in told]
-
-
-def _variants(runs: list[Run]) -> list[Parts]:
-    """The settings in which each run differs from others of its stage, method and algorithm, and their data."""
-    methods = [without(own, {*of_corruption(own), *DATA}) for own in _own(runs)]
-    data = [{name: own[name] for name in DATA if name in own} for own in _own(runs)]
-    of_methods = _differences(runs, methods, _method)
-    of_data = _differences(runs, data, lambda run: (*_method(run), run.set_name, run.labels["corruption"]))
-    return list(zip(of_methods, of_data, strict=True))
-
-
-def _method(run: Run) -> tuple[str, str, str]:
-    return run.stage, run.labels["algorithm"], run.method
-
-
-def _own(runs: list[Run]) -> list[Settings]:
-    """The runs' settings, without what goes by the set."""
-    return [without(run.settings, run.of_set) for run in runs]
-
-
-def _differences(runs: list[Run], settings: list[Settings], alike: Callable[[Run], Hashable]) -> list[str]:
-    """What differs of some settings among the runs that are alike, run by run; nothing where none are recorded."""
-    words = [""] * len(runs)
-    recorded = [i for i, own in enumerate(settings) if own]
-    for places in groups(recorded, lambda i: alike(runs[i])).values():
-        for i, told in zip(places, differences([settings[i] for i in places]), strict=True):
-            words[i] = told
-    return words
+    of_methods = differences([without(one, DATA) for one in own], methods)
+    # Two sets always differ in their fingerprints; only two contents of one set make another experiment.
+    data = [{name: one[name] for name in DATA if name in one} for one in own]
+    of_data = differences(data, list(zip(methods, sets, corruptions, strict=True)))
+    return [
+        replace(run, labels=run.labels | {"corruption": corruption}, parts=(of_method, of_set))
+        for run, corruption, of_method, of_set in zip(runs, corruptions, of_methods, of_data, strict=True)
+    ]
 
 
 def episodes_frame(runs: Iterable[Run]) -> pd.DataFrame:
@@ -330,7 +286,8 @@ _RUN = (
 
 
 def _run_row(run: Run) -> Row:
-    scores = {step: np.mean([row["score"] for row in rows]) for step, rows in groups(run.rows, _step).items()}
+    by_step = groups(run.rows, lambda row: int(row["step"]))
+    scores = {step: np.mean([row["score"] for row in rows]) for step, rows in by_step.items()}
     best = max(scores, key=scores.__getitem__)
     row: Row = {"id": run.result.id, "state": run.progress, "machine": run.result.machine}
     row |= {"git_commit": run.result.commit, "data_return": run.reference.data_return}
@@ -340,7 +297,3 @@ def _run_row(run: Run) -> Row:
         summed = summarise(episodes, run.reference) if episodes else {}
         row |= {prefix + name: summed.get(key) for name, key in CONTROL.items()}
     return row
-
-
-def _step(row: Row) -> int:
-    return row["step"]

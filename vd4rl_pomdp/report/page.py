@@ -9,7 +9,7 @@ runs.jsonl, episodes.csv         the raw rows that everything is made of, see `v
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import NamedTuple
 
@@ -36,7 +36,6 @@ from vd4rl_pomdp.report.load import (
     Choice,
     Run,
     episodes_frame,
-    groups,
     label,
     labels,
     load_runs,
@@ -47,14 +46,13 @@ from vd4rl_pomdp.report.load import (
 from vd4rl_pomdp.report.render import Block, Columns, block, render, terminal, texts, write_latex
 from vd4rl_pomdp.report.stats import FEW_SEEDS, number, with_interval
 from vd4rl_pomdp.report.theory import load_section
+from vd4rl_pomdp.report.variants import groups
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.runs.outputs import refuse_foreign
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.results import RUNS, refuse_loss, write_results
 
 MARK = "summary"
 """The table that is always there: its file tells a report's folder."""
-FIGURES = "figures"
 WIDEST = 6
 """Methods side by side in a matrix, at most: the others are put below."""
 SEEDS = 12
@@ -98,7 +96,7 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
     refuse_foreign(out, "report", f"{MARK}.csv", RUNS)
     runs = load_runs(paths, out, choice)
     results = [run.result for run in runs]
-    refuse_loss(results, out)
+    refuse_loss(results, out)  # early: drawing takes most of the time
     if not any(run.rows for run in runs):
         mazes = all(run.stage == "navigation" for run in runs)
         told = "`vd4rl-pomdp navigation report` reports its mazes" if mazes else "`vd4rl-pomdp finetune` evaluates"
@@ -112,7 +110,7 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
         refuse_loss(results, out)  # of runs that were added while this was drawn
         _write(out, made, shown, plots)
         write_results(out, results)
-        write_text(out / "index.html", page)
+        write_text(out / "index.html", page)  # last: whoever sees it finds what it links to
     return Report(out / "index.html", made[MARK], judged, claimed, mixed)
 
 
@@ -305,16 +303,15 @@ def _blocks(name: str, table: pd.DataFrame, rows: pd.DataFrame, words: int) -> I
                 columns = matrix.iloc[:, start : start + WIDEST].reset_index().rename_axis(columns=None)
                 yield block(str(heading), columns, words, seeds_note(mine["seeds"]))
         else:
-            note = seeds_note(mine["seeds"]) + (_told_note(mine["method"]) if name == "representations" else "")
+            note = seeds_note(mine["seeds"])
+            told = [method for method in dict.fromkeys(mine["method"]) if method in TOLD_STATES]
+            if name == "representations" and told:
+                # A linear probe reads easily what the encoder was trained to tell.
+                names = " and ".join(told)
+                note += f" {names}: trained on the states of all episodes, those that the probe holds out, too."
             if "not there" in shown and not shown["not there"].any():
                 shown = shown.drop(columns="not there")
             yield block(str(heading), shown, words, note)
-
-
-def _told_note(methods: Iterable[str]) -> str:
-    """What the probes of methods that regress the states are not."""
-    names = " and ".join(method for method in dict.fromkeys(methods) if method in TOLD_STATES)
-    return f" {names}: trained on the states of all episodes, those that the probe holds out, too." if names else ""
 
 
 NOTES = {
@@ -357,7 +354,14 @@ def _page(
         score=tables.SCORE,
         finished=sum(run.finished for run in runs),
         unfinished=[
-            (f"{title(run)}, seed {run.labels['seed']}", str(run.path), _state(run)) for run in runs if not run.finished
+            (
+                f"{title(run)}, seed {run.labels['seed']}",
+                run.path,
+                (run.result.diverged or {}).get("message"),
+                run.progress,
+            )
+            for run in runs
+            if not run.finished
         ],
         gaps=len(made["missing"]),
         rows=sum(len(run.result.rows) for run in runs),
@@ -375,7 +379,7 @@ def _page(
 
 def _write(out: Path, made: dict[str, pd.DataFrame], shown: dict[str, Shown], plots: dict[str, list[Plot]]) -> None:
     """Every table as CSV and LaTeX, and every figure; those that an earlier report had and this has not are removed."""
-    folder = out / FIGURES
+    folder = out / "figures"
     with disk_errors(out):
         folder.mkdir(exist_ok=True)
     for name, table in made.items():
@@ -395,12 +399,6 @@ def _write(out: Path, made: dict[str, pd.DataFrame], shown: dict[str, Shown], pl
         of_report = path.suffix in (".csv", ".png", ".pdf") and path.stem.partition("_")[0] in plots
         if of_report and path.stem not in {plot.name for plot in drawn}:
             path.unlink()
-
-
-def _state(run: Run) -> str:
-    """How far it is, and why no further."""
-    message = (run.result.diverged or {}).get("message")
-    return f"{run.progress}: {message}" if message else run.progress
 
 
 def unlike(runs: list[Run]) -> list[str]:

@@ -122,6 +122,8 @@ def difference_interval(scores: np.ndarray, others: np.ndarray) -> Interval | No
 
 def _t_interval(middle: float, seeds: list[np.ndarray], episodes: list[np.ndarray]) -> Interval | None:
     """About a sum of means, one for each array of values; the episodes' count where there are two or more."""
+    # No bootstrap: resampled means of three seeds spread by sqrt(2/3) standard errors, and their percentiles know no
+    # t distribution. Its 95% interval would hold the mean three times in four.
     if _single(seeds):
         return None
     parts = [*seeds, *(part for part in episodes if len(part) > 1)]
@@ -129,6 +131,7 @@ def _t_interval(middle: float, seeds: list[np.ndarray], episodes: list[np.ndarra
     free = np.array([len(part) - 1 for part in parts])
     if not errors.any():
         return None
+    # Welch and Satterthwaite: the degrees of freedom of a sum of variances, each known as well as its own count allows.
     reach = stdtrit(errors.sum() ** 2 / (errors**2 / free).sum(), 0.975) * math.sqrt(errors.sum())
     return float(middle - reach), float(middle + reach)
 
@@ -149,6 +152,7 @@ def bootstrap_intervals(
     """
     if _single(strata):
         return dict.fromkeys(statistics)
+    # Within tasks alone: what tells one task from another is no part of how far another seed would fall.
     drawn = [scores[rng.integers(len(scores), size=(replicates, len(scores)))] for scores in strata]
     samples = np.concatenate(drawn, axis=1)
     return {name: _ends(statistic(samples)) for name, statistic in statistics.items()}
@@ -187,6 +191,7 @@ def _single(strata: Strata) -> bool:
 
 def _shares(count: int, rng: np.random.Generator, replicates: int) -> np.ndarray:
     """(replicates, count): the share that each of `count` seeds has in a bootstrap sample."""
+    # A sample is told by how often it has each seed: statistics that are linear in it become one matrix product.
     drawn = rng.integers(count, size=(replicates, count)) + count * np.arange(replicates)[:, None]
     return np.bincount(drawn.ravel(), minlength=replicates * count).reshape(replicates, count) / count
 

@@ -67,6 +67,7 @@ def summary(evaluated: pd.DataFrame, gaps: pd.DataFrame, unranked: Collection[tu
     )
     table = pd.DataFrame(found, columns=list(columns))
     places = table[list(SETTING)].itertuples(index=False, name=None)
+    # Where a gate is missed an order by score would be read as a ranking of methods.
     by_name = pd.Series([place in unranked for place in places], table.index, dtype=bool)
     return _ordered(table, -table["score"].astype(float).mask(by_name, 0.0), labels(table))
 
@@ -138,6 +139,7 @@ def aggregate(evaluated: pd.DataFrame, gaps: pd.DataFrame) -> pd.DataFrame:
 
 def _aggregates(strata: stats.Strata) -> Row:
     scores, chosen = np.concatenate(strata), stats.aggregates(strata)
+    # Always the same draws: the same rows make the same page, to the byte.
     intervals = stats.bootstrap_intervals(strata, chosen, np.random.default_rng(0))
     found: Row = {}
     for name, statistic in chosen.items():

@@ -78,18 +78,13 @@ def table_rows(study: Study) -> list[Row]:
     for worlds in zip(*study["tables"].values(), strict=True):
         method = worlds[0]["method"]
         printed = study["printed"][method.removesuffix(" literal")]
-        entries = {column: [_mark(printed[column]), *(_entry(row, column) for row in worlds)] for column in COLUMNS}
+        entries: dict[str, list[str]] = {}
+        for column in COLUMNS:
+            mark, *marks = ("yes" if row[column] else "no" for row in (printed, *worlds))
+            claimed = (row["decodes_past"] and row["decodes_end"] for row in worlds)
+            entries[column] = [mark, *(m if holds else f"({m})" for m, holds in zip(marks, claimed, strict=True))]
         rows.append({"method": method, "entries": entries})
     return rows
-
-
-def _entry(row: Row, column: str) -> str:
-    mark = _mark(row[column])
-    return mark if row["decodes_past"] and row["decodes_end"] else f"({mark})"
-
-
-def _mark(value: bool) -> str:
-    return "yes" if value else "no"
 
 
 def print_theory(study: Study) -> None:

@@ -6,8 +6,8 @@ run has its own config, its encoder's, and the data of both.
 
 from __future__ import annotations
 
-from collections.abc import Collection, Mapping, Sequence
-from typing import Any
+from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
+from typing import Any, TypeVar
 
 from vd4rl_pomdp.core.settings import LATER, settings_of
 from vd4rl_pomdp.corruptions import corruption_settings
@@ -18,7 +18,7 @@ Parts = tuple[str, str]
 """What differs among all runs of a method, and of the data among those of one setting."""
 
 _UNSET = "unset"
-_PRESETS = ("preset", "pretraining preset")
+PRESETS = ("preset", "pretraining preset")
 DATA = ("data", "pretraining data")
 """Names of the sets' fingerprints."""
 OF_CORRUPTION = "corruption "
@@ -31,8 +31,17 @@ PLAIN = {
     **LATER,
 }
 """Values that add nothing to a method: what has them goes by the method's name, and others are its variants."""
-_LABELS = ("method", "task", "quality")
-"""Fields that are a run's labels, not its settings."""
+
+Member = TypeVar("Member")
+Key = TypeVar("Key", bound=Hashable)
+
+
+def groups(members: Iterable[Member], key: Callable[[Member], Key]) -> dict[Key, list[Member]]:
+    """Members by key, keys in the order in which they first come."""
+    found: dict[Key, list[Member]] = {}
+    for member in members:
+        found.setdefault(key(member), []).append(member)
+    return found
 
 
 def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Settings:
@@ -50,7 +59,7 @@ def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Setting
     found = own | {(f"pretraining {k}" if k in own else k): v for k, v in without(before, hiding).items()}
     found |= {OF_CORRUPTION + name: value for name, value in hiding.items()}
     found |= {"format": record["format"]} if "format" in record else {}
-    words = {name: _words(value) for name, value in found.items() if name not in _LABELS}
+    words = {name: _words(value) for name, value in found.items() if name not in ("method", "task", "quality")}
     if card.get("seed", record["config"]["seed"]) != record["config"]["seed"]:
         words[ENCODER_SEED] = str(card["seed"])
     data, first = record.get("inputs", {}).get("data"), card.get("data")
@@ -68,18 +77,6 @@ def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, An
     return {name: value for name, value in settings.items() if name not in names}
 
 
-def is_plain(settings: Settings, history: str = "method") -> bool:
-    """Whether settings add nothing to a method but a history; what is not recorded adds nothing."""
-    wanted = PLAIN | {"history": history}
-    return all(settings.get(name, PLAIN[name]) == value for name, value in wanted.items())
-
-
-def unlike(one: Settings, other: Settings, names: Collection[str]) -> list[str]:
-    """Which of some settings differ, but for what a method is named by; a preset stands for the others."""
-    found = [name for name in one if name in names and name not in PLAIN and one[name] != other[name]]
-    return [name for name in found if name in _PRESETS] or found
-
-
 def _words(value: Any) -> str:
     if isinstance(value, bool):
         return "yes" if value else "no"
@@ -88,26 +85,36 @@ def _words(value: Any) -> str:
     return f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def of_sets(settings: Sequence[Settings], sets: Sequence[str]) -> list[Settings]:
-    """Of each run the settings that go by the set, such as a budget: all runs on a set agree in them, sets differ.
+def without_sets(settings: Sequence[Settings], sets: Sequence[str], alike: Sequence[Hashable]) -> list[Settings]:
+    """Settings but those that go by the set, such as a budget: runs on one set agree in them, and the sets differ.
 
     Args:
-        settings: of all runs that are looked at together.
-        sets: task and quality of each run.
+        settings: of every run.
+        sets: task and quality of every run.
+        alike: what runs share that are looked at together.
     """
-    values: dict[str, dict[str, set[str]]] = {}
-    for one, place in zip(settings, sets, strict=True):
-        for name in one.keys() - {ENCODER_SEED, *DATA}:
-            values.setdefault(name, {}).setdefault(place, set()).add(one[name])
-    own = [
-        name
-        for name, by_set in values.items()
-        if all(len(found) == 1 for found in by_set.values()) and len(set().union(*by_set.values())) > 1
-    ]
-    return [{name: one[name] for name in sorted(own) if name in one} for one in settings]
+    # A task's own budget is no ablation: as a variant it would make two methods of one, and gaps on every other task.
+    kept = [dict(one) for one in settings]
+    for places in groups(range(len(settings)), alike.__getitem__).values():
+        for name in {name for i in places for name in settings[i]} - {ENCODER_SEED, *DATA}:
+            having = groups((i for i in places if name in settings[i]), sets.__getitem__)
+            values = [{settings[i][name] for i in mine} for mine in having.values()]
+            if all(len(found) == 1 for found in values) and len(set().union(*values)) > 1:
+                for i in places:
+                    kept[i].pop(name, None)
+    return kept
 
 
-def differences(settings: Sequence[Settings]) -> list[str]:
+def differences(settings: Sequence[Settings], alike: Sequence[Hashable]) -> list[str]:
+    """What differs of each run's settings among those that are alike, in words; nothing where none are recorded."""
+    words = [""] * len(settings)
+    for places in groups((i for i, own in enumerate(settings) if own), alike.__getitem__).values():
+        for i, told in zip(places, _differences([settings[i] for i in places]), strict=True):
+            words[i] = told
+    return words
+
+
+def _differences(settings: Sequence[Settings]) -> list[str]:
     """What differs among some settings: "max_k 1, steps 20"; nothing for a value that adds nothing.
 
     ENCODER_SEED is told even where it does not differ: no other name says that seeds share an encoder. A preset is
@@ -120,7 +127,7 @@ def differences(settings: Sequence[Settings]) -> list[str]:
     everywhere = [name for name, column in columns.items() if _UNSET not in column]
     columns = {name: column for name, column in columns.items() if not _decided(name, columns, everywhere)}
     presets: list[str] = []
-    for name in _PRESETS:
+    for name in PRESETS:
         if name in columns and not _decided(name, columns, presets):
             presets.append(name)
     columns = {name: column for name, column in columns.items() if not _decided(name, columns, presets)}

@@ -38,7 +38,7 @@ class Checkpoints:
         with disk_errors(self._folder):
             self._folder.mkdir(parents=True, exist_ok=True)
             write_bytes(self._path(step), pack({"format": FORMAT, "seconds": round(seconds, 2), "state": state}))
-            synchronise(self._folder)
+            synchronise(self._folder)  # before the oldest goes: a power cut would else leave neither
             self.prune(KEPT)
 
     def restore(self, take: Callable[[State], None]) -> float | None:
@@ -47,6 +47,7 @@ class Checkpoints:
         Raises:
             UserError: there are some, but none is whole, or they are of another format or run, or not readable.
         """
+        # A disk may give back other bytes than it took: the one before is worth more than a run begun again.
         damaged: dict[Path, str] = {}
         for path in map(self._path, self.steps()):
             content = read_bytes(path)
@@ -57,7 +58,20 @@ class Checkpoints:
                 continue
             for other, problem in damaged.items():
                 print(f"warning: {other}: is damaged ({problem}); resuming from step {path.stem}", file=sys.stderr)
-            self._hand_over(path, found, take)
+            if (stored := found["format"]) != FORMAT:
+                raise UserError(
+                    f"{path}: is a checkpoint of format {stored}, this version writes format {FORMAT} and cannot "
+                    "resume from it; choose another --out"
+                )
+            try:
+                take(found["state"])
+            except (UserError, torch.OutOfMemoryError):
+                raise
+            except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
+                raise UserError(
+                    f"{path}: this checkpoint does not fit the run ({first_line(error)}); choose another --out, or "
+                    f"remove {self._folder} to start the run again"
+                ) from error
             return float(found["seconds"])
         for path, problem in damaged.items():
             raise UserError(
@@ -65,22 +79,6 @@ class Checkpoints:
                 "start the run again"
             )
         return None
-
-    def _hand_over(self, path: Path, found: State, take: Callable[[State], None]) -> None:
-        if (stored := found["format"]) != FORMAT:
-            raise UserError(
-                f"{path}: is a checkpoint of format {stored}, this version writes format {FORMAT} and cannot resume "
-                "from it; choose another --out"
-            )
-        try:
-            take(found["state"])
-        except (UserError, torch.OutOfMemoryError):
-            raise
-        except (ValueError, KeyError, TypeError, RuntimeError, AttributeError) as error:
-            raise UserError(
-                f"{path}: this checkpoint does not fit the run ({first_line(error)}); choose another --out, or remove "
-                f"{self._folder} to start the run again"
-            ) from error
 
     def prune(self, kept: int) -> None:
         """Drop all but the newest `kept` checkpoints, and the remains of interrupted writes."""

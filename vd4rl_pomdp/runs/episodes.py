@@ -21,17 +21,12 @@ COLUMNS = (
 )
 
 
-def begin_episodes(path: Path) -> None:
-    """Make an `episodes.csv` without rows, unless there is one, so that a path that cannot be written is known early.
+def append_episodes(path: Path, rows: list[Row]) -> None:
+    """Append rows to an `episodes.csv`, which gets a header first; without rows it is begun, or found to be writable.
 
     Raises:
         UserError: the file cannot be written, is of another kind, or is damaged; it stays as it is.
     """
-    append_episodes(path, [])
-
-
-def append_episodes(path: Path, rows: list[Row]) -> None:
-    """Append rows to an `episodes.csv`, writing its header first; another kind of file raises UserError untouched."""
     there = read_episodes(path)
     with appending(path) as file:
         writer = csv.DictWriter(file, list(there[0]) if there else COLUMNS, lineterminator="\n")

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import csv
 import hashlib
-import io
 import json
-import math
 import os
 import secrets
-from collections.abc import Collection, Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import IO, Any
@@ -46,12 +44,7 @@ def read_json(path: Path) -> dict[str, Any]:
 def write_json(path: Path, value: Any, shared: bool = False) -> None:
     """Write a JSON file so that a reader sees it whole or not at all; `shared` as in `replacing_file`."""
     with replacing_file(path, shared) as fresh:
-        fresh.write_text(json_text(value), encoding="utf-8")
-
-
-def json_text(value: Any) -> str:
-    """A JSON file's content."""
-    return json.dumps(value, indent=2) + "\n"
+        fresh.write_text(json.dumps(value, indent=2) + "\n", encoding="utf-8")
 
 
 def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
@@ -62,31 +55,9 @@ def write_csv(path: Path, columns: Sequence[str], rows: Iterable[Row]) -> None:
         writer.writerows(rows)
 
 
-def read_csv(path: Path, columns: Sequence[str], words: Collection[str]) -> list[Row]:
-    """Rows of a CSV file that `write_csv` wrote, its values as text; none if there is no file.
-
-    Args:
-        path: the file.
-        columns: all of its columns, in order.
-        words: columns that may hold any text; the others hold finite numbers.
-
-    Raises:
-        UserError: the file has other columns, or is damaged.
-    """
-    if not path.exists():
-        return []
-    try:
-        reader = csv.DictReader(io.StringIO(read_bytes(path).decode(), newline=""))
-        if tuple(reader.fieldnames or ()) != tuple(columns):
-            raise UserError(f"{path}: has other columns than {', '.join(columns)}; remove it or choose another --out")
-        rows = list(reader)
-        if not all(math.isfinite(float(row[name])) for row in rows for name in columns if name not in words):
-            raise ValueError("a number is not finite")
-    except UserError:
-        raise
-    except (ValueError, TypeError, csv.Error) as error:
-        raise UserError(f"{path}: is damaged ({error}); remove it or choose another --out") from error
-    return rows
+def content_hash(told: Any) -> str:
+    """Name of what can be written as JSON, 24 characters."""
+    return hashlib.blake2b(json.dumps(told, sort_keys=True).encode(), digest_size=12).hexdigest()
 
 
 def sha256(path: Path) -> str:
@@ -118,6 +89,7 @@ def replacing_file(path: Path, shared: bool = False) -> Iterator[Path]:
     with disk_errors(path):
         try:
             yield fresh
+            # The content before the name: renamed first, a power cut could leave the name on an empty file.
             synchronise(fresh)
             fresh.replace(path)
         finally:

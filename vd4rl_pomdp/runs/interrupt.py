@@ -51,6 +51,7 @@ def handled(second: signal.Handlers | None = None) -> Iterator[None]:
     before = {number: old for number, old in before.items() if old not in (None, signal.SIG_IGN)}
 
     def answer(number: int, frame: FrameType | None) -> None:
+        # Whoever presses Ctrl-C twice does not want to wait for a checkpoint.
         for other, old in before.items():
             signal.signal(other, old if second is None else second)
         if sys.stderr.isatty():

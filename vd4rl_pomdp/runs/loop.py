@@ -32,7 +32,7 @@ class Loop:
     """The steps that are left of a training; made by `training`.
 
     for step in loop:
-        loop.add(learner.update())  # which adds one to `learner.step`
+        loop.add(losses_of_one_step())  # the body does the step and counts it in `learner.step`
         if loop.due(config.log_every):
             loop.log("loss")
     """
@@ -49,6 +49,7 @@ class Loop:
         while self._learner.step < self._total:
             yield self._learner.step + 1
             self._progress.advance()
+            # Here alone is a step whole: weights, optimiser and random streams are all of the same step.
             if self.due(self._run.config["checkpoint_every"]) or interrupt.asked():
                 self.save()
 

@@ -13,7 +13,7 @@ import sys
 import time
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal, Protocol
+from typing import Any, Literal, Protocol
 
 import torch
 from torch import Tensor
@@ -22,10 +22,7 @@ from vd4rl_pomdp.core.errors import UserError, in_one_line
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs import METRICS_FILE
 from vd4rl_pomdp.runs.files import appending, write_bytes
-from vd4rl_pomdp.runs.identity import recipe
-
-if TYPE_CHECKING:
-    from vd4rl_pomdp.runs.run import RunFolder
+from vd4rl_pomdp.runs.run import RunFolder, recipe
 
 WandbMode = Literal["off", "offline", "online"]
 EVALUATION = "eval/"
@@ -101,7 +98,12 @@ class MetricsLog:
             mirrors: by name, what opens a mirror, given the rows up to that step: it may lack any.
         """
         self._path = path
-        kept = [row for row in read_metrics(path) if row["step"] < step + (not _is_evaluation(row))]
+        # The checkpoint's own step is trained, but not evaluated: that follows it, and is done again.
+        kept = [
+            row
+            for row in read_metrics(path)
+            if row["step"] < step or (row["step"] == step and not any(name.startswith(EVALUATION) for name in row))
+        ]
         write_bytes(path, "".join(json.dumps(row) + "\n" for row in kept).encode())
         self._mirrors: dict[str, Mirror] = {}
         for name, opened in (mirrors or {}).items():
@@ -156,10 +158,6 @@ def _row(line: str) -> dict[str, float]:
     if not isinstance(row, dict) or "step" not in row or not all(isinstance(v, int | float) for v in row.values()):
         raise ValueError("it holds no numbers with their step")
     return row
-
-
-def _is_evaluation(row: Metrics) -> bool:
-    return any(name.startswith(EVALUATION) for name in row)
 
 
 def mirrors_of(

@@ -1,18 +1,28 @@
-"""Where a command may write: neither over another command's files nor into their folder.
+"""Where a command may write: neither over another command's files, nor into their folder, nor beside another process.
 
-A folder belongs to the run, policy, encoder or data set in it. Every command checks its --out here first.
+A folder belongs to the run, policy, encoder or data set in it. Every command checks its --out here first. While one is
+being written, its process owns it by a lock of the system's, which is free when that process has ended.
 """
 
 from __future__ import annotations
 
 import os
+import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
+from datetime import UTC, datetime
 from pathlib import Path
 
-from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_error
+from filelock import FileLock, Timeout
+
+from vd4rl_pomdp.core.errors import InUseError, UnavailableError, UserError, disk_error, disk_errors
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
 from vd4rl_pomdp.runs import CONFIG_FILE
+from vd4rl_pomdp.runs.interrupt import handled
 
-_SET_FILES = (".hdf5", ".h5")
+LOCK = ".lock"
+_WAIT_S = 0.2
+"""`in_use` holds a free lock for a moment, which keeps nobody from owning the folder."""
 
 
 def refuse_inside(out: Path) -> None:
@@ -50,20 +60,17 @@ def kept_in(folder: Path) -> str | None:
             return "an encoder"
         if names & {"curve.csv", "snapshots"}:
             return "a policy"
-        if _is_run(folder / CONFIG_FILE):
+        # Other programs have a config.json, too: what has a stage is this package's.
+        try:
+            record = parse_json(read_bytes(folder / CONFIG_FILE))
+        except UnavailableError:
+            raise
+        except (FileNotFoundError, ValueError):
+            record = None
+        if isinstance(record, dict) and "stage" in record:
             return "a run"
-    is_set = "collection.json" in names or any(name.lower().endswith(_SET_FILES) for name in names)
+    is_set = "collection.json" in names or any(name.lower().endswith((".hdf5", ".h5")) for name in names)
     return "a data set" if is_set else None
-
-
-def _is_run(config: Path) -> bool:
-    try:
-        record = parse_json(read_bytes(config))
-    except UnavailableError:
-        raise
-    except (FileNotFoundError, ValueError):
-        return False
-    return isinstance(record, dict) and "stage" in record
 
 
 def _names(folder: Path) -> list[str]:
@@ -74,3 +81,45 @@ def _names(folder: Path) -> list[str]:
         if isinstance(told := disk_error(folder, error), UnavailableError):
             raise told from error
         return []
+
+
+@contextmanager
+def owned(folder: Path) -> Iterator[None]:
+    """Own a folder, made if missing, and answer signals as `interrupt` says; the system frees what a killed one owned.
+
+    Raises:
+        InUseError: another process owns it, which the message names.
+        UserError: it cannot be written.
+    """
+    with disk_errors(folder):
+        folder.mkdir(parents=True, exist_ok=True)
+        lock = FileLock(folder / LOCK)
+        try:
+            lock.acquire(timeout=_WAIT_S, poll_interval=_WAIT_S / 10)
+        except Timeout:
+            owner = (folder / LOCK).read_text(encoding="utf-8") or "another process"
+            raise InUseError(f"{folder}: is in use by {owner}; wait until it ends, or choose another folder") from None
+    try:
+        since = datetime.now(UTC).strftime("%Y-%m-%d %H:%M:%S UTC")
+        with disk_errors(folder):
+            (folder / LOCK).write_text(
+                f"process {os.getpid()} on {socket.gethostname()} since {since}", encoding="utf-8"
+            )
+        with handled():
+            yield
+    finally:
+        # Deleted while it is still held, and never by anyone else: FileLock takes no lock on a name that is gone, so
+        # whoever waits makes a new file. Deleted after the release it could be another owner's, and there were two.
+        (folder / LOCK).unlink(missing_ok=True)
+        lock.release()
+
+
+def in_use(folder: Path) -> bool:
+    """Whether a process owns a folder, or seems to where this one may not look."""
+    if not (folder / LOCK).exists():
+        return False
+    try:
+        with FileLock(folder / LOCK).acquire(timeout=0):
+            return False
+    except (Timeout, PermissionError):
+        return True

@@ -61,17 +61,13 @@ class ProgressLine:
         a_tenth_on = self._done - done >= max(1, (self._total - self._first[0]) // self._PLAIN_LINES)
         if a_tenth_on or now - then >= self._PLAIN_S or self._done == self._total:
             self._plain = self._done, now
-            parts = [f"{self._title}: {self._done}/{self._total} {self._unit}", self._note, self._pace(now)]
-            print("  ".join(part for part in parts if part), file=self._console.file, flush=True)
-
-    def _pace(self, now: float) -> str:
-        """Speed since the start, and the time that is left at it."""
-        start, then = self._first
-        if now <= then or self._done <= start:
-            return ""
-        speed = (self._done - start) / (now - then)
-        left = timedelta(seconds=round(max(0, self._total - self._done) / speed))
-        return f"{speed:.3g} {self._unit}/s  ETA {left}"
+            parts = [f"{self._title}: {self._done}/{self._total} {self._unit}", self._note]
+            start, begun = self._first  # of this process: what one before it did took other seconds
+            if now > begun and self._done > start:
+                speed = (self._done - start) / (now - begun)
+                left = timedelta(seconds=round(max(0, self._total - self._done) / speed))
+                parts.append(f"{speed:.3g} {self._unit}/s  ETA {left}")
+            print("  ".join(filter(None, parts)), file=self._console.file, flush=True)
 
     def __enter__(self) -> Self:
         self._bar.start()

@@ -42,12 +42,17 @@ def versions() -> dict[str, str]:
 
 
 def git_commit() -> str:
-    """Commit of this project that runs, with `+` for uncommitted changes: a checkout's own, else the wheel's record.
+    """Commit of this project that runs, with `+` for uncommitted changes: a checkout's own, else what `setup.py` wrote.
 
     Empty where neither tells. A repository that merely surrounds the installed package is another project's.
     """
     root = Path(__file__).resolve().parents[2]
-    return checkout_commit(root) or recorded_commit(root)
+    if commit := checkout_commit(root):
+        return commit
+    try:
+        return (root / COMMIT_FILE).read_text(encoding="utf-8").strip()
+    except OSError:
+        return ""
 
 
 def checkout_commit(root: Path) -> str:
@@ -59,14 +64,6 @@ def checkout_commit(root: Path) -> str:
         dirty = subprocess.run(["git", "diff", "--quiet", "HEAD"], cwd=root, check=False).returncode
         return _git(root, "rev-parse", "HEAD") + ("+" if dirty else "")
     except (OSError, ValueError, KeyError, TypeError, subprocess.CalledProcessError):
-        return ""
-
-
-def recorded_commit(root: Path) -> str:
-    """The commit that `setup.py` wrote into a wheel or source archive, if `root` comes from one; else empty."""
-    try:
-        return (root / COMMIT_FILE).read_text(encoding="utf-8").strip()
-    except OSError:
         return ""
 
 

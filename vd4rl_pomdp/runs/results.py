@@ -22,13 +22,11 @@ from vd4rl_pomdp.core.reading import parse_json, read_bytes
 from vd4rl_pomdp.core.settings import LABELS, settings_of
 from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
 from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
-from vd4rl_pomdp.runs.files import Row, files_below, read_json, replacing_file, write_csv
-from vd4rl_pomdp.runs.identity import content_hash, identity
+from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json, replacing_file, write_csv
 from vd4rl_pomdp.runs.metrics import read_metrics
-from vd4rl_pomdp.runs.outputs import refuse_foreign
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.provenance import CONTINUED
-from vd4rl_pomdp.runs.run import remedy
+from vd4rl_pomdp.runs.run import identity, remedy
 
 RUNS = "runs.jsonl"
 FILES = {Path(file).stem: file for file in RECORDS} | {"encoder": f"encoder/{CONFIG_FILE}"}
@@ -40,7 +38,7 @@ class Result:
     """One run, finished or not, from its folder or from a results folder."""
 
     id: str
-    """Name of what it computes, see `runs.identity`."""
+    """Name of what it computes, see `runs.run.identity`."""
     path: Path
     """Its folder, or the results folder that tells of it."""
     files: dict[str, dict[str, Any]]
@@ -216,6 +214,7 @@ def read_results(folder: Path | str) -> list[Result]:
     for row in read_episodes(folder / EPISODES_FILE):
         if "id" not in row:
             raise UserError(f"{folder / EPISODES_FILE}: has no column 'id'; it was not written beside {RUNS}")
+        # 150,000 rows share a few dozen words: each word is kept once.
         shared = {name: sys.intern(row[name]) if isinstance(row[name], str) else row[name] for name in COLUMNS}
         by_run.setdefault(row["id"], []).append(shared)
     runs = [_parse(path, number, line, by_run) for number, line in enumerate(lines, 1)]
@@ -257,12 +256,14 @@ def write_results(out: Path, runs: Iterable[Result]) -> None:
     runs = list(runs)
     with disk_errors(out):
         out.mkdir(parents=True, exist_ok=True)
-    write_csv(out / EPISODES_FILE, ("id", *COLUMNS), ({"id": run.id} | row for run in runs for row in run.rows))
-    with replacing_file(out / RUNS) as fresh, fresh.open("w", encoding="utf-8") as file:
-        for run in runs:
-            files = {name: run.files[name] for name in FILES if name in run.files}
-            told = {"id": run.id, **files, "step": run.step, "episodes": len(run.rows)}
-            file.write(json.dumps(told | ({"losses": run.losses} if run.losses else {})) + "\n")
+    with replacing_file(out / RUNS) as fresh:
+        with fresh.open("w", encoding="utf-8") as file:
+            for run in runs:
+                files = {name: run.files[name] for name in FILES if name in run.files}
+                told = {"id": run.id, **files, "step": run.step, "episodes": len(run.rows)}
+                file.write(json.dumps(told | ({"losses": run.losses} if run.losses else {})) + "\n")
+        # Within: a disk that is full at either of them leaves both as they were.
+        write_csv(out / EPISODES_FILE, ("id", *COLUMNS), ({"id": run.id} | row for run in runs for row in run.rows))
 
 
 def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[Result]:

@@ -1,7 +1,8 @@
 """A run is a folder: config.json first, then metrics.jsonl, checkpoints/ and results; the same command resumes it.
 
 Everything but `timing.json`, `machine.json` and the seconds in a checkpoint is the same whether a run was interrupted
-or not. One process owns the folder at a time.
+or not. One process owns the folder at a time. What it computes has a name, its `identity`: equal for equal settings,
+seed, data and format, whatever its folder and its machine. Its `recipe` can be told before its data exist.
 """
 
 from __future__ import annotations
@@ -16,16 +17,14 @@ from typing import Any, Self
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.registry import code_of, warn_of_other_code
-from vd4rl_pomdp.core.settings import RUNTIME_FIELDS
+from vd4rl_pomdp.core.settings import RUNTIME_FIELDS, settings_of
 from vd4rl_pomdp.runs import CONFIG_FILE, DIVERGED_FILE, EPISODES_FILE, FORMAT, MACHINE_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, State
 from vd4rl_pomdp.runs.episodes import read_episodes
-from vd4rl_pomdp.runs.files import holds_anything, jsonable, read_json, write_json
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.files import content_hash, holds_anything, jsonable, read_json, write_json
+from vd4rl_pomdp.runs.outputs import owned
 from vd4rl_pomdp.runs.provenance import CONTINUED, command, git_commit, machine, versions
 
-_CODE = ("versions", "git_commit", "plugins", "sources")
-"""What a record tells of the code."""
 _NOTHING: Mapping[str, Any] = MappingProxyType({})
 
 
@@ -35,6 +34,27 @@ def remedy(folder: Path) -> str:
         f"put it back, or remove {folder / TIMING_FILE} and re-run its command: it resumes from the last "
         "checkpoint and writes it anew"
     )
+
+
+def identity(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:
+    """Name of what a run computes, 24 characters.
+
+    Args:
+        record: its config.json.
+        card: what the encoder it started from says of its pretraining; empty for a pretraining run.
+    """
+    inputs = record.get("inputs", {})
+    named = record["config"].get("exogenous")
+    images = inputs.get("exogenous", named)  # the content of a folder; the name again of those that are made
+    own = [] if images == named else [images]
+    return content_hash([recipe(record, card), inputs.get("data"), card.get("data"), *own])
+
+
+def recipe(record: Mapping[str, Any], card: Mapping[str, Any]) -> str:
+    """Name of what a run computes but for the content of its data, likewise."""
+    own = settings_of(record["config"]) | {"seed": record["config"]["seed"]}
+    before = {"settings": card["settings"], "seed": card["seed"]} if card else {}
+    return content_hash([record.get("format", 1), record["stage"], own, before])
 
 
 class RunFolder:
@@ -127,7 +147,7 @@ class RunFolder:
     def code(self) -> dict[str, Any]:
         """What the run began with, once it has: versions, commit, and where parts not of this package come from."""
         record = read_json(self.path / CONFIG_FILE)
-        return {name: record.get(name, {}) for name in _CODE}
+        return {name: record.get(name, {}) for name in ("versions", "git_commit", "plugins", "sources")}
 
     def _begin(self) -> None:
         """Write what the run begins with, or add to it where what it resumes with is something else."""
@@ -136,7 +156,7 @@ class RunFolder:
         if self._begins:
             record = {"format": FORMAT, "stage": self.stage, "config": self.config, "inputs": self.inputs}
             write_json(self.path / CONFIG_FILE, record | now | {"command": command(), "collection": self._collection})
-        if self._begins or not path.exists():
+        if self._begins or not path.exists():  # a start may have been killed between the two files
             write_json(path, hardware)
         else:
             told = read_json(path)
@@ -167,6 +187,7 @@ class RunFolder:
             UserError: it does not fit the run, or evaluations are there, which follow a checkpoint, and none is.
         """
         seconds = self._checkpoints.restore(take)
+        # Without this the run would begin again and append the same evaluations a second time.
         if seconds is None and read_episodes(self.path / EPISODES_FILE):
             raise UserError(
                 f"{self.path}: has evaluations, but the checkpoints that they were made after are gone: put them back, "
@@ -184,5 +205,5 @@ class RunFolder:
 
     def finish(self, **more: Any) -> None:
         """Mark the run as done, keeping its wall-clock seconds and the last checkpoint."""
-        self._checkpoints.prune(1)
+        self._checkpoints.prune(1)  # one stays: a result that is lost later is computed again from the end
         write_json(self.path / TIMING_FILE, {"seconds": round(self.seconds, 2)} | more)

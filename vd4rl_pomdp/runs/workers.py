@@ -35,7 +35,13 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
     if workers <= 1:
         yield from map(function, jobs)
         return
-    _refuse_unsendable(jobs[0])
+    try:
+        ForkingPickler.dumps(jobs[0])  # the pool tells of it only by a job's error, which looks like the job's own
+    except (PicklingError, AttributeError, TypeError) as error:
+        raise UserError(
+            f"a job cannot be sent to a worker process ({first_line(error)}): define its classes and functions in a "
+            "module, or use --workers 1"
+        ) from error
     pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)
     processes: dict[int, Any] = {}
     try:
@@ -79,22 +85,13 @@ def count_workers(workers: int) -> int:
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
-def _refuse_unsendable(job: object) -> None:
-    try:
-        ForkingPickler.dumps(job)
-    except (PicklingError, AttributeError, TypeError) as error:
-        raise UserError(
-            f"a job cannot be sent to a worker process ({first_line(error)}): define its classes and functions in a "
-            "module, or use --workers 1"
-        ) from error
-
-
 def _start_worker() -> None:
     """One thread a worker, which never outlives its parent, however that ends."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
     import threadpoolctl
     import torch
 
+    # Each library would start a thread for every core in every worker, and they would wait for one another.
     torch.set_num_threads(1)
     threadpoolctl.threadpool_limits(1)
 
@@ -103,4 +100,4 @@ def _end_with_parent() -> None:
     parent = multiprocessing.parent_process()
     assert parent is not None
     multiprocessing.connection.wait([parent.sentinel])
-    os._exit(1)
+    os._exit(1)  # at once, even inside a library's C code: nobody is left to take what it computes

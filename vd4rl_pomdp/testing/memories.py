@@ -92,15 +92,18 @@ def streaming_equals_batch(name: str, **options: Any) -> None:
 
 
 def a_state_depends_on_its_past_alone(name: str, **options: Any) -> None:
-    """What is put out at a row has a gradient to that row and all rows before, and to nothing else."""
+    """What is put out at a row has a gradient to that row and to earlier ones of its window, and to nothing else."""
+    # in float64: gradients across many rows are small, and none may be lost to rounding
     memory, x = make(name, **options).double(), rows().double().requires_grad_()
     out, _ = run_memory(memory, x)
     weights = torch.randn(out.shape[-1], generator=torch.Generator().manual_seed(0), dtype=torch.float64)
     for t in range(ROWS):
         (gradient,) = torch.autograd.grad((out[1, t] * weights).sum(), x, retain_graph=True)
         reached = [tuple(place) for place in torch.nonzero(gradient.abs().amax(2)).tolist()]
-        expected = [(1, row) for row in range(t + 1)]
-        claim(reached == expected, f"row {t} of window 1 has gradients to (window, row) {reached}")
+        past = {(1, row) for row in range(t + 1)}
+        told = f"row {t} of window 1 has gradients to (window, row) {reached}"
+        claim(past.issuperset(reached), f"{told}: only rows 0 to {t} of window 1 may have one")
+        claim((1, t) in reached and (t == 0 or len(reached) > 1), f"{told}: itself and an earlier row must have one")
 
 
 def actions_are_read_where_a_method_has_them(name: str, **options: Any) -> None:

@@ -1,5 +1,6 @@
 """Results folders: they hold what their runs' files hold, and lose nothing."""
 
+import errno
 import shutil
 from pathlib import Path
 
@@ -10,11 +11,10 @@ from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data.reference import Reference
 from vd4rl_pomdp.report import write_report
-from vd4rl_pomdp.runs import results
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
-from vd4rl_pomdp.runs.identity import identity
 from vd4rl_pomdp.runs.results import Result, add_results, find_results, read_results, read_run
+from vd4rl_pomdp.runs.run import identity
 
 COMMITTED = Path(__file__).parents[3] / "results"
 
@@ -55,6 +55,25 @@ def test_a_run_comes_back_as_its_files_hold_it(tmp_path):
     assert other.id == identity(read_json(before / "config.json"), {})
     assert other.losses == [(1, 0.5), (2, 0.25)]
     assert [content(run) for run in (one, other)] == [content(read_run(path)) for path in (run, before)]
+
+
+def test_a_full_disk_leaves_the_folder_as_it_was_and_the_same_command_adds(tmp_path, monkeypatch):
+    begin = Path.open
+
+    def full(path: Path, *args, **options):
+        if path.name == f".{full_at}.tmp":
+            raise OSError(errno.ENOSPC, "No space left on device")
+        return begin(path, *args, **options)
+
+    for number, full_at in enumerate(("runs.jsonl", "episodes.csv")):
+        whole_run(tmp_path / "runs" / full_at, number)
+        before = {path: path.read_bytes() for path in tmp_path.glob("out/*")}
+        with monkeypatch.context() as patch:
+            patch.setattr(Path, "open", full)
+            with pytest.raises(UserError, match="the disk is full"):
+                add_results([tmp_path / "runs"], tmp_path / "out")
+        assert {path: path.read_bytes() for path in tmp_path.glob("out/[!.]*")} == before
+        assert add_results([tmp_path / "runs"], tmp_path / "out").added == 1
 
 
 def test_a_run_that_went_on_elsewhere_names_every_machine_and_commit(tmp_path):
@@ -147,29 +166,18 @@ def test_a_row_that_was_cut_with_its_run_is_left_out(tmp_path):
     assert "unfinished" in write_report([tmp_path / "runs"], tmp_path / "report").page.read_text()
 
 
-def test_results_can_be_read_while_others_are_added(tmp_path, monkeypatch):
-    out = tmp_path / "out"
-    add_results([whole_run(tmp_path / "runs/0")], out)
-    later, read = whole_run(tmp_path / "runs/1", seed=1), results.read_episodes
-
-    def meanwhile(path):
-        rows = read(path)
-        with monkeypatch.context() as patch:
-            patch.setattr(results, "read_episodes", read)
-            add_results([later], out)
-        return rows
-
-    with monkeypatch.context() as patch:
-        patch.setattr(results, "read_episodes", meanwhile)
-        assert len(read_results(out)) == 1
-    assert len(read_results(out)) == 2
-
-
 def test_a_writing_that_is_killed_midway_leaves_what_was_there(tmp_path, monkeypatch):
     add_results([whole_run(tmp_path / "runs/0")], tmp_path / "out")
     before = [content(run) for run in read_results(tmp_path / "out")]
+    replace = Path.replace
+
+    def killed(path: Path, target: Path) -> Path:
+        if target.name == "runs.jsonl":
+            raise KeyboardInterrupt
+        return replace(path, target)
+
     with monkeypatch.context() as patch:
-        patch.setattr(results, "replacing_file", lambda path: (_ for _ in ()).throw(KeyboardInterrupt))
+        patch.setattr(Path, "replace", killed)
         with pytest.raises(KeyboardInterrupt):
             add_results([whole_run(tmp_path / "runs/1", seed=1)], tmp_path / "out")
     assert {row["seed"] for row in read_episodes(tmp_path / "out" / "episodes.csv")} == {0, 1}, "one file was written"

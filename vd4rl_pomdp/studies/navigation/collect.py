@@ -21,7 +21,7 @@ from vd4rl_pomdp.core.seeding import episode_seed
 from vd4rl_pomdp.core.tasks import MOST_EPISODES
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.shards import Columns, Shard, collect_set
-from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MAZES, MOST_STEPS, Style, check_maze, get_maze
+from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MAZES, MOST_STEPS, Style, get_maze
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.provenance import versions
@@ -90,7 +90,7 @@ def collection(config: MazeCollectConfig) -> dict[str, Any]:
 
 def check_config(config: MazeCollectConfig) -> None:
     """Raise UserError for settings that make no set."""
-    check_maze(config.maze)
+    get_maze(config.maze)
     refuse_outside(
         config, trajectories=(1, MOST_EPISODES), trajectory_rows=(2, MOST_ROWS), action_repeat=(1, MOST_STEPS),
         seed=(0, MAX_SEED), trajectories_per_shard=1, workers=0,

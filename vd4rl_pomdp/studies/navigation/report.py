@@ -18,8 +18,7 @@ import pandas as pd
 
 from vd4rl_pomdp.core.text import code, code_block, markdown, write_text
 from vd4rl_pomdp.envs.mazes import HARD, MAZES
-from vd4rl_pomdp.runs.outputs import refuse_foreign
-from vd4rl_pomdp.runs.ownership import owned
+from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.results import RUNS, Result
 from vd4rl_pomdp.studies.navigation import figures
 from vd4rl_pomdp.studies.navigation.claims import verdict_lines

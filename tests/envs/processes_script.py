@@ -1,4 +1,7 @@
-"""What `test_vector` runs: vectors of environments by fork and spawn, before and after the parent has rendered."""
+"""What `test_processes` runs: vectors of environments before and after the parent has rendered, then an optimiser."""
+
+import importlib.util
+import sys
 
 import gymnasium
 import torch
@@ -35,11 +38,12 @@ def refused(name: str) -> bool:
 if __name__ == "__main__":
     torch.set_num_threads(2)
     torch.rand(1000, 1000).exp().sum()  # on two threads, which a forked process does not inherit
-    walk(TASK, "fork")
-    walk(MAZE, "fork")
-    walk(GYMNASIUM, "fork")
-    gymnasium.make(TASK).reset(seed=0)
     for name in (TASK, MAZE, GYMNASIUM):
-        assert refused(name)
-        walk(name, "spawn")
+        walk(name, "fork")
+    gymnasium.make(TASK).reset(seed=0)
+    assert all(refused(name) for name in (TASK, MAZE, GYMNASIUM))
+    walk(TASK, "spawn")  # which inherits nothing: one kind of environment stands for all
+    # An optimiser imports Triton: if Mesa had loaded its LLVM first, this would be a segmentation fault.
+    torch.optim.Adam([torch.zeros(1, requires_grad=True)])
+    assert importlib.util.find_spec("triton") is None or "triton" in sys.modules
     print("as expected")

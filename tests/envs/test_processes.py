@@ -1,0 +1,47 @@
+"""OpenGL in several processes, and beside Triton: a process of its own, so that what hangs or dies takes no test along.
+
+PyTorch's builds for GPUs bring Triton; beside a build without it the `dev` extra installs it.
+"""
+
+import ast
+import contextlib
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+ROOT = Path(__file__).parents[2]
+SCRIPT = Path(__file__).with_name("processes_script.py")
+ENVS = ROOT / "vd4rl_pomdp" / "envs"
+
+
+def imported(path: Path) -> set[str]:
+    found = set()
+    for node in ast.walk(ast.parse(path.read_text())):
+        if isinstance(node, ast.ImportFrom) and node.module:
+            found.add(node.module.split(".")[0])
+        elif isinstance(node, ast.Import):
+            found |= {alias.name.split(".")[0] for alias in node.names}
+    return found
+
+
+def test_one_module_alone_loads_opengl():
+    folders = ("vd4rl_pomdp", "pretrain", "finetune", "baselines", "tests")
+    sources = [path for folder in folders for path in (ROOT / folder).rglob("*.py")]
+    loading = {path for path in sources if imported(path) & {"dm_control", "mujoco"}}
+    assert loading - {ENVS / "maze_renderers.py"} == {ENVS / "rendering.py"}  # the first after the second
+
+
+def test_processes_that_work_do_and_those_that_would_hang_are_refused(tmp_path):
+    shown = tmp_path / "shown.txt"
+    with shown.open("w") as file:
+        process = subprocess.Popen(
+            [sys.executable, "-X", "faulthandler", SCRIPT], stdout=file, stderr=file, start_new_session=True
+        )
+    try:
+        assert process.wait(timeout=240) == 0, shown.read_text()
+    finally:
+        with contextlib.suppress(ProcessLookupError):
+            os.killpg(process.pid, signal.SIGKILL)
+    assert shown.read_text().splitlines()[-1] == "as expected"

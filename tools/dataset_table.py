@@ -1,0 +1,114 @@
+"""Tabulate the sets that `data collect` makes: what their episodes return, and what collecting them costs.
+
+    python tools/dataset_table.py --qualities random medium_replay medium medium_expert expert expert_noisy
+
+Returns are those of a full collection with the default seed: every episode is played by physics alone, from the same
+seed and with the same actions, so its rewards are the same to the digit. Cost is measured on a short collection with
+rendering, on one core. A set that the table has by the same actors is not played again.
+"""
+
+from __future__ import annotations
+
+import csv
+import tempfile
+import time
+from dataclasses import dataclass
+from itertools import product
+from pathlib import Path
+
+import numpy as np
+from script import run_script
+
+from vd4rl_pomdp.core.errors import refuse_outside, refuse_unknown
+from vd4rl_pomdp.core.tasks import MOST_EPISODES, SET_QUALITIES, TASKS
+from vd4rl_pomdp.data.collect import CollectConfig, actor_hashes, collect, play
+from vd4rl_pomdp.data.folder import PROVENANCE
+from vd4rl_pomdp.policies.actor import ships
+from vd4rl_pomdp.runs.files import Row, read_json, write_csv, write_json
+from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
+
+EPISODES = 200
+CORES = 2
+RETURNS = ("task", "quality", "episode", "return")
+COSTS = ("task", "episodes", "rows", "cpu_seconds", "commit")
+SETS = ("task", "quality", "episodes", "mean", "min", "max", "seconds_100k")
+
+
+@dataclass(frozen=True)
+class Config:
+    """Settings of the table."""
+
+    out: Path = Path("results/datasets")
+    """Folder of returns.csv (a row an episode), costs.csv (a row a task), actors.json (hashes of the actors behind
+    each set) and sets.csv, the table."""
+    tasks: tuple[str, ...] = tuple(TASKS)
+    qualities: tuple[str, ...] = tuple(SET_QUALITIES)
+    """One whose actor does not ship is left out."""
+    timed_episodes: int = 4
+    """Episodes of the short rendered collection that is timed for each task."""
+    workers: int = 0
+    """Processes that play; 0 uses every core."""
+
+
+def main(config: Config) -> None:
+    """Play and time what the table lacks, and write it again."""
+    refuse_outside(config, timed_episodes=(1, MOST_EPISODES), workers=0)
+    for task, quality in product(config.tasks, config.qualities):
+        TASKS.named(task)
+        refuse_unknown("quality", quality, SET_QUALITIES)
+    out = config.out
+    returns, costs = rows_of(out / "returns.csv"), rows_of(out / "costs.csv")
+    actors = read_json(out / "actors.json") if (out / "actors.json").exists() else {}
+    for task, quality in product(config.tasks, config.qualities):
+        if not ships(task, quality):
+            continue
+        full = CollectConfig(task, quality, Path(), EPISODES, workers=config.workers)  # type: ignore[arg-type]
+        name, hashes = f"{task} {quality}", actor_hashes(full)
+        others = [row for row in returns if (row["task"], row["quality"]) != (task, quality)]
+        if actors.get(name) != hashes or len(others) == len(returns):
+            played = [float(rollout["reward"].sum()) for rollout in play(full)]
+            mine = [{"task": task, "quality": quality, "episode": i, "return": repr(v)} for i, v in enumerate(played)]
+            returns, actors[name] = others + mine, hashes
+            write_csv(out / "returns.csv", RETURNS, returns)
+            write_json(out / "actors.json", actors)
+    for task in config.tasks:
+        if not any(row["task"] == task for row in costs):
+            costs.append(cost(task, config.timed_episodes))
+            write_csv(out / "costs.csv", COSTS, costs)
+    write_csv(out / "sets.csv", SETS, summarise(returns, costs))
+    write_json(out / "provenance.json", {"git_commit": git_commit(), "versions": versions(), "machine": machine()})
+
+
+def rows_of(path: Path) -> list[Row]:
+    """Rows of a table of before, none if there is none."""
+    if not path.exists():
+        return []
+    with path.open(newline="", encoding="utf-8") as file:
+        return list(csv.DictReader(file))
+
+
+def summarise(returns: list[Row], costs: list[Row]) -> list[Row]:
+    """The table from the raw rows."""
+    seconds = {r["task"]: float(r["cpu_seconds"]) / float(r["rows"]) * 1e5 / CORES for r in costs}
+    table = []
+    for task, quality in product(dict.fromkeys(row["task"] for row in returns), SET_QUALITIES):
+        mine = [float(r["return"]) for r in returns if (r["task"], r["quality"]) == (task, quality)]
+        if mine:
+            row = {"task": task, "quality": quality, "episodes": len(mine), "seconds_100k": round(seconds[task])}
+            statistics = {"mean": np.mean(mine), "min": min(mine), "max": max(mine)}
+            table.append(row | {name: f"{value:.1f}" for name, value in statistics.items()})
+    return table
+
+
+def cost(task: str, episodes: int) -> Row:
+    """Processor time of a short collection of random episodes, rendering and writing included, in this process."""
+    with tempfile.TemporaryDirectory() as folder:
+        started = time.process_time()
+        collect(CollectConfig(task, "random", Path(folder) / task, episodes, workers=1))
+        spent = time.process_time() - started
+        rows = read_json(Path(folder) / task / PROVENANCE)["frames"]
+    return {"task": task, "episodes": episodes, "rows": rows, "cpu_seconds": f"{spent:.1f}", "commit": git_commit()}
+
+
+if __name__ == "__main__":
+    run_script(main, Config)
