@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vd4rl_pomdp.core.errors import told_apart
-from vd4rl_pomdp.core.settings import settings_of
+from vd4rl_pomdp.core.options import settings_of
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import STATE
 from vd4rl_pomdp.report.load import REFERENCES, SETTING, Run

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.options import LABELS, settings_of
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
-from vd4rl_pomdp.core.settings import LABELS, settings_of
 from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
 from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json, replacing_file, write_csv
