@@ -46,7 +46,7 @@ class Agent:
     def reset(self) -> None:
         """Forget everything: an episode begins."""
         self._state = self.encoder.initial_state(1)
-        self._action = torch.zeros(1, self.encoder.config.action_dim)
+        self._action = torch.zeros(1, self.encoder.config.action_dim)  # what first rows carry in training
 
     @property
     def picture_size(self) -> int:
@@ -63,6 +63,7 @@ class Agent:
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> np.ndarray:
         """Mean action (A,) float32 for a (C, S, S) uint8 observation."""
+        # one row at a time is all that an environment gives; training read the same states from whole windows
         z, self._state = self.encoder.step(obs[None], self._action, self._state)
         self._action = self.policy(z)
         return self._action[0].numpy()
@@ -106,7 +107,7 @@ class Episode:
     @property
     def total(self) -> float:
         """Its return, added up in order."""
-        return float(np.cumsum(self.rewards)[-1])
+        return float(np.cumsum(self.rewards)[-1])  # np.sum adds in pairs: other last digits
 
     @property
     def action_error(self) -> float | None:

@@ -34,13 +34,10 @@ def test_a_method_keeps_its_promises(name: str, check: Callable):
     run_check("method", check, name)
 
 
-@pytest.mark.parametrize("method", INVERSE)
-def test_the_loss_of_an_inverse_method_is_its_action_loss(method: str):
-    loss, logs = build(method).loss(batch(), 0.0)
+def test_the_loss_of_an_inverse_method_is_its_action_loss():
+    """`check_method` proves what weighted terms add to it."""
+    loss, logs = build("mik+a").loss(batch(), 0.0)
     assert torch.equal(loss.detach(), logs["action_loss"])
-    loss, logs = build(method, self_prediction=0.5, l2_states=0.1).loss(batch(), 0.25)
-    expected = logs["action_loss"] + 0.5 * logs["self_prediction"] + 0.1 * 0.75 * logs["l2_states"]
-    torch.testing.assert_close(loss.detach(), expected)
 
 
 def test_self_prediction_moves_the_prediction_and_never_its_target():
