@@ -29,7 +29,7 @@ from vd4rl_pomdp.core.tasks import (
 )
 from vd4rl_pomdp.data.shards import Columns, Shard, collect_set
 from vd4rl_pomdp.envs.make import layout_of, make_env
-from vd4rl_pomdp.envs.pixels import PixelEnv, Render
+from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.outputs import refuse_inside
@@ -260,6 +260,6 @@ def _roll_out(job: _Job) -> Columns:
 
 
 @cache
-def _environment(*arguments: Any) -> PixelEnv:
+def _environment(*arguments: Any) -> Any:
     """The process's environment for these arguments: one GL context serves all its episodes."""
     return make_env(*arguments)
