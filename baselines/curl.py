@@ -47,7 +47,7 @@ class CURL(Objective):
         super().__init__()
         self.encoder = encoder
         self.momentum_encoder = copy.deepcopy(encoder).requires_grad_(False)
-        self.bilinear = nn.Parameter(torch.rand(encoder.dim, encoder.dim))
+        self.bilinear = nn.Parameter(torch.rand(encoder.dim, encoder.dim))  # from 0 to 1, as the authors draw it
         self.draws = Draws(seed, "curl", "shift")
 
     def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
@@ -58,6 +58,7 @@ class CURL(Objective):
         batch, rows = query.shape[:2]
         real = window.real
         group = torch.arange(batch, device=query.device)[:, None].expand(-1, rows)[real]
+        # flat over windows and rows: the group tells which rows are neighbours of the anchor, and no negatives
         scores = query[real] @ self.bilinear @ positive[real].T
         loss = info_nce(scores, group)
         return loss, {"loss": loss.detach(), "accuracy": share_found(scores, group)}

@@ -103,4 +103,5 @@ class DRIML(Objective):
         both = torch.cat([now, action[:, None].expand(-1, now.shape[1], -1).to(now)], dim=-1)
         anchors, candidates = self.anchors[term](both), self.candidates[term](later)
         scores = anchors.transpose(0, 1) @ candidates.permute(1, 2, 0) / SCORE_DIM**0.5
+        # soft, because beyond a hard bound no gradient would bring a score back
         return LARGEST_SCORE * (scores.float() / LARGEST_SCORE).tanh()

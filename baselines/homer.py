@@ -53,7 +53,7 @@ class Bottleneck(nn.Module):
             logits = logits - (-self.draws.uniform(*logits.shape).log()).log()
         soft = logits.softmax(-1)
         hard = F.one_hot(logits.argmax(-1), soft.shape[-1]).to(soft)
-        return self.embedding(hard + soft - soft.detach())
+        return self.embedding(hard + soft - soft.detach())  # forward one code, backward the softmax
 
 
 @dataclass(frozen=True)
@@ -85,6 +85,7 @@ class HOMER(Objective):
         states = self.encoder.encode(window)
         real = window.real[:, 1:]
         state, action, following = states[:, :-1][real], window.action[:, :-1][real], states[:, 1:][real]
+        # now and then the true one is drawn: p(o') is the batch's own distribution, which contains it
         imposter = following[self.draws.integers(len(following), len(following))]
         logits = torch.stack([self.logits(state, action, following), self.logits(state, action, imposter)])
         truth = torch.tensor([[1.0], [0.0]], device=logits.device).expand_as(logits)

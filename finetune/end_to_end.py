@@ -40,7 +40,7 @@ class EndToEnd:
         device = batch.obs.device
         with autocast(device, self.config.precision):
             z = self.encoder.frame(batch.obs).float()
-            with torch.no_grad():
+            with torch.no_grad():  # the target's side; V-D4RL has no slow copy of the encoder either
                 next_z = self.encoder.frame(batch.next_obs).float()
         features = FeatureBatch(z, batch.action, batch.reward, batch.discount, next_z)
         return self.algorithm.update(features, self.optimiser)

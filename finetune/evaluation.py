@@ -24,7 +24,7 @@ from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import load_encoder, read_record
 from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
-from vd4rl_pomdp.policies.actor import Actor, read_actor
+from vd4rl_pomdp.policies.actor import read_actor
 from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
@@ -46,7 +46,7 @@ class Agent:
     def reset(self) -> None:
         """Forget everything: an episode begins."""
         self._state = self.encoder.initial_state(1)
-        self._action = torch.zeros(1, self.encoder.config.action_dim)
+        self._action = torch.zeros(1, self.encoder.config.action_dim)  # what first rows carry in training
 
     @property
     def picture_size(self) -> int:
@@ -63,6 +63,7 @@ class Agent:
     @torch.no_grad()
     def act(self, obs: torch.Tensor) -> np.ndarray:
         """Mean action (A,) float32 for a (C, S, S) uint8 observation."""
+        # one row at a time is all that an environment gives; training read the same states from whole windows
         z, self._state = self.encoder.step(obs[None], self._action, self._state)
         self._action = self.policy(z)
         return self._action[0].numpy()
@@ -106,7 +107,7 @@ class Episode:
     @property
     def total(self) -> float:
         """Its return, added up in order."""
-        return float(np.cumsum(self.rewards)[-1])
+        return float(np.cumsum(self.rewards)[-1])  # np.sum adds in pairs: other last digits
 
     @property
     def action_error(self) -> float | None:
@@ -152,6 +153,9 @@ def _environment(*place: Any) -> CorruptedEnv:
     return CorruptedEnv(*place)
 
 
+_read_actor = cache(read_actor)
+
+
 @lru_cache(maxsize=1)
 def _agent(encoder: Path, policy: Path, written: tuple[int, ...]) -> Agent:
     """The agent of two folders, read anew when another is asked for or one was `written` again."""
@@ -162,7 +166,7 @@ def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
     agent.reset()
     now = env.reset(EVALUATION_SEED + job.episode, EVALUATION_SEED, job.episode)
     film = [(now, 0.0)]
-    actor = job.actor and _actor(job.actor)
+    actor = job.actor and _read_actor(job.actor)
     rewards: list[float] = []
     errors: list[np.floating] = []
     while not now.time_step.last:
@@ -174,11 +178,6 @@ def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
         if job.film and len(rewards) % FILM_EVERY == 0:
             film.append((now, float(np.cumsum(rewards)[-1])))
     return Episode(job.corruption.corruption, job.episode, rewards, _film(film) if job.film else None, errors)
-
-
-@cache
-def _actor(path: Path) -> Actor:
-    return read_actor(path)
 
 
 def _film(shots: list[tuple[Observation, float]]) -> dict[str, np.ndarray]:

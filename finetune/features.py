@@ -67,6 +67,7 @@ class FrozenEncoder:
 
     def view(self, number: int) -> View:
         """One draw of corruption and shift; under `emission` all are corrupted alike."""
+        # from the run's own seed: the spread over seeds then holds that of what was hidden, too
         if isinstance(self.encoder.frame, StateFrame):
             return StateView(self.dataset, self.encoder.frame.observe, self._corruption, self._seed, STAGE, number)
         return View(self.dataset, self._corruption, self._shift, self._seed, STAGE, number)
@@ -90,6 +91,7 @@ class FrozenEncoder:
         """Frame features (rows, F) of a whole episode; one shift for all of it."""
         episode = self.dataset.rows_of(number)
         rows = torch.arange(episode.start, episode.stop, device=self.device)
+        # a memory would take shifts that change from row to row for motion
         key = derive_keys(view.shifts.seed, torch.tensor([number], device=self.device))
         return self.rows(rows, key.expand(len(rows)), view)
 
@@ -135,6 +137,7 @@ class FeatureSampler:
         dataset, rows = histories.dataset, histories.rows
         self._reward, self._discount, _ = dataset.n_step_returns(rows, n_step, gamma)
         self._action = dataset.action_after(rows)
+        # z and z' are both read from the cache, for the critics' target, too: the encoder never changes
         ends = [histories.of_view(view).numbers() for view in range(len(features))]
         self._first, self._last = (torch.stack(numbers) for numbers in zip(*ends, strict=True))
 
@@ -158,6 +161,7 @@ class FeatureSampler:
         )
 
     def _draw(self, count: int) -> Tensor:
+        # on the CPU, so that a GPU trains on the same batches
         drawn = torch.randint(count, (self._batch_size,), generator=self._generator)
         return drawn.to(self._action.device, non_blocking=True)
 
@@ -185,6 +189,7 @@ class ExactSampler(Sampler):
     @torch.no_grad()
     def _encode(self, rows: Tensor, next_rows: Tensor) -> tuple[Tensor, Tensor]:
         encoder = self._frozen.encoder
+        # one shift for all rows of a transition, as in a view: none within an episode of the environment either
         key = self.view.shifts.take((len(rows),), rows.device)
         if not encoder.remembers:
             features = self._frozen.rows(torch.cat([rows, next_rows]), key.repeat(2), self.view)

@@ -133,6 +133,7 @@ class RandomHistories:
         mine = torch.nonzero((row >= whole.start) & (row < whole.stop))[:, 0]
         if len(mine):
             row, last = row[mine], self.histories.ends[self.chosen[mine]]
+            # both ends from one beginning: else z' would remember rows that z does not
             first = (row - self.length[mine] + 1).clamp(min=whole.start)
             z, next_z = read_both_ends(encoder, lambda rows: frames[rows - whole.start], dataset, first, row, last)
             number = (dataset.num_rows + mine).to(out.device)
@@ -158,6 +159,7 @@ def read_both_ends(
         first, row, last: (B,) int64, of one episode each, first <= row <= last.
     """
     span = torch.arange(int((last - first).max()) + 1, device=row.device)
+    # shorter histories repeat their last row behind what is picked, which a forward memory cannot know of
     history = torch.minimum(first[:, None] + span, last[:, None])
     states = encoder.from_features(frames(history), dataset.actions_before(history))
     pick = torch.arange(len(row), device=row.device)

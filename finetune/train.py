@@ -112,7 +112,7 @@ def _trainer(
     seed_networks(config.seed, STAGE)
     policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(dataset.t.device)
     generator = stream_generator(config.seed, STAGE, "batches")
-    corruption = CorruptionConfig.fill(card.corruption)
+    corruption = CorruptionConfig.fill(card.corruption)  # as in pretraining: what is hidden belongs to the world
     returns = config.options if isinstance(config.options, ReturnOptions) else ReturnOptions()
     frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed)
     encode = partial(frozen.episode, view=frozen.view(0))
@@ -190,7 +190,7 @@ class FinetuneTrainer:
         self.reference.write(run.path)
         with training(run, self, title, config.updates, "updates", labels=labels, card=asdict(self.card)) as loop:
             drop_episodes_after(run.path / EPISODES_FILE, self.step)  # of a checkpoint that is gone
-            if self.step and loop.due(config.eval_every):
+            if self.step and loop.due(config.eval_every):  # cut between this step's checkpoint and its scores
                 self.evaluate(run, loop)
             for step in loop:
                 batch = self.sampler.sample()
@@ -201,7 +201,7 @@ class FinetuneTrainer:
                 if loop.due(config.log_every):
                     loop.log()
                 if loop.due(config.eval_every):
-                    loop.save()
+                    loop.save()  # first, so that a kill while episodes are played costs no update
                     self.evaluate(run, loop)
         if self.path:
             self.reference.with_path_error(self.path.action_error(self.algorithm.policy)).write(run.path)

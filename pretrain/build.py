@@ -30,6 +30,7 @@ def build_target(config: TrainingConfig, actions: np.ndarray) -> ActionTarget | 
     options = config.options
     if not isinstance(options, ActionOptions):
         return None
+    # K-means of other seeds ends in other codes: they belong to what varies from seed to seed
     return make_action_target(options.action_target, actions, flat(options).get("codes", 0), config.seed)
 
 
@@ -65,7 +66,7 @@ def build_objective(
             "history": history_of(config.method, method, getattr(config, "history", "method")),
             "use_actions": method.use_actions,
             "hidden_dim": hidden,
-            "history_window": 0 if past is None else past + 1,
+            "history_window": 0 if past is None else past + 1,  # the m rows of the past, and row t itself
             "memory_options": told,
         }
     encoder = Encoder(EncoderConfig(action_dim, **shape, **memory))

@@ -92,6 +92,7 @@ class StateWindowSampler(WindowSampler):
 
     def __init__(self, source: View, batch_size: int, length: int, generator: torch.Generator) -> None:
         super().__init__(source, batch_size, length, generator)
+        # kept apart from the windows of other methods, so that none of them can read a state by mistake
         self._states = source.dataset.states()
 
     def sample(self) -> StateWindows:
@@ -125,7 +126,7 @@ def _task_of(dataset: Dataset, config: PretrainConfig) -> str:
 
 def _card(config: PretrainConfig, dataset: Dataset, run: RunFolder) -> EncoderCard:
     losses = [row["action_loss"] for row in read_metrics(run.path / METRICS_FILE) if "action_loss" in row]
-    last_tenth = losses[-max(1, len(losses) // 10) :]
+    last_tenth = losses[-max(1, len(losses) // 10) :]  # the last row alone is noisy
     return EncoderCard(
         method=config.method,
         task=config.task,
@@ -182,6 +183,7 @@ class Trainer:
         window = self.batches.sample()
         with autocast(self.device, self.config.precision):
             loss, logs = self.objective.loss(window, self.step / max(1, self.config.steps))
+        # outside of autocast, which is for forward passes alone
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
         if self._learning_rate is not None:
@@ -216,7 +218,7 @@ class Trainer:
                 loop.add(self.update())
                 if loop.due(self.config.log_every) or step == also_at:
                     loop.log("loss", **measures())
-            loop.require_finite(self.objective)
+            loop.require_finite(self.objective)  # no later loss tells what the last step did
 
     def state(self) -> dict[str, Any]:
         """Everything needed to resume to the bit."""

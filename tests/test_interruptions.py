@@ -1,6 +1,8 @@
 """Every stage: full disks, signals, second starts and changed inputs cost nothing but the time to start again."""
 
 import errno
+import multiprocessing
+import os
 import shutil
 import signal
 from collections.abc import Callable
@@ -104,7 +106,8 @@ def stage(request) -> Stage:
         return run_navigation, lambda out: replace(config, out=out), Trainer
     data = request.getfixturevalue("data")
     if request.param == "pretrain":
-        return run_pretrain, lambda out: smoke_pretrain(data, out, method="no_history"), Trainer
+        changes = {"method": "no_history", "checkpoint_every": 4}
+        return run_pretrain, lambda out: smoke_pretrain(data, out, **changes), Trainer
     encoder, changes = request.getfixturevalue("encoder"), FINETUNE | {"algorithm": "bc"}
     return run_finetune, lambda out: smoke_finetune(encoder, data, out, **changes), bc.BC
 
@@ -137,6 +140,23 @@ def test_a_signal_keeps_the_running_step_and_the_run_ends_as_if_nothing_had_been
             run(config(tmp_path / "cut"))
     assert max(int(path.stem) for path in (tmp_path / "cut" / "checkpoints").iterdir()) == 7
     assert not list((tmp_path / "cut").glob(".*"))
+    run(config(tmp_path / "cut"))
+    assert contents(tmp_path / "cut") == whole
+
+
+def test_a_killed_run_ends_in_the_same_bits(stage, whole, tmp_path):
+    """Between two checkpoints, by a signal that no process can handle."""
+    run, config, learner = stage
+
+    def killed() -> None:
+        at_update(pytest.MonkeyPatch(), learner, 6, lambda: os.kill(os.getpid(), signal.SIGKILL))
+        run(config(tmp_path / "cut"))
+
+    child = multiprocessing.get_context("fork").Process(target=killed)
+    child.start()
+    child.join()
+    assert child.exitcode == -signal.SIGKILL
+    assert [path.name for path in (tmp_path / "cut" / "checkpoints").iterdir()] == ["4.pt"]
     run(config(tmp_path / "cut"))
     assert contents(tmp_path / "cut") == whole
 

@@ -2,11 +2,7 @@
 
 import csv
 import json
-import os
-import subprocess
-import sys
 from dataclasses import dataclass
-from pathlib import Path
 
 import pytest
 
@@ -16,7 +12,7 @@ from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS, Method
 from pretrain.train import pretrain
 from tests.helpers_data import write_fake_set
-from tests.helpers_pages import isolated_registries, load_example, write_example
+from tests.helpers_pages import isolated_registries, load_example
 from vd4rl_pomdp import testing
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
@@ -45,8 +41,6 @@ USED_IN = {
     "history": ["pretrain", "finetune"],
 }
 """Kind: the stages that run its code; the first is told of it by name."""
-PLAYED = ("corruption",)
-"""Kinds that are met here by worker processes, too, which run the script's module level."""
 
 
 @pytest.fixture
@@ -54,14 +48,6 @@ def load(tmp_path, monkeypatch):
     """Imports a page's file as a module; what it registers is forgotten at the end."""
     with isolated_registries():
         yield lambda kind: load_example(f"my_{KINDS[kind]}.py", tmp_path, monkeypatch)
-
-
-def run(script: Path, line: str, folder: Path) -> None:
-    """Run a command line of a script."""
-    environment = os.environ | {"VD4RL_POMDP_CACHE": str(folder / "cache")}
-    command = [sys.executable, str(script), *line.split()]
-    done = subprocess.run(command, capture_output=True, text=True, env=environment, check=False)
-    assert done.returncode == 0, done.stderr
 
 
 @pytest.mark.parametrize("kind", EXAMPLES)
@@ -75,10 +61,7 @@ def test_an_example_runs_through_every_stage_and_the_record_names_it(load, tmp_p
     common = f"--preset smoke --data {data}"
     main(f"pretrain {first} {common} --out {runs}/pretrain".split())
     finetune = f"finetune {second} --encoder {runs}/pretrain/encoder {common} --out {runs}/finetune --eval-episodes 2"
-    if kind in PLAYED:
-        run(write_example(f"my_{KINDS[kind]}.py", tmp_path), f"{finetune} --workers 2", tmp_path)
-    else:
-        main(f"{finetune} --workers 1".split())
+    main(f"{finetune} --workers 1".split())  # worker processes meet parts of one's own in test_own_task
     write_report([runs], tmp_path / "report")
     records = {stage: json.loads((runs / stage / "config.json").read_text()) for stage in ("pretrain", "finetune")}
     for stage in USED_IN[kind]:

@@ -13,10 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-import finetune.config
-import pretrain.config
+from finetune.config import FinetuneConfig
 from finetune.evaluation import Episode, episode_rows, evaluate_run
 from finetune.train import finetune as run_finetune
+from pretrain.config import PretrainConfig
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import read_shard
 from vd4rl_pomdp.cli import main
@@ -48,17 +48,17 @@ def tasks():
 
 
 def test_the_example_runs_through_every_stage(tasks, tmp_path):
-    """Worker processes, which import the file, meet the task in the commands that play."""
+    """Worker processes import the file and meet the task in the fine-tuning's episodes; all else is this process's."""
     script, data, runs = tmp_path / "my_task.py", tmp_path / "centre" / "random", tmp_path / "runs"
     script.write_text(CODE)
     for line in (
-        f"data collect --task centre --quality random --frame-size 64 --out {data} --episodes 4 --workers 2",
+        f"data collect --task centre --quality random --frame-size 64 --out {data} --episodes 3 --workers 1",
         f"data check {data}",
         f"pretrain --method mik+a --corruption patch --preset smoke --data {data} --out {runs}/pretrain",
         f"finetune --encoder {runs}/pretrain/encoder --preset smoke --data {data} --out {runs}/finetune --workers 2",
         f"report {runs} --out {tmp_path}/report",
     ):
-        if "--workers" not in line:
+        if "--workers 2" not in line:
             main(line.split())
             continue
         command = [sys.executable, str(script), *line.split()]
@@ -68,12 +68,10 @@ def test_the_example_runs_through_every_stage(tasks, tmp_path):
     assert [(row["method"], row["task"]) for row in rows] == [("mik+a", "centre")]
 
 
-def stages(data: Path, out: Path, method: str = "mik+a") -> Path:
-    """Pretrain and fine-tune at smoke size; the fine-tuning's folder."""
-    common = {"data": data, "workers": 1}
-    pretraining = pretrain.config.PretrainConfig.of("smoke", data=data, out=out / "pretrain", method=method)
-    encoder = run_pretrain(pretraining).path / "encoder"
-    return run_finetune(finetune.config.FinetuneConfig.of("smoke", encoder=encoder, out=out / "run", **common)).path
+def trained(data: Path, out: Path, method: str = "mik+a", **settings: object) -> FinetuneConfig:
+    """Pretrain at smoke size; the settings of a fine-tuning on that encoder."""
+    encoder = run_pretrain(PretrainConfig.of("smoke", data=data, out=out / "pretrain", method=method)).path / "encoder"
+    return FinetuneConfig.of("smoke", encoder=encoder, data=data, out=out / "run", workers=1, **settings)
 
 
 def test_a_task_of_dm_control_of_another_size_goes_through_every_stage(tasks, tmp_path):
@@ -82,7 +80,7 @@ def test_a_task_of_dm_control_of_another_size_goes_through_every_stage(tasks, tm
     checked = check_dataset(data)
     assert (checked["task"], checked["frame_size"]) == (name, size)
     assert checked["replay_max_error"] == 0.0
-    run = stages(data, tmp_path / "runs")
+    run = run_finetune(trained(data, tmp_path / "runs")).path
     assert load_encoder(run / "encoder")[0].config.size == size
     assert {row["task"] for row in read_episodes(run / "episodes.csv")} == {name}
     assert {row["task"] for row in evaluate_run(run, "patch", 1, 1)[0]} == {name}
@@ -95,12 +93,13 @@ def test_a_task_of_dm_control_of_another_size_goes_through_every_stage(tasks, tm
 def test_the_state_reference_reads_dm_controls_states_and_refuses_a_task_without(tasks, tmp_path):
     for name in ("cartpole_swingup", "centre"):
         collect(CollectConfig(name, "random", tmp_path / name, episodes=2, workers=1, frame_size=32), 8)
-    run = stages(tmp_path / "cartpole_swingup", tmp_path / "runs", "state")
-    assert load_encoder(run / "encoder")[0].config.channels == 5, (
+    config = PretrainConfig.of("smoke", method="state", out=tmp_path / "run", data=tmp_path)
+    run = run_pretrain(replace(config, data=tmp_path / "cartpole_swingup"))
+    assert load_encoder(run.path / "encoder")[0].config.channels == 5, (
         "place of the cart, sine and cosine of the pole, two velocities"
     )
     with pytest.raises(UserError, match="centre: stores no simulator states"):
-        stages(tmp_path / "centre", tmp_path / "none", "state")
+        run_pretrain(replace(config, data=tmp_path / "centre", out=tmp_path / "none"))
 
 
 def test_an_end_of_the_task_itself_is_stored_in_the_row_that_the_action_led_into(tasks, tmp_path):
@@ -171,7 +170,7 @@ def test_what_makes_no_task_is_refused_where_it_is_registered(tasks, task, told)
 def test_pictures_too_small_for_a_patch_a_shift_or_an_encoder_are_refused_before_training(tasks, tmp_path):
     data = tmp_path / "centre"
     collect(CollectConfig("centre", "random", data, episodes=2, workers=1, frame_size=16), 8)
-    base = pretrain.config.PretrainConfig.of("smoke", data=data, out=tmp_path / "run")
+    base = PretrainConfig.of("smoke", data=data, out=tmp_path / "run")
     for changes, message in (
         ({"corruption": "patch", "patch_size": 17}, r"patch size 17 exceeds the image \(16x16\)"),
         ({"shift": 16}, "--shift is 16; it must be at least 0 and at most 15"),
@@ -187,9 +186,7 @@ def test_an_evaluation_is_never_longer_than_the_task(tasks, tmp_path):
     data = tmp_path / "short"
     collect(CollectConfig("short", "random", data, episodes=3, workers=1, frame_size=50))
     assert {len(part) for part in np.split(open_dataset(data).t, 3)} == {10}
-    encoder = run_pretrain(pretrain.config.PretrainConfig.of("smoke", data=data, out=tmp_path / "pretrain")).path
-    config = finetune.config.FinetuneConfig.of("smoke", encoder=encoder / "encoder", data=data, workers=1)
-    run = run_finetune(replace(config, out=tmp_path / "run", eval_length=500))
+    run = run_finetune(trained(data, tmp_path, "random", eval_length=500))
     assert {row["length"] for row in read_episodes(run.path / "episodes.csv")} == {9}
 
 
@@ -197,11 +194,7 @@ def test_an_evaluation_is_of_whole_episodes_of_a_task_that_is_longer_than_the_be
     tasks.register("long", replace(tasks["centre"], arguments={"speed": 0.0}, decisions=510))
     data = tmp_path / "long"
     collect(CollectConfig("long", "random", data, episodes=2, workers=1, frame_size=50), 60)
-    encoder = run_pretrain(pretrain.config.PretrainConfig.of("smoke", data=data, out=tmp_path / "pretrain")).path
-    config = finetune.config.FinetuneConfig.of(
-        "smoke", encoder=encoder / "encoder", data=data, workers=1, updates=2, eval_every=2, out=tmp_path / "run"
-    )
-    config = replace(config, eval_length=500, eval_clean=False)  # the default
+    config = trained(data, tmp_path, "random", updates=2, eval_every=2, eval_length=500, eval_clean=False)
     run = run_finetune(config)
     assert run_finetune(config).finished, "the same command finds it"
     assert {row["length"] for row in read_episodes(run.path / "episodes.csv")} == {510}

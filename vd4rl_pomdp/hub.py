@@ -80,6 +80,7 @@ def push(folder: Path, repository: str, private: bool = False, revision: str = "
         if revision != "main":
             api.create_branch(**where, branch=revision, exist_ok=True)
         for file in files:
+            # A link: a set may be larger than what is free for temporary files.
             (Path(staged) / file.name).symlink_to(file.resolve())
         write_bytes(Path(staged) / CARD, card.encode())
         write_json(Path(staged) / LISTING, listing)
@@ -115,6 +116,7 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
             if folder.is_dir() and not others and not _wrong(folder, listing):
                 return False
             raise UserError(f"{folder}: is not empty and holds something else than {repository}; choose another folder")
+        # Beside the folder, so that the rename at the end is one step; its name tells the next pull what to resume.
         api.snapshot_download(**where, revision=revision, local_dir=staged, allow_patterns=[*listing])
     with disk_errors(folder):
         if wrong := _wrong(staged, listing):

@@ -80,6 +80,7 @@ class Algorithm(ABC):
             optimiser.zero_grad(set_to_none=True)
         asked = [p for optimiser in optimisers for group in optimiser.param_groups for p in group["params"]]
         with torch.autocast(loss.value.device.type, enabled=False):
+            # an actor's loss runs through the critics, whose own gradients are neither wanted nor computed
             loss.value.backward(inputs=asked)
         for optimiser in optimisers:
             optimiser.step()

@@ -63,6 +63,7 @@ class Gaussian(nn.Module):
     def forward(self, mean: Tensor, action: Tensor) -> Tensor:
         """Log-likelihoods of actions: (B, A), (B, A) -> (B,)."""
         std = self.log_std.clamp(*LOG_STD_RANGE).exp()
+        # validation would read values, and so wait for the GPU in every update
         return torch.distributions.Normal(mean, std, validate_args=False).log_prob(action).sum(-1)
 
 
@@ -108,6 +109,7 @@ class IQL(Algorithm):
         """Squared error of both critics, to the same target y."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
+            # V of the next state, not Q of an action that the policy chose there: nothing unseen is evaluated
             target = batch.reward + self.settings.gamma * batch.discount * self.value(next_z)[:, 0]
         first, second = self.critic(z, batch.action)
         loss = F.mse_loss(first, target) + F.mse_loss(second, target)
@@ -124,6 +126,7 @@ class IQL(Algorithm):
         z, action = self.policy.standardise(batch.z.detach()), batch.action
         with torch.no_grad():
             advantage = q - self.value(z)[:, 0]
+            # clipped: else the one transition that an untrained V underrates most decides the whole batch's gradient
             weight = (self.settings.temperature * advantage).exp().clamp(max=MOST_WEIGHT)
         chosen = self.policy.from_standardised(z)
         loss = -(weight * self.gaussian(chosen, action)).mean()

@@ -30,7 +30,9 @@ def noise_at(update: int, planned: int) -> float:
 
 def with_noise(action: Tensor, std: float, generator: torch.Generator) -> Tensor:
     """Noisy copy of (B, A) actions, within -1..1; the gradient passes as if nothing had been cut off."""
+    # drawn on the CPU, like all batches: the same numbers whatever the device
     noise = torch.randn(action.shape, generator=generator, dtype=action.dtype) * std
     noise = noise.to(action.device, non_blocking=True)
     noisy = action + noise.clamp(-NOISE_CLIP, NOISE_CLIP)
+    # straight through: with the true gradient, 0 beyond the bounds, a saturated action would never come back
     return noisy + (noisy.clamp(MARGIN - 1, 1 - MARGIN) - noisy).detach()

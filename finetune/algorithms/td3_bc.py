@@ -88,7 +88,9 @@ class TD3BC(Algorithm):
         """Squared error of both critics, to the same target y."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
+            # the smaller of two: the policy seeks out what a critic overrates, and no new data would correct it
             value = torch.minimum(*self.target_critic(next_z, self._next_action(next_z)))
+            # `discount` is 0 if the task itself ended within the n steps; a time limit ends nothing, so it bootstraps
             target = batch.reward + self.settings.gamma * batch.discount * value
         first, second = self.critic(z, batch.action)
         loss = F.mse_loss(first, target) + F.mse_loss(second, target)
@@ -99,6 +101,7 @@ class TD3BC(Algorithm):
         z = self.policy.standardise(batch.z.detach())  # the critics' loss alone trains an encoder
         chosen = self._policy_action(z)
         value = self._policy_value(z, chosen)
+        # one alpha for tasks of any reward; a number, because shrinking |Q| is no way to a better policy
         weight = self.settings.alpha / value.abs().mean().detach()
         cloning = F.mse_loss(chosen, batch.action)
         loss = cloning - weight * value.mean()
@@ -106,6 +109,7 @@ class TD3BC(Algorithm):
 
     def _next_action(self, next_z: Tensor) -> Tensor:
         """Action of the target policy, smoothed by clipped noise."""
+        # similar actions have similar values: a lone peak of the critic is averaged with what is around it
         action = self.target_policy.from_standardised(next_z)
         noise = torch.randn(action.shape, generator=self.generator).to(action.device, non_blocking=True) * TARGET_NOISE
         return (action + noise.clamp(-NOISE_CLIP, NOISE_CLIP)).clamp(-1, 1)

@@ -77,6 +77,7 @@ class MaskedInverse(InverseObjective):
                 "leave it out"
             )
         inputs = shape.feature_dim + (shape.action_dim + 1 if self.use_actions else 0)
+        # weights of its own: it reads time backwards, and only f is kept
         self.backward_memory = encoder.make_memory(inputs)
 
     def representations(self, window: Windows) -> tuple[Tensor, Tensor]:
@@ -88,6 +89,8 @@ class MaskedInverse(InverseObjective):
             blanked = [self._future_rows(self.encoder.frame(obs), window) for obs in self._blanked(window.obs)]
             span = None if self.n is None else self.n + 1
             return past, run_over_versions(self.backward_memory, [*blanked, rows], window.length, span)
+        # b runs from the window's end down, so that its state of row t+k has met no row, and no action, before t+k:
+        # what a pair masks is never an input, where zeros in its place would be one
         if self.n is None:
             return past, run_backward(self.backward_memory, rows, window.length)
         return past, run_over_next(self.backward_memory, rows, window.length, self.n + 1)
@@ -105,6 +108,7 @@ class MaskedInverse(InverseObjective):
             action, known = window.prev_action, torch.ones_like(window.has_action)
         else:
             action, known = window.action, window.has_action
+        # an action of zeros can be taken: the flag tells it from none
         return torch.cat([features, action.to(features), known[..., None].to(features)], dim=-1)
 
     def visible(self, t: int, k: int, rows: int) -> tuple[set[int], set[int]]:

@@ -44,7 +44,7 @@ class Supervised(Objective):
     def __init__(self, encoder: Encoder, target: StateScale, options: SupervisedOptions, seed: int) -> None:
         super().__init__()
         self.encoder = encoder
-        columns = torch.nonzero(target.std)[:, 0]
+        columns = torch.nonzero(target.std)[:, 0]  # the others cannot be standardised, and tell nothing
         if not len(columns):
             raise UserError("the simulator's states in this set are all the same: there is nothing to regress")
         self.register_buffer("columns", columns)

@@ -5,7 +5,9 @@ from PIL import Image
 
 from tests.studies.navigation.test_report import write_run
 from vd4rl_pomdp.cli import demo as demos
-from vd4rl_pomdp.cli.demo import conclusion, demo, demo_jobs, show_navigation
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.cli.demo import conclusion, demo_jobs, show_navigation
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.runs.episodes import append_episodes
 from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.studies.navigation.measures import Condition
@@ -52,8 +54,9 @@ def test_the_demo_uses_every_stage(tmp_path, preset):
     assert all(stage[stage.index("--preset") + 1] == preset for stage in words if "--preset" in stage)
 
 
-def test_the_demo_is_one_sweep_that_ends_with_report_conclusion_and_film(tmp_path, capsys):
+def test_the_demo_is_one_sweep_that_ends_with_report_conclusion_and_film(tmp_path, monkeypatch, capsys):
     carried, commands = [], []
+    monkeypatch.setattr(demos, "report", lambda words, program: commands.append(words))
 
     def carry_out(plans, folder, kind, options):
         assert folder.plans() == plans, "`sweep status` knows them"
@@ -62,9 +65,10 @@ def test_the_demo_is_one_sweep_that_ends_with_report_conclusion_and_film(tmp_pat
         write_returns(jobs)
         write_navigation(jobs)
 
-    demo(tmp_path / "demo", 3, "cpu", carry_out, commands.append)
+    monkeypatch.setattr(demos, "carry_out", carry_out)
+    main(["demo", "--out", str(tmp_path / "demo"), "--jobs", "3"])
     assert carried == [("local", 3)]
-    assert [command[0] for command in commands] == ["report"]
+    assert commands == [[str(tmp_path / "demo" / "runs"), "--out", str(tmp_path / "demo" / "report")]]
     shown = capsys.readouterr()
     told = [line.split()[2] for line in shown.err.splitlines() if line.startswith("$ vd4rl-pomdp")]
     assert Counter(told) == {"data": 1, "pretrain": 3, "finetune": 3, "navigation": 3, "report": 1}
@@ -74,19 +78,18 @@ def test_the_demo_is_one_sweep_that_ends_with_report_conclusion_and_film(tmp_pat
 
 def test_without_a_gpu_the_demo_does_a_job_a_core_up_to_four(tmp_path, monkeypatch):
     at_once = []
-    for cores in (2, 64):
-        monkeypatch.setattr(demos, "visible_gpus", list)
+
+    def carry_out(plans, folder, kind, options):
+        at_once.append(options.jobs)
+        raise UserError("far enough")
+
+    monkeypatch.setattr(demos, "carry_out", carry_out)
+    for gpus, cores in (([], 2), ([], 64), (["0"], 64)):
+        monkeypatch.setattr(demos, "visible_gpus", lambda gpus=gpus: gpus)
         monkeypatch.setattr(demos, "count_workers", lambda wanted, cores=cores: wanted or cores)
-        with pytest.raises(RuntimeError, match="far enough"):
-            demo(tmp_path, 0, "cpu", lambda *told: at_once.append(told[3].jobs) or stop(), stop)
-    monkeypatch.setattr(demos, "visible_gpus", lambda: ["0"])
-    with pytest.raises(RuntimeError, match="far enough"):
-        demo(tmp_path, 0, "cpu", lambda *told: at_once.append(told[3].jobs) or stop(), stop)
+        with pytest.raises(SystemExit, match="2"):
+            main(["demo", "--out", str(tmp_path)])
     assert at_once == [2, 4, 0]
-
-
-def stop():
-    raise RuntimeError("far enough")
 
 
 def test_the_demo_ends_with_the_last_evaluation_what_is_known_and_how_sure_it_is(tmp_path):

@@ -20,13 +20,11 @@ from vd4rl_pomdp.testing.methods import (
     checks_of,
     padding_changes_no_loss,
     predictions_depend_on_what_is_declared,
-    predicts_actions,
     steps_lower_the_loss,
     streaming_equals_batch,
 )
 
 CASES = [(name, check) for name in METHODS for check in checks_of(name)]
-INVERSE = [name for name in METHODS if predicts_actions(name)]
 
 
 @pytest.mark.parametrize(("name", "check"), CASES, ids=lambda value: getattr(value, "__name__", value))
@@ -34,13 +32,10 @@ def test_a_method_keeps_its_promises(name: str, check: Callable):
     run_check("method", check, name)
 
 
-@pytest.mark.parametrize("method", INVERSE)
-def test_the_loss_of_an_inverse_method_is_its_action_loss(method: str):
-    loss, logs = build(method).loss(batch(), 0.0)
+def test_the_loss_of_an_inverse_method_is_its_action_loss():
+    """`check_method` proves what weighted terms add to it."""
+    loss, logs = build("mik+a").loss(batch(), 0.0)
     assert torch.equal(loss.detach(), logs["action_loss"])
-    loss, logs = build(method, self_prediction=0.5, l2_states=0.1).loss(batch(), 0.25)
-    expected = logs["action_loss"] + 0.5 * logs["self_prediction"] + 0.1 * 0.75 * logs["l2_states"]
-    torch.testing.assert_close(loss.detach(), expected)
 
 
 def test_self_prediction_moves_the_prediction_and_never_its_target():
@@ -56,11 +51,6 @@ def test_self_prediction_moves_the_prediction_and_never_its_target():
         asked = torch.cat([past[:, t], torch.full((2, 1), k / objective.options.max_k)], dim=-1)
         errors.append((objective.predictor(asked) - past[:, t + k]).square().mean())
     torch.testing.assert_close(logs["self_prediction"], torch.stack(errors).mean().detach())
-
-
-def test_inverse_methods_are_those_of_the_papers():
-    expected = {"no_history", "ah", "ah+a", "fj", "fj+a", "mik", "mik+a", "acro", "one_step_inverse"}
-    assert set(INVERSE) == expected
 
 
 class Mean(Objective):

@@ -98,8 +98,6 @@ def test_what_cannot_be_fetched_or_is_wrong_is_one_line_and_what_came_before_sta
     mirror.damaged = {f"vd4rl/main/{EXPERT}/1_a_expert.hdf5"}
     with pytest.raises(UserError, match=r"1_a_expert\.hdf5: has a wrong SHA-256 and was removed; re-run the same"):
         fetch(mirror, tmp_path)
-    with pytest.raises(UserError, match=r"is a part of V-D4RL's walker_walk expert \(1_a_expert.hdf5 is missing\)"):
-        open_dataset(tmp_path / EXPERT)
     mirror.damaged, mirror.status = set(), {"1_a_expert": 404}
     with pytest.raises(
         UserError, match=r"1_a_expert\.hdf5: cannot be fetched \(.*404.*\); check the network"
@@ -146,50 +144,16 @@ def test_what_is_not_published_is_refused(tmp_path, arguments, message):
     assert not list(tmp_path.iterdir())
 
 
-def part_of_a_set(tmp_path, names, folder=EXPERT):
-    """Some of a set's files, of their published sizes and no shards inside."""
-    place = tmp_path / folder
-    place.mkdir(parents=True)
-    for name in names:
-        (place / name).write_bytes(CONTENT[name])
-    return place
-
-
-@pytest.mark.parametrize(
-    ("folder", "names", "task", "told"),
-    [
-        (EXPERT, ["0_a_expert.hdf5"], "walker_walk expert", "1_a_expert.hdf5 is missing"),
-        (BOTH, list(CONTENT)[:2], "walker_walk medium_expert", "0_a_medium.hdf5 is missing"),
-        ("mine", ["0_a_expert.hdf5"], "walker_walk expert", "1_a_expert.hdf5 is missing"),
-        ("mine", ["0_a_expert.hdf5", "0_a_medium.hdf5"], "walker_walk medium_expert", "1_a_expert.hdf5 is missing"),
-    ],
-)
-def test_a_part_of_a_published_set_is_told_with_what_gets_the_rest(mirror, tmp_path, folder, names, task, told):
-    place = part_of_a_set(tmp_path, names, folder)
-    words = "--task {} --quality {}".format(*task.split())
-    out = "DIR" if folder == "mine" else tmp_path
-    with pytest.raises(
-        UserError, match=re.escape(f"{place}: is a part of V-D4RL's {task} ({told}); get the rest")
-    ) as e:
-        open_dataset(place)
-    assert f"`vd4rl-pomdp data download {words} --out {out}`" in str(e.value)
-
-
-def test_a_part_of_a_published_set_gets_no_card_and_is_not_pushed(mirror, tmp_path):
-    place = part_of_a_set(tmp_path, ["0_a_expert.hdf5"])
-    for tell in (write_card, lambda folder: push(folder, "datasets/lab/set")):
-        with pytest.raises(UserError, match="is a part of V-D4RL's walker_walk expert"):
+@pytest.mark.usefixtures("mirror", "own_cache")
+def test_a_part_of_a_published_set_is_told_with_what_gets_the_rest(tmp_path):
+    place = write_fake_set(tmp_path / EXPERT, names=["0_a_expert.hdf5"])
+    part = (
+        f"{place}: is a part of V-D4RL's walker_walk expert, 1 of 2 shards (1_a_expert.hdf5 is missing); get the rest "
+    )
+    command = f"`vd4rl-pomdp data download --task walker_walk --quality expert --out {tmp_path}`"
+    for tell in (open_dataset, write_card, lambda folder: push(folder, "datasets/lab/set")):
+        with pytest.raises(UserError, match=re.escape(f"{part}with {command}")):
             tell(place)
-
-
-def test_a_shard_of_another_size_than_the_others_of_a_published_set_is_told(mirror, tmp_path):
-    place = part_of_a_set(tmp_path, list(CONTENT)[:2])
-    (place / "1_a_expert.hdf5").write_bytes(b"cut")
-    with pytest.raises(UserError, match=rf"\(1_a_expert.hdf5 has 3 bytes, not {6 * 999}\); get the rest with"):
-        open_dataset(place)
-    fetch(mirror, tmp_path)
-    with pytest.raises(UserError, match=r"0_a_expert.hdf5: is truncated, damaged or no HDF5 file"):  # as these are
-        open_dataset(place)
 
 
 @pytest.mark.usefixtures("mirror", "own_cache")
@@ -200,9 +164,6 @@ def test_a_set_of_ones_own_is_opened_unless_it_is_named_as_a_part_of_a_published
     write_fake_set(tmp_path / "b" / EXPERT, names=names[:1], attributes=told)
     write_fake_set(tmp_path / "c" / "mine", names=names[:1])
     write_fake_set(tmp_path / "d" / EXPERT)
-    write_fake_set(tmp_path / "e" / EXPERT, (5, 5), cuts=(5,), names=[names[0], "0_mine.hdf5"])
-    for folder in (f"a/{EXPERT}", f"b/{EXPERT}", "c/mine", f"d/{EXPERT}", f"e/{EXPERT}"):
+    for folder in (f"a/{EXPERT}", f"b/{EXPERT}", "c/mine", f"d/{EXPERT}"):
         assert open_dataset(tmp_path / folder).num_episodes == 2
     assert open_dataset(tmp_path / "c" / "mine" / names[0]).num_episodes == 2
-    with pytest.raises(UserError, match=r"walker_walk expert \(1_a_expert.hdf5 is missing\); get the rest"):
-        open_dataset(write_fake_set(tmp_path / EXPERT, names=names[:1]))

@@ -104,21 +104,6 @@ def test_the_actor_maximises_the_value_in_units_of_its_own_size_beside_cloning(s
         torch.testing.assert_close(one, other)
 
 
-@pytest.mark.parametrize(("kind", "delay", "tau"), [(TD3BC, 2, 0.005), (DrQv2BC, 1, 0.01)])
-def test_actor_and_targets_move_at_every_so_many_updates_and_targets_slowly(kind, delay, tau):
-    algorithm = make(kind)
-    pairs = [(algorithm.critic, algorithm.target_critic), (algorithm.policy.net, algorithm.target_policy.net)]
-    for number in range(1, 5):
-        actor = [p.clone() for p in algorithm.policy.net.parameters()]
-        old = [[p.clone() for p in target.parameters()] for _, target in pairs]
-        algorithm.update(batch(number))
-        moved = [(a != b).any().item() for a, b in zip(actor, algorithm.policy.net.parameters(), strict=True)]
-        assert moved == [number % delay == 0] * len(moved)
-        for (online, target), before in zip(pairs, old, strict=True):
-            for p, q, was in zip(online.parameters(), target.parameters(), before, strict=True):
-                torch.testing.assert_close(q, was.lerp(p, tau) if number % delay == 0 else was)
-
-
 def test_drqv2s_noise_decays_linearly_and_then_stays():
     found = [noise.noise_at(updates, 10**6) for updates in (0, 125_000, 250_000, 10**6)]
     assert found == pytest.approx([1.0, 0.55, 0.1, 0.1])
@@ -149,13 +134,6 @@ def test_noise_is_cut_off_with_the_action_and_lets_the_whole_gradient_pass():
     inside = action.detach().abs() < 0.6
     assert (moved[inside].abs() > 0.29).float().mean() > 0.9, "noise of ten is nearly always clipped"
     assert moved[inside].mean().abs() < 0.05
-
-
-def test_cloning_is_the_squared_error_of_the_policys_action(silent):
-    algorithm, given = make(BC), batch()
-    expected = F.mse_loss(algorithm.policy(given.z), given.action).item()
-    assert algorithm.update(given)["bc_loss"].item() == pytest.approx(expected)
-    assert algorithm.update(given)["bc_loss"].item() < expected
 
 
 def numbers(algorithm: IQL, given: FeatureBatch) -> dict[str, np.ndarray]:
@@ -314,26 +292,6 @@ def test_policies_read_standardised_representations():
     policy, given = make(BC).policy, batch()
     mean, std = given.z.mean(0), given.z.std(0, correction=0)
     torch.testing.assert_close(policy(given.z), policy.from_standardised((given.z - mean) / std), atol=1e-3, rtol=1e-3)
-
-
-@pytest.mark.parametrize("kind", [BC, TD3BC, DrQv2BC, IQL])
-def test_an_encoder_is_trained_by_the_first_loss_and_by_no_other(kind):
-    """V-D4RL's references train the encoder by the critic's loss (bc: by cloning); the actor's gradient stops at z."""
-    torch.manual_seed(0)
-    encoder, given = torch.nn.Linear(DIM, DIM), batch()
-    optimiser = torch.optim.SGD(encoder.parameters(), lr=1.0)
-    algorithm, twin = (make(kind, learning_rate=0.0) for _ in range(2))
-    first = twin.cloning_loss if kind is BC else twin.critic_loss
-    alone = first(replace(given, z=encoder(given.z))).value
-    expected = torch.autograd.grad(alone, list(encoder.parameters()))
-    before = [p.clone() for p in encoder.parameters()]
-    for number in range(2):  # the second update of TD3+BC trains the actor, too
-        moved = encoder.weight.clone()
-        algorithm.update(replace(given, z=encoder(given.z)), optimiser)
-        assert not torch.equal(encoder.weight, moved)
-        if number == 0:
-            for old, now, grad in zip(before, encoder.parameters(), expected, strict=True):
-                torch.testing.assert_close(now, old - grad)
 
 
 def test_what_reads_rewards_finds_the_better_action_and_bc_the_common_one():

@@ -9,9 +9,9 @@ from finetune.config import FinetuneConfig
 from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories, HistoryOptions
 from finetune.train import finetune
-from pretrain.train import pretrain
+from tests.finetune.conftest import BRIEF
 from tests.finetune.test_features import LENGTHS, ROWS, noise_set
-from tests.helpers_stages import smoke_finetune, smoke_pretrain
+from tests.helpers_stages import smoke_finetune
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import View
@@ -93,7 +93,7 @@ def test_exact_batches_begin_at_random_rows_too(frozen):
 
 def test_a_run_keeps_what_its_policy_reads_and_evaluates_with_it(encoder, data, tmp_path):
     told = {"readout": "frame+state", "history_window": 4, "random_histories": 0.5, "longest_history": 3}
-    config = smoke_finetune(encoder, data, tmp_path / "run", **told)
+    config = smoke_finetune(encoder, data, tmp_path / "run", **told, **BRIEF)
     run = finetune(config)
     kept, _ = load_encoder(run.path / "encoder")
     assert (kept.config.readout, kept.config.history_window) == ("frame+state", 4)
@@ -101,12 +101,6 @@ def test_a_run_keeps_what_its_policy_reads_and_evaluates_with_it(encoder, data, 
     record = json.loads((run.path / "config.json").read_text())["config"]
     assert {name: record[name] for name in told} == told
     assert finetune(config).finished
-
-
-def test_an_encoder_without_a_memory_has_no_options_of_one(data, tmp_path):
-    memoryless = pretrain(smoke_pretrain(data, tmp_path / "random", method="random")).path / "encoder"
-    record = json.loads((finetune(smoke_finetune(memoryless, data, tmp_path / "run")).path / "config.json").read_text())
-    assert "readout" not in record["config"], "nothing that is not read"
 
 
 def test_the_shortest_history_is_not_longer_than_the_longest():

@@ -4,8 +4,10 @@ import numpy as np
 import pytest
 import torch
 
+from finetune import train
 from finetune.path import DataPath
 from finetune.train import finetune
+from tests.finetune.conftest import BRIEF
 from tests.helpers_data import fake_rows
 from tests.helpers_stages import smoke_finetune
 from vd4rl_pomdp.core.tasks import TASKS
@@ -63,9 +65,10 @@ def test_an_episode_of_one_row_decides_nothing(walked, monkeypatch):
 
 
 @pytest.mark.parametrize("views", [1, 0])
-def test_a_run_keeps_its_path_error_and_compares_closed_loop_actions(walked, encoder, tmp_path, views):
+def test_a_run_keeps_its_path_error_and_compares_closed_loop_actions(walked, encoder, tmp_path, monkeypatch, views):
+    monkeypatch.setattr(train, "STANDARDISED_BY", 16)
     folder, _, actor = walked
-    config = smoke_finetune(encoder, folder, tmp_path / "run", updates=2, batch_size=4, eval_length=2, views=views)
+    config = smoke_finetune(encoder, folder, tmp_path / "run", views=views, **BRIEF)
     run = finetune(config).path
     reference = Reference.read(run)
     assert reference.actor == {"task": "walker_walk", "quality": "expert", "sha256": actor.sha256}

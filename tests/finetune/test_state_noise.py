@@ -1,6 +1,7 @@
 """States with noise of a probe's size: as large as asked, drawn like a corruption, none where none was asked for."""
 
 import json
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +13,7 @@ from finetune.features import ExactSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories
 from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
-from tests.helpers_stages import smoke_finetune, smoke_pretrain
+from tests.helpers_stages import smoke_pretrain
 from vd4rl_pomdp.core.options import NO_OPTIONS
 from vd4rl_pomdp.core.state_scale import StateScale
 from vd4rl_pomdp.core.tasks import TASKS
@@ -24,28 +25,36 @@ from vd4rl_pomdp.envs.corrupted import CorruptedEnv
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.policy import Policy
 
-pytestmark = pytest.mark.usefixtures("own_cache")
 WALKER = TASKS.named("walker_walk")
 ROWS, POSE, VELOCITY = 400, 25.0, 40.0
 
 
-@pytest.fixture
-def with_states(tmp_path, monkeypatch) -> Path:
+@pytest.fixture(scope="module")
+def with_states(tmp_path_factory) -> Iterator[Path]:
     """A set whose states are random numbers of many sizes; one pose never changes."""
-    path = write_fake_set(tmp_path / "own" / "walker_walk" / "expert", [ROWS] * 5, physics_dim=18)
+    folder = tmp_path_factory.mktemp("states")
+    path = write_fake_set(folder / "walker_walk" / "expert", [ROWS] * 5, physics_dim=18)
     physics = np.random.default_rng(0).normal(size=(5 * ROWS, 18)) * 10.0 ** np.arange(-2, 4).repeat(3) + 7
     physics[:, 3] = 2
-    monkeypatch.setattr("vd4rl_pomdp.data.store.Store.physics", lambda self: physics)
-    return path
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VD4RL_POMDP_CACHE", str(folder / "cache"))
+        patch.setattr("sys.argv", ["vd4rl-pomdp", "test"])
+        patch.setattr("vd4rl_pomdp.data.store.Store.physics", lambda self: physics.copy())
+        yield path
 
 
 def pretrained(data: Path, out: Path, **noise: float) -> Path:
     return run_pretrain(smoke_pretrain(data, out, method="state", **noise)).path / "encoder"
 
 
-@pytest.fixture
-def noisy(with_states, tmp_path) -> Path:
-    return pretrained(with_states, tmp_path / "noisy", pose_noise=POSE, velocity_noise=VELOCITY)
+@pytest.fixture(scope="module")
+def noisy(with_states, tmp_path_factory) -> Path:
+    return pretrained(with_states, tmp_path_factory.mktemp("noisy") / "run", pose_noise=POSE, velocity_noise=VELOCITY)
+
+
+@pytest.fixture(scope="module")
+def plain(with_states, tmp_path_factory) -> Path:
+    return pretrained(with_states, tmp_path_factory.mktemp("plain") / "run")
 
 
 def frozen(encoder: Path, dataset: Dataset, mode: str = "resample") -> FrozenEncoder:
@@ -136,17 +145,17 @@ def test_a_stream_of_rows_is_seen_as_a_batch_of_them_and_keyed_by_seed_episode_a
         assert 20 < (batch == 0).sum() < 70, "of 90 coordinates, half"
 
 
-def test_evaluation_repeats_whatever_the_number_of_workers(noisy, with_states, tmp_path):
+def test_evaluation_repeats_whatever_the_number_of_workers(noisy, plain, tmp_path):
     torch.manual_seed(0)
     policy = Policy(18, 6, 8)
     with torch.no_grad():
         policy.net[-1].weight.mul_(20)
     policy.save(tmp_path / "policy")
-    plain, corruption = pretrained(with_states, tmp_path / "plain"), CorruptionConfig.of("patch")
 
     def totals(encoder: Path, workers: int) -> list[float]:
         places = encoder, tmp_path / "policy"
-        jobs = [EpisodeJob(*places, WALKER, corruption, e, film=False, length=6) for e in (0, 1)]
+        under = CorruptionConfig.of("patch")
+        jobs = [EpisodeJob(*places, WALKER, under, e, film=False, length=6) for e in (0, 1)]
         return [episode.total for episode in evaluate(jobs, workers)]
 
     alone = totals(noisy, 1)
@@ -154,11 +163,10 @@ def test_evaluation_repeats_whatever_the_number_of_workers(noisy, with_states, t
     assert not set(totals(plain, 1)) & set(alone), "the noise changes what is done"
 
 
-def test_without_noise_states_are_handed_through(with_states, tmp_path):
-    encoder = pretrained(with_states, tmp_path / "plain")
-    assert json.loads((encoder / "config.json").read_text())["encoder"]["frame_options"] == {}
+def test_without_noise_states_are_handed_through(with_states, plain):
+    assert json.loads((plain / "config.json").read_text())["encoder"]["frame_options"] == {}
     dataset = open_dataset(with_states)
-    made = frozen(encoder, dataset)
+    made = frozen(plain, dataset)
     assert torch.equal(made.episode(1, made.view(0)), dataset.states()[ROWS : 2 * ROWS])
 
 
@@ -179,10 +187,10 @@ def test_a_scale_tells_constant_coordinates():
     assert scale.noise(100, 50).tolist() == pytest.approx([(np.pi / 2) ** 0.5, 0, (np.pi / 2) ** 0.5])
 
 
-def test_states_are_kept_in_full_precision(with_states, tmp_path):
+def test_states_are_kept_in_full_precision(with_states, plain, tmp_path):
     """A coordinate that never changes is scaled up: rounded to half precision, it would be another in evaluation."""
-    encoder, dataset = pretrained(with_states, tmp_path / "exact"), open_dataset(with_states)
+    dataset = open_dataset(with_states)
     dataset.physics[:, 3] = 1.3
-    seen, config = frozen(encoder, dataset), smoke_finetune(encoder, with_states, tmp_path / "out")
-    features = encode_views(seen, Histories(dataset, config.memory, 1, 0), 1, tmp_path / "features.npy")
+    histories = Histories(dataset, NO_OPTIONS, 1, 0)
+    features = encode_views(frozen(plain, dataset), histories, 1, tmp_path / "features.npy")
     assert torch.equal(features[0], dataset.states())

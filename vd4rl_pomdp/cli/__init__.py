@@ -19,7 +19,7 @@ from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE
 
 PROGRAM = "vd4rl-pomdp"
 COMMANDS = {
-    "demo": ("stages.demo", "every stage on a small set, in minutes"),
+    "demo": ("demo.demo", "every stage on a small set, in minutes"),
     "list": ("stages.list_parts", "all parts that have a name: methods, corruptions, algorithms and the like"),
     "data collect": ("data.collect", "render a set in V-D4RL's format from the shipped actors"),
     "data download": ("data.download", "fetch a published V-D4RL set"),

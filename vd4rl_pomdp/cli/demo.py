@@ -8,12 +8,14 @@ from __future__ import annotations
 import shlex
 import sys
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from importlib.util import find_spec
 from pathlib import Path
 
+from vd4rl_pomdp.cli.parsing import command
+from vd4rl_pomdp.cli.studies import report
+from vd4rl_pomdp.cli.sweeps import carry_out
 from vd4rl_pomdp.core.errors import refuse_no_folder, refuse_unknown
-from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.envs.mazes import get_maze
 from vd4rl_pomdp.report.load import PROBES
 from vd4rl_pomdp.report.stats import mean_and_error
@@ -26,7 +28,7 @@ from vd4rl_pomdp.studies.navigation.figures import write_film
 from vd4rl_pomdp.studies.navigation.measures import refitted_error
 from vd4rl_pomdp.studies.navigation.runs import find_navigation, load_runs
 from vd4rl_pomdp.sweeps.driver import visible_gpus
-from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder
+from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.options import LocalOptions
 from vd4rl_pomdp.sweeps.plan import Job, plan_jobs
@@ -50,48 +52,34 @@ def demo_jobs(out: Path, preset: str = "cpu") -> list[Job]:
     return jobs
 
 
-def demo(
-    out: Path,
-    at_once: int,
-    preset: str,
-    carry_out: Callable[[list[Plan], SweepFolder, str, Options], None],
-    run: Callable[[list[str]], None],
-) -> None:
-    """Run every command of the demo, after printing them so that they can be run by hand.
+@command
+def demo(out: Path = Path("runs/demo"), jobs: int = 0, preset: str = "cpu") -> None:
+    """Every stage, in minutes: three methods on a small walker_walk set, two in a maze; a table, a report, a film.
 
     Args:
-        out: folder of data, runs and report.
-        at_once: jobs at a time, 0 for what the machine takes.
-        preset: how long the stages take, one of PRESETS.
-        carry_out: what runs plans on an executor of a kind with options.
-        run: what carries out one command line.
-
-    Raises:
-        UserError: an unknown preset, a number of jobs that cannot be, or a folder that is something else.
+        out: Folder of the demo's data and runs; re-run the same command to resume.
+        jobs: Commands at a time; 0: as many as the GPUs take, or one a core, up to 4.
+        preset: cpu: minutes; smoke: only that every stage runs.
     """
     started = time.monotonic()
-    options = LocalOptions(jobs=at_once or _jobs_at_once())
+    at_once = 0 if visible_gpus() else min(count_workers(0), MOST_AT_ONCE)  # 0: one a GPU
+    options = LocalOptions(jobs=jobs or at_once)
     options.check()
     refuse_no_folder(out)
     refuse_kept(out)
-    jobs, folder = demo_jobs(out, preset), SweepFolder(out)
-    report = ("report", str(out / "runs"), "--out", str(out / "report"))
-    for words in (*(job.words for job in jobs if not job.finished), report):
-        print(f"$ vd4rl-pomdp {shlex.join(words)}", file=sys.stderr)
+    planned, folder = demo_jobs(out, preset), SweepFolder(out)
+    words = ["report", str(out / "runs"), "--out", str(out / "report")]
+    for line in (*(job.words for job in planned if not job.finished), words):  # so that they can be run by hand
+        print(f"$ vd4rl-pomdp {shlex.join(line)}", file=sys.stderr)
     print(f"Where this stands: vd4rl-pomdp sweep status {out}; what it prints: {folder.path / 'logs'}", file=sys.stderr)
-    carry_out([folder.keep_plan("demo", jobs)], folder, "local", options)
-    run(list(report))
-    print("\n".join(conclusion(jobs)))
+    carry_out([folder.keep_plan("demo", planned)], folder, "local", options)
+    report(words[1:], "vd4rl-pomdp report")
+    print("\n".join(conclusion(planned)))
     if "navigation" in GRIDS:
-        print("\n".join(show_navigation(jobs, out / FILM)))
+        print("\n".join(show_navigation(planned, out / FILM)))
     else:
         print("The mazes are left out: they need the extra `navigation`.")
     print(f"demo finished in {(time.monotonic() - started) / 60:.1f} minutes")
-
-
-def _jobs_at_once() -> int:
-    """One a core, or 0, which the executor takes for one a GPU."""
-    return 0 if visible_gpus() else min(count_workers(0), MOST_AT_ONCE)
 
 
 def conclusion(jobs: list[Job]) -> Iterator[str]:

@@ -34,6 +34,11 @@ def parse(config: Any, words: list[str], program: str, default: Any = None) -> A
         program: what stands before them.
         default: an instance that has the defaults.
     """
+    for before, word in zip(["", *words], words, strict=False):
+        # As a Path an empty word would be the working directory: `--out "$UNSET"` would write there.
+        if not word or (word.startswith("--") and word.endswith("=")):
+            name = word.rstrip("=") or (before if before.startswith("--") else "a word")
+            raise UserError(f"{name} is empty: is a variable of the shell not set? (see `{program} --help`)")
     words = [re.sub("(?<==)~.*", lambda path: os.path.expanduser(path[0]), word, count=1) for word in words]
     options = {} if default is None else {"default": default}
     shown = io.StringIO()

@@ -1,4 +1,4 @@
-"""The stages of an experiment: pretrain, finetune, evaluate; the demo runs them all, and the list names their parts."""
+"""The stages of an experiment: pretrain, finetune, evaluate; and the list of their parts."""
 
 from __future__ import annotations
 
@@ -81,22 +81,6 @@ def evaluate(
     result = labels | known | {"under": under}
     told = {name: "unknown" if value is None else value for name, value in flatten(result).items()}
     show(result if json else told, json)
-
-
-@command
-def demo(out: Path = Path("runs/demo"), jobs: int = 0, preset: str = "cpu") -> None:
-    """Every stage, in minutes: three methods on a small walker_walk set, two in a maze; a table, a report, a film.
-
-    Args:
-        out: Folder of the demo's data and runs; re-run the same command to resume.
-        jobs: Commands at a time; 0: as many as the GPUs take, or one a core, up to 4.
-        preset: cpu: minutes; smoke: only that every stage runs.
-    """
-    from vd4rl_pomdp.cli.demo import demo
-    from vd4rl_pomdp.cli.studies import report
-    from vd4rl_pomdp.cli.sweeps import carry_out
-
-    demo(out, jobs, preset, carry_out, lambda words: report(words[1:], "vd4rl-pomdp report"))
 
 
 @command

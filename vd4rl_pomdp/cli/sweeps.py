@@ -14,9 +14,9 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 import tyro
 
 from vd4rl_pomdp.cli.parsing import command, parse_stage, show
-from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder
+from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder, refuse_unknown
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
-from vd4rl_pomdp.sweeps.options import LocalOptions, executor_options
+from vd4rl_pomdp.sweeps.options import EXECUTORS, LocalOptions
 from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE, in_words, own_program, program_here, refuse_unknown_to_jobs
 
 if TYPE_CHECKING:
@@ -39,7 +39,8 @@ class _ExecutorConfig(StageConfig):
     @classmethod
     def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
         """Options of the executor."""
-        return {"options": executor_options(values["executor"]).fill(values)}
+        refuse_unknown("executor", values["executor"], EXECUTORS)
+        return {"options": EXECUTORS[values["executor"]].fill(values)}
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -69,6 +70,7 @@ class RunCommand(_ExecutorConfig):
 
 def run(words: list[str], program: str) -> None:
     """Carry out a grid, or resume it."""
+    # Imported here, as in every command: they load torch and the simulators, which no other command has to wait for.
     from vd4rl_pomdp.runs.outputs import refuse_kept
     from vd4rl_pomdp.sweeps.folder import SweepFolder, plan_name
     from vd4rl_pomdp.sweeps.grid import SHARED, load_grid, names, narrow
@@ -82,6 +84,7 @@ def run(words: list[str], program: str) -> None:
     grid = load_grid(asked.grid, asked.change, asked.testing)
     cells = narrow(grid.cells(), asked.only)
     check_cells(cells, asked.grid)
+    # Before the plan is made, which may decode sets for minutes.
     for place in (asked.out, asked.data or asked.out):
         refuse_no_folder(place)
     refuse_kept(asked.out)
@@ -125,17 +128,18 @@ def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, n
         options: its options.
         name: of the plan; empty: several are all that the folder has.
     """
-    from vd4rl_pomdp.sweeps.clusters import cluster_of, watch
+    from vd4rl_pomdp.sweeps.clusters import RayCluster, SlurmCluster, watch
     from vd4rl_pomdp.sweeps.driver import Driver
-    from vd4rl_pomdp.sweeps.folder import status
+    from vd4rl_pomdp.sweeps.folder import jobs_of, status
 
     if JOB_VARIABLE in os.environ:
         raise UserError("a job cannot start a sweep: end the file in `main()`, which reads the job's own command line")
     if kind == "local":
         finished = Driver(plans, options, folder).run()
     else:
-        finished = watch(plans, cluster_of(kind, options, folder), folder, name)
-    jobs = _jobs_of(plans)
+        cluster = {"slurm": SlurmCluster, "ray": RayCluster}[kind](options, folder.path / kind)
+        finished = watch(plans, cluster, folder, name)
+    jobs = jobs_of(plans)
     if not finished:
         found = status(jobs, folder.attempts(jobs))
         for job, row in found["failures"].items():
@@ -149,10 +153,6 @@ def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, n
     print(f"all {len(jobs)} jobs are finished")
 
 
-def _jobs_of(plans: list[Plan]) -> list[Job]:
-    return list({job.name: job for plan in plans for job in plan.jobs}.values())
-
-
 @command
 def show_status(out: tyro.conf.Positional[Path], json: bool = False) -> None:
     """Show where a sweep stands: counts, rate, time left, and failures with their last line.
@@ -161,10 +161,10 @@ def show_status(out: tyro.conf.Positional[Path], json: bool = False) -> None:
         out: Folder of the sweep.
         json: Print one JSON object.
     """
-    from vd4rl_pomdp.sweeps.folder import SweepFolder, in_lines, status
+    from vd4rl_pomdp.sweeps.folder import SweepFolder, in_lines, jobs_of, status
 
     folder = SweepFolder(out)
-    jobs = _jobs_of(folder.plans())
+    jobs = jobs_of(folder.plans())
     found = status(jobs, folder.attempts(jobs))
     if json:
         show(found, True)
@@ -182,12 +182,13 @@ class RetryCommand(_ExecutorConfig):
 
 def retry(words: list[str], program: str) -> None:
     """Run failures again."""
-    from vd4rl_pomdp.sweeps.folder import SweepFolder, failed
+    from vd4rl_pomdp.sweeps.folder import SweepFolder, failed, jobs_of
 
     asked = parse_stage(RetryCommand, words, program)
     folder = SweepFolder(asked.out)
     plans = folder.plans_to_do()
-    for name, rows in folder.attempts(_jobs_of(plans)).items():
+    # A row, not a deletion: other drivers may be reading the file.
+    for name, rows in folder.attempts(jobs_of(plans)).items():
         if failed(rows):
             folder.forget(name)
     carry_out(plans, folder, asked.executor, asked.options)

@@ -16,7 +16,8 @@ from stat import S_ISDIR
 from typing import Any
 
 TEMPORARY = 75
-"""Exit code of what the same command may not meet again, EX_TEMPFAIL of sysexits.h: a sweep tries it again."""
+"""Exit code of what the same command may not meet again, EX_TEMPFAIL of sysexits.h: a sweep tries it again. It sees no
+more of a job than this code, and bad input, 2, would be refused every time."""
 
 
 class UserError(ValueError):

@@ -132,6 +132,7 @@ class Registry(Mapping[str, Part], Generic[Part]):
             raise UserError(f"{self.kind} {name!r}: {error}") from None
         self._parts[name], self._origins[name] = part, origin
         path = Path(file)
+        # Hashed now: the file may be edited while this process runs what it said before.
         content = path.read_bytes() if path.is_file() else None
         self._sources[name] = "" if content is None else f"{path.name} {sha256(content).hexdigest()[:12]}"
 

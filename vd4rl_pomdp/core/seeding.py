@@ -24,6 +24,7 @@ def stream_seed(seed: int, *name: str | int) -> int:
         An integer in 0..2^63-1, the same on every machine.
     """
     key = [int.from_bytes(hashlib.blake2b(repr(part).encode(), digest_size=8).digest()) for part in name]
+    # Halved, because torch takes seeds below 2^63.
     return int(np.random.SeedSequence(seed, spawn_key=key).generate_state(1, np.uint64)[0]) >> 1
 
 

@@ -71,7 +71,9 @@ def shift_by_lines(images: Tensor, chosen: Tensor, offset: Tensor, out: Tensor) 
     must then be overwritten by the border.
     """
     n, planes, height, width = images.shape
+    # Row i is the run of `width` bytes that begins at byte i of all images: overlapping views, nothing is copied.
     runs = images.as_strided((images.numel() - width + 1, width), (1, 1))
+    # Runs of the first and the last image may reach beyond the memory; these are shifted by index, at the end.
     inner = chosen.clamp(1, n - 2)
     dy, dx = offset.unbind(1)
     line = (dy[:, None] + torch.arange(height)).clamp_(0, height - 1)
@@ -86,6 +88,7 @@ def shift_by_lines(images: Tensor, chosen: Tensor, offset: Tensor, out: Tensor) 
 def _repeat_borders(images: np.ndarray, shift: np.ndarray) -> None:
     """Overwrite the columns of (M, lines, W) images that an (M,) shift brought in by the outermost true one."""
     width = images.shape[-1]
+    # At most 2 * pad different shifts, each with a few columns: two short loops, whatever the batch.
     for size in np.unique(shift[shift != 0]).tolist():
         moved = np.flatnonzero(shift == size)
         edge = width - 1 - size if size > 0 else -size

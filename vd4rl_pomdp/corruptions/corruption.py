@@ -73,7 +73,9 @@ class Patch(Options):
             n, k, self.patch_count
         )
         top = draw_numbered(key, height - self.patch_size + 1, draw)
+        # Hashed once more: from the key itself rows and columns would draw the same.
         left = draw_numbered(hash_keys(key), width - self.patch_size + 1, draw)
+        # Every square of the frames by its corner, as a view: writing into it writes into the frames.
         squares = frames.unfold(3, self.patch_size, 1).unfold(4, self.patch_size, 1)
         sample = torch.arange(n, device=key.device)[:, None, None]
         frame = torch.arange(k, device=key.device)[:, None]
@@ -241,7 +243,9 @@ class Corruption:
             return torch.arange(stack, device=key.device).expand(len(key), stack)
         if self._zeroed > stack:
             raise UserError(f"cannot zero {self._zeroed} of {stack} stacked frames: choose a smaller --zeroed-frames")
+        # A stream beside those of the stages, so that which frames are zeroed tells nothing of where patches are.
         key = hash_keys(derive_keys(len(self._stages), key) ^ 1)
+        # Numbers sorted by random draws are a uniform permutation.
         return draw_integers(key, DRAWS, stack).argsort(dim=1)[:, self._zeroed :]
 
     def change_(self, frames: Tensor, key: Tensor, kept: Tensor) -> None:

@@ -12,6 +12,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+# SplitMix64's constants as int64: products overflow, and wrap as those of uint64 do.
 _GOLDEN = 0x9E3779B97F4A7C15 - (1 << 64)
 _MIX_A = 0xBF58476D1CE4E5B9 - (1 << 64)
 _MIX_B = 0x94D049BB133111EB - (1 << 64)
@@ -35,6 +36,7 @@ def _mix(key: Any) -> Any:
 
 def _shift_right(x: Any, bits: int) -> Any:
     """Logical right shift of int64."""
+    # `>>` alone would fill in copies of the sign.
     return (x >> bits) & ((1 << (64 - bits)) - 1)
 
 
@@ -57,6 +59,7 @@ def draw_numbered(key: Tensor, high: int, number: Tensor) -> Tensor:
     """The draws called `number`, int64 of shape (..., n) or one that broadcasts with it, of `draw_integers`."""
     key = key.view(*key.shape, *[1] * max(1, number.ndim - key.ndim))
     bits = _shift_right(hash_keys(key ^ hash_keys(number + 1)), 33)
+    # 31 bits scaled to `high`, without a division; off from uniform by less than high / 2^31.
     return (bits * high) >> 31
 
 

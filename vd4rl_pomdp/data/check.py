@@ -58,6 +58,7 @@ def check_dataset(path: Path | str, cache: Path | None = None, replay: ReplayFn 
     else:
         from vd4rl_pomdp.envs.dmc import replay_rewards
 
+        assert dataset.task is not None
         played = partial(replay or replay_rewards, dataset.task)
         replayed = _replay_error(dataset, dataset.store.array("reward"), played)
     shards = [path] if path.is_file() else [path / name for name in dataset.store.meta["shards"]]

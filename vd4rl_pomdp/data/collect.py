@@ -29,7 +29,7 @@ from vd4rl_pomdp.core.tasks import (
 )
 from vd4rl_pomdp.data.shards import Columns, Shard, collect_set
 from vd4rl_pomdp.envs.make import layout_of, make_env
-from vd4rl_pomdp.envs.pixels import PixelEnv, Render
+from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.outputs import refuse_inside
@@ -223,6 +223,7 @@ def _plan(config: CollectConfig) -> Iterator[tuple[Path, range, Collector]]:
 
 def _job(config: CollectConfig, collector: Collector, episode: int, length: int | None = None) -> _Job:
     """One episode; with a ladder, by who acted at the moment of training that the episode stands for."""
+    # The middle of the episode's share of the training run.
     actor = collector.actor_at((episode + 0.5) / config.episodes) if isinstance(collector, Ladder) else collector
     task, size = TASKS.named(config.task), config.frame_size
     return _Job(task, episode, config.seed, actor, config.render, size, length, _noise(config))
@@ -232,6 +233,7 @@ def _roll_out(job: _Job) -> Columns:
     """Rows of one episode, by key."""
     env = _environment(job.task, job.render, job.size, job.length)
     rng = np.random.default_rng([job.seed, job.episode])
+    # A stream of its own: an actor draws the same with and without noise on its actions.
     noise = np.random.default_rng(stream_seed(job.seed, "action noise", job.episode))
     now = env.reset(episode_seed(job.seed, job.episode))
     action = np.zeros(env.action_dim, np.float32)
@@ -258,6 +260,6 @@ def _roll_out(job: _Job) -> Columns:
 
 
 @cache
-def _environment(*arguments: Any) -> PixelEnv:
+def _environment(*arguments: Any) -> Any:
     """The process's environment for these arguments: one GL context serves all its episodes."""
     return make_env(*arguments)

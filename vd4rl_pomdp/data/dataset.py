@@ -174,6 +174,7 @@ class Dataset:
     def actions_before(self, rows: Tensor) -> Tensor:
         """a_{t-1} (..., T, A) float32 of (..., T) consecutive rows; zero in the first: a history begins without one."""
         actions = self.action[rows]
+        # The row stores an action, but it was taken before the history that is shown.
         actions[..., 0, :] = 0
         return actions
 
@@ -201,6 +202,7 @@ class Dataset:
         has no successor: there they are 0, 1 and the row itself.
         """
         refuse_number("n_step", n_step, 1)
+        # Row t + 1 holds what step t paid: rows t + 1 .. t + m are summed, none behind the episode's last.
         last = (self.episode_end - 1)[self.episode[rows]]
         step = torch.arange(n_step, device=rows.device)
         inside = rows[:, None] + step < last[:, None]
@@ -233,6 +235,7 @@ class Dataset:
             IndexError: an index is out of range.
         """
         number, per_episode = self._index(index, self.num_windows(length)), self.windows_per_episode(length)
+        # Starts are numbered through the episodes; where their counts pass a number, its episode is found.
         ends = per_episode.cumsum(0)
         episode = torch.searchsorted(ends, number, right=True)
         start = self.episode_start[episode] + number - (ends - per_episode)[episode]

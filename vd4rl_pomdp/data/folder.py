@@ -24,8 +24,6 @@ from vd4rl_pomdp.runs.files import read_json
 SUFFIXES = (".hdf5", ".h5")
 PLAN, PROVENANCE = "collection.json", "provenance.json"
 """What a collection writes before its first shard, and after its last."""
-_TOLD = 4
-"""How many files a message names."""
 
 
 @dataclass(frozen=True)
@@ -137,36 +135,21 @@ def _refuse_misnumbered(folder: Path, shards: Sequence[Path]) -> None:
 
 
 def _refuse_part(path: Path, shards: Sequence[Path]) -> None:
-    """Raise UserError for a part of a published set.
+    """Raise UserError for a folder of a published set that lacks some of its shards.
 
-    A shard of the name and size of a published one is that. Other sets are their makers' business, unless they tell
-    nothing of who made them and all their shards are called as those of the published set of their folder are.
+    A folder is one if it is called like the set, and its shards are, and say nothing of who made them.
     """
-    with disk_errors(path):
-        sizes = {shard.name: shard.stat().st_size if shard.exists() else -1 for shard in shards}
-    published: dict[tuple[str | None, str | None], dict[str, int]] = defaultdict(dict)
-    for file in manifest():
-        *_, of_task, of_quality, _, name = file.path.split("/")
-        published[of_task, of_quality][name] = file.size
-    alike = [key for key, wanted in published.items() if sizes.keys() <= wanted.keys()]
-    certain = [key for key in alike if sizes.items() & published[key].items()]
-    key = named = task_and_quality(path, [])
-    if certain and named not in certain:
-        key = min(certain, key=lambda key: len(published[key]))  # the shards of expert are in medium_expert, too
-    elif key not in alike or (not certain and read_attributes(shards[0])):
+    task, quality = task_and_quality(path, [])
+    wanted = [file.path.rpartition("/")[2] for file in manifest() if file.path.split("/")[2:4] == [task, quality]]
+    names = {shard.name for shard in shards}
+    missing = [name for name in wanted if name not in names]
+    if not missing or not names <= set(wanted) or read_attributes(shards[0]):
         return
-    (task, quality), wanted = key, published[key]
-    told = [f"{name} is missing" for name in wanted if name not in sizes]
-    if certain:
-        told += [f"{n} has {size} bytes, not {wanted[n]}" for n, size in sizes.items() if size != wanted[n]]
-    if not told:
-        return
-    more = f" and {len(told) - _TOLD} more" if len(told) > _TOLD else ""
     out = path.parents[2] if path.parts[-3:] == (task, quality, "84px") else "DIR"
+    command = f"vd4rl-pomdp data download --task {task} --quality {quality} --out {out}"
     raise UserError(
-        f"{path}: is a part of V-D4RL's {task} {quality} ({', '.join(told[:_TOLD])}{more}); get the rest with "
-        f"`vd4rl-pomdp data download --task {task} --quality {quality} --out {out}`, or give the shards other names to "
-        "train on them alone"
+        f"{path}: is a part of V-D4RL's {task} {quality}, {len(shards)} of {len(wanted)} shards ({missing[0]} is "
+        f"missing); get the rest with `{command}`, or give the shards other names to train on them alone"
     )
 
 

@@ -206,6 +206,7 @@ def _check_column(path: Path, key: str, value: np.ndarray, count: int) -> None:
         return
     if value.dtype.kind != "f":
         raise UserError(f"{path}: {key!r} is {value.dtype}, expected floating point; {_REPAIR}")
+    # Not `> _LARGEST`, which NaN passes.
     bad = np.flatnonzero(~(np.abs(value.reshape(count, -1)) <= _LARGEST).all(1))
     if len(bad):
         raise UserError(f"{path}: {key!r} is not finite as float32 in row {bad[0]} ({len(bad)} such rows); {_REPAIR}")

@@ -144,6 +144,7 @@ def _locked(folder: Path) -> Iterator[None]:
     """Let one process at a time decode into a folder; the others wait and find it done."""
     try:
         folder.parent.mkdir(parents=True, exist_ok=True)
+        # Never removed: two processes could then lock two files of one name.
         file = folder.with_suffix(".lock").open("w", encoding="utf-8")
     except OSError as error:
         raise disk_error(folder.parent, error) from error
@@ -179,6 +180,7 @@ def _decode(path: Path, shards: Sequence[Path], folder: Path) -> dict[str, Any]:
         meta = _describe(shards, scratch, len(rows["reward"]))
         (scratch / _META).write_text(json.dumps(meta, indent=1), encoding="utf-8")
         shutil.rmtree(folder, ignore_errors=True)  # a damaged one
+        # The last step: whatever kills the process before it leaves no folder of that name.
         scratch.rename(folder)
     except OSError as error:
         raise disk_error(folder.parent, error) from error

@@ -63,6 +63,7 @@ class View:
         if shift_key is None:
             shifts = len(rows) if self._shared == "window" else rows.numel()
             shift_key = self.shifts.take((shifts,), rows.device)
+        # Keys are taken whichever way is gone: the streams stand alike on every device.
         keys = self.corruption.keys(self.dataset.keys(rows))
         if augmentation.by_lines(self.dataset.frames, self._pad):
             return self._observe_by_lines(rows, shift_key, keys)
@@ -87,6 +88,7 @@ class View:
         """
         data, rows = self.dataset, self.dataset.window_rows(index, length)
         has_action = rows + 1 < data.episode_end[data.episode[rows]]
+        # Without an action, row 0 stands in (it has one) and is multiplied away: no branch, no wait for a GPU.
         following = data.action_after(torch.where(has_action, rows, 0))
         return Windows(
             obs=self.observe(rows),
@@ -136,7 +138,9 @@ class View:
         keys = keys.flatten()
         kept = corruption.kept(keys, stack)
         chosen = self.dataset.stack_rows(rows, stack).view(-1, stack).gather(1, kept)
+        # One image more than are chosen: the frame of zeros that `_spread` reads.
         images = BUFFERS.take((chosen.numel() + 1, *frames.shape[1:]))
+        # All frames under one key lie one after the other.
         offset = augmentation.draw_offset(shift_key, self._pad).repeat_interleave(
             chosen.numel() // max(1, len(shift_key)), 0
         )

@@ -62,6 +62,7 @@ class CorruptedEnv:
         self._seed, self._episode, self._t = corruption_seed, episode, 0
         self._choose_whether_to_draw()
         first = self.env.reset(environment_seed)
+        # Pushes out all of the last episode; the first frame stands for those before it, as in `Dataset.stack_rows`.
         self._frames.extend([self._frame(first)] * FRAME_STACK)
         return self._observation(first)
 

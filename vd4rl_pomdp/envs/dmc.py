@@ -68,6 +68,7 @@ class DMCEnv(PixelEnv):
     def _begin(self, seed: int) -> None:
         self._random.seed(seed)
         self.simulator.reset()
+        # As a replay begins: a reset leaves the solver's warm start of the episode before.
         start_from(self.simulator, self.physics.get_state())
 
     def _apply(self, action: np.ndarray) -> tuple[float, bool, float]:

@@ -39,6 +39,7 @@ class GymEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         refuse_number("frame_size", frame_size, *FRAME_SIZES)
         config = CorruptionConfig.of(corruption, **corruption_fields)
         check_corruption_fits(config, frame_size)
+        # No limit of its own: Gymnasium's wrapper truncates, and tells so.
         self._env = CorruptedEnv(TASKS.named(task), config, render, sys.maxsize, frame_size)
         shape = (3 * FRAME_STACK, frame_size, frame_size)
         self.observation_space = gymnasium.spaces.Box(0, 255, shape, np.uint8)

@@ -62,8 +62,8 @@ class GymnasiumEnv(PixelEnv):
                 self.env = task.environment(**arguments)
         """The Gymnasium environment."""
         space = self.env.action_space
-        bounded = isinstance(space, gymnasium.spaces.Box) and np.issubdtype(space.dtype, np.floating)
-        if not bounded or not space.low.size:
+        floating = np.issubdtype(space.dtype, np.floating)
+        if not isinstance(space, gymnasium.spaces.Box) or not floating or not space.low.size:
             raise UserError(
                 f"environment {self._name} has the actions {space}: only a bounded Box of floating point can be a "
                 "task; wrap the environment in one that translates them"
@@ -128,8 +128,7 @@ class GymnasiumEnv(PixelEnv):
         self._observation, _ = self._of_interface("reset", given, 2)
 
     def _apply(self, action: np.ndarray) -> tuple[float, bool, float]:
-        low, high = self._space.low, self._space.high
-        rescaled, total = between(np.reshape(action, low.shape), low, high), 0.0
+        rescaled, total = self._rescaled(action), 0.0
         for _ in range(self.task.action_repeat):
             with self._telling("cannot make a step"):
                 given = self.env.step(rescaled.copy())
@@ -156,12 +155,19 @@ class GymnasiumEnv(PixelEnv):
             raise UserError(f"environment {self._name} pays {reward}, expected a number: mend its rewards, or wrap it")
         return paid
 
+    def _rescaled(self, action: np.ndarray) -> np.ndarray:
+        """An (A,) action in [-1, 1] between the bounds of the environment's own, in its shape and dtype."""
+        low, high = self._space.low, self._space.high
+        return between(np.reshape(action, low.shape), low, high)
+
+    def _frame(self, size: int) -> np.ndarray:
+        """The present picture as (3, size, size) uint8, each pixel the mean of the area that it covers."""
+        picture = self._picture()
+        picture = picture if picture.shape[:2] == (size, size) else area_means(picture, size)
+        return np.array(picture.transpose(2, 0, 1), order="C")  # a copy: the environment may draw into its buffer again
+
     def _time_step(self, reward: float, discount: float, step_type: StepType) -> TimeStep:
-        frame = None
-        if self.size and self.drawing:
-            picture = self._picture()
-            picture = picture if picture.shape[:2] == (self.size, self.size) else area_means(picture, self.size)
-            frame = np.array(picture.transpose(2, 0, 1), order="C")  # a copy: environments may draw into one buffer
+        frame = self._frame(self.size) if self.size and self.drawing else None
         return TimeStep(frame, NOTHING.astype(np.float32), NOTHING, reward, discount, step_type)
 
     def _picture(self) -> np.ndarray:

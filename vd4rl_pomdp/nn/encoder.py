@@ -233,6 +233,7 @@ class Encoder(nn.Module):
         if span == 0:
             out, hidden = run_memory(self.memory, row, state.hidden)
             return self._read(features, out[:, 0]), state._replace(hidden=hidden)
+        # Under a window no hidden state is carried on: it would remember rows that have left the window.
         rows = torch.cat([state.rows, row], dim=1)[:, -span:]
         newest = run_memory(self.memory, self._forget_first_action(rows))[0][:, -1]
         return self._read(features, newest), state._replace(rows=rows)
@@ -256,6 +257,7 @@ class Encoder(nn.Module):
     def _over_last_rows(self, rows: Tensor, span: int) -> Tensor:
         """States of rows span.. of (B, T, I), each computed anew from the last `span` rows: (B, T - span, H)."""
         assert self.memory is not None
+        # The first of these windows ends in row span - 1, whose state the plain pass over the first rows gives.
         recent = rows.unfold(1, span, 1)[:, 1:].transpose(2, 3)
         states, _ = run_memory(self.memory, self._forget_first_action(recent.flatten(0, 1)))
         return states[:, -1].view(*recent.shape[:2], -1)

@@ -46,7 +46,8 @@ def save_encoder(folder: Path | str, encoder: Encoder, card: EncoderCard, frames
     """
     weights = {name: value.cpu().contiguous().clone() for name, value in encoder.state_dict().items()}
     record = EncoderRecord(encoder.config, card, __version__, git_commit(), frames)
-    _write(Path(folder), replace(record, **code_of(record.parts)), save(weights))
+    told = code_of(record.parts)
+    _write(Path(folder), replace(record, plugins=told["plugins"], sources=told["sources"]), save(weights))
 
 
 def _write(folder: Path, record: EncoderRecord, weights: bytes) -> None:

@@ -128,6 +128,7 @@ def run_backward(memory: Memory, x: Tensor, length: Tensor) -> Tensor:
     rows = torch.arange(x.shape[1], device=x.device)
     flip = length[:, None] - 1 - rows
     flip = torch.where(flip >= 0, flip, rows)  # padding stays behind the real rows
+    # The same permutation puts the states back: flipping twice changes nothing.
     out, _ = run_memory(memory, _take_rows(x, flip))
     return _take_rows(out, flip)
 

@@ -35,6 +35,7 @@ class Standardise(nn.Module):
         flat = features.view(-1, features.shape[-1])
         total = squares = torch.zeros_like(self.mean, dtype=torch.float64)
         for part in flat.split(65_536):
+            # Float32 sums over a whole set lose the digits that a small deviation is made of.
             values = part.double()
             total, squares = total + values.sum(0), squares + values.square().sum(0)
         mean = total / len(flat)

@@ -23,7 +23,7 @@ from vd4rl_pomdp.core.errors import UnavailableError, UserError, disk_errors, fi
 from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.outputs import in_use
 from vd4rl_pomdp.sweeps.driver import PATIENCE_S, Driver, say
-from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder, is_finished, lost_among
+from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder, is_finished, jobs_of, lost_among
 from vd4rl_pomdp.sweeps.options import LocalOptions, RayOptions, SlurmOptions
 
 LOOK_S = 15.0
@@ -52,6 +52,7 @@ class Task:
         except OSError as error:
             raise UserError(f"{self.cwd}: not on node {socket.gethostname()}; use a disk that all share") from error
         with interrupt.handled():
+            # submitit's own answer to it would be to submit the task again, which is for `watch` to decide.
             signal.signal(signal.SIGUSR2, lambda *_: os.kill(os.getpid(), signal.SIGTERM))
             folder = SweepFolder(self.out)
             Driver(folder.plans_to_do(self.plan), self.options, folder, helps=True).run()
@@ -69,7 +70,7 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
     Raises:
         UserError: the cluster refuses the first tasks, or tasks end and nothing happens.
     """
-    jobs = list({job.name: job for plan in plans for job in plan.jobs}.values())
+    jobs = jobs_of(plans)
     task = Task(folder.out, name, cluster.local, os.getcwd())
     said = {name: len(rows) for name, rows in folder.attempts(jobs).items()}
     vain, heard = 0, False
@@ -91,7 +92,7 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
                 live = cluster.live()
                 wanted = min(cluster.tasks, -(-len(could) // cluster.local.jobs)) - live
                 if wanted > 0:
-                    vain += not live
+                    vain += not live  # tasks that wait in the queue, perhaps for days, are not in vain
                     if vain > VAIN:
                         raise UserError(f"tasks end before they begin a job: see {cluster.folder}")
                     with interrupt.deferred():  # what is half asked for could not be taken back
@@ -151,6 +152,7 @@ class SlurmCluster:
     def stop(self) -> None:
         """Take what waits out of the queue, ask every task to end where nothing is lost, and wait for it."""
         try:
+            # Those that wait first: they would begin in the room of those that end.
             self._ask("scancel", "--quiet", "--state=PENDING")
             self._ask("scancel", "--quiet", "--signal=USR2")
             until = time.monotonic() + PATIENCE_S + 15
@@ -249,9 +251,9 @@ class RayCluster:
 
     def submit(self, task: Task, number: int) -> None:
         """Start tasks; Ray finds their nodes."""
-        run = self._ray.remote(max_retries=0)(_run)
+        run = self._ray.remote(max_retries=0)(lambda: task())  # the sweep's own rows decide what is tried again
         run = run.options(num_cpus=self._options.cpus, num_gpus=self._options.gpus, name=str(self.folder))
-        self._running += [run.remote(task) for _ in range(number)]
+        self._running += [run.remote() for _ in range(number)]
 
     def stop(self) -> None:
         """Cancel what waits, ask every task to end where nothing is lost, and wait for it."""
@@ -261,12 +263,3 @@ class RayCluster:
             _, left = self._ray.wait(self._running, num_returns=len(self._running), timeout=PATIENCE_S + 10)
             for task in left:
                 self._ray.cancel(task, force=True)
-
-
-def _run(task: Task) -> None:
-    task()
-
-
-def cluster_of(kind: str, options: Any, folder: SweepFolder) -> SlurmCluster | RayCluster:
-    """The cluster of an executor's name and options."""
-    return SlurmCluster(options, folder.path / kind) if kind == "slurm" else RayCluster(options, folder.path / kind)

@@ -31,6 +31,7 @@ from vd4rl_pomdp.sweeps.folder import (
     Plan,
     SweepFolder,
     is_finished,
+    jobs_of,
     lost_among,
 )
 from vd4rl_pomdp.sweeps.options import LocalOptions
@@ -82,7 +83,7 @@ class Driver:
             helps: whether it is one of several, which ends when there is nothing to start for IDLE_S.
         """
         self._plans = {job.name: plan for plan in plans for job in plan.jobs}
-        self._jobs = {job.name: job for plan in plans for job in plan.jobs}
+        self._jobs = {job.name: job for job in jobs_of(plans)}
         self._left = {name: job for name, job in self._jobs.items() if not is_finished(job)}
         self._free, self._threads = places(options), options.threads
         self._folder, self._helps = folder, helps
@@ -108,26 +109,23 @@ class Driver:
         """Start every job that can be; whether there is anything left to wait for."""
         attempts = self._folder.attempts(self._jobs.values())  # other drivers', too
         lost, running = lost_among(self._left.values(), attempts), {one.job.name for one in self._running}
-        ready = [
-            job
-            for job in self._left.values()
-            if job.name not in lost | running and not self._left.keys() & set(job.needs) and self._may(job, attempts)
-        ]
+        ready = []
+        for job in self._left.values():
+            rests = self._not_before.get(job.name, 0) > time.monotonic()
+            for last in attempts[job.name][-1:]:
+                rests |= last["cause"] in PASSING and time.time() < last["ended"] + PAUSE_S
+            if not rests and job.name not in lost | running and self._left.keys().isdisjoint(job.needs):
+                ready.append(job)
         if self._helps:
             random.shuffle(ready)  # or all drivers would start the same one
         for job in ready:
+            # Asked job by job: starting the ones before took time in which another driver may have begun this one.
             if self._free and not self._is_anothers(job):
                 self._begin(job)
         if self._running:
             self._busy = time.monotonic()
         idle = self._helps and time.monotonic() - self._busy > IDLE_S
         return len(self._left) > len(lost) and not idle
-
-    def _may(self, job: Job, attempts: dict[str, list[Row]]) -> bool:
-        """Whether it is time to look at a job."""
-        last = (attempts[job.name] or [{"cause": DONE, "ended": 0.0}])[-1]
-        rests = last["cause"] in PASSING and time.time() < last["ended"] + PAUSE_S
-        return not rests and time.monotonic() >= self._not_before.get(job.name, 0)
 
     def _is_anothers(self, job: Job) -> bool:
         """Whether another process is at a job, or has finished it; asked in this order, it cannot end in between."""
@@ -182,7 +180,7 @@ class Driver:
 
     def _stop(self) -> None:
         """Ask every job to end where nothing is lost, and wait for it."""
-        for one in self._running:
+        for one in self._running:  # all at once, so that they share the patience
             one.process.terminate()
         until = time.monotonic() + PATIENCE_S
         for one in self._running:
@@ -204,6 +202,8 @@ def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -
         place: the cores and the GPU that it may use.
         threads: its CPU threads; 0: one a core.
     """
+    # A command line in a process of its own: anyone can repeat it by hand, a crash or a lack of memory ends it alone,
+    # and cores, GPU and signals are the system's business. Of how it ended the exit code is all that is seen.
     imports = os.pathsep.join(filter(None, (str(_ROOT), os.environ.get("PYTHONPATH"))))
     told = {JOB_VARIABLE: "1", "PYTHONPATH": imports, "OMP_NUM_THREADS": str(threads or max(1, len(place.cores)))}
     if place.gpu is not None:
@@ -264,13 +264,12 @@ def places(options: LocalOptions) -> list[Place]:
             "raise that, or set CUDA_VISIBLE_DEVICES to nothing to run on the CPU"
         )
     cores = sorted(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else []
-    return [Place(_share(cores, number, jobs), gpus[number % len(gpus)] if gpus else None) for number in range(jobs)]
-
-
-def _share(cores: list[int], number: int, jobs: int) -> tuple[int, ...]:
-    """The cores of one of several jobs: at least one, unless the system does not tell what there is."""
-    first, end = (place * len(cores) // jobs for place in (number, number + 1))
-    return tuple(cores[first : max(end, first + 1)])
+    found = []
+    for number in range(jobs):
+        first, end = (place * len(cores) // jobs for place in (number, number + 1))
+        share = tuple(cores[first : max(end, first + 1)])  # at least one, unless the system does not tell them
+        found.append(Place(share, gpus[number % len(gpus)] if gpus else None))
+    return found
 
 
 def visible_gpus() -> list[str]:

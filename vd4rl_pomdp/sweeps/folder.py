@@ -90,14 +90,19 @@ class SweepFolder:
         paths = [path for path in sorted((self.path / "plans").glob("*.json")) if name in ("", path.stem)]
         if not paths:
             raise UserError(f"{self.out}: holds no sweep; `vd4rl-pomdp sweep run GRID --out {self.out}` makes one")
-        return [self._seen_from_here(read_plan(path)) for path in paths]
-
-    def _seen_from_here(self, plan: Plan) -> Plan:
-        def place(folder: Path) -> Path:
-            below = folder.is_relative_to(plan.out)
-            return self.out / folder.relative_to(plan.out) if below else plan.made_in / folder
-
-        return replace(plan, jobs=[replace(job, folder=place(job.folder)) for job in plan.jobs])
+        plans = []
+        for plan in map(read_plan, paths):
+            jobs = [
+                replace(
+                    job,
+                    folder=self.out / job.folder.relative_to(plan.out)
+                    if job.folder.is_relative_to(plan.out)
+                    else plan.made_in / job.folder,  # a set that lies elsewhere
+                )
+                for job in plan.jobs
+            ]
+            plans.append(replace(plan, jobs=jobs))
+        return plans
 
     def plans_to_do(self, name: str = "") -> list[Plan]:
         """As `plans`; UserError if the folder was moved, so that their commands name another one."""
@@ -120,6 +125,7 @@ class SweepFolder:
         line = (json.dumps(row) + "\n").encode()
         with disk_errors(self._attempts):
             self.path.mkdir(parents=True, exist_ok=True)
+            # Unbuffered, a line is one write, and appends of several drivers do not mix.
             with self._attempts.open("ab+", buffering=0) as file:
                 end = file.seek(0, os.SEEK_END)
                 if end and os.pread(file.fileno(), 1, end - 1) != b"\n":  # a full disk cut the row before
@@ -142,6 +148,7 @@ class SweepFolder:
                 rows = found[row["job"]]
                 if row["cause"] == _RETRIED:
                     rows.clear()
+                # A corrected command has not failed yet.
                 elif row["words"] == words[row["job"]] and row.keys() >= {"ended", "seconds", "line"}:
                     rows.append(row)
             except (ValueError, TypeError, KeyError):
@@ -161,9 +168,14 @@ def read_plan(path: Path) -> Plan:
         raise UserError(f"{path}: is damaged ({error}); remove it and start `sweep run` again") from error
 
 
+def jobs_of(plans: Iterable[Plan]) -> list[Job]:
+    """The jobs of several plans, once each."""
+    return list({job.name: job for plan in plans for job in plan.jobs}.values())
+
+
 def failed(rows: list[Row]) -> bool:
     """Whether a job is not tried again, judging by its attempts: one failed, or too many in a row were of no use."""
-    causes = [row["cause"] for row in rows[-TRIES:]]
+    causes = [row["cause"] for row in rows[-TRIES:]]  # an interruption among them begins the count anew
     return causes[-1:] == [FAILED] or (len(causes) == TRIES and set(causes) <= {*PASSING})
 
 
@@ -200,7 +212,10 @@ def status(jobs: list[Job], attempts: Mapping[str, list[Row]]) -> dict[str, Any]
         here = RUNNING if in_use(job.folder) else FAILED if failed(attempts[job.name]) else WAITING
         states[job.name] = BLOCKED if here == WAITING and job.name in lost else here
     to_do = sum(state in (RUNNING, WAITING) for state in states.values())
-    per_hour = _per_hour([row for rows in attempts.values() for row in rows])
+    tried, now = [row for rows in attempts.values() for row in rows], time.time()
+    began = min((row["ended"] - row["seconds"] for row in tried), default=now)
+    span = min(_RATE_S, max(now - began, 1.0))
+    per_hour = sum(row["cause"] == DONE and now - row["ended"] <= span for row in tried) * 3600 / span
     return {
         "counts": dict(Counter(states.values())),
         "per_hour": per_hour,
@@ -209,13 +224,6 @@ def status(jobs: list[Job], attempts: Mapping[str, list[Row]]) -> dict[str, Any]
         "states": states,
         "failures": {name: attempts[name][-1] for name, state in states.items() if state == FAILED},
     }
-
-
-def _per_hour(rows: list[Row]) -> float:
-    now = time.time()
-    began = min((row["ended"] - row["seconds"] for row in rows), default=now)
-    span = min(_RATE_S, max(now - began, 1.0))
-    return sum(row["cause"] == DONE and now - row["ended"] <= span for row in rows) * 3600 / span
 
 
 def in_lines(found: Mapping[str, Any]) -> list[str]:

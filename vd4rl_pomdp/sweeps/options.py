@@ -5,7 +5,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import ClassVar
 
-from vd4rl_pomdp.core.errors import UserError, refuse_unknown
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import Limits, Options
 
 
@@ -80,9 +80,3 @@ class RayOptions(Options):
 
 EXECUTORS: dict[str, type[Options]] = {"local": LocalOptions, "slurm": SlurmOptions, "ray": RayOptions}
 """Options by name."""
-
-
-def executor_options(name: str) -> type[Options]:
-    """Options of the executor called `name`; raises UserError listing the choices."""
-    refuse_unknown("executor", name, EXECUTORS)
-    return EXECUTORS[name]

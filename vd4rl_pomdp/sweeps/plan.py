@@ -27,6 +27,7 @@ from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json
 from vd4rl_pomdp.runs.results import Result, read_results
 from vd4rl_pomdp.runs.run import recipe
+from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
 from vd4rl_pomdp.sweeps.grid import GridCell
 from vd4rl_pomdp.sweeps.stages import COMMANDS, STAGES, collection_of, recipe_of, recorded, told
 
@@ -79,7 +80,8 @@ class DataSet:
         elif (self.folder / PLAN).exists():
             stored = read_json(self.folder / PLAN)
             for name in differing(stored, self.wanted)[:1]:
-                has, asked = (_in_words(name, values.get(name)) for values in (stored, self.wanted))
+                both = (values.get(name) for values in (stored, self.wanted))
+                has, asked = (f"the default {name}" if v is None else f"{name} {v}" for v in both)
                 raise UserError(f"{self.folder}: holds a set of {has}, the grid says {asked}; choose another --data")
         elif self.section == "collect":
             TASKS.named(self.wanted["task"])
@@ -103,7 +105,7 @@ class DataSet:
 
     def made(self, record: Mapping[str, Any]) -> bool:
         """Whether a run, as its config.json tells it, was trained on this set."""
-        if self.there:
+        if self.there:  # then its content decides, which another machine's renderer may have made otherwise
             return record.get("inputs", {}).get("data") == self.fingerprint
         return self.alike(record)
 
@@ -268,6 +270,7 @@ class _Planner:
         before = [self._collection(cell, data)]
         values: dict[str, Any] = {}
         for section in cell.chain[1:]:
+            # A policy's folder is told by its encoder's settings, too.
             values |= recorded(cell, section)
             before.append(self._training(cell, section, data, values, before))
         self._ask(before[-1], data)
@@ -296,7 +299,9 @@ class _Planner:
         run = _found(self._here, own, data)
         if run is not None:
             self._of_other_code.update(of_other_code(run.record, values))
-            self._on_other_encoders += section == "finetune" and _is_on_another(run, before[-1].folder / "encoder")
+            encoder = before[-1].folder / "encoder"
+            if section == "finetune" and (encoder / CONFIG).is_file():
+                self._on_other_encoders += run.record.get("inputs", {}).get("encoder") != encoder_hash(encoder)
             name, content = run.folder.relative_to(self._out).as_posix(), run.data
         else:
             name, content = self._free(_run_folder(cell, section, data.name, values), own), ""
@@ -332,7 +337,7 @@ class _Planner:
         """The finished jobs, those that were asked for, and those that an unfinished one needs."""
         found: list[Job] = []
         needed: set[str] = set()
-        for job in reversed(self._jobs.values()):
+        for job in reversed(self._jobs.values()):  # backwards: whatever needs a job comes after it
             if job.name in needed and job.section in STAGES:
                 job = replace(job, done=False)  # a kept row is no encoder to train on
             if not job.finished:
@@ -362,26 +367,17 @@ def _by_recipe(runs: Iterable[FoundRun]) -> dict[str, list[FoundRun]]:
 
 def _found(runs: Mapping[str, list[FoundRun]], own: str, data: DataSet) -> FoundRun | None:
     """The run of a recipe on a set, a finished one if there is one; images that it adds are those of now."""
-    fitting = [run for run in runs.get(own, ()) if run.on_one_set and data.made(run.record) and _adds_the_same(run)]
+    fitting = []
+    for run in runs.get(own, ()):
+        images = run.record.get("inputs", {}).get("exogenous")
+        same = images is None or images == _images_in(run.record["config"]["exogenous"])
+        if same and run.on_one_set and data.made(run.record):
+            fitting.append(run)
     return max(fitting, key=lambda run: run.finished, default=None)
 
 
-def _adds_the_same(run: FoundRun) -> bool:
-    """Whether the images that a run in a maze added, if it did, are still in their folder."""
-    images = run.record.get("inputs", {}).get("exogenous")
-    return images is None or images == _images_in(run.record["config"]["exogenous"])
-
-
-@cache
-def _images_in(source: str) -> str:
-    from vd4rl_pomdp.studies.navigation.pictures import source_fingerprint
-
-    return source_fingerprint(source)
-
-
-def _is_on_another(run: FoundRun, encoder: Path) -> bool:
-    """Whether a fine-tuning began with another encoder than the one that lies in a folder, if one does."""
-    return (encoder / CONFIG).is_file() and run.record.get("inputs", {}).get("encoder") != encoder_hash(encoder)
+_images_in = cache(source_fingerprint)
+"""Name of the images that runs in a maze add, read once for all of them."""
 
 
 def _run_folder(cell: GridCell, section: str, data: str, values: dict[str, Any]) -> str:
@@ -400,10 +396,6 @@ def _extras(cell: GridCell, section: str) -> str:
     words = (f",{name}={value}" for name, value in named.items() if name not in _IN_NAMES[section])
     extras = "".join(words).replace("/", "_")
     return extras if len(extras.encode()) <= _LONGEST else f",{content_hash(extras)}"
-
-
-def _in_words(name: str, value: Any) -> str:
-    return f"the default {name}" if value is None else f"{name} {value}"
 
 
 def _words_by_name(values: Mapping[str, Any]) -> dict[str, str]:

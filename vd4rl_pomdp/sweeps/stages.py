@@ -2,19 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from functools import cache
+from functools import cache, partial
 from typing import Any
 
+from finetune.config import FinetuneConfig, as_trained
+from pretrain.config import PretrainConfig, history_of
+from pretrain.objectives import METHODS
 from vd4rl_pomdp.cli.parsing import parse, parse_stage, with_presets
 from vd4rl_pomdp.core.errors import MAX_SEED, UserError, refuse_number
 from vd4rl_pomdp.core.options import flat, words_of
 from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
+from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.run import recipe
+from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig
+from vd4rl_pomdp.studies.navigation.collect import collection as maze_collection
+from vd4rl_pomdp.studies.navigation.config import NavigationConfig
 from vd4rl_pomdp.sweeps.grid import GridCell, Values
 
 COMMANDS = {
@@ -27,6 +34,15 @@ COMMANDS = {
 """Words of every section's command."""
 STAGES = {"pretrain": "pretrain", "finetune": "finetune", "navigation_train": "navigation"}
 """What a training's record calls its stage, by section."""
+_PARSERS: dict[str, Callable[[list[str], str], Any]] = {
+    "collect": partial(parse, CollectConfig),
+    "pretrain": partial(parse_stage, PretrainConfig),
+    "finetune": partial(parse_stage, FinetuneConfig),
+    "navigation_collect": partial(with_presets, MazeCollectConfig, PRESETS),
+    "navigation_train": partial(parse_stage, NavigationConfig),
+}
+"""Every section's settings, read as its command line is: a grid takes and refuses what the command does, and a recipe
+is that of the run that the command makes."""
 _READS = {"pretrain": ("data",), "finetune": ("data", "encoder"), "navigation_train": ("data",)}
 """Folders that a stage is given, beside the one it writes."""
 _TAKES = {"collect": (), "navigation_collect": ("preset",)}
@@ -71,39 +87,14 @@ def config_of(cell: GridCell, section: str) -> Any:
 @cache
 def _parsed(section: str, words: tuple[str, ...]) -> Any:
     """The settings of a section, once for all seeds."""
-    program = " ".join(("vd4rl-pomdp", *COMMANDS[section]))
     line = [*words, *words_of(dict.fromkeys((*_READS.get(section, ()), "out"), "-"))]
-    if section == "collect":
-        from vd4rl_pomdp.data.collect import CollectConfig
-
-        return parse(CollectConfig, line, program)
-    if section == "pretrain":
-        from pretrain.config import PretrainConfig
-
-        return parse_stage(PretrainConfig, line, program)
-    if section == "finetune":
-        from finetune.config import FinetuneConfig
-
-        return parse_stage(FinetuneConfig, line, program)
-    if section == "navigation_collect":
-        from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig
-
-        return with_presets(MazeCollectConfig, PRESETS, line, program)
-    from vd4rl_pomdp.studies.navigation.config import NavigationConfig
-
-    return parse_stage(NavigationConfig, line, program)
+    return _PARSERS[section](line, " ".join(("vd4rl-pomdp", *COMMANDS[section])))
 
 
 def collection_of(cell: GridCell) -> Values:
     """What tells the set of a cell from others, as its collection.json has it."""
-    section = cell.chain[0]
-    if section == "collect":
-        from vd4rl_pomdp.data.collect import collection
-
-        return collection(config_of(cell, section))
-    from vd4rl_pomdp.studies.navigation.collect import collection as maze_collection
-
-    return maze_collection(config_of(cell, section))
+    config = config_of(cell, cell.chain[0])
+    return collection(config) if isinstance(config, CollectConfig) else maze_collection(config)
 
 
 def recipe_of(cell: GridCell, section: str) -> str:
@@ -120,19 +111,9 @@ def recorded(cell: GridCell, section: str) -> Values:
     config = config_of(cell, section)
     if section == "pretrain":  # its set tells it the task
         config = replace(config, task=cell.value("task") or config.task)
-    if section == "finetune":
-        config = _as_trained(cell, config)
+    if section == "finetune":  # what its encoder's method cannot read is no part of what it trains with
+        before = config_of(cell, "pretrain")
+        method = METHODS.named(before.method)
+        remembers = history_of(before.method, method, before.history) != "none"
+        config = as_trained(config, method.end_to_end, remembers, TASKS.named(cell.value("task")).decisions)
     return jsonable(flat(config))
-
-
-def _as_trained(cell: GridCell, config: Any) -> Any:
-    """The config that a fine-tuning trains with: what its encoder's method cannot read is no part of it."""
-    from finetune.config import as_trained
-    from pretrain.config import history_of
-    from pretrain.objectives import METHODS
-
-    before = config_of(cell, "pretrain")
-    method = METHODS.named(before.method)
-    remembers = history_of(before.method, method, before.history) != "none"
-    decisions = TASKS.named(cell.value("task")).decisions
-    return as_trained(config, method.end_to_end, remembers, decisions)

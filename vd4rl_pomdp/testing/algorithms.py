@@ -170,7 +170,7 @@ def targets_creep_and_nothing_else_moves_by_itself(name: str, **options: Any) ->
     targets = {part: module for part, module in _modules(algorithm).items() if part.startswith("target_")}
     with torch.no_grad():
         for parameter in (p for module in targets.values() for p in module.parameters()):
-            parameter.add_(0.5)
+            parameter.add_(0.5)  # targets begin as copies, whose steps would be too small to tell
     crept = set()
     for number in range(UPDATES):
         before = _networks(algorithm)
@@ -191,7 +191,7 @@ def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **option
     one, other = (make(name, seed=seed, **options) for seed in (0, 1))
     for number in range(3):
         one.update(batch(number))
-    other.load_state_dict(unpack(pack(one.state_dict())))
+    other.load_state_dict(unpack(pack(one.state_dict())))  # through the checkpoint's own form, as a run resumes
     for number in range(3, 3 + UPDATES):
         logs = []
         for seed, algorithm in enumerate((one, other)):

@@ -69,6 +69,7 @@ def pictures_are_not_mixed(name: str, **options: Any) -> None:
     obs = pictures(3, options["size"]).float().requires_grad_()
     for training in (False, True):
         features = make(name, **options).frame.train(training)(obs)
+        # not the plain sum, which a layer norm makes a constant
         weights = torch.randn(features.shape[-1], generator=torch.Generator().manual_seed(0))
         (gradient,) = torch.autograd.grad((features[1] * weights).sum(), obs)
         reached = gradient.flatten(1).abs().amax(1) > 0

@@ -93,6 +93,7 @@ def streaming_equals_batch(name: str, **options: Any) -> None:
 
 def a_state_depends_on_its_past_alone(name: str, **options: Any) -> None:
     """What is put out at a row has a gradient to that row and to earlier ones of its window, and to nothing else."""
+    # in float64: gradients across many rows are small, and none may be lost to rounding
     memory, x = make(name, **options).double(), rows().double().requires_grad_()
     out, _ = run_memory(memory, x)
     weights = torch.randn(out.shape[-1], generator=torch.Generator().manual_seed(0), dtype=torch.float64)
