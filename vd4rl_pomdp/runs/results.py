@@ -214,7 +214,7 @@ def read_results(folder: Path | str) -> list[Result]:
     for row in read_episodes(folder / EPISODES_FILE):
         if "id" not in row:
             raise UserError(f"{folder / EPISODES_FILE}: has no column 'id'; it was not written beside {RUNS}")
-        # 150,000 rows share a few dozen words: each word is kept once.
+        # Rows by the hundred thousand repeat a few dozen words: each word is in memory once.
         shared = {name: sys.intern(row[name]) if isinstance(row[name], str) else row[name] for name in COLUMNS}
         by_run.setdefault(row["id"], []).append(shared)
     runs = [_parse(path, number, line, by_run) for number, line in enumerate(lines, 1)]
