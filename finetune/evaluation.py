@@ -13,8 +13,8 @@ import numpy as np
 import torch
 
 from vd4rl_pomdp.core.errors import UserError, refuse_number
+from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.core.registry import warn_of_other_code
-from vd4rl_pomdp.core.settings import LABELS
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, MOST_EPISODES, TASKS, Task
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data.reference import Reference, action_error

@@ -16,9 +16,8 @@ from pretrain.build import build_objective, build_target
 from pretrain.config import PretrainConfig, TrainingConfig
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.core.errors import UserError, refuse_outside
-from vd4rl_pomdp.core.options import flat
+from vd4rl_pomdp.core.options import flat, settings_of
 from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
-from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK, TASKS, UNKNOWN_QUALITY
 from vd4rl_pomdp.core.types import StateWindows, Windows
 from vd4rl_pomdp.corruptions import check_corruption_fits

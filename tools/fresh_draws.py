@@ -19,7 +19,7 @@ from script import run_script
 from finetune.features import FrozenEncoder
 from finetune.path import DataPath
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.settings import LABELS
+from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.reference import Reference

@@ -10,7 +10,7 @@ import pytest
 from tests.helpers_report import finished_result
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.settings import settings_of
+from vd4rl_pomdp.core.options import settings_of
 from vd4rl_pomdp.data.collect import CollectConfig, collection
 from vd4rl_pomdp.runs import FORMAT
 from vd4rl_pomdp.runs.results import read_results, write_results

@@ -12,6 +12,31 @@ from typing import Any, ClassVar, Self
 
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_outside, refuse_unknown
 
+RUNTIME_FIELDS = frozenset(
+    {
+        "out",
+        "device",
+        "workers",
+        "wandb",
+        "tensorboard",
+        "data",
+        "encoder",
+        "eval_clean",
+        "log_every",
+        "checkpoint_every",
+    }
+)
+"""Config fields that do not change a result, so that a run may go on with other values; data and encoder may be moved,
+and are compared by content; `eval_clean` adds rows that change no other."""
+NO_SETTINGS = RUNTIME_FIELDS | {"seed"}
+"""Config fields in which the seeds of one experiment may differ."""
+
+LATER = {"future_frames": "all"}
+"""Settings that earlier versions did not record, with what they did: having this value is the same as not having it."""
+
+LABELS = ("method", "task", "quality", "corruption", "algorithm", "seed")
+"""What names the rows of a run."""
+
 Limits = Mapping[str, float | tuple[float, float]]
 """Lowest, or lowest and highest, value of numbers by name."""
 
@@ -151,6 +176,15 @@ def _settings(config: Any) -> Iterator[tuple[str, str, Any]]:
             yield type(config).__name__, field.name, value
         for options in nested or ():
             yield from _settings(options)
+
+
+def settings_of(config: Mapping[str, Any]) -> dict[str, Any]:
+    """A stage's config, as JSON keeps it, without NO_SETTINGS: the same for all seeds of an experiment.
+
+    Runs are seeds of one experiment only if their settings agree.
+    """
+    told = {name: value for name, value in config.items() if name not in NO_SETTINGS}
+    return {name: value for name, value in told.items() if name not in LATER or value != LATER[name]}
 
 
 def words_of(settings: Mapping[str, Any]) -> list[str]:

@@ -16,7 +16,9 @@ from vd4rl_pomdp.report.gates import (
     GATED,
     Sides,
     as_it_is,
+    comparable,
     difference,
+    on_set,
     returns_of,
     seeds_by_variant,
     seen_under,
@@ -92,7 +94,7 @@ def judge_claims(runs: list[Run], unranked: Collection[tuple[str, ...]] = ()) ->
         runs: of a report.
         unranked: settings that are undecided: there nothing is judged.
     """
-    finished = [run for run in runs if run.evaluated and not run.end_to_end]
+    finished = comparable(runs)
     settings = sorted({run.of(GATED) for run in finished})
     rows = (_row(claim, place, finished, unranked) for claim in CLAIMS for place in settings)
     return [row for row in rows if row is not None]
@@ -110,10 +112,9 @@ def tally(rows: list[Row]) -> str:
 def _row(
     claim: ReturnClaim, place: tuple[str, ...], runs: list[Run], unranked: Collection[tuple[str, ...]]
 ) -> Row | None:
-    task, quality, corruption, algorithm = place
+    corruption, alike = place[2], on_set(place, runs)
     if claim.hidden == (corruption == "none"):
         return None
-    alike = [run for run in runs if run.of(("task", "quality", "algorithm")) == (task, quality, algorithm)]
     left = _runs_of(claim.left, claim.right, corruption, alike)
     right = _runs_of(claim.right, claim.left, corruption, alike)
     compared = sides(left, right) if claim.right.method else _decisive(left, right)
@@ -158,7 +159,6 @@ def _runs_of(side: Contender, other: Contender, corruption: str, runs: Iterable[
 
 
 def _side(name: str, runs: list[Run]) -> Row:
-    """Columns about one side."""
     shown = label(runs[0].named)
     return {name: shown, f"{name}_return": float(returns_of(runs).mean()), f"{name}_seeds": len(runs)}
 

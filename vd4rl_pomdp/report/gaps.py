@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from operator import attrgetter
 
-from vd4rl_pomdp.core.settings import LABELS
+from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.report.load import ALL, CONDITION, SETTING, Choice, Run, without_options
 from vd4rl_pomdp.report.variants import ENCODER_SEED, groups
 from vd4rl_pomdp.runs.files import Row

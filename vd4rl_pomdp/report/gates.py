@@ -15,7 +15,7 @@ from typing import NamedTuple
 import numpy as np
 
 from vd4rl_pomdp.core.errors import told_apart
-from vd4rl_pomdp.core.settings import settings_of
+from vd4rl_pomdp.core.options import settings_of
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import STATE
 from vd4rl_pomdp.report.load import REFERENCES, SETTING, Run
@@ -46,8 +46,19 @@ def gates(runs: list[Run]) -> list[Row]:
     `above_random` is the best method's mean return less that of `random`, as `sides` finds them, `low` and `high` its
     95% interval. What is not known is None.
     """
-    finished = [run for run in runs if run.evaluated and not run.end_to_end]
+    finished = comparable(runs)
     return [_gate(key, finished) for key in sorted({run.of(GATED) for run in finished})]
+
+
+def comparable(runs: Iterable[Run]) -> list[Run]:
+    """Finished runs whose encoders were frozen: one that the policy trains says nothing of an objective."""
+    return [run for run in runs if run.evaluated and not run.end_to_end]
+
+
+def on_set(place: tuple[str, ...], runs: Iterable[Run]) -> list[Run]:
+    """Runs of a row's task, quality and algorithm, whatever was hidden from them."""
+    task, quality, _, algorithm = place
+    return [run for run in runs if run.of(("task", "quality", "algorithm")) == (task, quality, algorithm)]
 
 
 def unranked(table: list[Row], names: Sequence[str] = GATED) -> set[tuple[str, ...]]:
@@ -57,9 +68,8 @@ def unranked(table: list[Row], names: Sequence[str] = GATED) -> set[tuple[str, .
 
 
 def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
-    task, quality, corruption, algorithm = key
-    alike = [run for run in runs if run.of(("task", "quality", "algorithm")) == (task, quality, algorithm)]
-    here, clean = (seen_under(under, alike) for under in (corruption, "none"))
+    alike = on_set(key, runs)
+    here, clean = (seen_under(under, alike) for under in (key[2], "none"))
     state, acro = best_of(as_it_is("state", here)), best_of(as_it_is("acro", clean))
     learned = [run for run in here if run.method not in REFERENCES]
     floor = as_it_is("random", here)

@@ -87,7 +87,7 @@ class Run:
     result: Result
     """Its files."""
     labels: Row
-    """Values of `settings.LABELS`; the task is empty until the run has opened its data. The corruption is followed
+    """Values of `options.LABELS`; the task is empty until the run has opened its data. The corruption is followed
     by its options where other runs have others of the same name, "patch, patch_size 48": that is another setting."""
     settings: Settings
     """All settings in which runs of its method may differ, in words."""

@@ -17,7 +17,7 @@ import pandas as pd
 from rich.console import Console
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
-from vd4rl_pomdp.core.settings import settings_of
+from vd4rl_pomdp.core.options import settings_of
 from vd4rl_pomdp.core.text import write_text
 from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import figures, tables

@@ -73,7 +73,6 @@ def summary(evaluated: pd.DataFrame, gaps: pd.DataFrame, unranked: Collection[tu
 
 
 def _scores(rows: pd.DataFrame) -> Row:
-    """Numbers of one condition."""
     means = rows.groupby("step")["score"].mean()
     found: Row = {}
     for prefix, step in (("", means.index.max()), ("best_", means.idxmax())):

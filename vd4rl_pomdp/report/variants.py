@@ -9,7 +9,7 @@ from __future__ import annotations
 from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar
 
-from vd4rl_pomdp.core.settings import LATER, settings_of
+from vd4rl_pomdp.core.options import LATER, settings_of
 from vd4rl_pomdp.corruptions import corruption_settings
 
 Settings = dict[str, str]

@@ -10,8 +10,8 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.core.reading import read_bytes, regular
-from vd4rl_pomdp.core.settings import LABELS
 from vd4rl_pomdp.runs.files import Row, appending, write_csv
 
 _WHOLE = ("seed", "step", "episode", "episode_seed", "length")

@@ -109,7 +109,7 @@ def owned(folder: Path) -> Iterator[None]:
             yield
     finally:
         # Deleted while it is still held, and never by anyone else: FileLock takes no lock on a name that is gone, so
-        # whoever waits makes a new file. Deleted after the release it could be another owner's, and there were two.
+        # whoever waits makes a new file. After the release it could be another owner's already, and two would own it.
         (folder / LOCK).unlink(missing_ok=True)
         lock.release()
 

@@ -18,8 +18,8 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.options import LABELS, settings_of
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
-from vd4rl_pomdp.core.settings import LABELS, settings_of
 from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
 from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json, replacing_file, write_csv
@@ -214,7 +214,7 @@ def read_results(folder: Path | str) -> list[Result]:
     for row in read_episodes(folder / EPISODES_FILE):
         if "id" not in row:
             raise UserError(f"{folder / EPISODES_FILE}: has no column 'id'; it was not written beside {RUNS}")
-        # 150,000 rows share a few dozen words: each word is kept once.
+        # Rows by the hundred thousand repeat a few dozen words: each word is in memory once.
         shared = {name: sys.intern(row[name]) if isinstance(row[name], str) else row[name] for name in COLUMNS}
         by_run.setdefault(row["id"], []).append(shared)
     runs = [_parse(path, number, line, by_run) for number, line in enumerate(lines, 1)]

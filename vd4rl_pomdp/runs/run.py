@@ -15,9 +15,8 @@ from types import MappingProxyType, TracebackType
 from typing import Any, Self
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.options import flat
+from vd4rl_pomdp.core.options import RUNTIME_FIELDS, flat, settings_of
 from vd4rl_pomdp.core.registry import code_of, warn_of_other_code
-from vd4rl_pomdp.core.settings import RUNTIME_FIELDS, settings_of
 from vd4rl_pomdp.runs import CONFIG_FILE, DIVERGED_FILE, EPISODES_FILE, FORMAT, MACHINE_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.checkpoint import Checkpoints, State
 from vd4rl_pomdp.runs.episodes import read_episodes

@@ -38,8 +38,8 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.options import RUNTIME_FIELDS
 from vd4rl_pomdp.core.reading import read_bytes
-from vd4rl_pomdp.core.settings import RUNTIME_FIELDS
 from vd4rl_pomdp.runs.interrupt import Terminated
 
 GRIDS = Path(__file__).with_name("grids")

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.settings import LABELS
+from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.data.collect import set_quality
 from vd4rl_pomdp.report.load import Choice, without_options
 from vd4rl_pomdp.runs.files import Row
@@ -54,7 +54,7 @@ class GridMembers(Choice):
         return found
 
     def asks(self, row: Row) -> bool:
-        """Whether a cell asks for a policy of these labels (`settings.LABELS`), whatever its variant."""
+        """Whether a cell asks for a policy of these labels (`options.LABELS`), whatever its variant."""
         return without_options(row, LABELS) in self._policies
 
     @property

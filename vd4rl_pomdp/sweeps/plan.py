@@ -14,9 +14,8 @@ from pathlib import Path
 from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.options import words_of
+from vd4rl_pomdp.core.options import settings_of, words_of
 from vd4rl_pomdp.core.registry import of_other_code
-from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, SET_QUALITIES, TASKS
 from vd4rl_pomdp.data.folder import PLAN, PROVENANCE, read_plan, shard_files, shard_paths, task_and_quality
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size

@@ -15,8 +15,8 @@ import numpy as np
 import pandas as pd
 
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import settings_of
 from vd4rl_pomdp.core.reading import read_bytes
-from vd4rl_pomdp.core.settings import settings_of
 from vd4rl_pomdp.envs.mazes import MAZES
 from vd4rl_pomdp.runs import TRAJECTORY_FILE
 from vd4rl_pomdp.runs.files import write_csv

@@ -8,8 +8,7 @@ from __future__ import annotations
 
 import shlex
 
-from vd4rl_pomdp.core.options import flat
-from vd4rl_pomdp.core.settings import settings_of
+from vd4rl_pomdp.core.options import flat, settings_of
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data.folder import read_plan
 from vd4rl_pomdp.nn.encoder import EncoderCard
