@@ -15,7 +15,7 @@ from tests.sweeps.slurm_cluster import slurm, why_not
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UnavailableError, UserError
 from vd4rl_pomdp.sweeps import clusters
-from vd4rl_pomdp.sweeps.clusters import RayCluster, SlurmCluster, Task, parameters, watch
+from vd4rl_pomdp.sweeps.clusters import ClusterTask, RayCluster, SlurmCluster, parameters, watch
 from vd4rl_pomdp.sweeps.folder import SweepFolder, is_finished
 from vd4rl_pomdp.sweeps.options import LocalOptions, RayOptions, SlurmOptions
 
@@ -76,7 +76,7 @@ def fakes(tmp_path, monkeypatch):
 def test_what_slurm_refuses_or_does_not_answer_is_one_line_and_stopping_asks_before_it_ends(
     fakes, tmp_path, monkeypatch, capsys
 ):
-    task = Task(tmp_path, "", LocalOptions(), str(tmp_path))
+    task = ClusterTask(tmp_path, "", LocalOptions(), str(tmp_path))
     cluster = fakes(sbatch="echo invalid partition >&2; exit 1")
     with pytest.raises(UserError, match=r"Slurm took no array .*invalid partition"):
         cluster.submit(task, 2)

@@ -27,7 +27,7 @@ from vd4rl_pomdp.core.tasks import (
     Quality,
     Task,
 )
-from vd4rl_pomdp.data.shards import Columns, Shard, collect_set
+from vd4rl_pomdp.data.shards import EpisodeArrays, Shard, collect_set
 from vd4rl_pomdp.envs.make import layout_of, make_env
 from vd4rl_pomdp.envs.pixels import Render
 from vd4rl_pomdp.policies.actor import Actor, Ladder, load_actor, load_ladder, read_actor
@@ -186,7 +186,7 @@ def set_quality(config: CollectConfig) -> str:
     return _base(config) + _suffix(config)
 
 
-def play(config: CollectConfig, length: int | None = None) -> Iterator[Columns]:
+def play(config: CollectConfig, length: int | None = None) -> Iterator[EpisodeArrays]:
     """Rows of all episodes that `collect` would render, by physics alone: the same seeds, actions and rewards.
 
     Args:
@@ -229,7 +229,7 @@ def _job(config: CollectConfig, collector: Collector, episode: int, length: int 
     return _Job(task, episode, config.seed, actor, config.render, size, length, _noise(config))
 
 
-def _roll_out(job: _Job) -> Columns:
+def _roll_out(job: _Job) -> EpisodeArrays:
     """Rows of one episode, by key."""
     env = _environment(job.task, job.render, job.size, job.length)
     rng = np.random.default_rng([job.seed, job.episode])

@@ -20,7 +20,7 @@ from vd4rl_pomdp.runs.progress import ProgressLine
 from vd4rl_pomdp.runs.provenance import command, git_commit, versions
 from vd4rl_pomdp.runs.workers import count_workers, run_jobs
 
-Columns = dict[str, np.ndarray]
+EpisodeArrays = dict[str, np.ndarray]
 """An episode's rows, by key."""
 
 
@@ -38,7 +38,7 @@ def collect_set(
     out: Path,
     settings: dict[str, Any],
     shards: list[Shard],
-    roll_out: Callable[[Any], Columns],
+    roll_out: Callable[[Any], EpisodeArrays],
     workers: int,
     title: tuple[str, str],
     task: str,

@@ -28,7 +28,7 @@ MOST_BYTES = 5 * 2**20
 Film = dict[str, np.ndarray]
 
 
-class Shown(NamedTuple):
+class ShownFilm(NamedTuple):
     """A film as the page carries it."""
 
     title: str
@@ -56,7 +56,7 @@ def read_film(path: Path) -> Film:
         raise UserError(f"{path}: cannot be read ({error}); remove it, and the report goes without") from error
 
 
-def shown_films(runs: Iterable[Run]) -> tuple[list[Shown], int]:
+def shown_films(runs: Iterable[Run]) -> tuple[list[ShownFilm], int]:
     """The film of the first seed of every method and setting, each read once, and how many found no room."""
     chosen: dict[tuple, Run] = {}
     for run in runs:
@@ -68,7 +68,7 @@ def shown_films(runs: Iterable[Run]) -> tuple[list[Shown], int]:
         name = f"{title(run)}, seed {run.labels['seed']}"
         still, moving = (base64.b64encode(picture).decode() for picture in (strip(film), movie(film)))
         share = min(1.0, len(film["clean"]) / STRIP_FRAMES)
-        made = Shown(name, still, moving, share, film["return"][-1])
+        made = ShownFilm(name, still, moving, share, film["return"][-1])
         size += len(made.strip) + len(made.movie)  # all of it is in the page, which has to open from disk
         if size > MOST_BYTES:
             break

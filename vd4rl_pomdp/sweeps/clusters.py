@@ -35,7 +35,7 @@ VAIN = 3
 
 
 @dataclass(frozen=True)
-class Task:
+class ClusterTask:
     """What runs on a node: a driver that helps with a sweep."""
 
     out: Path
@@ -71,7 +71,7 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
         UserError: the cluster refuses the first tasks, or tasks end and nothing happens.
     """
     jobs = jobs_of(plans)
-    task = Task(folder.out, name, cluster.local, os.getcwd())
+    task = ClusterTask(folder.out, name, cluster.local, os.getcwd())
     said = {name: len(rows) for name, rows in folder.attempts(jobs).items()}
     vain, heard = 0, False
     try:
@@ -140,7 +140,7 @@ class SlurmCluster:
         """How many tasks of this sweep wait or run; UnavailableError if Slurm does not answer."""
         return len(self._ask("squeue", "--array", "--noheader", "--format=%T").split())
 
-    def submit(self, task: Task, number: int) -> None:
+    def submit(self, task: ClusterTask, number: int) -> None:
         """Submit one array; UserError if Slurm does not take it."""
         try:
             with disk_errors(self.folder):
@@ -249,7 +249,7 @@ class RayCluster:
                 print(f"warning: a task ended ({told})", file=sys.stderr, flush=True)
         return len(self._running)
 
-    def submit(self, task: Task, number: int) -> None:
+    def submit(self, task: ClusterTask, number: int) -> None:
         """Start tasks; Ray finds their nodes."""
         run = self._ray.remote(max_retries=0)(lambda: task())  # the sweep's own rows decide what is tried again
         run = run.options(num_cpus=self._options.cpus, num_gpus=self._options.gpus, name=str(self.folder))

@@ -6,7 +6,7 @@ from pretrain.build import build_objective
 from pretrain.config import PretrainConfig
 from tests.studies.theory.random_worlds import worlds
 from vd4rl_pomdp.nn.action_target import make_action_target
-from vd4rl_pomdp.studies.theory.classifiers import Memory, compare
+from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, compare
 from vd4rl_pomdp.studies.theory.decodability import future_memory, past_memory
 from vd4rl_pomdp.studies.theory.gallery import WORLDS, biased, counterexample, echo, momentum
 from vd4rl_pomdp.studies.theory.views import VIEWS
@@ -21,7 +21,7 @@ def test_mik_a_is_the_multi_step_inverse_where_past_and_future_decode(world):
     m, n = past_memory(world, actions=True), future_memory(world, actions=True)
     assume(m is not None and n is not None and max(m, n) <= LIMIT)
     for k in (1, 2, 3):
-        found = compare(world, VIEWS["mik+a"], Memory(m, n), k)
+        found = compare(world, VIEWS["mik+a"], MemoryLengths(m, n), k)
         assert found.multi_step
         assert found.entropy == pytest.approx(found.multi_step_entropy)
 
@@ -31,19 +31,19 @@ def test_mik_a_is_the_multi_step_inverse_where_past_and_future_decode(world):
 def test_ah_is_the_one_step_inverse_where_observations_decode(world):
     m = past_memory(world, actions=False)
     assume(m is not None and m <= LIMIT)
-    assert all(compare(world, VIEWS["ah"], Memory(m, 0), k).one_step for k in (1, 2, 3))
+    assert all(compare(world, VIEWS["ah"], MemoryLengths(m, 0), k).one_step for k in (1, 2, 3))
 
 
 @settings(max_examples=25, deadline=None)
 @given(worlds())
 def test_ah_a_is_certain_on_every_world(world):
-    assert all(compare(world, VIEWS["ah+a"], Memory(1, 0), k).certain for k in (1, 2))
+    assert all(compare(world, VIEWS["ah+a"], MemoryLengths(1, 0), k).certain for k in (1, 2))
 
 
 @settings(max_examples=25, deadline=None)
 @given(worlds())
 def test_seeing_more_never_raises_the_entropy(world):
-    memory = Memory(1, 1)
+    memory = MemoryLengths(1, 1)
     for k in (1, 2):
         h = {name: compare(world, VIEWS[name], memory, k).entropy for name in VIEWS if "literal" not in name}
         assert h["ah+a"] <= h["ah"] + 1e-12 <= h["fj"] + 2e-12
@@ -53,37 +53,37 @@ def test_seeing_more_never_raises_the_entropy(world):
 
 def test_the_wrong_classifier_is_told_from_the_right_one():
     """Where the future does not decode, MIK+A's classifier is not the multi-step inverse, and this is noticed."""
-    row = compare(counterexample(), VIEWS["mik+a"], Memory(3, 3), 2)
+    row = compare(counterexample(), VIEWS["mik+a"], MemoryLengths(3, 3), 2)
     assert not row.decodes_end
     assert not row.multi_step
     assert row.entropy == pytest.approx(0.75 * 0.6931471805599453)
     assert row.multi_step_entropy == 0
-    literal = compare(counterexample(), VIEWS["mik+a literal"], Memory(3, 3), 2)
+    literal = compare(counterexample(), VIEWS["mik+a literal"], MemoryLengths(3, 3), 2)
     assert literal.multi_step
     assert literal.decodes_end
 
 
 def test_the_jumps_reach_back_behind_m():
     """FJ+A knows a_t up to k = m+1, and more than the two states at k = m+2: the later window reaches back to t+k-m."""
-    rows = [compare(counterexample(), VIEWS["fj+a"], Memory(3, 3), k) for k in range(1, 7)]
+    rows = [compare(counterexample(), VIEWS["fj+a"], MemoryLengths(3, 3), k) for k in range(1, 7)]
     assert [row.certain for row in rows] == [True] * 4 + [False] * 2
     assert [row.sees_action for row in rows] == [True] * 3 + [False] * 3
     assert [row.multi_step for row in rows] == [True, True, False, False, False, True]
-    literal = [compare(counterexample(), VIEWS["fj+a literal"], Memory(3, 3), k) for k in range(1, 6)]
+    literal = [compare(counterexample(), VIEWS["fj+a literal"], MemoryLengths(3, 3), k) for k in range(1, 6)]
     assert [row.sees_action for row in literal] == [True] * 4 + [False]
     assert [row.certain for row in literal] == [True] * 5
 
 
 def test_the_literal_future_sees_its_target_at_k_1_and_breaks_the_proof_where_states_forget_actions():
-    assert compare(momentum(), VIEWS["mik+a literal"], Memory(1, 1), 1).sees_action
-    assert not compare(momentum(), VIEWS["mik+a"], Memory(1, 1), 1).sees_action
-    assert not compare(momentum(), VIEWS["mik+a literal"], Memory(1, 1), 3).multi_step
-    assert compare(momentum(), VIEWS["mik+a"], Memory(1, 1), 3).multi_step
+    assert compare(momentum(), VIEWS["mik+a literal"], MemoryLengths(1, 1), 1).sees_action
+    assert not compare(momentum(), VIEWS["mik+a"], MemoryLengths(1, 1), 1).sees_action
+    assert not compare(momentum(), VIEWS["mik+a literal"], MemoryLengths(1, 1), 3).multi_step
+    assert compare(momentum(), VIEWS["mik+a"], MemoryLengths(1, 1), 3).multi_step
 
 
 def test_mik_needs_a_future_that_decodes_without_actions():
     for world, works in ((echo(), True), (momentum(), False)):
-        assert compare(biased(world), VIEWS["mik"], Memory(1, 1), 2).multi_step is works
+        assert compare(biased(world), VIEWS["mik"], MemoryLengths(1, 1), 2).multi_step is works
 
 
 @pytest.mark.parametrize("name", [name for name in VIEWS if name != "fj+a literal"])

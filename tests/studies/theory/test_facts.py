@@ -7,7 +7,7 @@ import pytest
 from hypothesis import HealthCheck, assume, given, settings
 
 from tests.studies.theory.random_worlds import worlds
-from vd4rl_pomdp.studies.theory.classifiers import Memory, clash, compare
+from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, clash, compare
 from vd4rl_pomdp.studies.theory.decodability import past_memory
 from vd4rl_pomdp.studies.theory.facts import PRINTED, facts, inverse_examples
 from vd4rl_pomdp.studies.theory.gallery import (
@@ -54,33 +54,35 @@ def test_every_fact_is_computed_and_contradicts_what_is_printed():
 def test_the_ladder():
     """From its first step (0, 0), (1, 0) and (1, 1) lead to the ground; if it is reached at once, only the first."""
     for method in ("fj", "fj+a"):
-        found = clash(ladder(), VIEWS[method], Memory(1, 0), 2)
+        found = clash(ladder(), VIEWS[method], MemoryLengths(1, 0), 2)
         assert (found.action, found.exact, found.multi_step, found.states) == (0, 1, Fraction(1, 3), (1, 0))
         assert found.seen["o_t+1"] == "ground"
-    assert compare(ladder(), VIEWS["fj"], Memory(1, 0), 1).one_step, "up to m, as printed"
+    assert compare(ladder(), VIEWS["fj"], MemoryLengths(1, 0), 1).one_step, "up to m, as printed"
 
 
 def test_the_literal_readings_on_one_and_two_states():
-    assert clash(idle(), VIEWS["fj+a literal"], Memory(0, 0), 1).exact == 1
-    assert set(clash(toggle(), VIEWS["mik+a literal"], Memory(0, 0), 2).seen) == {"o_t", "a_t+1", "o_t+2"}
+    assert clash(idle(), VIEWS["fj+a literal"], MemoryLengths(0, 0), 1).exact == 1
+    assert set(clash(toggle(), VIEWS["mik+a literal"], MemoryLengths(0, 0), 2).seen) == {"o_t", "a_t+1", "o_t+2"}
 
 
 def test_what_no_claim_forbids_contradicts_nothing():
     for k in (1, 2, 3, 4):
-        assert clash(switch(), VIEWS["mik+a"], Memory(0, 0), k) is None
-        assert clash(switch(), VIEWS["mik+a literal"], Memory(0, 0), k) is None, "its states record the last action"
-        assert clash(toggle(), VIEWS["fj+a"], Memory(0, 0), k) is None, "m = 0: both windows are rows"
+        assert clash(switch(), VIEWS["mik+a"], MemoryLengths(0, 0), k) is None
+        assert clash(switch(), VIEWS["mik+a literal"], MemoryLengths(0, 0), k) is None, (
+            "its states record the last action"
+        )
+        assert clash(toggle(), VIEWS["fj+a"], MemoryLengths(0, 0), k) is None, "m = 0: both windows are rows"
 
 
 @pytest.mark.parametrize(
     ("make", "memory"), [(idle, (0, 0)), (toggle, (0, 0)), (momentum, (1, 1))], ids=["idle", "toggle", "momentum"]
 )
 def test_without_the_leak_mik_a_is_right_where_the_literal_reading_is_not(make, memory):
-    assert all(clash(make(), VIEWS["mik+a"], Memory(*memory), k) is None for k in (1, 2, 3))
+    assert all(clash(make(), VIEWS["mik+a"], MemoryLengths(*memory), k) is None for k in (1, 2, 3))
 
 
 def test_with_the_leak_mik_a_is_right_where_the_future_decodes_only_so():
-    for world, memory in ((hidden_switch(), Memory(1, 0)), (counterexample(), Memory(3, 3))):
+    for world, memory in ((hidden_switch(), MemoryLengths(1, 0)), (counterexample(), MemoryLengths(3, 3))):
         assert all(clash(world, VIEWS["mik+a literal"], memory, k) is None for k in (1, 2, 3))
 
 
@@ -149,5 +151,5 @@ def test_a_forward_jump_is_the_multi_step_inverse_of_the_shorter_gap(actions, wo
 def test_the_shorter_gap_is_told_from_the_printed_one():
     """Where the later window tells its first state, and the gap makes a difference."""
     assert is_shorter_gap(echo(), 1, 3) is True
-    assert clash(echo(), VIEWS["fj+a"], Memory(1, 1), 3) is not None
+    assert clash(echo(), VIEWS["fj+a"], MemoryLengths(1, 1), 3) is not None
     assert is_shorter_gap(hidden_switch(), 1, 2) is None

@@ -5,7 +5,7 @@ import pytest
 from hypothesis import given, settings
 
 from tests.studies.theory.random_worlds import worlds
-from vd4rl_pomdp.studies.theory.classifiers import Memory
+from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths
 from vd4rl_pomdp.studies.theory.gallery import NOISE, biased, counterexample, echo, momentum
 from vd4rl_pomdp.studies.theory.partition import (
     discards_noise,
@@ -17,7 +17,7 @@ from vd4rl_pomdp.studies.theory.partition import (
 from vd4rl_pomdp.studies.theory.views import VIEWS
 from vd4rl_pomdp.studies.theory.world import with_noise
 
-MEMORY = Memory(3, 3)
+MEMORY = MemoryLengths(3, 3)
 
 
 def classes(world, method, max_k):
@@ -29,7 +29,7 @@ def classes(world, method, max_k):
 @given(worlds(most_states=3))
 @pytest.mark.parametrize("method", ["fj", "fj+a", "mik+a"])
 def test_a_coarsest_partition_factors_and_cannot_be_coarsened(method, world):
-    found = relation(world, VIEWS[method], Memory(1, 1), (1, 2))
+    found = relation(world, VIEWS[method], MemoryLengths(1, 1), (1, 2))
     blocks = found.coarsest()
     assert len(blocks) == len(found.histories)
     assert found.factors(blocks)
@@ -41,7 +41,7 @@ def test_a_coarsest_partition_factors_and_cannot_be_coarsened(method, world):
 @given(worlds(most_states=3))
 @pytest.mark.parametrize("method", ["fj+a", "mik+a"])
 def test_conflicts_are_the_pairs_that_no_partition_can_merge(method, world):
-    found = relation(world, VIEWS[method], Memory(1, 1), (1, 2))
+    found = relation(world, VIEWS[method], MemoryLengths(1, 1), (1, 2))
     conflicts, apart = found.conflicts(), np.arange(len(found.histories))
     for one, other in list(combinations(apart, 2))[:60]:
         merged = found.factors(np.where(apart == other, one, apart))
@@ -91,17 +91,17 @@ def test_one_encoder_on_true_states_recovers_aperiodic_worlds():
 def test_the_past_encoder_alone_may_merge_states_that_act_alike():
     """echo: (0, 1) and (2, 0) have the same successors; f can merge them under a policy that treats them alike."""
     world, ks = echo(), range(1, 5)
-    even = forced_shares(relation(world, VIEWS["mik+a"], Memory(1, 1), ks))
+    even = forced_shares(relation(world, VIEWS["mik+a"], MemoryLengths(1, 1), ks))
     assert {pair for pair, share in even.items() if share == 0} == {
         frozenset(((x, b), ((x + 2) % 4, 1 - b))) for x in range(4) for b in (0, 1)
     }
-    partial = forced_shares(relation(biased(world), VIEWS["mik+a"], Memory(1, 1), ks))
+    partial = forced_shares(relation(biased(world), VIEWS["mik+a"], MemoryLengths(1, 1), ks))
     assert set(partial.values()) == {1}
 
 
 def test_which_objectives_can_drop_the_exogenous_part():
     ks = (1, 2)
     for name in ("ah", "ah+a", "fj", "fj+a", "mik", "mik+a"):
-        assert discards_noise(relation(with_noise(momentum(), "noise", NOISE), VIEWS[name], Memory(1, 1), ks))
+        assert discards_noise(relation(with_noise(momentum(), "noise", NOISE), VIEWS[name], MemoryLengths(1, 1), ks))
     assert not discards_noise(relation(counterexample(), VIEWS["fj"], MEMORY, ks))
     assert discards_noise(relation(counterexample(), VIEWS["fj+a"], MEMORY, ks))

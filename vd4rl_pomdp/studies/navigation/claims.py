@@ -31,7 +31,7 @@ NEAR_ZERO = 5.0
 FEW = 15.0
 """State error (% of a standard deviation) below which a first person is said to know where it is."""
 _RELATIONS = {">=": operator.ge, "<=": operator.le, "<": operator.lt, ">": operator.gt}
-Side = tuple[Condition, Measure]
+ClaimSide = tuple[Condition, Measure]
 Numbers = Mapping[tuple[Any, ...], Mapping[int, float]]
 """What `numbers_of` returns."""
 
@@ -40,10 +40,10 @@ class Claim(NamedTuple):
     """`left` compared with `factor` times `right`; without a right side, with `factor` itself."""
 
     text: str
-    left: Side
+    left: ClaimSide
     relation: str
     factor: float
-    right: Side | None = None
+    right: ClaimSide | None = None
 
     def raw(self) -> Claim:
         """The same statement about errors in the simulator's units; itself where it names a bound in its own."""
@@ -78,7 +78,7 @@ class Verdict(NamedTuple):
 def claims(maze: str) -> list[Claim]:
     """The claims about one maze: first whether training has gone far enough to compare, then the paper's statements."""
 
-    def of(method: str, measure: Measure | str, max_k: int = 15, **options: bool) -> Side:
+    def of(method: str, measure: Measure | str, max_k: int = 15, **options: bool) -> ClaimSide:
         named = refitted_error(measure) if isinstance(measure, str) else measure
         return Condition(maze, method, max_k, **options), named
 
@@ -127,7 +127,7 @@ def judge(claim: Claim, numbers: Numbers) -> Verdict:
     return Verdict(claim, means[0], means[1], len(seeds), holding, known)
 
 
-def _by_seed(side: Side, numbers: Numbers) -> Mapping[int, float]:
+def _by_seed(side: ClaimSide, numbers: Numbers) -> Mapping[int, float]:
     condition, measure = side
     return numbers.get((*condition, *measure), {})
 

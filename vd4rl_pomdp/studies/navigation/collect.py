@@ -20,7 +20,7 @@ from vd4rl_pomdp.core.errors import MAX_SEED, MOST_ROWS, refuse_outside
 from vd4rl_pomdp.core.seeding import episode_seed
 from vd4rl_pomdp.core.tasks import MOST_EPISODES
 from vd4rl_pomdp.core.types import StepType
-from vd4rl_pomdp.data.shards import Columns, Shard, collect_set
+from vd4rl_pomdp.data.shards import EpisodeArrays, Shard, collect_set
 from vd4rl_pomdp.envs.mazes import ACTION_REPEAT, MAZES, MOST_STEPS, Style, get_maze
 from vd4rl_pomdp.runs.files import jsonable
 from vd4rl_pomdp.runs.outputs import refuse_inside
@@ -115,7 +115,7 @@ class _Job:
     action_repeat: int
 
 
-def _roll_out(job: _Job) -> Columns:
+def _roll_out(job: _Job) -> EpisodeArrays:
     """Rows of one trajectory, by key."""
     env = _environment(job.maze, job.action_repeat)
     rng = np.random.default_rng([job.seed, job.trajectory])

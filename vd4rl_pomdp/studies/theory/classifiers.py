@@ -12,7 +12,7 @@ from vd4rl_pomdp.studies.theory.world import Action, AgentState, World
 
 
 @dataclass(frozen=True)
-class Memory:
+class MemoryLengths:
     """Lengths of the windows that stand for past and future."""
 
     m: int
@@ -44,7 +44,7 @@ class Comparison:
     """H(a_t | s_t, s_{t+k}), in nats."""
 
 
-def first_row(view: ObjectiveView, memory: Memory) -> int:
+def first_row(view: ObjectiveView, memory: MemoryLengths) -> int:
     """The t of a pair that has a whole past window: literal windows reach one action further back."""
     return memory.m + (1 if view.literal and not view.masked else 0)
 
@@ -65,7 +65,7 @@ class Clash:
     """P(a_t | s_t, s_{t+k}) of it."""
 
 
-def clash(world: World, view: ObjectiveView, memory: Memory, k: int) -> Clash | None:
+def clash(world: World, view: ObjectiveView, memory: MemoryLengths, k: int) -> Clash | None:
     """The sequence on which one objective's classifier is farthest from the multi-step inverse; None if it is that."""
     t = first_row(view, memory)
     visible = view.visible(t, k, memory.m, memory.n, t + k + memory.n + 1)
@@ -85,7 +85,7 @@ def clash(world: World, view: ObjectiveView, memory: Memory, k: int) -> Clash | 
     return Clash(k, seen, states, world.actions[place], exact[row][place], multi[row][place])
 
 
-def compare(world: World, view: ObjectiveView, memory: Memory, k: int) -> Comparison:
+def compare(world: World, view: ObjectiveView, memory: MemoryLengths, k: int) -> Comparison:
     """Compare one objective's classifier at one k with those of the states, on every sequence of the world."""
     t = first_row(view, memory)
     rows = t + k + memory.n + 1

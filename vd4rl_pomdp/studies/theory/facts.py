@@ -12,7 +12,7 @@ from dataclasses import dataclass
 from itertools import product
 from typing import Any
 
-from vd4rl_pomdp.studies.theory.classifiers import Memory, clash
+from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, clash
 from vd4rl_pomdp.studies.theory.decodability import future_memory, past_memory
 from vd4rl_pomdp.studies.theory.gallery import (
     alternator,
@@ -80,12 +80,12 @@ def enumerated(world: World) -> dict[str, Any]:
     }
 
 
-def least_memory(world: World) -> Memory:
+def least_memory(world: World) -> MemoryLengths:
     """The least m and n with actions; where no n decodes, that of the literal reading, or 0 if none does either."""
     m = past_memory(world, actions=True)
     ns = [future_memory(world, actions=True, literal=literal) for literal in (False, True)]
     assert m is not None, f"{world.name}: no past decodes"
-    return Memory(m, next((n for n in ns if n is not None), 0))
+    return MemoryLengths(m, next((n for n in ns if n is not None), 0))
 
 
 @dataclass(frozen=True)
@@ -176,11 +176,11 @@ def facts() -> list[Fact]:
     ]
 
 
-Row = tuple[str, str, str, str]
+_Row = tuple[str, str, str, str]
 """World, quantity, claimed and computed number."""
 
 
-def _prediction(world: World, method: str, first_k: int) -> Row:
+def _prediction(world: World, method: str, first_k: int) -> _Row:
     """The first k, of GAPS, at which a method is not the multi-step inverse: where, and both probabilities."""
     memory = least_memory(world)
     for k in range(first_k, first_k + GAPS):
@@ -192,11 +192,11 @@ def _prediction(world: World, method: str, first_k: int) -> Row:
     raise AssertionError(f"{method} is the multi-step inverse of {world.name}")
 
 
-def _jumps(world: World) -> Row:
+def _jumps(world: World) -> _Row:
     """States that FJ+A tells apart by jumps beyond m, beside those by shorter ones and by the literal MIK+A."""
     m = least_memory(world).m
-    near, far = (always_apart(relation(world, VIEWS["fj+a"], Memory(m, m), range(1, k + 1))) for k in (m, m + 2))
-    masked = always_apart(relation(world, VIEWS["mik+a literal"], Memory(m, m), range(1, m + 1)))
+    near, far = (always_apart(relation(world, VIEWS["fj+a"], MemoryLengths(m, m), range(1, k + 1))) for k in (m, m + 2))
+    masked = always_apart(relation(world, VIEWS["mik+a literal"], MemoryLengths(m, m), range(1, m + 1)))
     aside = f"k up to {m}: {near[0]}; mik+a literal: {masked[0]}"
     return (
         world.name,
@@ -206,20 +206,20 @@ def _jumps(world: World) -> Row:
     )
 
 
-def _merged(world: World) -> Row:
+def _merged(world: World) -> _Row:
     """States that MIK+A's past encoder has to tell apart, with both actions equally likely."""
     reach = _reach(world)
     apart, pairs = always_apart(relation(world, VIEWS["mik+a"], least_memory(world), range(1, reach + 1)))
     return world.name, f"pairs of states apart by mik+a, k up to {reach}", f"{pairs} of {pairs}", f"{apart} of {pairs}"
 
 
-def _codes(world: World) -> Row:
+def _codes(world: World) -> _Row:
     """Codes that one encoder on true states needs at both ends, at every k up to twice the diameter."""
     codes = len(set(state_relation(world, range(1, 2 * _reach(world) + 1)).coarsest().tolist()))
     return world.name, f"codes on true states, k up to {2 * _reach(world)}", str(len(world.states)), str(codes)
 
 
-def _noise(world: World) -> Row:
+def _noise(world: World) -> _Row:
     """The first of two k beyond m up to which FJ+A's prediction depends on the exogenous part of its past."""
     memory = least_memory(world)
     needed = (

@@ -18,7 +18,7 @@ from itertools import combinations
 
 import numpy as np
 
-from vd4rl_pomdp.studies.theory.classifiers import Memory, first_row
+from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, first_row
 from vd4rl_pomdp.studies.theory.law import Law, Prediction, Variable, joint_law, number_rows
 from vd4rl_pomdp.studies.theory.views import ObjectiveView
 from vd4rl_pomdp.studies.theory.world import World
@@ -211,7 +211,7 @@ def _mark_differing(found: np.ndarray, mine: np.ndarray, key: np.ndarray, value:
         found[mine[gap:][differ], mine[:-gap][differ]] = True
 
 
-def relation(world: World, view: ObjectiveView, memory: Memory, ks: Iterable[int]) -> Relation:
+def relation(world: World, view: ObjectiveView, memory: MemoryLengths, ks: Iterable[int]) -> Relation:
     """F of one objective on a world, for some k.
 
     Where the past is a window, one t with a whole window stands for all. Where it is the whole history, every pair

@@ -8,7 +8,7 @@ from itertools import product
 from typing import Any
 
 from vd4rl_pomdp.runs.files import Row
-from vd4rl_pomdp.studies.theory.classifiers import Memory, compare
+from vd4rl_pomdp.studies.theory.classifiers import MemoryLengths, compare
 from vd4rl_pomdp.studies.theory.decodability import future_memory, past_memory
 from vd4rl_pomdp.studies.theory.facts import INVERSE, always_apart, enumerated, facts, least_memory
 from vd4rl_pomdp.studies.theory.gallery import WORLDS, counterexample, variants
@@ -83,7 +83,7 @@ class Case:
     name: str
     worlds: dict[tuple[bool, bool], World]
     """By (noise, state-dependent policy)."""
-    memory: Memory
+    memory: MemoryLengths
     diameter: int
     max_k: int
     """Largest k: the diameter, or m + 2 if that is more."""
@@ -189,7 +189,7 @@ EQUATIONS = (
 `Comparison`."""
 
 
-def compare_equations(rows: list[Row], memories: dict[str, Memory]) -> list[Row]:
+def compare_equations(rows: list[Row], memories: dict[str, MemoryLengths]) -> list[Row]:
     """For every equation and world: at which of its k it holds or fails, and whether its assumptions are met."""
     found = []
     for (method, where, form), (world, memory) in product(EQUATIONS, memories.items()):
