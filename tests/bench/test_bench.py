@@ -20,6 +20,18 @@ def test_a_set_smaller_than_the_usual_one_can_be_measured(tmp_path, monkeypatch)
     assert {name for name in GOALS if name.split(".")[0] in sections} <= set(measured)
 
 
+def test_drawing_is_measured_over_more_frames_than_an_episode_has(monkeypatch):
+    made = measures.make_env
+
+    def short(task, render):
+        env = made(task, render)
+        monkeypatch.setattr(env, "_length", 2)
+        return env
+
+    monkeypatch.setattr(measures, "make_env", short)
+    assert measures._render_wall(("fast", 5)) > 0
+
+
 def test_every_method_that_random_pictures_can_train_is_measured(tmp_path):
     dataset, _ = measures.synthetic_set(tmp_path, 2)
     measured = measures.methods(dataset, tmp_path, 1)

@@ -29,7 +29,6 @@ from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.data.parity import canary_frames, compare
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.envs.mazes import PICTURE_SIZE
-from vd4rl_pomdp.envs.pixels import PixelEnv
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.runs.device import Precision, pick_device
@@ -151,25 +150,30 @@ def collection(frames: int) -> dict[str, float]:
 
 def _render_speed(render: Any, frames: int) -> float:
     """Frames per CPU-second of one process."""
-    env, action = _warm_environment(render)
-    return rate(lambda: env.step(action), frames)
+    return rate(_acting(render), frames)
 
 
 def _render_wall(job: tuple[Any, int]) -> float:
     """Wall-clock seconds of one job, without the process's start."""
-    env, action = _warm_environment(job[0])
+    act = _acting(job[0])
     start = time.perf_counter()
     for _ in range(job[1]):
-        env.step(action)
+        act()
     return time.perf_counter() - start
 
 
-def _warm_environment(render: Any) -> tuple[PixelEnv, np.ndarray]:
+def _acting(render: Any) -> Callable[[], None]:
+    """One decision in an environment that has drawn its first frames, in a new episode when one is over."""
     env = make_env(TASKS["walker_walk"], render)
-    env.reset(0)
     action = np.zeros(env.action_dim, np.float32)
-    env.step(action)
-    return env, action
+    env.reset(0)
+
+    def act() -> None:
+        if env.step(action).last:
+            env.reset(0)
+
+    act()
+    return act
 
 
 def maze_pictures(frames: int) -> dict[str, float]:
