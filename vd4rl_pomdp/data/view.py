@@ -12,6 +12,7 @@ from vd4rl_pomdp.core import buffers
 from vd4rl_pomdp.core.buffers import BUFFERS
 from vd4rl_pomdp.core.errors import refuse_number, refuse_unknown
 from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.core.tasks import FRAME_STACK
 from vd4rl_pomdp.core.types import Transitions, Windows
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, augmentation
@@ -196,34 +197,34 @@ def _spread(images: Tensor, kept: Tensor, stack: int) -> Tensor:
 
 
 class Sampler:
-    """What samplers share: a view (of a set as it is stored, if a set is given), a batch size and a generator.
+    """What samplers share: a view (of a set as it is stored, if a set is given), a batch size and a random stream.
 
-    The generator lives on the CPU, so the draws do not depend on the set's device.
+    The stream is drawn on the CPU, so the batches do not depend on the set's device.
     """
 
-    def __init__(self, source: Dataset | View, batch_size: int, generator: torch.Generator) -> None:
+    def __init__(self, source: Dataset | View, batch_size: int, draws: RandomStream) -> None:
         refuse_number("batch_size", batch_size, 1)
         self.view = source if isinstance(source, View) else View(source)
-        self._batch_size, self._generator = batch_size, generator
+        self._batch_size, self.draws = batch_size, draws
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on with the same batches."""
-        return {"batches": self._generator.get_state(), "view": self.view.state_dict()}
+        return {"batches": self.draws.get_state(), "view": self.view.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
-        self._generator.set_state(state["batches"])
+        self.draws.set_state(state["batches"])
         self.view.load_state_dict(state["view"])
 
     def _draw(self, count: int) -> torch.Tensor:
-        return torch.randint(count, (self._batch_size,), generator=self._generator)
+        return self.draws.integers(count, self._batch_size)
 
 
 class WindowSampler(Sampler):
     """Windows whose starts are uniform over the set, drawn with replacement."""
 
-    def __init__(self, source: Dataset | View, batch_size: int, length: int, generator: torch.Generator) -> None:
-        super().__init__(source, batch_size, generator)
+    def __init__(self, source: Dataset | View, batch_size: int, length: int, draws: RandomStream) -> None:
+        super().__init__(source, batch_size, draws)
         self._length, self._count = length, self.view.dataset.num_windows(length)
 
     def sample(self) -> Windows:
@@ -242,11 +243,11 @@ class TransitionSampler(Sampler):
         self,
         source: Dataset | View,
         batch_size: int,
-        generator: torch.Generator,
+        draws: RandomStream,
         n_step: int = 1,
         gamma: float = 0.99,
     ) -> None:
-        super().__init__(source, batch_size, generator)
+        super().__init__(source, batch_size, draws)
         refuse_number("n_step", n_step, 1)
         self.view.dataset.require_transitions()
         self._n_step, self._gamma = n_step, gamma
