@@ -1,5 +1,6 @@
 """Which fine-tunings one process trains together, and that each of them stays a job of its own: with real processes."""
 
+import os
 from dataclasses import asdict, replace
 
 import pytest
@@ -87,6 +88,17 @@ def test_a_stack_is_of_one_width_and_every_job_keeps_its_row_and_its_log(tmp_pat
     logs = tmp_path / "sweep" / "logs"
     assert (logs / "of_x.log").read_text() == "its last line\n" * 2
     assert (logs / "of_z.log").read_text() == f"in one process with of_x: see {logs / 'of_x.log'}\n"
+
+
+def test_a_stack_has_the_places_of_its_jobs_as_far_as_nothing_else_needs_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(driver, "places", lambda _: [driver.Place((core,), None) for core in cores])
+    cores = sorted(os.sched_getaffinity(0))[:2]
+    jobs = [policy(tmp_path, name) for name in "abc"]
+    assert sweep(tmp_path, *jobs)
+    assert [one["cores"] for job in jobs for one in begun(job)] == [len(cores)] * 3
+    jobs = [policy(tmp_path, name) for name in "de"]
+    assert sweep(tmp_path, *jobs, job(tmp_path, "f"))
+    assert [one["cores"] for job in jobs for one in begun(job)] == [1] * 2
 
 
 @pytest.mark.parametrize("end", [2, "kill", "defect"])
