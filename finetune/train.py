@@ -115,14 +115,14 @@ def _trainer(
     draws = random_stream(config.seed, STAGE, "batches", device=dataset.t.device)
     corruption = CorruptionConfig.fill(card.corruption)  # as in pretraining: what is hidden belongs to the world
     returns = config.options if isinstance(config.options, ReturnOptions) else ReturnOptions()
-    frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed)
+    frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed_of_views)
     encode = partial(frozen.episode, view=frozen.view(0))
     sampler: FeatureSampler | ExactSampler | TransitionSampler
     if card.end_to_end:
-        view = View(dataset, corruption, config.shift, config.seed, STAGE)
+        view = View(dataset, corruption, config.shift, config.seed_of_views, STAGE)
         sampler = TransitionSampler(view, config.batch_size, draws, returns.n_step, returns.gamma)
     elif config.views:
-        histories = Histories(dataset, config.memory, returns.n_step, config.seed)
+        histories = Histories(dataset, config.memory, returns.n_step, config.seed_of_views)
         features = encode_views(frozen, histories, config.views, run.path / FEATURES_FILE)
         policy.standardise.fit(features)
         _probe(features, dataset, run)

@@ -8,6 +8,7 @@ from typing import Any, get_args
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core import buffers
 from vd4rl_pomdp.core.buffers import BUFFERS
 from vd4rl_pomdp.core.errors import refuse_number, refuse_unknown
 from vd4rl_pomdp.core.seeding import stream_seed
@@ -66,8 +67,14 @@ class View:
             shift_key = self.shifts.take((shifts,), rows.device)
         # Keys are taken whichever way is gone: the streams stand alike on every device.
         keys = self.corruption.keys(self.dataset.keys(rows))
-        if augmentation.by_lines(self.dataset.frames, self._pad):
+        frames = self.dataset.frames
+        if augmentation.by_lines(frames, self._pad):
             return self._observe_by_lines(rows, shift_key, keys)
+        if not buffers.in_host_memory(frames):
+            index = self.dataset.stack_rows(rows, self._frame_stack).view(-1, self._frame_stack)
+            obs = self.corruption.corruption.paint(frames, index, keys.flatten(), shift_key, self._pad)
+            if obs is not None:
+                return obs.view(*rows.shape, *obs.shape[1:])
         stacks = self.stacks(rows)
         shifted_alike = stacks if len(shift_key) == len(rows) else stacks.flatten(0, rows.ndim - 1)
         shifted = augmentation.random_shift(shifted_alike, shift_key, self._pad).view(stacks.shape)
@@ -77,7 +84,7 @@ class View:
         """(..., C, H, W) uint8 frame stacks of (...,) int64 rows as they are stored, neither shifted nor corrupted."""
         frames = self.dataset.frames
         index = self.dataset.stack_rows(rows, self._frame_stack).flatten()
-        out = BUFFERS.take((len(index), *frames.shape[1:])) if frames.device.type == "cpu" else None
+        out = BUFFERS.take((len(index), *frames.shape[1:])) if buffers.in_host_memory(frames) else None
         stored = torch.index_select(frames, 0, index, out=out)
         return stored.view(*rows.shape, frames.shape[1] * self._frame_stack, *frames.shape[2:])
 
@@ -127,11 +134,12 @@ class View:
 
     def state_dict(self) -> dict[str, Any]:
         """Where the streams stand."""
-        return {"corruption": self.corruption.stream.position, "shift": self.shifts.position}
+        return {"corruption": int(self.corruption.stream.position), "shift": int(self.shifts.position)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
-        self.corruption.stream.position, self.shifts.position = state["corruption"], state["shift"]
+        self.corruption.stream.go_to(state["corruption"])
+        self.shifts.go_to(state["shift"])
 
     def _observe_by_lines(self, rows: Tensor, shift_key: Tensor, keys: Tensor) -> Tensor:
         """The same for a set on a CPU: only frames that stay are read, shifted, changed, and put into their stacks."""
