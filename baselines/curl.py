@@ -50,7 +50,7 @@ class CURL(Objective):
         self.bilinear = nn.Parameter(torch.rand(encoder.dim, encoder.dim))  # from 0 to 1, as the authors draw it
         self.draws = Draws(seed, "curl", "shift")
 
-    def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """InfoNCE over all real rows of the batch."""
         query = self.encoder.encode(self._shifted(window))
         with torch.no_grad():

@@ -72,7 +72,7 @@ class DRIML(Objective):
         self.candidates = nn.ModuleDict({n + m: mlp(widths[m], 256, SCORE_DIM, layers=1) for n, m in TERMS})
         self.draws = Draws(seed, "driml", "k")
 
-    def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean of the four InfoNCE terms at one k; `loss_gl` is a global anchor with local candidates."""
         rows = window.obs.shape[1]
         k = 1 + int(self.draws.integers(min(self.max_k, rows - 1), 1))

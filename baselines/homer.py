@@ -80,7 +80,7 @@ class HOMER(Objective):
         """Log-odds (N,) that transitions of (N, D), (N, A), (N, D) are real."""
         return self.classifier(torch.cat([state, action.to(state), self.bottleneck(following)], dim=-1))[:, 0]
 
-    def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean binary cross-entropy of every real transition of the batch and one imposter for each."""
         states = self.encoder.encode(window)
         real = window.real[:, 1:]

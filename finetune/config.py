@@ -32,7 +32,7 @@ class FinetuneConfig(StageConfig):
     algorithm: str = "td3_bc"
     """Algorithm, `vd4rl-pomdp list` shows all; the references bc and drq_bc bring their own."""
     seed: int = 0
-    """Seed of the networks, the views, the batches, the noise and the random histories."""
+    """Seed of the networks, the batches and the noise, and of the views unless --view-seed is given."""
     updates: int = 500_000
     """Gradient updates."""
     batch_size: int = 256
@@ -43,6 +43,9 @@ class FinetuneConfig(StageConfig):
     """Adam's learning rate."""
     views: int = 4
     """Draws of corruption and shift under which the set is encoded once; 0 encodes every batch anew."""
+    view_seed: int | None = None
+    """Seed of the views: their corruption, shifts and random histories. Runs that share it train on the same features;
+    None: the run's own seed."""
     shift: int = 4
     """Random shift in pixels, one for each episode and view; for each transition with --views 0, for each observation
     where the encoder is trained."""
@@ -76,6 +79,11 @@ class FinetuneConfig(StageConfig):
     memory: Annotated[Options, tyro.conf.arg(name="memory")] = NO_OPTIONS
     """What of an encoder with a memory the policy is given."""
 
+    @property
+    def seed_of_views(self) -> int:
+        """What the views are drawn from."""
+        return self.seed if self.view_seed is None else self.view_seed
+
     choosers: ClassVar[tuple[str, ...]] = ("algorithm",)
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
         "paper": {},
@@ -107,7 +115,7 @@ class FinetuneConfig(StageConfig):
         super().check()
         refuse_outside(
             self, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, views=0,
-            shift=(0, FRAME_SIZES[1] - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
+            view_seed=(0, MAX_SEED), shift=(0, FRAME_SIZES[1] - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
             eval_length=1, log_every=1, checkpoint_every=1, workers=0,
         )  # fmt: skip
 

@@ -14,9 +14,10 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from finetune.histories import Histories, HistoryOptions, draw_lengths, read_both_ends, read_whole
+from finetune.histories import Histories, HistoryOptions, read_both_ends, read_whole
 from vd4rl_pomdp.core.errors import disk_errors
 from vd4rl_pomdp.core.options import Options
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.core.types import Batch
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.data import Dataset, StateView, View
@@ -131,9 +132,9 @@ class FeatureSampler:
 
     def __init__(
         self, histories: Histories, features: Tensor, batch_size: int, n_step: int, gamma: float,
-        generator: torch.Generator,
+        draws: RandomStream,
     ) -> None:  # fmt: skip
-        self._features, self._batch_size, self._generator = features, batch_size, generator
+        self._features, self._batch_size, self.draws = features, batch_size, draws
         dataset, rows = histories.dataset, histories.rows
         self._reward, self._discount, _ = dataset.n_step_returns(rows, n_step, gamma)
         self._action = dataset.action_after(rows)
@@ -143,11 +144,11 @@ class FeatureSampler:
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on with the same batches."""
-        return {"batches": self._generator.get_state()}
+        return {"batches": self.draws.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
-        self._generator.set_state(state["batches"])
+        self.draws.set_state(state["batches"])
 
     def sample(self) -> FeatureBatch:
         """The next batch."""
@@ -161,9 +162,7 @@ class FeatureSampler:
         )
 
     def _draw(self, count: int) -> Tensor:
-        # on the CPU, so that a GPU trains on the same batches
-        drawn = torch.randint(count, (self._batch_size,), generator=self._generator)
-        return drawn.to(self._action.device, non_blocking=True)
+        return self.draws.integers(count, self._batch_size)
 
 
 class ExactSampler(Sampler):
@@ -171,9 +170,9 @@ class ExactSampler(Sampler):
 
     def __init__(
         self, frozen: FrozenEncoder, options: Options, batch_size: int, n_step: int, gamma: float,
-        generator: torch.Generator,
+        draws: RandomStream,
     ) -> None:  # fmt: skip
-        super().__init__(frozen.view(0), batch_size, generator)
+        super().__init__(frozen.view(0), batch_size, draws)
         self._frozen, self._n_step, self._gamma = frozen, n_step, gamma
         self._options = options if isinstance(options, HistoryOptions) else HistoryOptions()
         self._starts = frozen.dataset.transition_rows
@@ -181,7 +180,7 @@ class ExactSampler(Sampler):
     def sample(self) -> FeatureBatch:
         """The next batch; an encoder with a memory reads every row of a transition's history, or of its window."""
         dataset = self._frozen.dataset
-        rows = self._starts[self._draw(len(self._starts)).to(self._starts.device)]
+        rows = self._starts[self._draw(len(self._starts))]
         reward, discount, next_rows = dataset.n_step_returns(rows, self._n_step, self._gamma)
         z, next_z = self._encode(rows, next_rows)
         return FeatureBatch(z, dataset.action_after(rows), reward, discount, next_z)
@@ -211,6 +210,7 @@ class ExactSampler(Sampler):
             first = torch.maximum(first, rows - window + 1)
         if not self._options.random_histories:
             return first
-        random = torch.rand(len(rows), generator=self._generator) < self._options.random_histories
-        length = draw_lengths(self._options, len(rows), self._generator).to(rows.device)
-        return torch.where(random.to(rows.device), torch.maximum(first, rows - length + 1), first)
+        random = self.draws.uniform(len(rows)) < self._options.random_histories
+        shortest, longest = self._options.shortest_history, self._options.longest_history
+        length = shortest + self.draws.integers(longest + 1 - shortest, len(rows))
+        return torch.where(random, torch.maximum(first, rows - length + 1), first)

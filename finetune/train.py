@@ -21,7 +21,8 @@ from finetune.histories import Histories, HistoryOptions
 from finetune.path import DataPath
 from vd4rl_pomdp.core.errors import refuse_outside
 from vd4rl_pomdp.core.registry import warn_of_other_code
-from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
+from vd4rl_pomdp.core.seeding import seed_networks
+from vd4rl_pomdp.core.streams import random_stream
 from vd4rl_pomdp.core.tasks import TASKS, UNKNOWN_QUALITY
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
@@ -111,27 +112,27 @@ def _trainer(
     """What a run trains and on which batches: cached features, features encoded anew, or pixels."""
     seed_networks(config.seed, STAGE)
     policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(dataset.t.device)
-    generator = stream_generator(config.seed, STAGE, "batches")
+    draws = random_stream(config.seed, STAGE, "batches", device=dataset.t.device)
     corruption = CorruptionConfig.fill(card.corruption)  # as in pretraining: what is hidden belongs to the world
     returns = config.options if isinstance(config.options, ReturnOptions) else ReturnOptions()
-    frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed)
+    frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed_of_views)
     encode = partial(frozen.episode, view=frozen.view(0))
     sampler: FeatureSampler | ExactSampler | TransitionSampler
     if card.end_to_end:
-        view = View(dataset, corruption, config.shift, config.seed, STAGE)
-        sampler = TransitionSampler(view, config.batch_size, generator, returns.n_step, returns.gamma)
+        view = View(dataset, corruption, config.shift, config.seed_of_views, STAGE)
+        sampler = TransitionSampler(view, config.batch_size, draws, returns.n_step, returns.gamma)
     elif config.views:
-        histories = Histories(dataset, config.memory, returns.n_step, config.seed)
+        histories = Histories(dataset, config.memory, returns.n_step, config.seed_of_views)
         features = encode_views(frozen, histories, config.views, run.path / FEATURES_FILE)
         policy.standardise.fit(features)
         _probe(features, dataset, run)
         encode = partial(_cached, features, dataset)
-        sampler = FeatureSampler(histories, features, config.batch_size, returns.n_step, returns.gamma, generator)
+        sampler = FeatureSampler(histories, features, config.batch_size, returns.n_step, returns.gamma, draws)
     else:
-        sampler = ExactSampler(frozen, config.memory, config.batch_size, returns.n_step, returns.gamma, generator)
+        sampler = ExactSampler(frozen, config.memory, config.batch_size, returns.n_step, returns.gamma, draws)
         batches = math.ceil(STANDARDISED_BY / config.batch_size)
         policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(batches)]))
-    noise = stream_generator(config.seed, STAGE, "noise")
+    noise = random_stream(config.seed, STAGE, "noise", device=dataset.t.device)
     algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
     reference = Reference.of(dataset)
     actor = reference.actor_file

@@ -17,13 +17,15 @@ from pretrain.config import PretrainConfig, TrainingConfig
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.core.errors import UserError, refuse_outside
 from vd4rl_pomdp.core.options import flat, settings_of
-from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
+from vd4rl_pomdp.core.seeding import seed_networks
+from vd4rl_pomdp.core.streams import RandomStream, random_stream
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK, TASKS, UNKNOWN_QUALITY
 from vd4rl_pomdp.core.types import StateWindows, Windows
 from vd4rl_pomdp.corruptions import check_corruption_fits
 from vd4rl_pomdp.data import Dataset, StateView, View, WindowSampler, open_dataset
 from vd4rl_pomdp.data.folder import read_plan
 from vd4rl_pomdp.envs.make import layout_of
+from vd4rl_pomdp.nn.adam import Adam, set_learning_rate
 from vd4rl_pomdp.nn.encoder import EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, save_encoder
 from vd4rl_pomdp.nn.frame import STATE, StateFrame
@@ -33,6 +35,7 @@ from vd4rl_pomdp.runs.device import autocast, pick_device
 from vd4rl_pomdp.runs.loop import training
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside
+from vd4rl_pomdp.runs.replay import Replay
 from vd4rl_pomdp.runs.run import RunFolder
 
 STAGE = "pretrain"
@@ -76,21 +79,21 @@ def make_objective(dataset: Dataset, config: PretrainConfig) -> Objective:
 
 def make_batches(dataset: Dataset, config: PretrainConfig, objective: Objective) -> Batches:
     """Windows of a set as the method is to see them, from the run's own random stream."""
-    method, batches = METHODS.named(config.method), stream_generator(config.seed, STAGE, "batches")
+    method, draws = METHODS.named(config.method), random_stream(config.seed, STAGE, "batches", device=dataset.t.device)
     frame = objective.encoder.frame
     if isinstance(frame, StateFrame):
         view: View = StateView(dataset, frame.observe, config.corruption, config.seed, STAGE)
     else:
         view = view_of(dataset, config)
-    given = view, config.batch_size, config.window, batches
+    given = view, config.batch_size, config.window, draws
     return StateWindowSampler(*given) if method.regresses_state else WindowSampler(*given)
 
 
 class StateWindowSampler(WindowSampler):
     """Windows with the simulator's states of their rows, for losses that are told them."""
 
-    def __init__(self, source: View, batch_size: int, length: int, generator: torch.Generator) -> None:
-        super().__init__(source, batch_size, length, generator)
+    def __init__(self, source: View, batch_size: int, length: int, draws: RandomStream) -> None:
+        super().__init__(source, batch_size, length, draws)
         # kept apart from the windows of other methods, so that none of them can read a state by mistake
         self._states = source.dataset.states()
 
@@ -144,6 +147,9 @@ def _card(config: PretrainConfig, dataset: Dataset, run: RunFolder) -> EncoderCa
 class Batches(Protocol):
     """Endless batches of windows."""
 
+    draws: RandomStream
+    """What they are drawn from."""
+
     def sample(self) -> Windows:
         """The next batch, as the objective is to see it."""
 
@@ -174,23 +180,33 @@ class Trainer:
         """
         self.objective, self.batches, self.config, self._learning_rate = objective, batches, config, learning_rate
         self.device = next(objective.parameters()).device
-        self.optimiser = torch.optim.Adam(objective.parameters(), lr=config.learning_rate)
+        self.optimiser = Adam(objective.parameters(), config.learning_rate)
         self.step = 0
+        self._replay = Replay(self._update, self.device, [batches.draws], trained=[objective, self.optimiser])
+        self._progress: float | Tensor = torch.zeros((), device=self.device) if self._replay.replays else 0.0
 
     def update(self) -> dict[str, Tensor]:
         """One gradient step; returns the objective's scalars."""
+        progress = self.step / max(1, self.config.steps)
+        if isinstance(self._progress, Tensor):
+            self._progress.fill_(progress)  # in place, for replayed steps
+        else:
+            self._progress = progress
+        if self._learning_rate is not None:
+            set_learning_rate(self.optimiser, self._learning_rate(self.step))
+        logs = self._replay(0)
+        self.step += 1
+        return logs
+
+    def _update(self, turn: int) -> dict[str, Tensor]:
         window = self.batches.sample()
         with autocast(self.device, self.config.precision):
-            loss, logs = self.objective.loss(window, self.step / max(1, self.config.steps))
+            loss, logs = self.objective.loss(window, self._progress)
         # outside of autocast, which is for forward passes alone
         self.optimiser.zero_grad(set_to_none=True)
         loss.backward()
-        if self._learning_rate is not None:
-            for group in self.optimiser.param_groups:
-                group["lr"] = self._learning_rate(self.step)
         self.optimiser.step()
         self.objective.after_step()
-        self.step += 1
         return logs
 
     def run(

@@ -50,7 +50,8 @@ def errors(folder: Path) -> list[Row]:
     dataset = open_dataset(Path(config["data"]))
     encoder, card = load_encoder(folder / "encoder")
     hiding = CorruptionConfig.fill(card.corruption)
-    frozen = FrozenEncoder(encoder, dataset, hiding, config["shift"], config["precision"], config["seed"])
+    seed = config["seed"] if config.get("view_seed") is None else config["view_seed"]
+    frozen = FrozenEncoder(encoder, dataset, hiding, config["shift"], config["precision"], seed)
     policy, shown = load_policy(folder / "policy"), read_actor(actor)
     named = {"method": card.method, "task": dataset.task, "quality": dataset.quality}
     named |= {"corruption": hiding.corruption, "algorithm": config["algorithm"], "seed": config["seed"]}

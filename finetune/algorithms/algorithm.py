@@ -12,6 +12,7 @@ from torch.optim import Optimizer
 
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.nn.policy import Policy
 
 
@@ -44,9 +45,7 @@ class Algorithm(ABC):
     summary: str = ""
     """One line that says what it is."""
 
-    def __init__(
-        self, policy: Policy, options: Any, learning_rate: float, updates: int, generator: torch.Generator
-    ) -> None:
+    def __init__(self, policy: Policy, options: Any, learning_rate: float, updates: int, draws: RandomStream) -> None:
         """Subclasses add their networks and optimisers.
 
         Args:
@@ -54,10 +53,10 @@ class Algorithm(ABC):
             options: an instance of the class's `options`, kept as `settings`.
             learning_rate: of all optimisers.
             updates: how many there will be, for schedules, kept as `planned`.
-            generator: what random numbers are drawn from.
+            draws: what random numbers are drawn from.
         """
         self.policy, self.settings, self.learning_rate = policy, options, learning_rate
-        self.planned, self.generator = updates, generator
+        self.planned, self.draws = updates, draws
         self.updates = 0
         """Updates that were made."""
 
@@ -92,11 +91,11 @@ class Algorithm(ABC):
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to resume: the state of all parts, the updates made, the noise."""
         parts = {name: part.state_dict() for name, part in self.parts().items()}
-        return parts | {"updates": self.updates, "noise": self.generator.get_state()}
+        return parts | {"updates": self.updates, "noise": self.draws.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
         for name, part in self.parts().items():
             part.load_state_dict(state[name])
         self.updates = state["updates"]
-        self.generator.set_state(state["noise"])
+        self.draws.set_state(state["noise"])

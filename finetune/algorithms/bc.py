@@ -27,6 +27,7 @@ from finetune.algorithms.algorithm import Algorithm, Loss
 from finetune.algorithms.noise import noise_at, with_noise
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Options
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.nn.policy import Policy
 
 
@@ -36,9 +37,9 @@ class BC(Algorithm):
     summary = "behaviour cloning, which uses no reward"
 
     def __init__(
-        self, policy: Policy, options: Options, learning_rate: float, updates: int, generator: torch.Generator
+        self, policy: Policy, options: Options, learning_rate: float, updates: int, draws: RandomStream
     ) -> None:
-        super().__init__(policy, options, learning_rate, updates, generator)
+        super().__init__(policy, options, learning_rate, updates, draws)
         self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=learning_rate, fused=True)
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
@@ -50,7 +51,7 @@ class BC(Algorithm):
 
     def cloning_loss(self, batch: FeatureBatch) -> Loss:
         """Mean of (a~ - a)^2."""
-        chosen = with_noise(self.policy(batch.z), noise_at(self.updates, self.planned), self.generator)
+        chosen = with_noise(self.policy(batch.z), noise_at(self.updates, self.planned), self.draws)
         loss = F.mse_loss(chosen, batch.action)
         return Loss(loss, {"bc_loss": loss.detach()})
 

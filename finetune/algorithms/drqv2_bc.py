@@ -38,7 +38,7 @@ class DrQv2BC(TD3BC):
         return self._policy_action(next_z)
 
     def _policy_action(self, z: Tensor) -> Tensor:
-        return with_noise(self.policy.from_standardised(z), noise_at(self.updates, self.planned), self.generator)
+        return with_noise(self.policy.from_standardised(z), noise_at(self.updates, self.planned), self.draws)
 
     def _policy_value(self, z: Tensor, action: Tensor) -> Tensor:
         return torch.minimum(*self.critic(z, action))

@@ -34,6 +34,7 @@ from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
 from finetune.algorithms.td3_bc import TwinCritic
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp, move_target
 from vd4rl_pomdp.nn.policy import Policy
 
@@ -75,9 +76,9 @@ class IQL(Algorithm):
     tau = 0.005
 
     def __init__(
-        self, policy: Policy, options: IQLOptions, learning_rate: float, updates: int, generator: torch.Generator
+        self, policy: Policy, options: IQLOptions, learning_rate: float, updates: int, draws: RandomStream
     ) -> None:
-        super().__init__(policy, options, learning_rate, updates, generator)
+        super().__init__(policy, options, learning_rate, updates, draws)
         dim, action_dim, hidden = (policy.shape[name] for name in ("dim", "action_dim", "hidden"))
         device = policy.standardise.mean.device
         self.critic = TwinCritic(dim, action_dim, hidden).to(device)

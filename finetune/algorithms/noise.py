@@ -5,8 +5,9 @@ Authors' code: github.com/conglu1997/v-d4rl (drqbc/utils.py, `TruncatedNormal` a
 
 from __future__ import annotations
 
-import torch
 from torch import Tensor
+
+from vd4rl_pomdp.core.streams import RandomStream
 
 NOISE_CLIP = 0.3
 """Largest noise on a dimension of an action."""
@@ -28,11 +29,9 @@ def noise_at(update: int, planned: int) -> float:
     return NOISE_START + done * (NOISE_END - NOISE_START)
 
 
-def with_noise(action: Tensor, std: float, generator: torch.Generator) -> Tensor:
+def with_noise(action: Tensor, std: float, draws: RandomStream) -> Tensor:
     """Noisy copy of (B, A) actions, within -1..1; the gradient passes as if nothing had been cut off."""
-    # drawn on the CPU, like all batches: the same numbers whatever the device
-    noise = torch.randn(action.shape, generator=generator, dtype=action.dtype) * std
-    noise = noise.to(action.device, non_blocking=True)
+    noise = draws.normal(*action.shape) * std
     noisy = action + noise.clamp(-NOISE_CLIP, NOISE_CLIP)
     # straight through: with the true gradient, 0 beyond the bounds, a saturated action would never come back
     return noisy + (noisy.clamp(MARGIN - 1, 1 - MARGIN) - noisy).detach()

@@ -22,6 +22,7 @@ from torch.optim import Optimizer
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp, move_target
 from vd4rl_pomdp.nn.policy import Policy
 
@@ -61,9 +62,9 @@ class TD3BC(Algorithm):
     policy_delay = 2
 
     def __init__(
-        self, policy: Policy, options: TD3BCOptions, learning_rate: float, updates: int, generator: torch.Generator
+        self, policy: Policy, options: TD3BCOptions, learning_rate: float, updates: int, draws: RandomStream
     ) -> None:
-        super().__init__(policy, options, learning_rate, updates, generator)
+        super().__init__(policy, options, learning_rate, updates, draws)
         shape = policy.shape
         device = policy.standardise.mean.device
         self.critic = TwinCritic(shape["dim"], shape["action_dim"], shape["hidden"]).to(device)
@@ -111,7 +112,7 @@ class TD3BC(Algorithm):
         """Action of the target policy, smoothed by clipped noise."""
         # similar actions have similar values: a lone peak of the critic is averaged with what is around it
         action = self.target_policy.from_standardised(next_z)
-        noise = torch.randn(action.shape, generator=self.generator).to(action.device, non_blocking=True) * TARGET_NOISE
+        noise = self.draws.normal(*action.shape) * TARGET_NOISE
         return (action + noise.clamp(-NOISE_CLIP, NOISE_CLIP)).clamp(-1, 1)
 
     def _policy_value(self, z: Tensor, action: Tensor) -> Tensor:

@@ -54,7 +54,7 @@ class Supervised(Objective):
         """Coordinates among them that are pose; they come first."""
         self.head = mlp(encoder.dim, options.head_dim, len(columns))
 
-    def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean squared error over real rows and coordinates; `pose_loss` and `velocity_loss` are those of one kind."""
         assert isinstance(window, StateWindows), "windows without states train no supervised reference"
         truth = (window.state[..., self.columns] - self.mean) / self.std

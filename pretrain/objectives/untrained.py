@@ -39,7 +39,7 @@ class Untrained(Objective):
         super().__init__()
         self.encoder = encoder
 
-    def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Zero."""
         loss = self.encoder.encode(window).sum() * 0
         return loss, {"loss": loss.detach()}

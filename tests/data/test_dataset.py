@@ -5,6 +5,7 @@ import torch
 
 from tests.helpers_data import fake_action, fake_reward, fake_rows, frame_identity, write_fake_set
 from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.core.types import row_key
 from vd4rl_pomdp.data import TransitionSampler, View, WindowSampler, open_dataset
 from vd4rl_pomdp.data.folder import shard_paths
@@ -208,10 +209,12 @@ def test_samplers_repeat_with_their_generator_and_cover_the_set(dataset):
         return [next(batches).key.tolist() for batches in [iter(sampler)] for _ in range(count)]
 
     def transitions(seed):
-        return TransitionSampler(View(dataset, frame_stack=1), 64, torch.Generator().manual_seed(seed), n_step=2)
+        return TransitionSampler(
+            View(dataset, frame_stack=1), 64, RandomStream(torch.Generator().manual_seed(seed)), n_step=2
+        )
 
     def windows(seed):
-        return WindowSampler(View(dataset, frame_stack=1), 64, 2, torch.Generator().manual_seed(seed))
+        return WindowSampler(View(dataset, frame_stack=1), 64, 2, RandomStream(torch.Generator().manual_seed(seed)))
 
     for make in (transitions, windows):
         first = draws(make(0), 30)
@@ -225,8 +228,8 @@ def test_samplers_repeat_with_their_generator_and_cover_the_set(dataset):
 def test_a_device_changes_nothing(tmp_path):
     folder = write_fake_set(tmp_path / "set", (9, 5))
     for make in (
-        lambda d: TransitionSampler(d, 32, torch.Generator().manual_seed(0), n_step=3),
-        lambda d: WindowSampler(d, 8, 4, torch.Generator().manual_seed(0)),
+        lambda d: TransitionSampler(d, 32, RandomStream(torch.Generator().manual_seed(0)), n_step=3),
+        lambda d: WindowSampler(d, 8, 4, RandomStream(torch.Generator().manual_seed(0))),
     ):
         here, there = (make(open_dataset(folder, tmp_path / "cache").to(device)).sample() for device in ("cpu", "cuda"))
         assert there.obs.is_cuda

@@ -5,6 +5,7 @@ import torch
 
 from tests.helpers_data import fake_action, write_fake_set
 from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.core.types import row_key, unpack_row_key
 from vd4rl_pomdp.corruptions import CorruptionConfig, KeyStream, augmentation
 from vd4rl_pomdp.data import Dataset, TransitionSampler, View, WindowSampler, open_dataset
@@ -17,8 +18,8 @@ def dataset(tmp_path) -> Dataset:
     return open_dataset(write_fake_set(tmp_path / "set", LENGTHS), tmp_path / "cache")
 
 
-def generator() -> torch.Generator:
-    return torch.Generator().manual_seed(0)
+def generator() -> RandomStream:
+    return RandomStream(torch.Generator().manual_seed(0))
 
 
 MAKE = {
@@ -52,7 +53,9 @@ def test_views_of_different_names_draw_apart_and_of_one_name_alike(dataset):
 
 
 def test_a_window_is_shifted_as_one_and_the_next_one_anew(dataset):
-    dataset.frames = torch.randint(0, 256, dataset.frames.shape, dtype=torch.uint8, generator=generator())
+    dataset.frames = torch.randint(
+        0, 256, dataset.frames.shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
+    )
     view = View(dataset, None, 4)
     rows = torch.tensor([[2, 2, 2], [2, 2, 2], [3, 3, 3]])
     seen = view.observe(rows)
@@ -65,7 +68,9 @@ def test_a_window_is_shifted_as_one_and_the_next_one_anew(dataset):
 @pytest.mark.parametrize("by_lines", [True, False])
 def test_observations_of_a_window_can_be_shifted_each_by_itself(dataset, monkeypatch, corruption, by_lines):
     """The frames of one observation still share a shift, and the two ways to shift agree."""
-    dataset.frames = torch.randint(0, 256, dataset.frames.shape, dtype=torch.uint8, generator=generator())
+    dataset.frames = torch.randint(
+        0, 256, dataset.frames.shape, dtype=torch.uint8, generator=torch.Generator().manual_seed(0)
+    )
     if not by_lines:
         monkeypatch.setattr(augmentation, "by_lines", lambda images, pad: False)
     view = View(dataset, CorruptionConfig.of(corruption), 4, shared="observation")

@@ -14,6 +14,7 @@ from finetune.algorithms.drqv2_bc import DrQv2BC
 from finetune.algorithms.iql import IQL, IQLOptions, expectile_loss
 from finetune.algorithms.td3_bc import TD3BC, TwinCritic
 from finetune.features import FeatureBatch
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.nn.policy import Policy
 
 DIM, ACTIONS, SIZE = 3, 2, 32
@@ -25,7 +26,7 @@ def make(kind: type, learning_rate: float = 1e-3, seed: int = 0) -> TD3BC:
     options = kind.options.fill({"gamma": 0.9, "alpha": 1.5})
     policy = Policy(DIM, ACTIONS, 16)
     policy.standardise.fit(batch().z)
-    algorithm = kind(policy, options, learning_rate, 40, torch.Generator().manual_seed(seed))
+    algorithm = kind(policy, options, learning_rate, 40, RandomStream(torch.Generator().manual_seed(seed)))
     if isinstance(algorithm, TD3BC):
         with torch.no_grad():
             for target in (algorithm.target_policy.net, algorithm.target_critic):
@@ -125,7 +126,7 @@ def test_noise_has_fallen_by_the_middle_of_a_training_shorter_than_v_d4rls(monke
 
 def test_noise_is_cut_off_with_the_action_and_lets_the_whole_gradient_pass():
     action = torch.linspace(-1, 1, 2001).requires_grad_()
-    noisy = noise.with_noise(action, 10.0, torch.Generator().manual_seed(0))
+    noisy = noise.with_noise(action, 10.0, RandomStream(torch.Generator().manual_seed(0)))
     noisy.sum().backward()
     assert torch.equal(action.grad, torch.ones_like(action))
     moved = noisy.detach() - action.detach()
@@ -245,7 +246,7 @@ def test_iqls_fixed_point_on_a_bandit_is_known():
     updates = 600
     torch.manual_seed(0)
     policy = Policy(2, 1, 32)
-    algorithm = IQL(policy, IQLOptions(), 1e-2, updates, torch.Generator())
+    algorithm = IQL(policy, IQLOptions(), 1e-2, updates, RandomStream(torch.Generator()))
     algorithm.tau = 0.05
     reward = (torch.arange(8) % 4 == 0).float()
     given = FeatureBatch(torch.zeros(8, 2), reward[:, None] - 0.5, reward, torch.zeros(8), torch.zeros(8, 2))
@@ -279,7 +280,9 @@ def test_iql_finds_the_way_that_few_go_and_cloning_follows_the_many():
     for kind in (IQL, BC):
         torch.manual_seed(0)
         policy = Policy(4, 1, 32)
-        algorithm = kind(policy, kind.options.fill(given), 1e-2, updates, torch.Generator().manual_seed(0))
+        algorithm = kind(
+            policy, kind.options.fill(given), 1e-2, updates, RandomStream(torch.Generator().manual_seed(0))
+        )
         algorithm.tau = 0.05
         for _ in range(updates):
             algorithm.update(chain())
@@ -300,7 +303,7 @@ def test_what_reads_rewards_finds_the_better_action_and_bc_the_common_one():
     for name, build in ALGORITHMS.items():
         torch.manual_seed(0)
         policy, options = Policy(2, 1, 32), build.options.fill({"alpha": 25.0})
-        algorithm = build(policy, options, 3e-3, 300, torch.Generator().manual_seed(0))
+        algorithm = build(policy, options, 3e-3, 300, RandomStream(torch.Generator().manual_seed(0)))
         action = torch.where(torch.arange(64) % 4 == 0, 0.5, -0.5)[:, None]
         batch = FeatureBatch(
             torch.zeros(64, 2), action, (action[:, 0] > 0).float(), torch.zeros(64), torch.zeros(64, 2)

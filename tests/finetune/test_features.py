@@ -8,6 +8,7 @@ from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder, encod
 from finetune.histories import Histories
 from tests.helpers_data import fake_action, fake_reward, fake_rows, write_fake_set
 from vd4rl_pomdp.core.options import NO_OPTIONS
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.data.format import write_shard
@@ -24,7 +25,7 @@ def test_every_field_of_a_batch_is_of_one_transition_and_both_ends_of_one_view(t
     dataset = open_dataset(write_fake_set(tmp_path / "set", LENGTHS))
     features = torch.stack(torch.meshgrid(torch.arange(VIEWS), torch.arange(len(ROWS)), indexing="ij"), -1)
     histories = Histories(dataset, NO_OPTIONS, N, 0)
-    sampler = FeatureSampler(histories, features, 500, N, GAMMA, torch.Generator().manual_seed(0))
+    sampler = FeatureSampler(histories, features, 500, N, GAMMA, RandomStream(torch.Generator().manual_seed(0)))
     batch, drawn = sampler.sample(), set()
     ends = zip(batch.z.int().tolist(), batch.next_z.int().tolist(), strict=True)
     for i, ((view, row), (next_view, next_row)) in enumerate(ends):
@@ -94,7 +95,7 @@ def test_exact_batches_agree_with_cached_features(encoder, data):
     network, _ = load_encoder(encoder)
     frozen = FrozenEncoder(network, dataset, CorruptionConfig(), 0, "fp32", 0)
     cached = torch.cat([frozen.episode(i, frozen.view(0)) for i in range(dataset.num_episodes)])
-    sampler = ExactSampler(frozen, NO_OPTIONS, 16, 3, 0.99, torch.Generator().manual_seed(0))
+    sampler = ExactSampler(frozen, NO_OPTIONS, 16, 3, 0.99, RandomStream(torch.Generator().manual_seed(0)))
     index = torch.randint(dataset.num_transitions, (16,), generator=torch.Generator().manual_seed(0))
     batch = sampler.sample()
     rows = sampler._starts[index]

@@ -13,6 +13,7 @@ from tests.finetune.conftest import BRIEF
 from tests.finetune.test_features import LENGTHS, ROWS, noise_set
 from tests.helpers_stages import smoke_finetune
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import View
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, load_encoder
@@ -70,7 +71,7 @@ def test_views_draw_their_random_histories_apart_and_the_same_again(frozen):
 def test_batches_are_of_the_drawn_histories(frozen, tmp_path):
     histories = Histories(frozen.dataset, HistoryOptions(random_histories=1.0, longest_history=2), N, 0)
     features = encode_views(frozen, histories, 1, tmp_path / "features.npy")
-    sampler = FeatureSampler(histories, features, 64, N, 0.99, torch.Generator().manual_seed(0))
+    sampler = FeatureSampler(histories, features, 64, N, 0.99, RandomStream(torch.Generator().manual_seed(0)))
     batch, known = sampler.sample(), features[0].float()
     first, last = histories.of_view(0).numbers()
     index = torch.randint(len(first), (64,), generator=torch.Generator().manual_seed(0))
@@ -81,7 +82,7 @@ def test_batches_are_of_the_drawn_histories(frozen, tmp_path):
 
 def test_exact_batches_begin_at_random_rows_too(frozen):
     options = HistoryOptions(random_histories=1.0, shortest_history=1, longest_history=1)
-    batch = ExactSampler(frozen, options, 16, N, 0.99, torch.Generator().manual_seed(0)).sample()
+    batch = ExactSampler(frozen, options, 16, N, 0.99, RandomStream(torch.Generator().manual_seed(0))).sample()
     index = torch.randint(len(ROWS) - 2, (16,), generator=torch.Generator().manual_seed(0))
     rows = frozen.dataset.transition_rows[index].tolist()
     for z, next_z, row in zip(batch.z, batch.next_z, rows, strict=True):

@@ -16,6 +16,7 @@ from tests.helpers_data import write_fake_set
 from tests.helpers_stages import smoke_pretrain
 from vd4rl_pomdp.core.options import NO_OPTIONS
 from vd4rl_pomdp.core.state_scale import StateScale
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.core.types import row_key
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
@@ -81,7 +82,7 @@ def test_the_error_is_as_large_as_was_asked_in_a_probes_unit(noisy, with_states)
     assert found[:8].mean() == pytest.approx(POSE, rel=0.03)
     assert found[8:].mean() == pytest.approx(VELOCITY, rel=0.03)
 
-    sampler = ExactSampler(made, NO_OPTIONS, 500, 1, 0.99, torch.Generator().manual_seed(0))
+    sampler = ExactSampler(made, NO_OPTIONS, 500, 1, 0.99, RandomStream(torch.Generator().manual_seed(0)))
     rows = sampler._starts[torch.randint(len(sampler._starts), (500,), generator=torch.Generator().manual_seed(0))]
     batch = sampler.sample()
     for z, at in ((batch.z, rows), (batch.next_z, rows + 1)):

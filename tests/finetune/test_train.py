@@ -7,6 +7,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import torch
+from safetensors.torch import load_file
 
 from finetune import train
 from finetune.features import FrozenEncoder
@@ -56,6 +58,21 @@ def test_finetuning_resumes_to_the_bit(encoder, data, tmp_path, monkeypatch, vie
     assert {row["corruption"] for row in rows} == {"patch+zero_frames"}
     assert {row["method"] for row in rows} == {"mik+a"}
     assert not (whole / "features.npy").exists()
+
+
+def test_runs_of_one_view_seed_train_other_networks_on_the_same_features(encoder, data, tmp_path):
+    def trained(name: str, **seeds: int) -> dict[str, torch.Tensor]:
+        run = run_finetune(smoke_finetune(encoder, data, tmp_path / name, **BRIEF, **seeds))
+        assert run.config["view_seed"] == seeds.get("view_seed")
+        return load_file(run.path / "policy" / "model.safetensors")
+
+    plain, told = trained("plain", seed=0), trained("told", seed=0, view_seed=0)
+    assert all(torch.equal(plain[name], told[name]) for name in plain), "the run's own seed is the default"
+    other, own = trained("other", seed=1, view_seed=0), trained("own", seed=1)
+    for name in ("standardise.mean", "standardise.std"):  # statistics of the features
+        assert torch.equal(other[name], plain[name])
+        assert not torch.equal(own[name], plain[name])
+    assert not torch.equal(other["net.0.weight"], plain["net.0.weight"])
 
 
 @pytest.fixture

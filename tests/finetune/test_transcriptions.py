@@ -12,6 +12,7 @@ from finetune.algorithms.td3_bc import TD3BC
 from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd
 from finetune.features import FeatureBatch
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.core.types import Transitions
 from vd4rl_pomdp.nn.policy import Policy
 
@@ -42,7 +43,7 @@ def started(name: str) -> TD3BC:
     with torch.no_grad():
         policy.net[-1].weight.mul_(30)
     options = ALGORITHMS[name].options.fill({"gamma": 0.9, "alpha": 1.5})
-    algorithm = ALGORITHMS[name](policy, options, 1e-3, 550_000, torch.Generator().manual_seed(7))
+    algorithm = ALGORITHMS[name](policy, options, 1e-3, 550_000, RandomStream(torch.Generator().manual_seed(7)))
     algorithm.updates = BEGUN[name]
     return algorithm
 

@@ -95,6 +95,7 @@ DIFFERENT = {
     "new option": ({"card": {"m": 8}}, {"card": {}}, ["m 8", "m unset"]),
     "plain": ({"card": {"history": "method"}}, {"card": {"history": "gru"}}, ["", "history gru"]),
     "later": ({"card": {"m": 8}}, {"card": {"m": 8, "future_frames": "newest"}}, ["", "future_frames newest"]),
+    "views": ({"card": {}}, {"card": {}, "view_seed": 0}, ["", "view_seed 0"]),
     "two": (
         {"card": {}, "random_histories": 0.0, "views": 4},
         {"card": {}, "random_histories": 0.5, "views": 8},

@@ -178,6 +178,9 @@ def test_a_setting_of_a_later_version_counts_where_it_changes_what_all_did_befor
     assert names("all")[0] == recipe(RECORD, {})
     assert names("newest")[0] != recipe(RECORD, {})
     assert names("newest")[1] != recipe(RECORD, CARD)
+    views = [recipe(_changed(RECORD, "config", "view_seed", seed), CARD) for seed in (None, 0, 1)]
+    assert views[0] == recipe(RECORD, CARD)
+    assert len(set(views)) == 3
 
 
 @pytest.mark.parametrize("change", [("seed", None, 1), ("settings", "steps", 21)])

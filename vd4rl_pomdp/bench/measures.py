@@ -21,6 +21,7 @@ from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
 from vd4rl_pomdp.bench.processes import make_trainer, touch
 from vd4rl_pomdp.core.options import NO_OPTIONS
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.core.tasks import EPISODE_TRANSITIONS, FRAME_SIZE, FRAME_STACK, TASKS
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.corruptions import CorruptionConfig
@@ -261,16 +262,16 @@ def _updates_per_s(
     corruption = CorruptionConfig.of("patch+zero_frames")
     frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, precision, 0)
     features = torch.randn(1, dataset.num_rows, encoder.dim, dtype=torch.float16, device=device)
-    generator = torch.Generator().manual_seed(0)
+    draws = RandomStream(torch.Generator().manual_seed(0), device)
     policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(device)
-    algorithm = TD3BC(policy, config.options, config.learning_rate, config.updates, generator)  # type: ignore[arg-type]
+    algorithm = TD3BC(policy, config.options, config.learning_rate, config.updates, draws)  # type: ignore[arg-type]
 
     def train(sampler: FeatureSampler | ExactSampler, updates: int) -> None:
         for _ in range(updates):
             algorithm.update(sampler.sample())
 
-    cached = FeatureSampler(Histories(dataset, NO_OPTIONS, 3, 0), features, BATCH, 3, 0.99, generator)
-    exact = ExactSampler(frozen, NO_OPTIONS, BATCH, 3, 0.99, generator)
+    cached = FeatureSampler(Histories(dataset, NO_OPTIONS, 3, 0), features, BATCH, 3, 0.99, draws)
+    exact = ExactSampler(frozen, NO_OPTIONS, BATCH, 3, 0.99, draws)
     many, few = 20, algorithm.policy_delay
     fast, slow = alternating(max(1, repeats), lambda: train(cached, many), lambda: train(exact, few))
     fast, slow = fast / many, slow / few

@@ -127,14 +127,15 @@ def train(seconds: float) -> None:
     from finetune.algorithms import TD3BC
     from finetune.config import FinetuneConfig
     from finetune.features import FeatureBatch
+    from vd4rl_pomdp.core.streams import RandomStream
     from vd4rl_pomdp.nn.encoder import EncoderConfig
     from vd4rl_pomdp.nn.policy import Policy
 
     torch.manual_seed(0)
     config, dim, actions = FinetuneConfig.of("cpu"), EncoderConfig(6).feature_dim, 6
     policy = Policy(dim, actions, config.hidden_dim)
-    generator = torch.Generator().manual_seed(0)
-    algorithm = TD3BC(policy, config.options, config.learning_rate, config.updates, generator)  # type: ignore[arg-type]
+    draws = RandomStream(torch.Generator().manual_seed(0))
+    algorithm = TD3BC(policy, config.options, config.learning_rate, config.updates, draws)  # type: ignore[arg-type]
     z, action, next_z = (torch.randn(256, width) for width in (dim, actions, dim))
     batch = FeatureBatch(z, action.tanh(), torch.rand(256), torch.ones(256), next_z)
     for _ in range(_WARM_UP):

@@ -7,8 +7,9 @@ from pathlib import Path
 
 import tyro
 
-from vd4rl_pomdp.cli.parsing import command, parse, show
+from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.parsing import parse
 from vd4rl_pomdp.sweeps.own_file import program_here
 
 REPLAY_TOLERANCE = 1e-6

@@ -8,9 +8,10 @@ from typing import Any
 
 import tyro
 
-from vd4rl_pomdp.cli.parsing import command, parse_stage, show
+from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.core.errors import flag_of, refuse_number
 from vd4rl_pomdp.core.options import LABELS
+from vd4rl_pomdp.core.parsing import parse_stage
 from vd4rl_pomdp.core.registry import REGISTRIES, Registry
 from vd4rl_pomdp.runs import EPISODES_FILE
 

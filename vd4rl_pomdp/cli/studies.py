@@ -8,8 +8,9 @@ from pathlib import Path
 
 import tyro
 
-from vd4rl_pomdp.cli.parsing import command, parse, parse_stage, show, with_presets
+from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.parsing import parse, parse_stage, with_presets
 from vd4rl_pomdp.runs import NAVIGATION_FILE
 
 

@@ -13,9 +13,10 @@ from typing import TYPE_CHECKING, Annotated, Any, ClassVar
 
 import tyro
 
-from vd4rl_pomdp.cli.parsing import command, parse_stage, show
+from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_no_folder, refuse_unknown
 from vd4rl_pomdp.core.options import NO_OPTIONS, Options, StageConfig
+from vd4rl_pomdp.core.parsing import parse_stage
 from vd4rl_pomdp.sweeps.options import EXECUTORS, LocalOptions
 from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE, in_words, own_program, program_here, refuse_unknown_to_jobs
 

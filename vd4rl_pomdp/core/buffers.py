@@ -1,4 +1,7 @@
-"""Memory for batches of frames that is used again: fresh pages for every batch cost more time than filling them."""
+"""Memory on the CPU: what numpy may work on in torch's place, and blocks for batches of frames that are used again.
+
+Fresh pages for every batch cost more time than filling them.
+"""
 
 from __future__ import annotations
 
@@ -11,6 +14,14 @@ from torch import Tensor
 
 _KEPT = 4
 """Blocks kept at most: two for a batch of transitions, twice."""
+
+
+def in_host_memory(x: Tensor) -> bool:
+    """Whether numpy may read and write a tensor, and Python decide by its values, without waiting for a GPU.
+
+    Both ways give the same numbers: the one for CPUs is faster there, the other can be replayed.
+    """
+    return x.device.type == "cpu"
 
 
 class FrameBuffers:

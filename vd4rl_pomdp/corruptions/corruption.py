@@ -13,19 +13,24 @@ from typing import Any, ClassVar, Literal, Protocol, Self, get_args
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core import buffers
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_unknown
 from vd4rl_pomdp.core.options import Limits, Options, flat, refuse_options
 from vd4rl_pomdp.core.registry import Registry
 from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
-from vd4rl_pomdp.corruptions.keys import DRAWS, KeyStream, derive_keys, draw_integers, draw_numbered, hash_keys
+from vd4rl_pomdp.corruptions.fused import Hiding, drawn, painted, zero_draws
+from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_numbered, hash_keys
 
 Mode = Literal["resample", "emission"]
 _CHANNELS = 3
 
 
 class Stage(Protocol):
-    """One step of a corruption, applied to the frames that are not zeroed; a dataclass of its own options."""
+    """One step of a corruption, applied to the frames that are not zeroed; a dataclass of its own options.
+
+    With the methods of `fused.Hiding`, too, a GPU needs no pass of its own for it.
+    """
 
     def __call__(self, frames: Tensor, key: Tensor, number: Tensor) -> None:
         """Change frames in place.
@@ -39,10 +44,10 @@ class Stage(Protocol):
 
 def _assign(target: Tensor, index: tuple[Tensor, ...], value: int) -> None:
     """`target[index] = value`; on a CPU by numpy, which is several times as fast."""
-    if target.device.type == "cpu":
+    if buffers.in_host_memory(target):
         target.numpy()[tuple(part.numpy() for part in index)] = value
-    else:
-        target[index] = value
+    else:  # as an assignment, the value would come from the CPU, and that be waited for
+        target.index_put_(index, torch.full((), value, dtype=target.dtype, device=target.device))
 
 
 @dataclass(frozen=True)
@@ -64,22 +69,41 @@ class Patch(Options):
     def __call__(self, frames: Tensor, key: Tensor, number: Tensor) -> None:
         """See `Stage`."""
         n, k, _, height, width = frames.shape
+        top, left = self._corners(key, number, height, width)
+        # Every square of the frames by its corner, as a view: writing into it writes into the frames.
+        squares = frames.unfold(3, self.patch_size, 1).unfold(4, self.patch_size, 1)
+        sample = torch.arange(n, device=key.device)[:, None, None]
+        frame = torch.arange(k, device=key.device)[:, None]
+        _assign(squares.movedim(2, 4), (sample, frame, top, left), self.patch_fill)
+
+    @property
+    def hidden_value(self) -> int:
+        """See `Hiding`."""
+        return self.patch_fill
+
+    def places(self, key: Tensor, number: Tensor, height: int, width: int) -> Tensor:
+        """See `Hiding`: (N, K, patches, 2) upper left corners."""
+        return torch.stack(self._corners(key, number, height, width), -1)
+
+    def hides(self, places: Tensor, y: Tensor, x: Tensor) -> Tensor:
+        """See `Hiding`."""
+        top, left = places[..., None, None].unbind(3)
+        inside = (top <= y) & (y < top + self.patch_size) & (left <= x) & (x < left + self.patch_size)
+        return inside.any(2)
+
+    def _corners(self, key: Tensor, number: Tensor, height: int, width: int) -> tuple[Tensor, Tensor]:
+        """Rows and columns (N, K, patches) of the upper left corners."""
         if self.patch_size > min(height, width):
             raise UserError(
                 f"patch size {self.patch_size} exceeds the image ({height}x{width}): choose a smaller --patch-size"
             )
         square = torch.arange(self.patch_count, device=key.device)
         draw = (0 if self.patch_shared else number[..., None] * self.patch_count) + square.expand(
-            n, k, self.patch_count
+            *number.shape, self.patch_count
         )
         top = draw_numbered(key, height - self.patch_size + 1, draw)
         # Hashed once more: from the key itself rows and columns would draw the same.
-        left = draw_numbered(hash_keys(key), width - self.patch_size + 1, draw)
-        # Every square of the frames by its corner, as a view: writing into it writes into the frames.
-        squares = frames.unfold(3, self.patch_size, 1).unfold(4, self.patch_size, 1)
-        sample = torch.arange(n, device=key.device)[:, None, None]
-        frame = torch.arange(k, device=key.device)[:, None]
-        _assign(squares.movedim(2, 4), (sample, frame, top, left), self.patch_fill)
+        return top, draw_numbered(hash_keys(key), width - self.patch_size + 1, draw)
 
 
 @dataclass(frozen=True)
@@ -199,6 +223,7 @@ class Corruption:
     def __init__(self, stages: list[Stage], zeroed: int = 0) -> None:
         self._stages, self._zeroed = stages, zeroed
         self._nothing = not stages and not zeroed
+        self._by_pixel = all(isinstance(stage, Hiding) for stage in stages)
 
     def __call__(self, obs: Tensor, key: Tensor) -> Tensor:
         """Corrupted copy of a batch.
@@ -237,16 +262,38 @@ class Corruption:
         stacks.zero_()[sample, kept] = frames
         return obs
 
+    def paint(self, frames: Tensor, index: Tensor, key: Tensor, shift_key: Tensor, pad: int) -> Tensor | None:
+        """Frames gathered, shifted and corrupted in one pass.
+
+        Args:
+            frames: (R, C, H, W) uint8.
+            index: (N, S) int64 of the frames of each stack.
+            key: (N,) int64, one a stack.
+            shift_key: (M,) int64, each for N / M stacks that follow one another.
+            pad: largest shift.
+
+        Returns:
+            (N, S * C, H, W) uint8; None where there is nothing to change, or a stage that only knows whole stacks.
+        """
+        if not self._by_pixel or not len(index) or not (pad or self._stages or self._zeroed):
+            return None
+        self._refuse_too_many(index.shape[1])
+        stages = tuple(self._stages)
+        size = frames.shape[-2], frames.shape[-1]
+        made = drawn(stages, self._zeroed, pad, key, shift_key, index.shape[1], size)
+        return painted(stages, frames, index, *made)
+
     def kept(self, key: Tensor, stack: int) -> Tensor:
         """Numbers of the frames that are not zeroed, (N, K) int64, in stacks of `stack` frames with (N,) int64 keys."""
         if not self._zeroed:
             return torch.arange(stack, device=key.device).expand(len(key), stack)
+        self._refuse_too_many(stack)
+        # Numbers sorted by random draws are a uniform permutation.
+        return zero_draws(key, len(self._stages), stack).argsort(dim=1)[:, self._zeroed :]
+
+    def _refuse_too_many(self, stack: int) -> None:
         if self._zeroed > stack:
             raise UserError(f"cannot zero {self._zeroed} of {stack} stacked frames: choose a smaller --zeroed-frames")
-        # A stream beside those of the stages, so that which frames are zeroed tells nothing of where patches are.
-        key = hash_keys(derive_keys(len(self._stages), key) ^ 1)
-        # Numbers sorted by random draws are a uniform permutation.
-        return draw_integers(key, DRAWS, stack).argsort(dim=1)[:, self._zeroed :]
 
     def change_(self, frames: Tensor, key: Tensor, kept: Tensor) -> None:
         """Apply the stages, in place, to the (N, K, 3, H, W) frames that (N, K) `kept` names."""

@@ -6,11 +6,13 @@ independent draws without a generator's state, so a corruption can be drawn agai
 
 from __future__ import annotations
 
-from functools import lru_cache
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from vd4rl_pomdp.core import buffers
 
 # SplitMix64's constants as int64: products overflow, and wrap as those of uint64 do.
 _GOLDEN = 0x9E3779B97F4A7C15 - (1 << 64)
@@ -22,7 +24,7 @@ DRAWS = 1 << 31
 
 def hash_keys(key: Tensor) -> Tensor:
     """Mix int64 keys of any shape into int64 values that look uniform."""
-    if key.device.type == "cpu":  # numpy takes a fraction of the time that torch needs for so few numbers
+    if buffers.in_host_memory(key):  # numpy takes a fraction of the time that torch needs for so few numbers
         return torch.from_numpy(_mix(key.numpy().reshape(-1))).view(key.shape)
     return _mix(key)
 
@@ -45,9 +47,8 @@ def derive_keys(seed: int, key: Tensor) -> Tensor:
     return hash_keys(_hash_seed(seed) ^ key)
 
 
-@lru_cache(maxsize=1024)
 def _hash_seed(seed: int) -> int:
-    return int(hash_keys(torch.tensor(seed)))
+    return (_mix(seed) + (1 << 63)) % (1 << 64) - (1 << 63)  # Python's integers do not wrap by themselves
 
 
 def draw_integers(key: Tensor, high: int, count: int) -> Tensor:
@@ -68,16 +69,26 @@ def draw_normals(key: Tensor, count: int) -> Tensor:
     return torch.special.ndtri((draw_integers(key, DRAWS, count).double() + 0.5) / DRAWS)
 
 
+def next_keys(seed: int, position: Tensor, shape: tuple[int, ...]) -> Tensor:
+    """The keys of a stream from `position` on, a 0-d int64 tensor that is moved behind them in place."""
+    numbers = position + torch.arange(math.prod(shape), device=position.device)
+    position += len(numbers)
+    return derive_keys(seed, numbers).view(shape)
+
+
 class KeyStream:
     """Fresh keys for every row of every batch; `position` is its whole state, so it can be saved and restored."""
 
     def __init__(self, seed: int, position: int = 0) -> None:
         self.seed = seed
-        self.position = position
+        self.position = torch.tensor(position)
+        """0-d int64, where keys are wanted: a step that is replayed holds no number of its own."""
 
     def take(self, shape: tuple[int, ...] | torch.Size, device: torch.device | str = "cpu") -> Tensor:
         """The next keys of the stream, shaped `shape`."""
-        count = torch.Size(shape).numel()
-        numbers = torch.arange(self.position, self.position + count, device=device)
-        self.position += count
-        return derive_keys(self.seed, numbers).view(shape)
+        self.position = self.position.to(device)
+        return next_keys(self.seed, self.position, tuple(shape))
+
+    def go_to(self, position: int) -> None:
+        """Go on from a position."""
+        self.position.fill_(position)

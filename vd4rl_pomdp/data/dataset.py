@@ -10,6 +10,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core import buffers
 from vd4rl_pomdp.core.errors import OutOfMemoryError, UserError, refuse_number
 from vd4rl_pomdp.core.state_scale import StateScale
 from vd4rl_pomdp.core.tasks import TASKS
@@ -46,8 +47,8 @@ class Dataset:
     def __init__(self, path: Path, store: Store) -> None:
         self.path = path
         self.store = store
-        self._windows: dict[int, int] = {}
-        """How many there are of each length that was asked for: to count anew would mean to wait for a GPU."""
+        self._windows: dict[int, tuple[int, Tensor]] = {}
+        """By length: how many there are, and up to each episode's end, (E,) int64; to count is to wait for a GPU."""
         self.fingerprint = store.fingerprint
         """Name of the set's content, the same for copies of the set."""
         self.task, self.quality = task_and_quality(path, store.meta["attributes"])
@@ -151,6 +152,7 @@ class Dataset:
             for name, value in vars(self).items():
                 if isinstance(value, Tensor):
                     setattr(self, name, value.to(device))
+            self._windows = {length: (count, ends.to(device)) for length, (count, ends) in self._windows.items()}
         except torch.OutOfMemoryError as error:
             raise OutOfMemoryError(
                 f"{self.path}: {self.frames.nbytes / 1e9:.1f} GB of frames exceed the free memory of {device}: "
@@ -183,7 +185,7 @@ class Dataset:
 
         A stack never reaches before its episode: there the first frame is repeated. IndexError for a negative row.
         """
-        if rows.device.type == "cpu" and (rows < 0).any():  # elsewhere to look would mean to wait
+        if buffers.in_host_memory(rows) and (rows < 0).any():  # elsewhere to look would mean to wait
             raise IndexError(f"row {int(rows.min())} is out of range for a set of {self.num_rows} rows")
         back = torch.arange(frame_stack - 1, -1, -1, device=rows.device)
         first = self.episode_start[self.episode[rows]]
@@ -218,9 +220,14 @@ class Dataset:
 
     def num_windows(self, length: int) -> int:
         """Number of windows of `length` consecutive rows of one episode; raises UserError as `check_windows` does."""
+        return self._counted(length)[0]
+
+    def _counted(self, length: int) -> tuple[int, Tensor]:
+        """What `_windows` holds of a length."""
         if length not in self._windows:
             self.check_windows(length)
-            self._windows[length] = int(self.windows_per_episode(length).sum())
+            ends = self.windows_per_episode(length).cumsum(0)
+            self._windows[length] = int(ends[-1]), ends
         return self._windows[length]
 
     def window_rows(self, index: Index, length: int) -> Tensor:
@@ -234,9 +241,9 @@ class Dataset:
             UserError: an episode is shorter than the window.
             IndexError: an index is out of range.
         """
-        number, per_episode = self._index(index, self.num_windows(length)), self.windows_per_episode(length)
+        count, ends = self._counted(length)
+        number, per_episode = self._index(index, count), self.windows_per_episode(length)
         # Starts are numbered through the episodes; where their counts pass a number, its episode is found.
-        ends = per_episode.cumsum(0)
         episode = torch.searchsorted(ends, number, right=True)
         start = self.episode_start[episode] + number - (ends - per_episode)[episode]
         return start[:, None] + torch.arange(length, device=start.device)
@@ -263,7 +270,7 @@ class Dataset:
         return (self.episode_end - self.episode_start - (length - 1)).clamp(min=0)
 
     def _index(self, index: Index, size: int) -> Tensor:
-        """`index` as (B,) int64 on the set's device; checked where it is, so a CPU index never waits for a GPU."""
+        """`index` as (B,) int64 on the set's device; its values are checked on a CPU, and nothing waits for a GPU."""
         if isinstance(index, np.ndarray):
             index = index.copy()  # torch takes neither negative strides nor, without a warning, read-only memory
         number = torch.atleast_1d(torch.as_tensor(index))
@@ -272,7 +279,9 @@ class Dataset:
         if number.is_floating_point() or number.dtype == torch.bool or number.ndim != 1:
             raise IndexError(f"an index is an integer or a flat list of them, not {number.dtype} of {number.ndim} axes")
         number = number.to(torch.int64)
-        low, high = int(number.min()), int(number.max())
-        if low < 0 or high >= size:
-            raise IndexError(f"index {low if low < 0 else high} is outside 0..{size - 1}")
-        return number.to(self.t.device, non_blocking=True)
+        if buffers.in_host_memory(number):
+            low, high = int(number.min()), int(number.max())
+            if low < 0 or high >= size:
+                raise IndexError(f"index {low if low < 0 else high} is outside 0..{size - 1}")
+        # without waiting; but a CPU would read before the copy has come
+        return number.to(self.t.device, non_blocking=self.t.device.type != "cpu")

@@ -8,9 +8,11 @@ from typing import Any, get_args
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core import buffers
 from vd4rl_pomdp.core.buffers import BUFFERS
 from vd4rl_pomdp.core.errors import refuse_number, refuse_unknown
 from vd4rl_pomdp.core.seeding import stream_seed
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.core.tasks import FRAME_STACK
 from vd4rl_pomdp.core.types import Transitions, Windows
 from vd4rl_pomdp.corruptions import BatchCorruption, CorruptionConfig, KeyStream, augmentation
@@ -65,8 +67,14 @@ class View:
             shift_key = self.shifts.take((shifts,), rows.device)
         # Keys are taken whichever way is gone: the streams stand alike on every device.
         keys = self.corruption.keys(self.dataset.keys(rows))
-        if augmentation.by_lines(self.dataset.frames, self._pad):
+        frames = self.dataset.frames
+        if augmentation.by_lines(frames, self._pad):
             return self._observe_by_lines(rows, shift_key, keys)
+        if not buffers.in_host_memory(frames):
+            index = self.dataset.stack_rows(rows, self._frame_stack).view(-1, self._frame_stack)
+            obs = self.corruption.corruption.paint(frames, index, keys.flatten(), shift_key, self._pad)
+            if obs is not None:
+                return obs.view(*rows.shape, *obs.shape[1:])
         stacks = self.stacks(rows)
         shifted_alike = stacks if len(shift_key) == len(rows) else stacks.flatten(0, rows.ndim - 1)
         shifted = augmentation.random_shift(shifted_alike, shift_key, self._pad).view(stacks.shape)
@@ -76,7 +84,7 @@ class View:
         """(..., C, H, W) uint8 frame stacks of (...,) int64 rows as they are stored, neither shifted nor corrupted."""
         frames = self.dataset.frames
         index = self.dataset.stack_rows(rows, self._frame_stack).flatten()
-        out = BUFFERS.take((len(index), *frames.shape[1:])) if frames.device.type == "cpu" else None
+        out = BUFFERS.take((len(index), *frames.shape[1:])) if buffers.in_host_memory(frames) else None
         stored = torch.index_select(frames, 0, index, out=out)
         return stored.view(*rows.shape, frames.shape[1] * self._frame_stack, *frames.shape[2:])
 
@@ -126,11 +134,12 @@ class View:
 
     def state_dict(self) -> dict[str, Any]:
         """Where the streams stand."""
-        return {"corruption": self.corruption.stream.position, "shift": self.shifts.position}
+        return {"corruption": int(self.corruption.stream.position), "shift": int(self.shifts.position)}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
-        self.corruption.stream.position, self.shifts.position = state["corruption"], state["shift"]
+        self.corruption.stream.go_to(state["corruption"])
+        self.shifts.go_to(state["shift"])
 
     def _observe_by_lines(self, rows: Tensor, shift_key: Tensor, keys: Tensor) -> Tensor:
         """The same for a set on a CPU: only frames that stay are read, shifted, changed, and put into their stacks."""
@@ -188,34 +197,34 @@ def _spread(images: Tensor, kept: Tensor, stack: int) -> Tensor:
 
 
 class Sampler:
-    """What samplers share: a view (of a set as it is stored, if a set is given), a batch size and a generator.
+    """What samplers share: a view (of a set as it is stored, if a set is given), a batch size and a random stream.
 
-    The generator lives on the CPU, so the draws do not depend on the set's device.
+    The stream is drawn on the CPU, so the batches do not depend on the set's device.
     """
 
-    def __init__(self, source: Dataset | View, batch_size: int, generator: torch.Generator) -> None:
+    def __init__(self, source: Dataset | View, batch_size: int, draws: RandomStream) -> None:
         refuse_number("batch_size", batch_size, 1)
         self.view = source if isinstance(source, View) else View(source)
-        self._batch_size, self._generator = batch_size, generator
+        self._batch_size, self.draws = batch_size, draws
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on with the same batches."""
-        return {"batches": self._generator.get_state(), "view": self.view.state_dict()}
+        return {"batches": self.draws.get_state(), "view": self.view.state_dict()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
-        self._generator.set_state(state["batches"])
+        self.draws.set_state(state["batches"])
         self.view.load_state_dict(state["view"])
 
     def _draw(self, count: int) -> torch.Tensor:
-        return torch.randint(count, (self._batch_size,), generator=self._generator)
+        return self.draws.integers(count, self._batch_size)
 
 
 class WindowSampler(Sampler):
     """Windows whose starts are uniform over the set, drawn with replacement."""
 
-    def __init__(self, source: Dataset | View, batch_size: int, length: int, generator: torch.Generator) -> None:
-        super().__init__(source, batch_size, generator)
+    def __init__(self, source: Dataset | View, batch_size: int, length: int, draws: RandomStream) -> None:
+        super().__init__(source, batch_size, draws)
         self._length, self._count = length, self.view.dataset.num_windows(length)
 
     def sample(self) -> Windows:
@@ -234,11 +243,11 @@ class TransitionSampler(Sampler):
         self,
         source: Dataset | View,
         batch_size: int,
-        generator: torch.Generator,
+        draws: RandomStream,
         n_step: int = 1,
         gamma: float = 0.99,
     ) -> None:
-        super().__init__(source, batch_size, generator)
+        super().__init__(source, batch_size, draws)
         refuse_number("n_step", n_step, 1)
         self.view.dataset.require_transitions()
         self._n_step, self._gamma = n_step, gamma

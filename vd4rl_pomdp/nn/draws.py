@@ -6,7 +6,7 @@ import torch
 from torch import Tensor, nn
 
 from vd4rl_pomdp.core.seeding import stream_seed
-from vd4rl_pomdp.corruptions.keys import KeyStream
+from vd4rl_pomdp.corruptions.keys import next_keys
 
 
 class Draws(nn.Module):
@@ -20,10 +20,7 @@ class Draws(nn.Module):
 
     def keys(self, *shape: int) -> Tensor:
         """Fresh int64 keys."""
-        stream = KeyStream(self.seed, int(self.position))
-        keys = stream.take(shape, self.position.device)
-        self.position.fill_(stream.position)
-        return keys
+        return next_keys(self.seed, self.position, shape)
 
     def integers(self, high: int, *shape: int) -> Tensor:
         """Uniform int64 in [0, high)."""

@@ -101,5 +101,4 @@ def _logits(scores: Tensor, group: Tensor | None) -> Tensor:
 @torch.no_grad()
 def move_target(target: nn.Module, online: nn.Module, tau: float) -> None:
     """Move a target's parameters by the share `tau` of the way to those of its network."""
-    for a, b in zip(online.parameters(), target.parameters(), strict=True):
-        b.lerp_(a, tau)
+    torch._foreach_lerp_(list(target.parameters()), list(online.parameters()), tau)

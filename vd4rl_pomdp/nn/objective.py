@@ -27,12 +27,13 @@ class Objective(nn.Module, ABC):
     encoder: Encoder
 
     @abstractmethod
-    def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Loss of one batch.
 
         Args:
             window: a batch whose `obs` are already corrupted and augmented.
-            progress: share of the training that is done, 0 to 1, for schedules.
+            progress: share of the training that is done, 0 to 1, for schedules; where steps are replayed a tensor, of
+                which Python cannot read the value.
 
         Returns:
             A scalar to minimise, and detached scalars to log: itself as `loss`, and whatever else tells how it goes.
@@ -135,13 +136,13 @@ class InverseObjective(Objective):
         past, future = self.representations(window)
         return self.head(past, future, self.pairs(window.obs.shape[1]).to(past.device))
 
-    def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean action loss over all real pairs, plus the optional terms; `loss_kNN` is the mean at each k."""
         past, future = self.representations(window)
         return self.loss_of(past, future, window, progress)
 
     def loss_of(
-        self, past: Tensor, future: Tensor, window: Windows, progress: float
+        self, past: Tensor, future: Tensor, window: Windows, progress: float | Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """`loss`, given the `representations` of the window."""
         scored = self.pairs(window.obs.shape[1])

@@ -25,10 +25,20 @@ OF_CORRUPTION = "corruption "
 """What the names of a corruption's settings begin with: other parts may have options of the same names."""
 ENCODER_SEED = "pretraining seed"
 """The seed of a run's encoder, where the run's own is another: its seeds share what they were pretrained with."""
+
+
+def _words(value: Any) -> str:
+    if isinstance(value, bool):
+        return "yes" if value else "no"
+    if value is None:
+        return "none"
+    return f"{value:g}" if isinstance(value, float) else str(value)
+
+
 PLAIN = {
     **{"history": "method", "random_histories": "0", "history_window": "0", "readout": "state"},
     **{"pose_noise": "0", "velocity_noise": "0"},
-    **LATER,
+    **{name: _words(value) for name, value in LATER.items()},
 }
 """Values that add nothing to a method: what has them goes by the method's name, and others are its variants."""
 
@@ -77,14 +87,6 @@ def without(settings: Mapping[str, Any], names: Collection[str]) -> dict[str, An
     return {name: value for name, value in settings.items() if name not in names}
 
 
-def _words(value: Any) -> str:
-    if isinstance(value, bool):
-        return "yes" if value else "no"
-    if value is None:
-        return "none"
-    return f"{value:g}" if isinstance(value, float) else str(value)
-
-
 def without_sets(settings: Sequence[Settings], sets: Sequence[str], alike: Sequence[Hashable]) -> list[Settings]:
     """Settings but those that go by the set, such as a budget: runs on one set agree in them, and the sets differ.
 
@@ -121,7 +123,7 @@ def _differences(settings: Sequence[Settings]) -> list[str]:
     named in place of the settings that it decides.
     """
     names = [name for name in dict.fromkeys(name for one in settings for name in one) if name != ENCODER_SEED]
-    columns = {name: [one.get(name, LATER.get(name, _UNSET)) for one in settings] for name in names}
+    columns = {name: [one.get(name, PLAIN[name] if name in LATER else _UNSET) for one in settings] for name in names}
     columns = {name: column for name, column in columns.items() if len(set(column)) > 1}
     # An option of a chosen part is not there without the part: naming the part says it all.
     everywhere = [name for name, column in columns.items() if _UNSET not in column]

@@ -12,6 +12,7 @@ from torch.optim import Optimizer
 from finetune.algorithms import ALGORITHMS, Algorithm, Loss
 from finetune.config import FinetuneConfig
 from finetune.features import FeatureBatch
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.runs.checkpoint import pack, unpack
 from vd4rl_pomdp.testing.contract import Check, claim, claim_close, run_checks, shown
@@ -49,7 +50,7 @@ def make(name: str, seed: int = 0, **options: Any) -> Algorithm:
     torch.manual_seed(seed)
     policy = Policy(DIM, ACTIONS, 16)
     policy.standardise.fit(batch().z)
-    algorithm = ALGORITHMS.named(name)(policy, chosen, 1e-3, 40, torch.Generator().manual_seed(seed))
+    algorithm = ALGORITHMS.named(name)(policy, chosen, 1e-3, 40, RandomStream(torch.Generator().manual_seed(seed)))
     claim(algorithm.policy is policy, "`policy` is not the one that it was given: train that")
     return algorithm
 
@@ -197,9 +198,7 @@ def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **option
         for seed, algorithm in enumerate((one, other)):
             torch.manual_seed(seed)
             logs.append({key: value.item() for key, value in algorithm.update(batch(number)).items()})
-        claim(
-            logs[0] == logs[1], f"update {number} logs {logs[0]} and {logs[1]}: keep all in parts, draw from generator"
-        )
+        claim(logs[0] == logs[1], f"update {number} logs {logs[0]} and {logs[1]}: keep all in parts, draw from draws")
     here, there = _tensors(one.state_dict()), _tensors(other.state_dict())
     differing = [key for key in here if not torch.equal(here[key], there[key])]
     claim(differing == [], f"these differ at the end: {shown(differing)}")

@@ -327,7 +327,7 @@ def test_streaming_and_windows_agree_for_the_mazes_encoders(maze_set, tmp_path, 
 
 
 def test_the_command_that_a_run_names_has_its_config(maze_set, tmp_path):
-    from vd4rl_pomdp.cli.parsing import parse_stage
+    from vd4rl_pomdp.core.parsing import parse_stage
 
     for config in (
         smoke(maze_set, tmp_path / "a run", method="fj+a", m=3, self_prediction=0.5, k_embedding=False),

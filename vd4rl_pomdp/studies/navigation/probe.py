@@ -79,12 +79,15 @@ class ErrorSums(nn.Module):
         error = (estimate.detach().float() - truth)[:, burn_in:].abs().flatten(0, 1)
         under = hidden[:, burn_in:].flatten()
         weights = torch.stack([torch.ones_like(under), under]).to(error)
-        self.sums = self.sums.to(error.device) + (weights @ error).double()
-        self.counts = self.counts.to(error.device) + weights.sum(1).double()
+        self.to(error.device)
+        # in place, as a replayed step adds to the tensors that it was captured with
+        self.sums.add_((weights @ error).double())
+        self.counts.add_(weights.sum(1).double())
 
     def reset(self) -> None:
         """Count anew."""
-        self.sums, self.counts = torch.zeros_like(self.sums), torch.zeros_like(self.counts)
+        self.sums.zero_()
+        self.counts.zero_()
 
     def percent(self) -> dict[str, float]:
         """`state`, `position`, `velocity`, and the same with `_hidden` where any counted row was hidden."""

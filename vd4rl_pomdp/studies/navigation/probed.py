@@ -11,7 +11,8 @@ from torch import Tensor
 
 from pretrain.build import build_objective, build_target
 from pretrain.train import Trainer
-from vd4rl_pomdp.core.seeding import seed_networks, stream_generator
+from vd4rl_pomdp.core.seeding import seed_networks
+from vd4rl_pomdp.core.streams import random_stream
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.objective import InverseObjective, Objective
@@ -38,8 +39,6 @@ class ProbedObjective(Objective):
         assert isinstance(objective, InverseObjective)
         self.objective, self.probe, self.errors = objective, StateProbe(objective.encoder.dim), ErrorSums()
         self.data, self.config = data, config
-        self.states: tuple[Tensor, Tensor, Tensor]
-        """Estimated and true states, and which rows were hidden, of the last batch."""
 
     @property
     def encoder(self) -> Encoder:  # type: ignore[override]
@@ -51,23 +50,23 @@ class ProbedObjective(Objective):
         """Where it is."""
         return next(self.parameters()).device
 
-    def loss(self, window: Windows, progress: float) -> tuple[Tensor, dict[str, Tensor]]:
+    def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Objective's and probe's loss of one batch, whose frames are encoded once."""
         past, future = self.objective.representations(window)
         rows = self.data.dataset.rows(window.key)
         supervised = self.config.method in SUPERVISED
         estimate, truth = self.probe(past, frozen=not supervised), self.data.states.values[rows]
         error = (estimate.float() - truth).square().mean()
-        self.states = (estimate, truth, self.data.states.hidden[rows])
+        with torch.autocast(error.device.type, enabled=False):
+            self.errors.add(estimate, truth, self.data.states.hidden[rows], self.config.burn_in)
         if supervised:
             return error, {"loss": error.detach()}
         loss, logs = self.objective.loss_of(past, future, window, progress)
         return loss + error, logs | {"probe_loss": error.detach()}
 
     def after_step(self) -> None:
-        """Count the errors of the batch just trained on, outside of autocast."""
+        """The objective's."""
         self.objective.after_step()
-        self.errors.add(*self.states, self.config.burn_in)
 
     def take_errors(self) -> dict[str, float]:
         """Mean errors since the last call."""
@@ -81,19 +80,19 @@ class MazeBatches:
 
     def __init__(self, data: MazeData, config: NavigationConfig) -> None:
         self._data, self._batch_size = data, config.batch_size
-        self._generator = stream_generator(config.seed, STAGE, "batches")
+        self.draws = random_stream(config.seed, STAGE, "batches", device=data.dataset.t.device)
 
     def sample(self) -> Windows:
         """The next batch."""
-        return self._data.windows(torch.randint(self._data.training, (self._batch_size,), generator=self._generator))
+        return self._data.windows(self.draws.integers(self._data.training, self._batch_size))
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to resume with the same batches."""
-        return {"generator": self._generator.get_state()}
+        return {"generator": self.draws.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
-        self._generator.set_state(state["generator"])
+        self.draws.set_state(state["generator"])
 
 
 def make_trainer(data: MazeData, config: NavigationConfig, device: torch.device) -> tuple[Trainer, ProbedObjective]:

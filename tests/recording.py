@@ -1,0 +1,76 @@
+"""Plays a CUDA graph's part on the CPU: operators are recorded once and run again on the very same tensors.
+
+What a graph would freeze is frozen here, too: Python, numbers read from tensors, random draws. What a graph refuses is
+refused.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import torch
+from torch import Tensor
+from torch.utils._python_dispatch import TorchDispatchMode
+from torch.utils._pytree import tree_flatten
+
+_WAITING = {"_local_scalar_dense", "item", "nonzero", "masked_select", "equal", "is_nonzero", "unique", "_unique2"}
+_DRAWING = {"rand", "randn", "randint", "randperm", "normal_", "uniform_", "bernoulli_", "random_", "multinomial"}
+
+
+class _Recorder(TorchDispatchMode):
+    def __init__(self) -> None:
+        super().__init__()
+        self.calls: list[tuple[Any, tuple, dict, list[Tensor]]] = []
+        self._made: set[int] = set()
+        self._kept: dict[int, tuple[torch.UntypedStorage, torch.UntypedStorage]] = {}
+
+    def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
+        kwargs = kwargs or {}
+        name = func.overloadpacket.__name__
+        if name in _WAITING:
+            raise RuntimeError(f"operation not permitted when stream is capturing: {name} reads a value")
+        if name in _DRAWING:
+            raise RuntimeError(f"operation not permitted when stream is capturing: {name} draws")
+        for number, argument in enumerate(func._schema.arguments):
+            if argument.alias_info is not None and argument.alias_info.is_write:
+                given = args[number] if number < len(args) else kwargs.get(argument.name)
+                for tensor in tree_flatten(given)[0]:
+                    self._keep(tensor)
+        out = func(*args, **kwargs)
+        outs = [x.detach() for x in tree_flatten(out)[0] if isinstance(x, Tensor)]
+        read = {x.untyped_storage().data_ptr() for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)}
+        self._made |= {x.untyped_storage().data_ptr() for x in outs} - read
+        self.calls.append((func, args, kwargs, outs))
+        return out
+
+    def _keep(self, tensor: Any) -> None:
+        if isinstance(tensor, Tensor):
+            storage = tensor.untyped_storage()
+            if storage.data_ptr() not in self._made:
+                self._kept.setdefault(storage.data_ptr(), (storage, storage.clone()))
+
+    def undo(self) -> None:
+        """As capturing does no work, take back what was written."""
+        for storage, before in self._kept.values():
+            storage.copy_(before)
+
+
+def record(function: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
+    """See `vd4rl_pomdp.runs.replay.Capture`."""
+    recorder = _Recorder()
+    try:
+        with recorder:
+            result = function()
+    finally:
+        recorder.undo()
+
+    @torch.no_grad()
+    def replay() -> None:
+        for func, args, kwargs, outs in recorder.calls:
+            again = [x for x in tree_flatten(func(*args, **kwargs))[0] if isinstance(x, Tensor)]
+            for old, new in zip(outs, again, strict=True):
+                if old.data_ptr() != new.data_ptr():  # else a view, or written in place
+                    old.copy_(new)
+
+    return replay, result

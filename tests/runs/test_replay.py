@@ -1,0 +1,136 @@
+"""Steps that are replayed against steps that are run, on a CPU, where a recorder plays the CUDA graph's part."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+import torch
+from torch import Tensor, nn
+
+from tests.recording import record
+from vd4rl_pomdp.core.streams import BLOCK, RandomStream
+from vd4rl_pomdp.nn.adam import Adam, set_learning_rate
+from vd4rl_pomdp.nn.heads import move_target
+from vd4rl_pomdp.runs.replay import Replay
+
+CPU = torch.device("cpu")
+
+
+class Regression:
+    """A small training: a batch by index, noise, a target network, a second part in every other step."""
+
+    def __init__(self) -> None:
+        torch.manual_seed(0)
+        self.x, self.y = torch.randn(100, 5), torch.randn(100, 1)
+        self.net, self.target = nn.Linear(5, 1), nn.Linear(5, 1)
+        self.optimiser = Adam(self.net.parameters(), 1e-2, fused=True)
+        self.optimiser.param_groups[0]["lr"] = torch.tensor(1e-2)
+        self.draws = RandomStream(torch.Generator().manual_seed(3))
+        self.done = torch.zeros((), dtype=torch.int64)
+
+    def step(self, turn: int) -> dict[str, Tensor]:
+        index, noise = self.draws.integers(100, 8), self.draws.normal(8, 5)
+        loss = (self.net(self.x[index] + 0.1 * noise) - self.y[index]).square().mean()
+        self.optimiser.zero_grad(set_to_none=True)
+        loss.backward()
+        set_learning_rate(self.optimiser, 1e-2 * (1 - self.done / 1000))
+        self.optimiser.step()
+        logs = {"loss": loss.detach(), "index": index[0], "noise": noise[0, 0]}
+        if turn == 1:
+            move_target(self.target, self.net, 0.1)
+            logs["shift"] = self.draws.uniform(1)[0]
+        self.done += 1
+        return logs
+
+    def state(self) -> list[Tensor]:
+        state = [*self.net.parameters(), *self.target.parameters(), self.done]
+        return [*state, *(x for s in self.optimiser.state.values() for x in s.values()), self.draws.get_state()]
+
+
+def train(made: Regression, steps: int, capture: Any = None, begun: int = 0) -> list[dict[str, float]]:
+    """The scalars of every step, read after the last."""
+    replay = Replay(made.step, CPU, [made.draws], 2, [made], capture)
+    logs = [replay(step % 2) for step in range(begun, begun + steps)]
+    return [{name: float(value) for name, value in row.items()} for row in logs]
+
+
+def test_replayed_steps_are_those_that_are_run() -> None:
+    """Batches, noise, learning rate, targets and the second turn, over more than a block; read late."""
+    run, replayed = Regression(), Regression()
+    expected, got = train(run, BLOCK + 30), train(replayed, BLOCK + 30, record)
+    assert [row.keys() for row in got] == [row.keys() for row in expected]
+    for row, other in zip(got, expected, strict=True):
+        assert row == pytest.approx(other, rel=1e-4, abs=1e-6)
+    for one, other in zip(replayed.state(), run.state(), strict=True):
+        torch.testing.assert_close(one, other)
+
+
+def test_a_state_is_that_of_the_steps_made_however_they_were_drawn() -> None:
+    """A replayed training saves what one that is run would, and either goes on from it."""
+    run, replayed = Regression(), Regression()
+    train(run, 41)
+    train(replayed, 41, record)
+    assert torch.equal(run.draws.get_state(), replayed.draws.get_state())
+    ahead = Regression()
+    train(ahead, 20, record)
+    replay = Replay(ahead.step, CPU, [ahead.draws], 2, [ahead], record)
+    ahead.draws.one_by_one()
+    ahead.draws.set_state(run.draws.get_state())
+    for step in range(20):
+        logs = replay((41 + step) % 2)
+        assert int(run.draws.integers(100, 8)[0]) == int(logs["index"])
+        run.draws.normal(8, 5)
+        if (41 + step) % 2:
+            run.draws.uniform(1)
+
+
+class Reads(Regression):
+    def step(self, turn: int) -> dict[str, Tensor]:
+        logs = super().step(turn)
+        if logs["loss"] < -1:  # Python decides by a value
+            raise AssertionError
+        return logs
+
+
+class Counts(Regression):
+    count = 0
+
+    def step(self, turn: int) -> dict[str, Tensor]:
+        self.count += 1
+        return super().step(turn) | {"count": torch.tensor(float(self.count))}
+
+
+class Rebinds(Regression):
+    mean = torch.zeros(())
+
+    def step(self, turn: int) -> dict[str, Tensor]:
+        logs = super().step(turn)
+        self.mean = 0.9 * self.mean + 0.1 * logs["loss"].detach()
+        return logs | {"mean": self.mean}
+
+
+class Draws(Regression):
+    def step(self, turn: int) -> dict[str, Tensor]:
+        return super().step(turn) | {"own": torch.randn(1)[0]}
+
+
+@pytest.mark.parametrize(
+    ("made", "reason"),
+    [(Reads, "item|local_scalar"), (Counts, "count"), (Rebinds, "mean"), (Draws, "randn")],
+)
+def test_what_cannot_be_replayed_is_run_and_told_once(
+    made: type[Regression], reason: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """The same numbers as without, and one line."""
+    torch.manual_seed(0)
+    expected = train(made(), 40)
+    torch.manual_seed(0)
+    got = train(made(), 40, record)
+    for row, other in zip(got, expected, strict=True):
+        row.pop("own", None)
+        other.pop("own", None)
+        assert row == pytest.approx(other, rel=1e-4)
+    told = capsys.readouterr().err
+    assert told.count("warning") == 1
+    assert [word for word in reason.split("|") if word in told]

@@ -1,0 +1,74 @@
+"""Words of a command line as settings, with one-line errors for bad ones."""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import io
+import os
+import re
+from collections.abc import Iterable
+from dataclasses import fields, replace
+from pathlib import Path
+from typing import Any, TypeVar
+
+import tyro
+
+from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_unknown
+from vd4rl_pomdp.core.options import StageConfig
+
+Stage = TypeVar("Stage", bound=StageConfig)
+
+
+def parse(config: Any, words: list[str], program: str, default: Any = None) -> Any:
+    """Words as an instance of a config class, or as what a function returns for them.
+
+    Args:
+        config: the class or function.
+        words: of a command line, behind the command.
+        program: what stands before them.
+        default: an instance that has the defaults.
+    """
+    for before, word in zip(["", *words], words, strict=False):
+        # As a Path an empty word would be the working directory: `--out "$UNSET"` would write there.
+        if not word or (word.startswith("--") and word.endswith("=")):
+            name = word.rstrip("=") or (before if before.startswith("--") else "a word")
+            raise UserError(f"{name} is empty: is a variable of the shell not set? (see `{program} --help`)")
+    words = [re.sub("(?<==)~.*", lambda path: os.path.expanduser(path[0]), word, count=1) for word in words]
+    options = {} if default is None else {"default": default}
+    shown = io.StringIO()
+    try:
+        with contextlib.redirect_stderr(shown):
+            return tyro.cli(config, args=words, prog=program, config=(tyro.conf.OmitArgPrefixes,), **options)
+    except SystemExit as end:
+        if end.code != 2:
+            raise
+        lines = (line for line in shown.getvalue().splitlines() if not line.startswith(("╭", "╰")))
+        text = re.sub(r"[\u2500-\u257f]+|-{5,}", " ", " ".join(lines).partition("For full helptext")[0])
+        raise UserError(f"{' '.join(text.split())} (see `{program} --help`)") from None
+
+
+def parse_stage(config: type[Stage], words: list[str], program: str) -> Stage:
+    """Parse a stage's config: preset, method and the like decide which flags there are, and their defaults."""
+    chosen = _chosen(words, (*config.choosers, *["preset"] * (len(config.presets) > 1)))
+    required = {f.name: tyro.MISSING for f in fields(config) if f.default == Path()}
+    parsed: Stage = parse(config, words, program, config.of(**chosen, **required))
+    parsed.check()
+    return parsed
+
+
+def with_presets(config: type, presets: dict[str, Any], words: list[str], program: str) -> Any:
+    """Parse a config whose flag `--preset` chooses the defaults of all others."""
+    name = _chosen(words, ["preset"]).get("preset", next(iter(presets)))
+    refuse_unknown("preset", name, presets)
+    default = presets[name]
+    missing = {f.name: tyro.MISSING for f in fields(config) if getattr(default, f.name) in (Path(), "")}
+    return parse(config, words, program, replace(default, **missing))
+
+
+def _chosen(words: list[str], names: Iterable[str]) -> dict[str, str]:
+    """The values that a command line gives some flags."""
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
+    for name in names:
+        parser.add_argument(flag_of(name), f"--{name}", dest=name, nargs="?", const="")
+    return vars(parser.parse_known_args(words)[0])

@@ -1,0 +1,162 @@
+"""A run's random numbers: drawn on the CPU from named streams, one by one or, where steps are replayed, in blocks.
+
+A replayed step cannot draw: it reads. So a stream notes what a step asks for, draws that for a whole block of steps, in
+the order in which they would have drawn it themselves, sends the block in one copy, and hands out a row a step.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from vd4rl_pomdp.core.seeding import stream_generator
+
+BLOCK = 256
+"""Steps that are drawn at once."""
+_ALIGNED = 16
+"""Bytes; where a row's numbers may begin, whatever their type."""
+
+
+@dataclass(frozen=True)
+class _Draw:
+    """What a step asks for."""
+
+    kind: str
+    shape: tuple[int, ...]
+    high: int = 0
+
+    def made(self, generator: torch.Generator) -> Tensor:
+        if self.kind == "integers":
+            return torch.randint(self.high, self.shape, generator=generator)
+        if self.kind == "normal":
+            return torch.randn(self.shape, generator=generator)
+        return torch.rand(self.shape, generator=generator)
+
+    @property
+    def dtype(self) -> torch.dtype:
+        return torch.int64 if self.kind == "integers" else torch.float32
+
+    @property
+    def size(self) -> int:
+        """Bytes."""
+        return math.prod(self.shape) * self.dtype.itemsize
+
+
+class RandomStream:
+    """Numbers of one stream; the same on every device, and the same one by one as in blocks."""
+
+    def __init__(self, generator: torch.Generator, device: torch.device | str = "cpu") -> None:
+        """See the class.
+
+        Args:
+            generator: on the CPU, at the stream's beginning.
+            device: where the numbers are wanted.
+        """
+        self._generator, self._device = generator, torch.device(device)
+        self._asked: dict[int, list[_Draw]] = {}
+        """By turn: what its step asked for when it was last run."""
+        self._turn, self._place = 0, 0
+        self._block: Tensor | None = None
+        """(BLOCK, bytes) uint8 on the device; None: numbers are drawn one by one."""
+
+    def integers(self, high: int, *shape: int) -> Tensor:
+        """Uniform int64 in [0, high)."""
+        return self._next(_Draw("integers", shape, high))
+
+    def normal(self, *shape: int) -> Tensor:
+        """Standard normal float32."""
+        return self._next(_Draw("normal", shape))
+
+    def uniform(self, *shape: int) -> Tensor:
+        """Uniform float32 in [0, 1)."""
+        return self._next(_Draw("uniform", shape))
+
+    def get_state(self) -> Tensor:
+        """State of the generator after the steps that were made, whatever was drawn ahead."""
+        if self._block is None:
+            return self._generator.get_state()
+        made = torch.Generator()
+        made.set_state(self._before)
+        self._draw_steps(made, self._used)
+        return made.get_state()
+
+    def set_state(self, state: Tensor) -> None:
+        """Go on from `get_state`."""
+        self._generator.set_state(state)
+        if self._block is not None:
+            self._before, self._used, self._filled = state.clone(), 0, False
+
+    def begin(self, turn: int) -> None:
+        """A step of a turn begins: what it asks for is noted, or, in blocks, read from its row."""
+        self._turn, self._place = turn, 0
+        if self._block is None:
+            self._asked[turn] = []
+        else:
+            self._row = self._block.index_select(0, self._counter)[0]
+
+    def end(self) -> None:
+        """The step has asked for all its numbers; in blocks, the next row's turn has come. Part of a replayed step."""
+        if self._block is not None:
+            if self._place < len(self._asked[self._turn]):
+                raise RuntimeError("a step asked for fewer random numbers than the steps before it")
+            self._counter.add_(1)
+
+    def in_blocks(self) -> None:
+        """Draw in blocks from now on; a step of every turn has been run, turn 0 comes next."""
+        self._offsets, width = {}, _ALIGNED
+        for turn, asked in self._asked.items():
+            ends = [0]
+            for draw in asked:
+                ends.append(ends[-1] + -(-draw.size // _ALIGNED) * _ALIGNED)
+            self._offsets[turn], width = ends[:-1], max(width, ends[-1])
+        self._block = torch.zeros(BLOCK, width, dtype=torch.uint8, device=self._device)
+        self._counter = torch.zeros(1, dtype=torch.int64, device=self._device)
+        self._before, self._used, self._first, self._filled = self._generator.get_state(), 0, 0, False
+
+    def one_by_one(self) -> None:
+        """Draw one by one again, from where the steps made so far end."""
+        if self._block is not None:
+            state, self._block = self.get_state(), None
+            self._generator.set_state(state)
+
+    def provide(self, turn: int) -> None:
+        """See to it that the block holds the next step's row; called before a step of `turn` is replayed."""
+        assert self._block is not None
+        if self._used == BLOCK or not self._filled:
+            self._before, self._first = self._generator.get_state(), turn
+            rows = torch.zeros(self._block.shape, dtype=torch.uint8, pin_memory=self._device.type == "cuda")
+            self._draw_steps(self._generator, BLOCK, rows)
+            # pinned memory that is freed here is not used again before the copy has ended
+            self._block.copy_(rows, non_blocking=True)
+            self._counter.zero_()
+            self._used, self._filled = 0, True
+        self._used += 1
+
+    def _draw_steps(self, generator: torch.Generator, steps: int, rows: Tensor | None = None) -> None:
+        """Draw what `steps` steps from the block's first turn on ask for, into the rows if there are any."""
+        for step in range(steps):
+            turn = (self._first + step) % len(self._asked)
+            for draw, offset in zip(self._asked[turn], self._offsets[turn], strict=True):
+                drawn = draw.made(generator)
+                if rows is not None:
+                    rows[step, offset : offset + draw.size] = drawn.view(-1).view(torch.uint8)
+
+    def _next(self, draw: _Draw) -> Tensor:
+        if self._block is None:
+            self._asked.setdefault(self._turn, []).append(draw)
+            # to a GPU without waiting; to the CPU a copy would be read before it has come
+            return draw.made(self._generator).to(self._device, non_blocking=self._device.type != "cpu")
+        asked, place = self._asked[self._turn], self._place
+        if place >= len(asked) or asked[place] != draw:
+            raise RuntimeError(f"a step asked for {draw}, other random numbers than the steps before it")
+        self._place += 1
+        offset = self._offsets[self._turn][place]
+        return self._row[offset : offset + draw.size].view(draw.dtype).view(draw.shape)
+
+
+def random_stream(seed: int, *name: str | int, device: torch.device | str = "cpu") -> RandomStream:
+    """The stream called `name` of a run (see `stream_seed`), for a device."""
+    return RandomStream(stream_generator(seed, *name), device)

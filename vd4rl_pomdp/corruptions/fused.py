@@ -1,0 +1,115 @@
+"""Observations by one pass over their pixels, for a GPU: of which frame, shifted how far, hidden or not.
+
+`drawn` gives a few numbers for every stack, `painted` every pixel by arithmetic on indices: a few kernels, if compiled.
+Masks, shifts and pixels are those of `Corruption.apply_` and `augmentation.random_shift`, which a CPU runs.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple, Protocol, runtime_checkable
+
+import torch
+from torch import Tensor
+
+from vd4rl_pomdp.core.compiling import compiled_on_gpu
+from vd4rl_pomdp.corruptions.augmentation import draw_offset
+from vd4rl_pomdp.corruptions.keys import DRAWS, derive_keys, draw_integers, hash_keys
+
+
+@runtime_checkable
+class Hiding(Protocol):
+    """A stage that can also say of a single pixel whether it hides it; others are applied to whole stacks."""
+
+    @property
+    def hidden_value(self) -> int:
+        """Value of the pixels that it hides, 0 to 255."""
+
+    def places(self, key: Tensor, number: Tensor, height: int, width: int) -> Tensor:
+        """Where it hides pixels: (N, K, ...) numbers of whatever kind `hides` reads.
+
+        Args:
+            key: (N,) int64, what to draw from.
+            number: (N, K) int64 place of each frame in its stack.
+            height: of a frame.
+            width: of a frame.
+        """
+
+    def hides(self, places: Tensor, y: Tensor, x: Tensor) -> Tensor:
+        """Whether pixels are hidden: (N, K, H, W) bool, given `places`, (H, 1) rows and (W,) columns, int64."""
+
+
+class Drawn(NamedTuple):
+    """What is drawn for N stacks of S frames."""
+
+    offset: Tensor | None
+    """(N, 2) int64, as `augmentation.draw_offset` has it; None: nothing is shifted."""
+    kept: Tensor | None
+    """(N, S) bool: frames that are not zeroed; None: all are kept."""
+    places: tuple[Tensor, ...]
+    """One of each stage."""
+
+
+def zero_draws(key: Tensor, stages: int, stack: int) -> Tensor:
+    """(N, stack) int64 draws, by which the frames of stacks with (N,) keys are put in the order in which they zero."""
+    # A stream beside those of the stages, so that which frames are zeroed tells nothing of where patches are.
+    return draw_integers(hash_keys(derive_keys(stages, key) ^ 1), DRAWS, stack)
+
+
+@compiled_on_gpu
+def drawn(
+    stages: tuple[Any, ...], zeroed: int, pad: int, key: Tensor, shift_key: Tensor, stack: int, size: tuple[int, int]
+) -> Drawn:
+    """Draws for stacks of `stack` frames.
+
+    Args:
+        stages: each `Hiding`.
+        zeroed: frames of a stack that are zeroed.
+        pad: largest shift.
+        key: (N,) int64, what the corruption is drawn from.
+        shift_key: (M,) int64, what the shifts are drawn from, each for N / M stacks that follow one another.
+        stack: frames S of a stack.
+        size: height and width of a frame.
+    """
+    offset = kept = None
+    if pad:
+        offset = draw_offset(shift_key, pad).repeat_interleave(len(key) // len(shift_key), 0)
+    if zeroed:
+        draws, place = zero_draws(key, len(stages), stack), torch.arange(stack, device=key.device)
+        before = draws[:, None] < draws[:, :, None]
+        # ranks by comparison, equal draws in order: what sorting gives
+        before |= (draws[:, None] == draws[:, :, None]) & (place < place[:, None])
+        kept = before.sum(2) >= zeroed
+    number = torch.arange(stack, device=key.device).expand(len(key), stack)
+    places = tuple(stage.places(derive_keys(n, key), number, *size) for n, stage in enumerate(stages))
+    return Drawn(offset, kept, places)
+
+
+@compiled_on_gpu
+def painted(
+    stages: tuple[Any, ...],
+    frames: Tensor,
+    index: Tensor,
+    offset: Tensor | None,
+    kept: Tensor | None,
+    places: tuple[Tensor, ...],
+) -> Tensor:
+    """Stacks (N, S * C, H, W) uint8, given what was `drawn` for them.
+
+    Args:
+        stages: each `Hiding`.
+        frames: (R, C, H, W) uint8.
+        index: (N, S) int64 of the frames in each stack.
+        offset, kept, places: see `Drawn`.
+    """
+    _, channels, height, width = frames.shape
+    y, x = torch.arange(height, device=frames.device), torch.arange(width, device=frames.device)
+    row, column = y.expand(len(index), height), x.expand(len(index), width)
+    if offset is not None:
+        row, column = (row + offset[:, :1]).clamp(0, height - 1), (column + offset[:, 1:]).clamp(0, width - 1)
+    channel = torch.arange(channels, device=frames.device)[:, None, None]
+    pixels = frames[index[:, :, None, None, None], channel, row[:, None, None, :, None], column[:, None, None, None, :]]
+    for stage, place in zip(stages, places, strict=True):
+        pixels = torch.where(stage.hides(place, y[:, None], x)[:, :, None], stage.hidden_value, pixels)
+    if kept is not None:
+        pixels = torch.where(kept[:, :, None, None, None], pixels, 0)
+    return pixels.flatten(1, 2)

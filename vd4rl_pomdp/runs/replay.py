@@ -1,0 +1,201 @@
+"""A training's step, captured once and replayed: on a GPU some hundred launches become one.
+
+A step is a function without arguments but its turn. Whatever changes from step to step it reads from tensors that stay
+where they are: weights, optimiser state, counters, random numbers (`RandomStream`, `KeyStream`). A step that cannot be
+captured, because Python decides by a value or keeps a number of its own, is run as it is, and that is said once.
+"""
+
+from __future__ import annotations
+
+import os
+import sys
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.optim import Optimizer
+
+from vd4rl_pomdp.core.errors import first_line
+from vd4rl_pomdp.core.streams import RandomStream
+
+Logs = dict[str, Tensor]
+Capture = Callable[[Callable[[], Tensor]], tuple[Callable[[], None], Tensor]]
+"""Takes a function without running it; gives what replays it, and the tensor that then holds its result."""
+EAGER_VARIABLE = "VD4RL_POMDP_EAGER"
+"""Set to 1, no step is replayed."""
+WARM_UP = 3
+"""Steps of every turn that are run as they are: libraries choose their kernels, optimisers make their state."""
+
+
+class Replay:
+    """Calls a step; on a GPU replays it after the first few calls. Each call is one step of the training."""
+
+    def __init__(
+        self,
+        step: Callable[[int], Logs],
+        device: torch.device,
+        streams: Sequence[RandomStream] = (),
+        period: int = 1,
+        trained: Sequence[Any] = (),
+        capture: Capture | None = None,
+    ) -> None:
+        """See the class.
+
+        Args:
+            step: does the step of a turn, 0 to period - 1, and returns scalars.
+            device: where it does.
+            streams: all that it draws from.
+            period: steps after which Python does the same again, as with an actor that moves in every second step.
+            trained: what the step changes: whose Python numbers must stay as they are for it to be replayed.
+            capture: what captures; None: CUDA graphs on a GPU, nothing elsewhere.
+        """
+        self._step, self._streams, self._period, self._trained = step, streams, period, trained
+        self._side = torch.cuda.Stream(device) if device.type == "cuda" else None
+        if capture is None and self._side is not None and os.environ.get(EAGER_VARIABLE) != "1":
+            capture = CudaCapture(self._side)
+        self._capture = capture
+        self._eager = 0
+        self._steps: dict[int, tuple[Callable[[], None], list[str], Tensor]] = {}
+        """By turn: what replays it, the names of its scalars and where they are."""
+
+    @property
+    def replays(self) -> bool:
+        """Whether steps are replayed, now or after the first few."""
+        return self._capture is not None
+
+    def __call__(self, turn: int) -> Logs:
+        """Do the step of a turn; turns follow one another. The scalars are copies, of this step."""
+        with self._on_side():
+            if self._capture is None:
+                return self._step(turn)
+            if turn not in self._steps and not self._ready(turn):
+                return self._run(turn)
+            for stream in self._streams:
+                stream.provide(turn)
+            replay, names, values = self._steps[turn]
+            replay()
+            return dict(zip(names, values.clone().unbind(), strict=True))
+
+    def _run(self, turn: int) -> Logs:
+        self._eager += 1
+        for stream in self._streams:
+            stream.begin(turn)
+        logs = self._step(turn)
+        for stream in self._streams:
+            stream.end()
+        return logs
+
+    def _ready(self, turn: int) -> bool:
+        """Whether the step can be replayed: every turn is captured when turn 0 comes after the warm-up."""
+        if turn != 0 or self._eager < WARM_UP * self._period:
+            if turn == 0:
+                self._before = python_state(self._trained)
+            return False
+        try:
+            if changed := changed_in(self._before, python_state(self._trained)):
+                raise RuntimeError(f"{changed} changes from step to step")
+            for stream in self._streams:
+                stream.in_blocks()
+            for each in range(self._period):
+                self._steps[each] = self._captured(each)
+        except Exception as error:  # whatever it is, the step can be run as it is
+            self._give_up(first_line(error))
+            return False
+        return True
+
+    def _captured(self, turn: int) -> tuple[Callable[[], None], list[str], Tensor]:
+        assert self._capture is not None
+        names: list[str] = []
+
+        def step() -> Tensor:
+            for stream in self._streams:
+                stream.begin(turn)
+            logs = self._step(turn)
+            for stream in self._streams:
+                stream.end()
+            names.extend(logs)
+            return torch.stack([value.detach().float().reshape(()) for value in logs.values()])
+
+        replay, values = self._capture(step)
+        return replay, names, values
+
+    def _give_up(self, reason: str) -> None:
+        self._capture, self._steps = None, {}
+        for stream in self._streams:
+            stream.one_by_one()
+        line = f"warning: steps are run one by one, not replayed as a CUDA graph, which is slower: {reason}"
+        print(line, file=sys.stderr, flush=True)
+
+    @contextmanager
+    def _on_side(self) -> Iterator[None]:
+        """A stream of its own, as capturing wants it; what was begun before comes before, what follows after."""
+        if self._side is None:
+            yield
+            return
+        current = torch.cuda.current_stream(self._side.device)
+        self._side.wait_stream(current)
+        with torch.cuda.stream(self._side):
+            yield
+        current.wait_stream(self._side)
+
+
+class CudaCapture:
+    """Captures functions as CUDA graphs that share their memory, since they are replayed one after the other."""
+
+    def __init__(self, stream: torch.cuda.Stream) -> None:
+        self._stream, self._pool = stream, torch.cuda.graph_pool_handle()
+
+    def __call__(self, function: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
+        """See `Capture`."""
+        graph = torch.cuda.CUDAGraph()
+        # thread_local: what other threads do with the GPU meanwhile is no part of it
+        with torch.cuda.graph(graph, self._pool, self._stream, capture_error_mode="thread_local"):
+            result = function()
+        return graph.replay, result
+
+
+State = dict[str, Any]
+
+
+def python_state(objects: Sequence[Any]) -> State:
+    """What Python holds in the attributes of objects, and of the modules and optimisers in them, by name.
+
+    Numbers and strings by value, tensors as they are: one that is put in another's place is a change, which a replayed
+    step would not see; one that is written to is none.
+    """
+    found: State = {}
+    seen: set[int] = set()
+
+    def visit(name: str, value: Any) -> None:
+        if isinstance(value, bool | int | float | str | Tensor):
+            found[name] = value
+            return
+        if id(value) in seen or isinstance(value, RandomStream):
+            return
+        seen.add(id(value))
+        if isinstance(value, Optimizer):
+            visit(f"{name}.param_groups", value.param_groups)
+        elif isinstance(value, Mapping):
+            for key, item in value.items():
+                visit(f"{name}.{key}", item)
+        elif isinstance(value, list | tuple):
+            for number, item in enumerate(value):
+                visit(f"{name}.{number}", item)
+        elif isinstance(value, nn.Module) or any(value is one for one in objects):
+            visit(name, vars(value))
+
+    for one in objects:
+        visit(type(one).__name__, one)
+    return found
+
+
+def changed_in(before: State, after: State) -> str:
+    """Name of an attribute that has changed, empty if none has."""
+    for name in before.keys() | after.keys():
+        one, other = before.get(name), after.get(name)
+        same = one is other if isinstance(one, Tensor) or isinstance(other, Tensor) else one == other
+        if not same:
+            return name
+    return ""
