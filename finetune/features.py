@@ -5,10 +5,13 @@ With `--views 0` every batch is encoded anew instead.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+import hashlib
+from collections.abc import Iterator
+from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
 from typing import Any
+from weakref import WeakValueDictionary
 
 import numpy as np
 import torch
@@ -16,7 +19,7 @@ from torch import Tensor
 
 from finetune.histories import Histories, HistoryOptions, read_both_ends, read_whole
 from vd4rl_pomdp.core.errors import disk_errors
-from vd4rl_pomdp.core.options import Options
+from vd4rl_pomdp.core.options import Options, flat
 from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.core.types import Batch
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
@@ -25,11 +28,13 @@ from vd4rl_pomdp.data.view import Sampler
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.runs.device import Precision, autocast
-from vd4rl_pomdp.runs.files import replacing_file
+from vd4rl_pomdp.runs.files import content_hash, replacing_file
 from vd4rl_pomdp.runs.progress import ProgressLine
 
-CHUNK = 128
-"""Rows that go through the frame encoder at once."""
+CHUNK, GPU_CHUNK = 128, 2048
+"""Rows that go through the frame encoder at once, on a CPU and on a GPU."""
+GPU_GROUP = 4096
+"""Rows of consecutive episodes that a memory reads at once on a GPU; on a CPU it reads one episode after the other."""
 STAGE = "finetune"
 
 
@@ -65,6 +70,8 @@ class FrozenEncoder:
         self._shift, self._seed = shift, seed
         self.device = dataset.t.device
         self._corruption = corruption
+        # on a CPU another batch gives other last digits: there it stays what it was
+        self.chunk, self.group = (CHUNK, 1) if self.device.type == "cpu" else (GPU_CHUNK, GPU_GROUP)
 
     def view(self, number: int) -> View:
         """One draw of corruption and shift; under `emission` all are corrupted alike."""
@@ -77,7 +84,7 @@ class FrozenEncoder:
     def rows(self, rows: Tensor, shift_key: Tensor, view: View) -> Tensor:
         """Frame features (N, F) of (N,) rows, shifted by (N,) keys, in chunks."""
         parts = []
-        for part, key in zip(rows.split(CHUNK), shift_key.split(CHUNK), strict=True):
+        for part, key in zip(rows.split(self.chunk), shift_key.split(self.chunk), strict=True):
             obs = view.observe(part, key)
             with autocast(self.device, self.precision):
                 parts.append(self.encoder.frame(obs).float())
@@ -86,19 +93,43 @@ class FrozenEncoder:
     @torch.no_grad()
     def episode(self, number: int, view: View) -> Tensor:
         """Representations (rows, D) of a whole episode, streamed from its first row."""
-        return read_whole(self.encoder, self.frames(number, view), self.dataset, number)
+        one = range(number, number + 1)
+        return read_whole(self.encoder, self.frames(one, view), self.dataset, one)
 
-    def frames(self, number: int, view: View) -> Tensor:
-        """Frame features (rows, F) of a whole episode; one shift for all of it."""
-        episode = self.dataset.rows_of(number)
-        rows = torch.arange(episode.start, episode.stop, device=self.device)
+    def frames(self, episodes: range, view: View) -> Tensor:
+        """Frame features (rows, F) of consecutive whole episodes; one shift for all of an episode."""
+        whole = self.dataset.rows_of(episodes)
+        rows = torch.arange(whole.start, whole.stop, device=self.device)
         # a memory would take shifts that change from row to row for motion
-        key = derive_keys(view.shifts.seed, torch.tensor([number], device=self.device))
-        return self.rows(rows, key.expand(len(rows)), view)
+        return self.rows(rows, derive_keys(view.shifts.seed, self.dataset.episode[rows]), view)
+
+    def groups(self) -> Iterator[range]:
+        """All episodes in order, so many at a time that they fill no more than `group` rows, each as the longest."""
+        lengths = (self.dataset.episode_end - self.dataset.episode_start).tolist()
+        first, longest = 0, 0
+        for number, length in enumerate(lengths):
+            longest = max(longest, length)
+            if number > first and longest * (number + 1 - first) > self.group:
+                yield range(first, number)
+                first, longest = number, length
+        yield range(first, len(lengths))
+
+    def name(self) -> str:
+        """What decides what every view of the set looks like to the encoder: equal for equal features."""
+        weights = hashlib.blake2b()
+        for value in self.encoder.state_dict().values():
+            weights.update(value.cpu().reshape(-1).view(torch.uint8).numpy())
+        network = [weights.hexdigest(), asdict(self.encoder.config), self.precision]
+        drawn = [self.dataset.fingerprint, flat(self._corruption), self._shift, self._seed]
+        return content_hash([network, drawn, str(self.device), self.chunk, self.group])
+
+
+_ENCODED: WeakValueDictionary[tuple[str, str, int], Tensor] = WeakValueDictionary()
+"""Features that a training of this process still uses, by all that decides them."""
 
 
 def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: Path) -> Tensor:
-    """Encode the whole set under `views` draws, or read what this run encoded before.
+    """Encode the whole set under `views` draws, unless a training of this process did, or this run before.
 
     Args:
         frozen: the encoder and its set.
@@ -108,23 +139,32 @@ def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: 
 
     Returns:
         (views, features, D) on the data set's device, float16 of pixels and float32 of simulator states, which may
-        hardly differ and are then scaled up; numbered as `Histories` says.
+        hardly differ and are then scaled up; numbered as `Histories` says. Not to be written to: trainings on the same
+        features share them.
     """
-    if kept.exists():
-        with disk_errors(kept):
-            return torch.from_numpy(np.load(kept)).to(frozen.device)
-    episodes, dtype = frozen.dataset.num_episodes, np.float32 if frozen.encoder.reads_state else np.float16
-    features = np.empty((views, histories.features, frozen.encoder.dim), dtype)
-    with torch.no_grad(), ProgressLine("encode", views * episodes, "episodes") as progress:
+    key = frozen.name(), histories.name(), views
+    if (features := _ENCODED.get(key)) is None:
+        if kept.exists():
+            with disk_errors(kept):
+                features = torch.from_numpy(np.load(kept)).to(frozen.device)
+        else:
+            features = _encode(frozen, histories, views)
+            with replacing_file(kept) as fresh, fresh.open("wb") as file:
+                np.save(file, features.cpu().numpy())
+        _ENCODED[key] = features
+    return features
+
+
+def _encode(frozen: FrozenEncoder, histories: Histories, views: int) -> Tensor:
+    dtype = torch.float32 if frozen.encoder.reads_state else torch.float16
+    features = torch.empty((views, histories.features, frozen.encoder.dim), dtype=dtype, device=frozen.device)
+    with torch.no_grad(), ProgressLine("encode", views * frozen.dataset.num_episodes, "episodes") as progress:
         for number in range(views):
             view, random = frozen.view(number), histories.of_view(number)
-            for episode in range(episodes):
-                frames = frozen.frames(episode, view)
-                random.fill(torch.from_numpy(features[number]), frozen.encoder, frames, episode)
-                progress.advance()
-    with replacing_file(kept) as fresh, fresh.open("wb") as file:
-        np.save(file, features)
-    return torch.from_numpy(features).to(frozen.device)
+            for episodes in frozen.groups():
+                random.fill(features[number], frozen.encoder, frozen.frames(episodes, view), episodes)
+                progress.advance(len(episodes))
+    return features
 
 
 class FeatureSampler:

@@ -9,7 +9,7 @@ begin at random rows instead: both ends of such a transition are then read from 
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
 import torch
@@ -20,6 +20,7 @@ from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.core.seeding import stream_generator
 from vd4rl_pomdp.data import Dataset
 from vd4rl_pomdp.nn.encoder import Encoder, Readout
+from vd4rl_pomdp.runs.files import content_hash
 
 
 @dataclass(frozen=True)
@@ -76,7 +77,7 @@ class Histories:
             n_step: rows from one end of a transition to the other; fewer at an episode's end.
             seed: the run's seed.
         """
-        self.dataset, self._seed = dataset, seed
+        self.dataset, self._n_step, self._seed = dataset, n_step, seed
         self._options = options if isinstance(options, HistoryOptions) else HistoryOptions()
         self.rows = dataset.transition_rows
         """(M,) int64: first end of every transition."""
@@ -86,6 +87,10 @@ class Histories:
         """R."""
         self.features = dataset.num_rows + 2 * self.random
         """Features of a view."""
+
+    def name(self) -> str:
+        """What decides which features of a view there are: equal for equal ones."""
+        return content_hash([asdict(self._options), self._n_step, self._seed]) if self.random else ""
 
     def of_view(self, view: int) -> RandomHistories:
         """What is drawn for a view."""
@@ -117,34 +122,39 @@ class RandomHistories:
         first[self.chosen], last[self.chosen] = fresh, fresh + len(self.chosen)
         return first, last
 
-    def fill(self, out: Tensor, encoder: Encoder, frames: Tensor, episode: int) -> None:
-        """Write an episode's features into a view's.
+    def fill(self, out: Tensor, encoder: Encoder, frames: Tensor, episodes: range) -> None:
+        """Write the features of consecutive episodes into a view's.
 
         Args:
             out: (features, D), numbered as `Histories` says.
             encoder: with a memory, if any history is random.
-            frames: (L, F) frame features of the episode's rows.
-            episode: its number.
+            frames: (rows, F) frame features of the episodes' rows.
+            episodes: their numbers.
         """
         dataset = self.histories.dataset
-        whole = dataset.rows_of(episode)
-        out[whole] = read_whole(encoder, frames, dataset, episode)
+        whole = dataset.rows_of(episodes)
+        out[whole] = read_whole(encoder, frames, dataset, episodes)
         row = self.histories.rows[self.chosen]
         mine = torch.nonzero((row >= whole.start) & (row < whole.stop))[:, 0]
         if len(mine):
             row, last = row[mine], self.histories.ends[self.chosen[mine]]
             # both ends from one beginning: else z' would remember rows that z does not
-            first = (row - self.length[mine] + 1).clamp(min=whole.start)
+            first = torch.maximum(row - self.length[mine] + 1, dataset.episode_start[dataset.episode[row]])
             z, next_z = read_both_ends(encoder, lambda rows: frames[rows - whole.start], dataset, first, row, last)
             number = (dataset.num_rows + mine).to(out.device)
             out[number], out[number + len(self.chosen)] = z.to(out), next_z.to(out)
 
 
-def read_whole(encoder: Encoder, frames: Tensor, dataset: Dataset, episode: int) -> Tensor:
-    """Representations (L, D) of an episode's rows, whose (L, F) frame features are given, from its first row on."""
-    whole = dataset.rows_of(episode)
-    rows = torch.arange(whole.start, whole.stop, device=frames.device)
-    return encoder.from_features(frames[None], dataset.actions_before(rows)[None])[0]
+def read_whole(encoder: Encoder, frames: Tensor, dataset: Dataset, episodes: range) -> Tensor:
+    """Representations (rows, D) of consecutive episodes from their first rows on, given their (rows, F) features."""
+    if not encoder.remembers:
+        return frames
+    first, end = (ends[episodes.start : episodes.stop, None] for ends in (dataset.episode_start, dataset.episode_end))
+    span = torch.arange(int((end - first).max()), device=frames.device)
+    # shorter episodes repeat their last row behind it, which a forward memory cannot know of
+    rows = torch.minimum(first + span, end - 1)
+    states = encoder.from_features(frames[rows - rows[0, 0]], dataset.actions_before(rows))
+    return states[first + span < end]
 
 
 def read_both_ends(

@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder, encode_views
-from finetune.histories import Histories
+from finetune.histories import Histories, HistoryOptions
 from tests.helpers_data import fake_action, fake_reward, fake_rows, write_fake_set
 from vd4rl_pomdp.core.options import NO_OPTIONS
 from vd4rl_pomdp.core.streams import RandomStream
@@ -41,9 +41,9 @@ def test_every_field_of_a_batch_is_of_one_transition_and_both_ends_of_one_view(t
     assert drawn == {(view, row) for view in range(VIEWS) for row in starts}
 
 
-def noise_set(folder, first_action: float = 0.0) -> Dataset:
+def noise_set(folder, first_action: float = 0.0, lengths: tuple[int, ...] = LENGTHS) -> Dataset:
     """Episodes of random pixels; the first row of each stores an action that nobody took."""
-    rows = fake_rows(LENGTHS)
+    rows = fake_rows(lengths)
     rows["observation"] = np.random.default_rng(0).integers(1, 256, rows["observation"].shape, dtype=np.uint8)
     rows["action"][rows["step_type"] == 0] = first_action
     folder.mkdir()
@@ -51,11 +51,13 @@ def noise_set(folder, first_action: float = 0.0) -> Dataset:
     return open_dataset(folder)
 
 
-def frozen(dataset: Dataset, corruption: CorruptionConfig, shift: int) -> FrozenEncoder:
+def frozen(
+    dataset: Dataset, corruption: CorruptionConfig, shift: int, seed: int = 0, **settings: object
+) -> FrozenEncoder:
     torch.manual_seed(0)
-    config = EncoderConfig(6, "nature", 16, "gru", use_actions=True, hidden_dim=8)
-    encoder = Encoder(config).eval().requires_grad_(False)
-    return FrozenEncoder(encoder, dataset, corruption, shift, "fp32", 0)
+    told = {"history": "gru", "use_actions": True, "hidden_dim": 8} | settings
+    encoder = Encoder(EncoderConfig(6, "nature", 16, **told)).eval().requires_grad_(False)
+    return FrozenEncoder(encoder.to(dataset.t.device), dataset, corruption, shift, "fp32", seed)
 
 
 def views_of(tmp_path, corruption: str, mode: str, shift: int) -> torch.Tensor:
@@ -102,3 +104,64 @@ def test_exact_batches_agree_with_cached_features(encoder, data):
     torch.testing.assert_close(batch.z, cached[rows], atol=1e-5, rtol=1e-4)
     next_rows = torch.minimum(rows + 3, dataset.episode_end[dataset.episode[rows]] - 1)
     torch.testing.assert_close(batch.next_z, cached[next_rows], atol=1e-5, rtol=1e-4)
+
+
+MEMORIES = {"none": {"history": "none"}, "whole": {}, "window": {"history_window": 3}}
+OPTIONS = HistoryOptions(random_histories=0.5, shortest_history=1, longest_history=3)
+
+
+@pytest.mark.parametrize("memory", MEMORIES)
+@pytest.mark.parametrize(("chunk", "group"), [(3, 10), (100, 100)])
+def test_episodes_that_are_encoded_together_are_as_one_by_one(tmp_path, memory, chunk, group):
+    """As on a GPU: rows of several episodes in one batch, and memories that read episodes of uneven length at once."""
+    dataset, found = noise_set(tmp_path / "set", 0.9, (6, 4, 1, 5, 9)), []
+    for together in (False, True):
+        made = frozen(dataset, CorruptionConfig.of("patch+zero_frames"), 4, **MEMORIES[memory])
+        if together:
+            made.chunk, made.group = chunk, group
+        assert max(map(len, made.groups())) == (1 if not together else 2 if group == 10 else 5)
+        histories = Histories(dataset, NO_OPTIONS if memory == "none" else OPTIONS, N, 0)
+        found.append(encode_views(made, histories, 2, tmp_path / str(together)))
+    torch.testing.assert_close(found[1], found[0], atol=2e-3, rtol=0)
+    assert found[0].float().std(1).mean() > 2e-2, "rows differ"
+
+
+def test_a_process_encodes_once_for_all_trainings_that_see_the_same(tmp_path):
+    dataset, patch = noise_set(tmp_path / "set"), CorruptionConfig.of("patch")
+    whole, random = (Histories(dataset, options, N, 0) for options in (NO_OPTIONS, OPTIONS))
+    kept = iter(tmp_path / f"{number}.npy" for number in range(99))
+    first = encode_views(frozen(dataset, patch, 4), whole, 2, next(kept))
+    assert encode_views(frozen(dataset, patch, 4), whole, 2, tmp_path / "no.npy") is first
+    assert not (tmp_path / "no.npy").exists(), "one file is enough to resume from"
+    assert encode_views(frozen(dataset, patch, 4), Histories(dataset, NO_OPTIONS, 3, 1), 2, tmp_path / "no") is first
+    others = [
+        (frozen(dataset, patch, 4, seed=1), whole, 2),
+        (frozen(dataset, patch, 3), whole, 2),
+        (frozen(dataset, CorruptionConfig.of("patch", patch_size=8), 4), whole, 2),
+        (frozen(dataset, patch, 4, use_actions=False), whole, 2),
+        (frozen(noise_set(tmp_path / "other", 0.9), patch, 4), whole, 2),
+        (frozen(dataset, patch, 4), whole, 3),
+        (frozen(dataset, patch, 4), random, 2),
+        (frozen(dataset, patch, 4), Histories(dataset, OPTIONS, N, 1), 2),
+        (frozen(dataset, patch, 4), Histories(dataset, OPTIONS, 1, 0), 2),
+    ]
+    own = [encode_views(*other, next(kept)) for other in others]
+    assert len({id(features) for features in [first, *own]}) == len(others) + 1
+    moved = frozen(dataset, patch, 4)
+    moved.encoder.gru.weight_ih_l0.data += 1
+    assert not torch.equal(encode_views(moved, whole, 2, next(kept)), first)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("memory", MEMORIES)
+def test_a_gpu_encodes_what_a_cpu_does(tmp_path, memory):
+    options = NO_OPTIONS if memory == "none" else OPTIONS
+    noise_set(tmp_path / "set", 0.9, (60, 40, 1, 50, 90) * 20)
+    found = {}
+    for device in ("cpu", "cuda"):
+        dataset = open_dataset(tmp_path / "set").to(device)
+        made = frozen(dataset, CorruptionConfig.of("patch+zero_frames"), 4, **MEMORIES[memory])
+        found[device] = encode_views(made, Histories(dataset, options, N, 0), 2, tmp_path / f"{device}.npy")
+        assert found[device].device.type == device
+        assert np.array_equal(np.load(tmp_path / f"{device}.npy"), found[device].cpu().numpy())
+    torch.testing.assert_close(found["cuda"].cpu(), found["cpu"], atol=1e-2, rtol=0)  # TF32

@@ -123,9 +123,10 @@ class Dataset:
                 f"{self.path}: stores no simulator states; `data collect` makes sets of dm_control's tasks that do"
             )
 
-    def rows_of(self, episode: int) -> slice:
-        """The rows of an episode."""
-        return slice(int(self.episode_start[episode]), int(self.episode_end[episode]))
+    def rows_of(self, episode: int | range) -> slice:
+        """The rows of an episode, or of consecutive ones."""
+        first, last = (episode, episode) if isinstance(episode, int) else (episode[0], episode[-1])
+        return slice(int(self.episode_start[first]), int(self.episode_end[last]))
 
     def states(self) -> Tensor:
         """(N, P') float32 poses and velocities on the set's device; raises UserError if the set has no states."""

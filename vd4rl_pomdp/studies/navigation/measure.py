@@ -34,8 +34,8 @@ def evaluate(probed: ProbedObjective) -> tuple[dict[str, float], dict[str, float
     probed.objective.eval()
     for number in probed.data.spread(probed.config.evaluation_windows, held_out=True):
         with autocast(probed.device, probed.config.precision):
-            _, logs = probed.loss(probed.data.windows(number), 1.0)
-        errors.add(*probed.states, probed.config.burn_in)
+            _, logs, states = probed.measured(probed.data.windows(number), 1.0)
+        errors.add(*states, probed.config.burn_in)
         count += len(number)
         for name, value in logs.items():
             sums[name] += float(value) * len(number)

@@ -51,18 +51,27 @@ class ProbedObjective(Objective):
         return next(self.parameters()).device
 
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Objective's and probe's loss of one batch, whose frames are encoded once."""
+        """Objective's and probe's loss of one batch; its errors count until `take_errors`."""
+        loss, logs, states = self.measured(window, progress)
+        with torch.autocast(self.device.type, enabled=False):
+            self.errors.add(*states, self.config.burn_in)
+        return loss, logs
+
+    def measured(
+        self, window: Windows, progress: float | Tensor
+    ) -> tuple[Tensor, dict[str, Tensor], tuple[Tensor, Tensor, Tensor]]:
+        """The loss of one batch, whose frames are encoded once, with its estimated and true states and which of them
+        were hidden."""
         past, future = self.objective.representations(window)
         rows = self.data.dataset.rows(window.key)
         supervised = self.config.method in SUPERVISED
         estimate, truth = self.probe(past, frozen=not supervised), self.data.states.values[rows]
         error = (estimate.float() - truth).square().mean()
-        with torch.autocast(error.device.type, enabled=False):
-            self.errors.add(estimate, truth, self.data.states.hidden[rows], self.config.burn_in)
+        states = (estimate, truth, self.data.states.hidden[rows])
         if supervised:
-            return error, {"loss": error.detach()}
+            return error, {"loss": error.detach()}, states
         loss, logs = self.objective.loss_of(past, future, window, progress)
-        return loss + error, logs | {"probe_loss": error.detach()}
+        return loss + error, logs | {"probe_loss": error.detach()}, states
 
     def after_step(self) -> None:
         """The objective's."""
