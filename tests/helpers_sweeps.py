@@ -3,6 +3,7 @@
 import json
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 from vd4rl_pomdp.runs.run import recipe
@@ -12,15 +13,18 @@ from vd4rl_pomdp.sweeps.plan import Job
 RECORD = {"stage": "pretrain", "config": {"seed": 0}, "inputs": {"data": "its set"}}
 PROGRAM = """
 import json, os, sys, time
+from contextlib import ExitStack
 from pathlib import Path
 from vd4rl_pomdp.runs.outputs import owned
-folder, script = Path(sys.argv[1]), Path(sys.argv[1] + ".script")
-with owned(folder):
+
+def do(folder):
+    script = Path(f"{folder}.script")
     if (folder / "timing.json").exists():  # another driver was faster
-        sys.exit()
+        return
     with (folder / "begun").open("a") as file:
         seen = {name: os.environ.get(name) for name in ("OMP_NUM_THREADS", "CUDA_VISIBLE_DEVICES")}
-        print(json.dumps(seen | {"time": time.time(), "cores": len(os.sched_getaffinity(0))}), file=file)
+        seen |= {"time": time.time(), "cores": len(os.sched_getaffinity(0)), "process": os.getpid()}
+        print(json.dumps(seen), file=file)
     ends = json.loads(script.read_text()) if script.exists() else []
     script.write_text(json.dumps(ends[1:]))
     end = ends[0] if ends else "done"
@@ -29,12 +33,22 @@ with owned(folder):
     print("its last line", flush=True)
     if end == "kill":
         os.kill(os.getpid(), 9)
+    if end == "defect":
+        raise ValueError("what is wrong\\nand more of it")
     if isinstance(end, int):
         sys.exit(end)
     (folder / "config.json").write_text(json.dumps(RECORD))
     (folder / "timing.json").write_text("{}")
     with (folder / "ended").open("a") as file:
         print(time.time(), file=file)
+
+words = sys.argv[1:]
+folders = [Path(words[at + 1]) for at, word in enumerate(words) if word == "--out"] or [Path(words[0])]
+with ExitStack() as stack:
+    for folder in folders:
+        stack.enter_context(owned(folder))
+    for folder in folders:
+        do(folder)
 """
 
 
@@ -45,11 +59,18 @@ def job(out: Path, name: str, *needs: str, ends: tuple[int | str, ...] = ()) -> 
         out: the sweep's folder.
         name: the job's.
         needs: names of jobs before it.
-        ends: exit codes, "kill" (SIGKILL), or "wait" (well, once OUT/go is there).
+        ends: exit codes, "kill" (SIGKILL), "defect" (a traceback), or "wait" (well, once OUT/go is there).
     """
     out.mkdir(exist_ok=True)
     (out / f"{name}.script").write_text(json.dumps(ends))
     return Job(name, "pretrain", out / name, [str(out / name)], list(needs), recipe=recipe(RECORD, {}))
+
+
+def policy(out: Path, name: str, *needs: str, ends: tuple[int | str, ...] = (), updates: int = 40) -> Job:
+    """Likewise a fine-tuning, which may be stacked with those of as many updates."""
+    encoder = out / (needs[-1] if needs else name) / "encoder"
+    words = ["finetune", "--updates", str(updates), "--encoder", str(encoder), "--out", str(out / name)]
+    return replace(job(out, name, *needs, ends=ends), section="finetune", words=words)
 
 
 def keep_plan(out: Path, *jobs: Job, name: str = "plan") -> Plan:

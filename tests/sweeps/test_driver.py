@@ -50,7 +50,8 @@ def test_every_job_runs_once_after_those_it_needs_so_many_at_a_time(tmp_path, at
 
 
 @pytest.mark.parametrize(("end", "cause", "attempts"), [
-    ("kill", "killed", TRIES), (TEMPORARY, "unavailable", TRIES), (1, "failed", 1), (2, "failed", 1),
+    ("kill", "killed", TRIES), (TEMPORARY, "unavailable", TRIES), ("defect", "failed", 1), (1, "failed", 1),
+    (2, "failed", 1),
 ])  # fmt: skip
 def test_what_can_pass_is_tried_again_what_fails_is_told_and_the_rest_goes_on(tmp_path, capsys, end, cause, attempts):
     bad, after, other = jobs = [
@@ -64,7 +65,8 @@ def test_what_can_pass_is_tried_again_what_fails_is_told_and_the_rest_goes_on(tm
     main(["sweep", "status", str(tmp_path), "--json"])
     told = json.loads(capsys.readouterr().out)
     assert told["states"] == {"bad": "failed", "after": "blocked", "other": "done"}
-    assert told["failures"]["bad"]["line"] == "its last line"
+    line = "ValueError: what is wrong" if end == "defect" else "its last line"
+    assert told["failures"]["bad"]["line"] == line
     main(["sweep", "retry", str(tmp_path)])
     assert capsys.readouterr().out == "all 3 jobs are finished\n"
     assert (len(begun(bad)), len(begun(other))) == (attempts + 1, 1)
@@ -75,7 +77,7 @@ def test_a_failed_sweep_ends_with_each_failure_in_a_line_and_what_to_do(tmp_path
     with pytest.raises(SystemExit, match="1"):
         main(["sweep", "retry", str(tmp_path)])
     told = capsys.readouterr()
-    assert told.err.splitlines()[-1] == "failed: bad: its last line"
+    assert told.err.splitlines()[-1] == f"failed: bad: its last line (see {tmp_path}/sweep/logs/bad.log)"
     program = tmp_path / "program.py"
     line = f"1 of 1 jobs are not finished, 1 failed; `python {program} sweep retry {tmp_path}` takes those up again\n"
     assert told.out == line

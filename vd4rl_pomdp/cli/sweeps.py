@@ -99,24 +99,28 @@ def run(words: list[str], program: str) -> None:
     for warning in warnings:
         print(f"warning: {warning}", file=sys.stderr)
     if asked.dry_run:
-        _print_plan(jobs)
+        _print_plan(jobs, getattr(asked.options, "stack", 1))
         return
     plan = folder.keep_plan(name, jobs, own_program())
     carry_out([plan], folder, asked.executor, asked.options, name)
 
 
-def _print_plan(jobs: list[Job]) -> None:
-    """Every job as one line of shell, and what is shared."""
+def _print_plan(jobs: list[Job], stack: int) -> None:
+    """Every job as one line of shell, what is shared, and how many processes that makes."""
+    from vd4rl_pomdp.sweeps.stacks import in_stacks
+
     users = Counter(name for job in jobs for name in job.needs)
-    left = 0
+    left: list[Job] = []
     for job in jobs:
         done = job.finished
         shared = f", for {users[job.name]} jobs" if users[job.name] > 1 else ""
-        print(f"# {job.name}: {'done' if done else 'goes on' if job.begun else 'new'}{shared}")
+        print(f"# {job.name}: {'done' if done else 'resumes' if job.begun else 'new'}{shared}")
         if not done:
             print(f"{program_here()} {shlex.join(job.words)}")
-            left += 1
-    print(f"# {len(jobs)} jobs, {len(jobs) - left} done, {left} to do")
+            left.append(job)
+    processes = len(in_stacks(left, stack, {}))
+    packed = f" in at least {processes} processes" if processes < len(left) else ""
+    print(f"# {len(jobs)} jobs, {len(jobs) - len(left)} done, {len(left)} to do{packed}")
 
 
 def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, name: str = "") -> None:
@@ -131,7 +135,7 @@ def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, n
     """
     from vd4rl_pomdp.sweeps.clusters import RayCluster, SlurmCluster, watch
     from vd4rl_pomdp.sweeps.driver import Driver
-    from vd4rl_pomdp.sweeps.folder import jobs_of, status
+    from vd4rl_pomdp.sweeps.folder import failure, jobs_of, status
 
     if JOB_VARIABLE in os.environ:
         raise UserError("a job cannot start a sweep: end the file in `main()`, which reads the job's own command line")
@@ -143,8 +147,8 @@ def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, n
     jobs = jobs_of(plans)
     if not finished:
         found = status(jobs, folder.attempts(jobs))
-        for job, row in found["failures"].items():
-            print(f"failed: {job}: {row['line']}", file=sys.stderr)
+        for row in found["failures"].values():
+            print(failure(row, folder.out), file=sys.stderr)
         left = f"{len(jobs) - found['counts'].get('done', 0)} of {len(jobs)} jobs are not finished"
         retry = f"sweep retry {shlex.quote(str(folder.out))}" + (f" --executor {kind}" if kind != "local" else "")
         same = "" if kind == "local" else ", given this command's flags,"
@@ -156,7 +160,7 @@ def carry_out(plans: list[Plan], folder: SweepFolder, kind: str, options: Any, n
 
 @command
 def show_status(out: tyro.conf.Positional[Path], json: bool = False) -> None:
-    """Show where a sweep stands: counts, rate, time left, and failures with their last line.
+    """Show where a sweep stands: counts, rate, time left, and failures with their error and log.
 
     Args:
         out: Folder of the sweep.
@@ -170,7 +174,7 @@ def show_status(out: tyro.conf.Positional[Path], json: bool = False) -> None:
     if json:
         show(found, True)
     else:
-        print(*in_lines(found), sep="\n")
+        print(*in_lines(found, out), sep="\n")
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -197,7 +201,12 @@ def retry(words: list[str], program: str) -> None:
 
 @command
 def join(
-    out: tyro.conf.Positional[Path], plan: str = "", jobs: int = 0, jobs_per_gpu: int = 1, threads: int = 0
+    out: tyro.conf.Positional[Path],
+    plan: str = "",
+    jobs: int = 0,
+    jobs_per_gpu: int = 1,
+    threads: int = 0,
+    stack: int = 1,
 ) -> None:
     """Help with a sweep on this machine: take jobs that nobody has, and end when there is none to take.
 
@@ -209,11 +218,12 @@ def join(
         jobs: Jobs at a time on this machine; 0: as many as its GPUs take, or one without a GPU.
         jobs_per_gpu: Jobs at a time on each GPU.
         threads: CPU threads of a job; 0: its share of the machine's cores.
+        stack: Most fine-tunings that one process trains as a stack, which counts as one job at a time.
     """
     from vd4rl_pomdp.sweeps.driver import Driver
     from vd4rl_pomdp.sweeps.folder import SweepFolder
 
-    options = LocalOptions(jobs, jobs_per_gpu, threads)
+    options = LocalOptions(jobs, jobs_per_gpu, threads, stack)
     options.check()
     folder = SweepFolder(out)
     finished = Driver(folder.plans_to_do(plan), options, folder, helps=True).run()

@@ -46,6 +46,12 @@ class EncoderConfig:
     memory_options: dict[str, Any] = field(default_factory=dict)
     """What else the memory was told, by name."""
 
+    @property
+    def dim(self) -> int:
+        """Width of the representation."""
+        widths = {"frame": self.feature_dim, "state": self.hidden_dim}
+        return widths["frame"] if self.history == "none" else sum(widths[part] for part in self.readout.split("+"))
+
 
 @dataclass(frozen=True)
 class EncoderCard:
@@ -166,8 +172,7 @@ class Encoder(nn.Module):
     @property
     def dim(self) -> int:
         """Width of the representation."""
-        widths = {"frame": self.config.feature_dim, "state": self.config.hidden_dim}
-        return sum(widths[part] for part in self.config.readout.split("+")) if self.memory else widths["frame"]
+        return self.config.dim
 
     @property
     def remembers(self) -> bool:

@@ -25,6 +25,7 @@ from vd4rl_pomdp.runs.outputs import in_use
 from vd4rl_pomdp.sweeps.driver import PATIENCE_S, Driver, say
 from vd4rl_pomdp.sweeps.folder import Plan, SweepFolder, is_finished, jobs_of, lost_among
 from vd4rl_pomdp.sweeps.options import LocalOptions, RayOptions, SlurmOptions
+from vd4rl_pomdp.sweeps.stacks import in_stacks
 
 LOOK_S = 15.0
 """Seconds between two looks at the cluster."""
@@ -90,7 +91,8 @@ def watch(plans: list[Plan], cluster: SlurmCluster | RayCluster, folder: SweepFo
                 vain = 0
             try:
                 live = cluster.live()
-                wanted = min(cluster.tasks, -(-len(could) // cluster.local.jobs)) - live
+                processes = len(in_stacks(could, cluster.local.stack, attempts))
+                wanted = min(cluster.tasks, -(-processes // cluster.local.jobs)) - live
                 if wanted > 0:
                     vain += not live  # tasks that wait in the queue, perhaps for days, are not in vain
                     if vain > VAIN:
@@ -130,7 +132,7 @@ class SlurmCluster:
             if shutil.which(name) is None:
                 raise UserError(f"--executor slurm finds no {name} here: start the sweep where Slurm's commands are")
         self.folder, self.tasks = folder, options.tasks
-        self.local = LocalOptions(options.jobs_per_task, options.jobs_per_task)
+        self.local = LocalOptions(options.jobs_per_task, options.jobs_per_task, stack=options.stack)
         digest = hashlib.blake2b(str(folder.resolve()).encode(), digest_size=4).hexdigest()
         self._name = f"vd4rl-pomdp-{digest}"
         self._executor = submitit.AutoExecutor(folder, cluster="slurm")
@@ -206,7 +208,7 @@ class RayCluster:
         except ImportError as error:
             raise UserError("--executor ray needs Ray: pip install '.[ray]' in a clone of vd4rl-pomdp") from error
         self._ray, self._options, self.folder = ray, options, folder
-        self.local = LocalOptions(jobs=1, threads=max(1, int(options.cpus)))
+        self.local = LocalOptions(jobs=1, threads=max(1, int(options.cpus)), stack=options.stack)
         self._running: list[Any] = []
         before = signal.getsignal(signal.SIGTERM)  # which Ray would answer in its own way
         try:

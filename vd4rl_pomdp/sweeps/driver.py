@@ -13,7 +13,7 @@ import socket
 import subprocess
 import sys
 import time
-from collections.abc import Iterable
+from collections.abc import Hashable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -37,6 +37,7 @@ from vd4rl_pomdp.sweeps.folder import (
 from vd4rl_pomdp.sweeps.options import LocalOptions
 from vd4rl_pomdp.sweeps.own_file import JOB_VARIABLE
 from vd4rl_pomdp.sweeps.plan import Job
+from vd4rl_pomdp.sweeps.stacks import in_stacks, kind_of, runs_alone, width_of, words_of_stack
 
 POLL_S = 0.5
 PAUSE_S = 60.0
@@ -61,7 +62,8 @@ class Place:
 
 @dataclass(frozen=True)
 class _Running:
-    job: Job
+    jobs: list[Job]
+    """Several: a stack."""
     place: Place
     process: subprocess.Popen
     began: float
@@ -85,13 +87,15 @@ class Driver:
         self._plans = {job.name: plan for plan in plans for job in plan.jobs}
         self._jobs = {job.name: job for job in jobs_of(plans)}
         self._left = {name: job for name, job in self._jobs.items() if not is_finished(job)}
-        self._free, self._threads = places(options), options.threads
+        self._free, self._threads, self._stack = places(options), options.threads, options.stack
         self._folder, self._helps = folder, helps
         self._running: list[_Running] = []
         self._not_before: dict[str, float] = {}
         """When to look again at what others have, or what has just failed."""
         self._busy = time.monotonic()
         """When something last ran."""
+        self._widths: dict[str, int | None] = {}
+        """Of what fine-tunings are given, once their encoders are there."""
 
     def run(self) -> bool:
         """Work until nothing is left that can be done; whether all is finished."""
@@ -108,7 +112,8 @@ class Driver:
     def _look(self) -> bool:
         """Start every job that can be; whether there is anything left to wait for."""
         attempts = self._folder.attempts(self._jobs.values())  # other drivers', too
-        lost, running = lost_among(self._left.values(), attempts), {one.job.name for one in self._running}
+        lost = lost_among(self._left.values(), attempts)
+        running = {job.name for one in self._running for job in one.jobs}
         ready = []
         for job in self._left.values():
             rests = self._not_before.get(job.name, 0) > time.monotonic()
@@ -116,16 +121,42 @@ class Driver:
                 rests |= last["cause"] in PASSING and time.time() < last["ended"] + PAUSE_S
             if not rests and job.name not in lost | running and self._left.keys().isdisjoint(job.needs):
                 ready.append(job)
-        if self._helps:
-            random.shuffle(ready)  # or all drivers would start the same one
-        for job in ready:
-            # Asked job by job: starting the ones before took time in which another driver may have begun this one.
-            if self._free and not self._is_anothers(job):
-                self._begin(job)
+        for jobs in self._in_processes(ready, attempts, lost, running) if self._free else ():
+            # Asked now: starting the ones before took time in which another driver may have begun these.
+            if self._free and (mine := [job for job in jobs if not self._is_anothers(job)]):
+                self._begin(mine)
         if self._running:
             self._busy = time.monotonic()
         idle = self._helps and time.monotonic() - self._busy > IDLE_S
         return len(self._left) > len(lost) and not idle
+
+    def _in_processes(
+        self, ready: list[Job], attempts: Mapping[str, list[Row]], lost: set[str], running: set[str]
+    ) -> list[list[Job]]:
+        """Ready jobs by process, in the order to start them in; a stack that is about to grow is left out."""
+
+        def alike(job: Job) -> Hashable:
+            if self._stack == 1 or not (kind := kind_of(job)):
+                return None
+            plan = self._plans[job.name]
+            if job.name not in self._widths:
+                self._widths[job.name] = width_of(job, plan.made_in)
+            return plan.made_in, tuple(plan.program), self._widths[job.name], kind
+
+        # Only for what comes when a job that runs here ends: for anything else a place would be idle too long.
+        waiting = {job.name: self._left.keys() & job.needs for job in self._left.values() if job.name not in lost}
+        soon = {kind_of(self._left[name]) for name, needs in waiting.items() if needs and needs <= running}
+        now, later = [], []
+        for jobs in in_stacks(ready, self._stack, attempts, alike):
+            kind = kind_of(jobs[0])
+            if len(jobs) == self._stack or not kind or runs_alone(attempts[jobs[0].name]):
+                now.append(jobs)
+            elif kind not in soon:
+                later.append(jobs)  # after the pretrainings, which may add to it
+        if self._helps:
+            for some in (now, later):
+                random.shuffle(some)  # or all drivers would start the same one
+        return now + later
 
     def _is_anothers(self, job: Job) -> bool:
         """Whether another process is at a job, or has finished it; asked in this order, it cannot end in between."""
@@ -137,46 +168,59 @@ class Driver:
             return False
         return True
 
-    def _begin(self, job: Job) -> None:
-        log, place = self._folder.path / "logs" / f"{job.name}.log", self._free[0]
+    def _log(self, job: Job) -> Path:
+        return self._folder.path / "logs" / f"{job.name}.log"
+
+    def _begin(self, jobs: list[Job]) -> None:
+        log, place = self._log(jobs[0]), self._free[0]
         try:
             with disk_errors(log):
-                log.parent.mkdir(parents=True, exist_ok=True)
+                for job in jobs:
+                    self._log(job).parent.mkdir(parents=True, exist_ok=True)
+                for job in jobs[1:]:
+                    with self._log(job).open("a", encoding="utf-8") as file:
+                        print(f"in one process with {jobs[0].name}: see {log}", file=file)
                 size = log.stat().st_size if log.exists() else 0
-                process = start(job.words, self._plans[job.name], log, place, self._threads)
+                process = start(words_of_stack(jobs), self._plans[jobs[0].name], log, place, self._threads)
         except UserError as error:
-            self._end(job, UNAVAILABLE, 0.0, str(error))
+            self._end(jobs, UNAVAILABLE, 0.0, str(error))
             return
         self._free.remove(place)
-        self._running.append(_Running(job, place, process, time.monotonic(), log, size))
+        self._running.append(_Running(jobs, place, process, time.monotonic(), log, size))
 
     def _collect(self) -> None:
         for one in [one for one in self._running if one.process.poll() is not None]:
             self._running.remove(one)
             self._free.append(one.place)
             cause = cause_of(one.process.returncode)
-            line = "" if cause == DONE else _last_line(one.log, one.log_size)
-            self._end(one.job, cause, time.monotonic() - one.began, line)
+            line = "" if cause == DONE else _line_of_end(one.log, one.log_size)
+            self._end(one.jobs, cause, time.monotonic() - one.began, line)
 
-    def _end(self, job: Job, cause: str, seconds: float, line: str) -> None:
-        """Keep the row of an attempt, and tell it."""
-        finished = is_finished(job)
-        if not finished and cause == FAILED and in_use(job.folder):  # another driver was faster: no attempt
-            self._not_before[job.name] = time.monotonic() + IN_USE_S
-            return
-        if finished:
-            self._left.pop(job.name, None)
-        elif cause == DONE:
-            cause, line = FAILED, f"{job.folder}: holds nothing finished, though the command ended well"
-        if cause in PASSING:
-            self._not_before[job.name] = time.monotonic() + PAUSE_S
-        row: Row = {"job": job.name, "cause": cause, "line": line, "ended": round(time.time(), 1)}
-        row |= {"seconds": round(seconds, 1), "host": socket.gethostname(), "words": job.words}
-        try:
-            self._folder.add(row)
-        except UnavailableError as error:
-            print(f"warning: {error}", file=sys.stderr)
-        say(row, len(self._jobs) - len(self._left), len(self._jobs))
+    def _end(self, jobs: list[Job], cause: str, seconds: float, line: str) -> None:
+        """Keep the rows of an attempt, and tell them."""
+        told: Row = {"ended": round(time.time(), 1), "seconds": round(seconds, 1), "host": socket.gethostname()}
+        told |= {"log": str(self._log(jobs[0]).relative_to(self._folder.out))}
+        told |= {"stack": len(jobs)} if len(jobs) > 1 else {}
+        unfinished = [job for job in jobs if not is_finished(job)]
+        if cause == FAILED and any(in_use(job.folder) for job in unfinished):  # another driver was faster: no attempt
+            self._not_before |= {job.name: time.monotonic() + IN_USE_S for job in unfinished}
+            jobs = [job for job in jobs if job not in unfinished]
+        for job in jobs:
+            if job not in unfinished:
+                self._left.pop(job.name, None)
+                how, why = DONE, ""  # however the process ended
+            elif cause == DONE:
+                how, why = FAILED, f"{job.folder}: holds nothing finished, though the command ended well"
+            else:
+                how, why = cause, line
+            if how in PASSING:
+                self._not_before[job.name] = time.monotonic() + PAUSE_S
+            row: Row = {"job": job.name, "cause": how, "line": why, "words": job.words} | told
+            try:
+                self._folder.add(row)
+            except UnavailableError as error:
+                print(f"warning: {error}", file=sys.stderr)
+            say(row, len(self._jobs) - len(self._left), len(self._jobs))
 
     def _stop(self) -> None:
         """Ask every job to end where nothing is lost, and wait for it."""
@@ -239,13 +283,18 @@ def cause_of(code: int) -> str:
     return KILLED if code < 0 else {0: DONE, TEMPORARY: UNAVAILABLE}.get(code, FAILED)
 
 
-def _last_line(log: Path, start: int) -> str:
-    """The last line that is not empty in a log, behind so many bytes of it."""
+def _line_of_end(log: Path, start: int) -> str:
+    """Why a job ended, in a log behind so many bytes of it: its last line, or that of an exception with a traceback."""
     try:
         text = log.read_bytes()[start:].decode(errors="replace")
     except OSError:
         return ""
-    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "")
+    lines = [line for line in text.splitlines() if line.strip()]
+    last = lines[-1].strip() if lines else ""
+    _, traceback, rest = "\n".join(lines).rpartition("Traceback (most recent call last):\n")
+    if not traceback or last.startswith("error: "):
+        return last
+    return next((line for line in rest.splitlines() if not line[0].isspace()), last)  # its message may have more lines
 
 
 def say(row: Row, done: int, of: int) -> None:

@@ -5,8 +5,8 @@
                                  GRID~*.json those of a grid of one's own, of a part of one, or of one with other
                                  settings
     OUT/sweep/attempts.jsonl     one object a line: job, ended (Unix time), seconds, cause, line, host, words (of its
-                                 command)
-    OUT/sweep/logs/JOB.log
+                                 command), log (below OUT); of a job in a stack also stack (its number of jobs)
+    OUT/sweep/logs/JOB.log       what a stack prints is in that of its first job
     OUT/sweep/slurm/             what the tasks of a cluster print
 
 Rows are appended whole, so that several drivers may share a folder. Whether a job is finished is never read here: its
@@ -176,7 +176,8 @@ def jobs_of(plans: Iterable[Plan]) -> list[Job]:
 def failed(rows: list[Row]) -> bool:
     """Whether a job is not tried again, judging by its attempts: one failed, or too many in a row were of no use."""
     causes = [row["cause"] for row in rows[-TRIES:]]  # an interruption among them begins the count anew
-    return causes[-1:] == [FAILED] or (len(causes) == TRIES and set(causes) <= {*PASSING})
+    alone = not any("stack" in row for row in rows[-1:])  # a stack's failure may be another job's
+    return (causes[-1:] == [FAILED] and alone) or (len(causes) == TRIES and set(causes) <= {*PASSING})
 
 
 def lost_among(jobs: Iterable[Job], rows: Mapping[str, list[Row]]) -> set[str]:
@@ -226,13 +227,18 @@ def status(jobs: list[Job], attempts: Mapping[str, list[Row]]) -> dict[str, Any]
     }
 
 
-def in_lines(found: Mapping[str, Any]) -> list[str]:
-    """A status as text."""
+def failure(row: Row, out: Path) -> str:
+    """The last attempt at a failed job of the sweep in `out`, as a line."""
+    return f"failed: {row['job']}: {row['line']}" + (f" (see {out / row['log']})" if "log" in row else "")
+
+
+def in_lines(found: Mapping[str, Any], out: Path) -> list[str]:
+    """A status as text, of the sweep in `out`."""
     counts = ", ".join(f"{number} {state}" for state, number in sorted(found["counts"].items()))
     left = "unknown" if found["seconds_left"] is None else f"{found['seconds_left'] / 3600:.1f} h"
     shown = [
         f"{len(found['states'])} jobs: {counts}",
         f"{found['per_hour']:.1f} jobs an hour, {left} left at this rate",
     ]
-    shown += [f"failed: {name}: {row['line']}" for name, row in found["failures"].items()]
+    shown += [failure(row, out) for row in found["failures"].values()]
     return shown + [f"running: {name}" for name, state in found["states"].items() if state == RUNNING]

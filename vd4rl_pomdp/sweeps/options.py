@@ -19,8 +19,11 @@ class LocalOptions(Options):
     """Jobs at a time on each GPU."""
     threads: int = 0
     """CPU threads of a job; 0: its share of the machine's cores."""
+    stack: int = 1
+    """Most fine-tunings that one process trains as a stack, which counts as one job at a time; their results are those
+    of single runs within rounding."""
 
-    limits: ClassVar[Limits] = {"jobs": (0, 1024), "jobs_per_gpu": (1, 64), "threads": (0, 4096)}
+    limits: ClassVar[Limits] = {"jobs": (0, 1024), "jobs_per_gpu": (1, 64), "threads": (0, 4096), "stack": (1, 64)}
 
 
 @dataclass(frozen=True)
@@ -49,10 +52,12 @@ class SlurmOptions(Options):
     """Tasks in the queue or running at a time."""
     sbatch: list[str] = field(default_factory=list)
     """Further parameters of sbatch: reservation=mine exclusive."""
+    stack: int = 1
+    """Most fine-tunings that one process trains as a stack, which counts as one job at a time."""
 
     limits: ClassVar[Limits] = {
         **{"time": (5, 60 * 24 * 365), "gpus": (0, 64), "cpus": (1, 4096), "memory": (0.01, 10**6)},
-        **{"jobs_per_task": (1, 1024), "tasks": (1, 1000)},
+        **{"jobs_per_task": (1, 1024), "tasks": (1, 1000), "stack": (1, 64)},
     }
 
 
@@ -68,8 +73,10 @@ class RayOptions(Options):
     """GPUs of a job: 0.25 lets four share one."""
     jobs: int = 0
     """Jobs at a time; 0: as many as the nodes take that are there. On a cluster that grows when asked, say how many."""
+    stack: int = 1
+    """Most fine-tunings that one process trains as a stack, which counts as one job at a time."""
 
-    limits: ClassVar[Limits] = {"cpus": (0.01, 4096), "gpus": (0, 64), "jobs": (0, 10**5)}
+    limits: ClassVar[Limits] = {"cpus": (0.01, 4096), "gpus": (0, 64), "jobs": (0, 10**5), "stack": (1, 64)}
 
     def check(self) -> None:
         """Refuse a share of several GPUs, which Ray does not give."""
