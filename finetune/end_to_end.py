@@ -23,6 +23,7 @@ from finetune.algorithms import Algorithm
 from finetune.config import FinetuneConfig
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.types import Transitions
+from vd4rl_pomdp.nn.adam import Adam
 from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.runs.device import autocast
 
@@ -33,7 +34,7 @@ class EndToEnd:
     def __init__(self, algorithm: Algorithm, encoder: Encoder, config: FinetuneConfig) -> None:
         self.algorithm, self.encoder, self.config = algorithm, encoder.train().requires_grad_(True), config
         self.policy = algorithm.policy
-        self.optimiser = torch.optim.Adam(encoder.parameters(), lr=config.learning_rate)
+        self.optimiser = Adam(encoder.parameters(), config.learning_rate)
 
     def update(self, batch: Transitions) -> dict[str, Tensor]:
         """One update of encoder, critic and actor; returns detached scalars."""

@@ -6,7 +6,7 @@ With `--views 0` every batch is encoded anew instead.
 from __future__ import annotations
 
 import hashlib
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 from pathlib import Path
@@ -20,7 +20,7 @@ from torch import Tensor
 from finetune.histories import Histories, HistoryOptions, read_both_ends, read_whole
 from vd4rl_pomdp.core.errors import disk_errors
 from vd4rl_pomdp.core.options import Options, flat
-from vd4rl_pomdp.core.streams import RandomStream
+from vd4rl_pomdp.core.streams import RandomStream, stacked
 from vd4rl_pomdp.core.types import Batch
 from vd4rl_pomdp.corruptions import CorruptionConfig, derive_keys
 from vd4rl_pomdp.data import Dataset, StateView, View
@@ -174,13 +174,15 @@ class FeatureSampler:
         self, histories: Histories, features: Tensor, batch_size: int, n_step: int, gamma: float,
         draws: RandomStream,
     ) -> None:  # fmt: skip
-        self._features, self._batch_size, self.draws = features, batch_size, draws
+        self.features, self.batch_size, self.draws = features, batch_size, draws
         dataset, rows = histories.dataset, histories.rows
-        self._reward, self._discount, _ = dataset.n_step_returns(rows, n_step, gamma)
-        self._action = dataset.action_after(rows)
+        reward, discount, _ = dataset.n_step_returns(rows, n_step, gamma)
+        self.told = torch.cat([dataset.action_after(rows), reward[:, None], discount[:, None]], dim=1)
+        """(M, A + 2): action, reward and discount of every transition. Few tensors: a GPU is asked for each apart."""
         # z and z' are both read from the cache, for the critics' target, too: the encoder never changes
-        ends = [histories.of_view(view).numbers() for view in range(len(features))]
-        self._first, self._last = (torch.stack(numbers) for numbers in zip(*ends, strict=True))
+        ends = [torch.stack(histories.of_view(view).numbers()) for view in range(len(features))]
+        self.ends = torch.stack([number + view * features.shape[1] for view, number in enumerate(ends)], dim=1)
+        """(2, views, M) int64: where both ends of every transition are in each view, views one behind the other."""
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to go on with the same batches."""
@@ -192,17 +194,44 @@ class FeatureSampler:
 
     def sample(self) -> FeatureBatch:
         """The next batch."""
-        index, view = self._draw(len(self._action)), self._draw(len(self._features))
-        return FeatureBatch(
-            z=self._features[view, self._first[view, index]].float(),
-            action=self._action[index],
-            reward=self._reward[index],
-            discount=self._discount[index],
-            next_z=self._features[view, self._last[view, index]].float(),
-        )
+        count = len(self.told)
+        index = self.draws.integers(count, self.batch_size)
+        view = self.draws.integers(len(self.features), self.batch_size)
+        ends = self.ends.flatten(1)[:, torch.add(index, view, alpha=count)]
+        return _batch(self.features.flatten(0, 1)[ends], self.told[index])
 
-    def _draw(self, count: int) -> Tensor:
-        return self.draws.integers(count, self._batch_size)
+
+class StackedSampler:
+    """Batches of several runs that are trained as one, each run's own (`finetune.stack`)."""
+
+    def __init__(self, samplers: Sequence[FeatureSampler]) -> None:
+        """Begin where the runs' samplers, of as many views and transitions in a batch, stand; they stay there."""
+        self._features = [sampler.features.flatten(0, 1) for sampler in samplers]
+        self._shared = all(sampler.features is samplers[0].features for sampler in samplers)
+        self._counts, self._views = [len(sampler.told) for sampler in samplers], len(samplers[0].features)
+        self._shape = len(samplers), samplers[0].batch_size
+        self.draws = stacked([sampler.draws for sampler in samplers])
+        self._told = torch.cat([sampler.told for sampler in samplers])
+        self._ends = torch.cat([sampler.ends for sampler in samplers], dim=2).flatten(1)
+        first = [sum(self._counts[:number]) for number in range(len(samplers))]
+        self._first = torch.tensor(first, device=self._told.device)[:, None]
+
+    def sample(self) -> FeatureBatch:
+        """The next batch of every run: tensors of (S, B, ...)."""
+        index = self.draws.integers(self._counts, *self._shape) + self._first
+        view = self.draws.integers(self._views, *self._shape)
+        ends = self._ends[:, torch.add(index, view, alpha=len(self._told))]
+        if self._shared:
+            both = self._features[0][ends]
+        else:
+            both = torch.stack([own[end] for own, end in zip(self._features, ends.unbind(1), strict=True)], dim=1)
+        return _batch(both, self._told[index])
+
+
+def _batch(both: Tensor, told: Tensor) -> FeatureBatch:
+    """A batch of (2, ..., D) features of both ends, and (..., A + 2) of what else is known."""
+    z, next_z = both.float()
+    return FeatureBatch(z, told[..., :-2], told[..., -2], told[..., -1], next_z)
 
 
 class ExactSampler(Sampler):

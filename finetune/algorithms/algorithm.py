@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
 from torch import Tensor
@@ -14,6 +15,8 @@ from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.nn.policy import Policy
+
+Result = TypeVar("Result")
 
 
 @dataclass(frozen=True)
@@ -38,12 +41,18 @@ class Loss(NamedTuple):
 
 
 class Algorithm(ABC):
-    """Trains a policy on batches of representations."""
+    """Trains a policy on batches of representations.
+
+    Where updates are replayed, Python runs a few of them only; where runs are stacked, `update` sees all of theirs at
+    once, and each loss one (`stack`). Neither needs a line in an algorithm that keeps to what is said here.
+    """
 
     options: type[Options] = Options
     """Class of its options."""
     summary: str = ""
     """One line that says what it is."""
+    period: int = 1
+    """Updates after which Python does the same again."""
 
     def __init__(self, policy: Policy, options: Any, learning_rate: float, updates: int, draws: RandomStream) -> None:
         """Subclasses add their networks and optimisers.
@@ -53,25 +62,61 @@ class Algorithm(ABC):
             options: an instance of the class's `options`, kept as `settings`.
             learning_rate: of all optimisers.
             updates: how many there will be, for schedules, kept as `planned`.
-            draws: what random numbers are drawn from.
+            draws: what random numbers are drawn from, in `update` and not in a loss: a stack's update draws for all.
         """
         self.policy, self.settings, self.learning_rate = policy, options, learning_rate
         self.planned, self.draws = updates, draws
-        self.updates = 0
-        """Updates that were made."""
+        self.updates: int | Tensor = 0
+        """Updates that were made: a number, or where they are replayed a tensor without dimensions."""
+        self._turn = 0
+
+    @property
+    def turn(self) -> int:
+        """Which update of a `period` is made, 0 to period - 1: a number of Python's, to decide by."""
+        return self._turn if isinstance(self.updates, Tensor) else self.updates % self.period
+
+    def count_on(self, device: torch.device) -> None:
+        """Count updates by a tensor from now on, which replayed updates can read and add to."""
+        self.updates = torch.tensor(int(self.updates), device=device)
+
+    def take_turn(self, turn: int) -> None:
+        """Tell the turn of the update that comes, which no tensor can."""
+        self._turn = turn
 
     @abstractmethod
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
-        """Compute each loss in turn and `step` along it, and count the update.
+        """`minimise` each loss in turn, and count the update: `self.updates += 1`.
 
         Args:
-            batch: transitions of representations.
+            batch: transitions of representations; of stacked runs each tensor has a leading dimension more, S.
             encoder: optimiser of what computed `batch.z`, where that is trained, too: it takes the step along the first
                 loss, the only one whose gradient may reach `batch.z`.
 
         Returns:
-            Detached scalars of all losses by name.
+            Detached scalars of all losses by name, (S,) of stacked runs.
         """
+
+    def minimise(
+        self, loss_function: Callable[..., Loss], batch: FeatureBatch, *tensors: Tensor, along: Sequence[Optimizer]
+    ) -> dict[str, Tensor]:
+        """Compute a loss of one run's batch and tensors, and step along its gradient.
+
+        Args:
+            loss_function: a method of this algorithm; it changes nothing and draws nothing.
+            batch: its first argument.
+            tensors: what else it is given, random numbers that were drawn for it, say.
+            along: optimisers whose parameters move.
+
+        Returns:
+            What it logs.
+        """
+        loss = self.each(loss_function, batch, *tensors)
+        self.step(loss, *along)
+        return dict(loss.logs)
+
+    def each(self, function: Callable[..., Result], batch: FeatureBatch, *tensors: Tensor) -> Result:
+        """What a function that is no loss computes of a batch; of stacked runs, of each one's."""
+        return function(batch, *tensors)
 
     def step(self, loss: Loss, *optimisers: Optimizer) -> None:
         """Step along the gradient of a loss, which is taken in full precision; only the optimisers' parameters move."""
@@ -79,8 +124,9 @@ class Algorithm(ABC):
             optimiser.zero_grad(set_to_none=True)
         asked = [p for optimiser in optimisers for group in optimiser.param_groups for p in group["params"]]
         with torch.autocast(loss.value.device.type, enabled=False):
-            # an actor's loss runs through the critics, whose own gradients are neither wanted nor computed
-            loss.value.backward(inputs=asked)
+            # an actor's loss runs through the critics, whose own gradients are neither wanted nor computed;
+            # losses of stacked runs share no parameter, so the gradient of their sum is each one's own
+            loss.value.backward(torch.ones_like(loss.value), inputs=asked)
         for optimiser in optimisers:
             optimiser.step()
 
@@ -91,11 +137,14 @@ class Algorithm(ABC):
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to resume: the state of all parts, the updates made, the noise."""
         parts = {name: part.state_dict() for name, part in self.parts().items()}
-        return parts | {"updates": self.updates, "noise": self.draws.get_state()}
+        return parts | {"updates": int(self.updates), "noise": self.draws.get_state()}
 
     def load_state_dict(self, state: dict[str, Any]) -> None:
         """Continue from `state_dict`."""
         for name, part in self.parts().items():
             part.load_state_dict(state[name])
-        self.updates = state["updates"]
+        if isinstance(self.updates, Tensor):
+            self.updates.fill_(state["updates"])
+        else:
+            self.updates = state["updates"]
         self.draws.set_state(state["noise"])

@@ -18,7 +18,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor
 from torch.optim import Optimizer
@@ -28,6 +27,7 @@ from finetune.algorithms.noise import noise_at, with_noise
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.core.streams import RandomStream
+from vd4rl_pomdp.nn.adam import Adam
 from vd4rl_pomdp.nn.policy import Policy
 
 
@@ -40,18 +40,18 @@ class BC(Algorithm):
         self, policy: Policy, options: Options, learning_rate: float, updates: int, draws: RandomStream
     ) -> None:
         super().__init__(policy, options, learning_rate, updates, draws)
-        self.optimiser = torch.optim.Adam(policy.net.parameters(), lr=learning_rate, fused=True)
+        self.optimiser = Adam(policy.net.parameters(), learning_rate, fused=True)
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
         """One step along the one loss."""
-        loss = self.cloning_loss(batch)
-        self.step(loss, self.optimiser, *encoder)
+        noise = self.draws.normal(*batch.action.shape) * noise_at(self.updates, self.planned)
+        logs = self.minimise(self.cloning_loss, batch, noise, along=(self.optimiser, *encoder))
         self.updates += 1
-        return loss.logs
+        return logs
 
-    def cloning_loss(self, batch: FeatureBatch) -> Loss:
+    def cloning_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:
         """Mean of (a~ - a)^2."""
-        chosen = with_noise(self.policy(batch.z), noise_at(self.updates, self.planned), self.draws)
+        chosen = with_noise(self.policy(batch.z), noise)
         loss = F.mse_loss(chosen, batch.action)
         return Loss(loss, {"bc_loss": loss.detach()})
 

@@ -20,11 +20,14 @@ Differences to the authors' loop:
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
 from finetune.algorithms.noise import noise_at, with_noise
 from finetune.algorithms.td3_bc import TD3BC
+from finetune.features import FeatureBatch
 
 
 class DrQv2BC(TD3BC):
@@ -32,13 +35,21 @@ class DrQv2BC(TD3BC):
 
     summary = "the update of V-D4RL's baseline: no target actor, scheduled noise"
     tau = 0.01
-    policy_delay = 1
+    period = 1
 
-    def _next_action(self, next_z: Tensor) -> Tensor:
-        return self._policy_action(next_z)
+    def next_noise(self, batch: FeatureBatch) -> Tensor:
+        """Noise for the next actions, of a scheduled size; the actor's own have the like."""
+        return self.draws.normal(*batch.action.shape) * noise_at(self.updates, self.planned)
 
-    def _policy_action(self, z: Tensor) -> Tensor:
-        return with_noise(self.policy.from_standardised(z), noise_at(self.updates, self.planned), self.draws)
+    def actor_noise(self, batch: FeatureBatch) -> Sequence[Tensor]:
+        """Noise for the actor's own actions."""
+        return (self.next_noise(batch),)
+
+    def _next_action(self, next_z: Tensor, noise: Tensor) -> Tensor:
+        return self._policy_action(next_z, noise)
+
+    def _policy_action(self, z: Tensor, *noise: Tensor) -> Tensor:
+        return with_noise(self.policy.from_standardised(z), *noise)
 
     def _policy_value(self, z: Tensor, action: Tensor) -> Tensor:
         return torch.minimum(*self.critic(z, action))

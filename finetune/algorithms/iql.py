@@ -31,10 +31,12 @@ from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
+from finetune.algorithms.noise import share_of
 from finetune.algorithms.td3_bc import TwinCritic
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.core.streams import RandomStream
+from vd4rl_pomdp.nn.adam import Adam, set_learning_rate
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp, move_target
 from vd4rl_pomdp.nn.policy import Policy
 
@@ -86,25 +88,25 @@ class IQL(Algorithm):
         self.value = mlp(dim, hidden, 1, last=ExactLinear).to(device)
         self.gaussian = Gaussian(action_dim).to(device)
         actor = [*policy.net.parameters(), *self.gaussian.parameters()]
-        self.policy_optimiser = torch.optim.Adam(actor, lr=learning_rate, fused=True)
-        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=learning_rate, fused=True)
-        self.value_optimiser = torch.optim.Adam(self.value.parameters(), lr=learning_rate, fused=True)
+        self.policy_optimiser = Adam(actor, learning_rate, fused=True)
+        self.critic_optimiser = Adam(self.critic.parameters(), learning_rate, fused=True)
+        self.value_optimiser = Adam(self.value.parameters(), learning_rate, fused=True)
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
         """A step of the critics and their targets, then of the value, then of the actor."""
-        critic = self.critic_loss(batch)
-        self.step(critic, self.critic_optimiser, *encoder)
+        critic = self.minimise(self.critic_loss, batch, along=(self.critic_optimiser, *encoder))
         move_target(self.target_critic, self.critic, self.tau)
-        with torch.no_grad():  # once, because two losses read it
-            q = torch.minimum(*self.target_critic(self.policy.standardise(batch.z), batch.action))
-        value = self.value_loss(batch, q)
-        self.step(value, self.value_optimiser)
-        for group in self.policy_optimiser.param_groups:
-            group["lr"] = self.policy_learning_rate
-        actor = self.actor_loss(batch, q)
-        self.step(actor, self.policy_optimiser)
+        q = self.each(self.target_value, batch)  # once, because two losses read it
+        value = self.minimise(self.value_loss, batch, q, along=(self.value_optimiser,))
+        set_learning_rate(self.policy_optimiser, self.policy_learning_rate)
+        actor = self.minimise(self.actor_loss, batch, q, along=(self.policy_optimiser,))
         self.updates += 1
-        return critic.logs | value.logs | actor.logs
+        return critic | value | actor
+
+    @torch.no_grad()
+    def target_value(self, batch: FeatureBatch) -> Tensor:
+        """The (B,) smaller target value of the actions taken."""
+        return torch.minimum(*self.target_critic(self.policy.standardise(batch.z), batch.action))
 
     def critic_loss(self, batch: FeatureBatch) -> Loss:
         """Squared error of both critics, to the same target y."""
@@ -135,10 +137,11 @@ class IQL(Algorithm):
         return Loss(loss, logs | {"bc_loss": F.mse_loss(chosen.detach(), action)})
 
     @property
-    def policy_learning_rate(self) -> float:
+    def policy_learning_rate(self) -> float | Tensor:
         """Learning rate of the actor, which falls to 0 along a cosine."""
-        done = min(1.0, self.updates / self.planned)
-        return self.learning_rate * (1 + math.cos(math.pi * done)) / 2
+        done = share_of(self.updates, self.planned)
+        cosine = torch.cos(math.pi * done) if isinstance(done, Tensor) else math.cos(math.pi * done)
+        return self.learning_rate * (1 + cosine) / 2
 
     def parts(self) -> dict[str, Any]:
         """Networks, target and optimisers."""

@@ -7,8 +7,6 @@ from __future__ import annotations
 
 from torch import Tensor
 
-from vd4rl_pomdp.core.streams import RandomStream
-
 NOISE_CLIP = 0.3
 """Largest noise on a dimension of an action."""
 NOISE_START, NOISE_END, NOISE_UPDATES = 1.0, 0.1, 250_000
@@ -17,21 +15,27 @@ MARGIN = 1e-6
 """How far from -1 and 1 a noisy action stays."""
 
 
-def noise_at(update: int, planned: int) -> float:
+def share_of(done: int | Tensor, whole: float) -> float | Tensor:
+    """How much of a whole is done, 1 at most: a number of a number, a tensor of one."""
+    if isinstance(done, Tensor):
+        return (done.double() / whole).clamp(max=1.0)
+    return min(1.0, done / whole)
+
+
+def noise_at(update: int | Tensor, planned: int) -> float | Tensor:
     """Standard deviation of the noise after so many updates: it falls linearly, then stays.
 
     Args:
-        update: updates that were made.
+        update: updates that were made, see `Algorithm.updates`.
         planned: all that there will be; it falls over half of them where that is sooner than in V-D4RL, which makes
             550,000: noise that has not fallen when training ends pushes the policy's actions outwards.
     """
-    done = min(1.0, update / min(NOISE_UPDATES, planned / 2))
+    done = share_of(update, min(NOISE_UPDATES, planned / 2))
     return NOISE_START + done * (NOISE_END - NOISE_START)
 
 
-def with_noise(action: Tensor, std: float, draws: RandomStream) -> Tensor:
-    """Noisy copy of (B, A) actions, within -1..1; the gradient passes as if nothing had been cut off."""
-    noise = draws.normal(*action.shape) * std
+def with_noise(action: Tensor, noise: Tensor) -> Tensor:
+    """Copy of (B, A) actions with (B, A) noise, within -1..1; the gradient passes as if nothing had been cut off."""
     noisy = action + noise.clamp(-NOISE_CLIP, NOISE_CLIP)
     # straight through: with the true gradient, 0 beyond the bounds, a saturated action would never come back
     return noisy + (noisy.clamp(MARGIN - 1, 1 - MARGIN) - noisy).detach()

@@ -11,6 +11,7 @@ Differences: states are frozen representations, standardised like the authors' s
 from __future__ import annotations
 
 import copy
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any, ClassVar
 
@@ -23,6 +24,7 @@ from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.core.streams import RandomStream
+from vd4rl_pomdp.nn.adam import Adam
 from vd4rl_pomdp.nn.heads import ExactLinear, mlp, move_target
 from vd4rl_pomdp.nn.policy import Policy
 
@@ -59,7 +61,8 @@ class TD3BC(Algorithm):
     options: type[Options] = TD3BCOptions
     summary = "TD3 with a behaviour cloning term"
     tau = 0.005
-    policy_delay = 2
+    period = 2
+    """Updates of the critics to one of the actor."""
 
     def __init__(
         self, policy: Policy, options: TD3BCOptions, learning_rate: float, updates: int, draws: RandomStream
@@ -69,38 +72,44 @@ class TD3BC(Algorithm):
         device = policy.standardise.mean.device
         self.critic = TwinCritic(shape["dim"], shape["action_dim"], shape["hidden"]).to(device)
         self.target_policy, self.target_critic = copy.deepcopy(policy), copy.deepcopy(self.critic)
-        self.policy_optimiser = torch.optim.Adam(policy.net.parameters(), lr=learning_rate, fused=True)
-        self.critic_optimiser = torch.optim.Adam(self.critic.parameters(), lr=learning_rate, fused=True)
+        self.policy_optimiser = Adam(policy.net.parameters(), learning_rate, fused=True)
+        self.critic_optimiser = Adam(self.critic.parameters(), learning_rate, fused=True)
 
     def update(self, batch: FeatureBatch, *encoder: Optimizer) -> dict[str, Tensor]:
-        """A step of the critics, and in every `policy_delay`-th update one of the actor and of the targets."""
-        loss = self.critic_loss(batch)
-        self.step(loss, self.critic_optimiser, *encoder)
-        logs = loss.logs
-        if (self.updates + 1) % self.policy_delay == 0:
-            loss = self.actor_loss(batch)
-            self.step(loss, self.policy_optimiser)
+        """A step of the critics, and in the last update of a `period` one of the actor and of the targets."""
+        optimisers = (self.critic_optimiser, *encoder)
+        logs = self.minimise(self.critic_loss, batch, self.next_noise(batch), along=optimisers)
+        if self.turn == self.period - 1:
+            drawn = self.actor_noise(batch)
+            logs |= self.minimise(self.actor_loss, batch, *drawn, along=(self.policy_optimiser,))
             self.move_targets()
-            logs = logs | loss.logs
         self.updates += 1  # last, because DrQ-v2's noise of both losses is that of the updates made before
         return logs
 
-    def critic_loss(self, batch: FeatureBatch) -> Loss:
+    def next_noise(self, batch: FeatureBatch) -> Tensor:
+        """Noise for the next actions: similar actions have similar values, so a lone peak of the critic is averaged."""
+        return (self.draws.normal(*batch.action.shape) * TARGET_NOISE).clamp(-NOISE_CLIP, NOISE_CLIP)
+
+    def actor_noise(self, batch: FeatureBatch) -> Sequence[Tensor]:
+        """Noise for the actor's own actions: none."""
+        return ()
+
+    def critic_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:
         """Squared error of both critics, to the same target y."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
             # the smaller of two: the policy seeks out what a critic overrates, and no new data would correct it
-            value = torch.minimum(*self.target_critic(next_z, self._next_action(next_z)))
+            value = torch.minimum(*self.target_critic(next_z, self._next_action(next_z, noise)))
             # `discount` is 0 if the task itself ended within the n steps; a time limit ends nothing, so it bootstraps
             target = batch.reward + self.settings.gamma * batch.discount * value
         first, second = self.critic(z, batch.action)
         loss = F.mse_loss(first, target) + F.mse_loss(second, target)
         return Loss(loss, {"critic_loss": loss.detach(), "q": first.detach().mean()})
 
-    def actor_loss(self, batch: FeatureBatch) -> Loss:
+    def actor_loss(self, batch: FeatureBatch, *noise: Tensor) -> Loss:
         """Cloning less the value, in units of the value's own size."""
         z = self.policy.standardise(batch.z.detach())  # the critics' loss alone trains an encoder
-        chosen = self._policy_action(z)
+        chosen = self._policy_action(z, *noise)
         value = self._policy_value(z, chosen)
         # one alpha for tasks of any reward; a number, because shrinking |Q| is no way to a better policy
         weight = self.settings.alpha / value.abs().mean().detach()
@@ -108,18 +117,15 @@ class TD3BC(Algorithm):
         loss = cloning - weight * value.mean()
         return Loss(loss, {"actor_loss": loss.detach(), "bc_loss": cloning.detach()})
 
-    def _next_action(self, next_z: Tensor) -> Tensor:
-        """Action of the target policy, smoothed by clipped noise."""
-        # similar actions have similar values: a lone peak of the critic is averaged with what is around it
-        action = self.target_policy.from_standardised(next_z)
-        noise = self.draws.normal(*action.shape) * TARGET_NOISE
-        return (action + noise.clamp(-NOISE_CLIP, NOISE_CLIP)).clamp(-1, 1)
+    def _next_action(self, next_z: Tensor, noise: Tensor) -> Tensor:
+        """Action of the target policy, smoothed by noise."""
+        return (self.target_policy.from_standardised(next_z) + noise).clamp(-1, 1)
 
     def _policy_value(self, z: Tensor, action: Tensor) -> Tensor:
         """What the actor maximises."""
         return self.critic.first(torch.cat([z, action], dim=-1))
 
-    def _policy_action(self, z: Tensor) -> Tensor:
+    def _policy_action(self, z: Tensor, *noise: Tensor) -> Tensor:
         """The action that the actor's loss is about."""
         return self.policy.from_standardised(z)
 

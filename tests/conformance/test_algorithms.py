@@ -16,6 +16,7 @@ from vd4rl_pomdp.testing.algorithms import (
     actions_lie_within_their_bounds,
     an_algorithm_that_goes_on_elsewhere_takes_the_same_steps,
     losses_are_finite_scalars,
+    stacks_take_the_steps_of_single_runs,
     targets_creep_and_nothing_else_moves_by_itself,
     the_first_loss_alone_reaches_the_representations,
 )
@@ -46,21 +47,21 @@ class Idle(BC):
 
 
 class Silent(BC):
-    def cloning_loss(self, batch):
-        return super().cloning_loss(batch)._replace(logs={})
+    def cloning_loss(self, batch, noise):
+        return super().cloning_loss(batch, noise)._replace(logs={})
 
 
 class Attached(BC):
-    def cloning_loss(self, batch):
-        value = super().cloning_loss(batch).value
+    def cloning_loss(self, batch, noise):
+        value = super().cloning_loss(batch, noise).value
         return Loss(value, {"bc_loss": value})
 
 
 class Numbering(BC):
     """Its log stands in the column that numbers the rows."""
 
-    def cloning_loss(self, batch):
-        value = super().cloning_loss(batch).value
+    def cloning_loss(self, batch, noise):
+        value = super().cloning_loss(batch, noise).value
         return Loss(value, {"step": value.detach()})
 
 
@@ -78,8 +79,8 @@ class Unlisted(BC):
         self.scale = torch.nn.Parameter(torch.ones(()))
         self.optimiser.add_param_group({"params": [self.scale], "lr": 1e-3})
 
-    def cloning_loss(self, batch):
-        value, logs = super().cloning_loss(batch)
+    def cloning_loss(self, batch, noise):
+        value, logs = super().cloning_loss(batch, noise)
         return Loss(value * self.scale, logs)
 
 
@@ -107,8 +108,8 @@ class Other(BC):
 
 
 class Blind(BC):
-    def cloning_loss(self, batch):
-        return super().cloning_loss(batch.replace(z=batch.z.detach()))
+    def cloning_loss(self, batch, noise):
+        return super().cloning_loss(batch.replace(z=batch.z.detach()), noise)
 
 
 class Frozen(BC):
@@ -145,8 +146,29 @@ class Forgetful(TD3BC):
 
 
 class Drawing(BC):
-    def cloning_loss(self, batch):
-        return super().cloning_loss(batch.replace(z=batch.z + torch.randn(batch.z.shape)))
+    def cloning_loss(self, batch, noise):
+        return super().cloning_loss(batch.replace(z=batch.z + torch.randn(batch.z.shape)), noise)
+
+
+class Late(BC):
+    """Draws within its loss, where a stack has one run's batch and the streams of all."""
+
+    def cloning_loss(self, batch, noise):
+        return super().cloning_loss(batch, self.draws.normal(*batch.action.shape))
+
+
+class Reading(BC):
+    """Decides by a value, which a stack has several of."""
+
+    def cloning_loss(self, batch, noise):
+        return super().cloning_loss(batch, noise if batch.reward.sum() > 0 else -noise)
+
+
+class Mixing(BC):
+    """Computes from the whole batch outside of any loss: of stacked runs, from those of all."""
+
+    def update(self, batch, *encoder):
+        return super().update(batch.replace(action=batch.action - batch.action.mean()), *encoder)
 
 
 class Unbounded(BC):
@@ -156,9 +178,9 @@ class Unbounded(BC):
 
 
 class Writing(BC):
-    def cloning_loss(self, batch):
+    def cloning_loss(self, batch, noise):
         batch.reward.mul_(2)
-        return super().cloning_loss(batch)
+        return super().cloning_loss(batch, noise)
 
 
 MUTANTS = [
@@ -178,6 +200,9 @@ MUTANTS = [
     (Still, targets_creep_and_nothing_else_moves_by_itself, "of the targets target_critic, target_policy moved none"),
     (Forgetful, an_algorithm_that_goes_on_elsewhere_takes_the_same_steps, "update 3 logs"),
     (Drawing, an_algorithm_that_goes_on_elsewhere_takes_the_same_steps, "update 3 logs"),
+    (Late, stacks_take_the_steps_of_single_runs, "first dimension must be that of the batch"),
+    (Reading, stacks_take_the_steps_of_single_runs, "runs of Reading do not stack .*data-dependent"),
+    (Mixing, stacks_take_the_steps_of_single_runs, "a stacked run is not what it is alone: .*bc_loss by"),
     (Unbounded, actions_lie_within_their_bounds, "one has the size"),
     (Writing, a_batch_is_left_as_it_was, "it changed reward"),
 ]

@@ -89,7 +89,7 @@ def test_noise_on_the_next_action_is_clipped_and_so_is_the_action(monkeypatch, k
 def test_the_actor_maximises_the_value_in_units_of_its_own_size_beside_cloning(silent, kind):
     """-lambda Q(z, pi(z)) + (pi(z) - a)^2, lambda = alpha / mean |Q| a number; TD3 takes Q_1, DrQ-v2 the smaller Q."""
     algorithm, given = make(kind, learning_rate=0.0), batch()
-    for _ in range(algorithm.policy_delay):
+    for _ in range(algorithm.period):
         metrics = algorithm.update(given)
     found = [p.grad.clone() for p in algorithm.policy.net.parameters()]
 
@@ -126,7 +126,7 @@ def test_noise_has_fallen_by_the_middle_of_a_training_shorter_than_v_d4rls(monke
 
 def test_noise_is_cut_off_with_the_action_and_lets_the_whole_gradient_pass():
     action = torch.linspace(-1, 1, 2001).requires_grad_()
-    noisy = noise.with_noise(action, 10.0, RandomStream(torch.Generator().manual_seed(0)))
+    noisy = noise.with_noise(action, 10.0 * torch.randn(2001, generator=torch.Generator().manual_seed(0)))
     noisy.sum().backward()
     assert torch.equal(action.grad, torch.ones_like(action))
     moved = noisy.detach() - action.detach()

@@ -272,7 +272,7 @@ def _updates_per_s(
 
     cached = FeatureSampler(Histories(dataset, NO_OPTIONS, 3, 0), features, BATCH, 3, 0.99, draws)
     exact = ExactSampler(frozen, NO_OPTIONS, BATCH, 3, 0.99, draws)
-    many, few = 20, algorithm.policy_delay
+    many, few = 20, algorithm.period
     fast, slow = alternating(max(1, repeats), lambda: train(cached, many), lambda: train(exact, few))
     fast, slow = fast / many, slow / few
     return {"cached_updates_per_s": 1 / fast, "exact_updates_per_s": 1 / slow, "cached_over_exact": slow / fast}

@@ -7,11 +7,13 @@ the order in which they would have drawn it themselves, sends the block in one c
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.seeding import stream_generator
 
 BLOCK = 256
@@ -22,15 +24,16 @@ _ALIGNED = 16
 
 @dataclass(frozen=True)
 class _Draw:
-    """What a step asks for."""
+    """What a step asks for, of each run."""
 
     kind: str
     shape: tuple[int, ...]
-    high: int = 0
+    high: tuple[int, ...] = ()
+    """One a run."""
 
-    def made(self, generator: torch.Generator) -> Tensor:
+    def made(self, generator: torch.Generator, run: int) -> Tensor:
         if self.kind == "integers":
-            return torch.randint(self.high, self.shape, generator=generator)
+            return torch.randint(self.high[run], self.shape, generator=generator)
         if self.kind == "normal":
             return torch.randn(self.shape, generator=generator)
         return torch.rand(self.shape, generator=generator)
@@ -46,7 +49,11 @@ class _Draw:
 
 
 class RandomStream:
-    """Numbers of one stream; the same on every device, and the same one by one as in blocks."""
+    """Numbers of one stream; the same on every device, and the same one by one as in blocks.
+
+    A stream of several runs that are trained as one (`stacked`) hands out each run's own numbers: every shape that it
+    is asked for, and gives, begins with the number of runs.
+    """
 
     def __init__(self, generator: torch.Generator, device: torch.device | str = "cpu") -> None:
         """See the class.
@@ -55,39 +62,43 @@ class RandomStream:
             generator: on the CPU, at the stream's beginning.
             device: where the numbers are wanted.
         """
-        self._generator, self._device = generator, torch.device(device)
+        self._generators, self._device = [generator], torch.device(device)
+        self._runs: tuple[int, ...] = ()
+        """Their number, where there are several."""
         self._asked: dict[int, list[_Draw]] = {}
         """By turn: what its step asked for when it was last run."""
         self._turn, self._place = 0, 0
         self._block: Tensor | None = None
-        """(BLOCK, bytes) uint8 on the device; None: numbers are drawn one by one."""
+        """(BLOCK, runs, bytes) uint8 on the device; None: numbers are drawn one by one."""
 
-    def integers(self, high: int, *shape: int) -> Tensor:
-        """Uniform int64 in [0, high)."""
-        return self._next(_Draw("integers", shape, high))
+    def integers(self, high: int | Sequence[int], *shape: int) -> Tensor:
+        """Uniform int64 in [0, high); of several runs each may have a bound of its own."""
+        bounds = (high,) * len(self._generators) if isinstance(high, int) else tuple(high)
+        return self._next("integers", shape, bounds)
 
     def normal(self, *shape: int) -> Tensor:
         """Standard normal float32."""
-        return self._next(_Draw("normal", shape))
+        return self._next("normal", shape)
 
     def uniform(self, *shape: int) -> Tensor:
         """Uniform float32 in [0, 1)."""
-        return self._next(_Draw("uniform", shape))
+        return self._next("uniform", shape)
 
-    def get_state(self) -> Tensor:
-        """State of the generator after the steps that were made, whatever was drawn ahead."""
+    def get_state(self, run: int = 0) -> Tensor:
+        """State of a run's generator after the steps that were made, whatever was drawn ahead."""
         if self._block is None:
-            return self._generator.get_state()
+            return self._generators[run].get_state()
         made = torch.Generator()
-        made.set_state(self._before)
-        self._draw_steps(made, self._used)
+        made.set_state(self._before[run])
+        self._draw_steps(made, run, self._used)
         return made.get_state()
 
     def set_state(self, state: Tensor) -> None:
-        """Go on from `get_state`."""
-        self._generator.set_state(state)
+        """Go on from `get_state`, as a stream of one run."""
+        (generator,) = self._generators
+        generator.set_state(state)
         if self._block is not None:
-            self._before, self._used, self._filled = state.clone(), 0, False
+            self._before, self._used, self._filled = [state.clone()], 0, False
 
     def begin(self, turn: int) -> None:
         """A step of a turn begins: what it asks for is noted, or, in blocks, read from its row."""
@@ -112,51 +123,76 @@ class RandomStream:
             for draw in asked:
                 ends.append(ends[-1] + -(-draw.size // _ALIGNED) * _ALIGNED)
             self._offsets[turn], width = ends[:-1], max(width, ends[-1])
-        self._block = torch.zeros(BLOCK, width, dtype=torch.uint8, device=self._device)
+        shape = BLOCK, len(self._generators), width
+        self._block = torch.zeros(shape, dtype=torch.uint8, device=self._device)
         self._counter = torch.zeros(1, dtype=torch.int64, device=self._device)
-        self._before, self._used, self._first, self._filled = self._generator.get_state(), 0, 0, False
+        self._before, self._used, self._first, self._filled = self._states(), 0, 0, False
 
     def one_by_one(self) -> None:
         """Draw one by one again, from where the steps made so far end."""
         if self._block is not None:
-            state, self._block = self.get_state(), None
-            self._generator.set_state(state)
+            states = [self.get_state(run) for run in range(len(self._generators))]
+            for generator, state in zip(self._generators, states, strict=True):
+                generator.set_state(state)
+            self._block = None
 
     def provide(self, turn: int) -> None:
         """See to it that the block holds the next step's row; called before a step of `turn` is replayed."""
         assert self._block is not None
         if self._used == BLOCK or not self._filled:
-            self._before, self._first = self._generator.get_state(), turn
+            self._before, self._first = self._states(), turn
             rows = torch.zeros(self._block.shape, dtype=torch.uint8, pin_memory=self._device.type == "cuda")
-            self._draw_steps(self._generator, BLOCK, rows)
+            for run, generator in enumerate(self._generators):
+                self._draw_steps(generator, run, BLOCK, rows[:, run])
             # pinned memory that is freed here is not used again before the copy has ended
             self._block.copy_(rows, non_blocking=True)
             self._counter.zero_()
             self._used, self._filled = 0, True
         self._used += 1
 
-    def _draw_steps(self, generator: torch.Generator, steps: int, rows: Tensor | None = None) -> None:
-        """Draw what `steps` steps from the block's first turn on ask for, into the rows if there are any."""
+    def _states(self) -> list[Tensor]:
+        return [generator.get_state() for generator in self._generators]
+
+    def _draw_steps(self, generator: torch.Generator, run: int, steps: int, rows: Tensor | None = None) -> None:
+        """Draw what `steps` steps of a run from the block's first turn on ask for, into (steps, bytes) if there are."""
         for step in range(steps):
             turn = (self._first + step) % len(self._asked)
             for draw, offset in zip(self._asked[turn], self._offsets[turn], strict=True):
-                drawn = draw.made(generator)
+                drawn = draw.made(generator, run)
                 if rows is not None:
                     rows[step, offset : offset + draw.size] = drawn.view(-1).view(torch.uint8)
 
-    def _next(self, draw: _Draw) -> Tensor:
+    def _next(self, kind: str, shape: tuple[int, ...], high: tuple[int, ...] = ()) -> Tensor:
+        if shape[: len(self._runs)] != self._runs:
+            raise UserError(
+                f"a step of {self._runs[0]} stacked runs asked for random numbers of the shape {shape}: their first "
+                "dimension must be that of the batch, as in `self.draws.normal(*batch.action.shape)`"
+            )
+        draw = _Draw(kind, shape[len(self._runs) :], high)
         if self._block is None:
             self._asked.setdefault(self._turn, []).append(draw)
+            made = [draw.made(generator, run) for run, generator in enumerate(self._generators)]
+            drawn = torch.stack(made) if self._runs else made[0]
             # to a GPU without waiting; to the CPU a copy would be read before it has come
-            return draw.made(self._generator).to(self._device, non_blocking=self._device.type != "cpu")
+            return drawn.to(self._device, non_blocking=self._device.type != "cpu")
         asked, place = self._asked[self._turn], self._place
         if place >= len(asked) or asked[place] != draw:
             raise RuntimeError(f"a step asked for {draw}, other random numbers than the steps before it")
         self._place += 1
         offset = self._offsets[self._turn][place]
-        return self._row[offset : offset + draw.size].view(draw.dtype).view(draw.shape)
+        return self._row[:, offset : offset + draw.size].view(draw.dtype).view(shape)
 
 
 def random_stream(seed: int, *name: str | int, device: torch.device | str = "cpu") -> RandomStream:
     """The stream called `name` of a run (see `stream_seed`), for a device."""
     return RandomStream(stream_generator(seed, *name), device)
+
+
+def stacked(streams: Sequence[RandomStream]) -> RandomStream:
+    """One stream of several runs, from where their own stand, which stay there; one by one at first."""
+    one = RandomStream(torch.Generator(), streams[0]._device)
+    one._generators = [torch.Generator() for _ in streams]
+    for generator, stream in zip(one._generators, streams, strict=True):
+        generator.set_state(stream.get_state())
+    one._runs = (len(streams),)
+    return one

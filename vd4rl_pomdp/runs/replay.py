@@ -44,7 +44,7 @@ class Replay:
         """See the class.
 
         Args:
-            step: does the step of a turn, 0 to period - 1, and returns scalars.
+            step: does the step of a turn, 0 to period - 1, and returns scalars, or tensors of one a run.
             device: where it does.
             streams: all that it draws from.
             period: steps after which Python does the same again, as with an actor that moves in every second step.
@@ -116,7 +116,8 @@ class Replay:
             for stream in self._streams:
                 stream.end()
             names.extend(logs)
-            return torch.stack([value.detach().float().reshape(()) for value in logs.values()])
+            # a number each, or, of stacked runs, one a run
+            return torch.stack([value.detach().float().squeeze() for value in logs.values()])
 
         replay, values = self._capture(step)
         return replay, names, values

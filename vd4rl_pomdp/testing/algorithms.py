@@ -1,7 +1,8 @@
-"""What every fine-tuning algorithm must satisfy: its losses, what they move, its targets, state and draws."""
+"""What every fine-tuning algorithm must satisfy: its losses, what they move, its targets, state, draws and stacks."""
 
 from __future__ import annotations
 
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass, fields
 from typing import Any
 
@@ -12,6 +13,8 @@ from torch.optim import Optimizer
 from finetune.algorithms import ALGORITHMS, Algorithm, Loss
 from finetune.config import FinetuneConfig
 from finetune.features import FeatureBatch
+from finetune.stack import Stack
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.runs.checkpoint import pack, unpack
@@ -87,12 +90,12 @@ def watched(algorithm: Algorithm, given: FeatureBatch) -> tuple[list[Step], dict
     return steps, logs
 
 
-def _tensors(state: Any, path: str = "") -> dict[str, Tensor]:
+def tensors_of(state: Any, path: str = "") -> dict[str, Tensor]:
     """Copies of all tensors of a nested state, by path."""
     if isinstance(state, Tensor):
         return {path: state.detach().clone()}
     items = state.items() if isinstance(state, dict) else enumerate(state) if isinstance(state, list | tuple) else ()
-    return {k: v for key, value in items for k, v in _tensors(value, f"{path}/{key}").items()}
+    return {k: v for key, value in items for k, v in tensors_of(value, f"{path}/{key}").items()}
 
 
 def _modules(algorithm: Algorithm) -> dict[str, nn.Module]:
@@ -101,7 +104,7 @@ def _modules(algorithm: Algorithm) -> dict[str, nn.Module]:
 
 def _networks(algorithm: Algorithm) -> dict[str, Tensor]:
     """Copies of all parameters and buffers, by part and name."""
-    return _tensors({name: module.state_dict() for name, module in _modules(algorithm).items()})
+    return tensors_of({name: module.state_dict() for name, module in _modules(algorithm).items()})
 
 
 def _optimised(optimiser: Optimizer) -> list[Tensor]:
@@ -199,9 +202,80 @@ def an_algorithm_that_goes_on_elsewhere_takes_the_same_steps(name: str, **option
             torch.manual_seed(seed)
             logs.append({key: value.item() for key, value in algorithm.update(batch(number)).items()})
         claim(logs[0] == logs[1], f"update {number} logs {logs[0]} and {logs[1]}: keep all in parts, draw from draws")
-    here, there = _tensors(one.state_dict()), _tensors(other.state_dict())
+    here, there = tensors_of(one.state_dict()), tensors_of(other.state_dict())
     differing = [key for key in here if not torch.equal(here[key], there[key])]
     claim(differing == [], f"these differ at the end: {shown(differing)}")
+
+
+def permuted(algorithm: Algorithm, seed: int) -> Algorithm:
+    """An algorithm that reads the rows of every batch in another order: the same, but for the order of summation."""
+
+    def each(function: Callable[..., Any], given: FeatureBatch, *tensors: Tensor) -> Any:
+        order = torch.randperm(len(given.z), generator=torch.Generator().manual_seed(seed)).to(given.z.device)
+        result = function(given.replace(**{name: given[name][order] for name in given}), *(t[order] for t in tensors))
+        return result if isinstance(result, Loss) else result[order.argsort()]
+
+    algorithm.each = each  # type: ignore[method-assign]
+    return algorithm
+
+
+def farther_than_rounding(
+    found: Mapping[str, Tensor],
+    single: Callable[[Callable[[Algorithm], Algorithm]], Mapping[str, Tensor]],
+    times: float = 4.0,
+) -> list[str]:
+    """Which tensors are farther from those of a single run than rounding takes it, and how far.
+
+    Args:
+        found: the tensors by name.
+        single: gives those of a single run, made anew and changed as it is told before its first update.
+        times: how often what three other orders of summation, or float32's last digit, change a tensor at most.
+    """
+    expected = single(lambda algorithm: algorithm)
+    others = [single(lambda algorithm, seed=seed: permuted(algorithm, seed)) for seed in range(3)]  # type: ignore[misc]
+    claim(found.keys() == expected.keys(), f"they have {shown(found)}, a single run {shown(expected)}")
+    far = []
+    for name, value in expected.items():
+        value = value.double()
+        digit = torch.finfo(torch.float32).eps * value.abs().max()
+        bound = times * torch.stack([digit, *((other[name].double() - value).abs().max() for other in others)]).max()
+        apart = (found[name].double() - value).abs().max()
+        if not apart <= bound:
+            far.append(f"{name} by {apart:.2g}, which rounding explains up to {bound:.2g}")
+    return far
+
+
+def course(algorithm: Algorithm, logs: list[dict[str, Tensor]]) -> dict[str, Tensor]:
+    """Where updates ended, and each scalar that they logged on the way, as one tensor."""
+    series: dict[str, list[Tensor]] = {}
+    for row in logs:
+        for key, value in row.items():
+            series.setdefault(key, []).append(value)
+    return tensors_of(algorithm.state_dict()) | {key: torch.stack(values) for key, values in series.items()}
+
+
+def stacks_take_the_steps_of_single_runs(name: str, **options: Any) -> None:
+    """Runs trained as one, which Python sees one `update` of, take each one's own steps but for rounding."""
+    seeds, updates = range(3), 5 * UPDATES
+    runs = [make(name, seed, **options) for seed in seeds]
+    whole = Stack(runs)
+    logs = []
+    for number in range(updates):
+        given = [batch(100 * seed + number) for seed in seeds]
+        try:
+            logs.append(whole.update(FeatureBatch(**{key: torch.stack([b[key] for b in given]) for key in given[0]})))
+        except (UserError, RuntimeError) as error:
+            claim(False, f"an update of three stacked runs fails: {error}")
+    whole.settle()
+    for seed, run in zip(seeds, runs, strict=True):
+
+        def single(change: Callable[[Algorithm], Algorithm], seed: int = seed) -> dict[str, Tensor]:
+            one = change(make(name, seed, **options))
+            return course(one, [one.update(batch(100 * seed + number)) for number in range(updates)])
+
+        found = course(run, [{key: value[seed] for key, value in row.items()} for row in logs])
+        far = farther_than_rounding(found, single)
+        claim(not far, f"a stacked run is not what it is alone: {shown(far)}")
 
 
 def actions_lie_within_their_bounds(name: str, **options: Any) -> None:
@@ -228,6 +302,7 @@ CHECKS: tuple[Check, ...] = (
     the_first_loss_alone_reaches_the_representations,
     targets_creep_and_nothing_else_moves_by_itself,
     an_algorithm_that_goes_on_elsewhere_takes_the_same_steps,
+    stacks_take_the_steps_of_single_runs,
     actions_lie_within_their_bounds,
     a_batch_is_left_as_it_was,
 )
