@@ -68,19 +68,25 @@ def all_pairs(rows: int, max_k: int) -> Tensor:
     return torch.tensor(pairs, dtype=torch.int64).view(-1, 2)
 
 
-def info_nce(scores: Tensor, group: Tensor | None = None) -> Tensor:
+def info_nce(scores: Tensor, group: Tensor | None = None, real: Tensor | None = None) -> Tensor:
     """InfoNCE (van den Oord et al. 2018, arXiv 1807.03748): cross-entropy of telling each anchor's own candidate.
 
     Args:
         scores: (..., N, N), anchors by candidates; the diagonal holds the true pairs.
         group: (N,) int64; the other candidates of an anchor's own group are no negatives. None: all others are.
+        real: (N,) bool: pairs that count, as anchors and as candidates. None: all do.
 
     Returns:
         Mean over anchors and leading dimensions, in nats. It is log(candidates) when scores tell nothing.
     """
     logits = _logits(scores, group)
     truth = torch.arange(scores.shape[-1], device=scores.device).expand(logits.shape[:-1])
-    return F.cross_entropy(logits.flatten(0, -2), truth.reshape(-1))
+    if real is None:
+        return F.cross_entropy(logits.flatten(0, -2), truth.reshape(-1))
+    own = torch.eye(len(real), dtype=torch.bool, device=scores.device)
+    logits = logits.masked_fill(~real & ~own, -torch.inf)
+    losses = F.cross_entropy(logits.flatten(0, -2), truth.reshape(-1), reduction="none").view(truth.shape)
+    return (losses * real).sum(-1).mean() / real.sum()
 
 
 def share_found(scores: Tensor, group: Tensor | None = None) -> Tensor:
