@@ -29,8 +29,10 @@ if TYPE_CHECKING:
     from pretrain.train import Trainer
 
 STEPS = 3
+JAX_MISSING = "not installed: `pip install '.[policy]'` in the package's folder"
 _SERVE = "from vd4rl_pomdp.bench.processes import serve; serve()"
 _WARM_UP = 20
+_BETWEEN_WAITS = 8
 
 
 def memory(folder: Path, frame_bytes: int) -> dict[str, float]:
@@ -252,22 +254,24 @@ def jax_updates(shape: dict[str, int], updates: int, tf32: bool = False) -> Call
     return measure
 
 
-def pretraining_steps(folder: str, device: str, windows: int, seed: int, seconds: float) -> Callable[[], dict[str, Any]]:
+def pretraining_steps(
+    folder: str, device: str, size: dict[str, Any], seed: int, seconds: float
+) -> Callable[[], dict[str, Any]]:
     """Pretrain on the set in a folder, of `mik+a` in the `paper` preset and bf16, for so long."""
-    from vd4rl_pomdp.bench.gpu import TINY, milliseconds, pretraining, wait
+    from vd4rl_pomdp.bench.gpu import Size, milliseconds, pretraining, wait
 
     place = torch.device(device)
     dataset = open_dataset(Path(folder) / "set", Path(folder) / "cache").to(place)
-    trainer = make_trainer(dataset, replace(pretraining(Path(folder), "mik+a", TINY, seed), batch_size=windows))
+    trainer = make_trainer(dataset, pretraining(Path(folder), "mik+a", Size(**size), seed))
     milliseconds(trainer.update, place, 1, 1)  # settles it
 
     def measure() -> dict[str, float]:
         start, steps = time.perf_counter(), 0
         while (spent := time.perf_counter() - start) < seconds:
-            for _ in range(10):
+            for _ in range(_BETWEEN_WAITS):
                 trainer.update()
             wait(place)
-            steps += 10
+            steps += _BETWEEN_WAITS
         return {"steps_per_s": steps / spent}
 
     return measure
