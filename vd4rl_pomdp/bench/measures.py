@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from finetune.algorithms import TD3BC, Algorithm
+from finetune.algorithms import TD3BC
 from finetune.config import FinetuneConfig
 from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder, StackedSampler
 from finetune.histories import Histories
@@ -268,13 +268,11 @@ def _updates_per_s(
     draws = RandomStream(torch.Generator().manual_seed(0), device)
     algorithm, cached = _policy_of(dataset, features, config.hidden_dim, 0)
 
-    def train(sampler: FeatureSampler | ExactSampler, updates: int) -> None:
-        for _ in range(updates):
-            algorithm.update(sampler.sample())
-
     exact = ExactSampler(frozen, NO_OPTIONS, BATCH, 3, 0.99, draws)
     many, few = 20, algorithm.period
-    fast, slow = alternating(max(1, repeats), lambda: train(cached, many), lambda: train(exact, few))
+    fast, slow = alternating(
+        max(1, repeats), partial(_train, algorithm, cached, many), partial(_train, algorithm, exact, few)
+    )
     fast, slow = fast / many, slow / few
     return {"cached_updates_per_s": 1 / fast, "exact_updates_per_s": 1 / slow, "cached_over_exact": slow / fast}
 
@@ -284,23 +282,17 @@ def against_jax(dataset: Dataset, repeats: int, widths: Sequence[int] = (256, 10
     if importlib.util.find_spec("jax") is None:
         return {"jax": JAX_MISSING}
     results: dict[str, Any] = {}
-    views, updates = FinetuneConfig.of("cpu").views, 10
-    features = torch.randn(views, dataset.num_rows, EncoderConfig(6).feature_dim).half()
+    views = FinetuneConfig.of("cpu").views
+    features = torch.randn(views, dataset.num_rows, EncoderConfig(6).feature_dim, device=dataset.t.device).half()
     for hidden in widths:
-        algorithm, sampler = _policy_of(dataset, features, hidden, 0)
+        pair, updates = _policy_of(dataset, features, hidden, 0), max(2, 2560 // hidden)
         shape = {"hidden_dim": hidden, "batch_size": BATCH, "dim": features.shape[-1], "rows": dataset.num_rows}
         shape |= {"action_dim": dataset.action_dim, "views": views}
+        mine, theirs = [], []
         with Worker("jax_updates", shape, updates) as worker:
             worker.answer()
-            theirs = []
-
-            def ours(algorithm: Algorithm = algorithm, sampler: FeatureSampler = sampler) -> None:
-                for _ in range(updates):
-                    algorithm.update(sampler.sample())
-
-            mine = []
             for _ in range(repeats):
-                mine.append(seconds_of(ours, 1) / updates * 1e3)
+                mine.append(seconds_of(partial(_train, *pair, updates), 1) / updates * 1e3)
                 worker.begin()
                 theirs.append(worker.answer()["ms"])
         ms = statistics.median(mine)
@@ -311,7 +303,7 @@ def against_jax(dataset: Dataset, repeats: int, widths: Sequence[int] = (256, 10
 def stacking(dataset: Dataset, repeats: int) -> dict[str, float]:
     """Milliseconds of an update of one policy of the cpu preset, and of one of five that are trained as one."""
     config, updates, runs = FinetuneConfig.of("cpu"), 10, 5
-    features = torch.randn(config.views, dataset.num_rows, EncoderConfig(6).feature_dim).half()
+    features = torch.randn(config.views, dataset.num_rows, EncoderConfig(6).feature_dim, device=dataset.t.device).half()
     results: dict[str, float] = {}
     for precision in ("fp32", "bf16"):
         algorithms, samplers = zip(
@@ -319,15 +311,16 @@ def stacking(dataset: Dataset, repeats: int) -> dict[str, float]:
         )
         pairs = (algorithms[0], samplers[0]), (Stack(algorithms[1:]), StackedSampler(samplers[1:]))
 
-        def train(algorithm: Any, sampler: Any, precise: Any = precision) -> None:
-            for _ in range(updates):
-                with torch.autocast("cpu", torch.bfloat16, precise == "bf16", cache_enabled=False):
-                    algorithm.update(sampler.sample())
-
-        one, five = alternating(repeats, *(partial(train, *pair) for pair in pairs))
+        with torch.autocast(features.device.type, torch.bfloat16, precision == "bf16", cache_enabled=False):
+            one, five = alternating(repeats, *(partial(_train, *pair, updates) for pair in pairs))
         results |= {f"{precision}_ms": one / updates * 1e3, f"{precision}_of_five_ms": five / updates / runs * 1e3}
         results[f"{precision}_of_five_over_one"] = five / runs / one
     return results
+
+
+def _train(algorithm: TD3BC | Stack, sampler: FeatureSampler | ExactSampler | StackedSampler, updates: int) -> None:
+    for _ in range(updates):
+        algorithm.update(sampler.sample())
 
 
 def _policy_of(dataset: Dataset, features: torch.Tensor, hidden: int, seed: int) -> tuple[TD3BC, FeatureSampler]:

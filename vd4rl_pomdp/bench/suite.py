@@ -71,8 +71,8 @@ def bench(quick: bool = False, device: str = "auto") -> dict[str, Any]:
         results |= {
             "pretraining": pretraining(dataset, Path(folder), repeats),
             "finetuning": finetuning(dataset, repeats),
-            "jax": against_jax(dataset, repeats),
-            "stacking": stacking(dataset, repeats),
+            "jax": against_jax(dataset, max(2, repeats // 3)),
+            "stacking": stacking(dataset, max(2, repeats // 3)),
             "methods": methods(dataset, Path(folder), repeats),
             "memory": memory(Path(folder), dataset.frames.numel()),
         }
