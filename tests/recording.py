@@ -25,6 +25,10 @@ _WAITING = {"_local_scalar_dense", "item", "nonzero", "masked_select", "equal", 
 _DRAWING = {"rand", "randn", "randint", "randperm", "normal_", "uniform_", "bernoulli_", "random_", "multinomial"}
 
 
+def _masks(args: Any) -> bool:
+    return any(isinstance(x, Tensor) and x.dtype in (torch.bool, torch.uint8) for x in tree_flatten(args[1:2])[0])
+
+
 class _Recorder(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
@@ -39,6 +43,8 @@ class _Recorder(TorchDispatchMode):
         name = func.overloadpacket.__name__
         if name in _WAITING:
             raise RuntimeError(f"operation not permitted when stream is capturing: {name} reads a value")
+        if name.strip("_").startswith(("index", "unsafe_index")) and _masks(args):
+            raise RuntimeError(f"operation not permitted when stream is capturing: {name} counts what a mask chooses")
         if name in _DRAWING:
             raise RuntimeError(f"operation not permitted when stream is capturing: {name} draws")
         for number, argument in enumerate(func._schema.arguments):
