@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from inspect import unwrap
 from typing import Any
 
 import torch
@@ -17,6 +18,12 @@ class Adam(torch.optim.Adam):
 
     A state of another device can be loaded.
     """
+
+    # What PyTorch wraps these in keeps its compiler away, and imports all of that for it: 140 MB, and a second or more.
+    add_param_group = unwrap(torch.optim.Adam.add_param_group)
+    zero_grad = unwrap(torch.optim.Adam.zero_grad)
+    state_dict = unwrap(torch.optim.Adam.state_dict)
+    step = torch.no_grad()(unwrap(torch.optim.Adam.step))
 
     def __init__(self, parameters: Iterable[nn.Parameter], learning_rate: float, fused: bool = False) -> None:
         """See the class.
@@ -35,7 +42,7 @@ class Adam(torch.optim.Adam):
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue from another's `state_dict`, by this device's kind of step."""
         own = [{name: group[name] for name in (*_OF_DEVICE, "lr")} for group in self.param_groups]
-        super().load_state_dict(state_dict)
+        unwrap(torch.optim.Adam.load_state_dict)(self, state_dict)
         for group, before in zip(self.param_groups, own, strict=True):
             rate = float(group["lr"])
             group.update(before)  # the tensor that a captured step reads stays the same one

@@ -96,11 +96,11 @@ class InverseObjective(Objective):
         super().__init__()
         self.encoder = encoder
         self.options = options
-        self._sent: dict[tuple[torch.device, int], tuple[Tensor, list[int]]] = {}
         self.target = target
         self.head = PairHead(
             encoder.dim, future_dim, options.largest_gap, target.outputs, options.head_dim, options.k_embedding
         )
+        self._pairs: dict[tuple[int, torch.device], tuple[Tensor, list[int]]] = {}
         self.predictor = mlp(encoder.dim + 1, 512, encoder.dim, layers=3) if options.self_prediction else None
 
     @abstractmethod
@@ -132,17 +132,17 @@ class InverseObjective(Objective):
         """The (t, k) that are scored in a window of `rows` rows: (P, 2) int64 on the CPU, not to be changed."""
         return all_pairs(rows, self.options.largest_gap)
 
-    def _pairs_on(self, device: torch.device, rows: int) -> tuple[Tensor, list[int]]:
-        """The `pairs` on a device, and which k there are; sent there once."""
-        if (device, rows) not in self._sent:
+    def _scored(self, rows: int, device: torch.device) -> tuple[Tensor, list[int]]:
+        """`pairs` on a device, and the k among them, in order; copied there once, as a replayed step copies nothing."""
+        if (rows, device) not in self._pairs:
             pairs = self.pairs(rows)
-            self._sent[device, rows] = pairs.to(device), pairs[:, 1].unique().tolist()
-        return self._sent[device, rows]
+            self._pairs[rows, device] = pairs.to(device), sorted(set(pairs[:, 1].tolist()))
+        return self._pairs[rows, device]
 
     def action_logits(self, window: Windows) -> Tensor:
         """Predictions for every pair: (B, P, target.outputs)."""
         past, future = self.representations(window)
-        return self.head(past, future, self._pairs_on(past.device, window.obs.shape[1])[0])
+        return self.head(past, future, self._scored(window.obs.shape[1], past.device)[0])
 
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean action loss over all real pairs, plus the optional terms; `loss_kNN` is the mean at each k."""
@@ -153,7 +153,7 @@ class InverseObjective(Objective):
         self, past: Tensor, future: Tensor, window: Windows, progress: float | Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """`loss`, given the `representations` of the window."""
-        pairs, gaps = self._pairs_on(past.device, window.obs.shape[1])
+        pairs, gaps = self._scored(window.obs.shape[1], past.device)
         losses = self.target.loss(self.head(past, future, pairs), window.action[:, pairs[:, 0]])
         real = window.real[:, pairs.sum(1)].to(losses)
         total = _mean_over(real, losses)
