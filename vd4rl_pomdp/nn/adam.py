@@ -47,11 +47,18 @@ class Adam(torch.optim.Adam):
             rate = float(group["lr"])
             group.update(before)  # the tensor that a captured step reads stays the same one
             set_rate(group, rate)
-            for parameter in group["params"]:
-                step = self.state.get(parameter, {}).get("step")
-                if step is not None:  # PyTorch keeps it where the other's kind of step wants it
-                    on = parameter.device if group["capturable"] or group["fused"] else "cpu"
-                    self.state[parameter]["step"] = step.to(on, torch.float32)
+            for parameter in self.state.keys() & set(group["params"]):
+                self.state[parameter] = {
+                    name: self._placed(name, value, parameter, group) for name, value in self.state[parameter].items()
+                }
+
+    @staticmethod
+    def _placed(name: str, value: Tensor, parameter: Tensor, group: dict[str, Any]) -> Tensor:
+        """A loaded tensor where, and laid out as, the step wants it."""
+        if name == "step":
+            return value.to(parameter.device if group["capturable"] or group["fused"] else "cpu", torch.float32)
+        # a fused step on a CPU walks through memory: in another layout it would pair the wrong numbers, in silence
+        return torch.empty_like(parameter).copy_(value)
 
 
 def set_rate(group: dict[str, Any], rate: float | Tensor) -> None:
