@@ -76,27 +76,21 @@ class DRIML(Objective):
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean of the four InfoNCE terms at one k; `loss_gl` is a global anchor with local candidates."""
         rows = window.obs.shape[1]
-        k = 1 + self.draws.integers(min(self.max_k, rows - 1), 1)
+        k = 1 + self.draws.integers(min(self.max_k, rows - 1))
         maps = self._frame.maps(window.obs)
         states = self.encoder.from_features(self._frame.from_maps(maps), window.prev_action)
-        t = torch.arange(rows - 1, device=k.device)
-        ahead = (t + k).clamp(max=rows - 1)
-        real = (t + k < rows) & window.real[:, ahead]
+        # a step that is replayed has one shape, whatever k is: there rows that have no later one are left out by `real`
+        anchors = rows - (int(k) if buffers.in_host_memory(k) else 1)
+        there = torch.arange(anchors, device=k.device) + k
+        real = (there < window.length[:, None]).flatten()
+        there = there.clamp(max=rows - 1)
+        action = window.action[:, :anchors].flatten(0, 1)
         features = {"g": states[:, :, None], "l": self._places(maps)}
-        # a GPU would have to be asked how many are real: there all are scored, and the others do not count
-        counted = None if buffers.in_host_memory(real) else real.flatten()
-
-        def taken(x: Tensor) -> Tensor:
-            return x[real] if counted is None else x.flatten(0, 1)
-
-        action = taken(window.action[:, :-1])
-        now = {n: taken(x[:, :-1]) for n, x in features.items()}
-        later = {m: taken(x[:, ahead]) for m, x in features.items()}
-        terms = {
-            f"loss_{n}{m}": info_nce(self._scores(n + m, now[n], action, later[m]), real=counted) for n, m in TERMS
-        }
+        now = {n: x[:, :anchors].flatten(0, 1) for n, x in features.items()}
+        later = {m: x.index_select(1, there).flatten(0, 1) for m, x in features.items()}
+        terms = {f"loss_{n}{m}": info_nce(self._scores(n + m, now[n], action, later[m]), real=real) for n, m in TERMS}
         loss = torch.stack(list(terms.values())).mean()
-        return loss, {"loss": loss.detach(), "k": k[0].float()} | {n: term.detach() for n, term in terms.items()}
+        return loss, {"loss": loss.detach(), "k": k.float()} | {n: t.detach() for n, t in terms.items()}
 
     @property
     def _frame(self) -> FrameEncoder:

@@ -25,6 +25,10 @@ _WAITING = {"_local_scalar_dense", "item", "nonzero", "masked_select", "equal", 
 _DRAWING = {"rand", "randn", "randint", "randperm", "normal_", "uniform_", "bernoulli_", "random_", "multinomial"}
 
 
+def _indices(args: tuple) -> list[Tensor | None]:
+    return args[1] if len(args) > 1 and isinstance(args[1], list | tuple) else []
+
+
 class _Recorder(TorchDispatchMode):
     def __init__(self) -> None:
         super().__init__()
@@ -39,6 +43,12 @@ class _Recorder(TorchDispatchMode):
         name = func.overloadpacket.__name__
         if name in _WAITING:
             raise RuntimeError(f"operation not permitted when stream is capturing: {name} reads a value")
+        if name.startswith("index") and any(x is not None and x.dtype == torch.bool for x in _indices(args)):
+            raise RuntimeError(f"operation not permitted when stream is capturing: {name} counts a mask's values")
+        if (
+            name == "lift_fresh" and args[0].ndim
+        ):  # without axes it may be the number of an assignment, which is not sent
+            raise RuntimeError("operation not permitted when stream is capturing: a tensor of Python's numbers is sent")
         if name in _DRAWING:
             raise RuntimeError(f"operation not permitted when stream is capturing: {name} draws")
         for number, argument in enumerate(func._schema.arguments):

@@ -28,7 +28,7 @@ def states(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def trained(folder: Path, method: str, steps: int, device: str = "cpu", noise: float = 0.0) -> tuple[Trainer, list]:
-    """A trainer after some steps, and its scalars, read after the last; `noise` changes its first weights' last bits."""
+    """A trainer after some steps, and its scalars, read at the end; `noise` changes the last bits of its weights."""
     config = PretrainConfig.of("smoke", method=method, data=folder, out=folder, corruption="patch+zero_frames")
     if "l2_states" in vars(config.options):
         config = config.altered(l2_states=0.1)
