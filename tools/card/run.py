@@ -169,7 +169,7 @@ class Session:
             subprocess.run(["nvidia-cuda-mps-control"], input=b"quit\n", env=self.env, timeout=10, check=False)
 
 
-class Grid:
+class GridPart:
     """A grid as the command that carries it out, and what it needs first."""
 
     def __init__(self, session: Session, name: str, work: Path, home: Path | None, flags: list[str]) -> None:
@@ -200,7 +200,7 @@ class Grid:
         return self.collect(until) or self._session.run(self._words, until - time.monotonic())[0]
 
 
-def run_tests(session: Session, seconds: float, grids: list[Grid]) -> int:
+def run_tests(session: Session, seconds: float, grids: list[GridPart]) -> int:
     """Run the tests that need a GPU, and collect the sets of grids beside them; the tests' exit code."""
     words = [sys.executable, "-m", "pytest", "-m", "gpu", "-q", "-ra", "--durations=0", "--durations-min=1"]
     words += ["-p", "no:cacheprovider", "--continue-on-collection-errors", "-c", str(HERE / "pyproject.toml")]
@@ -275,7 +275,7 @@ def main() -> None:
     shares = told.mps and session.share_gpu()
     try:
         parts = [(name, float(limit or "inf")) for name, _, limit in (part.partition("=") for part in told.parts)]
-        grids = {n: Grid(session, n, told.work, told.home, flags) for n, _ in parts if n not in ("tests", "bench")}
+        grids = {n: GridPart(session, n, told.work, told.home, flags) for n, _ in parts if n not in ("tests", "bench")}
         for name, limit in parts:
             seconds, began = min(limit, session.left()), time.monotonic()
             session.say(f"{name}: {seconds:.0f} s at most")
