@@ -56,12 +56,12 @@ class CURL(Objective):
         with torch.no_grad():
             positive = self.momentum_encoder.encode(self._shifted(window))
         batch, rows = query.shape[:2]
-        real = window.real
-        group = torch.arange(batch, device=query.device)[:, None].expand(-1, rows)[real]
+        group = torch.arange(batch, device=query.device).repeat_interleave(rows)
         # flat over windows and rows: the group tells which rows are neighbours of the anchor, and no negatives
-        scores = query[real] @ self.bilinear @ positive[real].T
-        loss = info_nce(scores, group)
-        return loss, {"loss": loss.detach(), "accuracy": share_found(scores, group)}
+        scores = query.flatten(0, 1) @ self.bilinear @ positive.flatten(0, 1).T
+        counted = group, window.real.flatten()
+        loss = info_nce(scores, *counted)
+        return loss, {"loss": loss.detach(), "accuracy": share_found(scores, *counted)}
 
     def after_step(self) -> None:
         """Move the momentum encoder."""

@@ -31,6 +31,7 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vd4rl_pomdp.core import buffers
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.core.types import Windows
 from vd4rl_pomdp.nn.action_target import ActionTarget
@@ -75,17 +76,21 @@ class DRIML(Objective):
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean of the four InfoNCE terms at one k; `loss_gl` is a global anchor with local candidates."""
         rows = window.obs.shape[1]
-        k = 1 + int(self.draws.integers(min(self.max_k, rows - 1), 1))
+        k = 1 + self.draws.integers(min(self.max_k, rows - 1))
         maps = self._frame.maps(window.obs)
         states = self.encoder.from_features(self._frame.from_maps(maps), window.prev_action)
-        real = window.real[:, k:]
-        action = window.action[:, :-k][real]
+        # a step that is replayed has one shape, whatever k is: there rows that have no later one are left out by `real`
+        anchors = rows - (int(k) if buffers.in_host_memory(k) else 1)
+        there = torch.arange(anchors, device=k.device) + k
+        real = (there < window.length[:, None]).flatten()
+        there = there.clamp(max=rows - 1)
+        action = window.action[:, :anchors].flatten(0, 1)
         features = {"g": states[:, :, None], "l": self._places(maps)}
-        now = {n: x[:, :-k][real] for n, x in features.items()}
-        later = {m: x[:, k:][real] for m, x in features.items()}
-        terms = {f"loss_{n}{m}": info_nce(self._scores(n + m, now[n], action, later[m])) for n, m in TERMS}
+        now = {n: x[:, :anchors].flatten(0, 1) for n, x in features.items()}
+        later = {m: x.index_select(1, there).flatten(0, 1) for m, x in features.items()}
+        terms = {f"loss_{n}{m}": info_nce(self._scores(n + m, now[n], action, later[m]), real=real) for n, m in TERMS}
         loss = torch.stack(list(terms.values())).mean()
-        return loss, {"loss": loss.detach(), "k": torch.tensor(float(k))} | {n: t.detach() for n, t in terms.items()}
+        return loss, {"loss": loss.detach(), "k": k.float()} | {n: t.detach() for n, t in terms.items()}
 
     @property
     def _frame(self) -> FrameEncoder:

@@ -52,7 +52,7 @@ class Bottleneck(nn.Module):
         if self.training:
             logits = logits - (-self.draws.uniform(*logits.shape).log()).log()
         soft = logits.softmax(-1)
-        hard = F.one_hot(logits.argmax(-1), soft.shape[-1]).to(soft)
+        hard = (logits.argmax(-1, keepdim=True) == torch.arange(soft.shape[-1], device=soft.device)).to(soft)
         return self.embedding(hard + soft - soft.detach())  # forward one code, backward the softmax
 
 
@@ -83,12 +83,16 @@ class HOMER(Objective):
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean binary cross-entropy of every real transition of the batch and one imposter for each."""
         states = self.encoder.encode(window)
-        real = window.real[:, 1:]
-        state, action, following = states[:, :-1][real], window.action[:, :-1][real], states[:, 1:][real]
+        pairs = states[:, :-1], window.action[:, :-1], states[:, 1:]
+        state, action, following = (x.flatten(0, 1) for x in pairs)
+        real = window.real[:, 1:].flatten()
+        count, real_first = real.sum(), (~real).int().argsort(stable=True)
         # now and then the true one is drawn: p(o') is the batch's own distribution, which contains it
-        imposter = following[self.draws.integers(len(following), len(following))]
+        imposter = following[real_first[self.draws.integers(count, len(following))]]
         logits = torch.stack([self.logits(state, action, following), self.logits(state, action, imposter)])
-        truth = torch.tensor([[1.0], [0.0]], device=logits.device).expand_as(logits)
-        loss = F.binary_cross_entropy_with_logits(logits, truth)
-        right = ((logits > 0) == (truth > 0)).float().mean()
+        truth = torch.zeros_like(logits)
+        truth[0] = 1
+        weight, share = real.to(logits), real.float().mean()
+        loss = F.binary_cross_entropy_with_logits(logits, truth, weight) / share
+        right = (((logits > 0) == (truth > 0)) * weight).mean() / share
         return loss, {"loss": loss.detach(), "accuracy": right}

@@ -6,16 +6,27 @@ refused.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
+from functools import partial
+from types import ModuleType
 from typing import Any
 
+import pytest
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils._python_dispatch import TorchDispatchMode
-from torch.utils._pytree import tree_flatten
+from torch.utils._pytree import tree_flatten, tree_map
+
+from vd4rl_pomdp.core import buffers
+from vd4rl_pomdp.nn.adam import Adam
+from vd4rl_pomdp.runs.replay import Replay
 
 _WAITING = {"_local_scalar_dense", "item", "nonzero", "masked_select", "equal", "is_nonzero", "unique", "_unique2"}
 _DRAWING = {"rand", "randn", "randint", "randperm", "normal_", "uniform_", "bernoulli_", "random_", "multinomial"}
+
+
+def _indices(args: tuple) -> list[Tensor | None]:
+    return args[1] if len(args) > 1 and isinstance(args[1], list | tuple) else []
 
 
 class _Recorder(TorchDispatchMode):
@@ -27,9 +38,17 @@ class _Recorder(TorchDispatchMode):
 
     def __torch_dispatch__(self, func: Any, types: Any, args: Any = (), kwargs: Any = None) -> Any:
         kwargs = kwargs or {}
+        # as they are now: lists may be changed later, and tensors be turned in place
+        now = tree_map(lambda x: x.detach() if isinstance(x, Tensor) else x, (args, kwargs))
         name = func.overloadpacket.__name__
         if name in _WAITING:
             raise RuntimeError(f"operation not permitted when stream is capturing: {name} reads a value")
+        if name.startswith("index") and any(x is not None and x.dtype == torch.bool for x in _indices(args)):
+            raise RuntimeError(f"operation not permitted when stream is capturing: {name} counts a mask's values")
+        if (
+            name == "lift_fresh" and args[0].ndim
+        ):  # without axes it may be the number of an assignment, which is not sent
+            raise RuntimeError("operation not permitted when stream is capturing: a tensor of Python's numbers is sent")
         if name in _DRAWING:
             raise RuntimeError(f"operation not permitted when stream is capturing: {name} draws")
         for number, argument in enumerate(func._schema.arguments):
@@ -41,7 +60,8 @@ class _Recorder(TorchDispatchMode):
         outs = [x.detach() for x in tree_flatten(out)[0] if isinstance(x, Tensor)]
         read = {x.untyped_storage().data_ptr() for x in tree_flatten((args, kwargs))[0] if isinstance(x, Tensor)}
         self._made |= {x.untyped_storage().data_ptr() for x in outs} - read
-        self.calls.append((func, args, kwargs, outs))
+        if torch.Tag.inplace_view not in func.tags:
+            self.calls.append((func, *now, outs))
         return out
 
     def _keep(self, tensor: Any) -> None:
@@ -70,7 +90,30 @@ def record(function: Callable[[], Tensor]) -> tuple[Callable[[], None], Tensor]:
         for func, args, kwargs, outs in recorder.calls:
             again = [x for x in tree_flatten(func(*args, **kwargs))[0] if isinstance(x, Tensor)]
             for old, new in zip(outs, again, strict=True):
+                assert old.shape == new.shape, (func, old.shape, new.shape)
                 if old.data_ptr() != new.data_ptr():  # else a view, or written in place
                     old.copy_(new)
 
     return replay, result
+
+
+class ReplayedAdam(Adam):
+    """Adam on a CPU as it is on a GPU: fused, its learning rate a tensor."""
+
+    def __init__(self, parameters: Iterable[nn.Parameter], learning_rate: float, fused: bool = True) -> None:
+        super().__init__(parameters, learning_rate, fused=True)
+        for group in self.param_groups:
+            group["lr"] = torch.tensor(learning_rate)
+
+
+def replays(patch: pytest.MonkeyPatch, *modules: ModuleType, capture: Any = record) -> None:
+    """Let trainings of modules that name `Replay` and `Adam` run on the CPU as they do on a GPU.
+
+    With `capture` None they run the same operators without being replayed.
+    """
+    patch.setattr(buffers, "in_host_memory", lambda x: False)  # numpy's work would not be recorded
+    for module in modules:
+        if hasattr(module, "Replay"):
+            patch.setattr(module, "Replay", partial(Replay, capture=capture))
+        if hasattr(module, "Adam"):
+            patch.setattr(module, "Adam", ReplayedAdam)

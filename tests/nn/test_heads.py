@@ -5,7 +5,7 @@ import torch
 import torch.nn.functional as F
 
 from vd4rl_pomdp.nn.action_target import BinsTarget, KMeansTarget, MSETarget
-from vd4rl_pomdp.nn.heads import PairHead, all_pairs
+from vd4rl_pomdp.nn.heads import PairHead, all_pairs, info_nce
 
 ROWS, MAX_K = 5, 3
 
@@ -39,6 +39,15 @@ def test_the_head_tells_gaps_apart_if_and_only_if_it_is_told_them():
         out = head(told)(*alike, pairs)[0]
         same = torch.isclose(out[:, None], out[None]).all(-1)
         assert torch.equal(same, (pairs[:, None, 1] == pairs[None, :, 1]) if told else torch.ones_like(same))
+
+
+def test_pairs_that_do_not_count_are_as_if_left_out():
+    generator = torch.Generator().manual_seed(0)
+    scores, real = torch.randn(3, 6, 6, generator=generator), torch.tensor([True, False, True, True, False, True])
+    group = torch.tensor([0, 0, 0, 1, 1, 1])
+    for told in (None, group):
+        left = info_nce(scores[:, real][:, :, real], None if told is None else told[real])
+        torch.testing.assert_close(info_nce(scores, told, real), left)
 
 
 def test_k_means_asks_for_the_nearest_centre():

@@ -22,8 +22,8 @@ class Draws(nn.Module):
         """Fresh int64 keys."""
         return next_keys(self.seed, self.position, shape)
 
-    def integers(self, high: int, *shape: int) -> Tensor:
-        """Uniform int64 in [0, high)."""
+    def integers(self, high: int | Tensor, *shape: int) -> Tensor:
+        """Uniform int64 in [0, high); a step that is replayed may tell `high` as a 0-d int64 tensor."""
         return ((self.keys(*shape) >> 33 & 0x3FFFFFFF) * high) >> 30
 
     def uniform(self, *shape: int) -> Tensor:

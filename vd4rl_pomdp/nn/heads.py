@@ -9,6 +9,11 @@ import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
+from vd4rl_pomdp.core import buffers
+
+_IGNORED = -100
+"""In the place of an anchor's candidate, where the anchor does not count."""
+
 
 class PairHead(nn.Module):
     """An MLP of (s_t, g_{t+k}, k) for many pairs at once.
@@ -68,34 +73,51 @@ def all_pairs(rows: int, max_k: int) -> Tensor:
     return torch.tensor(pairs, dtype=torch.int64).view(-1, 2)
 
 
-def info_nce(scores: Tensor, group: Tensor | None = None) -> Tensor:
+def info_nce(scores: Tensor, group: Tensor | None = None, real: Tensor | None = None) -> Tensor:
     """InfoNCE (van den Oord et al. 2018, arXiv 1807.03748): cross-entropy of telling each anchor's own candidate.
 
     Args:
         scores: (..., N, N), anchors by candidates; the diagonal holds the true pairs.
         group: (N,) int64; the other candidates of an anchor's own group are no negatives. None: all others are.
+        real: (N,) bool; the others are neither anchors nor candidates. None: all are.
 
     Returns:
         Mean over anchors and leading dimensions, in nats. It is log(candidates) when scores tell nothing.
     """
-    logits = _logits(scores, group)
-    truth = torch.arange(scores.shape[-1], device=scores.device).expand(logits.shape[:-1])
-    return F.cross_entropy(logits.flatten(0, -2), truth.reshape(-1))
+    real = _unless_all(real)
+    logits = _logits(scores, group, real)
+    truth = torch.arange(scores.shape[-1], device=scores.device)
+    if real is not None:
+        truth = truth.masked_fill(~real, _IGNORED)
+    truth = truth.expand(logits.shape[:-1])
+    return F.cross_entropy(logits.flatten(0, -2), truth.reshape(-1), ignore_index=_IGNORED)
 
 
-def share_found(scores: Tensor, group: Tensor | None = None) -> Tensor:
+def share_found(scores: Tensor, group: Tensor | None = None, real: Tensor | None = None) -> Tensor:
     """Share of anchors whose own candidate scores highest among those that `info_nce` counts; the same arguments."""
     truth = torch.arange(scores.shape[-1], device=scores.device)
-    return (_logits(scores, group).argmax(-1) == truth).float().mean()
+    real = _unless_all(real)
+    found = (_logits(scores, group, real).argmax(-1) == truth).float()
+    return found.mean() if real is None else (found * real).mean() / real.float().mean()
 
 
-def _logits(scores: Tensor, group: Tensor | None) -> Tensor:
+def _unless_all(real: Tensor | None) -> Tensor | None:
+    """None where all are real, if that can be seen without waiting for a GPU."""
+    return None if real is not None and buffers.in_host_memory(real) and real.all() else real
+
+
+def _logits(scores: Tensor, group: Tensor | None, real: Tensor | None) -> Tensor:
     """Scores in float32; -inf where a candidate is no negative."""
     logits = scores.float()
-    if group is None:
+    if group is None and real is None:
         return logits
-    own = torch.eye(len(group), dtype=torch.bool, device=scores.device)
-    return logits.masked_fill((group[:, None] == group[None, :]) & ~own, -torch.inf)
+    # its own stays, also where an anchor is not real: over nothing but -inf a softmax would have no gradient
+    own = torch.eye(scores.shape[-1], dtype=torch.bool, device=scores.device)
+    if group is not None:
+        logits = logits.masked_fill((group[:, None] == group[None, :]) & ~own, -torch.inf)
+    if real is not None:
+        logits = logits.masked_fill(~real & ~own, -torch.inf)
+    return logits
 
 
 @torch.no_grad()

@@ -100,6 +100,7 @@ class InverseObjective(Objective):
         self.head = PairHead(
             encoder.dim, future_dim, options.largest_gap, target.outputs, options.head_dim, options.k_embedding
         )
+        self._pairs: dict[tuple[int, torch.device], tuple[Tensor, list[int]]] = {}
         self.predictor = mlp(encoder.dim + 1, 512, encoder.dim, layers=3) if options.self_prediction else None
 
     @abstractmethod
@@ -131,10 +132,17 @@ class InverseObjective(Objective):
         """The (t, k) that are scored in a window of `rows` rows: (P, 2) int64 on the CPU, not to be changed."""
         return all_pairs(rows, self.options.largest_gap)
 
+    def _scored(self, rows: int, device: torch.device) -> tuple[Tensor, list[int]]:
+        """`pairs` on a device, and the k among them, in order; copied there once, as a replayed step copies nothing."""
+        if (rows, device) not in self._pairs:
+            pairs = self.pairs(rows)
+            self._pairs[rows, device] = pairs.to(device), sorted(set(pairs[:, 1].tolist()))
+        return self._pairs[rows, device]
+
     def action_logits(self, window: Windows) -> Tensor:
         """Predictions for every pair: (B, P, target.outputs)."""
         past, future = self.representations(window)
-        return self.head(past, future, self.pairs(window.obs.shape[1]).to(past.device))
+        return self.head(past, future, self._scored(window.obs.shape[1], past.device)[0])
 
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
         """Mean action loss over all real pairs, plus the optional terms; `loss_kNN` is the mean at each k."""
@@ -145,15 +153,14 @@ class InverseObjective(Objective):
         self, past: Tensor, future: Tensor, window: Windows, progress: float | Tensor
     ) -> tuple[Tensor, dict[str, Tensor]]:
         """`loss`, given the `representations` of the window."""
-        scored = self.pairs(window.obs.shape[1])
-        pairs = scored.to(past.device, non_blocking=True)
+        pairs, gaps = self._scored(window.obs.shape[1], past.device)
         losses = self.target.loss(self.head(past, future, pairs), window.action[:, pairs[:, 0]])
         real = window.real[:, pairs.sum(1)].to(losses)
         total = _mean_over(real, losses)
         sums = losses.new_zeros(2, self.options.largest_gap + 1)  # of losses and of real pairs at every k of 0..K
         sums.index_add_(1, pairs[:, 1], torch.stack([(losses.detach() * real).sum(0), real.sum(0)]))
         means = sums[0] / sums[1].clamp(min=1)
-        logs = {"action_loss": total.detach()} | {f"loss_k{k:02d}": means[k] for k in scored[:, 1].unique().tolist()}
+        logs = {"action_loss": total.detach()} | {f"loss_k{k:02d}": means[k] for k in gaps}
         if self.predictor is not None:
             term = self._self_prediction(past, pairs, real)
             total, logs["self_prediction"] = total + self.options.self_prediction * term, term.detach()
