@@ -41,6 +41,9 @@ NOT_RUN = {
     "vd4rl-pomdp data collect": "renders whole episodes; data/test_collect runs shorter ones",
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
     "vd4rl-pomdp hub": "needs a Hub; test_hub has one of its own",
+    **dict.fromkeys(
+        ("python tools/card", "tar xf card", "python3 card/run.py"), "fetches packages; tests/tools has a stub"
+    ),
     "python tools/train_actor.py": "trains for hours; tests/tools trains less",
     "python tools/export_actor.py": "as above",
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",

@@ -38,6 +38,7 @@ class Adam(torch.optim.Adam):
         gpu = device.type == "cuda"
         rate = torch.tensor(learning_rate, device=device) if gpu else learning_rate
         super().__init__(parameters, lr=rate, fused=True if gpu or fused else None, capturable=gpu)
+        self._warned_capturable_if_run_uncaptured = True  # steps before the first replayed one are not captured
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue from another's `state_dict`, by this device's kind of step."""
