@@ -52,6 +52,7 @@ NOT_RUN = {
     "vd4rl-pomdp results add": "tests/runs/results adds runs",
     "vd4rl-pomdp pretrain --method": "pretrain/test_train runs every method in its smoke size",
     "vd4rl-pomdp finetune --encoder RUN": "as above",
+    "vd4rl-pomdp finetune --seeds": "tests/finetune/test_stack trains less",
     "vd4rl-pomdp sweep": "trains for minutes; tests/sweeps trains less",
 }
 """How a line begins that is parsed, if it is ours, but not run, and why."""
