@@ -91,7 +91,7 @@ class Size:
     """Rows."""
 
 
-PAPER = Size(100, 1024, 256, 16, 4, 5, 512, 128, 100, 500, 5)  # as many updates as are drawn at once, or more
+PAPER = Size(100, 1024, 256, 16, 4, 5, 512, 64, 100, 500, 5)  # as many updates as are drawn at once, or more
 TINY = Size(1, 16, 8, 2, 1, 1, 2, 1, 1, 3, 2, "nature", 16)
 """Shows on any machine in seconds that all runs, and measures nothing worth telling."""
 
@@ -298,6 +298,7 @@ def encoders_at_once(dataset: Dataset, folder: Path, size: Size) -> dict[str, fl
     device = dataset.t.device
     streams = [torch.cuda.Stream(device) if device.type == "cuda" else None for _ in range(size.runs)]
     updates = [make_trainer(dataset, pretraining(folder, "mik+a", size, seed)).update for seed in range(size.runs)]
+    wait(device)  # what they were made of is on another stream
 
     def step() -> None:
         for stream, update in zip(streams, updates, strict=True):
@@ -349,7 +350,7 @@ def peer(dataset: Dataset, features: torch.Tensor, size: Size, replayed_ms: floa
     return told
 
 
-def evaluation(encoder: Encoder, dataset: Dataset, folder: Path, size: Size, limit: float = 90.0) -> dict[str, Any]:
+def evaluation(encoder: Encoder, dataset: Dataset, folder: Path, size: Size, limit: float = 70.0) -> dict[str, Any]:
     """Seconds of an evaluation on every core, unless nothing can be drawn here or it takes over `limit`."""
     card = EncoderCard("mik+a", "walker_walk", "bench", flat(CorruptionConfig.of(CORRUPTION)), 0, 0, "paper")
     save_encoder(folder / "encoder", encoder, card)
