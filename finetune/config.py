@@ -32,7 +32,8 @@ class FinetuneConfig(StageConfig):
     algorithm: str = "td3_bc"
     """Algorithm, `vd4rl-pomdp list` shows all; the references bc and drq_bc bring their own."""
     seed: int = 0
-    """Seed of the networks, the batches and the noise, and of the views unless --view-seed is given."""
+    """Seed of the networks, the batches and the noise, and of the views unless --view-seed is given. --seeds 0,1,2 in
+    its place trains as many runs as one: OUT/seed0 and so on."""
     updates: int = 500_000
     """Gradient updates."""
     batch_size: int = 256
