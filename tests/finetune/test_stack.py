@@ -8,8 +8,8 @@ from typing import Any
 import pytest
 import torch
 
-from finetune import train
-from finetune.algorithms import ALGORITHMS
+from finetune import end_to_end, train
+from finetune.algorithms import ALGORITHMS, bc, iql, td3_bc
 from finetune.config import FinetuneConfig
 from finetune.features import FeatureSampler, StackedSampler
 from finetune.histories import Histories
@@ -17,7 +17,7 @@ from finetune.train import finetune, finetune_all
 from pretrain.train import pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import CutError, cut_at, smoke_finetune, smoke_pretrain
-from tests.recording import record
+from tests.recording import record, replays
 from vd4rl_pomdp.cli import main, run_to_end
 from vd4rl_pomdp.core.options import NO_OPTIONS
 from vd4rl_pomdp.core.streams import RandomStream
@@ -218,7 +218,7 @@ def encoders(trained, tmp_path_factory) -> dict[str, Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VD4RL_POMDP_CACHE", str(trained / "cache"))
         states = write_fake_set(folder / "walker_walk" / "expert", [20, 25, 30], physics_dim=18)
-        for method in ("state", "drq_bc", "acro"):
+        for method in ("state", "drq_bc", "bc", "acro"):
             given = states if method == "state" else trained / "walker_walk" / "expert"
             made[method] = pretrain(smoke_pretrain(given, folder / method, method=method)).path / "encoder"
     return made
@@ -235,16 +235,13 @@ def made(name: str, data: Path, seed: int, device: str = "cpu") -> SimpleNamespa
     policy.standardise.fit(features)
     streams = [RandomStream(torch.Generator().manual_seed(10 * seed + n), device) for n in range(2)]
     algorithm = ALGORITHMS[name](policy, config.options, config.learning_rate, config.updates, streams[0])
-    for part in algorithm.parts().values():
-        for group in getattr(part, "param_groups", ()):
-            group["lr"] = torch.as_tensor(group["lr"], device=device)
     sampler = FeatureSampler(Histories(dataset, NO_OPTIONS, 2, 0), features, 16, 2, 0.9, streams[1])
     return SimpleNamespace(algorithm=algorithm, sampler=sampler, config=config, settle=lambda: None)
 
 
-def course_of(runs: list[SimpleNamespace], updates: int, capture: Any = None) -> list[dict[str, torch.Tensor]]:
+def course_of(runs: list[SimpleNamespace], updates: int) -> list[dict[str, torch.Tensor]]:
     """What each run logs and where it ends; the logs are read after the last update."""
-    step = train.Updates(runs, capture)
+    step = train.Updates(runs)
     logs = [step(number) for number in range(updates)]
     found = []
     for number, run in enumerate(runs):
@@ -259,20 +256,38 @@ def course_of(runs: list[SimpleNamespace], updates: int, capture: Any = None) ->
 def test_replayed_updates_are_those_that_are_run(data, monkeypatch, capsys, name, runs):
     """Fresh noise and batches, the actor's delay, and schedules up to their end; every scalar is of its own update."""
     monkeypatch.setattr("vd4rl_pomdp.core.streams.BLOCK", 32)
-    eager, replayed = ([made(name, data, seed) for seed in range(runs)] for _ in range(2))
-    expected, found = course_of(eager, 75), course_of(replayed, 75, record)
+    found = []
+    for capture in (None, record):
+        replays(monkeypatch, train, td3_bc, iql, bc, capture=capture)
+        members = [made(name, data, seed) for seed in range(runs)]
+        found.append(course_of(members, 75))
     assert not capsys.readouterr().err, "it is replayed"
-    for one, other in zip(found, expected, strict=True):
+    for one, other in zip(*found, strict=True):
         assert one.keys() == other.keys()
-        for key, value in other.items():
+        for key, value in one.items():
             torch.testing.assert_close(
-                one[key], value, rtol=1e-4, atol=1e-6, msg=lambda told, key=key: f"{key}: {told}"
+                other[key], value, rtol=1e-4, atol=1e-6, msg=lambda told, key=key: f"{key}: {told}"
             )
-    rates = [
-        float(run.algorithm.parts()["policy_optimiser" if name != "bc" else "optimiser"].param_groups[0]["lr"])
-        for run in replayed
-    ]
+    optimiser = "optimiser" if name == "bc" else "policy_optimiser"
+    rates = [float(run.algorithm.parts()[optimiser].param_groups[0]["lr"]) for run in members]
     assert rates == pytest.approx([0.0 if name == "iql" else 1e-3] * runs, abs=1e-9)
+
+
+@pytest.mark.parametrize("method", ["mik+a", "acro", "drq_bc", "bc"])
+def test_replayed_runs_are_those_that_are_run(encoders, data, tmp_path, monkeypatch, capsys, method):
+    """On features, on batches that are encoded anew, and where the encoder is trained along; cut and resumed, too."""
+    changes = BRIEF | {"updates": 20, "eval_every": 10, "views": 0 if method == "acro" else 1}
+    monkeypatch.setattr(train, "STANDARDISED_BY", 16)
+    for folder, capture in (("run", None), ("replayed", record)):
+        replays(monkeypatch, train, end_to_end, td3_bc, bc, capture=capture)
+        config = smoke_finetune(encoders[method], data, tmp_path / folder, **changes)
+        with monkeypatch.context() as patch:
+            cut_at(patch, 4)
+            with pytest.raises(CutError):
+                finetune(config)
+        finetune(config)
+    assert "warning" not in capsys.readouterr().err
+    same_but_for_rounding(tmp_path / "run", tmp_path / "replayed")
 
 
 @pytest.mark.gpu
