@@ -58,7 +58,7 @@ from vd4rl_pomdp.runs import (
     TIMING_FILE,
     interrupt,
 )
-from vd4rl_pomdp.runs.device import pick_device
+from vd4rl_pomdp.runs.device import pick_device, set_products
 from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.loop import Loop, in_step, save, training
@@ -357,9 +357,10 @@ class Updates:
             for number, trainer in enumerate(trainers):
                 trainer.settle = partial(_settle, trainer, stack, sampler, number)
         device = first.policy.standardise.mean.device
-        bf16 = trainers[0].config.update_precision == "bf16"
+        precision = trainers[0].config.update_precision
+        set_products(device, precision)
         # not cached, because weights move between the losses of an update
-        self._precise = torch.autocast(device.type, torch.bfloat16, bf16, cache_enabled=False)
+        self._precise = torch.autocast(device.type, torch.bfloat16, precision == "bf16", cache_enabled=False)
         streams, trained = [self._sampler.draws, self._counting.draws], [self._algorithm, self._counting]
         self._replay = Replay(self._update, device, streams, self._counting.period, trained)
         if self._replay.replays:

@@ -14,7 +14,7 @@ import statistics
 import tempfile
 import time
 import traceback
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -27,9 +27,9 @@ from finetune.algorithms import ALGORITHMS
 from finetune.algorithms.algorithm import Algorithm
 from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd
-from finetune.features import STAGE, FeatureSampler, FrozenEncoder, StackedSampler, encode_views
+from finetune.features import STAGE, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories
-from finetune.stack import Stack
+from finetune.train import FinetuneTrainer, Updates
 from pretrain.config import PretrainConfig
 from vd4rl_pomdp.bench.measures import synthetic_set
 from vd4rl_pomdp.bench.processes import JAX_MISSING, Worker, at_once, make_trainer
@@ -43,7 +43,7 @@ from vd4rl_pomdp.nn.encoder_folder import save_encoder
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
-from vd4rl_pomdp.runs.replay import EAGER_VARIABLE, Replay
+from vd4rl_pomdp.runs.replay import EAGER_VARIABLE
 
 AIMS: dict[str, tuple[str, float]] = {
     "td3_bc.replayed_ms": ("<=", 0.55),
@@ -240,56 +240,54 @@ def stacked(dataset: Dataset, features: torch.Tensor, size: Size) -> dict[str, f
 def on_features(
     dataset: Dataset, features: torch.Tensor, name: str, size: Size, seeds: int
 ) -> Callable[[], dict[str, torch.Tensor]]:
-    """The next update of an algorithm, or of so many stacked runs of it."""
-    config = FinetuneConfig.of("paper", algorithm=name).altered(hidden_dim=size.hidden_dim, batch_size=size.batch_size)
-    histories = Histories(dataset, NO_OPTIONS, 3, 0)
-    algorithms, samplers = [], []
+    """The next update of an algorithm, or of so many stacked runs of it, sampling included, as in training."""
+    config, device = finetuning(name, size), features.device
+    histories, trainers = Histories(dataset, NO_OPTIONS, 3, 0), []
     for seed in range(seeds):
-        batches = random_stream(seed, "bench", "batches", device=features.device)
-        samplers.append(FeatureSampler(histories, features, config.batch_size, 3, 0.99, batches))
-        algorithms.append(algorithm_of(config, features.shape[-1], dataset, seed))
-        algorithms[-1].policy.standardise.fit(features[:1])
-    if seeds == 1:
-        return replayed(algorithms[0], samplers[0], algorithms[0], features.device)
-    stack = Stack(algorithms)
-    return replayed(stack, StackedSampler(samplers), stack.whole, features.device)
+        batches = random_stream(seed, STAGE, "batches", device=device)
+        sampler = FeatureSampler(histories, features, config.batch_size, 3, 0.99, batches)
+        algorithm = algorithm_of(config, features.shape[-1], dataset, seed)
+        algorithm.policy.standardise.fit(features[:1])
+        trainers.append(trainer_of(algorithm, sampler, config))
+    return next_update(trainers)
 
 
 def end_to_end(dataset: Dataset, size: Size) -> Callable[[], dict[str, torch.Tensor]]:
     """The next update of `drq_bc`, which trains its encoder, too."""
-    device = dataset.t.device
-    config = FinetuneConfig.of("paper", algorithm="drqv2_bc", precision="bf16").altered(
-        hidden_dim=size.hidden_dim, batch_size=size.batch_size
-    )
+    config, device = finetuning("drqv2_bc", size), dataset.t.device
     encoder = Encoder(EncoderConfig(dataset.action_dim)).to(device)
     algorithm = algorithm_of(config, encoder.dim, dataset, 0)
     view = View(dataset, CorruptionConfig.of(CORRUPTION), config.shift, 0, STAGE)
-    sampler = TransitionSampler(view, config.batch_size, random_stream(0, "bench", "batches", device=device), 3, 0.99)
-    return replayed(EndToEnd(algorithm, encoder, config), sampler, algorithm, device)
+    batches = random_stream(0, STAGE, "batches", device=device)
+    sampler = TransitionSampler(view, config.batch_size, batches, 3, 0.99)
+    return next_update([trainer_of(EndToEnd(algorithm, encoder, config), sampler, config)])
+
+
+def finetuning(algorithm: str, size: Size) -> FinetuneConfig:
+    """Settings of a fine-tuning: the `paper` preset, an encoder in bf16."""
+    return FinetuneConfig.of(
+        "paper", algorithm=algorithm, precision="bf16", hidden_dim=size.hidden_dim, batch_size=size.batch_size
+    )
 
 
 def algorithm_of(config: FinetuneConfig, dim: int, dataset: Dataset, seed: int) -> Algorithm:
     """A config's algorithm on representations of a width, where the set is."""
     device = dataset.t.device
     policy = Policy(dim, dataset.action_dim, config.hidden_dim).to(device)
-    noise = random_stream(seed, "bench", "noise", device=device)
+    noise = random_stream(seed, STAGE, "noise", device=device)
     return ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
 
 
-def replayed(
-    learner: Any, sampler: Any, algorithm: Algorithm, device: torch.device
-) -> Callable[[], dict[str, torch.Tensor]]:
-    """The next update of what learns, from a batch of its own, replayed as in training."""
+def trainer_of(algorithm: Algorithm | EndToEnd, sampler: Any, config: FinetuneConfig) -> FinetuneTrainer:
+    """A run that is never written."""
+    unwritten: Any = [None] * 4  # where its results would go, and what they would be compared with
+    return FinetuneTrainer(algorithm, sampler, config, *unwritten)
 
-    def step(turn: int) -> dict[str, torch.Tensor]:
-        algorithm.take_turn(turn)
-        return learner.update(sampler.sample())
 
-    replay = Replay(step, device, [sampler.draws, algorithm.draws], algorithm.period, [algorithm])
-    if replay.replays:
-        algorithm.count_on(device)
-    turns = itertools.cycle(range(algorithm.period))
-    return lambda: replay(next(turns))
+def next_update(trainers: Sequence[FinetuneTrainer]) -> Callable[[], dict[str, torch.Tensor]]:
+    """The next update of runs, of all at once."""
+    updates, made = Updates(trainers), itertools.count()
+    return lambda: updates(next(made))
 
 
 def encoders_at_once(dataset: Dataset, folder: Path, size: Size) -> dict[str, float]:

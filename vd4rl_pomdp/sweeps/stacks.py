@@ -23,7 +23,7 @@ STACKED = "finetune"
 
 def kind_of(job: Job) -> tuple[str, ...]:
     """What jobs have in common that stack, as far as it can be told before their encoders are there; () if none may."""
-    if job.section != STACKED:
+    if job.section != STACKED or job.settings.get("views") == "0":  # then pixels are read, by an encoder a run
         return ()
     words = list(job.words)
     for flag in _OWN:
