@@ -144,7 +144,8 @@ class Driver:
                 self._widths[job.name] = width_of(job, plan.made_in)
             return plan.made_in, tuple(plan.program), self._widths[job.name], kind
 
-        now, small = [], []
+        now: list[list[Job]] = []
+        small: list[list[Job]] = []
         for jobs in in_stacks(ready, self._stack, attempts, alike):
             grows = len(jobs) < self._stack and kind_of(jobs[0]) and not runs_alone(attempts[jobs[0].name])
             (small if grows else now).append(jobs)
