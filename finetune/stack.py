@@ -61,15 +61,14 @@ class Stack:
         """An update of every run, on a batch whose tensors are (S, B, ...); (S,) logs."""
         return self.whole.update(batch)
 
-    def settle(self) -> None:
-        """Tell every run how far it is: updates, random numbers, and its slice of the optimisers' state."""
-        for number, run in enumerate(self.runs):
-            run.updates = int(self.whole.updates)
-            run.draws.set_state(self.whole.draws.get_state(number))
+    def settle(self, number: int) -> None:
+        """Tell a run how far it is: updates, random numbers, and its slice of the optimisers' state."""
+        run = self.runs[number]
+        run.updates = int(self.whole.updates)
+        run.draws.set_state(self.whole.draws.get_state(number))
         for part, own in self._parts:
             if isinstance(part, Optimizer):
-                for number, each in enumerate(own):
-                    _slice_optimiser(part, each, number)
+                _slice_optimiser(part, own[number], number)
 
     def _each(self, function: Callable[..., Result], batch: FeatureBatch, *tensors: Tensor) -> Result:
         """What a function says of each run's batch, under each run's weights."""

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import math
+import sys
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict, replace
 from functools import partial
 from pathlib import Path
@@ -16,10 +19,12 @@ from finetune.algorithms.algorithm import ReturnOptions
 from finetune.config import FinetuneConfig, as_trained
 from finetune.end_to_end import EndToEnd
 from finetune.evaluation import episode_rows, evaluate, jobs_of, own_and_none
-from finetune.features import STAGE, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
+from finetune.features import STAGE, ExactSampler, FeatureSampler, FrozenEncoder, StackedSampler, encode_views
 from finetune.histories import Histories, HistoryOptions
 from finetune.path import DataPath
-from vd4rl_pomdp.core.errors import refuse_outside
+from finetune.stack import Stack
+from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_outside
+from vd4rl_pomdp.core.options import flat
 from vd4rl_pomdp.core.registry import warn_of_other_code
 from vd4rl_pomdp.core.seeding import seed_networks
 from vd4rl_pomdp.core.streams import random_stream
@@ -53,12 +58,13 @@ from vd4rl_pomdp.runs import (
     TIMING_FILE,
     interrupt,
 )
-from vd4rl_pomdp.runs.device import pick_device
+from vd4rl_pomdp.runs.device import pick_device, set_products
 from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_json
-from vd4rl_pomdp.runs.loop import Loop, training
+from vd4rl_pomdp.runs.loop import Loop, in_step, save, training
 from vd4rl_pomdp.runs.metrics import EVALUATION
 from vd4rl_pomdp.runs.outputs import refuse_inside
+from vd4rl_pomdp.runs.replay import Capture, Replay
 from vd4rl_pomdp.runs.run import RunFolder
 
 RESULTS = ("policy/config.json", "policy/model.safetensors", EPISODES_FILE, *FILES_OF_RUN)
@@ -70,30 +76,99 @@ STANDARDISED_BY = 1024
 
 def finetune(config: FinetuneConfig) -> RunFolder:
     """Run the stage, or resume it; writes the policy and `episodes.csv` into the run's folder."""
-    config.check()
-    refuse_inside(config.out)
-    dataset = open_dataset(config.data)
-    dataset.require_transitions()
-    encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frame_size)
-    refuse_outside(config, shift=(0, dataset.frame_size - 1))
-    config = as_trained(config, card.end_to_end, encoder.memory is not None, TASKS.named(card.task).decisions)
-    if isinstance(config.memory, HistoryOptions):
-        encoder.config = replace(encoder.config, **config.memory.encoder_changes)
-    if encoder.reads_state:
-        dataset.require_states()
-    device = pick_device(config.device)
-    untold = card.quality if card.data == dataset.fingerprint else UNKNOWN_QUALITY
-    card = replace(card, quality=dataset.quality or untold)  # the policy's set names its rows
-    inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
-    before = read_record(config.encoder)
-    with RunFolder(config.out, STAGE, config, inputs, RESULTS, before.parts, read_plan(config.data)) as run:
-        if not run.finished:
-            warn_of_other_code(config.encoder, before.code, before.parts, "it was pretrained; pretrain it again")
-            write_json(run.path / LABELS_FILE, labels_of(config, card))
-            _keep_encoder(config, run.path)
-            dataset.to(device)
-            _trainer(config, dataset, encoder.to(device), card, run).run(run)
-    return run
+    return finetune_all([config])[0]
+
+
+def finetune_all(
+    configs: Sequence[FinetuneConfig], words: Sequence[Sequence[str] | None] | None = None
+) -> list[RunFolder]:
+    """Run the stage, or resume it, for several runs at once, whose updates are one (see `finetune.stack`).
+
+    Args:
+        configs: of each run; they may differ in seeds, encoder, data, and how they are evaluated.
+        words: of each run's own command, for its record.
+
+    Raises:
+        UserError: settings that cannot work, or runs that do not stack.
+        FloatingPointError: a run diverged; the others were trained to their end.
+    """
+    datasets: dict[Path, Dataset] = {}
+    asked = [_Asked(config, datasets, own) for config, own in zip(configs, words or [None] * len(configs), strict=True)]
+    if len(asked) > 1:
+        _refuse_unlike(asked)
+    with ExitStack() as owned:
+        for one in asked:
+            owned.enter_context(one.run)
+        train([one.trainer() for one in asked if not one.run.finished])
+    return [one.run for one in asked]
+
+
+class _Asked:
+    """A run that was asked for, and what it reads."""
+
+    def __init__(self, config: FinetuneConfig, datasets: dict[Path, Dataset], words: Sequence[str] | None) -> None:
+        """Read what a config names, sets only where they are not among those that were opened; nothing is written."""
+        config.check()
+        refuse_inside(config.out)
+        self.dataset = dataset = datasets.get(config.data) or open_dataset(config.data)
+        datasets[config.data] = dataset
+        dataset.require_transitions()
+        self.encoder, card = load_encoder(config.encoder, dataset.task, dataset.action_dim, dataset.frame_size)
+        refuse_outside(config, shift=(0, dataset.frame_size - 1))
+        remembers, decisions = self.encoder.memory is not None, TASKS.named(card.task).decisions
+        self.config = config = as_trained(config, card.end_to_end, remembers, decisions)
+        if isinstance(config.memory, HistoryOptions):
+            self.encoder.config = replace(self.encoder.config, **config.memory.encoder_changes)
+        if self.encoder.reads_state:
+            dataset.require_states()
+        self.device = pick_device(config.device)
+        untold = card.quality if card.data == dataset.fingerprint else UNKNOWN_QUALITY
+        self.card = replace(card, quality=dataset.quality or untold)  # the policy's set names its rows
+        inputs = {"data": dataset.fingerprint, "encoder": encoder_hash(config.encoder)}
+        self.before = read_record(config.encoder)
+        plan = read_plan(config.data)
+        self.run = RunFolder(config.out, STAGE, config, inputs, RESULTS, self.before.parts, plan, words)
+
+    def trainer(self) -> FinetuneTrainer:
+        """What trains the run, whose folder is owned; encodes the set."""
+        what = "it was pretrained; pretrain it again"
+        warn_of_other_code(self.config.encoder, self.before.code, self.before.parts, what)
+        write_json(self.run.path / LABELS_FILE, labels_of(self.config, self.card))
+        _keep_encoder(self.config, self.run.path)
+        self.dataset.to(self.device)
+        return _trainer(self.config, self.dataset, self.encoder.to(self.device), self.card, self.run)
+
+
+ALIKE = (
+    *("algorithm", "updates", "batch_size", "hidden_dim", "learning_rate", "update_precision", "views", "device"),
+    *("eval_every", "log_every", "checkpoint_every"),
+)
+"""Settings that runs of a stack share, besides the algorithm's options."""
+
+
+def _refuse_unlike(asked: Sequence[_Asked]) -> None:
+    """Raise UserError for runs that do not stack, naming two and what they differ in."""
+    first = asked[0]
+    for number, one in enumerate(asked):
+        if one.card.end_to_end:
+            raise UserError(f"{one.config.out}: {one.card.method} trains its encoder, too, and does not stack")
+        if not one.config.views:
+            raise UserError(f"{one.config.out}: --views 0 encodes every batch anew and does not stack")
+        if any(one.config.out.resolve() == other.config.out.resolve() for other in asked[:number]):
+            raise UserError(f"--out {one.config.out} is given twice: a folder holds one run")
+        for (what, value), (_, other) in zip(_alike(first), _alike(one), strict=False):
+            if value != other:
+                raise UserError(
+                    f"{first.config.out} and {one.config.out} do not stack: {what} is {value} there and {other} here; "
+                    "train them by commands of their own"
+                )
+
+
+def _alike(asked: _Asked) -> list[tuple[str, Any]]:
+    """What runs of a stack share, in words and by value; the algorithm first, which decides what options there are."""
+    settings = {name: getattr(asked.config, name) for name in ALIKE} | flat(asked.config.options)
+    widths = [("the representations' width", asked.encoder.dim), ("the actions' width", asked.dataset.action_dim)]
+    return [(flag_of(name), value) for name, value in settings.items()] + widths
 
 
 def labels_of(config: FinetuneConfig, card: EncoderCard) -> dict[str, Any]:
@@ -138,7 +213,13 @@ def _trainer(
     actor = reference.actor_file
     path = DataPath(dataset, read_actor(actor), encode) if actor and dataset.physics is not None else None
     return FinetuneTrainer(
-        EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm, sampler, config, card, reference, path
+        EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm,
+        sampler,
+        config,
+        card,
+        run,
+        reference,
+        path,
     )
 
 
@@ -161,7 +242,10 @@ def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
 
 
 class FinetuneTrainer:
-    """One algorithm on one stream of batches."""
+    """One run: an algorithm, its stream of batches, and where the results go."""
+
+    loop: Loop
+    """While it is trained."""
 
     def __init__(
         self,
@@ -169,48 +253,40 @@ class FinetuneTrainer:
         sampler: FeatureSampler | ExactSampler | TransitionSampler,
         config: FinetuneConfig,
         card: EncoderCard,
+        run: RunFolder,
         reference: Reference,
         path: DataPath | None,
     ) -> None:
         self.algorithm, self.sampler = algorithm, sampler
-        self.config, self.card = config, card
+        self.config, self.card, self.folder = config, card, run
         self.reference, self.path = reference, path
         self.step = 0
-        self._precise = torch.autocast(
-            algorithm.policy.standardise.mean.device.type,
-            torch.bfloat16,
-            config.update_precision == "bf16",
-            cache_enabled=False,
-        )
-        """Not cached, because weights move between the losses of an update."""
+        self.settle: Callable[[], None] = lambda: None
+        """Brings algorithm and sampler to the last update's state, where others make the updates."""
 
-    def run(self, run: RunFolder) -> None:
-        """Train to the end, from the newest checkpoint if there is one."""
-        config, labels = self.config, labels_of(self.config, self.card)
-        title = f"finetune {config.algorithm} on {self.card.method}"
-        self.reference.write(run.path)
-        with training(run, self, title, config.updates, "updates", labels=labels, card=asdict(self.card)) as loop:
-            drop_episodes_after(run.path / EPISODES_FILE, self.step)  # of a checkpoint that is gone
-            if self.step and loop.due(config.eval_every):  # cut between this step's checkpoint and its scores
-                self.evaluate(run, loop)
-            for step in loop:
-                batch = self.sampler.sample()
-                with self._precise:
-                    logs = self.algorithm.update(batch)  # type: ignore[arg-type]
-                loop.add(logs)
-                self.step = step
-                if loop.due(config.log_every):
-                    loop.log()
-                if loop.due(config.eval_every):
-                    loop.save()  # first, so that a kill while episodes are played costs no update
-                    self.evaluate(run, loop)
+    def begin(self, title: str) -> AbstractContextManager[Loop]:
+        """Open the loop, from the newest checkpoint if there is one; a run without a title shows no progress."""
+        self.reference.write(self.folder.path)
+        labels, total = labels_of(self.config, self.card), self.config.updates
+        return training(self.folder, self, title, total, "updates", labels=labels, card=asdict(self.card))
+
+    def resume(self) -> None:
+        """Drop what is newer than the checkpoint, and make up for an evaluation that was cut off behind it."""
+        drop_episodes_after(self.folder.path / EPISODES_FILE, self.step)  # of a checkpoint that is gone
+        if self.step and self.loop.due(self.config.eval_every):
+            self.evaluate()
+
+    def finish(self) -> None:
+        """Write what a trained run ends with."""
+        path = self.folder.path
         if self.path:
-            self.reference.with_path_error(self.path.action_error(self.algorithm.policy)).write(run.path)
-        (run.path / FEATURES_FILE).unlink(missing_ok=True)
-        write_json(run.path / RENDER_FILE, render_info(self.card.task))
-        run.finish(updates=self.step)
+            error = self.path.action_error(self.algorithm.policy)
+            self.reference.with_path_error(error).write(path)
+        (path / FEATURES_FILE).unlink(missing_ok=True)
+        write_json(path / RENDER_FILE, render_info(self.card.task))
+        self.folder.finish(updates=self.step)
 
-    def evaluate(self, run: RunFolder, loop: Loop) -> None:
+    def evaluate(self) -> None:
         """Keep this step's policy, play its episodes unless their rows are there, and log the scores.
 
         The step's checkpoint is kept: while it plays, a signal need not wait.
@@ -218,6 +294,7 @@ class FinetuneTrainer:
         Raises:
             FloatingPointError: a weight is not finite.
         """
+        run, loop = self.folder, self.loop
         own = CorruptionConfig.fill(self.card.corruption)
         under = own_and_none(own) if self.config.eval_clean and self.step == self.config.updates else [own]
         with interrupt.deferred(False):
@@ -228,7 +305,7 @@ class FinetuneTrainer:
                 save_encoder(run.path / "encoder", self.algorithm.encoder, self.card)
             rows = [row for row in read_episodes(run.path / EPISODES_FILE) if row["step"] == self.step]
             if len(rows) < len(under) * self.config.eval_episodes:
-                rows = self._play(run, loop, under)
+                rows = self._play(run, under)
         scores = {
             f"{EVALUATION}{measure}/{name}": float(np.mean([r[measure] for r in rows if r["evaluated_under"] == name]))
             for name in dict.fromkeys(row["evaluated_under"] for row in rows)
@@ -237,7 +314,7 @@ class FinetuneTrainer:
         loop.log_evaluation(scores)
         loop.show(score=scores[f"{EVALUATION}score/{own.corruption}"])
 
-    def _play(self, run: RunFolder, loop: Loop, under: list[CorruptionConfig]) -> list[Row]:
+    def _play(self, run: RunFolder, under: list[CorruptionConfig]) -> list[Row]:
         """Keep a film of the first episode, then append the rows of all; they are the result."""
         config, task = self.config, TASKS.named(self.card.task)
         drop_episodes_after(run.path / EPISODES_FILE, self.step - 1)
@@ -253,6 +330,7 @@ class FinetuneTrainer:
 
     def state(self) -> dict[str, Any]:
         """Everything needed to resume to the bit."""
+        self.settle()
         parts = {"algorithm": self.algorithm.state_dict(), "sampler": self.sampler.state_dict()}
         return {"step": self.step} | parts
 
@@ -261,6 +339,98 @@ class FinetuneTrainer:
         self.step = state["step"]
         self.algorithm.load_state_dict(state["algorithm"])
         self.sampler.load_state_dict(state["sampler"])
+
+
+class Updates:
+    """Updates of one run, or of several at once; replayed where a GPU is."""
+
+    def __init__(self, trainers: Sequence[FinetuneTrainer], capture: Capture | None = None) -> None:
+        """Begin where the trainers stand; `capture` as `Replay` has it."""
+        first = trainers[0].algorithm
+        self._algorithm: Algorithm | EndToEnd = first
+        self._sampler: Any = trainers[0].sampler
+        self._counting = first.algorithm if isinstance(first, EndToEnd) else first
+        if len(trainers) > 1:
+            stack = Stack([trainer.algorithm for trainer in trainers])  # type: ignore[misc]
+            self._sampler = sampler = StackedSampler([trainer.sampler for trainer in trainers])  # type: ignore[misc]
+            self._algorithm = self._counting = stack.whole
+            for number, trainer in enumerate(trainers):
+                trainer.settle = partial(_settle, trainer, stack, sampler, number)
+        device = first.policy.standardise.mean.device
+        precision = trainers[0].config.update_precision
+        set_products(device, precision)
+        # not cached, because weights move between the losses of an update
+        self._precise = torch.autocast(device.type, torch.bfloat16, precision == "bf16", cache_enabled=False)
+        streams, trained = [self._sampler.draws, self._counting.draws], [self._algorithm, self._counting]
+        self._replay = Replay(self._update, device, streams, self._counting.period, trained, capture)
+        if self._replay.replays:
+            self._counting.count_on(device)
+
+    def __call__(self, made: int) -> dict[str, torch.Tensor]:
+        """The update after so many: its scalars, of several runs a number each."""
+        return self._replay(made % self._counting.period)
+
+    def _update(self, turn: int) -> dict[str, torch.Tensor]:
+        self._counting.take_turn(turn)
+        batch = self._sampler.sample()
+        with self._precise:
+            return self._algorithm.update(batch)
+
+
+def _settle(trainer: FinetuneTrainer, stack: Stack, sampler: StackedSampler, number: int) -> None:
+    stack.settle(number)
+    trainer.sampler.draws.set_state(sampler.draws.get_state(number))
+
+
+def train(trainers: Sequence[FinetuneTrainer]) -> None:
+    """Train runs to their end; those after the same update together, and those that are behind the others first.
+
+    Raises:
+        FloatingPointError: one diverged, and is marked; the others were trained to their end.
+    """
+    left, diverged = list(trainers), list[FloatingPointError]()
+
+    def each(act: Callable[[FinetuneTrainer], None], group: Sequence[FinetuneTrainer]) -> None:
+        for trainer in [one for one in group if one in left]:
+            try:
+                act(trainer)
+            except FloatingPointError as error:
+                trainer.folder.mark_diverged(trainer.step, str(error))
+                diverged.append(error)
+                left.remove(trainer)
+                if left:
+                    print(f"warning: training diverged, {error}; the other runs go on", file=sys.stderr)
+
+    with ExitStack() as opened:
+        for trainer in trainers:
+            title = f"finetune {trainer.config.algorithm} on {trainer.card.method}" if trainer is trainers[0] else ""
+            more = f" and {len(trainers) - 1} more" if title and len(trainers) > 1 else ""
+            trainer.loop = opened.enter_context(trainer.begin(title + more))
+        each(FinetuneTrainer.resume, trainers)
+        while behind := [one for one in left if one.step < one.config.updates]:
+            first = min(one.step for one in behind)
+            group = [one for one in behind if one.step == first]
+            until = min((one.step for one in left if one.step > first), default=behind[0].config.updates)
+            updates, settings = Updates(group), group[0].config
+            for step in in_step(loops := [one.loop for one in group], until):
+                logs = updates(step - 1)
+                for number, one in enumerate(group):
+                    if one in left:
+                        one.loop.add(logs if len(group) == 1 else {name: value[number] for name, value in logs.items()})
+                        one.step = step
+                if loops[0].due(settings.log_every):
+                    each(lambda one: one.loop.log(), group)
+                if loops[0].due(settings.eval_every):
+                    save([one.loop for one in group if one in left])  # first: a kill while it plays costs no update
+                    each(FinetuneTrainer.evaluate, group)
+                loops[:] = [one.loop for one in group if one in left]
+            for one in group:
+                one.settle()
+                one.settle = lambda: None
+    for trainer in left:
+        trainer.finish()
+    if diverged:
+        raise diverged[0]
 
 
 def _keep_encoder(config: FinetuneConfig, run: Path) -> None:

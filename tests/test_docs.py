@@ -41,6 +41,9 @@ NOT_RUN = {
     "vd4rl-pomdp data collect": "renders whole episodes; data/test_collect runs shorter ones",
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
     "vd4rl-pomdp hub": "needs a Hub; test_hub has one of its own",
+    **dict.fromkeys(
+        ("python tools/card", "tar xf card", "python3 card/run.py"), "fetches packages; tests/tools has a stub"
+    ),
     "python tools/train_actor.py": "trains for hours; tests/tools trains less",
     "python tools/export_actor.py": "as above",
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
@@ -49,6 +52,7 @@ NOT_RUN = {
     "vd4rl-pomdp results add": "tests/runs/results adds runs",
     "vd4rl-pomdp pretrain --method": "pretrain/test_train runs every method in its smoke size",
     "vd4rl-pomdp finetune --encoder RUN": "as above",
+    "vd4rl-pomdp finetune --seeds": "tests/finetune/test_stack trains less",
     "vd4rl-pomdp sweep": "trains for minutes; tests/sweeps trains less",
 }
 """How a line begins that is parsed, if it is ours, but not run, and why."""

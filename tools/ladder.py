@@ -1,6 +1,7 @@
 """Carry out results/ladder's grid, and keep what its page needs besides a run's last policy.
 
     OMP_NUM_THREADS=1 OMP_WAIT_POLICY=PASSIVE python tools/ladder.py --work DIR [--jobs 1] [--only ...]
+    python tools/ladder.py --work DIR --rows    # adds what is finished to results/ladder, at any time
 
 Runs `vd4rl-pomdp sweep run results/ladder/grid.toml`, taking finished rows from results/ladder. A fine-tuning
 overwrites its policy at each evaluation; every version is copied to DIR/snapshots, since the cloning loss on held-out
@@ -10,6 +11,7 @@ episodes is measured for each rung. Re-run the same command to resume.
 from __future__ import annotations
 
 import argparse
+import csv
 import json
 import shutil
 import subprocess
@@ -18,6 +20,10 @@ import time
 from pathlib import Path
 
 RESULTS = Path(__file__).parent.parent / "results" / "ladder"
+CURVES = ("q", "critic_loss", "actor_loss", "bc_loss")
+CURVE_EVERY = 2000
+"""Updates between two rows of curves.csv, each a mean over the updates of a row of metrics."""
+_PROGRAM = str(Path(sys.executable).parent / "vd4rl-pomdp")
 
 
 def keep_policies(runs: Path, snapshots: Path) -> None:
@@ -33,14 +39,31 @@ def keep_policies(runs: Path, snapshots: Path) -> None:
             shutil.copy2(weights, target)
 
 
+def keep_rows(runs: Path) -> int:
+    """Add finished runs to results/ladder, and the curves of their losses and critic values to its curves.csv."""
+    code = subprocess.run([_PROGRAM, "results", "add", str(runs), "--out", str(RESULTS)]).returncode
+    with (RESULTS / "curves.csv").open("w", newline="") as file:
+        table = csv.DictWriter(file, ["run", "step", *CURVES], extrasaction="ignore", lineterminator="\n")
+        table.writeheader()
+        for metrics in sorted(runs.rglob("finetune-*/metrics.jsonl")):
+            if (metrics.parent / "timing.json").exists():
+                rows = [json.loads(line) for line in metrics.read_text().splitlines()]
+                name = metrics.parent.relative_to(runs).as_posix()
+                table.writerows({"run": name} | row for row in rows if "q" in row and row["step"] % CURVE_EVERY == 0)
+    return code
+
+
 def main() -> int:
-    """Run the sweep to its end."""
+    """Run the sweep to its end, or keep what it has."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0] if __doc__ else "")
     parser.add_argument("--work", type=Path, required=True, help="folder of runs, sets and snapshots")
     parser.add_argument("--jobs", default="1")
     parser.add_argument("--only", nargs="*", default=[])
+    parser.add_argument("--rows", action="store_true")
     args = parser.parse_args()
-    command = [str(Path(sys.executable).parent / "vd4rl-pomdp"), "sweep", "run", str(RESULTS / "grid.toml")]
+    if args.rows:
+        return keep_rows(args.work / "runs")
+    command = [_PROGRAM, "sweep", "run", str(RESULTS / "grid.toml")]
     command += ["--out", str(args.work / "runs"), "--data", str(args.work / "data"), "--jobs", args.jobs]
     command += ["--done", str(RESULTS)] if (RESULTS / "runs.jsonl").exists() else []
     command += ["--only", *args.only] if args.only else []

@@ -58,6 +58,8 @@ def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
         return lambda dataset, *_: seen.setdefault(name, {"device": dataset.t.device.type})
 
     named = ("sampling", "pretraining", "finetuning", "methods")
+    monkeypatch.setattr(suite, "against_jax", lambda *_: {})
+    monkeypatch.setattr(suite, "stacking", lambda *_: {})
     for name in named:
         monkeypatch.setattr(suite, name, section(name))
     for name in ("memory", "collection", "sharing", "maze_pictures", "maze_training"):
@@ -66,6 +68,37 @@ def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
     monkeypatch.setattr(suite, "pick_device", lambda name: torch.device("meta"))
     results = suite.bench()
     assert [results[name]["device"] for name in named] == ["cpu", "meta", "meta", "meta"]
+
+
+def test_policies_are_measured_stacked_and_against_jax(tmp_path, monkeypatch):
+    monkeypatch.setattr(measures, "BATCH", 4)
+    dataset, _ = measures.synthetic_set(tmp_path, 1)
+    stacked = measures.stacking(dataset, 1)
+    assert all(value > 0 for value in stacked.values())
+    assert {name for name in GOALS if name.startswith("stacking.")} <= {f"stacking.{name}" for name in stacked}
+
+    class Jax:
+        def __init__(self, *_):
+            pass
+
+        def __enter__(self):
+            return self
+
+        def __exit__(self, *_):
+            pass
+
+        def begin(self):
+            pass
+
+        def answer(self):
+            return {"ms": 1.0}
+
+    monkeypatch.setattr(measures, "Worker", Jax)
+    monkeypatch.setattr(measures.importlib.util, "find_spec", lambda _: True)
+    told = measures.against_jax(dataset, 1, (16,))
+    assert told["units_16_jax_over_ours"] == pytest.approx(1 / told["units_16_ms"])
+    monkeypatch.setattr(measures.importlib.util, "find_spec", lambda _: None)
+    assert "pip install" in measures.against_jax(dataset, 1)["jax"]
 
 
 @pytest.mark.gpu

@@ -14,6 +14,7 @@ from pretrain.train import Trainer, make_batches, make_objective
 from tests.helpers_data import write_fake_set
 from tests.recording import record, replays
 from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.runs.checkpoint import pack, unpack
 from vd4rl_pomdp.runs.device import pick_device
 from vd4rl_pomdp.runs.replay import EAGER_VARIABLE
 
@@ -69,6 +70,24 @@ def test_a_replayed_step_is_the_one_that_is_run(
     assert_same(replayed, run, 1e-4)
     assert "warning" not in capsys.readouterr().err
     assert replayed[0]._replay.replays
+
+
+@pytest.mark.parametrize("method", ["mik+a", "curl", "driml"])
+def test_a_replayed_training_resumes_where_it_was_cut(
+    states: Path, monkeypatch: pytest.MonkeyPatch, method: str
+) -> None:
+    """From the state of one that is replayed or of one that is run."""
+    replays(monkeypatch, pretrain.train, capture=record)
+    whole = trained(states, method, STEPS)
+    for capture in (record, None):
+        replays(monkeypatch, pretrain.train, capture=capture)
+        cut = trained(states, method, STEPS // 2)
+        replays(monkeypatch, pretrain.train, capture=record)
+        resumed = trained(states, method, 0)
+        resumed[0].restore(unpack(pack(cut[0].state())))
+        logs = [resumed[0].update() for _ in range(STEPS - STEPS // 2)]
+        logs = [{name: float(value) for name, value in row.items()} for row in logs]
+        assert_same((resumed[0], cut[1] + logs), whole, 1e-4)
 
 
 def distance(one: tuple[Trainer, list], other: tuple[Trainer, list]) -> list[float]:

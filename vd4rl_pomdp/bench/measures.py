@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+import importlib.util
 import statistics
 import tempfile
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -15,13 +17,14 @@ import torch
 
 from finetune.algorithms import TD3BC
 from finetune.config import FinetuneConfig
-from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder
+from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder, StackedSampler
 from finetune.histories import Histories
+from finetune.stack import Stack
 from pretrain.config import PretrainConfig
 from pretrain.objectives import METHODS
-from vd4rl_pomdp.bench.processes import make_trainer, touch
+from vd4rl_pomdp.bench.processes import JAX_MISSING, Worker, make_trainer, touch
 from vd4rl_pomdp.core.options import NO_OPTIONS
-from vd4rl_pomdp.core.streams import RandomStream
+from vd4rl_pomdp.core.streams import RandomStream, random_stream
 from vd4rl_pomdp.core.tasks import EPISODE_TRANSITIONS, FRAME_SIZE, FRAME_STACK, TASKS
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.corruptions import CorruptionConfig
@@ -263,19 +266,70 @@ def _updates_per_s(
     frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, precision, 0)
     features = torch.randn(1, dataset.num_rows, encoder.dim, dtype=torch.float16, device=device)
     draws = RandomStream(torch.Generator().manual_seed(0), device)
-    policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(device)
-    algorithm = TD3BC(policy, config.options, config.learning_rate, config.updates, draws)  # type: ignore[arg-type]
+    algorithm, cached = _policy_of(dataset, features, config.hidden_dim, 0)
 
-    def train(sampler: FeatureSampler | ExactSampler, updates: int) -> None:
-        for _ in range(updates):
-            algorithm.update(sampler.sample())
-
-    cached = FeatureSampler(Histories(dataset, NO_OPTIONS, 3, 0), features, BATCH, 3, 0.99, draws)
     exact = ExactSampler(frozen, NO_OPTIONS, BATCH, 3, 0.99, draws)
     many, few = 20, algorithm.period
-    fast, slow = alternating(max(1, repeats), lambda: train(cached, many), lambda: train(exact, few))
+    fast, slow = alternating(
+        max(1, repeats), partial(_train, algorithm, cached, many), partial(_train, algorithm, exact, few)
+    )
     fast, slow = fast / many, slow / few
     return {"cached_updates_per_s": 1 / fast, "exact_updates_per_s": 1 / slow, "cached_over_exact": slow / fast}
+
+
+def against_jax(dataset: Dataset, repeats: int, widths: Sequence[int] = (256, 1024)) -> dict[str, Any]:
+    """Milliseconds of a TD3+BC update, sampling included, and how many times as long the same takes in JAX."""
+    if importlib.util.find_spec("jax") is None:
+        return {"jax": JAX_MISSING}
+    results: dict[str, Any] = {}
+    views = FinetuneConfig.of("cpu").views
+    features = torch.randn(views, dataset.num_rows, EncoderConfig(6).feature_dim, device=dataset.t.device).half()
+    for hidden in widths:
+        pair, updates = _policy_of(dataset, features, hidden, 0), max(2, 2560 // hidden)
+        shape = {"hidden_dim": hidden, "batch_size": BATCH, "dim": features.shape[-1], "rows": dataset.num_rows}
+        shape |= {"action_dim": dataset.action_dim, "views": views}
+        mine, theirs = [], []
+        with Worker("jax_updates", shape, updates) as worker:
+            worker.answer()
+            for _ in range(repeats):
+                mine.append(seconds_of(partial(_train, *pair, updates), 1) / updates * 1e3)
+                worker.begin()
+                theirs.append(worker.answer()["ms"])
+        ms = statistics.median(mine)
+        results |= {f"units_{hidden}_ms": ms, f"units_{hidden}_jax_over_ours": statistics.median(theirs) / ms}
+    return results
+
+
+def stacking(dataset: Dataset, repeats: int) -> dict[str, float]:
+    """Milliseconds of an update of one policy of the cpu preset, and of one of five that are trained as one."""
+    config, updates, runs = FinetuneConfig.of("cpu"), 10, 5
+    features = torch.randn(config.views, dataset.num_rows, EncoderConfig(6).feature_dim, device=dataset.t.device).half()
+    results: dict[str, float] = {}
+    for precision in ("fp32", "bf16"):
+        algorithms, samplers = zip(
+            *(_policy_of(dataset, features, config.hidden_dim, seed) for seed in range(1 + runs)), strict=True
+        )
+        pairs = (algorithms[0], samplers[0]), (Stack(algorithms[1:]), StackedSampler(samplers[1:]))
+
+        with torch.autocast(features.device.type, torch.bfloat16, precision == "bf16", cache_enabled=False):
+            one, five = alternating(repeats, *(partial(_train, *pair, updates) for pair in pairs))
+        results |= {f"{precision}_ms": one / updates * 1e3, f"{precision}_of_five_ms": five / updates / runs * 1e3}
+        results[f"{precision}_of_five_over_one"] = five / runs / one
+    return results
+
+
+def _train(algorithm: TD3BC | Stack, sampler: FeatureSampler | ExactSampler | StackedSampler, updates: int) -> None:
+    for _ in range(updates):
+        algorithm.update(sampler.sample())
+
+
+def _policy_of(dataset: Dataset, features: torch.Tensor, hidden: int, seed: int) -> tuple[TD3BC, FeatureSampler]:
+    """TD3+BC on cached features, and its batches."""
+    config = FinetuneConfig.of("cpu")
+    batches, noise = (random_stream(seed, "bench", name, device=features.device) for name in ("batches", "noise"))
+    policy = Policy(features.shape[-1], dataset.action_dim, hidden).to(features.device)
+    algorithm = TD3BC(policy, config.options, config.learning_rate, config.updates, noise)  # type: ignore[arg-type]
+    return algorithm, FeatureSampler(Histories(dataset, NO_OPTIONS, 3, 0), features, BATCH, 3, 0.99, batches)
 
 
 def maze_training() -> dict[str, float]:

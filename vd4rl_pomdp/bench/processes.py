@@ -5,18 +5,22 @@ The library that torch's threads wait in is told how when it is loaded, so a run
 
 from __future__ import annotations
 
+import json
 import os
 import resource
 import statistics
 import subprocess
 import sys
+import threading
 import time
+from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import torch
 
+from vd4rl_pomdp.core.errors import WorkerDiedError
 from vd4rl_pomdp.data import Dataset, open_dataset
 from vd4rl_pomdp.runs.workers import run_jobs
 
@@ -25,8 +29,10 @@ if TYPE_CHECKING:
     from pretrain.train import Trainer
 
 STEPS = 3
-_TRAIN = "import sys; from vd4rl_pomdp.bench.processes import train; train(float(sys.argv[1]))"
+JAX_MISSING = "not installed: `pip install '.[policy]'` in the package's folder"
+_SERVE = "from vd4rl_pomdp.bench.processes import serve; serve()"
 _WARM_UP = 20
+_BETWEEN_WAITS = 8
 
 
 def memory(folder: Path, frame_bytes: int) -> dict[str, float]:
@@ -100,30 +106,79 @@ def sharing(seconds: float, rounds: int = 3) -> dict[str, float]:
 def _speeds(seconds: float, count: int, **environment: str) -> list[float]:
     """Updates/s of so many processes that train at the same time."""
     with ExitStack() as stack:
-        processes = [
-            stack.enter_context(
-                subprocess.Popen(
-                    [sys.executable, "-c", _TRAIN, str(seconds)],
-                    env=os.environ | environment,
-                    stdin=subprocess.PIPE,
-                    stdout=subprocess.PIPE,
-                    text=True,
-                )
-            )
-            for _ in range(count)
-        ]
-        for process in processes:
-            assert process.stdout is not None
-            process.stdout.readline()  # it is ready
-        for process in processes:
-            assert process.stdin is not None
-            process.stdin.write("\n")
-            process.stdin.flush()
-        return [float(process.communicate()[0]) for process in processes]
+        workers = [stack.enter_context(Worker("training", seconds, **environment)) for _ in range(count)]
+        return [told["updates_per_s"] for told in at_once(workers)]
 
 
-def train(seconds: float) -> None:
-    """Fine-tune on random features as the cpu preset does: print that it is ready, wait for a line, print updates/s."""
+class Worker:
+    """A process that calls a function of this module, which prepares a measurement, and measures when it is asked."""
+
+    def __init__(self, function: str, *arguments: Any, **environment: str) -> None:
+        """Start it.
+
+        Args:
+            function: its name; it returns a function without arguments that returns a dict.
+            arguments: what JSON can write.
+            environment: variables of the process.
+        """
+        self.process = subprocess.Popen(
+            [sys.executable, "-c", _SERVE, json.dumps([function, *arguments])],
+            env=os.environ | environment,
+            stdin=subprocess.PIPE,
+            stdout=subprocess.PIPE,
+            text=True,
+        )
+
+    def __enter__(self) -> Worker:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.process.kill()
+        self.process.communicate()
+
+    def begin(self) -> None:
+        """Tell it to measure once."""
+        assert self.process.stdin is not None
+        self.process.stdin.write("\n")
+        self.process.stdin.flush()
+
+    def answer(self, within: float = 600.0) -> dict[str, Any]:
+        """What it measured, or, the first time, that it is ready.
+
+        Raises:
+            WorkerDiedError: it ended, or took longer than `within` seconds, after which it is killed.
+        """
+        assert self.process.stdout is not None
+        timer = threading.Timer(within, self.process.kill)
+        timer.start()
+        line = self.process.stdout.readline()
+        timer.cancel()
+        if not line:
+            raise WorkerDiedError(f"a measuring process ended without an answer, or took over {within:.0f} s")
+        answer: dict[str, Any] = json.loads(line)
+        return answer
+
+
+def at_once(workers: Sequence[Worker]) -> list[dict[str, Any]]:
+    """What fresh workers measure at the same time, once all of them are ready."""
+    for worker in workers:
+        worker.answer()
+    for worker in workers:
+        worker.begin()
+    return [worker.answer() for worker in workers]
+
+
+def serve() -> None:
+    """The process of a `Worker`."""
+    name, *arguments = json.loads(sys.argv[1])
+    measure = globals()[name](*arguments)
+    print("{}", flush=True)  # it is ready
+    for _ in sys.stdin:
+        print(json.dumps(measure()), flush=True)
+
+
+def training(seconds: float) -> Callable[[], dict[str, float]]:
+    """Fine-tune on random features as the cpu preset does, for so long."""
     from finetune.algorithms import TD3BC
     from finetune.config import FinetuneConfig
     from finetune.features import FeatureBatch
@@ -140,10 +195,98 @@ def train(seconds: float) -> None:
     batch = FeatureBatch(z, action.tanh(), torch.rand(256), torch.ones(256), next_z)
     for _ in range(_WARM_UP):
         algorithm.update(batch)
-    print("ready", flush=True)
-    sys.stdin.readline()
-    start, updates = time.perf_counter(), 0
-    while (spent := time.perf_counter() - start) < seconds:
-        algorithm.update(batch)
-        updates += 1
-    print(updates / spent)
+
+    def measure() -> dict[str, float]:
+        start, updates = time.perf_counter(), 0
+        while (spent := time.perf_counter() - start) < seconds:
+            algorithm.update(batch)
+            updates += 1
+        return {"updates_per_s": updates / spent}
+
+    return measure
+
+
+def jax_updates(shape: dict[str, int], updates: int, tf32: bool = False) -> Callable[[], dict[str, Any]]:
+    """The peer's TD3+BC on random features (see `jax_peer`), `updates` a call, on the device that JAX picks.
+
+    Args:
+        shape: `hidden_dim`, `batch_size`, `dim`, `action_dim`, `views`, `rows`.
+        updates: even.
+        tf32: on a GPU, products of TF32 numbers, JAX's own default; else of float32 numbers, PyTorch's.
+    """
+    import jax
+
+    from finetune.algorithms import TD3BC
+    from finetune.config import FinetuneConfig
+    from vd4rl_pomdp.bench import jax_peer
+    from vd4rl_pomdp.core.streams import RandomStream
+    from vd4rl_pomdp.nn.policy import Policy
+
+    jax.config.update("jax_default_matmul_precision", "tensorfloat32" if tf32 else "float32")
+    torch.manual_seed(0)
+    config, rows, dim, actions = FinetuneConfig.of("paper"), shape["rows"], shape["dim"], shape["action_dim"]
+    policy = Policy(dim, actions, shape["hidden_dim"])
+    draws = RandomStream(torch.Generator())
+    algorithm = TD3BC(policy, config.options, config.learning_rate, config.updates, draws)  # type: ignore[arg-type]
+    first = torch.arange(rows - 3).expand(shape["views"], -1)
+    features = torch.randn(shape["views"], rows, dim).half()
+    told = torch.rand(rows - 3, actions), torch.rand(rows - 3), torch.ones(rows - 3)
+    scale = policy.standardise.mean, policy.standardise.std
+    table = jax_peer.Table(*map(jax_peer.as_jax, (features, first, first + 3, *told, *scale)))
+    learnt, key = jax_peer.learnt_by(algorithm), jax.random.key(0)
+    make = jax_peer.make_updates(algorithm)
+
+    def train(learnt: Any, table: Any, key: Any) -> Any:
+        return make(learnt, table, jax_peer.draw(key, table, updates, shape["batch_size"]))
+
+    compiled = jax.jit(train, donate_argnums=0)
+
+    def measure() -> dict[str, Any]:
+        nonlocal learnt, key
+        key, drawn = jax.random.split(key)
+        start = time.perf_counter()
+        learnt, losses = compiled(learnt, table, drawn)
+        jax.block_until_ready((learnt, losses))
+        return {"ms": (time.perf_counter() - start) / updates * 1e3, "device": jax.devices()[0].device_kind}
+
+    for _ in range(2):
+        measure()
+    return measure
+
+
+def pretraining_steps(
+    folder: str, device: str, size: dict[str, Any], seed: int, seconds: float
+) -> Callable[[], dict[str, Any]]:
+    """Pretrain on the set in a folder, of `mik+a` in the `paper` preset and bf16, for so long."""
+    from vd4rl_pomdp.bench.gpu import Size, milliseconds, pretraining, wait
+
+    place = torch.device(device)
+    dataset = open_dataset(Path(folder) / "set", Path(folder) / "cache").to(place)
+    trainer = make_trainer(dataset, pretraining(Path(folder), "mik+a", Size(**size), seed))
+    milliseconds(trainer.update, place, 1, 1)  # settles it
+
+    def measure() -> dict[str, float]:
+        start, steps = time.perf_counter(), 0
+        while (spent := time.perf_counter() - start) < seconds:
+            for _ in range(_BETWEEN_WAITS):
+                trainer.update()
+            wait(place)
+            steps += _BETWEEN_WAITS
+        return {"steps_per_s": steps / spent}
+
+    return measure
+
+
+def playing(run: str, episodes: int, decisions: int) -> Callable[[], dict[str, float]]:
+    """Play episodes of the encoder and the policy in a folder, on every core."""
+    from finetune.evaluation import evaluate, jobs_of
+    from vd4rl_pomdp.core.tasks import TASKS
+    from vd4rl_pomdp.corruptions import CorruptionConfig
+
+    def measure() -> dict[str, float]:
+        under = [CorruptionConfig.of("patch+zero_frames")]
+        start = time.perf_counter()
+        evaluate(jobs_of(Path(run), TASKS.named("walker_walk"), under, episodes, decisions), 0)
+        return {"seconds": time.perf_counter() - start}
+
+    return measure

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import tempfile
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from rich.console import Console
 from rich.table import Table
 
 from vd4rl_pomdp.bench.measures import (
+    against_jax,
     collection,
     finetuning,
     maze_pictures,
@@ -18,6 +20,7 @@ from vd4rl_pomdp.bench.measures import (
     methods,
     pretraining,
     sampling,
+    stacking,
     synthetic_set,
 )
 from vd4rl_pomdp.bench.processes import memory, sharing
@@ -48,42 +51,46 @@ GOALS: dict[str, tuple[str, float]] = {
 """What this package promises on two cores without a GPU; of bf16 over fp32, where `machine.bf16_kernels` says yes."""
 
 
-def bench(quick: bool = False) -> dict[str, Any]:
+def bench(quick: bool = False, device: str = "auto") -> dict[str, Any]:
     """Run every measurement.
 
     Args:
         quick: a smaller set and fewer repetitions.
+        device: where networks are trained.
 
     Returns:
         Nested ratios and rates, with the machine and the versions they were measured on.
     """
+    place = pick_device(device)
     torch.manual_seed(0)
     repeats = 5 if quick else 15
     with tempfile.TemporaryDirectory() as folder:
         dataset, opening = synthetic_set(Path(folder), 20 if quick else 200)
         results: dict[str, Any] = {"opening": opening, "sampling": sampling(dataset, repeats)}
-        dataset.to(pick_device("auto"))
+        dataset.to(place)
         results |= {
             "pretraining": pretraining(dataset, Path(folder), repeats),
             "finetuning": finetuning(dataset, repeats),
+            "jax": against_jax(dataset, max(2, repeats // 3)),
+            "stacking": stacking(dataset, max(2, repeats // 3)),
             "methods": methods(dataset, Path(folder), repeats),
             "memory": memory(Path(folder), dataset.frames.numel()),
         }
     results["collection"] = collection(60 if quick else 200)
     results["sharing"] = sharing(3 if quick else 10)
     results["mazes"] = maze_pictures(60 if quick else 200) | maze_training()
-    return results | {"machine": machine(), "versions": versions()}
+    return results | {"machine": machine(device), "versions": versions()}
 
 
-def print_table(results: dict[str, Any]) -> None:
+def print_table(results: dict[str, Any], goals: Mapping[str, tuple[str, float]], title: str) -> None:
     """All measurements on the terminal, those that have a goal with it and a verdict."""
-    table = Table(title="speed and memory, ratios within one run")
+    table = Table(title=title)
     table.add_column("measurement")
     for name in ("value", "goal", ""):
         table.add_column(name, justify="right")
     for name, value in flatten(results).items():
         shown = f"{value:.4g}" if isinstance(value, float) else str(value)
-        relation, goal = GOALS.get(name, ("", 0.0))
+        relation, goal = goals.get(name, ("", 0.0))
         if relation and float(shown) == goal:
             shown = str(value)  # a goal that is missed is not shown as reached
         reached = value <= goal if relation == "<=" else value >= goal if relation else None

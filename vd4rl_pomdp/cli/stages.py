@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import tyro
 
 from vd4rl_pomdp.cli.parsing import command, show
-from vd4rl_pomdp.core.errors import flag_of, refuse_number
+from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_number
 from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.core.parsing import parse_stage
 from vd4rl_pomdp.core.registry import REGISTRIES, Registry
@@ -26,12 +27,41 @@ def pretrain(words: list[str], program: str) -> None:
 
 
 def finetune(words: list[str], program: str) -> None:
-    """Train a policy."""
+    """Train a policy, or several as one: WORDS + WORDS, or one for each of `--seeds`."""
     from finetune.config import FinetuneConfig
-    from finetune.train import finetune
+    from finetune.train import finetune_all
 
-    run = finetune(parse_stage(FinetuneConfig, words, program))
-    print(f"episodes: {run.path / EPISODES_FILE}")
+    runs = [one for part in _between(words, "+") for one in _of_seeds(part)]
+    configs = [parse_stage(FinetuneConfig, one, program) for one in runs]
+    for run in finetune_all(configs, runs if len(runs) > 1 else None):
+        print(f"episodes: {run.path / EPISODES_FILE}")
+
+
+def _between(words: list[str], mark: str) -> list[list[str]]:
+    """The words before, between and after the marks."""
+    ends = [number for number, word in enumerate(words) if word == mark]
+    return [words[first:end] for first, end in zip([0, *(e + 1 for e in ends)], [*ends, len(words)], strict=True)]
+
+
+def _of_seeds(words: list[str]) -> list[list[str]]:
+    """The words of each run that `--seeds` stands for: `--seed N --out OUT/seedN`; without it those that are given."""
+    reader = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    reader.add_argument("--seeds", nargs="?", const="")
+    seeds, rest = reader.parse_known_args(words)
+    if seeds.seeds is None:
+        return [words]
+    numbers = seeds.seeds.split(",")
+    if not all(number.isdecimal() for number in numbers) or len(set(numbers)) < len(numbers):
+        raise UserError(f"--seeds is {seeds.seeds!r}: give different whole numbers, as in --seeds 0,1,2")
+    reader = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    reader.add_argument("--out")
+    reader.add_argument("--seed")
+    told, rest = reader.parse_known_args(rest)
+    if told.seed is not None:
+        raise UserError("--seed and --seeds are both given: leave one out")
+    if told.out is None:
+        raise UserError("--seeds needs --out OUT: its runs are OUT/seed0 and so on")
+    return [[*rest, "--seed", number, "--out", str(Path(told.out) / f"seed{number}")] for number in numbers]
 
 
 @command

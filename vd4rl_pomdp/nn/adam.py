@@ -38,6 +38,7 @@ class Adam(torch.optim.Adam):
         gpu = device.type == "cuda"
         rate = torch.tensor(learning_rate, device=device) if gpu else learning_rate
         super().__init__(parameters, lr=rate, fused=True if gpu or fused else None, capturable=gpu)
+        self._warned_capturable_if_run_uncaptured = True  # steps before the first replayed one are not captured
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
         """Continue from another's `state_dict`, by this device's kind of step."""
@@ -47,11 +48,18 @@ class Adam(torch.optim.Adam):
             rate = float(group["lr"])
             group.update(before)  # the tensor that a captured step reads stays the same one
             set_rate(group, rate)
-            for parameter in group["params"]:
-                step = self.state.get(parameter, {}).get("step")
-                if step is not None:  # PyTorch keeps it where the other's kind of step wants it
-                    on = parameter.device if group["capturable"] or group["fused"] else "cpu"
-                    self.state[parameter]["step"] = step.to(on, torch.float32)
+            for parameter in self.state.keys() & set(group["params"]):
+                self.state[parameter] = {
+                    name: self._placed(name, value, parameter, group) for name, value in self.state[parameter].items()
+                }
+
+    @staticmethod
+    def _placed(name: str, value: Tensor, parameter: Tensor, group: dict[str, Any]) -> Tensor:
+        """A loaded tensor where, and laid out as, the step wants it."""
+        if name == "step":
+            return value.to(parameter.device if group["capturable"] or group["fused"] else "cpu", torch.float32)
+        # a fused step on a CPU walks through memory: in another layout it would pair the wrong numbers, in silence
+        return torch.empty_like(parameter).copy_(value)
 
 
 def set_rate(group: dict[str, Any], rate: float | Tensor) -> None:

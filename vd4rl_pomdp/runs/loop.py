@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import closing, contextmanager
 from typing import Any, Protocol
 
@@ -46,12 +46,7 @@ class Loop:
 
     def __iter__(self) -> Iterator[int]:
         """Number of each step, which the loop's body does; its state is then saved if that is due, or a signal came."""
-        while self._learner.step < self._total:
-            yield self._learner.step + 1
-            self._progress.advance()
-            # Here alone is a step whole: weights, optimiser and random streams are all of the same step.
-            if self.due(self._run.config["checkpoint_every"]) or interrupt.asked():
-                self.save()
+        return in_step([self], self._total)
 
     def due(self, every: int) -> bool:
         """Whether the step just done is one of every so many, or the last."""
@@ -59,11 +54,29 @@ class Loop:
 
     def save(self) -> None:
         """Keep the state after the step just done, and end here if a signal asks for it."""
+        save([self])
+
+    def keep(self) -> None:
+        """Keep the state after the step just done."""
         step = self._learner.step
         if step != self._saved:
             self._run.save(step, {"learner": self._learner.state(), "means": self._means.state_dict()})
             self._saved = step
-        interrupt.check(f"{self._run.path} keeps step {step}")
+
+    def advance(self) -> bool:
+        """Show that a step was done; whether it is to be kept."""
+        self._progress.advance()
+        return self.due(self._run.config["checkpoint_every"]) or interrupt.asked()
+
+    @property
+    def where(self) -> str:
+        """What is kept, and of which step."""
+        return f"{self._run.path} keeps step {self._learner.step}"
+
+    @property
+    def step(self) -> int:
+        """Steps done."""
+        return self._learner.step
 
     def add(self, logs: dict[str, Tensor]) -> None:
         """Count the scalars of the step just done for the next row of metrics."""
@@ -92,6 +105,25 @@ class Loop:
             raise FloatingPointError(f"{self._run.path}: weights are not finite after step {self._learner.step}")
 
 
+def in_step(loops: Sequence[Loop], until: int) -> Iterator[int]:
+    """Number of each step, up to `until`, of loops whose learners one body trains, all after the same step.
+
+    Loops that are taken out meanwhile are left alone.
+    """
+    while loops and loops[0].step < until:
+        yield loops[0].step + 1
+        # Here alone is a step whole: weights, optimiser and random streams are all of the same step.
+        if any([loop.advance() for loop in loops]):
+            save(loops)
+
+
+def save(loops: Sequence[Loop]) -> None:
+    """Keep the states of all after the step just done, and end here if a signal asks for it."""
+    for loop in loops:
+        loop.keep()
+    interrupt.check(", ".join(loop.where for loop in loops))
+
+
 @contextmanager
 def training(
     run: RunFolder,
@@ -108,7 +140,7 @@ def training(
     Args:
         run: the run.
         learner: what is trained.
-        title: what the progress line says.
+        title: what the progress line says; empty: it is not shown.
         total: the step at which the loop ends.
         unit: what the progress line counts.
         labels: what names the run where it is tracked: method, task, quality, corruption.

@@ -15,6 +15,7 @@ from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, Protocol
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -32,6 +33,8 @@ INIT_TIMEOUT_S, FINISH_TIMEOUT_S = 30.0, 60.0
 """How long wandb may wait for its server before the first row and after the last one."""
 LONGEST = {"name": 128, "group": 128, "tags": 64}
 """Characters that wandb accepts."""
+_MOST_ADDED = 1024
+"""Steps whose scalars wait for their sum."""
 Metrics = Mapping[str, float]
 """One row: its `step`, and numbers by name."""
 
@@ -41,7 +44,9 @@ class Means:
 
     def __init__(self) -> None:
         self._sums: dict[str, tuple[Tensor, int]] = {}
-        """Of each scalar: its sum, float32, where it was computed, and how many steps gave it."""
+        """Of each scalar: its sum, float32, and how many steps gave it."""
+        self._added: list[tuple[tuple[str, ...], Tensor]] = []
+        """Names and copies of the scalars of steps that are not in the sums yet."""
 
     def add(self, logs: dict[str, Tensor]) -> None:
         """Count a step's scalars, each a tensor of one element; a GPU is not waited for.
@@ -51,24 +56,42 @@ class Means:
         """
         if taken := [name for name in logs if name == "step" or name.startswith(EVALUATION)]:
             raise UserError(f"a scalar of the loss is called {taken[0]!r}, as something else is in {METRICS_FILE}")
-        for name, value in logs.items():
-            value = value.detach().float()
-            total, steps = self._sums.get(name) or (torch.zeros_like(value), 0)
-            self._sums[name] = total.to(value.device) + value, steps + 1
+        if logs:
+            device = next(iter(logs.values())).device
+            values = [value.detach().float().reshape(()).to(device) for value in logs.values()]
+            self._added.append((tuple(logs), torch.stack(values)))  # one operation; to sum would be one a scalar
+        if len(self._added) >= _MOST_ADDED:
+            self._sum()
+
+    def _sum(self) -> None:
+        """Add the steps' scalars to the sums, in order and in float32."""
+        if not self._added:
+            return
+        columns: dict[str, list[np.float32]] = {}
+        values = torch.cat([values for _, values in self._added]).cpu().numpy()
+        for name, value in zip((name for names, _ in self._added for name in names), values, strict=True):
+            columns.setdefault(name, []).append(value)
+        for name, column in columns.items():
+            total, steps = self._sums.get(name) or (torch.zeros(()), 0)
+            summed = np.cumsum([np.float32(total), *column], dtype=np.float32)[-1]
+            self._sums[name] = torch.tensor(summed), steps + len(column)
+        self._added = []
 
     def take(self) -> dict[str, float]:
         """The means, which begin anew."""
+        self._sum()
         means = {name: float(total) / steps for name, (total, steps) in self._sums.items()}
         self._sums = {}
         return means
 
     def state_dict(self) -> dict[str, tuple[Tensor, int]]:
         """What `load_state_dict` takes."""
+        self._sum()
         return dict(self._sums)
 
     def load_state_dict(self, state: dict[str, tuple[Tensor, int]]) -> None:
         """Resume counting from `state_dict`."""
-        self._sums = {name: (total, steps) for name, (total, steps) in state.items()}
+        self._sums, self._added = {name: (total, steps) for name, (total, steps) in state.items()}, []
 
 
 class Mirror(Protocol):

@@ -13,7 +13,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 
 
 class ProgressLine:
-    """A progress bar on stderr; where that is no terminal, a plain line each tenth of the way and each half minute."""
+    """A progress bar on stderr; where that is no terminal, a plain line each tenth of the way and each half minute.
+
+    One without a title is not shown.
+    """
 
     _PLAIN_LINES = 10
     _PLAIN_S = 30.0
@@ -21,7 +24,7 @@ class ProgressLine:
     def __init__(
         self, title: str, total: int, unit: str, start: int = 0, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._console = Console(stderr=True)
+        self._console, self._shown = Console(stderr=True), bool(title)
         self._title, self._total, self._unit, self._done = title, total, unit, start
         self._bar = Progress(
             TextColumn("{task.description}", markup=False),
@@ -33,7 +36,7 @@ class ProgressLine:
             TimeRemainingColumn(elapsed_when_finished=False),
             TextColumn("{task.fields[note]}"),
             console=self._console,
-            disable=not self._console.is_terminal,
+            disable=not (self._console.is_terminal and title),
             speed_estimate_period=120,
         )
         self._task = self._bar.add_task(title, total=total, completed=start, speed="", note="")
@@ -52,7 +55,7 @@ class ProgressLine:
         speed = self._bar.tasks[0].speed
         if speed:
             self._bar.update(self._task, speed=f"{speed:.3g} {self._unit}/s")
-        if amount and not self._console.is_terminal:
+        if amount and self._shown and not self._console.is_terminal:
             self._print_now_and_then()
 
     def _print_now_and_then(self) -> None:

@@ -8,6 +8,7 @@ import shlex
 import subprocess
 import sys
 import tomllib
+from collections.abc import Sequence
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
@@ -90,13 +91,19 @@ def machine(device: str = "auto") -> dict[str, Any]:
     }
 
 
-def command() -> str:
-    """The command line, the program named as a user would type it."""
+def command(stage: str = "", words: Sequence[str] | None = None) -> str:
+    """The command line, the program named as a user would type it.
+
+    Args:
+        stage: the command of one run, where the command line names several.
+        words: that run's, behind the command; None: the command line's.
+    """
     script = Path(sys.argv[0])
     program = [script.name]
     if script.name in ("__main__.py", "-c"):  # python -m PACKAGE, and a worker's own command line
         program = ["vd4rl-pomdp", *([script.parent.name] if script.parent.name in ("pretrain", "finetune") else [])]
-    return shlex.join([*program, *sys.argv[1:]])
+    given = sys.argv[1:] if words is None else [*(word for word in sys.argv[1:2] if word == stage), *words]
+    return shlex.join([*program, *given])
 
 
 def _processor() -> str:

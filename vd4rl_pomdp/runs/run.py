@@ -68,6 +68,7 @@ class RunFolder:
         results: Sequence[str] = (),
         parts: Mapping[str, str] = _NOTHING,
         collection: Mapping[str, Any] = _NOTHING,
+        words: Sequence[str] | None = None,
     ) -> None:
         """Nothing is written yet.
 
@@ -79,6 +80,7 @@ class RunFolder:
             results: files that a finished run holds.
             parts: names of parts that the inputs bring along, by the registries' `setting`: an encoder's corruption.
             collection: how the data were collected, for the record.
+            words: of its own command, where the command line names several runs.
 
         Raises:
             UserError: the folder holds something else, a run with other settings, inputs or of another format, or one
@@ -91,7 +93,7 @@ class RunFolder:
         self._checkpoints = Checkpoints(path)
         self._started, self._before = time.monotonic(), 0.0
         self._stack = ExitStack()
-        self._results, self._collection = results, dict(collection)
+        self._results, self._collection, self._words = results, dict(collection), words
         self._parts = self.config | parts
         self._check()
 
@@ -154,7 +156,8 @@ class RunFolder:
         hardware, path = machine(self.config.get("device", "auto")), self.path / MACHINE_FILE
         if self._begins:
             record = {"format": FORMAT, "stage": self.stage, "config": self.config, "inputs": self.inputs}
-            write_json(self.path / CONFIG_FILE, record | now | {"command": command(), "collection": self._collection})
+            told = {"command": command(self.stage, self._words), "collection": self._collection}
+            write_json(self.path / CONFIG_FILE, record | now | told)
         if self._begins or not path.exists():  # a start may have been killed between the two files
             write_json(path, hardware)
         else:

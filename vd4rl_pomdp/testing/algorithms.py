@@ -266,13 +266,13 @@ def stacks_take_the_steps_of_single_runs(name: str, **options: Any) -> None:
             logs.append(whole.update(FeatureBatch(**{key: torch.stack([b[key] for b in given]) for key in given[0]})))
         except (UserError, RuntimeError) as error:
             claim(False, f"an update of three stacked runs fails: {error}")
-    whole.settle()
     for seed, run in zip(seeds, runs, strict=True):
 
         def single(change: Callable[[Algorithm], Algorithm], seed: int = seed) -> dict[str, Tensor]:
             one = change(make(name, seed, **options))
             return course(one, [one.update(batch(100 * seed + number)) for number in range(updates)])
 
+        whole.settle(seed)
         found = course(run, [{key: value[seed] for key, value in row.items()} for row in logs])
         far = farther_than_rounding(found, single)
         claim(not far, f"a stacked run is not what it is alone: {shown(far)}")

@@ -1,0 +1,79 @@
+import json
+
+import pytest
+
+from vd4rl_pomdp.bench import gpu, processes
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.errors import UserError, WorkerDiedError
+from vd4rl_pomdp.runs.files import flatten
+
+
+class Here:
+    """A worker that is no process."""
+
+    def __init__(self, function, *arguments, **environment):
+        self.measure, self.ready = getattr(processes, function)(*arguments), False
+
+    def __enter__(self):
+        return self
+
+    def __exit__(self, *_):
+        pass
+
+    def begin(self):
+        pass
+
+    def answer(self, within=0.0):
+        told, self.ready = self.measure() if self.ready else {}, True
+        return json.loads(json.dumps(told))
+
+
+@pytest.fixture
+def here(monkeypatch):
+    monkeypatch.setattr(gpu, "Worker", Here)
+    monkeypatch.setattr(processes, "_BETWEEN_WAITS", 1)
+
+
+def test_all_that_is_measured_on_a_gpu_runs_on_a_cpu_and_claims_nothing(here, capsys):
+    main(["bench", "--gpu", "--quick", "--device", "cpu", "--json"])
+    told = flatten(json.loads(capsys.readouterr().out))
+    assert [name for name in told if name.endswith("failed")] == []
+    assert told["device"] == "cpu"
+    measured = {name for name in gpu.AIMS if name != "td3_bc.jax_over_replayed"}
+    assert measured <= set(told)
+    assert all(told[name] > 0 for name in measured)
+    assert "jax" in told["td3_bc.jax"] or "no GPU" in told["td3_bc.jax"]
+
+
+def test_a_measurement_that_fails_costs_none_of_the_others(here, monkeypatch, capsys):
+    def fails(*_):
+        raise RuntimeError("capture failed: not permitted")
+
+    for name in ("measured", "stacked", "peer", "encoders_at_once", "evaluation"):
+        monkeypatch.setattr(gpu, name, lambda *_: {"ms": 1.0})
+    monkeypatch.setattr(gpu, "encoding", fails)
+    monkeypatch.setattr(gpu, "stacked", fails)
+    results = gpu.gpu_bench("cpu", quick=True)
+    assert results["encoding"] == results["stacked"] == {"failed": "capture failed: not permitted"}
+    assert results["mik+a"] == results["evaluation"] == {"ms": 1.0}
+    gpu_lines = capsys.readouterr().err
+    assert "RuntimeError" in gpu_lines
+
+
+def test_without_a_gpu_only_a_trial_is_run():
+    with pytest.raises(UserError, match="none is visible: on a CPU, try the code with --quick"):
+        gpu.gpu_bench("cpu")
+
+
+def test_a_process_that_ends_or_takes_too_long_is_told():
+    with processes.Worker("nothing") as worker, pytest.raises(WorkerDiedError, match="without an answer"):
+        worker.answer()
+    with processes.Worker("training", 60) as worker, pytest.raises(WorkerDiedError, match="over 0 s"):
+        worker.answer(0.01)
+
+
+@pytest.mark.gpu
+def test_all_is_measured_on_a_gpu_replayed():
+    results = gpu.gpu_bench("cuda", quick=True)
+    assert [name for name in flatten(results) if name.endswith("failed")] == []
+    assert results["td3_bc"]["peak_gib"] > 0

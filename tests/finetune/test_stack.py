@@ -1,0 +1,296 @@
+"""Runs that are trained as one are what they are alone: folders, records and states, and numbers up to rounding."""
+
+import csv
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
+
+import pytest
+import torch
+
+from finetune import train
+from finetune.algorithms import ALGORITHMS
+from finetune.config import FinetuneConfig
+from finetune.features import FeatureSampler, StackedSampler
+from finetune.histories import Histories
+from finetune.train import finetune, finetune_all
+from pretrain.train import pretrain
+from tests.helpers_data import write_fake_set
+from tests.helpers_stages import CutError, cut_at, smoke_finetune, smoke_pretrain
+from tests.recording import record
+from vd4rl_pomdp.cli import main, run_to_end
+from vd4rl_pomdp.core.options import NO_OPTIONS
+from vd4rl_pomdp.core.streams import RandomStream
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.nn.encoder_folder import read_record
+from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.metrics import read_metrics
+from vd4rl_pomdp.runs.run import identity
+from vd4rl_pomdp.testing.algorithms import course, farther_than_rounding
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+BRIEF = {"updates": 12, "eval_every": 6, "checkpoint_every": 4, "log_every": 3, "batch_size": 4, "eval_length": 2}
+
+
+def same_but_for_rounding(one: Path, other: Path) -> None:
+    """Two folders of one run: the same files, records and rows, and numbers close to one another."""
+    names = [sorted(p.relative_to(run).as_posix() for p in run.rglob("*") if p.is_file()) for run in (one, other)]
+    assert names[0] == names[1]
+    records = [read_json(run / "config.json") for run in (one, other)]
+    for told in records:
+        told["config"].pop("out")
+        told.pop("command")
+    assert records[0] == records[1]
+    for name in ("labels.json", "reference.json", "probe.json", "render.json"):
+        if (one / name).exists() and name != "reference.json":
+            assert (one / name).read_bytes() == (other / name).read_bytes()
+    rows = [list(csv.DictReader((run / "episodes.csv").open())) for run in (one, other)]
+    for row, theirs in zip(*rows, strict=True):
+        for number in ("return", "score"):
+            assert float(row.pop(number)) == pytest.approx(float(theirs.pop(number)), abs=2e-4)
+        row.pop("action_error"), theirs.pop("action_error")
+        assert row == theirs
+    metrics = [read_metrics(run / "metrics.jsonl") for run in (one, other)]
+    assert len(metrics[0]) == len(metrics[1])
+    for row, theirs in zip(*metrics, strict=True):
+        assert row == pytest.approx(theirs, rel=1e-4, abs=1e-5)
+    states = [torch.load(max((run / "checkpoints").glob("*.pt")))["state"]["learner"] for run in (one, other)]
+    close(*states)
+
+
+def close(one, other) -> None:
+    """Nested states of the same form, whose floats are close and whose other values are equal."""
+    assert type(one) is type(other)
+    if isinstance(one, dict):
+        assert list(one) == list(other)
+        one, other = list(one.values()), list(other.values())
+    if isinstance(one, list | tuple):
+        for mine, theirs in zip(one, other, strict=True):
+            close(mine, theirs)
+    elif isinstance(one, torch.Tensor):
+        torch.testing.assert_close(one, other, rtol=1e-3, atol=1e-5)
+    else:
+        assert one == other
+
+
+@pytest.mark.parametrize("algorithm", ["td3_bc", "iql"])
+def test_seeds_are_folders_of_single_runs(encoder, data, tmp_path, monkeypatch, algorithm):
+    words = ["finetune", "--preset", "smoke", "--encoder", str(encoder), "--data", str(data), "--algorithm", algorithm]
+    words += ["--updates", "12", "--eval-every", "6", "--batch-size", "4", "--eval-length", "2", "--workers", "1"]
+    for call in (["--seeds", "0,3", "--out", str(tmp_path / "s")], ["--seed", "3", "--out", str(tmp_path / "alone")]):
+        monkeypatch.setattr("sys.argv", ["vd4rl-pomdp", *words, *call])
+        main()
+    same_but_for_rounding(tmp_path / "s" / "seed3", tmp_path / "alone")
+    commands = [read_json(run / "config.json")["command"] for run in (tmp_path / "s" / "seed3", tmp_path / "alone")]
+    assert commands[0].replace(str(tmp_path / "s" / "seed3"), str(tmp_path / "alone")) == commands[1]
+    card = read_record(encoder).pretrain.__dict__
+    names = {identity(read_json(run / "config.json"), card) for run in (tmp_path / "s/seed3", tmp_path / "alone")}
+    assert len(names) == 1
+    weights = [(tmp_path / "s" / seed / "policy/model.safetensors").read_bytes() for seed in ("seed0", "seed3")]
+    assert weights[0] != weights[1]
+
+
+def test_a_batch_of_a_stack_holds_each_runs_own(tmp_path):
+    """Of sets of several lengths, and of one set's features that all share."""
+    sets = [open_dataset(write_fake_set(tmp_path / name, lengths)) for name, lengths in (("a", (6, 4)), ("b", (9,)))]
+    own = [(data, torch.randn(3, data.num_rows, 5).half()) for data in (sets[0], sets[1], sets[0])]
+    for chosen in (own, [own[0]] * 3):
+        alone, members = (
+            [
+                FeatureSampler(
+                    Histories(data, NO_OPTIONS, 2, 0), features, 7, 2, 0.9,
+                    RandomStream(torch.Generator().manual_seed(seed)),
+                )
+                for seed, (data, features) in enumerate(chosen)
+            ]
+            for _ in range(2)
+        )  # fmt: skip
+        members[1].sample(), alone[1].sample()  # they need not begin at one place
+        sampler = StackedSampler(members)
+        for _ in range(3):
+            batch = sampler.sample()
+            for number, single in enumerate(alone):
+                expected = single.sample()
+                assert all(torch.equal(batch[name][number], expected[name]) for name in expected)
+
+
+def test_members_go_on_alone_or_in_another_stack(encoder, data, tmp_path, monkeypatch):
+    """Cut at its second checkpoint, a stack's members stand where single runs would; one is then ahead of the other."""
+    configs = {name: smoke_finetune(encoder, data, tmp_path / name, **BRIEF, seed=seed) for name, seed in SEEDS.items()}
+    for config in list(configs.values())[3:]:
+        finetune(config)
+    with monkeypatch.context() as patch:
+        cut_at(patch, 4)  # the first of three writes its second one, the others do not
+        with pytest.raises(CutError):
+            finetune_all([configs["a"], configs["b"], configs["c"]])
+    steps = {name: {int(p.stem) for p in (tmp_path / name / "checkpoints").glob("*.pt")} for name in ("a", "b", "c")}
+    assert steps == {"a": {4}, "b": {4}, "c": {4}}
+    with monkeypatch.context() as patch:
+        cut_at(patch, 2)
+        with pytest.raises(CutError):
+            finetune(configs["a"])  # alone; it gets as far as step 6, which is evaluated
+    told = []
+    with monkeypatch.context() as patch:
+        init = train.Updates.__init__
+        patch.setattr(
+            train.Updates,
+            "__init__",
+            lambda self, group, *more: (told.append([t.step for t in group]), init(self, group, *more))[1],
+        )
+        finetune_all([configs["c"], configs["a"], configs["b"]])
+    assert told == [[4, 4], [6, 6, 6]]
+    for name in ("a", "b", "c"):
+        same_but_for_rounding(tmp_path / name, tmp_path / f"{name} alone")
+    before = {p: p.stat().st_mtime_ns for p in (tmp_path / "a").rglob("*")}
+    finetune_all([configs["c"], configs["a"]])
+    assert {p: p.stat().st_mtime_ns for p in (tmp_path / "a").rglob("*")} == before, "what is finished stays"
+
+
+SEEDS = {"a": 0, "b": 1, "c": 2, "a alone": 0, "b alone": 1, "c alone": 2}
+
+
+def test_methods_of_one_width_stack(encoders, data, tmp_path):
+    """With and without a memory, which is given to the policy in its own way, and with seeds and views of their own."""
+    given = {"mik+a": {"seed": 1, "view_seed": 7}, "acro": {"seed": 2, "shift": 2, "eval_episodes": 2}}
+    for folder in ("stacked", "alone"):
+        configs = [
+            smoke_finetune(encoders[method], data, tmp_path / folder / method, **(BRIEF | more))
+            for method, more in given.items()
+        ]
+        for some in [configs] if folder == "stacked" else [[config] for config in configs]:
+            finetune_all(some)
+    for method in given:
+        same_but_for_rounding(tmp_path / "stacked" / method, tmp_path / "alone" / method)
+
+
+def test_a_run_that_diverges_is_marked_and_the_others_end(encoder, data, tmp_path, capsys, monkeypatch):
+    configs = [smoke_finetune(encoder, data, tmp_path / str(seed), **BRIEF, seed=seed) for seed in range(3)]
+    make = train._trainer
+
+    def broken(config, *more):
+        made = make(config, *more)
+        if config.seed == 1:
+            made.sampler.told[:, -2] = float("inf")
+        return made
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train, "_trainer", broken)
+        with pytest.raises(FloatingPointError, match=rf"{tmp_path / '1'}: critic_loss is .* in the row of step 3"):
+            finetune_all(configs)
+    assert "the other runs go on" in capsys.readouterr().err
+    assert read_json(tmp_path / "1" / "diverged.json")["step"] == 3
+    assert not (tmp_path / "1" / "timing.json").exists()
+    finetune(smoke_finetune(encoder, data, tmp_path / "alone", **BRIEF, seed=2))
+    same_but_for_rounding(tmp_path / "2", tmp_path / "alone")
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "told"),
+    [
+        ("", "--batch-size 8", "do not stack: --batch-size is 4 there and 8 here"),
+        ("", "--algorithm iql", "do not stack: --algorithm is td3_bc there and iql here"),
+        ("", "--alpha 5", "do not stack: --alpha is 2.5 there and 5.0 here"),
+        ("", "--encoder {state} --data {states}", "do not stack: the representations' width is 32 there and 18 here"),
+        ("", "--encoder {drq_bc}", "b: drq_bc trains its encoder, too, and does not stack"),
+        ("--views 0", "--views 0", "a: --views 0 encodes every batch anew and does not stack"),
+        ("", "--out {out}/a", "a is given twice: a folder holds one run"),
+        ("--seeds 0,0", "", "--seeds is '0,0': give different whole numbers"),
+        ("--seeds 0,1 --seed 3", "", "--seed and --seeds are both given"),
+    ],
+)
+def test_what_does_not_stack_is_one_line_and_nothing_is_begun(encoders, data, tmp_path, first, second, told):
+    out = tmp_path / "out"
+    given = f"--preset smoke --data {data} --encoder {encoders['mik+a']} --batch-size 4 --updates 12 --eval-every 6"
+    words = f"finetune {given} --out {out}/a {first} + {given} --out {out}/b {second}"
+    end = run_to_end(words.format(out=out, **encoders).split())
+    assert end.code == 2
+    assert told in end.line
+    assert "\n" not in end.line
+    assert not out.exists()
+
+
+@pytest.fixture(scope="module")
+def encoders(trained, tmp_path_factory) -> dict[str, Path]:
+    """Encoders of several kinds, by method."""
+    folder = tmp_path_factory.mktemp("encoders")
+    made = {"mik+a": trained / "pretrained" / "encoder", "states": folder / "walker_walk" / "expert"}
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("VD4RL_POMDP_CACHE", str(trained / "cache"))
+        states = write_fake_set(folder / "walker_walk" / "expert", [20, 25, 30], physics_dim=18)
+        for method in ("state", "drq_bc", "acro"):
+            given = states if method == "state" else trained / "walker_walk" / "expert"
+            made[method] = pretrain(smoke_pretrain(given, folder / method, method=method)).path / "encoder"
+    return made
+
+
+def made(name: str, data: Path, seed: int, device: str = "cpu") -> SimpleNamespace:
+    """An algorithm and its batches, as a run has them; learning rates are tensors, which a replayed step reads."""
+    torch.manual_seed(seed)
+    dataset = open_dataset(data).to(device)
+    generator = torch.Generator().manual_seed(seed)
+    features = torch.randn(2, dataset.num_rows, 5, generator=generator).half().to(device)
+    config = FinetuneConfig.of("smoke", algorithm=name, learning_rate=1e-3, updates=40)
+    policy = Policy(5, dataset.action_dim, 16).to(device)
+    policy.standardise.fit(features)
+    streams = [RandomStream(torch.Generator().manual_seed(10 * seed + n), device) for n in range(2)]
+    algorithm = ALGORITHMS[name](policy, config.options, config.learning_rate, config.updates, streams[0])
+    for part in algorithm.parts().values():
+        for group in getattr(part, "param_groups", ()):
+            group["lr"] = torch.as_tensor(group["lr"], device=device)
+    sampler = FeatureSampler(Histories(dataset, NO_OPTIONS, 2, 0), features, 16, 2, 0.9, streams[1])
+    return SimpleNamespace(algorithm=algorithm, sampler=sampler, config=config, settle=lambda: None)
+
+
+def course_of(runs: list[SimpleNamespace], updates: int, capture: Any = None) -> list[dict[str, torch.Tensor]]:
+    """What each run logs and where it ends; the logs are read after the last update."""
+    step = train.Updates(runs, capture)
+    logs = [step(number) for number in range(updates)]
+    found = []
+    for number, run in enumerate(runs):
+        run.settle()
+        own = logs if len(runs) == 1 else [{name: value[number] for name, value in row.items()} for row in logs]
+        found.append(course(run.algorithm, own) | {"batches": run.sampler.draws.get_state()})
+    return found
+
+
+@pytest.mark.parametrize("runs", [1, 3])
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_replayed_updates_are_those_that_are_run(data, monkeypatch, capsys, name, runs):
+    """Fresh noise and batches, the actor's delay, and schedules up to their end; every scalar is of its own update."""
+    monkeypatch.setattr("vd4rl_pomdp.core.streams.BLOCK", 32)
+    eager, replayed = ([made(name, data, seed) for seed in range(runs)] for _ in range(2))
+    expected, found = course_of(eager, 75), course_of(replayed, 75, record)
+    assert not capsys.readouterr().err, "it is replayed"
+    for one, other in zip(found, expected, strict=True):
+        assert one.keys() == other.keys()
+        for key, value in other.items():
+            torch.testing.assert_close(
+                one[key], value, rtol=1e-4, atol=1e-6, msg=lambda told, key=key: f"{key}: {told}"
+            )
+    rates = [
+        float(run.algorithm.parts()["policy_optimiser" if name != "bc" else "optimiser"].param_groups[0]["lr"])
+        for run in replayed
+    ]
+    assert rates == pytest.approx([0.0 if name == "iql" else 1e-3] * runs, abs=1e-9)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("runs", [1, 5])
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_on_a_gpu_captured_updates_are_within_rounding_of_eager_ones(data, monkeypatch, capsys, name, runs):
+    """And stacked ones, captured or not, of single ones; 200 updates, four times what another order of sums does."""
+    captured = course_of([made(name, data, seed, "cuda") for seed in range(runs)], 200)
+    assert not capsys.readouterr().err, "it is captured"
+    monkeypatch.setenv("VD4RL_POMDP_EAGER", "1")
+    eager = course_of([made(name, data, seed, "cuda") for seed in range(runs)], 200)
+    for seed in range(runs):
+
+        def single(change: Any, seed: int = seed) -> dict[str, torch.Tensor]:
+            run = made(name, data, seed, "cuda")
+            change(run.algorithm)
+            return course_of([run], 200)[0]
+
+        assert farther_than_rounding(captured[seed], single) == []
+        assert farther_than_rounding(eager[seed], single) == []
+        torch.testing.assert_close(captured[seed]["batches"], eager[seed]["batches"])

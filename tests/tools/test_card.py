@@ -1,0 +1,116 @@
+"""What goes to a machine without a network, and what comes home from it."""
+
+import os
+import shutil
+import subprocess
+import sys
+import tarfile
+import tomllib
+from pathlib import Path
+
+import pytest
+from packaging.requirements import Requirement
+from packaging.utils import canonicalize_name
+
+from vd4rl_pomdp.sweeps.grid import load_grid
+from vd4rl_pomdp.sweeps.stages import check_cells
+
+ROOT = Path(__file__).parents[2]
+CARD = ROOT / "tools" / "card"
+NOT_CARRIED = {"torch", "numpy", "pandas", "wandb", "huggingface-hub"}
+"""What the machine has, and what trainings there do not import."""
+STUB = """
+import json, os, signal, sys, time
+from pathlib import Path
+words = sys.argv[1:]
+out = Path(words[words.index("--out") + 1])
+if "--dry-run" in words:
+    print(f"vd4rl-pomdp data collect --out '{out.parent / 'the set'}'\\n# 2 jobs, 0 done, 2 to do")
+elif words[:2] == ["data", "collect"]:
+    out.mkdir(parents=True)
+elif words[:2] == ["results", "add"]:
+    out.mkdir(exist_ok=True)
+    (out / "runs.jsonl").write_text("its rows")
+else:
+    def end(*_):
+        (out / "cut").mkdir()
+        (out / "cut/config.json").write_text('{"stage": "finetune"}')
+        sys.exit(143)
+    signal.signal(signal.SIGTERM, end)
+    run = out / "done"
+    (run / "encoder").mkdir(parents=True)
+    (run / "encoder/config.json").write_text("{}")
+    (run / "encoder/model.safetensors").write_bytes(os.urandom(2**24))
+    (run / "config.json").write_text('{"stage": "pretrain"}')
+    (run / "timing.json").write_text("{}")
+    print("trains", flush=True)
+    time.sleep(60)
+"""
+
+
+def names(lines):
+    return {canonicalize_name(Requirement(line).name) for line in lines}
+
+
+def carried():
+    return [line for line in (CARD / "packages.txt").read_text().splitlines() if line and line[0] != "#"]
+
+
+def test_every_dependency_is_carried_or_known_to_be_needless_there():
+    project = tomllib.loads((ROOT / "pyproject.toml").read_text())["project"]
+    needed = {r for r in map(Requirement, project["dependencies"]) if "python_version >=" not in str(r.marker)}
+    assert {canonicalize_name(r.name) for r in needed} - NOT_CARRIED <= names(carried())
+    pinned = [line for line in (ROOT / "constraints.txt").read_text().splitlines() if "==" in line]
+    assert names(carried()) <= names(pinned)
+
+
+def test_what_the_machine_has_in_a_version_that_suits_stays_here(monkeypatch):
+    monkeypatch.syspath_prepend(CARD)
+    import pack
+
+    left = set(names(carried())) - set(pack.wanted(["H5py==3.13.0", "mujoco==3.2.0", "rich", "joblib @ file:///here"]))
+    assert left == {"h5py", "rich", "joblib"}
+
+
+@pytest.mark.parametrize("grid", sorted(CARD.glob("*.toml")), ids=lambda path: path.stem)
+def test_the_grids_can_be_carried_out(grid):
+    for testing in (False, True):
+        check_cells(load_grid(str(grid), testing=testing).cells(), grid.stem)
+
+
+def test_a_part_ends_at_its_limit_and_what_is_finished_goes_home_and_on(tmp_path):
+    program = tmp_path / "card" / "site" / "vd4rl_pomdp"
+    program.mkdir(parents=True)
+    shutil.copy(CARD / "run.py", program.parents[1])
+    (program / "data").mkdir()
+    for module in ("__init__", "data/__init__"):
+        (program / f"{module}.py").touch()
+    (program / "data/parity.py").write_text("def render_info(): return 'a renderer'")
+    (program / "__main__.py").write_text(STUB)
+    (program.parent / "torch.py").write_text(
+        "import types; __version__ = '2'; cuda = types.SimpleNamespace(device_count=lambda: 0, get_device_name=None)"
+    )
+    env = os.environ | {"PYTHONPATH": ""}
+    words = [sys.executable, str(program.parents[1] / "run.py"), "--seconds", "300", "--work", str(tmp_path / "work")]
+
+    def call(out, *more):
+        subprocess.run([*words, "--out", str(tmp_path / out), *more], env=env, check=True, capture_output=True)
+        return (tmp_path / out / "log.txt").read_text()
+
+    log = call("first", "--bring", "20", "grid=2", "--", "--jobs", "2")
+    assert "the set: collected" in log
+    assert "drawn by a renderer" in log
+    assert "trains\n" in log
+    assert "asked to end" in log
+    assert "exit code 143" in log
+    first = tmp_path / "first"
+    assert (first / "results/runs.jsonl").read_text() == "its rows"
+    with tarfile.open(first / "records.tar.xz") as file:
+        assert {"cut/config.json", "done/config.json", "done/timing.json"} <= set(file.getnames())
+    assert sorted(path.stat().st_size for path in first.glob("encoders.tar.*"))[-1] == 15 * 2**20
+
+    content = (tmp_path / "work/runs/done/encoder/model.safetensors").read_bytes()
+    shutil.rmtree(tmp_path / "work")
+    assert "no time left" in call("second", "--home", str(first), "--seconds", "10", "grid")
+    assert (tmp_path / "work/runs/done/encoder/model.safetensors").read_bytes() == content
+    assert not (tmp_path / "work/runs/cut").exists()

@@ -1,0 +1,299 @@
+"""On a machine with a GPU and without a network: train until a deadline, and leave what is worth bringing home.
+
+    tar xf card.tar.xz                        # which pack.py made; tests, bench and the grids lie beside this file
+    python3 card/run.py --out home --seconds 570 tests=120 bench=180 cell.toml -- --jobs-per-gpu 5 --stack 5
+
+Parts are carried out in order, each until its own limit, the last ones until the deadline: `tests` are those marked
+gpu, `bench` is `vd4rl-pomdp bench --gpu`, anything else is a grid of `vd4rl-pomdp sweep run`, whose further flags stand
+behind `--`. Of a grid the sets come first, each drawn by all cores, and while the tests run if there are any. At the
+deadline trainings write a checkpoint into the folder --work: on this machine the same command goes on from there.
+
+--out holds log.txt; results/, the rows of finished runs, as `results add` keeps them; records.tar.xz, the small files
+of all runs, metrics among them; and, with --bring MIB, encoders.tar.*, finished encoders as far as they fit, smallest
+first, in parts of 15 MiB. Another machine goes on from such a folder by `--home FOLDER`: it trains neither these
+encoders, if its own set has the same content, nor the policies whose rows are there. What was not finished it begins
+anew.
+"""
+
+from __future__ import annotations
+
+import argparse
+import io
+import json
+import os
+import shlex
+import shutil
+import signal
+import subprocess
+import sys
+import tarfile
+import tempfile
+import threading
+import time
+from contextlib import suppress
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+
+HERE = Path(__file__).resolve().parent
+PROGRAM = [sys.executable, "-P", "-m", "vd4rl_pomdp"]
+TO_END = 40.0
+"""Seconds before the deadline in which trainings write their checkpoints, and what goes home is packed."""
+TO_PACK = 15.0
+VENDORS = ("/usr/share/glvnd", "/etc/glvnd", "/usr/local/nvidia/share/glvnd", "/usr/local/share/glvnd")
+"""Where a driver may say which library draws."""
+PART_BYTES = 15 * 2**20
+DRAWS = "from vd4rl_pomdp.data.parity import render_info; print(render_info())"
+
+
+class Session:
+    """One call: its clock, its log, and the environment of what it starts."""
+
+    def __init__(self, out: Path, seconds: float) -> None:
+        self.began = time.monotonic()
+        self.seconds = seconds
+        out.mkdir(parents=True, exist_ok=True)
+        self._log = (out / "log.txt").open("a", buffering=1)
+        paths = [str(HERE / "site"), str(HERE), *filter(None, [os.environ.get("PYTHONPATH")])]
+        self.env = os.environ | {"PYTHONPATH": os.pathsep.join(paths), "PYTHONUNBUFFERED": "1"}
+        self.env.setdefault("MUJOCO_GL", "egl")
+        self.gpu = False
+        self.processes: list[subprocess.Popen] = []
+
+    def left(self, reserve: float = TO_END) -> float:
+        """Seconds until what runs has to end."""
+        return self.began + self.seconds - reserve - time.monotonic()
+
+    def say(self, line: str) -> None:
+        """Tell a line, with the time."""
+        self.write(f"[{time.monotonic() - self.began:6.1f} s] {line}\n")
+
+    def write(self, text: str) -> None:
+        """Put text on the screen and into the log."""
+        self._log.write(text)
+        with suppress(OSError):
+            print(text, end="", flush=True)
+
+    def run(self, words: list[str], seconds: float, quiet: bool = False) -> tuple[int, str]:
+        """Run a command for so many seconds at most; its exit code, and what it printed.
+
+        It is asked to end by SIGTERM, as a training ends with a checkpoint, and killed where nothing else is left.
+        """
+        if seconds <= 0:
+            self.say(f"no time left for {shlex.join(words)}")
+            return 143, ""
+        process = subprocess.Popen(
+            words, env=self.env, text=True, errors="replace", stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+        )
+        lines: list[str] = []
+
+        def read() -> None:
+            for line in process.stdout or ():
+                lines.append(line)
+                if not quiet:
+                    self.write(line)
+
+        self.processes.append(process)
+        reader = threading.Thread(target=read, daemon=True)
+        reader.start()
+        try:
+            process.wait(seconds)
+        except subprocess.TimeoutExpired:
+            self.say("time is up: asked to end")
+        finally:  # and if this process is asked to end itself
+            if process.poll() is None:
+                process.terminate()
+                with suppress(subprocess.TimeoutExpired):
+                    process.wait(max(5.0, self.left(TO_PACK)))
+                process.kill()
+                process.wait()
+        reader.join(5)
+        return process.returncode, "".join(lines)
+
+    def describe(self) -> None:
+        """Tell the machine, and the versions that are used."""
+        found = (
+            "import torch; print(torch.__version__, *map(torch.cuda.get_device_name, range(torch.cuda.device_count())))"
+        )
+        code, told = self.run([sys.executable, "-c", found], 90, quiet=True)
+        self.gpu = len(told.split()) > 1
+        self.say(f"Python {sys.version.split()[0]}, {os.cpu_count()} cores, torch {told.strip()} ({code})")
+        sys.path.insert(0, str(HERE / "site"))
+        names = ("vd4rl-pomdp", "numpy", "scipy", "mujoco", "h5py", "scikit-learn", "matplotlib", "jax", "filelock")
+        for name in names:
+            try:
+                self.write(f"{name} {version(name)}, ")
+            except PackageNotFoundError:
+                self.write(f"no {name}, ")
+        self.write("\n")
+
+    def find_renderer(self) -> None:
+        """Choose the first environment in which a frame is drawn: the machine's own, or with what was packed."""
+        files = [str(file) for folder in VENDORS for file in Path(folder).glob("egl_vendor.d/*nvidia*.json")]
+        own = {
+            "LD_LIBRARY_PATH": os.pathsep.join(filter(None, [str(HERE / "opengl"), os.environ.get("LD_LIBRARY_PATH")]))
+        }
+        vendor = {"__EGL_VENDOR_LIBRARY_FILENAMES": files[0]} if files else {}
+        before, found, told = dict(self.env), None, ""
+        for more in ({}, own, vendor, own | vendor):
+            self.env = before | more
+            code, told = self.run([sys.executable, "-P", "-c", DRAWS], 60, quiet=True)
+            if code == 0 and (found is None or "NVIDIA" in told):
+                found = more
+                self.say(f"drawn by {told.strip().splitlines()[-1]} {more or ''}")
+            if found is not None and ("NVIDIA" in told or not self.gpu):
+                break
+        self.env = before | (found or {})
+        if found is None:
+            self.say(f"nothing draws here: {told.strip()[-500:]}")
+
+    def share_gpu(self) -> bool:
+        """Start NVIDIA's Multi-Process Service, if it is there and works; whether it runs."""
+        if not shutil.which("nvidia-cuda-mps-control"):
+            self.say("no Multi-Process Service here")
+            return False
+        folder, before = tempfile.mkdtemp(prefix="mps"), dict(self.env)
+        self.env |= {"CUDA_MPS_PIPE_DIRECTORY": folder, "CUDA_MPS_LOG_DIRECTORY": folder}
+        subprocess.run(["nvidia-cuda-mps-control", "-d"], env=self.env, stdout=subprocess.DEVNULL, check=False)
+        code, told = self.run(
+            [sys.executable, "-c", "import torch; print(torch.ones(9, device='cuda').sum())"], 60, True
+        )
+        self.say("Multi-Process Service runs" if code == 0 else f"it does not work: {told[-300:]}")
+        if code:
+            self.stop_sharing()
+            self.env = before
+        return code == 0
+
+    def stop_sharing(self) -> None:
+        """End the Multi-Process Service."""
+        with suppress(subprocess.TimeoutExpired):
+            subprocess.run(["nvidia-cuda-mps-control"], input=b"quit\n", env=self.env, timeout=10, check=False)
+
+
+class GridPart:
+    """A grid as the command that carries it out, and what it needs first."""
+
+    def __init__(self, session: Session, name: str, work: Path, home: Path | None, flags: list[str]) -> None:
+        self._session = session
+        file = HERE / name
+        self._words = [*PROGRAM, "sweep", "run", str(file) if file.is_file() else name, "--out", str(work / "runs")]
+        self._words += ["--data", str(work / "data"), *flags]
+        self._words += ["--done", str(home / "results")] if home and (home / "results").is_dir() else []
+
+    def collect(self, until: float) -> int:
+        """Collect its sets, one after another, until a time; the exit code."""
+        code, plan = self._session.run([*self._words, "--dry-run"], until - time.monotonic(), quiet=True)
+        if code:
+            self._session.write(plan)
+            return code
+        self._session.say(plan.strip().splitlines()[-1])
+        for line in plan.splitlines():
+            command = shlex.split(line, comments=True)[1:]
+            if command[:2] == ["data", "collect"]:
+                code, told = self._session.run([*PROGRAM, *command], until - time.monotonic(), quiet=True)
+                self._session.say(f"{command[-1]}: {told if code else 'collected'}")
+                if code:
+                    return code
+        return 0
+
+    def train(self, until: float) -> int:
+        """Carry it out until a time; the exit code."""
+        return self.collect(until) or self._session.run(self._words, until - time.monotonic())[0]
+
+
+def run_tests(session: Session, seconds: float, grids: list[GridPart]) -> int:
+    """Run the tests that need a GPU, and collect the sets of grids beside them; the tests' exit code."""
+    words = [sys.executable, "-m", "pytest", "-m", "gpu", "-q", "-ra", "--durations=0", "--durations-min=1"]
+    words += ["-p", "no:cacheprovider", "--continue-on-collection-errors", "-c", str(HERE / "pyproject.toml")]
+    files = [path for path in sorted((HERE / "tests").rglob("test_*.py")) if "mark.gpu" in path.read_text()]
+    until = time.monotonic() + session.left()
+    beside = threading.Thread(target=lambda: [grid.collect(until) for grid in grids], daemon=True)
+    beside.start()
+    code, _ = session.run([*words, *map(str, files)], seconds)  # other files may import what is not here
+    beside.join()
+    return code
+
+
+def restore(home: Path, runs: Path) -> None:
+    """Put the encoders that an earlier call brought home where a sweep finds them."""
+    parts = sorted(home.glob("encoders.tar.*"))
+    if parts:
+        with tarfile.open(fileobj=io.BytesIO(b"".join(part.read_bytes() for part in parts))) as file:
+            file.extractall(runs, filter="data")
+
+
+def bring_home(session: Session, runs: Path, out: Path, mib: float) -> None:
+    """Put into `out` what is worth it."""
+    folders = [path.parent for path in runs.rglob("config.json") if path.parent.name != "encoder"]
+    stages = {folder: json.loads((folder / "config.json").read_text()).get("stage", "") for folder in folders}
+    if any((folder / "timing.json").exists() for folder in folders):
+        code, told = session.run([*PROGRAM, "results", "add", str(runs), "--out", str(out / "results")], 60, quiet=True)
+        session.say(f"rows: {told.strip()} ({code})")
+    with tarfile.open(out / "records.tar.xz", "w:xz", preset=3) as file:
+        for path in sorted(runs.rglob("*")):
+            if path.suffix in (".json", ".jsonl", ".csv", ".log") and path.is_file():
+                file.add(path, path.relative_to(runs))
+    finished = [f for f, stage in stages.items() if stage == "pretrain" and (f / "timing.json").exists()]
+    buffer, room = io.BytesIO(), mib * 2**20
+    with tarfile.open(fileobj=buffer, mode="w") as file:
+        for folder in sorted(finished, key=lambda folder: (folder / "encoder" / "model.safetensors").stat().st_size):
+            files = [*folder.glob("*.json*"), *folder.glob("encoder/*")]
+            room -= sum(path.stat().st_size + 2048 for path in files)
+            if room < 0:
+                break
+            for path in files:
+                file.add(path, path.relative_to(runs))
+    content = buffer.getvalue() if mib else b""
+    for number, start in enumerate(range(0, len(content), PART_BYTES)):
+        (out / f"encoders.tar.{number}").write_bytes(content[start : start + PART_BYTES])
+    for path in sorted(path for path in out.rglob("*") if path.is_file()):
+        session.say(f"{path.stat().st_size / 1e6:8.3f} MB  {path.relative_to(out)}")
+
+
+def main() -> None:
+    """Carry out all parts."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("parts", nargs="+", metavar="PART", help="tests, bench or a grid; NAME=SECONDS limits it")
+    parser.add_argument("--out", type=Path, required=True, help="what goes home")
+    parser.add_argument("--work", type=Path, default=HERE / "work", help="runs and sets, which stay here")
+    parser.add_argument("--home", type=Path, help="the --out of an earlier call")
+    parser.add_argument("--seconds", type=float, default=570, help="all of it, packing included")
+    parser.add_argument("--bring", type=float, default=0, metavar="MIB", help="encoders, up to this size in all")
+    parser.add_argument("--mps", action="store_true", help="share the GPU by NVIDIA's Multi-Process Service")
+    words = sys.argv[1:]
+    at = words.index("--") if "--" in words else len(words)
+    told, flags = parser.parse_args(words[:at]), words[at + 1 :]
+
+    session = Session(told.out, told.seconds)
+    signal.signal(signal.SIGTERM, lambda *_: sys.exit(143))
+    told.work.mkdir(parents=True, exist_ok=True)
+    if told.home:
+        restore(told.home, told.work / "runs")
+        if (told.home / "results").is_dir() and told.home.resolve() != told.out.resolve():
+            shutil.copytree(told.home / "results", told.out / "results", dirs_exist_ok=True)
+    session.describe()
+    session.find_renderer()
+    shares = told.mps and session.share_gpu()
+    try:
+        parts = [(name, float(limit or "inf")) for name, _, limit in (part.partition("=") for part in told.parts)]
+        grids = {n: GridPart(session, n, told.work, told.home, flags) for n, _ in parts if n not in ("tests", "bench")}
+        for name, limit in parts:
+            seconds, began = min(limit, session.left()), time.monotonic()
+            session.say(f"{name}: {seconds:.0f} s at most")
+            if name == "tests":
+                code = run_tests(session, seconds, list(grids.values()))
+            elif name == "bench":
+                code, _ = session.run([*PROGRAM, "bench", "--gpu"], seconds)
+            else:
+                code = grids[name].train(began + seconds)
+            session.say(f"{name}: {time.monotonic() - began:.1f} s, exit code {code}")
+    finally:
+        for process in session.processes:
+            process.terminate()
+        if shares:
+            session.stop_sharing()
+        bring_home(session, told.work / "runs", told.out, told.bring)
+        session.say("done")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,365 @@
+"""`vd4rl-pomdp bench --gpu`: what a card makes of the `paper` preset, replayed and eager, beside the peer, in one run.
+
+Times are medians over blocks of many steps, from one synchronisation to the next; the steps before them, in which
+libraries choose their kernels and steps are captured, are not counted.
+"""
+
+from __future__ import annotations
+
+import gc
+import importlib.util
+import itertools
+import os
+import statistics
+import tempfile
+import time
+import traceback
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import asdict, dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import torch
+
+from finetune.algorithms import ALGORITHMS
+from finetune.algorithms.algorithm import Algorithm
+from finetune.config import FinetuneConfig
+from finetune.end_to_end import EndToEnd
+from finetune.features import STAGE, FeatureSampler, FrozenEncoder, encode_views
+from finetune.histories import Histories
+from finetune.train import FinetuneTrainer, Updates
+from pretrain.config import PretrainConfig
+from vd4rl_pomdp.bench.measures import synthetic_set
+from vd4rl_pomdp.bench.processes import JAX_MISSING, Worker, at_once, make_trainer
+from vd4rl_pomdp.core.errors import UserError, WorkerDiedError, first_line
+from vd4rl_pomdp.core.options import NO_OPTIONS, flat
+from vd4rl_pomdp.core.streams import random_stream
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import Dataset, TransitionSampler, View
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig
+from vd4rl_pomdp.nn.encoder_folder import save_encoder
+from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.runs.device import pick_device
+from vd4rl_pomdp.runs.provenance import git_commit, machine, versions
+from vd4rl_pomdp.runs.replay import EAGER_VARIABLE
+
+AIMS: dict[str, tuple[str, float]] = {
+    "td3_bc.replayed_ms": ("<=", 0.55),
+    "td3_bc.jax_over_replayed": (">=", 1.0),
+    "stacked.all_ms": ("<=", 1.0),
+    "mik+a.replayed_ms": ("<=", 3.3),
+    "acro.replayed_ms": ("<=", 2.6),
+    "encoders_at_once.each_ms": ("<=", 2.5),
+    "iql.eager_over_replayed": (">=", 9.0),
+    "bc.eager_over_replayed": (">=", 9.0),
+    "drqv2_bc.eager_over_replayed": (">=", 9.0),
+    "drq_bc.eager_over_replayed": (">=", 3.0),
+    "encoding.seconds": ("<=", 15.0),
+    "evaluation.seconds": ("<=", 60.0),
+}
+"""What is promised of one H200, its evaluation of 16 cores with EGL."""
+CORRUPTION = "patch+zero_frames"
+_SETTLED = 12
+"""Steps before anything is timed: more than are run before a step is captured."""
+
+
+@dataclass(frozen=True)
+class Size:
+    """How much is measured; the preset's settings but for those here."""
+
+    episodes: int
+    hidden_dim: int
+    batch_size: int
+    windows: int
+    """In a batch of pretraining."""
+    views: int
+    blocks: int
+    updates: int
+    """Of a policy, in a block."""
+    steps: int
+    """Of an encoder, in a block."""
+    played: int
+    """Episodes of the evaluation."""
+    decisions: int
+    """Of each."""
+    runs: int
+    """Stacked policies, and encoders at a time."""
+    frame_encoder: str = "drq"
+    window: int = 32
+    """Rows."""
+
+
+PAPER = Size(100, 1024, 256, 16, 4, 5, 512, 64, 100, 500, 5)  # as many updates as are drawn at once, or more
+TINY = Size(1, 16, 8, 2, 1, 1, 2, 1, 1, 3, 2, "nature", 16)
+"""Shows on any machine in seconds that all runs, and measures nothing worth telling."""
+
+
+def gpu_bench(device_name: str = "auto", quick: bool = False) -> dict[str, Any]:
+    """Run every measurement.
+
+    Args:
+        device_name: a GPU's; a CPU is accepted for a trial of the code, with `quick`.
+        quick: trial sizes, whose numbers claim nothing.
+
+    Returns:
+        Nested times, ratios and peaks of memory, with the machine, the commit and the versions.
+
+    Raises:
+        UserError: no GPU is visible, and none of this is a trial.
+    """
+    device = pick_device(device_name)
+    if device.type != "cuda" and not quick:
+        raise UserError("bench --gpu measures a GPU, and none is visible: on a CPU, try the code with --quick")
+    torch.manual_seed(0)
+    size = TINY if quick else PAPER
+    results: dict[str, Any] = {"device": device.type}
+
+    def add(name: str, measure: Callable[[], dict[str, Any]]) -> None:
+        try:
+            results[name] = results.get(name, {}) | measure()
+        except Exception as error:  # whatever it is, the rest is worth measuring
+            traceback.print_exc()
+            results[name] = results.get(name, {}) | {"failed": first_line(error)}
+        free(device)
+
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        dataset = synthetic_set(folder, size.episodes)[0].to(device)
+        encoder = make_trainer(dataset, pretraining(folder, "mik+a", size)).objective.encoder.eval()
+        features = torch.randn(size.views, dataset.num_rows, encoder.dim, device=device).half()
+        add("encoding", lambda: encoding(dataset, encoder, folder, size))
+        for algorithm in ("td3_bc", "iql", "bc", "drqv2_bc"):
+            update = partial(on_features, dataset, features, algorithm, size, 1)
+            add(algorithm, partial(measured, update, device, size.updates, size.blocks))
+        add("td3_bc", lambda: peer(dataset, features, size, results["td3_bc"]["replayed_ms"]))
+        add("stacked", lambda: stacked(dataset, features, size))
+        add("drq_bc", lambda: measured(partial(end_to_end, dataset, size), device, size.steps, size.blocks))
+        for method in ("mik+a", "acro"):
+            train = partial(next_step, dataset, pretraining(folder, method, size))
+            add(method, partial(measured, train, device, size.steps, size.blocks))
+        add("encoders_at_once", lambda: encoders_at_once(dataset, folder, size))
+        add("evaluation", lambda: evaluation(encoder, dataset, folder, size))
+    return results | {"machine": machine(device_name), "commit": git_commit(), "versions": versions()}
+
+
+def measured(make: Callable[[], Callable[[], Any]], device: torch.device, steps: int, blocks: int) -> dict[str, float]:
+    """Milliseconds of a step, run as it is and replayed, and the memory that replaying it takes at most."""
+    with eager():
+        slow = milliseconds(make(), device, max(1, steps // 4), max(1, blocks // 2))
+    free(device)
+    step = make()
+    fast = milliseconds(step, device, steps, blocks)
+    told = {"eager_ms": slow, "replayed_ms": fast, "eager_over_replayed": slow / fast} | peak(device)
+    del step
+    free(device)
+    return told
+
+
+def milliseconds(step: Callable[[], Any], device: torch.device, steps: int, blocks: int) -> float:
+    """Median over blocks of so many steps, of one step."""
+    for _ in range(_SETTLED if device.type == "cuda" else 1):
+        step()
+    times = []
+    for _ in range(blocks):
+        wait(device)
+        start = time.perf_counter()
+        for _ in range(steps):
+            step()
+        wait(device)
+        times.append((time.perf_counter() - start) / steps * 1e3)
+    return statistics.median(times)
+
+
+@contextmanager
+def eager() -> Iterator[None]:
+    """What is made here is never replayed."""
+    before = os.environ.get(EAGER_VARIABLE)
+    os.environ[EAGER_VARIABLE] = "1"
+    try:
+        yield
+    finally:
+        del os.environ[EAGER_VARIABLE]
+        if before is not None:
+            os.environ[EAGER_VARIABLE] = before
+
+
+def wait(device: torch.device) -> None:
+    """Until a GPU has done all that it was given."""
+    if device.type == "cuda":
+        torch.cuda.synchronize(device)
+
+
+def free(device: torch.device) -> None:
+    """Give back the memory of what is gone, and begin to watch its peak."""
+    gc.collect()
+    if device.type == "cuda":
+        torch.cuda.empty_cache()
+        torch.cuda.reset_peak_memory_stats(device)
+
+
+def peak(device: torch.device) -> dict[str, float]:
+    """Most memory of a GPU that tensors took since `free`, the data set's among them."""
+    return {"peak_gib": torch.cuda.max_memory_allocated(device) / 2**30} if device.type == "cuda" else {}
+
+
+def pretraining(folder: Path, method: str, size: Size, seed: int = 0) -> PretrainConfig:
+    """Settings of a pretraining: the `paper` preset in bf16."""
+    return PretrainConfig.of(
+        "paper", data=folder, out=folder, method=method, corruption=CORRUPTION, precision="bf16", seed=seed,
+        frame_encoder=size.frame_encoder, batch_size=size.windows, window=size.window,
+        max_k=min(15, size.window - 1),
+    )  # fmt: skip
+
+
+def next_step(dataset: Dataset, config: PretrainConfig) -> Callable[[], Any]:
+    """The next step of a pretraining."""
+    return make_trainer(dataset, config).update
+
+
+def encoding(dataset: Dataset, encoder: Encoder, folder: Path, size: Size) -> dict[str, float]:
+    """Seconds that the features of a set's views take."""
+    device, config = dataset.t.device, FinetuneConfig.of("paper", precision="bf16")
+    frozen = FrozenEncoder(encoder, dataset, CorruptionConfig.of(CORRUPTION), config.shift, config.precision, 0)
+    histories = Histories(dataset, NO_OPTIONS, 3, 0)
+    start = time.perf_counter()
+    encode_views(frozen, histories, size.views, folder / "features.npy")
+    wait(device)
+    seconds = time.perf_counter() - start
+    return {"views": size.views, "episodes": dataset.num_episodes, "seconds": seconds} | peak(device)
+
+
+def stacked(dataset: Dataset, features: torch.Tensor, size: Size) -> dict[str, float]:
+    """Milliseconds of an update of several stacked runs of TD3+BC, of all and of each."""
+    device, update = features.device, on_features(dataset, features, "td3_bc", size, size.runs)
+    ms = milliseconds(update, device, size.updates, size.blocks)
+    return {"runs": size.runs, "all_ms": ms, "a_seed_ms": ms / size.runs} | peak(device)
+
+
+def on_features(
+    dataset: Dataset, features: torch.Tensor, name: str, size: Size, seeds: int
+) -> Callable[[], dict[str, torch.Tensor]]:
+    """The next update of an algorithm, or of so many stacked runs of it, sampling included, as in training."""
+    config, device = finetuning(name, size), features.device
+    histories, trainers = Histories(dataset, NO_OPTIONS, 3, 0), []
+    for seed in range(seeds):
+        batches = random_stream(seed, STAGE, "batches", device=device)
+        sampler = FeatureSampler(histories, features, config.batch_size, 3, 0.99, batches)
+        algorithm = algorithm_of(config, features.shape[-1], dataset, seed)
+        algorithm.policy.standardise.fit(features[:1])
+        trainers.append(trainer_of(algorithm, sampler, config))
+    return next_update(trainers)
+
+
+def end_to_end(dataset: Dataset, size: Size) -> Callable[[], dict[str, torch.Tensor]]:
+    """The next update of `drq_bc`, which trains its encoder, too."""
+    config, device = finetuning("drqv2_bc", size), dataset.t.device
+    encoder = Encoder(EncoderConfig(dataset.action_dim)).to(device)
+    algorithm = algorithm_of(config, encoder.dim, dataset, 0)
+    view = View(dataset, CorruptionConfig.of(CORRUPTION), config.shift, 0, STAGE)
+    batches = random_stream(0, STAGE, "batches", device=device)
+    sampler = TransitionSampler(view, config.batch_size, batches, 3, 0.99)
+    return next_update([trainer_of(EndToEnd(algorithm, encoder, config), sampler, config)])
+
+
+def finetuning(algorithm: str, size: Size) -> FinetuneConfig:
+    """Settings of a fine-tuning: the `paper` preset, an encoder in bf16."""
+    return FinetuneConfig.of(
+        "paper", algorithm=algorithm, precision="bf16", hidden_dim=size.hidden_dim, batch_size=size.batch_size
+    )
+
+
+def algorithm_of(config: FinetuneConfig, dim: int, dataset: Dataset, seed: int) -> Algorithm:
+    """A config's algorithm on representations of a width, where the set is."""
+    device = dataset.t.device
+    policy = Policy(dim, dataset.action_dim, config.hidden_dim).to(device)
+    noise = random_stream(seed, STAGE, "noise", device=device)
+    return ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
+
+
+def trainer_of(algorithm: Algorithm | EndToEnd, sampler: Any, config: FinetuneConfig) -> FinetuneTrainer:
+    """A run that is never written."""
+    unwritten: Any = [None] * 4  # where its results would go, and what they would be compared with
+    return FinetuneTrainer(algorithm, sampler, config, *unwritten)
+
+
+def next_update(trainers: Sequence[FinetuneTrainer]) -> Callable[[], dict[str, torch.Tensor]]:
+    """The next update of runs, of all at once."""
+    updates, made = Updates(trainers), itertools.count()
+    return lambda: updates(next(made))
+
+
+def encoders_at_once(dataset: Dataset, folder: Path, size: Size) -> dict[str, float]:
+    """Milliseconds that a step of one of several pretrainings at a time takes: that of all over their number.
+
+    In one process, each on a stream of its own, and in a process each; the better way counts.
+    """
+    device = dataset.t.device
+    streams = [torch.cuda.Stream(device) if device.type == "cuda" else None for _ in range(size.runs)]
+    updates = [make_trainer(dataset, pretraining(folder, "mik+a", size, seed)).update for seed in range(size.runs)]
+    wait(device)  # what they were made of is on another stream
+
+    def step() -> None:
+        for stream, update in zip(streams, updates, strict=True):
+            with torch.cuda.stream(stream):
+                update()
+
+    in_one = milliseconds(step, device, size.steps, size.blocks) / size.runs
+    told = {"at_once": size.runs, "on_streams_ms": in_one} | peak(device)
+    updates.clear()
+    free(device)
+    seconds = 4.0 if size is PAPER else 0.1
+    with ExitStack() as stack:
+        workers = [
+            stack.enter_context(Worker("pretraining_steps", str(folder), str(device), asdict(size), seed, seconds))
+            for seed in range(size.runs)
+        ]
+        speed = sum(answer["steps_per_s"] for answer in at_once(workers))
+    return told | {"in_processes_ms": 1e3 / speed, "each_ms": min(in_one, 1e3 / speed)}
+
+
+def peer(dataset: Dataset, features: torch.Tensor, size: Size, replayed_ms: float) -> dict[str, Any]:
+    """The same update in JAX: on this card if JAX sees it, and only then a ratio."""
+    if importlib.util.find_spec("jax") is None:
+        return {"jax": JAX_MISSING}
+    shape = {
+        "hidden_dim": size.hidden_dim,
+        "batch_size": size.batch_size,
+        "dim": features.shape[-1],
+        "action_dim": dataset.action_dim,
+        "views": len(features),
+        "rows": dataset.num_rows,
+    }
+    told: dict[str, Any] = {}
+    for tf32 in (False, True):
+        try:
+            # without the variable JAX takes three quarters of the card's memory as it starts
+            with Worker("jax_updates", shape, size.updates, tf32, XLA_PYTHON_CLIENT_PREALLOCATE="false") as worker:
+                worker.answer(60)
+                answers = []
+                for _ in range(size.blocks):
+                    worker.begin()
+                    answers.append(worker.answer(60))
+        except WorkerDiedError as error:
+            return told | {"jax": first_line(error)}
+        device, ms = answers[0]["device"], statistics.median(answer["ms"] for answer in answers)
+        if device == "cpu":  # a kind of processor, in JAX's words
+            return {"jax": f"sees no GPU: {ms:.3g} ms on the CPU"}
+        told |= {"jax_tf32_ms": ms} if tf32 else {"jax_ms": ms, "jax_over_replayed": ms / replayed_ms}
+    return told
+
+
+def evaluation(encoder: Encoder, dataset: Dataset, folder: Path, size: Size, limit: float = 70.0) -> dict[str, Any]:
+    """Seconds of an evaluation on every core, unless nothing can be drawn here or it takes over `limit`."""
+    card = EncoderCard("mik+a", "walker_walk", "bench", flat(CorruptionConfig.of(CORRUPTION)), 0, 0, "paper")
+    save_encoder(folder / "encoder", encoder, card)
+    Policy(encoder.dim, dataset.action_dim, size.hidden_dim).save(folder / "policy")
+    told = {"episodes": size.played, "cores": os.cpu_count()}
+    try:
+        with Worker("playing", str(folder), size.played, size.decisions) as worker:
+            worker.answer()
+            worker.begin()
+            return told | worker.answer(limit)
+    except WorkerDiedError as error:
+        return told | {"left_out": first_line(error)}

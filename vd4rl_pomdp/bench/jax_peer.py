@@ -1,0 +1,185 @@
+"""The peer: TD3+BC in JAX, of the same networks, batches and options as `finetune.algorithms.TD3BC`.
+
+Compiled whole, many updates in a call (`lax.scan`), as fast JAX code has it (JAX-CORL, github.com/nissymori/JAX-CORL).
+JAX comes with the extra `policy`: this module is imported only where the peer is asked for.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from torch import Tensor, nn
+
+from finetune.algorithms.td3_bc import NOISE_CLIP, TARGET_NOISE, TD3BC
+
+BETAS, EPS = (0.9, 0.999), 1e-8
+Net = list[tuple[Array, Array]]
+"""Weights (inputs, outputs) and biases of a perceptron's layers."""
+
+
+class Adam(NamedTuple):
+    """An optimiser's state."""
+
+    steps: Array
+    first: Any
+    second: Any
+
+
+class Learnt(NamedTuple):
+    """Everything that an update changes."""
+
+    policy: Net
+    critics: tuple[Net, Net]
+    target_policy: Net
+    target_critics: tuple[Net, Net]
+    policy_adam: Adam
+    critic_adam: Adam
+
+
+class Table(NamedTuple):
+    """What batches are gathered from: M transitions, V views of N features."""
+
+    features: Array
+    """(V, N, D)."""
+    first: Array
+    """(V, M): number of the feature of a transition's first end."""
+    last: Array
+    """(V, M)."""
+    action: Array
+    """(M, A)."""
+    reward: Array
+    """(M,)."""
+    discount: Array
+    """(M,)."""
+    mean: Array
+    """(D,), of the features."""
+    std: Array
+    """(D,)."""
+
+
+class Draws(NamedTuple):
+    """Random numbers of U updates."""
+
+    index: Array
+    """(U, B): transitions."""
+    view: Array
+    """(U, B)."""
+    noise: Array
+    """(U, B, A), standard normal, for the target policy's actions."""
+
+
+def learnt_by(algorithm: TD3BC) -> Learnt:
+    """The weights of an algorithm that has made no update."""
+    policy, target_policy = net(algorithm.policy.net), net(algorithm.target_policy.net)
+    critics, targets = ((net(twin.first), net(twin.second)) for twin in (algorithm.critic, algorithm.target_critic))
+    return Learnt(policy, critics, target_policy, targets, new_adam(policy), new_adam(critics))
+
+
+def net(module: nn.Sequential) -> Net:
+    """A copy of a perceptron's layers."""
+    return [(as_jax(layer.weight).T, as_jax(layer.bias)) for layer in module if isinstance(layer, nn.Linear)]
+
+
+def as_jax(tensor: Tensor) -> Array:
+    """A copy of a tensor, where JAX computes."""
+    return jnp.array(tensor.detach().cpu().numpy())
+
+
+def new_adam(weights: Any) -> Adam:
+    """The state before the first step."""
+    zeros = [jax.tree.map(jnp.zeros_like, weights) for _ in range(2)]
+    return Adam(jnp.zeros((), jnp.int32), *zeros)
+
+
+def draw(key: Array, table: Table, updates: int, batch_size: int) -> Draws:
+    """Numbers of so many updates, all at once."""
+    index, view, noise = jax.random.split(key, 3)
+    shape = updates, batch_size
+    return Draws(
+        jax.random.randint(index, shape, 0, len(table.action)),
+        jax.random.randint(view, shape, 0, len(table.features)),
+        jax.random.normal(noise, (*shape, table.action.shape[-1])),
+    )
+
+
+def make_updates(algorithm: TD3BC) -> Callable[[Learnt, Table, Draws], tuple[Learnt, dict[str, Array]]]:
+    """A function, not compiled yet, that makes U updates with an algorithm's options.
+
+    U is even: in every second update the actor and the targets move. It gives what is learnt then, and the losses:
+    `critic_loss` (U / 2, 2) and `actor_loss` (U / 2,).
+    """
+    gamma, alpha, tau = algorithm.settings.gamma, algorithm.settings.alpha, algorithm.tau
+
+    def critic_loss(critics: tuple[Net, Net], learnt: Learnt, table: Table, draws: Draws) -> Array:
+        z, action, next_z = batch(table, draws)
+        noise = jnp.clip(draws.noise * TARGET_NOISE, -NOISE_CLIP, NOISE_CLIP)
+        next_action = jnp.clip(jnp.tanh(forward(learnt.target_policy, next_z)) + noise, -1, 1)
+        value = jnp.minimum(*values(learnt.target_critics, next_z, next_action))
+        target = table.reward[draws.index] + gamma * table.discount[draws.index] * value
+        return sum(((q - target) ** 2).mean() for q in values(critics, z, action))
+
+    def actor_loss(policy: Net, learnt: Learnt, table: Table, draws: Draws) -> Array:
+        z, action, _ = batch(table, draws)
+        chosen = jnp.tanh(forward(policy, z))
+        value = forward(learnt.critics[0], jnp.concatenate([z, chosen], -1))[:, 0]
+        weight = alpha / jax.lax.stop_gradient(jnp.abs(value).mean())
+        return ((chosen - action) ** 2).mean() - weight * value.mean()
+
+    def pair(learnt: Learnt, table: Table, draws: Draws) -> tuple[Learnt, dict[str, Array]]:
+        losses = []
+        for turn in range(2):
+            drawn = Draws(*(numbers[turn] for numbers in draws))
+            loss, gradient = jax.value_and_grad(critic_loss)(learnt.critics, learnt, table, drawn)
+            critics, adam = adam_step(learnt.critics, learnt.critic_adam, gradient, algorithm.learning_rate)
+            learnt = learnt._replace(critics=critics, critic_adam=adam)
+            losses.append(loss)
+        loss, gradient = jax.value_and_grad(actor_loss)(learnt.policy, learnt, table, drawn)
+        policy, adam = adam_step(learnt.policy, learnt.policy_adam, gradient, algorithm.learning_rate)
+        learnt = learnt._replace(policy=policy, policy_adam=adam)
+        moved = [
+            jax.tree.map(lambda old, new: old + tau * (new - old), *both)
+            for both in ((learnt.target_policy, policy), (learnt.target_critics, learnt.critics))
+        ]
+        learnt = learnt._replace(target_policy=moved[0], target_critics=moved[1])
+        return learnt, {"critic_loss": jnp.stack(losses), "actor_loss": loss}
+
+    def updates(learnt: Learnt, table: Table, draws: Draws) -> tuple[Learnt, dict[str, Array]]:
+        pairs = jax.tree.map(lambda numbers: numbers.reshape(-1, 2, *numbers.shape[1:]), draws)
+        return jax.lax.scan(lambda learnt, drawn: pair(learnt, table, drawn), learnt, pairs)
+
+    return updates
+
+
+def batch(table: Table, draws: Draws) -> tuple[Array, Array, Array]:
+    """Standardised representations (B, D) of the first ends, the actions (B, A), those of the last ends."""
+    ends = (table.features[draws.view, end[draws.view, draws.index]] for end in (table.first, table.last))
+    z, next_z = ((feature.astype(jnp.float32) - table.mean) / table.std for feature in ends)
+    return z, table.action[draws.index], next_z
+
+
+def forward(layers: Net, x: Array) -> Array:
+    """Outputs of a perceptron."""
+    for weight, bias in layers[:-1]:
+        x = jax.nn.relu(x @ weight + bias)
+    weight, bias = layers[-1]
+    return x @ weight + bias
+
+
+def values(critics: tuple[Net, Net], z: Array, action: Array) -> tuple[Array, Array]:
+    """Both critics' values (B,)."""
+    both = jnp.concatenate([z, action], -1)
+    return forward(critics[0], both)[:, 0], forward(critics[1], both)[:, 0]
+
+
+def adam_step(weights: Any, adam: Adam, gradient: Any, learning_rate: float) -> tuple[Any, Adam]:
+    """Adam (Kingma & Ba 2015, arXiv 1412.6980), in PyTorch's order of operations."""
+    steps = adam.steps + 1
+    first = jax.tree.map(lambda m, g: m + (1 - BETAS[0]) * (g - m), adam.first, gradient)
+    second = jax.tree.map(lambda v, g: BETAS[1] * v + (1 - BETAS[1]) * g * g, adam.second, gradient)
+    size, scale = learning_rate / (1 - BETAS[0] ** steps), jnp.sqrt(1 - BETAS[1] ** steps)
+    moved = jax.tree.map(lambda w, m, v: w - size * m / (jnp.sqrt(v) / scale + EPS), weights, first, second)
+    return moved, Adam(steps, first, second)
