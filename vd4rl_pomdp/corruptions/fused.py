@@ -55,7 +55,7 @@ def zero_draws(key: Tensor, stages: int, stack: int) -> Tensor:
     return draw_integers(hash_keys(derive_keys(stages, key) ^ 1), DRAWS, stack)
 
 
-@compiled_on_gpu
+@compiled_on_gpu()
 def drawn(
     stages: tuple[Any, ...], zeroed: int, pad: int, key: Tensor, shift_key: Tensor, stack: int, size: tuple[int, int]
 ) -> Drawn:
@@ -75,16 +75,16 @@ def drawn(
         offset = draw_offset(shift_key, pad).repeat_interleave(len(key) // len(shift_key), 0)
     if zeroed:
         draws, place = zero_draws(key, len(stages), stack), torch.arange(stack, device=key.device)
-        before = draws[:, None] < draws[:, :, None]
+        one, other = draws[:, :, None], draws[:, None]
         # ranks by comparison, equal draws in order: what sorting gives
-        before |= (draws[:, None] == draws[:, :, None]) & (place < place[:, None])
+        before = (other < one) | ((other == one) & (place < place[:, None]))
         kept = before.sum(2) >= zeroed
     number = torch.arange(stack, device=key.device).expand(len(key), stack)
     places = tuple(stage.places(derive_keys(n, key), number, *size) for n, stage in enumerate(stages))
     return Drawn(offset, kept, places)
 
 
-@compiled_on_gpu
+@compiled_on_gpu()
 def painted(
     stages: tuple[Any, ...],
     frames: Tensor,
