@@ -38,7 +38,7 @@ class Hiding(Protocol):
         """Whether pixels are hidden: (N, K, H, W) bool, given `places`, (H, 1) rows and (W,) columns, int64."""
 
 
-class Drawn(NamedTuple):
+class StackDraws(NamedTuple):
     """What is drawn for N stacks of S frames."""
 
     offset: Tensor | None
@@ -58,7 +58,7 @@ def zero_draws(key: Tensor, stages: int, stack: int) -> Tensor:
 @compiled_on_gpu(training=True)
 def drawn(
     stages: tuple[Any, ...], zeroed: int, pad: int, key: Tensor, shift_key: Tensor, stack: int, size: tuple[int, int]
-) -> Drawn:
+) -> StackDraws:
     """Draws for stacks of `stack` frames.
 
     Args:
@@ -81,7 +81,7 @@ def drawn(
         kept = before.sum(2) >= zeroed
     number = torch.arange(stack, device=key.device).expand(len(key), stack)
     places = tuple(stage.places(derive_keys(n, key), number, *size) for n, stage in enumerate(stages))
-    return Drawn(offset, kept, places)
+    return StackDraws(offset, kept, places)
 
 
 @compiled_on_gpu(training=True)
@@ -99,7 +99,7 @@ def painted(
         stages: each `Hiding`.
         frames: (R, C, H, W) uint8.
         index: (N, S) int64 of the frames in each stack.
-        offset, kept, places: see `Drawn`.
+        offset, kept, places: see `StackDraws`.
     """
     _, channels, height, width = frames.shape
     y, x = torch.arange(height, device=frames.device), torch.arange(width, device=frames.device)
