@@ -66,6 +66,7 @@ from vd4rl_pomdp.runs.metrics import EVALUATION
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.replay import Replay
 from vd4rl_pomdp.runs.run import RunFolder
+from vd4rl_pomdp.runs.workers import kept_workers
 
 RESULTS = ("policy/config.json", "policy/model.safetensors", EPISODES_FILE, *FILES_OF_RUN)
 """What a finished run holds."""
@@ -402,6 +403,7 @@ def train(trainers: Sequence[FinetuneTrainer]) -> None:
                     print(f"warning: training diverged, {error}; the other runs go on", file=sys.stderr)
 
     with ExitStack() as opened:
+        opened.enter_context(kept_workers())
         for trainer in trainers:
             title = f"finetune {trainer.config.algorithm} on {trainer.card.method}" if trainer is trainers[0] else ""
             more = f" and {len(trainers) - 1} more" if title and len(trainers) > 1 else ""

@@ -117,7 +117,8 @@ class Worker:
         """Start it.
 
         Args:
-            function: its name, with its module's where that is not this one; it returns a function without arguments that returns a dict.
+            function: its name, with its module's where that is not this one; it returns a function without
+                arguments that returns a dict.
             arguments: what JSON can write.
             environment: variables of the process.
         """
