@@ -75,7 +75,6 @@ def test_policies_are_measured_stacked_and_against_jax(tmp_path, monkeypatch):
     dataset, _ = measures.synthetic_set(tmp_path, 1)
     stacked = measures.stacking(dataset, 1)
     assert all(value > 0 for value in stacked.values())
-    assert {name for name in GOALS if name.startswith("stacking.")} <= {f"stacking.{name}" for name in stacked}
 
     class Jax:
         def __init__(self, *_):
