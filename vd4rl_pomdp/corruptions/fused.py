@@ -38,7 +38,16 @@ class Hiding(Protocol):
         """Whether pixels are hidden: (N, K, H, W) bool, given `places`, (H, 1) rows and (W,) columns, int64."""
 
 
-class Drawn(NamedTuple):
+def tells_pixels(stage: Any) -> bool:
+    """Whether a stage is `Hiding`, and not by inheritance from one that does something else to frames."""
+    kinds = type(stage).__mro__
+    tells, does = (
+        next((i for i, kind in enumerate(kinds) if name in vars(kind)), len(kinds)) for name in ("hides", "__call__")
+    )
+    return isinstance(stage, Hiding) and tells <= does
+
+
+class StackDraws(NamedTuple):
     """What is drawn for N stacks of S frames."""
 
     offset: Tensor | None
@@ -58,7 +67,7 @@ def zero_draws(key: Tensor, stages: int, stack: int) -> Tensor:
 @compiled_on_gpu()
 def drawn(
     stages: tuple[Any, ...], zeroed: int, pad: int, key: Tensor, shift_key: Tensor, stack: int, size: tuple[int, int]
-) -> Drawn:
+) -> StackDraws:
     """Draws for stacks of `stack` frames.
 
     Args:
@@ -81,7 +90,7 @@ def drawn(
         kept = before.sum(2) >= zeroed
     number = torch.arange(stack, device=key.device).expand(len(key), stack)
     places = tuple(stage.places(derive_keys(n, key), number, *size) for n, stage in enumerate(stages))
-    return Drawn(offset, kept, places)
+    return StackDraws(offset, kept, places)
 
 
 @compiled_on_gpu()
@@ -99,7 +108,7 @@ def painted(
         stages: each `Hiding`.
         frames: (R, C, H, W) uint8.
         index: (N, S) int64 of the frames in each stack.
-        offset, kept, places: see `Drawn`.
+        offset, kept, places: see `StackDraws`.
     """
     _, channels, height, width = frames.shape
     y, x = torch.arange(height, device=frames.device), torch.arange(width, device=frames.device)
