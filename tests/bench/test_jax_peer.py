@@ -35,7 +35,7 @@ def test_the_peer_in_jax_makes_the_same_updates():
         ours.append(algorithm.update(FeatureBatch(ends[0], *told, ends[1])))
     arrays = {name: jax_peer.as_jax(tensor) for name, tensor in table.items()}
     arrays |= {name: jax_peer.as_jax(getattr(policy.standardise, name)) for name in ("mean", "std")}
-    draws = jax_peer.Draws(*map(jax_peer.as_jax, (index, view, noise)))
+    draws = jax_peer.BatchDraws(*map(jax_peer.as_jax, (index, view, noise)))
     learnt, losses = jax.jit(jax_peer.make_updates(algorithm))(learnt, jax_peer.Table(**arrays), draws)
     critic = torch.stack([logs["critic_loss"] for logs in ours]).view(-1, 2)
     actor = torch.stack([logs["actor_loss"] for logs in ours[1::2]])

@@ -61,6 +61,7 @@ AIMS: dict[str, tuple[str, float]] = {
 }
 """What is promised of one H200, its evaluation of 16 cores with EGL."""
 CORRUPTION = "patch+zero_frames"
+_BETWEEN_WAITS = 8
 _SETTLED = 12
 """Steps before anything is timed: more than are run before a step is captured."""
 
@@ -312,11 +313,34 @@ def encoders_at_once(dataset: Dataset, folder: Path, size: Size) -> dict[str, fl
     seconds = 4.0 if size is PAPER else 0.1
     with ExitStack() as stack:
         workers = [
-            stack.enter_context(Worker("pretraining_steps", str(folder), str(device), asdict(size), seed, seconds))
+            stack.enter_context(
+                Worker(f"{__name__}.pretraining_steps", str(folder), str(device), asdict(size), seed, seconds)
+            )
             for seed in range(size.runs)
         ]
         speed = sum(answer["steps_per_s"] for answer in at_once(workers))
     return told | {"in_processes_ms": 1e3 / speed, "each_ms": min(in_one, 1e3 / speed)}
+
+
+def pretraining_steps(
+    folder: str, device: str, size: dict[str, Any], seed: int, seconds: float
+) -> Callable[[], dict[str, Any]]:
+    """Pretrain on the set in a folder, of `mik+a` in the `paper` preset and bf16, for so long."""
+    place = torch.device(device)
+    dataset = open_dataset(Path(folder) / "set", Path(folder) / "cache").to(place)
+    trainer = make_trainer(dataset, pretraining(Path(folder), "mik+a", Size(**size), seed))
+    milliseconds(trainer.update, place, 1, 1)  # settles it
+
+    def measure() -> dict[str, float]:
+        start, steps = time.perf_counter(), 0
+        while (spent := time.perf_counter() - start) < seconds:
+            for _ in range(_BETWEEN_WAITS):
+                trainer.update()
+            wait(place)
+            steps += _BETWEEN_WAITS
+        return {"steps_per_s": steps / spent}
+
+    return measure
 
 
 def peer(dataset: Dataset, features: torch.Tensor, size: Size, replayed_ms: float) -> dict[str, Any]:
