@@ -110,7 +110,8 @@ class Session:
                 process.terminate()
                 with suppress(subprocess.TimeoutExpired):
                     process.wait(min(max(5.0, self.left(TO_PACK)), TO_END))
-                os.killpg(process.pid, signal.SIGKILL)
+                with suppress(ProcessLookupError):  # else it and its workers
+                    os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
         reader.join(5)
         return process.returncode, "".join(lines)
