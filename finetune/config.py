@@ -51,9 +51,9 @@ class FinetuneConfig(StageConfig):
     """Random shift in pixels, one for each episode and view; for each transition with --views 0, for each observation
     where the encoder is trained."""
     precision: Precision = "fp32"
-    """Precision of the encoder: fp32, or bf16 autocast."""
+    """Precision of the encoder: fp32, tf32 (on a GPU), or bf16 autocast."""
     update_precision: Precision = "fp32"
-    """Precision of the algorithm's matrix products, but for last layers: fp32, or bf16 autocast."""
+    """Precision of the algorithm's matrix products: fp32, tf32 (on a GPU), or, but for last layers, bf16 autocast."""
     eval_every: int = 50_000
     """Updates between two evaluations; the last one is always evaluated."""
     eval_episodes: int = 10
@@ -87,7 +87,7 @@ class FinetuneConfig(StageConfig):
 
     choosers: ClassVar[tuple[str, ...]] = ("algorithm",)
     presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
-        "paper": {},
+        "paper": {"update_precision": "tf32"},
         "cpu": {"updates": 50_000, "hidden_dim": 256, "precision": "bf16", "eval_every": 25_000},
         "smoke": {
             "updates": 40,

@@ -58,7 +58,7 @@ from vd4rl_pomdp.runs import (
     TIMING_FILE,
     interrupt,
 )
-from vd4rl_pomdp.runs.device import pick_device
+from vd4rl_pomdp.runs.device import pick_device, set_products
 from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.loop import Loop, in_step, save, training
@@ -66,6 +66,7 @@ from vd4rl_pomdp.runs.metrics import EVALUATION
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.replay import Capture, Replay
 from vd4rl_pomdp.runs.run import RunFolder
+from vd4rl_pomdp.runs.workers import kept_workers
 
 RESULTS = ("policy/config.json", "policy/model.safetensors", EPISODES_FILE, *FILES_OF_RUN)
 """What a finished run holds."""
@@ -357,9 +358,10 @@ class Updates:
             for number, trainer in enumerate(trainers):
                 trainer.settle = partial(_settle, trainer, stack, sampler, number)
         device = first.policy.standardise.mean.device
-        bf16 = trainers[0].config.update_precision == "bf16"
+        precision = trainers[0].config.update_precision
+        set_products(device, precision)
         # not cached, because weights move between the losses of an update
-        self._precise = torch.autocast(device.type, torch.bfloat16, bf16, cache_enabled=False)
+        self._precise = torch.autocast(device.type, torch.bfloat16, precision == "bf16", cache_enabled=False)
         streams, trained = [self._sampler.draws, self._counting.draws], [self._algorithm, self._counting]
         self._replay = Replay(self._update, device, streams, self._counting.period, trained, capture)
         if self._replay.replays:
@@ -401,6 +403,7 @@ def train(trainers: Sequence[FinetuneTrainer]) -> None:
                     print(f"warning: training diverged, {error}; the other runs go on", file=sys.stderr)
 
     with ExitStack() as opened:
+        opened.enter_context(kept_workers())
         for trainer in trainers:
             title = f"finetune {trainer.config.algorithm} on {trainer.card.method}" if trainer is trainers[0] else ""
             more = f" and {len(trainers) - 1} more" if title and len(trainers) > 1 else ""

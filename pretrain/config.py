@@ -55,7 +55,7 @@ class TrainingConfig(StageConfig):
     """Frame encoder: drq, nature (a fraction of its cost), nature_half (half the resolution), small or mixer; or
     state, the simulator's, in place of pixels."""
     precision: Precision = "fp32"
-    """fp32, or bf16 autocast."""
+    """Precision of products: fp32, tf32 (on a GPU), or bf16 autocast."""
     device: str = "auto"
     """auto, cpu or cuda."""
     log_every: int = 50

@@ -31,7 +31,7 @@ from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, save_encoder
 from vd4rl_pomdp.nn.frame import STATE, StateFrame
 from vd4rl_pomdp.nn.objective import Objective
 from vd4rl_pomdp.runs import METRICS_FILE
-from vd4rl_pomdp.runs.device import autocast, pick_device
+from vd4rl_pomdp.runs.device import autocast, pick_device, set_products
 from vd4rl_pomdp.runs.loop import training
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside
@@ -180,6 +180,7 @@ class Trainer:
         """
         self.objective, self.batches, self.config, self._learning_rate = objective, batches, config, learning_rate
         self.device = next(objective.parameters()).device
+        set_products(self.device, config.precision)
         self.optimiser = Adam(objective.parameters(), config.learning_rate)
         self.step = 0
         self._replay = Replay(self._update, self.device, [batches.draws], trained=[objective, self.optimiser])

@@ -1,12 +1,18 @@
 """What a GPU does in one pass over the pixels, against what a CPU does line by line."""
 
+import shutil
+from functools import partial
+
 import pytest
 import torch
 
 from tests.helpers_data import write_fake_set
-from vd4rl_pomdp.core import buffers
+from tests.recording import record
+from vd4rl_pomdp.core import buffers, compiling
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.corruptions import CORRUPTIONS, CorruptionConfig, corruption, fused
-from vd4rl_pomdp.data import Dataset, View, open_dataset
+from vd4rl_pomdp.data import Dataset, TransitionSampler, View, WindowSampler, open_dataset
+from vd4rl_pomdp.runs.replay import Replay
 
 OPTIONS = [
     {"zeroed_frames": 1, "patch_size": 5, "patch_fill": 7},
@@ -69,3 +75,113 @@ def test_equal_draws_zero_the_same_frames_by_ranks_as_by_sorting(monkeypatch):
         kept = corruption.Corruption([], zeroed).kept(key, 3)
         by_rank = fused.drawn((), zeroed, 0, key, key, 3, (1, 1)).kept
         assert torch.equal(torch.zeros_like(by_rank).scatter_(1, kept, True), by_rank)
+
+
+def test_torch_compiles_one_pass_as_a_whole_and_to_the_same_bits(dataset, monkeypatch):
+    """A GPU compiles all of it; here its operators are traced, and those on pixels compiled if there is a compiler."""
+    monkeypatch.setattr(buffers, "in_host_memory", lambda x: False)
+    config = CorruptionConfig.of("patch+zero_frames", patch_size=5, patch_count=2, patch_fill=7)
+    rows = torch.arange(24).view(4, 6)
+    expected = View(dataset, config, 4).observe(rows)
+    backend = "inductor" if shutil.which("g++") else "aot_eager"
+    traced = {"drawn": "aot_eager", "painted": backend}
+    for name, how in traced.items():
+        written = getattr(corruption, name).__wrapped__
+        monkeypatch.setattr(corruption, name, torch.compile(written, backend=how, fullgraph=True))
+    torch.compiler.reset()
+    assert torch.equal(View(dataset, config, 4).observe(rows), expected)
+
+
+def test_what_cannot_be_compiled_runs_as_it_is_written_and_that_is_told_once(monkeypatch, capsys):
+    def refuse(function):
+        raise RuntimeError("no compiler\nand more")
+
+    monkeypatch.setattr(torch, "compile", refuse)
+    monkeypatch.setattr(torch.Tensor, "is_cuda", True)
+    double = compiling.compiled_on_gpu()(lambda x: 2 * x)
+    assert [int(double(torch.tensor(3))) for _ in range(2)] == [6, 6]
+    assert capsys.readouterr().err.count("is not compiled, which is slower: no compiler") == 1
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("name", CORRUPTIONS)
+@pytest.mark.parametrize("options", OPTIONS)
+def test_a_gpu_makes_the_observations_of_a_cpu(dataset, capsys, name, options):
+    config = CorruptionConfig.fill({"corruption": name} | options)
+    for settings in ({"shift": 0}, {"shift": 4}, {"shift": 4, "shared": "observation"}, {"shift": 16}):
+        here = seen(dataset, config, **settings)
+        try:
+            there = seen(dataset.to("cuda"), config, **settings)
+        finally:
+            dataset.to("cpu")
+        for one, other in zip(here, there, strict=True):
+            assert torch.equal(one, other)
+    assert "not compiled" not in capsys.readouterr().err
+
+
+def samplers(dataset: Dataset, config: CorruptionConfig) -> list[WindowSampler | TransitionSampler]:
+    def draws():
+        return RandomStream(torch.Generator().manual_seed(5), dataset.t.device)
+
+    view = partial(View, dataset, config, 4, 3)
+    return [WindowSampler(view("w"), 6, 4, draws()), TransitionSampler(view("t"), 6, draws(), n_step=3)]
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("mode", ["resample", "emission"])
+def test_a_gpu_samples_the_batches_of_a_cpu_without_waiting_also_as_a_graph(dataset, mode):
+    """Keys go on within a graph: each replay samples the next batch."""
+    config, steps = CorruptionConfig.of("patch+zero_frames", mode, patch_size=5), 12
+    expected = [[s.sample().to("cpu").replace() for _ in range(steps)] for s in samplers(dataset, config)]
+    try:
+        dataset.to("cuda")
+        for sampler, batches in zip(samplers(dataset, config), expected, strict=True):
+            held = []
+
+            def step(turn, sampler=sampler, held=held):
+                batch = sampler.sample()
+                if not held:
+                    held.append({name: torch.empty_like(batch[name]) for name in batch})
+                for name, place in held[0].items():
+                    place.copy_(batch[name])
+                return {"loss": batch.obs.float().mean()}
+
+            replay = Replay(step, torch.device("cuda"), [sampler.draws])
+            found = []
+            for number in range(steps):
+                # the first step compiles, and a block of draws is sent now and then: neither is part of sampling
+                torch.cuda.set_sync_debug_mode("error" if 0 < number < 3 else "default")
+                replay(0)
+                torch.cuda.set_sync_debug_mode("default")
+                found.append({name: value.cpu() for name, value in held[0].items()})
+            assert replay.replays
+            for batch, other in zip(batches, found, strict=True):
+                for name in batch:
+                    torch.testing.assert_close(other[name], batch[name], rtol=1e-6, atol=1e-6)
+    finally:
+        torch.cuda.set_sync_debug_mode("default")
+        dataset.to("cpu")
+
+
+@pytest.mark.parametrize("mode", ["resample", "emission"])
+def test_a_replayed_sampler_gives_the_batches_of_one_that_is_run(dataset, monkeypatch, mode):
+    """On a CPU a recorder plays the graph's part, and refuses what would wait for a GPU."""
+    config, steps = CorruptionConfig.of("patch+zero_frames", mode, patch_size=5), 8
+    expected = [[s.sample() for _ in range(steps)] for s in samplers(dataset, config)]
+    expected = [[{name: batch[name].clone() for name in batch} for batch in batches] for batches in expected]
+    monkeypatch.setattr(buffers, "in_host_memory", lambda x: False)
+    for sampler, batches in zip(samplers(dataset, config), expected, strict=True):
+        held = {name: torch.empty_like(value) for name, value in batches[0].items()}
+
+        def step(turn, sampler=sampler, held=held):
+            batch = sampler.sample()
+            for name, place in held.items():
+                place.copy_(batch[name])
+            return {"loss": batch.obs.float().mean()}
+
+        replay = Replay(step, torch.device("cpu"), [sampler.draws], capture=record)
+        for batch in batches:
+            replay(0)
+            for name, value in batch.items():
+                assert torch.equal(held[name], value), name
+        assert replay.replays

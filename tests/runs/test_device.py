@@ -5,7 +5,7 @@ import torch
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.nn.heads import ExactLinear
-from vd4rl_pomdp.runs.device import autocast, pick_device
+from vd4rl_pomdp.runs.device import autocast, pick_device, set_products
 
 CPU = torch.device("cpu")
 
@@ -34,3 +34,23 @@ def test_a_device_that_is_not_there_is_refused(name, told):
     assert pick_device("cpu") == CPU
     with pytest.raises(UserError, match=told):
         pick_device(name)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize(("precision", "error"), [("fp32", (0, 1e-5)), ("tf32", (1e-5, 1e-2))])
+def test_products_on_a_gpu_have_the_precision_that_is_set(precision, error):
+    g = torch.Generator().manual_seed(0)
+    a, b = torch.randn(512, 512, generator=g), torch.randn(512, 512, generator=g)
+    truth = (a.double() @ b.double()).float()
+    set_products(torch.device("cuda"), precision)
+    found = (a.cuda() @ b.cuda()).cpu()
+    off = float((found - truth).norm() / truth.norm())
+    set_products(torch.device("cuda"), "fp32")
+    assert error[0] <= off <= error[1]
+
+
+def test_tf32_on_a_cpu_is_fp32():
+    assert not autocast(CPU, "tf32")._enabled
+    before = torch.get_float32_matmul_precision()
+    set_products(CPU, "tf32")
+    assert torch.get_float32_matmul_precision() == before

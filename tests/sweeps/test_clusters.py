@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.helpers_sweeps import begun, job, keep_plan, until
+from tests.helpers_sweeps import begun, job, keep_plan, policy, until
 from tests.sweeps.slurm_cluster import slurm, why_not
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UnavailableError, UserError
@@ -61,14 +61,14 @@ def fakes(tmp_path, monkeypatch):
     """Slurm's commands as scripts, which note how they are called."""
     pytest.importorskip("submitit")
 
-    def write(**scripts: str) -> SlurmCluster:
+    def write(stack: int = 1, **scripts: str) -> SlurmCluster:
         for name, text in (FAKES | scripts).items():
             script = tmp_path / "bin" / name
             script.parent.mkdir(exist_ok=True)
             script.write_text(f"#!/bin/sh\necho {name} $* >> {tmp_path}/called\n{text}\n")
             script.chmod(0o755)
         monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
-        return SlurmCluster(SlurmOptions(), tmp_path / "slurm")
+        return SlurmCluster(SlurmOptions(stack=stack), tmp_path / "slurm")
 
     return write
 
@@ -132,9 +132,10 @@ def test_without_slurms_commands_one_is_told_where_to_start(tmp_path, monkeypatc
 class Vain:
     """A cluster whose tasks end before they begin a job, after one look at which it does not answer."""
 
-    folder, local, tasks = Path("tasks"), LocalOptions(jobs=1), 2
+    folder, tasks = Path("tasks"), 2
 
-    def __init__(self):
+    def __init__(self, stack=1):
+        self.local = LocalOptions(jobs=1, stack=stack)
         self.asked, self.answers, self.stopped = [], iter([None, UnavailableError("it does not answer")]), False
 
     def live(self):
@@ -159,6 +160,15 @@ def test_a_cluster_that_does_nothing_ends_the_sweep_and_one_that_falls_silent_is
     assert cluster.asked == [2] * 3, "as many as the jobs need, and no more than it may have"
     assert cluster.stopped
     assert capsys.readouterr().err == "warning: it does not answer; trying again\n"
+
+
+def test_a_task_is_asked_for_a_stack(fakes, tmp_path, monkeypatch):
+    monkeypatch.setattr(clusters, "LOOK_S", 0.0)
+    plan, cluster = keep_plan(tmp_path, *(policy(tmp_path, name) for name in "abc")), Vain(stack=3)
+    with pytest.raises(UserError, match="tasks end before they begin a job"):
+        watch([plan], cluster, SweepFolder(tmp_path), "plan")
+    assert cluster.asked == [1] * 3
+    assert fakes(stack=5).local == LocalOptions(1, 1, stack=5)
 
 
 RAY = """

@@ -1,9 +1,11 @@
 """Which fine-tunings one process trains together, and that each of them stays a job of its own: with real processes."""
 
+import os
 from dataclasses import asdict, replace
 
 import pytest
 
+from tests.helpers_data import write_fake_set
 from tests.helpers_sweeps import begun, job, keep_plan, policy, until
 from tests.sweeps.test_driver import causes, code, command
 from vd4rl_pomdp.cli import main
@@ -11,6 +13,7 @@ from vd4rl_pomdp.core.errors import TEMPORARY
 from vd4rl_pomdp.nn.encoder import EncoderCard, EncoderConfig, EncoderRecord
 from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.runs.outputs import owned
+from vd4rl_pomdp.runs.results import read_run
 from vd4rl_pomdp.sweeps import driver
 from vd4rl_pomdp.sweeps.driver import Driver
 from vd4rl_pomdp.sweeps.folder import SweepFolder, is_finished
@@ -57,6 +60,8 @@ def test_jobs_stack_that_differ_in_seed_encoder_data_and_folder_alone(tmp_path):
     assert in_stacks([a, other, c], 5, {}) == [[a, c], [other]]
     for settings in ({"algorithm": "bc"}, {"task": "cheetah_run"}):  # which the encoder decides, not the command
         assert in_stacks([a, replace(b, settings=settings), c], 5, {}) == [[a, c], [replace(b, settings=settings)]]
+    pixels = [replace(one, settings={"views": "0"}) for one in jobs]
+    assert in_stacks(pixels, 5, {}) == [[one] for one in pixels]
     encoders = [job(tmp_path, name) for name in "de"]
     assert in_stacks(encoders, 5, {}) == [[one] for one in encoders]
 
@@ -87,6 +92,17 @@ def test_a_stack_is_of_one_width_and_every_job_keeps_its_row_and_its_log(tmp_pat
     logs = tmp_path / "sweep" / "logs"
     assert (logs / "of_x.log").read_text() == "its last line\n" * 2
     assert (logs / "of_z.log").read_text() == f"in one process with of_x: see {logs / 'of_x.log'}\n"
+
+
+def test_a_stack_has_the_places_of_its_jobs_as_far_as_nothing_else_needs_them(tmp_path, monkeypatch):
+    monkeypatch.setattr(driver, "places", lambda _: [driver.Place((core,), None) for core in cores])
+    cores = sorted(os.sched_getaffinity(0))[:2]
+    jobs = [policy(tmp_path, name) for name in "abc"]
+    assert sweep(tmp_path, *jobs)
+    assert [one["cores"] for job in jobs for one in begun(job)] == [len(cores)] * 3
+    jobs = [policy(tmp_path, name) for name in "de"]
+    assert sweep(tmp_path, *jobs, job(tmp_path, "f"))
+    assert [one["cores"] for job in jobs for one in begun(job)] == [1] * 2
 
 
 @pytest.mark.parametrize("end", [2, "kill", "defect"])
@@ -148,3 +164,34 @@ def test_another_drivers_job_is_left_out_of_a_stack_and_drivers_share_what_is_le
     assert (code(process), code(others)) == (0, 0)
     assert [len(begun(one)) for one in jobs] == [1] * 6
     assert all(set(causes(tmp_path, one)) == {"done"} for one in jobs)
+
+
+GRID = """
+seed = [0, 1]
+preset = "smoke"
+[collect]
+task = "walker_walk"
+quality = "expert"
+[pretrain]
+method = "random"
+[finetune]
+eval_clean = false
+"""
+
+
+def test_a_grids_policies_are_trained_as_a_stack_and_each_is_a_run_of_its_own(tmp_path, monkeypatch, capsys):
+    monkeypatch.setenv("VD4RL_POMDP_CACHE", str(tmp_path / "cache"))
+    write_fake_set(tmp_path / "out" / "data" / "walker_walk" / "expert", [20, 25])
+    (tmp_path / "grid.toml").write_text(GRID)
+    words = ["sweep", "run", str(tmp_path / "grid.toml"), "--out", str(tmp_path / "out"), "--stack", "2"]
+    main([*words, "--dry-run"])
+    assert capsys.readouterr().out.endswith("# 5 jobs, 1 done, 4 to do in at least 3 processes\n")
+    main(words)
+    assert capsys.readouterr().out == "all 5 jobs are finished\n"
+    (plan,) = SweepFolder(tmp_path / "out").plans()
+    policies = [one for one in plan.jobs if one.section == "finetune"]
+    rows = SweepFolder(tmp_path / "out").attempts(policies)
+    assert [(row["cause"], row["stack"]) for one in policies for row in rows[one.name]] == [("done", 2)] * 2
+    assert [read_run(one.folder).labels["seed"] for one in policies] == [0, 1]
+    main([*words[:-2], "--dry-run"])
+    assert capsys.readouterr().out.endswith("# 5 jobs, 5 done, 0 to do\n"), "what is done alone or in a stack"

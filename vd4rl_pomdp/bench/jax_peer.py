@@ -21,7 +21,7 @@ Net = list[tuple[Array, Array]]
 """Weights (inputs, outputs) and biases of a perceptron's layers."""
 
 
-class Adam(NamedTuple):
+class Moments(NamedTuple):
     """An optimiser's state."""
 
     steps: Array
@@ -36,8 +36,8 @@ class Learnt(NamedTuple):
     critics: tuple[Net, Net]
     target_policy: Net
     target_critics: tuple[Net, Net]
-    policy_adam: Adam
-    critic_adam: Adam
+    policy_adam: Moments
+    critic_adam: Moments
 
 
 class Table(NamedTuple):
@@ -61,7 +61,7 @@ class Table(NamedTuple):
     """(D,)."""
 
 
-class Draws(NamedTuple):
+class BatchDraws(NamedTuple):
     """Random numbers of U updates."""
 
     index: Array
@@ -89,24 +89,24 @@ def as_jax(tensor: Tensor) -> Array:
     return jnp.array(tensor.detach().cpu().numpy())
 
 
-def new_adam(weights: Any) -> Adam:
+def new_adam(weights: Any) -> Moments:
     """The state before the first step."""
     zeros = [jax.tree.map(jnp.zeros_like, weights) for _ in range(2)]
-    return Adam(jnp.zeros((), jnp.int32), *zeros)
+    return Moments(jnp.zeros((), jnp.int32), *zeros)
 
 
-def draw(key: Array, table: Table, updates: int, batch_size: int) -> Draws:
+def draw(key: Array, table: Table, updates: int, batch_size: int) -> BatchDraws:
     """Numbers of so many updates, all at once."""
     index, view, noise = jax.random.split(key, 3)
     shape = updates, batch_size
-    return Draws(
+    return BatchDraws(
         jax.random.randint(index, shape, 0, len(table.action)),
         jax.random.randint(view, shape, 0, len(table.features)),
         jax.random.normal(noise, (*shape, table.action.shape[-1])),
     )
 
 
-def make_updates(algorithm: TD3BC) -> Callable[[Learnt, Table, Draws], tuple[Learnt, dict[str, Array]]]:
+def make_updates(algorithm: TD3BC) -> Callable[[Learnt, Table, BatchDraws], tuple[Learnt, dict[str, Array]]]:
     """A function, not compiled yet, that makes U updates with an algorithm's options.
 
     U is even: in every second update the actor and the targets move. It gives what is learnt then, and the losses:
@@ -114,7 +114,7 @@ def make_updates(algorithm: TD3BC) -> Callable[[Learnt, Table, Draws], tuple[Lea
     """
     gamma, alpha, tau = algorithm.settings.gamma, algorithm.settings.alpha, algorithm.tau
 
-    def critic_loss(critics: tuple[Net, Net], learnt: Learnt, table: Table, draws: Draws) -> Array:
+    def critic_loss(critics: tuple[Net, Net], learnt: Learnt, table: Table, draws: BatchDraws) -> Array:
         z, action, next_z = batch(table, draws)
         noise = jnp.clip(draws.noise * TARGET_NOISE, -NOISE_CLIP, NOISE_CLIP)
         next_action = jnp.clip(jnp.tanh(forward(learnt.target_policy, next_z)) + noise, -1, 1)
@@ -122,17 +122,17 @@ def make_updates(algorithm: TD3BC) -> Callable[[Learnt, Table, Draws], tuple[Lea
         target = table.reward[draws.index] + gamma * table.discount[draws.index] * value
         return sum(((q - target) ** 2).mean() for q in values(critics, z, action))
 
-    def actor_loss(policy: Net, learnt: Learnt, table: Table, draws: Draws) -> Array:
+    def actor_loss(policy: Net, learnt: Learnt, table: Table, draws: BatchDraws) -> Array:
         z, action, _ = batch(table, draws)
         chosen = jnp.tanh(forward(policy, z))
         value = forward(learnt.critics[0], jnp.concatenate([z, chosen], -1))[:, 0]
         weight = alpha / jax.lax.stop_gradient(jnp.abs(value).mean())
         return ((chosen - action) ** 2).mean() - weight * value.mean()
 
-    def pair(learnt: Learnt, table: Table, draws: Draws) -> tuple[Learnt, dict[str, Array]]:
+    def pair(learnt: Learnt, table: Table, draws: BatchDraws) -> tuple[Learnt, dict[str, Array]]:
         losses = []
         for turn in range(2):
-            drawn = Draws(*(numbers[turn] for numbers in draws))
+            drawn = BatchDraws(*(numbers[turn] for numbers in draws))
             loss, gradient = jax.value_and_grad(critic_loss)(learnt.critics, learnt, table, drawn)
             critics, adam = adam_step(learnt.critics, learnt.critic_adam, gradient, algorithm.learning_rate)
             learnt = learnt._replace(critics=critics, critic_adam=adam)
@@ -147,14 +147,14 @@ def make_updates(algorithm: TD3BC) -> Callable[[Learnt, Table, Draws], tuple[Lea
         learnt = learnt._replace(target_policy=moved[0], target_critics=moved[1])
         return learnt, {"critic_loss": jnp.stack(losses), "actor_loss": loss}
 
-    def updates(learnt: Learnt, table: Table, draws: Draws) -> tuple[Learnt, dict[str, Array]]:
+    def updates(learnt: Learnt, table: Table, draws: BatchDraws) -> tuple[Learnt, dict[str, Array]]:
         pairs = jax.tree.map(lambda numbers: numbers.reshape(-1, 2, *numbers.shape[1:]), draws)
         return jax.lax.scan(lambda learnt, drawn: pair(learnt, table, drawn), learnt, pairs)
 
     return updates
 
 
-def batch(table: Table, draws: Draws) -> tuple[Array, Array, Array]:
+def batch(table: Table, draws: BatchDraws) -> tuple[Array, Array, Array]:
     """Standardised representations (B, D) of the first ends, the actions (B, A), those of the last ends."""
     ends = (table.features[draws.view, end[draws.view, draws.index]] for end in (table.first, table.last))
     z, next_z = ((feature.astype(jnp.float32) - table.mean) / table.std for feature in ends)
@@ -175,11 +175,11 @@ def values(critics: tuple[Net, Net], z: Array, action: Array) -> tuple[Array, Ar
     return forward(critics[0], both)[:, 0], forward(critics[1], both)[:, 0]
 
 
-def adam_step(weights: Any, adam: Adam, gradient: Any, learning_rate: float) -> tuple[Any, Adam]:
+def adam_step(weights: Any, adam: Moments, gradient: Any, learning_rate: float) -> tuple[Any, Moments]:
     """Adam (Kingma & Ba 2015, arXiv 1412.6980), in PyTorch's order of operations."""
     steps = adam.steps + 1
     first = jax.tree.map(lambda m, g: m + (1 - BETAS[0]) * (g - m), adam.first, gradient)
     second = jax.tree.map(lambda v, g: BETAS[1] * v + (1 - BETAS[1]) * g * g, adam.second, gradient)
     size, scale = learning_rate / (1 - BETAS[0] ** steps), jnp.sqrt(1 - BETAS[1] ** steps)
     moved = jax.tree.map(lambda w, m, v: w - size * m / (jnp.sqrt(v) / scale + EPS), weights, first, second)
-    return moved, Adam(steps, first, second)
+    return moved, Moments(steps, first, second)

@@ -5,6 +5,7 @@ The library that torch's threads wait in is told how when it is loaded, so a run
 
 from __future__ import annotations
 
+import importlib
 import json
 import os
 import resource
@@ -32,7 +33,6 @@ STEPS = 3
 JAX_MISSING = "not installed: `pip install '.[policy]'` in the package's folder"
 _SERVE = "from vd4rl_pomdp.bench.processes import serve; serve()"
 _WARM_UP = 20
-_BETWEEN_WAITS = 8
 
 
 def memory(folder: Path, frame_bytes: int) -> dict[str, float]:
@@ -111,13 +111,14 @@ def _speeds(seconds: float, count: int, **environment: str) -> list[float]:
 
 
 class Worker:
-    """A process that calls a function of this module, which prepares a measurement, and measures when it is asked."""
+    """A process that calls a function, which prepares a measurement, and measures when it is asked."""
 
     def __init__(self, function: str, *arguments: Any, **environment: str) -> None:
         """Start it.
 
         Args:
-            function: its name; it returns a function without arguments that returns a dict.
+            function: its name, with its module's where that is not this one; it returns a function without
+                arguments that returns a dict.
             arguments: what JSON can write.
             environment: variables of the process.
         """
@@ -171,7 +172,8 @@ def at_once(workers: Sequence[Worker]) -> list[dict[str, Any]]:
 def serve() -> None:
     """The process of a `Worker`."""
     name, *arguments = json.loads(sys.argv[1])
-    measure = globals()[name](*arguments)
+    module, _, function = name.rpartition(".")
+    measure = getattr(importlib.import_module(module or __name__), function)(*arguments)
     print("{}", flush=True)  # it is ready
     for _ in sys.stdin:
         print(json.dumps(measure()), flush=True)
@@ -251,29 +253,6 @@ def jax_updates(shape: dict[str, int], updates: int, tf32: bool = False) -> Call
 
     for _ in range(2):
         measure()
-    return measure
-
-
-def pretraining_steps(
-    folder: str, device: str, size: dict[str, Any], seed: int, seconds: float
-) -> Callable[[], dict[str, Any]]:
-    """Pretrain on the set in a folder, of `mik+a` in the `paper` preset and bf16, for so long."""
-    from vd4rl_pomdp.bench.gpu import Size, milliseconds, pretraining, wait
-
-    place = torch.device(device)
-    dataset = open_dataset(Path(folder) / "set", Path(folder) / "cache").to(place)
-    trainer = make_trainer(dataset, pretraining(Path(folder), "mik+a", Size(**size), seed))
-    milliseconds(trainer.update, place, 1, 1)  # settles it
-
-    def measure() -> dict[str, float]:
-        start, steps = time.perf_counter(), 0
-        while (spent := time.perf_counter() - start) < seconds:
-            for _ in range(_BETWEEN_WAITS):
-                trainer.update()
-            wait(place)
-            steps += _BETWEEN_WAITS
-        return {"steps_per_s": steps / spent}
-
     return measure
 
 

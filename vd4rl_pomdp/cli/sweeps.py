@@ -218,7 +218,7 @@ def join(
         jobs: Jobs at a time on this machine; 0: as many as its GPUs take, or one without a GPU.
         jobs_per_gpu: Jobs at a time on each GPU.
         threads: CPU threads of a job; 0: its share of the machine's cores.
-        stack: Most fine-tunings that one process trains as a stack, which counts as one job at a time.
+        stack: Most fine-tunings that one process trains as a stack, in the place of one job.
     """
     from vd4rl_pomdp.sweeps.driver import Driver
     from vd4rl_pomdp.sweeps.folder import SweepFolder

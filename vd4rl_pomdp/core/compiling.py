@@ -13,29 +13,44 @@ from torch import Tensor
 from vd4rl_pomdp.core.errors import first_line
 
 
-def compiled_on_gpu(function: Callable[..., Any]) -> Callable[..., Any]:
-    """`function`, compiled where one of its arguments is a tensor on a GPU.
+def compiled_on_gpu(training: bool = False) -> Callable[[Callable[..., Any]], Any]:
+    """Decorator of a function that is compiled where one of its arguments is a tensor on a GPU.
 
-    Where that fails, for want of a C compiler or whatever reason, one line says so, and it runs as it is written.
-    `TORCH_COMPILE_DISABLE=1` in the environment turns compiling off.
+    Where that fails, for want of a C compiler or whatever reason, one line says so, and it runs as it is written, which
+    is its attribute `__wrapped__`. `TORCH_COMPILE_DISABLE=1` in the environment turns compiling off.
+
+    Args:
+        training: only where gradients are wanted: elsewhere sizes vary, and compiling takes longer than it saves.
     """
-    compiled, failed = None, False
 
-    @wraps(function)
-    def call(*args: Any) -> Any:
-        nonlocal compiled, failed
-        if failed or not any(isinstance(arg, Tensor) and arg.is_cuda for arg in args):
-            return function(*args)
-        try:
-            compiled = compiled or torch.compile(function)  # not before: it takes seconds to import what compiles
-            return compiled(*args)
-        except torch.OutOfMemoryError:
-            raise
-        except Exception as error:
-            out = function(*args)  # what is wrong with the arguments is raised here
-            failed = True
-            line = f"warning: {function.__qualname__} is not compiled, which is slower: {first_line(error)}"
-            print(line, file=sys.stderr, flush=True)
-            return out
+    def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
+        compiled, failed = None, False
 
-    return call
+        @wraps(function)
+        def call(*args: Any) -> Any:
+            nonlocal compiled, failed
+            on_gpu = any(isinstance(arg, Tensor) and arg.is_cuda for arg in args)
+            if failed or not on_gpu or (training and not torch.is_grad_enabled()):
+                return function(*args)
+            try:
+                compiled = compiled or _compile(function)
+                return compiled(*args)
+            except torch.OutOfMemoryError:
+                raise
+            except Exception as error:
+                out = function(*args)  # what is wrong with the arguments is raised here
+                failed = True
+                line = f"warning: {function.__qualname__} is not compiled, which is slower: {first_line(error)}"
+                print(line, file=sys.stderr, flush=True)
+                return out
+
+        return call
+
+    return decorate
+
+
+def _compile(function: Callable[..., Any]) -> Callable[..., Any]:
+    import torch._functorch.config  # only here: it takes seconds to import what compiles
+
+    torch._functorch.config.donated_buffer = False  # or a loss could not keep its graph for a second gradient
+    return torch.compile(function)

@@ -38,7 +38,7 @@ class Hiding(Protocol):
         """Whether pixels are hidden: (N, K, H, W) bool, given `places`, (H, 1) rows and (W,) columns, int64."""
 
 
-class Drawn(NamedTuple):
+class StackDraws(NamedTuple):
     """What is drawn for N stacks of S frames."""
 
     offset: Tensor | None
@@ -55,10 +55,10 @@ def zero_draws(key: Tensor, stages: int, stack: int) -> Tensor:
     return draw_integers(hash_keys(derive_keys(stages, key) ^ 1), DRAWS, stack)
 
 
-@compiled_on_gpu
+@compiled_on_gpu(training=True)
 def drawn(
     stages: tuple[Any, ...], zeroed: int, pad: int, key: Tensor, shift_key: Tensor, stack: int, size: tuple[int, int]
-) -> Drawn:
+) -> StackDraws:
     """Draws for stacks of `stack` frames.
 
     Args:
@@ -75,16 +75,16 @@ def drawn(
         offset = draw_offset(shift_key, pad).repeat_interleave(len(key) // len(shift_key), 0)
     if zeroed:
         draws, place = zero_draws(key, len(stages), stack), torch.arange(stack, device=key.device)
-        before = draws[:, None] < draws[:, :, None]
+        one, other = draws[:, :, None], draws[:, None]
         # ranks by comparison, equal draws in order: what sorting gives
-        before |= (draws[:, None] == draws[:, :, None]) & (place < place[:, None])
+        before = (other < one) | ((other == one) & (place < place[:, None]))
         kept = before.sum(2) >= zeroed
     number = torch.arange(stack, device=key.device).expand(len(key), stack)
     places = tuple(stage.places(derive_keys(n, key), number, *size) for n, stage in enumerate(stages))
-    return Drawn(offset, kept, places)
+    return StackDraws(offset, kept, places)
 
 
-@compiled_on_gpu
+@compiled_on_gpu(training=True)
 def painted(
     stages: tuple[Any, ...],
     frames: Tensor,
@@ -99,7 +99,7 @@ def painted(
         stages: each `Hiding`.
         frames: (R, C, H, W) uint8.
         index: (N, S) int64 of the frames in each stack.
-        offset, kept, places: see `Drawn`.
+        offset, kept, places: see `StackDraws`.
     """
     _, channels, height, width = frames.shape
     y, x = torch.arange(height, device=frames.device), torch.arange(width, device=frames.device)

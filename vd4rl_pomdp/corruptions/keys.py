@@ -26,7 +26,7 @@ def hash_keys(key: Tensor) -> Tensor:
     """Mix int64 keys of any shape into int64 values that look uniform."""
     if buffers.in_host_memory(key):  # numpy takes a fraction of the time that torch needs for so few numbers
         return torch.from_numpy(_mix(key.numpy().reshape(-1))).view(key.shape)
-    return _mix(key)
+    return _mix(key ^ 0)  # it changes nothing, but torch.compile would add to a counted number as to a 32-bit index
 
 
 def _mix(key: Any) -> Any:

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 import torch
 from torch import Tensor, nn
 
+from vd4rl_pomdp.core.compiling import compiled_on_gpu
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import Limits, Options, refuse_options
 from vd4rl_pomdp.core.registry import Registry
@@ -67,21 +68,35 @@ class FrameEncoder(nn.Module):
 
     def forward(self, obs: Tensor) -> Tensor:
         """Features of every stack."""
-        return self.from_maps(self.maps(obs))
+        return _features(self, obs, self._precision(obs))
 
     def maps(self, obs: Tensor) -> Tensor:
         """Feature maps (..., C', H', W') of every stack, the layer before `from_maps`."""
-        dtype = next(self.project.parameters()).dtype
-        if torch.is_autocast_enabled(obs.device.type):
-            dtype = torch.get_autocast_dtype(obs.device.type)  # a float32 copy would be the largest tensor
-        pixels = obs.reshape(-1, *obs.shape[-3:]).contiguous(memory_format=torch.channels_last).to(dtype, copy=True)
-        image = pixels.mul_(1 / 255).sub_(0.5)
-        return self.convolutions(image).view(*obs.shape[:-3], *self.map_shape)
+        return _maps(self, obs, self._precision(obs))
 
     def from_maps(self, maps: Tensor) -> Tensor:
         """Features (..., feature_dim) float32 of feature maps."""
         dtype = next(self.project.parameters()).dtype
         return self.project(maps.flatten(-3).flatten(0, -2)).to(dtype).view(*maps.shape[:-3], -1)
+
+    def _precision(self, obs: Tensor) -> torch.dtype:
+        """What pixels are converted to."""
+        if torch.is_autocast_enabled(obs.device.type):
+            return torch.get_autocast_dtype(obs.device.type)  # a float32 copy would be the largest tensor
+        return next(self.project.parameters()).dtype
+
+
+# functions, not methods: what was compiled must not go along where an encoder is copied
+@compiled_on_gpu(training=True)
+def _maps(encoder: FrameEncoder, obs: Tensor, dtype: torch.dtype) -> Tensor:
+    pixels = obs.reshape(-1, *obs.shape[-3:]).contiguous(memory_format=torch.channels_last).to(dtype, copy=True)
+    image = pixels.mul_(1 / 255).sub_(0.5)
+    return encoder.convolutions(image).view(*obs.shape[:-3], *encoder.map_shape)
+
+
+@compiled_on_gpu(training=True)
+def _features(encoder: FrameEncoder, obs: Tensor, dtype: torch.dtype) -> Tensor:
+    return encoder.from_maps(_maps.__wrapped__(encoder, obs, dtype))
 
 
 def _drq(channels: int, size: int, options: FrameOptions) -> nn.Sequential:

@@ -8,7 +8,8 @@ import torch
 
 from vd4rl_pomdp.core.errors import UserError
 
-Precision = Literal["fp32", "bf16"]
+Precision = Literal["fp32", "tf32", "bf16"]
+"""Of matrix products. tf32: on a GPU their factors have 10 bits of mantissa, as JAX's do by default; elsewhere fp32."""
 
 
 def pick_device(name: str) -> torch.device:
@@ -32,3 +33,12 @@ def autocast(device: torch.device, precision: Precision) -> torch.autocast:
     bf16 products are of bf16 numbers, summed in fp32 and rounded; norms and the like stay in fp32.
     """
     return torch.autocast(device.type, torch.bfloat16, enabled=precision == "bf16")
+
+
+def set_products(device: torch.device, precision: Precision) -> None:
+    """Let matrix products of float32 on a GPU be of `precision` from now on, gradients included, in this process.
+
+    PyTorch's convolutions and recurrent layers are in TF32 on a GPU whatever is set here.
+    """
+    if device.type == "cuda":
+        torch.set_float32_matmul_precision("high" if precision == "tf32" else "highest")

@@ -157,16 +157,13 @@ class CudaCapture:
         return graph.replay, result
 
 
-State = dict[str, Any]
-
-
-def python_state(objects: Sequence[Any]) -> State:
+def python_state(objects: Sequence[Any]) -> dict[str, Any]:
     """What Python holds in the attributes of objects, and of the modules and optimisers in them, by name.
 
     Numbers and strings by value, tensors as they are: one that is put in another's place is a change, which a replayed
     step would not see; one that is written to is none.
     """
-    found: State = {}
+    found: dict[str, Any] = {}
     seen: set[int] = set()
 
     def visit(name: str, value: Any) -> None:
@@ -192,7 +189,7 @@ def python_state(objects: Sequence[Any]) -> State:
     return found
 
 
-def changed_in(before: State, after: State) -> str:
+def changed_in(before: dict[str, Any], after: dict[str, Any]) -> str:
     """Name of an attribute that has changed, empty if none has."""
     for name in before.keys() | after.keys():
         one, other = before.get(name), after.get(name)

@@ -64,7 +64,7 @@ class Place:
 class _Running:
     jobs: list[Job]
     """Several: a stack."""
-    place: Place
+    places: list[Place]
     process: subprocess.Popen
     began: float
     log: Path
@@ -121,10 +121,11 @@ class Driver:
                 rests |= last["cause"] in PASSING and time.time() < last["ended"] + PAUSE_S
             if not rests and job.name not in lost | running and self._left.keys().isdisjoint(job.needs):
                 ready.append(job)
-        for jobs in self._in_processes(ready, attempts, lost, running) if self._free else ():
+        processes = self._in_processes(ready, attempts, lost, running) if self._free else []
+        for number, jobs in enumerate(processes, 1):
             # Asked now: starting the ones before took time in which another driver may have begun these.
             if self._free and (mine := [job for job in jobs if not self._is_anothers(job)]):
-                self._begin(mine)
+                self._begin(mine, spare=len(self._free) - 1 - len(processes[number:]))
         if self._running:
             self._busy = time.monotonic()
         idle = self._helps and time.monotonic() - self._busy > IDLE_S
@@ -143,20 +144,19 @@ class Driver:
                 self._widths[job.name] = width_of(job, plan.made_in)
             return plan.made_in, tuple(plan.program), self._widths[job.name], kind
 
-        # Only for what comes when a job that runs here ends: for anything else a place would be idle too long.
-        waiting = {job.name: self._left.keys() & job.needs for job in self._left.values() if job.name not in lost}
-        soon = {kind_of(self._left[name]) for name, needs in waiting.items() if needs and needs <= running}
-        now, later = [], []
+        now: list[list[Job]] = []
+        small: list[list[Job]] = []
         for jobs in in_stacks(ready, self._stack, attempts, alike):
-            kind = kind_of(jobs[0])
-            if len(jobs) == self._stack or not kind or runs_alone(attempts[jobs[0].name]):
-                now.append(jobs)
-            elif kind not in soon:
-                later.append(jobs)  # after the pretrainings, which may add to it
+            grows = len(jobs) < self._stack and kind_of(jobs[0]) and not runs_alone(attempts[jobs[0].name])
+            (small if grows else now).append(jobs)
         if self._helps:
-            for some in (now, later):
+            for some in (now, small):
                 random.shuffle(some)  # or all drivers would start the same one
-        return now + later
+        # Only for what comes when a job that runs here ends: for anything else a place would be idle too long.
+        run = running | {job.name for jobs in now[: len(self._free)] for job in jobs}
+        waiting = {job.name: self._left.keys() & job.needs for job in self._left.values() if job.name not in lost}
+        soon = {kind_of(self._left[name]) for name, needs in waiting.items() if needs and needs <= run}
+        return now + [jobs for jobs in small if kind_of(jobs[0]) not in soon]
 
     def _is_anothers(self, job: Job) -> bool:
         """Whether another process is at a job, or has finished it; asked in this order, it cannot end in between."""
@@ -171,8 +171,11 @@ class Driver:
     def _log(self, job: Job) -> Path:
         return self._folder.path / "logs" / f"{job.name}.log"
 
-    def _begin(self, jobs: list[Job]) -> None:
-        log, place = self._log(jobs[0]), self._free[0]
+    def _begin(self, jobs: list[Job], spare: int) -> None:
+        """Start a process; a stack has up to a place for each job, which it evaluates on, as far as some are spare."""
+        log, gpu = self._log(jobs[0]), self._free[0].gpu
+        taken = [place for place in self._free if place.gpu == gpu][: max(1, min(len(jobs), 1 + spare))]
+        place = Place(tuple(sorted({core for one in taken for core in one.cores})), gpu)
         try:
             with disk_errors(log):
                 for job in jobs:
@@ -185,13 +188,13 @@ class Driver:
         except UserError as error:
             self._end(jobs, UNAVAILABLE, 0.0, str(error))
             return
-        self._free.remove(place)
-        self._running.append(_Running(jobs, place, process, time.monotonic(), log, size))
+        self._free = [place for place in self._free if not any(place is one for one in taken)]
+        self._running.append(_Running(jobs, taken, process, time.monotonic(), log, size))
 
     def _collect(self) -> None:
         for one in [one for one in self._running if one.process.poll() is not None]:
             self._running.remove(one)
-            self._free.append(one.place)
+            self._free += one.places
             cause = cause_of(one.process.returncode)
             line = "" if cause == DONE else _line_of_end(one.log, one.log_size)
             self._end(one.jobs, cause, time.monotonic() - one.began, line)

@@ -20,8 +20,8 @@ class LocalOptions(Options):
     threads: int = 0
     """CPU threads of a job; 0: its share of the machine's cores."""
     stack: int = 1
-    """Most fine-tunings that one process trains as a stack, which counts as one job at a time; their results are those
-    of single runs within rounding."""
+    """Most fine-tunings that one process trains as a stack, in the place of one job; their results are those of single
+    runs within rounding."""
 
     limits: ClassVar[Limits] = {"jobs": (0, 1024), "jobs_per_gpu": (1, 64), "threads": (0, 4096), "stack": (1, 64)}
 
@@ -53,7 +53,7 @@ class SlurmOptions(Options):
     sbatch: list[str] = field(default_factory=list)
     """Further parameters of sbatch: reservation=mine exclusive."""
     stack: int = 1
-    """Most fine-tunings that one process trains as a stack, which counts as one job at a time."""
+    """Most fine-tunings that one process trains as a stack, in the place of one job."""
 
     limits: ClassVar[Limits] = {
         **{"time": (5, 60 * 24 * 365), "gpus": (0, 64), "cpus": (1, 4096), "memory": (0.01, 10**6)},
@@ -74,7 +74,7 @@ class RayOptions(Options):
     jobs: int = 0
     """Jobs at a time; 0: as many as the nodes take that are there. On a cluster that grows when asked, say how many."""
     stack: int = 1
-    """Most fine-tunings that one process trains as a stack, which counts as one job at a time."""
+    """Most fine-tunings that one process trains as a stack, in the place of one job."""
 
     limits: ClassVar[Limits] = {"cpus": (0.01, 4096), "gpus": (0, 64), "jobs": (0, 10**5), "stack": (1, 64)}
 

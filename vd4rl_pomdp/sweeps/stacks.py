@@ -23,7 +23,7 @@ STACKED = "finetune"
 
 def kind_of(job: Job) -> tuple[str, ...]:
     """What jobs have in common that stack, as far as it can be told before their encoders are there; () if none may."""
-    if job.section != STACKED:
+    if job.section != STACKED or job.settings.get("views") == "0":  # then pixels are read, by an encoder a run
         return ()
     words = list(job.words)
     for flag in _OWN:
@@ -43,7 +43,8 @@ def width_of(job: Job, made_in: Path) -> int | None:
         encoder = read_record(made_in / job.words[job.words.index("--encoder") + 1]).encoder
     except (ValueError, UserError):
         return None
-    return replace(encoder, readout=job.settings.get("readout", encoder.readout)).dim
+    told = {"readout": job.settings["readout"]} if "readout" in job.settings else {}
+    return replace(encoder, **told).dim  # type: ignore[arg-type]
 
 
 def runs_alone(rows: Iterable[Row]) -> bool:
