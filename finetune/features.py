@@ -31,7 +31,7 @@ from vd4rl_pomdp.runs.device import Precision, autocast
 from vd4rl_pomdp.runs.files import content_hash, replacing_file
 from vd4rl_pomdp.runs.progress import ProgressLine
 
-CHUNK, GPU_CHUNK = 128, 2048
+CHUNK, GPU_CHUNK = 128, 1024
 """Rows that go through the frame encoder at once, on a CPU and on a GPU."""
 GPU_GROUP = 4096
 """Rows of consecutive episodes that a memory reads at once on a GPU; on a CPU it reads one episode after the other."""
@@ -158,7 +158,9 @@ def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: 
 def _encode(frozen: FrozenEncoder, histories: Histories, views: int) -> Tensor:
     dtype = torch.float32 if frozen.encoder.reads_state else torch.float16
     features = torch.empty((views, histories.features, frozen.encoder.dim), dtype=dtype, device=frozen.device)
-    with torch.no_grad(), ProgressLine("encode", views * frozen.dataset.num_episodes, "episodes") as progress:
+    total = views * frozen.dataset.num_episodes
+    # without gradients nothing is compiled on a GPU, which takes longer than encoding does
+    with torch.no_grad(), ProgressLine("encode", total, "episodes") as progress:
         for number in range(views):
             view, random = frozen.view(number), histories.of_view(number)
             for episodes in frozen.groups():

@@ -12,7 +12,7 @@ class Here:
     """A worker that is no process."""
 
     def __init__(self, function, *arguments, **environment):
-        self.measure, self.ready = getattr(processes, function)(*arguments), False
+        self.measure, self.ready = processes.named(function)(*arguments), False
 
     def __enter__(self):
         return self
@@ -31,7 +31,7 @@ class Here:
 @pytest.fixture
 def here(monkeypatch):
     monkeypatch.setattr(gpu, "Worker", Here)
-    monkeypatch.setattr(processes, "_BETWEEN_WAITS", 1)
+    monkeypatch.setattr(gpu, "_BETWEEN_WAITS", 1)
 
 
 def test_all_that_is_measured_on_a_gpu_runs_on_a_cpu_and_claims_nothing(here, capsys):

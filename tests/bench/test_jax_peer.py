@@ -4,6 +4,7 @@ import torch
 from finetune.algorithms import TD3BC
 from finetune.algorithms.td3_bc import TD3BCOptions
 from finetune.features import FeatureBatch
+from vd4rl_pomdp.core.streams import RandomStream
 from vd4rl_pomdp.nn.policy import Policy
 
 jax = pytest.importorskip("jax", reason="JAX comes with the extra `policy`")
@@ -24,7 +25,7 @@ def test_the_peer_in_jax_makes_the_same_updates():
     }
     policy = Policy(dim, actions, 24)
     policy.standardise.fit(table["features"])
-    algorithm = TD3BC(policy, TD3BCOptions(), 3e-4, updates, torch.Generator().manual_seed(1))
+    algorithm = TD3BC(policy, TD3BCOptions(), 3e-4, updates, RandomStream(torch.Generator().manual_seed(1)))
     learnt = jax_peer.learnt_by(algorithm)
     index, view = torch.randint(rows, (updates, size)), torch.randint(views, (updates, size))
     noise = torch.randn(updates, size, actions, generator=torch.Generator().manual_seed(1))

@@ -1,6 +1,7 @@
 """Jobs over worker processes: in order, their errors told, and no process left however the caller ends."""
 
 import multiprocessing
+import multiprocessing.connection
 import os
 import signal
 import subprocess
@@ -11,7 +12,7 @@ import time
 import pytest
 
 from vd4rl_pomdp.core.errors import DiskFullError, UserError, WorkerDiedError
-from vd4rl_pomdp.runs.workers import count_workers, run_jobs
+from vd4rl_pomdp.runs.workers import count_workers, kept_workers, run_jobs
 
 PARENT = """
 from tests.runs.test_workers import tell_and_sleep
@@ -32,6 +33,11 @@ def act(job: str) -> str:
     if job == "die":
         os.kill(os.getpid(), signal.SIGKILL)
     return job.upper()
+
+
+def number_of_process(_: int) -> int:
+    time.sleep(0.2)
+    return os.getpid()
 
 
 def alive(pid: int) -> bool:
@@ -86,4 +92,21 @@ def test_results_that_nobody_takes_leave_no_workers():
     threading.Timer(1.0, lambda: signal.pthread_kill(main, signal.SIGINT)).start()
     with pytest.raises(KeyboardInterrupt):
         next(results)
+    assert not multiprocessing.active_children()
+
+
+def test_workers_that_are_kept_serve_again_until_one_dies_or_more_are_wanted():
+    def serving(workers: int) -> set[int]:
+        return set(run_jobs(number_of_process, range(workers), workers))
+
+    with kept_workers():
+        first = serving(2)
+        assert serving(2) == first
+        more = serving(3)
+        assert not more & first
+        killed = multiprocessing.active_children()[0]
+        killed.kill()
+        multiprocessing.connection.wait([killed.sentinel])
+        assert not serving(2) & more
+        assert len(multiprocessing.active_children()) == 2
     assert not multiprocessing.active_children()

@@ -37,7 +37,7 @@ from vd4rl_pomdp.core.errors import UserError, WorkerDiedError, first_line
 from vd4rl_pomdp.core.options import NO_OPTIONS, flat
 from vd4rl_pomdp.core.streams import random_stream
 from vd4rl_pomdp.corruptions import CorruptionConfig
-from vd4rl_pomdp.data import Dataset, TransitionSampler, View
+from vd4rl_pomdp.data import Dataset, TransitionSampler, View, open_dataset
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig
 from vd4rl_pomdp.nn.encoder_folder import save_encoder
 from vd4rl_pomdp.nn.policy import Policy

@@ -64,7 +64,7 @@ def zero_draws(key: Tensor, stages: int, stack: int) -> Tensor:
     return draw_integers(hash_keys(derive_keys(stages, key) ^ 1), DRAWS, stack)
 
 
-@compiled_on_gpu()
+@compiled_on_gpu(training=True)
 def drawn(
     stages: tuple[Any, ...], zeroed: int, pad: int, key: Tensor, shift_key: Tensor, stack: int, size: tuple[int, int]
 ) -> StackDraws:
@@ -93,7 +93,7 @@ def drawn(
     return StackDraws(offset, kept, places)
 
 
-@compiled_on_gpu()
+@compiled_on_gpu(training=True)
 def painted(
     stages: tuple[Any, ...],
     frames: Tensor,

@@ -22,11 +22,62 @@ Job = TypeVar("Job")
 Result = TypeVar("Result")
 
 
+class _Pool:
+    """Worker processes that have started."""
+
+    def __init__(self, workers: int) -> None:
+        self._executor = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)
+        self._processes: dict[int, Any] = {}
+
+    def map(self, function: Callable[[Job], Result], jobs: Sequence[Job]) -> Iterator[Result]:
+        with _blocked_signals():
+            results = self._executor.map(function, jobs)
+            self._processes = dict(self._executor._processes)
+        return results
+
+    def serves(self, workers: int) -> bool:
+        """Whether so many are there and alive."""
+        # by their sentinels: `is_alive` says yes to a process that another thread has waited for
+        ended = multiprocessing.connection.wait([process.sentinel for process in self._processes.values()], 0)
+        return len(self._processes) >= workers and not ended
+
+    def close(self) -> None:
+        for process in self._processes.values():  # they hold nothing that could be lost, and `shutdown` waits for jobs
+            process.kill()
+        self._executor.shutdown(cancel_futures=True)
+
+
+_kept: list[_Pool] = []
+"""Idle workers, of one pool at most."""
+_keeping = False
+
+
+@contextmanager
+def kept_workers() -> Iterator[None]:
+    """Within the block, workers that have done their jobs wait for those of the next `run_jobs`.
+
+    They need not start again, nor open what they opened: for evaluations of a training, which follow one another.
+    """
+    global _keeping
+    before, _keeping = _keeping, True
+    try:
+        yield
+    finally:
+        _keeping = before
+        if not _keeping:
+            _close_kept()
+
+
+def _close_kept() -> None:
+    while _kept:
+        _kept.pop().close()
+
+
 def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: int) -> Iterator[Result]:
     """Yield function(job) for every job, in order.
 
-    Workers are fresh processes (no GL context or thread pool is inherited) with one thread each. With one worker
-    everything runs in the calling process; 0 is a worker for every core.
+    Workers are fresh processes (no GL context or thread pool is inherited) with one thread each; under `kept_workers`
+    they may have served before. With one worker everything runs in the calling process; 0 is a worker for every core.
 
     Raises:
         UserError: a worker died, or a job cannot be sent to one; what a job raises is raised here.
@@ -42,13 +93,12 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
             f"a job cannot be sent to a worker process ({first_line(error)}): define its classes and functions in a "
             "module, or use --workers 1"
         ) from error
-    pool = ProcessPoolExecutor(workers, multiprocessing.get_context("spawn"), _start_worker)
-    processes: dict[int, Any] = {}
+    if _kept and not _kept[0].serves(workers):
+        _close_kept()
+    pool, done = _kept.pop() if _kept else _Pool(workers), False
     try:
-        with _blocked_signals():
-            results = pool.map(function, jobs)
-            processes = dict(pool._processes)
-        yield from results
+        yield from pool.map(function, jobs)
+        done = True
     except BrokenProcessPool as error:
         if error.__cause__ is not None:  # a result that cannot be read here
             raise
@@ -57,9 +107,10 @@ def run_jobs(function: Callable[[Job], Result], jobs: Sequence[Job], workers: in
             "use fewer --workers and re-run the same command"
         ) from None
     finally:
-        for process in processes.values():  # they hold nothing that could be lost, and `shutdown` waits for their jobs
-            process.kill()
-        pool.shutdown(cancel_futures=True)
+        if done and _keeping and not _kept:
+            _kept.append(pool)
+        else:
+            pool.close()
 
 
 @contextmanager
