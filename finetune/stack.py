@@ -125,8 +125,8 @@ def _stack_optimiser(whole: Optimizer, runs: Sequence[Optimizer]) -> None:
 
 def _slice_optimiser(whole: Optimizer, run: Optimizer, number: int) -> None:
     """Give a run's optimiser its slice of the state."""
-    for group, own in zip(whole.param_groups, run.param_groups, strict=True):
-        own.update({name: _copy(value) for name, value in group.items() if name != "params"})
+    for group, its in zip(whole.param_groups, run.param_groups, strict=True):
+        its.update({name: _copy(value) for name, value in group.items() if name != "params"})
     for parameter, own in zip(_parameters(whole), _parameters(run), strict=True):
         for name, value in whole.state[parameter].items():
             run.state[own][name] = value[number] if _follows(name, value, parameter) else _copy(value)

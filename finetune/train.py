@@ -64,7 +64,7 @@ from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.loop import Loop, in_step, save, training
 from vd4rl_pomdp.runs.metrics import EVALUATION
 from vd4rl_pomdp.runs.outputs import refuse_inside
-from vd4rl_pomdp.runs.replay import Capture, Replay
+from vd4rl_pomdp.runs.replay import Replay
 from vd4rl_pomdp.runs.run import RunFolder
 from vd4rl_pomdp.runs.workers import kept_workers
 
@@ -345,8 +345,8 @@ class FinetuneTrainer:
 class Updates:
     """Updates of one run, or of several at once; replayed where a GPU is."""
 
-    def __init__(self, trainers: Sequence[FinetuneTrainer], capture: Capture | None = None) -> None:
-        """Begin where the trainers stand; `capture` as `Replay` has it."""
+    def __init__(self, trainers: Sequence[FinetuneTrainer]) -> None:
+        """Begin where the trainers stand."""
         first = trainers[0].algorithm
         self._algorithm: Algorithm | EndToEnd = first
         self._sampler: Any = trainers[0].sampler
@@ -363,7 +363,7 @@ class Updates:
         # not cached, because weights move between the losses of an update
         self._precise = torch.autocast(device.type, torch.bfloat16, precision == "bf16", cache_enabled=False)
         streams, trained = [self._sampler.draws, self._counting.draws], [self._algorithm, self._counting]
-        self._replay = Replay(self._update, device, streams, self._counting.period, trained, capture)
+        self._replay = Replay(self._update, device, streams, self._counting.period, trained)
         if self._replay.replays:
             self._counting.count_on(device)
 

@@ -1,6 +1,7 @@
 """Runs that are trained as one are what they are alone: folders, records and states, and numbers up to rounding."""
 
 import csv
+from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -8,8 +9,8 @@ from typing import Any
 import pytest
 import torch
 
-from finetune import train
-from finetune.algorithms import ALGORITHMS
+from finetune import end_to_end, train
+from finetune.algorithms import ALGORITHMS, bc, iql, td3_bc
 from finetune.config import FinetuneConfig
 from finetune.features import FeatureSampler, StackedSampler
 from finetune.histories import Histories
@@ -17,11 +18,12 @@ from finetune.train import finetune, finetune_all
 from pretrain.train import pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_stages import CutError, cut_at, smoke_finetune, smoke_pretrain
-from tests.recording import record
+from tests.recording import record, replays
 from vd4rl_pomdp.cli import main, run_to_end
 from vd4rl_pomdp.core.options import NO_OPTIONS
 from vd4rl_pomdp.core.streams import RandomStream
-from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data import TransitionSampler, View, open_dataset
+from vd4rl_pomdp.nn import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.encoder_folder import read_record
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.runs.files import read_json
@@ -218,7 +220,7 @@ def encoders(trained, tmp_path_factory) -> dict[str, Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("VD4RL_POMDP_CACHE", str(trained / "cache"))
         states = write_fake_set(folder / "walker_walk" / "expert", [20, 25, 30], physics_dim=18)
-        for method in ("state", "drq_bc", "acro"):
+        for method in ("state", "drq_bc", "bc", "acro"):
             given = states if method == "state" else trained / "walker_walk" / "expert"
             made[method] = pretrain(smoke_pretrain(given, folder / method, method=method)).path / "encoder"
     return made
@@ -235,16 +237,13 @@ def made(name: str, data: Path, seed: int, device: str = "cpu") -> SimpleNamespa
     policy.standardise.fit(features)
     streams = [RandomStream(torch.Generator().manual_seed(10 * seed + n), device) for n in range(2)]
     algorithm = ALGORITHMS[name](policy, config.options, config.learning_rate, config.updates, streams[0])
-    for part in algorithm.parts().values():
-        for group in getattr(part, "param_groups", ()):
-            group["lr"] = torch.as_tensor(group["lr"], device=device)
     sampler = FeatureSampler(Histories(dataset, NO_OPTIONS, 2, 0), features, 16, 2, 0.9, streams[1])
     return SimpleNamespace(algorithm=algorithm, sampler=sampler, config=config, settle=lambda: None)
 
 
-def course_of(runs: list[SimpleNamespace], updates: int, capture: Any = None) -> list[dict[str, torch.Tensor]]:
+def course_of(runs: list[SimpleNamespace], updates: int) -> list[dict[str, torch.Tensor]]:
     """What each run logs and where it ends; the logs are read after the last update."""
-    step = train.Updates(runs, capture)
+    step = train.Updates(runs)
     logs = [step(number) for number in range(updates)]
     found = []
     for number, run in enumerate(runs):
@@ -259,38 +258,85 @@ def course_of(runs: list[SimpleNamespace], updates: int, capture: Any = None) ->
 def test_replayed_updates_are_those_that_are_run(data, monkeypatch, capsys, name, runs):
     """Fresh noise and batches, the actor's delay, and schedules up to their end; every scalar is of its own update."""
     monkeypatch.setattr("vd4rl_pomdp.core.streams.BLOCK", 32)
-    eager, replayed = ([made(name, data, seed) for seed in range(runs)] for _ in range(2))
-    expected, found = course_of(eager, 75), course_of(replayed, 75, record)
+    found = []
+    for capture in (None, record):
+        replays(monkeypatch, train, td3_bc, iql, bc, capture=capture)
+        members = [made(name, data, seed) for seed in range(runs)]
+        found.append(course_of(members, 60))
     assert not capsys.readouterr().err, "it is replayed"
-    for one, other in zip(found, expected, strict=True):
+    for one, other in zip(*found, strict=True):
         assert one.keys() == other.keys()
-        for key, value in other.items():
+        for key, value in one.items():
             torch.testing.assert_close(
-                one[key], value, rtol=1e-4, atol=1e-6, msg=lambda told, key=key: f"{key}: {told}"
+                other[key], value, rtol=1e-4, atol=1e-6, msg=lambda told, key=key: f"{key}: {told}"
             )
-    rates = [
-        float(run.algorithm.parts()["policy_optimiser" if name != "bc" else "optimiser"].param_groups[0]["lr"])
-        for run in replayed
-    ]
+    optimiser = "optimiser" if name == "bc" else "policy_optimiser"
+    rates = [float(run.algorithm.parts()[optimiser].param_groups[0]["lr"]) for run in members]
     assert rates == pytest.approx([0.0 if name == "iql" else 1e-3] * runs, abs=1e-9)
 
 
-@pytest.mark.gpu
-@pytest.mark.parametrize("runs", [1, 5])
-@pytest.mark.parametrize("name", ALGORITHMS)
-def test_on_a_gpu_captured_updates_are_within_rounding_of_eager_ones(data, monkeypatch, capsys, name, runs):
-    """And stacked ones, captured or not, of single ones; 200 updates, four times what another order of sums does."""
-    captured = course_of([made(name, data, seed, "cuda") for seed in range(runs)], 200)
-    assert not capsys.readouterr().err, "it is captured"
-    monkeypatch.setenv("VD4RL_POMDP_EAGER", "1")
-    eager = course_of([made(name, data, seed, "cuda") for seed in range(runs)], 200)
+@pytest.mark.parametrize("method", ["mik+a", "acro", "drq_bc", "bc"])
+def test_replayed_runs_are_those_that_are_run(encoders, data, tmp_path, monkeypatch, capsys, method):
+    """On features, on batches that are encoded anew, and where the encoder is trained along; cut and resumed, too."""
+    changes = BRIEF | {"updates": 20, "eval_every": 10, "views": 0 if method == "acro" else 1}
+    monkeypatch.setattr(train, "STANDARDISED_BY", 16)
+    for folder, capture in (("run", None), ("replayed", record)):
+        replays(monkeypatch, train, end_to_end, td3_bc, bc, capture=capture)
+        config = smoke_finetune(encoders[method], data, tmp_path / folder, **changes)
+        with monkeypatch.context() as patch:
+            cut_at(patch, 4)
+            with pytest.raises(CutError):
+                finetune(config)
+        finetune(config)
+    assert "warning" not in capsys.readouterr().err
+    same_but_for_rounding(tmp_path / "run", tmp_path / "replayed")
+
+
+def along(name: str, data: Path, precision: str) -> SimpleNamespace:
+    """An algorithm that trains its encoder, too, on a GPU."""
+    torch.manual_seed(0)
+    dataset = open_dataset(data).to("cuda")
+    config = FinetuneConfig.of("smoke", algorithm=name, learning_rate=1e-3, updates=40, precision=precision)
+    encoder = Encoder(EncoderConfig(dataset.action_dim, feature_dim=16)).to("cuda")
+    policy = Policy(encoder.dim, dataset.action_dim, 16).to("cuda")
+    streams = [RandomStream(torch.Generator().manual_seed(number), "cuda") for number in range(2)]
+    inner = ALGORITHMS[name](policy, config.options, config.learning_rate, config.updates, streams[0])
+    sampler = TransitionSampler(View(dataset, "patch+zero_frames", 4), 16, streams[1], 2, 0.9)
+    algorithm = end_to_end.EndToEnd(inner, encoder, config)
+    return SimpleNamespace(algorithm=algorithm, sampler=sampler, config=config, settle=lambda: None)
+
+
+GPU_UPDATES = 200
+
+
+def within_rounding(monkeypatch, capsys, make: Callable[[int], SimpleNamespace], runs: int) -> None:
+    """Captured updates, and those that are run, are farther from single ones by no more than rounding explains."""
+    found = {}
+    for eager in ("0", "1"):
+        monkeypatch.setenv("VD4RL_POMDP_EAGER", eager)
+        found[eager] = course_of([make(seed) for seed in range(runs)], GPU_UPDATES)
+    assert "warning: steps are run" not in capsys.readouterr().err
     for seed in range(runs):
 
         def single(change: Any, seed: int = seed) -> dict[str, torch.Tensor]:
-            run = made(name, data, seed, "cuda")
-            change(run.algorithm)
-            return course_of([run], 200)[0]
+            run = make(seed)
+            change(getattr(run.algorithm, "algorithm", run.algorithm))
+            return course_of([run], GPU_UPDATES)[0]
 
-        assert farther_than_rounding(captured[seed], single) == []
-        assert farther_than_rounding(eager[seed], single) == []
-        torch.testing.assert_close(captured[seed]["batches"], eager[seed]["batches"])
+        for courses in found.values():
+            assert farther_than_rounding(courses[seed], single) == []
+        assert torch.equal(found["0"][seed]["batches"], found["1"][seed]["batches"])
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("runs", [1, 3])
+@pytest.mark.parametrize("name", ALGORITHMS)
+def test_on_a_gpu_captured_and_stacked_updates_are_single_ones_but_for_rounding(data, monkeypatch, capsys, name, runs):
+    within_rounding(monkeypatch, capsys, lambda seed: made(name, data, seed, "cuda"), runs)
+
+
+@pytest.mark.gpu
+@pytest.mark.parametrize("precision", ["fp32", "bf16"])
+@pytest.mark.parametrize("name", ["drqv2_bc", "bc"])
+def test_on_a_gpu_an_encoder_is_trained_along_within_a_captured_update(data, monkeypatch, capsys, name, precision):
+    within_rounding(monkeypatch, capsys, lambda seed: along(name, data, precision), 1)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import tracemalloc
 from typing import Any
 
 import pytest
@@ -134,3 +135,15 @@ def test_what_cannot_be_replayed_is_run_and_told_once(
     told = capsys.readouterr().err
     assert told.count("warning") == 1
     assert [word for word in reason.split("|") if word in told]
+
+
+def test_draws_that_are_not_replayed_leave_nothing_behind() -> None:
+    """A training on a CPU makes a million."""
+    draws = RandomStream(torch.Generator().manual_seed(0))
+    draws.integers(10, 4)
+    tracemalloc.start()
+    for _ in range(500):
+        draws.normal(4)
+    left, _ = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert left < 20_000

@@ -67,6 +67,8 @@ class RandomStream:
         """Their number, where there are several."""
         self._asked: dict[int, list[_Draw]] = {}
         """By turn: what its step asked for when it was last run."""
+        self._noted: list[_Draw] | None = None
+        """What the step that is run has asked for; None outside of steps that may be replayed."""
         self._turn, self._place = 0, 0
         self._block: Tensor | None = None
         """(BLOCK, runs, bytes) uint8 on the device; None: numbers are drawn one by one."""
@@ -104,12 +106,13 @@ class RandomStream:
         """A step of a turn begins: what it asks for is noted, or, in blocks, read from its row."""
         self._turn, self._place = turn, 0
         if self._block is None:
-            self._asked[turn] = []
+            self._noted = self._asked[turn] = []
         else:
             self._row = self._block.index_select(0, self._counter)[0]
 
     def end(self) -> None:
         """The step has asked for all its numbers; in blocks, the next row's turn has come. Part of a replayed step."""
+        self._noted = None
         if self._block is not None:
             if self._place < len(self._asked[self._turn]):
                 raise RuntimeError("a step asked for fewer random numbers than the steps before it")
@@ -130,6 +133,7 @@ class RandomStream:
 
     def one_by_one(self) -> None:
         """Draw one by one again, from where the steps made so far end."""
+        self._noted = None
         if self._block is not None:
             states = [self.get_state(run) for run in range(len(self._generators))]
             for generator, state in zip(self._generators, states, strict=True):
@@ -170,7 +174,8 @@ class RandomStream:
             )
         draw = _Draw(kind, shape[len(self._runs) :], high)
         if self._block is None:
-            self._asked.setdefault(self._turn, []).append(draw)
+            if self._noted is not None:
+                self._noted.append(draw)
             made = [draw.made(generator, run) for run, generator in enumerate(self._generators)]
             drawn = torch.stack(made) if self._runs else made[0]
             # to a GPU without waiting; to the CPU a copy would be read before it has come

@@ -215,7 +215,7 @@ def permuted(algorithm: Algorithm, seed: int) -> Algorithm:
         result = function(given.replace(**{name: given[name][order] for name in given}), *(t[order] for t in tensors))
         return result if isinstance(result, Loss) else result[order.argsort()]
 
-    algorithm.each = each  # type: ignore[method-assign]
+    algorithm.each = each  # type: ignore[method-assign, assignment]
     return algorithm
 
 
