@@ -12,7 +12,7 @@ class Here:
     """A worker that is no process."""
 
     def __init__(self, function, *arguments, **environment):
-        self.measure, self.ready = getattr(processes, function)(*arguments), False
+        self.measure, self.ready = processes.named(function)(*arguments), False
 
     def __enter__(self):
         return self

@@ -169,11 +169,17 @@ def at_once(workers: Sequence[Worker]) -> list[dict[str, Any]]:
     return [worker.answer() for worker in workers]
 
 
+def named(function: str) -> Callable[..., Callable[[], dict[str, Any]]]:
+    """The function that a `Worker` is told."""
+    module, _, name = function.rpartition(".")
+    found: Callable[..., Callable[[], dict[str, Any]]] = getattr(importlib.import_module(module or __name__), name)
+    return found
+
+
 def serve() -> None:
     """The process of a `Worker`."""
     name, *arguments = json.loads(sys.argv[1])
-    module, _, function = name.rpartition(".")
-    measure = getattr(importlib.import_module(module or __name__), function)(*arguments)
+    measure = named(name)(*arguments)
     print("{}", flush=True)  # it is ready
     for _ in sys.stdin:
         print(json.dumps(measure()), flush=True)
