@@ -78,6 +78,22 @@ CALLS: list[int] = []
 
 
 @dataclass(frozen=True)
+class Elsewhere(Patch):
+    """Hides other pixels on a GPU."""
+
+    def hides(self, places, y, x):
+        return super().hides(places, y + 1, x)
+
+
+@dataclass(frozen=True)
+class Inheriting(Patch):
+    """What `Patch` tells of pixels is not true of it."""
+
+    def __call__(self, frames, key, number):
+        frames[..., 0, :] = 0
+
+
+@dataclass(frozen=True)
 class Failing(Options):
     def __call__(self, frames, key, number):
         raise IndexError("no such column")
@@ -91,6 +107,7 @@ MUTANTS = [
     (Drawing, draws_depend_on_keys_alone, "equal keys gave different pixels"),
     (Counting, emission_never_changes_a_row, "a row looked otherwise when it came again"),
     (Counting, a_view_shows_shifted_then_corrupted_stacks, "they differ under resample with a shift of 0"),
+    (Elsewhere, a_view_shows_shifted_then_corrupted_stacks, "a GPU would hide other pixels"),
     (Failing, pixels_stay_pixels, "IndexError: no such column"),
 ]
 
@@ -99,6 +116,11 @@ MUTANTS = [
 def stages():
     with STAGES.isolated():
         yield STAGES
+
+
+def test_a_stage_that_does_something_else_than_the_one_it_inherits_from_is_called_on_frames(stages):
+    stages.register("mine", Inheriting)
+    run_check("corruption", a_view_shows_shifted_then_corrupted_stacks, "mine")
 
 
 @pytest.mark.parametrize(("kind", "check", "reason"), MUTANTS, ids=lambda value: getattr(value, "__name__", ""))

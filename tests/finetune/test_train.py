@@ -75,6 +75,15 @@ def test_runs_of_one_view_seed_train_other_networks_on_the_same_features(encoder
     assert not torch.equal(other["net.0.weight"], plain["net.0.weight"])
 
 
+def test_a_stack_of_one_view_seed_encodes_once(encoder, data, tmp_path, monkeypatch):
+    encode, encoded = FrozenEncoder.frames, []
+    monkeypatch.setattr(FrozenEncoder, "frames", lambda *words: (encoded.append(words), encode(*words))[1])
+    told = [smoke_finetune(encoder, data, tmp_path / f"seed{n}", seed=n, view_seed=7, **BRIEF) for n in (0, 1)]
+    runs = train.finetune_all(told)
+    assert len(encoded) == 3, "episodes"
+    assert all(run.finished and not (run.path / "features.npy").exists() for run in runs)
+
+
 @pytest.fixture
 def with_states(tmp_path) -> Path:
     return write_fake_set(tmp_path / "own" / "walker_walk" / "expert", [20, 25, 30], physics_dim=18)

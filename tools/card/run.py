@@ -82,7 +82,13 @@ class Session:
             self.say(f"no time left for {shlex.join(words)}")
             return 143, ""
         process = subprocess.Popen(
-            words, env=self.env, text=True, errors="replace", stdout=subprocess.PIPE, stderr=subprocess.STDOUT
+            words,
+            env=self.env,
+            text=True,
+            errors="replace",
+            start_new_session=True,
+            stdout=subprocess.PIPE,
+            stderr=subprocess.STDOUT,
         )
         lines: list[str] = []
 
@@ -103,8 +109,9 @@ class Session:
             if process.poll() is None:
                 process.terminate()
                 with suppress(subprocess.TimeoutExpired):
-                    process.wait(max(5.0, self.left(TO_PACK)))
-                process.kill()
+                    process.wait(min(max(5.0, self.left(TO_PACK)), TO_END))
+                with suppress(ProcessLookupError):  # else it and its workers
+                    os.killpg(process.pid, signal.SIGKILL)
                 process.wait()
         reader.join(5)
         return process.returncode, "".join(lines)
@@ -202,7 +209,7 @@ class GridPart:
 
 def run_tests(session: Session, seconds: float, grids: list[GridPart]) -> int:
     """Run the tests that need a GPU, and collect the sets of grids beside them; the tests' exit code."""
-    words = [sys.executable, "-m", "pytest", "-m", "gpu", "-q", "-ra", "--durations=0", "--durations-min=1"]
+    words = [sys.executable, "-m", "pytest", "-m", "gpu", "-v", "-ra", "--durations=0", "--durations-min=1"]
     words += ["-p", "no:cacheprovider", "--continue-on-collection-errors", "-c", str(HERE / "pyproject.toml")]
     files = [path for path in sorted((HERE / "tests").rglob("test_*.py")) if "mark.gpu" in path.read_text()]
     until = time.monotonic() + session.left()
@@ -242,7 +249,7 @@ def bring_home(session: Session, runs: Path, out: Path, mib: float) -> None:
                 break
             for path in files:
                 file.add(path, path.relative_to(runs))
-    content = buffer.getvalue() if mib else b""
+    content = buffer.getvalue() if mib and finished else b""
     for number, start in enumerate(range(0, len(content), PART_BYTES)):
         (out / f"encoders.tar.{number}").write_bytes(content[start : start + PART_BYTES])
     for path in sorted(path for path in out.rglob("*") if path.is_file()):
@@ -282,7 +289,8 @@ def main() -> None:
             if name == "tests":
                 code = run_tests(session, seconds, list(grids.values()))
             elif name == "bench":
-                code, _ = session.run([*PROGRAM, "bench", "--gpu"], seconds)
+                trial = [] if session.gpu else ["--quick", "--device", "cpu"]
+                code, _ = session.run([*PROGRAM, "bench", "--gpu", *trial], seconds)
             else:
                 code = grids[name].train(began + seconds)
             session.say(f"{name}: {time.monotonic() - began:.1f} s, exit code {code}")

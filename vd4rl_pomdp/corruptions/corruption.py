@@ -19,7 +19,7 @@ from vd4rl_pomdp.core.options import Limits, Options, flat, refuse_options
 from vd4rl_pomdp.core.registry import Registry
 from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
-from vd4rl_pomdp.corruptions.fused import Hiding, drawn, painted, zero_draws
+from vd4rl_pomdp.corruptions.fused import drawn, painted, tells_pixels, zero_draws
 from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_numbered, hash_keys
 
 Mode = Literal["resample", "emission"]
@@ -223,7 +223,7 @@ class Corruption:
     def __init__(self, stages: list[Stage], zeroed: int = 0) -> None:
         self._stages, self._zeroed = stages, zeroed
         self._nothing = not stages and not zeroed
-        self._by_pixel = all(isinstance(stage, Hiding) for stage in stages)
+        self._by_pixel = all(tells_pixels(stage) for stage in stages)
 
     def __call__(self, obs: Tensor, key: Tensor) -> Tensor:
         """Corrupted copy of a batch.

@@ -38,6 +38,15 @@ class Hiding(Protocol):
         """Whether pixels are hidden: (N, K, H, W) bool, given `places`, (H, 1) rows and (W,) columns, int64."""
 
 
+def tells_pixels(stage: Any) -> bool:
+    """Whether a stage is `Hiding`, and not by inheritance from one that does something else to frames."""
+    kinds = type(stage).__mro__
+    tells, does = (
+        next((i for i, kind in enumerate(kinds) if name in vars(kind)), len(kinds)) for name in ("hides", "__call__")
+    )
+    return isinstance(stage, Hiding) and tells <= does
+
+
 class StackDraws(NamedTuple):
     """What is drawn for N stacks of S frames."""
 

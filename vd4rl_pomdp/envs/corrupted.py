@@ -35,6 +35,8 @@ class Observation:
     """(1,) int64: what the corruption was drawn from, the same for a row of an episode wherever it is played."""
 
 
+_AHEAD = 32
+"""Rows of which it is found out at once whether their frames will be seen."""
 Drawn = Literal["all", "seen", "nothing"]
 """Which frames are drawn: all, those that an agent will see in any stack, or none."""
 
@@ -80,10 +82,19 @@ class CorruptedEnv:
     def _choose_whether_to_draw(self) -> None:
         """Turn drawing on for frames that will be seen: what is zeroed in a stack is known before it is drawn."""
         if self._draws == "seen":
-            kept = self._corruption.kept(self._keys(torch.arange(self._t, self._t + FRAME_STACK)), FRAME_STACK)
-            newest = torch.arange(FRAME_STACK - 1, -1, -1)[:, None]  # the frame's place in the stacks from row t on
-            places = kept <= newest if self._t == 0 else kept == newest  # the first fills all places before its own
-            self.env.drawing = bool(places.any())
+            if self._t % _AHEAD == 0:
+                self._seen = self._seen_from(self._t)
+            self.env.drawing = self._seen[self._t % _AHEAD]
+
+    def _seen_from(self, t: int) -> list[bool]:
+        """Whether the frames of _AHEAD rows will be seen."""
+        kept = self._corruption.kept(self._keys(torch.arange(t, t + _AHEAD + FRAME_STACK - 1)), FRAME_STACK)
+        # a frame's place is the newest in its own row's stack, and one less in each that follows
+        newest = [(row, FRAME_STACK - 1 - row) for row in range(FRAME_STACK)]
+        seen = torch.stack([(kept[row : row + _AHEAD] == place).any(1) for row, place in newest]).any(0).tolist()
+        if t == 0:  # the first fills all places before its own
+            seen[0] = any(bool((kept[row] <= place).any()) for row, place in newest)
+        return seen
 
     def _keys(self, t: Tensor) -> Tensor:
         """What (T,) rows are corrupted by: (T,) int64."""

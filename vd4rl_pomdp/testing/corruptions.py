@@ -142,6 +142,14 @@ def _claim_view(dataset: Dataset, config: CorruptionConfig, shift: int) -> None:
         expected = apart(random_shift(View(dataset).stacks(rows), key, shift).clone(), dataset.keys(rows))
         seen = together.observe(rows, key)
         claim(torch.equal(seen, expected), f"they differ under {config.corruption_mode} with a shift of {shift}")
+    again = BatchCorruption(config, 1, "a")
+    for _ in range(2):
+        keys = again.keys(dataset.keys(rows)).flatten()
+    index = dataset.stack_rows(rows, FRAME_STACK).view(-1, FRAME_STACK)
+    painted = again.corruption.paint(dataset.frames, index, keys, key, shift)
+    if painted is not None:
+        same = torch.equal(painted.view_as(expected), expected)
+        claim(same, "a GPU would hide other pixels: what `hides` tells is not what the stage does to frames")
 
 
 def _random_set(folder: Path) -> Dataset:
