@@ -1,6 +1,8 @@
 """Runs that are trained as one are what they are alone: folders, records and states, and numbers up to rounding."""
 
 import csv
+import os
+import signal
 from collections.abc import Callable
 from pathlib import Path
 from types import SimpleNamespace
@@ -26,6 +28,7 @@ from vd4rl_pomdp.data import TransitionSampler, View, open_dataset
 from vd4rl_pomdp.nn import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.encoder_folder import read_record
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.runs import interrupt
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.run import identity
@@ -147,6 +150,23 @@ def test_members_go_on_alone_or_in_another_stack(encoder, data, tmp_path, monkey
     before = {p: p.stat().st_mtime_ns for p in (tmp_path / "a").rglob("*")}
     finetune_all([configs["c"], configs["a"]])
     assert {p: p.stat().st_mtime_ns for p in (tmp_path / "a").rglob("*")} == before, "what is finished stays"
+
+
+def test_a_signal_ends_all_runs_after_one_step(encoder, data, tmp_path, monkeypatch):
+    configs = [smoke_finetune(encoder, data, tmp_path / str(seed), **BRIEF, seed=seed) for seed in range(2)]
+    call = train.Updates.__call__
+
+    def struck(self, done):
+        if done == 4:
+            os.kill(os.getpid(), signal.SIGTERM)
+        return call(self, done)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(train.Updates, "__call__", struck)
+        with pytest.raises(interrupt.Terminated) as ended:
+            finetune_all(configs)
+    assert all(f"{config.out} keeps step 5" in ended.value.reason for config in configs)
+    assert all((config.out / "checkpoints" / "5.pt").exists() for config in configs)
 
 
 SEEDS = {"a": 0, "b": 1, "c": 2, "a alone": 0, "b alone": 1, "c alone": 2}

@@ -156,8 +156,8 @@ class RunFolder:
         hardware, path = machine(self.config.get("device", "auto")), self.path / MACHINE_FILE
         if self._begins:
             record = {"format": FORMAT, "stage": self.stage, "config": self.config, "inputs": self.inputs}
-            told = {"command": command(self.stage, self._words), "collection": self._collection}
-            write_json(self.path / CONFIG_FILE, record | now | told)
+            made_by = {"command": command(self.stage, self._words), "collection": self._collection}
+            write_json(self.path / CONFIG_FILE, record | now | made_by)
         if self._begins or not path.exists():  # a start may have been killed between the two files
             write_json(path, hardware)
         else:
