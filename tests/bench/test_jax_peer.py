@@ -58,7 +58,7 @@ def test_the_peer_draws_every_number_anew():
     empty = jax.numpy.zeros
     table = jax_peer.Table(*map(empty, [(2, 9, 4), (2, 7), (2, 7), (7, 3), (7,), (7,), (4,), (4,)]))
     drawn = jax_peer.draw(jax.random.key(0), table, 6, 50)
-    assert (drawn.index.shape, drawn.view.shape, drawn.noise.shape) == ((6, 50), (6, 50), (6, 50, 3))
-    assert set(drawn.index.ravel().tolist()) == set(range(7))
+    assert (drawn.transition.shape, drawn.view.shape, drawn.noise.shape) == ((6, 50), (6, 50), (6, 50, 3))
+    assert set(drawn.transition.ravel().tolist()) == set(range(7))
     assert set(drawn.view.ravel().tolist()) == {0, 1}
     assert len(set(drawn.noise.ravel().tolist())) == drawn.noise.size

@@ -64,7 +64,7 @@ class Table(NamedTuple):
 class BatchDraws(NamedTuple):
     """Random numbers of U updates."""
 
-    index: Array
+    transition: Array
     """(U, B): transitions."""
     view: Array
     """(U, B)."""
@@ -119,7 +119,7 @@ def make_updates(algorithm: TD3BC) -> Callable[[Learnt, Table, BatchDraws], tupl
         noise = jnp.clip(draws.noise * TARGET_NOISE, -NOISE_CLIP, NOISE_CLIP)
         next_action = jnp.clip(jnp.tanh(forward(learnt.target_policy, next_z)) + noise, -1, 1)
         value = jnp.minimum(*values(learnt.target_critics, next_z, next_action))
-        target = table.reward[draws.index] + gamma * table.discount[draws.index] * value
+        target = table.reward[draws.transition] + gamma * table.discount[draws.transition] * value
         return sum(((q - target) ** 2).mean() for q in values(critics, z, action))
 
     def actor_loss(policy: Net, learnt: Learnt, table: Table, draws: BatchDraws) -> Array:
@@ -156,9 +156,9 @@ def make_updates(algorithm: TD3BC) -> Callable[[Learnt, Table, BatchDraws], tupl
 
 def batch(table: Table, draws: BatchDraws) -> tuple[Array, Array, Array]:
     """Standardised representations (B, D) of the first ends, the actions (B, A), those of the last ends."""
-    ends = (table.features[draws.view, end[draws.view, draws.index]] for end in (table.first, table.last))
+    ends = (table.features[draws.view, end[draws.view, draws.transition]] for end in (table.first, table.last))
     z, next_z = ((feature.astype(jnp.float32) - table.mean) / table.std for feature in ends)
-    return z, table.action[draws.index], next_z
+    return z, table.action[draws.transition], next_z
 
 
 def forward(layers: Net, x: Array) -> Array:

@@ -309,10 +309,10 @@ def stacking(dataset: Dataset, repeats: int) -> dict[str, float]:
         algorithms, samplers = zip(
             *(_policy_of(dataset, features, config.hidden_dim, seed) for seed in range(1 + runs)), strict=True
         )
-        pairs = (algorithms[0], samplers[0]), (Stack(algorithms[1:]), StackedSampler(samplers[1:]))
-
+        single = partial(_train, algorithms[0], samplers[0], updates)
+        stacked = partial(_train, Stack(algorithms[1:]), StackedSampler(samplers[1:]), updates)
         with torch.autocast(features.device.type, torch.bfloat16, precision == "bf16", cache_enabled=False):
-            one, five = alternating(repeats, *(partial(_train, *pair, updates) for pair in pairs))
+            one, five = alternating(repeats, single, stacked)
         results |= {f"{precision}_ms": one / updates * 1e3, f"{precision}_of_five_ms": five / updates / runs * 1e3}
         results[f"{precision}_of_five_over_one"] = five / runs / one
     return results
