@@ -64,7 +64,7 @@ class Table(NamedTuple):
 class BatchDraws(NamedTuple):
     """Random numbers of U updates."""
 
-    index: Array
+    index: Array  # type: ignore[assignment]
     """(U, B): transitions."""
     view: Array
     """(U, B)."""

@@ -292,7 +292,7 @@ def against_jax(dataset: Dataset, repeats: int, widths: Sequence[int] = (256, 10
         with Worker("jax_updates", shape, updates) as worker:
             worker.answer()
             for _ in range(repeats):
-                mine.append(seconds_of(partial(_train, *pair, updates), 1) / updates * 1e3)
+                mine.append(seconds_of(partial(_train, pair[0], pair[1], updates), 1) / updates * 1e3)
                 worker.begin()
                 theirs.append(worker.answer()["ms"])
         ms = statistics.median(mine)
@@ -312,7 +312,7 @@ def stacking(dataset: Dataset, repeats: int) -> dict[str, float]:
         pairs = (algorithms[0], samplers[0]), (Stack(algorithms[1:]), StackedSampler(samplers[1:]))
 
         with torch.autocast(features.device.type, torch.bfloat16, precision == "bf16", cache_enabled=False):
-            one, five = alternating(repeats, *(partial(_train, *pair, updates) for pair in pairs))
+            one, five = alternating(repeats, *(partial(_train, pair[0], pair[1], updates) for pair in pairs))
         results |= {f"{precision}_ms": one / updates * 1e3, f"{precision}_of_five_ms": five / updates / runs * 1e3}
         results[f"{precision}_of_five_over_one"] = five / runs / one
     return results
