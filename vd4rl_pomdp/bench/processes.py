@@ -151,6 +151,7 @@ class Worker:
         """
         assert self.process.stdout is not None
         timer = threading.Timer(within, self.process.kill)
+        timer.daemon = True  # a signal may end this process while it waits
         timer.start()
         line = self.process.stdout.readline()
         timer.cancel()
