@@ -16,7 +16,7 @@ import torch
 
 import finetune.train
 from finetune.algorithms import bc, td3_bc
-from finetune.features import FrozenEncoder
+from finetune.features import _ENCODED, FrozenEncoder
 from finetune.train import finetune as run_finetune
 from pretrain.train import Trainer
 from pretrain.train import pretrain as run_pretrain
@@ -323,8 +323,10 @@ def test_features_are_encoded_once_however_often_a_run_is_cut(encoder, finetuned
     monkeypatch.setattr(FrozenEncoder, "frames", lambda *words: (encoded.append(words), encode(*words))[1])
     with monkeypatch.context() as patch:
         fill_disk(patch, ".pt.tmp", 1)
+        _ENCODED.clear()
         with pytest.raises(UserError):
             run_finetune(config)
+    _ENCODED.clear()  # another process goes on
     run_finetune(config)
     assert len(encoded) == 3, "episodes"
     assert not (config.out / "features.npy").exists()

@@ -185,7 +185,7 @@ def test_what_a_policy_is_given_depends_on_its_history_alone(dataset: Dataset, e
     def given(frames: torch.Tensor, actions: torch.Tensor) -> torch.Tensor:
         dataset.action = actions
         if end == "whole":
-            return read_whole(encoder, frames[7:], dataset, 1)[10 - 7]
+            return read_whole(encoder, frames[7:], dataset, range(1, 2))[10 - 7]
         rows = [torch.tensor([row]) for row in (8, 10, 12)]
         return read_both_ends(encoder, lambda rows: frames[rows], dataset, *rows)[end == "last end"][0]
 

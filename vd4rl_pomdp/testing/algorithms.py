@@ -261,7 +261,7 @@ def stacks_take_the_steps_of_single_runs(name: str, **options: Any) -> None:
     whole = Stack(runs)
     logs = []
     for number in range(updates):
-        given = [batch(100 * seed + number) for seed in seeds]
+        given = [batch(seed * updates + number) for seed in seeds]
         try:
             logs.append(whole.update(FeatureBatch(**{key: torch.stack([b[key] for b in given]) for key in given[0]})))
         except (UserError, RuntimeError) as error:
@@ -270,7 +270,7 @@ def stacks_take_the_steps_of_single_runs(name: str, **options: Any) -> None:
 
         def single(change: Callable[[Algorithm], Algorithm], seed: int = seed) -> dict[str, Tensor]:
             one = change(make(name, seed, **options))
-            return course(one, [one.update(batch(100 * seed + number)) for number in range(updates)])
+            return course(one, [one.update(batch(seed * updates + number)) for number in range(updates)])
 
         whole.settle(seed)
         found = course(run, [{key: value[seed] for key, value in row.items()} for row in logs])
