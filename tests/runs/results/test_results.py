@@ -262,7 +262,7 @@ def test_results_go_into_no_folder_of_another_kind(tmp_path):
 def test_committed_runs_say_what_they_were_made_with(place):
     for run in read_results(place.parent):
         assert run.settled
-        assert run.measured or run.losses
+        assert run.measured or run.losses or run.record["config"]["method"] == "random"  # which is not trained
         assert run.labels["task"]
         assert run.record["command"]
         assert run.record["git_commit"]
