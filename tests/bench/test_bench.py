@@ -4,6 +4,7 @@ import pytest
 import torch
 
 from pretrain.objectives import METHODS
+from tests.helpers_bench import NoProcess
 from vd4rl_pomdp.bench import measures, processes, suite
 from vd4rl_pomdp.bench.suite import GOALS
 from vd4rl_pomdp.runs.files import flatten
@@ -76,19 +77,7 @@ def test_policies_are_measured_stacked_and_against_jax(tmp_path, monkeypatch):
     stacked = measures.stacking(dataset, 1)
     assert all(value > 0 for value in stacked.values())
 
-    class Jax:
-        def __init__(self, *_):
-            pass
-
-        def __enter__(self):
-            return self
-
-        def __exit__(self, *_):
-            pass
-
-        def begin(self):
-            pass
-
+    class Jax(NoProcess):
         def answer(self):
             return {"ms": 1.0}
 

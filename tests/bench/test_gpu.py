@@ -2,26 +2,18 @@ import json
 
 import pytest
 
+from tests.helpers_bench import NoProcess
 from vd4rl_pomdp.bench import gpu, processes
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError, WorkerDiedError
 from vd4rl_pomdp.runs.files import flatten
 
 
-class Here:
-    """A worker that is no process."""
+class Here(NoProcess):
+    """Measures in this process."""
 
     def __init__(self, function, *arguments, **environment):
         self.measure, self.ready = processes.named(function)(*arguments), False
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        pass
-
-    def begin(self):
-        pass
 
     def answer(self, within=0.0):
         told, self.ready = self.measure() if self.ready else {}, True
