@@ -14,9 +14,11 @@ from typing import NamedTuple
 from vd4rl_pomdp.report.gates import (
     FAILED,
     GATED,
+    NOT_RECORDED,
     Sides,
     as_it_is,
     comparable,
+    converged,
     difference,
     on_set,
     returns_of,
@@ -88,7 +90,8 @@ def judge_claims(runs: list[Run], unranked: Collection[tuple[str, ...]] = ()) ->
 
     `difference` is the left side's mean return less the right one's, `low` and `high` its 95% interval, by which it is
     judged; `clean_` are the same for the policies played with nothing hidden. Where no runs of both sides have like
-    settings, there are none, and the verdict says what differs.
+    settings, there are none, and the verdict says what differs. Nothing is judged unless the critics of both sides are
+    known to have converged.
 
     Args:
         runs: of a report.
@@ -137,7 +140,7 @@ def _decisive(left: list[Run], others: list[Run]) -> Sides:
     pairs = [pair for seeds in seeds_by_variant(others) if (pair := sides(left, seeds)).left]
     alike = [pair for pair in pairs if not pair.unlike]
     refuted = [pair for pair in alike if _beyond(*difference(pair)[1]) == FAILS]
-    doubted = [pair for pair in alike if _beyond(*difference(pair)[1]) != HOLDS]
+    doubted = [pair for pair in alike if _beyond(*difference(pair)[1]) != HOLDS or not converged(pair.right)]
     # Comparing with the best other method alone would pass over a lesser one that a single seed leaves open.
     decisive = refuted or doubted or alike or pairs
     return max(decisive, key=lambda pair: returns_of(pair.right).mean(), default=Sides([], [], []))
@@ -168,7 +171,10 @@ def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
         return f"not judged: other {', '.join(compared.unlike)}"
     if row["kind"] == DISTANCE:
         return ""
-    if unranked:
+    settled = converged([*compared.left, *compared.right])
+    if unranked or settled is False:
         return f"not judged: {FAILED}"
+    if settled is None:
+        return f"not judged: {NOT_RECORDED}"
     found = _beyond(row["low"], row["high"])
     return NOT_REFUTED if found == OPEN and row["kind"] == "not below" else found
