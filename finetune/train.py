@@ -202,7 +202,7 @@ def _trainer(
         sampler = TransitionSampler(view, config.batch_size, draws, returns.n_step, returns.gamma)
     elif config.views:
         histories = Histories(dataset, config.memory, returns.n_step, config.seed_of_views)
-        features = encode_views(frozen, histories, config.views, run.path / FEATURES_FILE)
+        features = encode_views(frozen, histories, config.views, run.path / FEATURES_FILE, run.inputs["encoder"])
         policy.standardise.fit(features)
         _probe(features, dataset, run)
         encode = partial(_cached, features, dataset)

@@ -107,7 +107,7 @@ def write_seeds(
 
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports draw no figures, which takes most of their time."""
-    sections = ("scores", "profiles", "curves", "probes", "errors", "costs", "losses")
+    sections = ("scores", "lead", "profiles", "curves", "probes", "errors", "costs", "losses")
     monkeypatch.setattr(page, "_plots", lambda runs, made: {name: [] for name in sections})
 
 

@@ -314,6 +314,16 @@ def test_a_downloaded_set_is_found_below_its_size(copy, tmp_path):
     assert jobs[0].folder == copy / "data" / "walker_walk" / "expert" / "84px"
 
 
+def test_the_grid_of_published_files_takes_downloaded_sets(tmp_path, capsys, own_cache):
+    for task in ("walker_walk", "cheetah_run"):
+        for quality in ("medium_expert", "expert"):
+            write_fake_set(tmp_path / "vd4rl" / task / quality / "84px", [20, 25])
+    main(["sweep", "run", "vd4rl", "--data", str(tmp_path / "vd4rl"), "--out", str(tmp_path / "out"), "--dry-run"])
+    shown = capsys.readouterr().out
+    assert "data collect" not in shown
+    assert f"{4 * 6 * 5 * 2 + 4} jobs, 4 done" in shown, "6 encoders and policies a seed and set, and the sets"
+
+
 def test_a_run_that_added_other_images_is_another(tmp_path):
     class AnySet:
         def made(self, record):

@@ -26,6 +26,7 @@ from vd4rl_pomdp.report.figures import Plot, seeds_note, to_svg, write_table
 from vd4rl_pomdp.report.films import shown_films
 from vd4rl_pomdp.report.gaps import find_gaps
 from vd4rl_pomdp.report.gates import gates, unranked
+from vd4rl_pomdp.report.lead import leads
 from vd4rl_pomdp.report.load import (
     ALL,
     CONDITION,
@@ -126,6 +127,7 @@ def _tables(runs: list[Run], choice: Choice) -> tuple[dict[str, pd.DataFrame], l
         MARK: tables.summary(final, gaps, unranked(judged, SETTING)),
         "gates": pd.DataFrame(judged),
         "claims": pd.DataFrame(claimed),
+        "lead": pd.DataFrame(leads(runs)),
         "curves": tables.curves(evaluated),
         "aggregate": tables.aggregate(final, gaps),
         "runs": every,
@@ -203,6 +205,16 @@ SHOWN: dict[str, tuple[int, Columns]] = {
             "right": _side("right"),
             "difference": ("difference", "low", "high", 0),
             "played clean": ("clean_difference", "clean_low", "clean_high", 0),
+        },
+    ),
+    "lead": (
+        3,
+        {
+            "setting": with_algorithm,
+            "difference": label,
+            "pretraining": lambda row: f"{row['steps']:,} x {row['stacks']}",
+            "% of the data's return": ("difference", "low", "high", 1),
+            "seeds": lambda row: f"{row['left_seeds']}, {row['right_seeds']}",
         },
     ),
     MARK: (
@@ -354,6 +366,7 @@ def _plots(runs: list[Run], made: dict[str, pd.DataFrame]) -> dict[str, list[Plo
     return {
         "scores": figures.bar_plots(made[MARK], made["runs"], data, looks),
         "profiles": figures.profile_plots(made["profiles"], made["aggregate"], looks),
+        "lead": figures.lead_plots(made["lead"]),
         "curves": figures.curve_plots(made["curves"], looks),
         **{name: figures.dot_plots(made["runs"], looks, name) for name in figures.DOTS},
         "costs": figures.cost_plots(made["costs"]),
