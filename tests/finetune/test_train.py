@@ -23,6 +23,7 @@ from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.runs.metrics import read_metrics
+from vd4rl_pomdp.runs.results import find_results
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 CORRUPTION = "patch+zero_frames"
@@ -246,6 +247,23 @@ def test_a_run_cut_behind_an_evaluation_has_the_metrics_of_a_whole_one(encoder, 
             run_finetune(cut)
     run_finetune(cut)
     assert contents(cut.out) == contents(whole.path)
+
+
+def test_the_clean_evaluation_may_have_another_number_of_episodes_and_is_made_up_for(encoder, data, tmp_path):
+    """The same rows, whatever else is played; a run that was cut within its last evaluation plays it again."""
+    few = {"updates": 4, "eval_every": 2, "batch_size": 4, "eval_length": 2, "eval_episodes": 3}
+    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "out", **few, eval_clean_episodes=2)).path
+    rows = [(row["step"], row["evaluated_under"]) for row in csv.DictReader((run / "episodes.csv").open())]
+    assert rows == [("2", CORRUPTION)] * 3 + [("4", CORRUPTION)] * 3 + [("4", "none")] * 2
+    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **few)).path
+    lines = (whole / "episodes.csv").read_text().splitlines()
+    assert (run / "episodes.csv").read_text().splitlines() == lines[:-1]
+    before = contents(run)
+    (run / "episodes.csv").write_text("\n".join(lines[:-2]) + "\n")  # a clean episode is missing
+    (run / "timing.json").unlink()
+    run_finetune(smoke_finetune(encoder, data, run, **few, eval_clean_episodes=2))
+    assert contents(run) == before
+    assert find_results([run])[0].id == find_results([whole])[0].id
 
 
 def test_the_clean_evaluation_can_be_left_out(encoder, data, tmp_path):

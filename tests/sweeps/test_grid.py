@@ -274,3 +274,23 @@ def test_a_setting_that_no_stage_takes_is_told_with_its_place(file, section, mes
     path = file(section)
     with pytest.raises(UserError, match=message):
         check_cells(load_grid(path).cells(), "mine.toml")
+
+
+def test_the_protocols_layers_are_what_its_page_says():
+    """Its commands make every policy once, on a set of the seed's own; its table counts them."""
+    page = (ROOT / "results" / "protocol.md").read_text()
+    cells = load_grid(str(ROOT / "results" / "protocol.toml")).cells()
+    commands = re.findall(r"--only (.*(?:\n    .*)?)", page)
+    layers = [narrow(cells, only.replace("\\", " ").split()) for only in commands]
+    counted = [int(count) for count in re.findall(r"^\|.*\| (\d+) \|$", page, re.MULTILINE)]
+    assert [len(layer) for layer in layers] == [56, 56, *(sum(counted[i:j]) for i, j in ((3, 5), (5, 6), (6, 8)))]
+    assert sum(map(len, layers)) == len(cells) == sum(counted)
+    assert len({id(cell) for layer in layers for cell in layer}) == len(cells)
+    for cell in cells:
+        collected, policy = collection_of(cell), recorded(cell, "finetune")
+        assert (collected["seed"], collected["episodes"]) == (100 + cell.seed, 100)
+        played = policy["eval_episodes"], policy["eval_clean_episodes"]
+        assert played == ((60, 30) if cell.value("task") == "walker_walk" else (40, 20))
+        assert policy["eval_every"] > policy["updates"], "at the end alone"
+        assert cell.value("shift_shared") == (True if cell.value("method") == "acro" else None)
+    assert [cell.seed for cell in layers[0]] == sorted(cell.seed for cell in layers[0])

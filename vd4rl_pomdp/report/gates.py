@@ -19,7 +19,7 @@ from vd4rl_pomdp.core.options import settings_of
 from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import STATE
-from vd4rl_pomdp.report.load import REFERENCES, SETTING, Run
+from vd4rl_pomdp.report.load import REFERENCES, SETTING, Run, a_set_a_seed
 from vd4rl_pomdp.report.stats import interval
 from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, PLAIN, PRESETS, groups, of_corruption
 from vd4rl_pomdp.runs.files import Row
@@ -184,7 +184,7 @@ def sides(left: Iterable[Run], right: Iterable[Run]) -> Sides:
     First come pairs of like settings, then those with more than one seed on both sides, then those that return most.
     """
     others = seeds_by_variant(right)
-    pairs = [Sides(one, other, _unlike(one[0], other[0])) for one in seeds_by_variant(left) for other in others]
+    pairs = [Sides(one, other, _unlike(one, other)) for one in seeds_by_variant(left) for other in others]
     alike = [pair for pair in pairs if not pair.unlike]
     return max(alike or pairs, key=lambda pair: _preference(pair.left, pair.right), default=Sides([], [], []))
 
@@ -201,16 +201,21 @@ def _preference(*compared: list[Run]) -> tuple[int, float]:
     return sum(len(seeds) > 1 for seeds in compared), sum(float(returns_of(seeds).mean()) for seeds in compared)
 
 
-def _unlike(one: Run, other: Run) -> list[str]:
-    """Settings that both have, but not alike, other than what a claim is about and what hides pixels.
+def _unlike(left: list[Run], right: list[Run]) -> list[str]:
+    """Settings that seeds of both sides have, but not alike, other than what a claim is about and what hides pixels.
 
-    Of a method that is not pretrained, only settings of fine-tuning count.
+    Of a method that is not pretrained, only settings of fine-tuning count. Where every training seed has a set of its
+    own, that of both sides is the same.
     """
+    one, other = left[0], right[0]
     names = (one.settings.keys() & other.settings.keys()) - PLAIN.keys() - of_corruption(one.settings).keys()
     for run in (one, other):
         if run.method in ("random", STATE):
             names &= settings_of(run.record["config"]).keys() | {DATA[0]}
-    found = [name for name in one.settings if name in names and one.settings[name] != other.settings[name]]
+    found = [name for name in one.settings if name in names - {DATA[0]} and one.settings[name] != other.settings[name]]
+    sets = {run.settings.get(DATA[0]) for run in (*left, *right)}
+    if DATA[0] in names and len(sets) > 1 and not a_set_a_seed([*left, *right]):
+        found.append(DATA[0])
     return [name for name in found if name in PRESETS] or found  # a preset stands for what it decides
 
 

@@ -265,11 +265,34 @@ def _told_apart(runs: list[Run]) -> list[Run]:
     of_methods = differences([without(one, DATA) for one in own], methods)
     # Two sets always differ in their fingerprints; only two contents of one set make another experiment.
     data = [{name: one[name] for name in DATA if name in one} for one in own]
-    of_data = differences(data, list(zip(methods, sets, corruptions, strict=True)))
+    places = list(zip(methods, sets, corruptions, strict=True))
+    for alike in (places, list(zip(places, of_methods, strict=True))):
+        for mine in groups(range(len(runs)), alike.__getitem__).values():
+            if a_set_a_seed([runs[i] for i in mine]):
+                for i in mine:
+                    data[i][DATA[0]] = "one a seed"
+    of_data = differences(data, places)
     return [
         replace(run, labels=run.labels | {"corruption": corruption}, parts=(of_method, of_set))
         for run, corruption, of_method, of_set in zip(runs, corruptions, of_methods, of_data, strict=True)
     ]
+
+
+def a_set_a_seed(runs: Sequence[Run]) -> bool:
+    """Whether each of two or more training seeds has a set of its own, collected alike but for the collection's seed.
+
+    Then sets vary as seeds do, and runs on them are seeds of one method. Two contents for one training seed, or of one
+    collection, make other experiments.
+    """
+    plans = [run.record.get("collection") or {} for run in runs]
+    contents = [run.record.get("inputs", {}).get("data") for run in runs]
+    seeds = [run.labels["seed"] for run in runs]
+    found = set(zip(seeds, contents, [plan.get("seed") for plan in plans], strict=True))
+    if not all(plans) or len(found) < 2 or any(len(set(column)) < len(found) for column in zip(*found, strict=True)):
+        return False
+    drawn = [(plan.get("rendered_by") or {}).get("canary") for plan in plans]
+    told = [without(plan, ("seed", "rendered_by")) | {"drawn": one} for plan, one in zip(plans, drawn, strict=True)]
+    return all(one == told[0] for one in told)
 
 
 def episodes_frame(runs: Iterable[Run]) -> pd.DataFrame:

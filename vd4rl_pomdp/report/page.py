@@ -36,6 +36,7 @@ from vd4rl_pomdp.report.load import (
     TOLD_STATES,
     Choice,
     Run,
+    a_set_a_seed,
     episodes_frame,
     label,
     labels,
@@ -181,6 +182,24 @@ def _chance(row: Row) -> str:
     return with_interval(row["probability"], row["low"], row["high"], 2) + few
 
 
+def _claim(row: Row) -> str:
+    return row["claim"] + (f" ({row['family']})" if row["family"] else "")
+
+
+def _p(row: Row) -> str:
+    """A p value, and the one that is adjusted for its family."""
+    if pd.isna(row["p"]):
+        return number(None)
+    told = "" if pd.isna(row["adjusted_p"]) else f" ({row['adjusted_p']:.3f})"
+    return f"{row['p']:.3f}{told}"
+
+
+def _smallest(row: Row) -> str:
+    """The difference that would be found, and as a share of the data's return."""
+    share = "" if pd.isna(row["smallest_share"]) else f" ({100 * row['smallest_share']:.0f}%)"
+    return number(row["smallest"], 0) + share
+
+
 SHOWN: dict[str, tuple[int, Columns]] = {
     "gates": (
         2,
@@ -198,12 +217,14 @@ SHOWN: dict[str, tuple[int, Columns]] = {
     "claims": (
         4,
         {
-            "claim": "claim",
+            "claim": _claim,
             "setting": setting,
             "verdict": lambda row: row["verdict"] or "–",
             "left": _side("left"),
             "right": _side("right"),
             "difference": ("difference", "low", "high", 0),
+            "p (Holm)": _p,
+            "would be found": _smallest,
             "played clean": ("clean_difference", "clean_low", "clean_high", 0),
         },
     ),
@@ -440,8 +461,11 @@ def _write(out: Path, made: dict[str, pd.DataFrame], shown: dict[str, Shown], pl
 def unlike(runs: list[Run]) -> list[str]:
     """What stands side by side and was not made of the same, in sentences: contents of a set, code of a part."""
     told: dict[str, dict[str, set[str]]] = {}
-    for run in (run for run in runs if run.stage == "finetune" and run.rows):
-        states = {f"the set of {run.set_name} has {{}} contents": run.record.get("inputs", {}).get("data", "")[:12]}
+    played = [run for run in runs if run.stage == "finetune" and run.rows]
+    own = {name for name, mine in groups(played, lambda run: run.set_name).items() if a_set_a_seed(mine)}
+    for run in played:
+        content = "" if run.set_name in own else run.record.get("inputs", {}).get("data", "")[:12]
+        states = {f"the set of {run.set_name} has {{}} contents": content}
         states |= {f"{part} has {{}} states of its code": code for part, code in _code(run).items()}
         for subject, state in states.items():
             if state:
@@ -494,7 +518,7 @@ def print_summary(report: Report, console: Console | None = None) -> None:
     """The verdicts of the gates and claims, then the tables of final scores, one a setting."""
     console = console or Console()
     lines = [f"{with_algorithm(row)}: {row['verdict']}" for row in report.gates]
-    tallies = {claim: tally(rows) for claim, rows in groups(report.claims, lambda row: row["claim"]).items()}
+    tallies = {claim: tally(rows) for claim, rows in groups(report.claims, _claim).items()}
     lines += [f"{claim}: {told}" for claim, told in tallies.items() if told]
     for line in (*lines, f"{tables.SCORE}; mean over seeds [95% t interval]"):
         console.print(line, markup=False, highlight=False)

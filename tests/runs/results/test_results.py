@@ -109,6 +109,18 @@ def test_runs_are_there_once_and_stay_as_they_are(tmp_path, capsys):
     assert (tmp_path / "copy" / "runs.jsonl").read_bytes() == (tmp_path / "out" / "runs.jsonl").read_bytes()
 
 
+@pytest.mark.parametrize(("name", "taken"), [("README.md", True), ("grid.toml", True), ("notes.txt", False)])
+def test_rows_may_come_after_their_page_and_their_grid(tmp_path, name, taken):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).touch()
+    run = whole_run(tmp_path / "run")
+    if taken:
+        assert add_results([run], tmp_path / "out").added == 1
+    else:
+        with pytest.raises(UserError, match="is not empty and holds no results"):
+            add_results([run], tmp_path / "out")
+
+
 def test_a_run_that_lost_its_last_evaluation_is_not_told_of_by_the_one_before(tmp_path):
     run = whole_run(tmp_path / "run")
     write_json(run / "timing.json", {"seconds": 1.0, "updates": 10})
