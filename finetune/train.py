@@ -50,20 +50,23 @@ from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.nn.probes import probe_state
 from vd4rl_pomdp.policies.actor import read_actor
 from vd4rl_pomdp.runs import (
+    CRITIC_FILE,
     EPISODES_FILE,
     FILM_FILE,
     LABELS_FILE,
+    METRICS_FILE,
     PRETRAIN_TIMING_FILE,
     PROBE_FILE,
     RENDER_FILE,
     TIMING_FILE,
     interrupt,
 )
+from vd4rl_pomdp.runs.critic import critic_of
 from vd4rl_pomdp.runs.device import pick_device, set_products
 from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.loop import Loop, in_step, save, training
-from vd4rl_pomdp.runs.metrics import EVALUATION
+from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.replay import Replay
 from vd4rl_pomdp.runs.run import RunFolder
@@ -286,6 +289,9 @@ class FinetuneTrainer:
             self.reference.with_path_error(error).write(path)
         (path / FEATURES_FILE).unlink(missing_ok=True)
         write_json(path / RENDER_FILE, render_info(self.card.task))
+        gamma = getattr(self.config.options, "gamma", None)
+        critic = critic_of(read_metrics(path / METRICS_FILE), self.step, self.reference.mean_reward, gamma)
+        write_json(path / CRITIC_FILE, critic)
         self.folder.finish(updates=self.step)
 
     def evaluate(self) -> None:

@@ -105,6 +105,8 @@ def test_an_encoder_that_is_trained_along_or_reads_states_resumes_to_the_bit(
     assert (trained != (made / "model.safetensors").read_bytes()) == along
     rows = list(csv.DictReader((whole / "episodes.csv").open()))
     assert {row["algorithm"] for row in rows} == {"drqv2_bc" if along else "td3_bc"}
+    critic = json.loads((whole / "critic.json").read_text())
+    assert (critic["value"] != 0, critic["moved"]) == (True, None), "two rows of metrics tell of no movement"
 
 
 def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_them(with_states, data, tmp_path):
@@ -209,6 +211,24 @@ def test_scores_are_rows_of_metrics_by_what_was_evaluated_under(encoder, data, t
                 expected = np.mean([float(episode[measure]) for episode in mine])
                 assert row[f"eval/{measure}/{under}"] == pytest.approx(expected, abs=1e-12)
     assert "eval/score/none" not in rows[0]
+
+
+@pytest.mark.parametrize("algorithm", ["td3_bc", "drqv2_bc", "iql", "bc"])
+def test_a_run_ends_with_what_its_critic_came_to(encoder, data, tmp_path, algorithm):
+    """Of the rows of its metrics; resumed runs and stacks are held against whole and single ones elsewhere."""
+    changes = {"updates": 15, "log_every": 1, "batch_size": 4, "eval_length": 2, "eval_every": 15, "eval_clean": False}
+    changes |= {} if algorithm == "bc" else {"gamma": 0.9, "n_step": 2}
+    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", algorithm=algorithm, **changes))
+    told = json.loads((run.path / "critic.json").read_text())
+    if algorithm == "bc":
+        assert told == {}
+        return
+    q = [row["q"] for row in read_metrics(run.path / "metrics.jsonl") if row["step"] > 12 and "q" in row]
+    assert told["value"] == pytest.approx(np.mean(q), abs=1e-4)
+    assert told["moved"] == pytest.approx((q[2] - q[0]) / 2 * 3 / np.mean(q), rel=1e-3)
+    dataset = open_dataset(data)
+    earned = dataset.reward[dataset.t > 0].double().mean()
+    assert told["data"] == pytest.approx(float(earned) / (1 - 0.9), abs=1e-3)
 
 
 def test_a_run_cut_behind_an_evaluation_has_the_metrics_of_a_whole_one(encoder, data, tmp_path, monkeypatch):

@@ -240,6 +240,25 @@ def test_nothing_is_judged_where_a_gate_is_missed(tmp_path):
     assert verdicts == {"not judged: undecided at this budget"}
 
 
+@pytest.mark.parametrize(
+    ("moved", "verdict"), [(0.05, "undecided at this budget"), (None, "convergence is not recorded")]
+)
+def test_nothing_is_judged_unless_the_critics_of_both_sides_are_known_to_have_converged(tmp_path, moved, verdict):
+    write(tmp_path, GOOD | {("mik", "patch"): ()})
+    rows = judged(write(tmp_path, {("mik", "patch"): GOOD["mik", "patch"]}, moved=moved))
+    for claim in (MEMORY, ACTIONS, FIRST):
+        assert rows[claim]["verdict"] == f"not judged: {verdict}"
+        assert rows[claim]["low"] < rows[claim]["difference"] < rows[claim]["high"], "told all the same"
+    assert rows["acro returns less where pixels are hidden"]["verdict"] == "holds", "mik is none of it"
+
+
+def test_a_claim_against_every_method_rests_on_each(tmp_path):
+    write(tmp_path, GOOD)
+    rows = judged(write(tmp_path, {("driml", "patch"): (20, 22)}, moved=0.05))
+    assert (rows[FIRST]["right"], rows[FIRST]["verdict"]) == ("driml", "not judged: undecided at this budget")
+    assert rows[ACTIONS]["verdict"] == "holds"
+
+
 def test_the_page_and_the_terminal_tell_what_becomes_of_the_claims(tmp_path, capsys):
     write(tmp_path / "runs", GOOD | {("mik", "patch"): (60,)})
     report = write_report([tmp_path / "runs"], tmp_path / "out")

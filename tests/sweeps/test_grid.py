@@ -9,7 +9,7 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 from vd4rl_pomdp.studies.navigation.measures import condition_of, paper_rows
 from vd4rl_pomdp.sweeps.grid import load_grid, names, narrow
-from vd4rl_pomdp.sweeps.stages import check_cells, collection_of, recorded
+from vd4rl_pomdp.sweeps.stages import check_cells, collection_of, recipe_of, recorded
 
 ROOT = Path(__file__).parents[2]
 PAGE = ROOT / "docs" / "sweeps.md"
@@ -223,11 +223,23 @@ def test_navigation_at_20000_steps_has_the_published_cells_and_first_seeds_first
     assert told == {("ah+a", 15), ("ah+a", 1), ("mik+a", 15), ("mik+a", 1), ("ah", 15)}
 
 
-def test_the_grid_of_published_files_needs_no_states_and_shares_a_set_among_seeds():
-    cells = load_grid("vd4rl").cells()
+def test_the_leads_shorter_pretrainings_are_runs_of_the_protocol():
+    def made(name, *only):
+        cells = narrow(load_grid(str(ROOT / "results" / name)).cells(), only)
+        return {(recipe_of(cell, "finetune"), repr(sorted(collection_of(cell).items()))) for cell in cells}
+
+    both = ["method=mik+a,acro", "quality=medium_expert", "corruption=patch+zero_frames"]
+    assert made("lead/grid.toml", "steps=3000") == made("protocol.toml", *both)
+    assert len(made("lead/grid.toml", "steps=20000")) == 2 * 3 * 5
+
+
+def test_the_grid_of_published_files_is_the_protocols_first_layer_without_states():
+    cells, protocol = load_grid("vd4rl").cells(), load_grid(str(ROOT / "results" / "protocol.toml")).cells()
     assert not {cell.value("method") for cell in cells} & {"state", "supervised", "supervised+a"}
     assert {cell.seed for cell in cells} == set(range(5))
-    assert len({repr(collection_of(cell)) for cell in cells}) == 4, "two tasks, two qualities"
+    assert len({repr(collection_of(cell)) for cell in cells}) == 4, "two tasks, two qualities: seeds share a set"
+    first, theirs = ({recipe_of(c, "finetune") for c in narrow(grid, ["seed=0"])} for grid in (cells, protocol))
+    assert first < theirs
 
 
 def test_the_navigation_grid_holds_every_condition_of_the_papers_tables():

@@ -20,9 +20,11 @@ from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gates import (
     FAILED,
     GATED,
+    NOT_RECORDED,
     Sides,
     as_it_is,
     comparable,
+    converged,
     difference,
     episodes_of,
     on_set,
@@ -108,7 +110,8 @@ def judge_claims(runs: list[Run], unranked: Collection[tuple[str, ...]] = ()) ->
     two-sided p value; `clean_` are the same for the policies played with nothing hidden. A claim of a family is judged
     by `adjusted_p`, an exploratory one by `p`. `smallest` is the difference that a test at 5% finds in 80% of cases
     with this standard error, `smallest_share` the same as a share of the data's return. Where no runs of both sides
-    have like settings, there are none, and the verdict says what differs.
+    have like settings, there are none, and the verdict says what differs. Nothing is judged unless the critics of both
+    sides are known to have converged.
 
     Args:
         runs: of a report.
@@ -178,7 +181,7 @@ def _decisive(left: list[Run], others: list[Run]) -> Sides:
     pairs = [pair for seeds in seeds_by_variant(others) if (pair := sides(left, seeds)).left]
     alike = [pair for pair in pairs if not pair.unlike]
     refuted = [pair for pair in alike if _beyond(*difference(pair)[1]) == FAILS]
-    doubted = [pair for pair in alike if _beyond(*difference(pair)[1]) != HOLDS]
+    doubted = [pair for pair in alike if _beyond(*difference(pair)[1]) != HOLDS or not converged(pair.right)]
     # Comparing with the best other method alone would pass over a lesser one that a single seed leaves open.
     decisive = refuted or doubted or alike or pairs
     return max(decisive, key=lambda pair: returns_of(pair.right).mean(), default=Sides([], [], []))
@@ -209,8 +212,11 @@ def _verdict(row: Row, compared: Sides, unranked: bool) -> str:
         return f"not judged: other {', '.join(compared.unlike)}"
     if row["kind"] == DISTANCE:
         return ""
-    if unranked:
+    settled = converged([*compared.left, *compared.right])
+    if unranked or settled is False:
         return f"not judged: {FAILED}"
+    if settled is None:
+        return f"not judged: {NOT_RECORDED}"
     p = row["p"] if row["adjusted_p"] is None else row["adjusted_p"]
     sign = HOLDS if row["difference"] > 0 else FAILS
     found = FEW if p is None else sign if p < stats.LEVEL else OPEN

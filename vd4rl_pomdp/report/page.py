@@ -135,6 +135,7 @@ def _tables(runs: list[Run], choice: Choice) -> tuple[dict[str, pd.DataFrame], l
         "representations": tables.representations(every),
         "costs": tables.costs(every),
         "control": tables.control(every),
+        "critics": tables.critics(every),
         "improvement": tables.improvement(final),
         "profiles": tables.profiles(final),
         "missing": gaps,
@@ -153,6 +154,14 @@ def _count(row: Row) -> str:
 
 def _side(side: str) -> Callable[[Row], str]:
     return lambda row: f"{row[side]}: {row[f'{side}_return']:.0f} (n = {row[f'{side}_seeds']})"
+
+
+def _bar(row: Row) -> str:
+    return f"{number(row['acro_bar'], 2)} ({row['bar_from']})"
+
+
+def _converged(row: Row) -> str:
+    return "not recorded" if pd.isna(row["converged"]) else f"{row['converged']:.0f} of {row['seeds']}"
 
 
 def _span(cost: str) -> Callable[[Row], str]:
@@ -200,6 +209,7 @@ SHOWN: dict[str, tuple[int, Columns]] = {
             "data's return": ("data_return", 0),
             "state": ("state_share", 2),
             "acro, none": ("acro_share", 2),
+            "its bar": _bar,
             "best": ("best_share", 2),
             "best – random": ("above_random", "low", "high", 0),
         },
@@ -288,6 +298,17 @@ SHOWN: dict[str, tuple[int, Columns]] = {
             "seeds": ("seeds", 0),
         },
     ),
+    "critics": (
+        1,
+        {
+            "setting": setting,
+            "method": label,
+            "critic's value": ("critic_value", 1),
+            "data's discounted return": ("data_value", 1),
+            "moved, %": lambda row: number(100 * row["critic_moved"]),
+            "converged": _converged,
+        },
+    ),
     "costs": (
         2,
         {
@@ -311,6 +332,8 @@ def _shown(made: dict[str, pd.DataFrame]) -> dict[str, Shown]:
         rows = made[name]
         if name == "control" and rows["data_return"].isna().all() and rows["clean_return"].isna().all():
             rows = rows.iloc[:0]  # nothing is known but the return as trained
+        if name == "critics" and rows["critic_value"].isna().all():
+            rows = rows.iloc[:0]
         table = texts(rows, columns)
         found[name] = Shown(table, list(_blocks(name, table, rows, words)), words)
     return found
