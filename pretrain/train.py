@@ -133,7 +133,7 @@ def _card(config: PretrainConfig, dataset: Dataset, run: RunFolder) -> EncoderCa
         method=config.method,
         task=config.task,
         quality=dataset.quality or UNKNOWN_QUALITY,
-        corruption=flat(config.corruption),
+        corruption=settings_of(flat(config.corruption)),
         seed=config.seed,
         steps=config.steps,
         preset=config.preset,
