@@ -25,9 +25,20 @@ from vd4rl_pomdp.testing.memories import (
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-@pytest.mark.parametrize("options", [{}, {"gru_layers": 2}], ids=["one layer", "two"])
-def test_the_gru_keeps_its_promises(check, options):
-    run_check("memory", check, "gru", **options)
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("gru", {}),
+        ("gru", {"gru_layers": 2}),
+        ("transformer", {}),
+        ("transformer", {"transformer_layers": 3, "transformer_heads": 1, "attention_window": 2}),
+        ("lru", {}),
+        ("lru", {"lru_layers": 1, "lru_units": 5, "r_min": 0.9, "r_max": 0.99, "max_phase": 0.3}),
+    ],
+    ids=str,
+)
+def test_a_memory_keeps_its_promises(check, name, options):
+    run_check("memory", check, name, **options)
 
 
 @pytest.fixture
