@@ -66,11 +66,24 @@ def test_mik_a_trains_with_another_memory_and_its_encoder_is_used_and_named(memo
     assert finetune(smoke_finetune(made / "encoder", data, tmp_path / "finetuned", **brief)).finished
 
 
+@pytest.mark.parametrize("history", ["transformer", "lru"])
+def test_a_memory_goes_through_every_stage(data, own_cache, tmp_path, history):
+    made = pretrain(smoke_pretrain(data, tmp_path / "pretrained", method="mik+a", history=history, steps=1)).path
+    brief = {"updates": 1, "batch_size": 4, "eval_length": 2, "random_histories": 0.5, "precision": "bf16"}
+    assert finetune(smoke_finetune(made / "encoder", data, tmp_path / "finetuned", **brief)).finished
+
+
 class Averaged(GRU):
     """Sees the whole window."""
 
     def forward(self, rows, state):
         return super().forward(rows - rows.mean(1, keepdim=True), state)
+
+
+class Short(GRU):
+    """Sees more than it says."""
+
+    reach = 2
 
 
 class Forgetful(GRU):
@@ -110,6 +123,7 @@ class Hidden(GRU):
             a_state_depends_on_its_past_alone,
             r"row 0 of window 1 has gradients to \(window, row\) \[\(1, 0\), ",
         ),
+        (Short, a_state_depends_on_its_past_alone, "only rows 1 to 2 of window 1 may have one"),
         (Forgetful, streaming_equals_batch, "they differ at row 1"),
         (Wide, outputs_have_one_shape, r"\(3, 6, 14\)"),
         (Unused, gradients_reach_all_parameters, "none reaches unused.bias, unused.weight"),
