@@ -464,16 +464,16 @@ def unlike(runs: list[Run]) -> list[str]:
     played = [run for run in runs if run.stage == "finetune" and run.rows]
     own = {name for name, mine in groups(played, lambda run: run.set_name).items() if a_set_a_seed(mine)}
     for run in played:
-        content = "" if run.set_name in own else run.record.get("inputs", {}).get("data", "")[:12]
+        content = "" if run.set_name in own else str(run.record.get("inputs", {}).get("data", ""))[:12]
         states = {f"the set of {run.set_name} has {{}} contents": content}
         states |= {f"{part} has {{}} states of its code": code for part, code in _code(run).items()}
         for subject, state in states.items():
             if state:
                 told.setdefault(subject, {}).setdefault(state, set()).add(label(run.named))
     sentences = []
-    for subject, states in told.items():
-        words = "; ".join(f"{state} ({', '.join(sorted(methods))})" for state, methods in states.items())
-        sentences += [f"{subject.format(len(states))}: {words}"] if len(states) > 1 else []
+    for subject, known in told.items():
+        words = "; ".join(f"{state} ({', '.join(sorted(methods))})" for state, methods in known.items())
+        sentences += [f"{subject.format(len(known))}: {words}"] if len(known) > 1 else []
     return sentences
 
 

@@ -138,13 +138,13 @@ def mean_interval(scores: np.ndarray) -> Interval | None:
         how far the next seed's would be.
     """
     found = _estimate(scores.mean(), [scores.mean(1)], [scores.mean(0)])
-    return found and found.interval
+    return found.interval if found else None
 
 
 def difference_interval(scores: np.ndarray, others: np.ndarray) -> Interval | None:
     """The same of the mean of (n, episodes) scores less that of (m, episodes) others."""
     found = difference(scores, others)
-    return found and found.interval
+    return found.interval if found else None
 
 
 def difference(scores: np.ndarray, others: np.ndarray) -> Estimate | None:
