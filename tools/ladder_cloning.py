@@ -12,19 +12,19 @@ import csv
 import sys
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from functools import cache, partial
 from pathlib import Path
 
+import numpy as np
+import torch
 from script import run_script
 
 from finetune.features import FrozenEncoder
-from finetune.path import EPISODES, DataPath
 from vd4rl_pomdp.core.reading import read_bytes, read_tensors, safetensors_metadata
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.data.collect import CollectConfig, collect
 from vd4rl_pomdp.data.folder import PROVENANCE
-from vd4rl_pomdp.nn.encoder_folder import load_encoder
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.files import Row, read_json, write_csv
@@ -33,6 +33,8 @@ RESULTS = Path(__file__).parents[1] / "results" / "ladder"
 COLUMNS = ("run", "step", "trained_on", "held_out")
 SEED = 10_000
 """Collection seed of the held-out episodes: no training set has it."""
+EPISODES = 20
+"""Held-out episodes, and episodes of a run's own set beside them, evenly spaced."""
 
 
 @dataclass(frozen=True)
@@ -77,27 +79,47 @@ def held_out(run: Path, folder: Path) -> Path:
     return place
 
 
+@torch.no_grad()
 def cloning_losses(run: Path, policies: Mapping[int, Path], data: Path | None) -> list[float]:
-    """Losses of a run's policies under its corruption, drawn as in its first view, without random shifts.
+    """Mean squared differences of the actions of a run's policies from a set's, over decisions and dimensions.
+
+    The set is seen under the run's corruption, in a draw that it did not learn from, and unshifted, as it is played.
 
     Args:
         run: its folder, with the encoder.
         policies: files by update.
-        data: a set; None: the run's own, of which as many episodes are taken.
+        data: the set; None: the run's own.
     """
     config = _record(run)["config"]
-    encoder, card = load_encoder(run / "encoder")
-    dataset, seed = open_dataset(data or config["data"]), config.get("view_seed")
-    seed = config["seed"] if seed is None else seed
-    frozen = FrozenEncoder(encoder, dataset, CorruptionConfig.fill(card.corruption), 0, config["precision"], seed)
-    path = DataPath(dataset, None, cache(partial(frozen.episode, view=frozen.view(0))))
-    shape = read_json(run / "policy" / CONFIG_FILE)
-    losses = []
-    for file in policies.values():
-        policy = Policy(**shape)
-        policy.load_state_dict(read_tensors(file))
-        losses.append(path.cloning_loss(policy.eval()))
-    return losses
+    encoder, corruption = _encoder(run / "encoder")
+    dataset = open_dataset(data or config["data"])
+    frozen = FrozenEncoder(encoder, dataset, corruption, 0, config["precision"], config["seed"])
+    loaded = [_policy(run, file) for file in policies.values()]
+    squares: list[list[np.ndarray]] = [[] for _ in loaded]
+    view = frozen.view(config["views"])
+    for number in np.unique(np.linspace(0, dataset.num_episodes - 1, EPISODES).astype(int)).tolist():
+        states, actions = frozen.episode(number, view)[:-1], dataset.action[dataset.rows_of(number)][1:]
+        for policy, found in zip(loaded, squares, strict=True):
+            found.append((policy(states) - actions).square().mean(1).numpy())
+    return [float(np.concatenate(found).mean()) for found in squares]
+
+
+def _encoder(folder: Path) -> tuple[Encoder, CorruptionConfig]:
+    """An encoder, and what hid its pixels, from a folder that may be older than a memory's own options."""
+    record = read_json(folder / CONFIG_FILE)
+    told = record["encoder"]
+    if "gru_layers" in told:
+        layers = told.pop("gru_layers")
+        told["memory_options"] = {"gru_layers": layers} if told["history"] == "gru" else {}
+    encoder = Encoder(EncoderConfig(**told))
+    encoder.load_state_dict(read_tensors(folder / "model.safetensors"))
+    return encoder.eval(), CorruptionConfig.fill(record["pretrain"]["corruption"])
+
+
+def _policy(run: Path, file: Path) -> Policy:
+    policy = Policy(**read_json(run / "policy" / CONFIG_FILE))
+    policy.load_state_dict(read_tensors(file))
+    return policy.eval()
 
 
 def _record(run: Path) -> Row:
