@@ -60,6 +60,8 @@ class FinetuneConfig(StageConfig):
     """Episodes of an evaluation."""
     eval_clean: bool = True
     """Play the last evaluation under no corruption, too, which takes as long again; it changes nothing else."""
+    eval_clean_episodes: int = 0
+    """Episodes of the last evaluation under no corruption; 0: as many as under the corruption."""
     eval_length: int = 500
     """Most decisions in an evaluation episode, which never has more than the task's; fewer only for trials. The default
     is all of them, of a task that has more, too."""
@@ -117,7 +119,7 @@ class FinetuneConfig(StageConfig):
         refuse_outside(
             self, seed=(0, MAX_SEED), updates=1, batch_size=1, hidden_dim=1, learning_rate=0, views=0,
             view_seed=(0, MAX_SEED), shift=(0, FRAME_SIZES[1] - 1), eval_every=1, eval_episodes=(1, MOST_EPISODES),
-            eval_length=1, log_every=1, checkpoint_every=1, workers=0,
+            eval_clean_episodes=(0, MOST_EPISODES), eval_length=1, log_every=1, checkpoint_every=1, workers=0,
         )  # fmt: skip
 
 

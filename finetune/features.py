@@ -5,7 +5,6 @@ With `--views 0` every batch is encoded anew instead.
 
 from __future__ import annotations
 
-import hashlib
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -114,12 +113,9 @@ class FrozenEncoder:
                 first, longest = number, length
         yield range(first, len(lengths))
 
-    def name(self) -> str:
-        """What decides what every view of the set looks like to the encoder: equal for equal features."""
-        weights = hashlib.blake2b()
-        for value in self.encoder.state_dict().values():
-            weights.update(value.cpu().reshape(-1).view(torch.uint8).numpy())
-        network = [weights.hexdigest(), asdict(self.encoder.config), self.precision]
+    def name(self, encoder: str) -> str:
+        """What decides what every view of the set looks like to the encoder of this name: equal for equal features."""
+        network = [encoder, asdict(self.encoder.config), self.precision]
         drawn = [self.dataset.fingerprint, flat(self._corruption), self._shift, self._seed]
         return content_hash([network, drawn, str(self.device), self.chunk, self.group])
 
@@ -128,7 +124,7 @@ _ENCODED: WeakValueDictionary[tuple[str, str, int], Tensor] = WeakValueDictionar
 """Features that a training of this process still uses, by all that decides them."""
 
 
-def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: Path) -> Tensor:
+def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: Path, encoder: str) -> Tensor:
     """Encode the whole set under `views` draws, unless a training of this process did, or this run before.
 
     Args:
@@ -136,13 +132,14 @@ def encode_views(frozen: FrozenEncoder, histories: Histories, views: int, kept: 
         histories: which features there are.
         views: how many draws of corruption and shift.
         kept: file that keeps the features for the run's resumption; the run refuses another set or encoder itself.
+        encoder: the encoder's name, which tells its weights from all others (`encoder_hash`).
 
     Returns:
         (views, features, D) on the data set's device, float16 of pixels and float32 of simulator states, which may
         hardly differ and are then scaled up; numbered as `Histories` says. Not to be written to: trainings on the same
         features share them.
     """
-    key = frozen.name(), histories.name(), views
+    key = frozen.name(encoder), histories.name(), views
     if (features := _ENCODED.get(key)) is None:
         if kept.exists():
             with disk_errors(kept):

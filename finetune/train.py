@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import sys
+from collections import Counter
 from collections.abc import Callable, Sequence
 from contextlib import AbstractContextManager, ExitStack
 from dataclasses import asdict, replace
@@ -49,20 +50,23 @@ from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.nn.probes import probe_state
 from vd4rl_pomdp.policies.actor import read_actor
 from vd4rl_pomdp.runs import (
+    CRITIC_FILE,
     EPISODES_FILE,
     FILM_FILE,
     LABELS_FILE,
+    METRICS_FILE,
     PRETRAIN_TIMING_FILE,
     PROBE_FILE,
     RENDER_FILE,
     TIMING_FILE,
     interrupt,
 )
+from vd4rl_pomdp.runs.critic import critic_of
 from vd4rl_pomdp.runs.device import pick_device, set_products
 from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, read_episodes
 from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_json
 from vd4rl_pomdp.runs.loop import Loop, in_step, save, training
-from vd4rl_pomdp.runs.metrics import EVALUATION
+from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
 from vd4rl_pomdp.runs.outputs import refuse_inside
 from vd4rl_pomdp.runs.replay import Replay
 from vd4rl_pomdp.runs.run import RunFolder
@@ -199,7 +203,7 @@ def _trainer(
         sampler = TransitionSampler(view, config.batch_size, draws, returns.n_step, returns.gamma)
     elif config.views:
         histories = Histories(dataset, config.memory, returns.n_step, config.seed_of_views)
-        features = encode_views(frozen, histories, config.views, run.path / FEATURES_FILE)
+        features = encode_views(frozen, histories, config.views, run.path / FEATURES_FILE, run.inputs["encoder"])
         policy.standardise.fit(features)
         _probe(features, dataset, run)
         encode = partial(_cached, features, dataset)
@@ -285,6 +289,9 @@ class FinetuneTrainer:
             self.reference.with_path_error(error).write(path)
         (path / FEATURES_FILE).unlink(missing_ok=True)
         write_json(path / RENDER_FILE, render_info(self.card.task))
+        gamma = getattr(self.config.options, "gamma", None)
+        critic = critic_of(read_metrics(path / METRICS_FILE), self.step, self.reference.mean_reward, gamma)
+        write_json(path / CRITIC_FILE, critic)
         self.folder.finish(updates=self.step)
 
     def evaluate(self) -> None:
@@ -295,9 +302,11 @@ class FinetuneTrainer:
         Raises:
             FloatingPointError: a weight is not finite.
         """
-        run, loop = self.folder, self.loop
+        run, loop, config = self.folder, self.loop, self.config
         own = CorruptionConfig.fill(self.card.corruption)
-        under = own_and_none(own) if self.config.eval_clean and self.step == self.config.updates else [own]
+        counts = config.eval_episodes, config.eval_clean_episodes or config.eval_episodes
+        clean = config.eval_clean and self.step == config.updates
+        under = list(zip(own_and_none(own) if clean else [own], counts, strict=False))
         with interrupt.deferred(False):
             loop.require_finite(self.algorithm.policy)
             self.algorithm.policy.save(run.path / "policy", self.step)
@@ -305,7 +314,8 @@ class FinetuneTrainer:
                 loop.require_finite(self.algorithm.encoder)
                 save_encoder(run.path / "encoder", self.algorithm.encoder, self.card)
             rows = [row for row in read_episodes(run.path / EPISODES_FILE) if row["step"] == self.step]
-            if len(rows) < len(under) * self.config.eval_episodes:
+            played = Counter(row["evaluated_under"] for row in rows)
+            if any(played[one.corruption] < episodes for one, episodes in under):
                 rows = self._play(run, under)
         scores = {
             f"{EVALUATION}{measure}/{name}": float(np.mean([r[measure] for r in rows if r["evaluated_under"] == name]))
@@ -315,13 +325,16 @@ class FinetuneTrainer:
         loop.log_evaluation(scores)
         loop.show(score=scores[f"{EVALUATION}score/{own.corruption}"])
 
-    def _play(self, run: RunFolder, under: list[CorruptionConfig]) -> list[Row]:
-        """Keep a film of the first episode, then append the rows of all; they are the result."""
+    def _play(self, run: RunFolder, under: list[tuple[CorruptionConfig, int]]) -> list[Row]:
+        """Play so many episodes under each, keep a film of the first, then append the rows of all: the result."""
         config, task = self.config, TASKS.named(self.card.task)
         drop_episodes_after(run.path / EPISODES_FILE, self.step - 1)
-        episodes = evaluate(
-            jobs_of(run.path, task, under, config.eval_episodes, config.eval_length, film=True), config.workers
-        )
+        jobs = [
+            job
+            for number, (one, count) in enumerate(under)
+            for job in jobs_of(run.path, task, [one], count, config.eval_length, film=not number)
+        ]
+        episodes = evaluate(jobs, config.workers)
         rows = episode_rows(episodes, labels_of(config, self.card) | {"step": self.step})
         if episodes[0].film is not None:
             with replacing_file(run.path / FILM_FILE) as fresh, fresh.open("wb") as file:

@@ -79,6 +79,8 @@ def write_seeds(
     scores: dict[tuple[str, str], tuple[float, ...]],
     data_return: float | None,
     algorithm: str = "td3_bc",
+    moved: float | None = 0.01,
+    of_set: dict[str, str] | None = None,
     **settings: Any,
 ) -> Path:
     """Runs that end with the given scores, by method and corruption a seed each, beside data of a mean return.
@@ -88,20 +90,24 @@ def write_seeds(
         scores: by method and corruption.
         data_return: of the data that they learned from.
         algorithm: that fine-tuned them.
+        moved: share of its value by which each critic moved at the end; None: runs that did not record it.
+        of_set: task and quality, if it is not the expert walker's.
         settings: of their encoders.
     """
     for (method, corruption), seeds in scores.items():
         for seed, score in enumerate(seeds):
             place = folder / "-".join(map(str, (method, corruption, seed, algorithm, *settings.values())))
-            labels = {"corruption": corruption, "algorithm": algorithm}
+            labels = {"corruption": corruption, "algorithm": algorithm} | (of_set or {})
             run = write_run(place, method, seed, {5: [99.0], 10: [score]}, labels=labels)
             Reference(data_return).write(describe(run, {"history": "method"} | settings, seed=seed))
+            if moved is not None:
+                write_json(run / "critic.json", {"value": 150.0, "moved": moved, "data": 160.0})
     return folder
 
 
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports draw no figures, which takes most of their time."""
-    sections = ("scores", "profiles", "curves", "probes", "errors", "costs", "losses")
+    sections = ("scores", "lead", "profiles", "curves", "probes", "errors", "costs", "losses")
     monkeypatch.setattr(page, "_plots", lambda runs, made: {name: [] for name in sections})
 
 

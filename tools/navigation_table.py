@@ -10,7 +10,7 @@ import numpy as np
 
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 from vd4rl_pomdp.report.stats import mean_and_error
-from vd4rl_pomdp.runs.results import read_results
+from vd4rl_pomdp.runs.results import RUNS, read_results
 from vd4rl_pomdp.studies.navigation.claims import Numbers
 from vd4rl_pomdp.studies.navigation.measures import (
     OBJECTIVES,
@@ -46,6 +46,10 @@ a percentage is a mean over both coordinates, so the raw error lies between its 
 STARS, COMPASS = "first_person", "compass_first_person"
 PICTURES = {"rgb50": "colour, 50x50", "rgb100": "colour, 100x100"}
 """Pictures other than the preset's, as the pages call them."""
+TRAINING_LOSS = Measure("action_loss", "training", "")
+"""As the paper's tables have it."""
+LONGER = "budget"
+"""The folder of runs of 20,000 steps."""
 _ORDER = ("mik+a", "fj+a", "ah", "mik", "fj", "ah+a", "no_history")
 
 
@@ -55,8 +59,9 @@ def main_runs() -> list[NavigationRun]:
 
 
 def numbers_in(folder: str = ".") -> Numbers:
-    """Numbers of the runs of results/navigation, or of a folder within it."""
-    return numbers_of(frame_of(load_runs(read_results(RESULTS / folder))))
+    """Numbers of the runs of results/navigation, or of a folder within it; none where no run was kept yet."""
+    place = RESULTS / folder
+    return numbers_of(frame_of(load_runs(read_results(place)))) if (place / RUNS).exists() else {}
 
 
 def values(numbers: Numbers, condition: Condition, measure: Measure) -> list[float]:
@@ -119,6 +124,18 @@ def texture_lines(numbers: Numbers) -> Iterator[str]:
     for maze in _measured(numbers):
         if with_them := list(_state_lines(numbers, "textures", Condition(maze, "", exogenous=True))):
             yield from (*with_them, *_state_lines(numbers, "without", Condition(maze, "")))
+
+
+def budget_lines(usual: Numbers, longer: Numbers) -> Iterator[str]:
+    """State errors and action losses under three curtains after 2,500 and after 20,000 steps."""
+    told = [(words, steps) for words in ("state error", "action loss") for steps in ("2,500", "20,000")]
+    yield from _head(["seeds", *(f"{words}, {steps} steps" for words, steps in told)])
+    for method, k in (("ah+a", 15), ("ah+a", 1), ("mik+a", 15), ("mik+a", 1), ("ah", 15)):
+        condition = Condition("three_curtains", method, k)
+        seeds = ", ".join(str(len(values(numbers, condition, MEASURES[0]))) for numbers in (usual, longer))
+        measures = (MEASURES[0], TRAINING_LOSS)
+        cells = " | ".join(_cell(numbers, condition, one) for one in measures for numbers in (usual, longer))
+        yield f"| `{method}`, K = {k} | {seeds} | {cells} |"
 
 
 def _state_lines(numbers: Numbers, words: str, cell: Condition) -> Iterator[str]:

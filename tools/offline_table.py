@@ -166,16 +166,16 @@ def table_name(task: str, quality: str, corruption: str) -> str:
 def gate_lines(runs: Sequence[Run]) -> Iterator[str]:
     """What has to hold on a set before methods are ranked on it."""
     yield (
-        "| set | data's return | `state`, of it | `acro` with nothing hidden, of it | best of it | best less `random` |"
-        " passed |"
+        "| set | data's return | `state`, of it | `acro` with nothing hidden, of it | its bar (published score) |"
+        " best of it | best less `random` | passed |"
     )
-    yield "|---|---:|---:|---:|---:|---:|---|"
+    yield "|---|---:|---:|---:|---:|---:|---:|---|"
     for row in _judged(runs):
         shares = [
             number(row[f"{name}_share"], 2) + f" (n = {row[f'{name}_seeds']})" * (row[f"{name}_seeds"] < 3)
             for name in ("state", "acro")
         ]
-        shares.append(number(row["best_share"], 2))
+        shares += [f"{number(row['acro_bar'], 2)} ({row['bar_from']})", number(row["best_share"], 2)]
         above = with_interval(row["above_random"], row["low"], row["high"], 0)
         yield f"| {row['name']} | {row['data_return']:.0f} | {' | '.join(shares)} | {above} | {row['passed']} |"
 

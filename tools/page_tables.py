@@ -50,6 +50,7 @@ def pages() -> dict[str, Tables]:
             "mazes": navigation_table.state_lines(mazes, (15, 1)),
             "three_curtains": navigation_table.maze_lines(mazes, "three_curtains"),
             "textures": navigation_table.texture_lines(mazes),
+            "budget": navigation_table.budget_lines(mazes, navigation_table.numbers_in(navigation_table.LONGER)),
         },
         "results/navigation/longer/README.md": {"hard": navigation_table.hard_lines(mazes)},
         "results/navigation/first_person/README.md": {

@@ -84,7 +84,8 @@ def test_policies_are_measured_stacked_and_against_jax(tmp_path, monkeypatch):
     monkeypatch.setattr(measures, "Worker", Jax)
     monkeypatch.setattr(measures.importlib.util, "find_spec", lambda _: True)
     told = measures.against_jax(dataset, 1, (16,))
-    assert told["units_16_jax_over_ours"] == pytest.approx(1 / told["units_16_ms"])
+    for ours in ("units_16_fp32", "units_16_bf16"):
+        assert told[f"{ours}_jax_over_ours"] == pytest.approx(1 / told[f"{ours}_ms"])
     monkeypatch.setattr(measures.importlib.util, "find_spec", lambda _: None)
     assert "pip install" in measures.against_jax(dataset, 1)["jax"]
 

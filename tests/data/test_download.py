@@ -8,6 +8,7 @@ import pytest
 
 from tests.helpers_data import write_fake_set
 from tests.helpers_hub import Hub, Repo
+from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.data import download as module
 from vd4rl_pomdp.data import folder as listed
@@ -63,6 +64,13 @@ def test_the_manifest_lists_the_published_sets():
     assert len({file.sha256 for file in listed}) == 62
     assert sum({file.sha256: file.size for file in listed}.values()) == pytest.approx(10.5e9, rel=0.01)
     assert len({tuple(file.path.split("/")[2:4]) for file in listed}) == 15
+
+
+def test_one_command_fetches_several_sets(mirror, tmp_path, capsys):
+    words = ["--task", "walker_walk", "--quality", "medium_expert", "expert", "--endpoint", mirror.endpoint]
+    main(["data", "download", *words, "--out", str(tmp_path)])
+    assert all((tmp_path / path).read_bytes() == content for path, content in FILES.items())
+    assert capsys.readouterr().out.count("check them with") == 2
 
 
 def test_a_set_arrives_whole_and_nothing_is_fetched_or_stored_twice(mirror, tmp_path):

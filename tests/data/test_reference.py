@@ -46,6 +46,12 @@ def test_a_sets_actor_is_known_if_it_is_one_and_ships(tmp_path, shards, known):
     assert (reference.actor_file is None) == (known is None)
     assert reference.data_return == pytest.approx(np.mean(dataset.returns.tolist()), abs=1e-4)
     assert reference.path_error is None
+    assert reference.mean_reward == pytest.approx(float(dataset.reward[dataset.t > 0].mean()), abs=1e-5)
+
+
+def test_a_reference_of_an_earlier_run_does_not_tell_its_rewards(tmp_path):
+    (tmp_path / REFERENCE_FILE).write_text('{"data_return": 2.0, "actor": null, "path_error": null}')
+    assert Reference.read(tmp_path) == Reference(2.0)
 
 
 def test_a_reference_is_kept_in_the_run_and_an_actor_that_ships_no_more_is_unknown(tmp_path):

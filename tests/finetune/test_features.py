@@ -62,7 +62,7 @@ def frozen(
 
 def views_of(tmp_path, corruption: str, mode: str, shift: int) -> torch.Tensor:
     made = frozen(noise_set(tmp_path / "set"), CorruptionConfig.of(corruption, mode), shift)
-    return encode_views(made, Histories(made.dataset, NO_OPTIONS, N, 0), 2, tmp_path / "features.npy")
+    return encode_views(made, Histories(made.dataset, NO_OPTIONS, N, 0), 2, tmp_path / "features.npy", "name")
 
 
 @pytest.mark.parametrize(
@@ -121,7 +121,7 @@ def test_episodes_that_are_encoded_together_are_as_one_by_one(tmp_path, memory, 
             made.chunk, made.group = chunk, group
         assert max(map(len, made.groups())) == (1 if not together else 2 if group == 10 else 5)
         histories = Histories(dataset, NO_OPTIONS if memory == "none" else OPTIONS, N, 0)
-        found.append(encode_views(made, histories, 2, tmp_path / str(together)))
+        found.append(encode_views(made, histories, 2, tmp_path / str(together), "name"))
     torch.testing.assert_close(found[1], found[0], atol=2e-3, rtol=0)
     assert found[0].float().std(1).mean() > 2e-2, "rows differ"
 
@@ -130,10 +130,11 @@ def test_a_process_encodes_once_for_all_trainings_that_see_the_same(tmp_path):
     dataset, patch = noise_set(tmp_path / "set"), CorruptionConfig.of("patch")
     whole, random = (Histories(dataset, options, N, 0) for options in (NO_OPTIONS, OPTIONS))
     kept = iter(tmp_path / f"{number}.npy" for number in range(99))
-    first = encode_views(frozen(dataset, patch, 4), whole, 2, next(kept))
-    assert encode_views(frozen(dataset, patch, 4), whole, 2, tmp_path / "no.npy") is first
+    first = encode_views(frozen(dataset, patch, 4), whole, 2, next(kept), "name")
+    assert encode_views(frozen(dataset, patch, 4), whole, 2, tmp_path / "no.npy", "name") is first
     assert not (tmp_path / "no.npy").exists(), "one file is enough to resume from"
-    assert encode_views(frozen(dataset, patch, 4), Histories(dataset, NO_OPTIONS, 3, 1), 2, tmp_path / "no") is first
+    unread = Histories(dataset, NO_OPTIONS, 3, 1)
+    assert encode_views(frozen(dataset, patch, 4), unread, 2, tmp_path / "no", "name") is first
     others = [
         (frozen(dataset, patch, 4, seed=1), whole, 2),
         (frozen(dataset, patch, 3), whole, 2),
@@ -145,11 +146,11 @@ def test_a_process_encodes_once_for_all_trainings_that_see_the_same(tmp_path):
         (frozen(dataset, patch, 4), Histories(dataset, OPTIONS, N, 1), 2),
         (frozen(dataset, patch, 4), Histories(dataset, OPTIONS, 1, 0), 2),
     ]
-    own = [encode_views(*other, next(kept)) for other in others]
+    own = [encode_views(*other, next(kept), "name") for other in others]
     assert len({id(features) for features in [first, *own]}) == len(others) + 1
     moved = frozen(dataset, patch, 4)
     moved.encoder.gru.weight_ih_l0.data += 1
-    assert not torch.equal(encode_views(moved, whole, 2, next(kept)), first)
+    assert not torch.equal(encode_views(moved, whole, 2, next(kept), "moved"), first)
 
 
 @pytest.mark.gpu
@@ -161,7 +162,7 @@ def test_a_gpu_encodes_what_a_cpu_does(tmp_path, memory):
     for device in ("cpu", "cuda"):
         dataset = open_dataset(tmp_path / "set").to(device)
         made = frozen(dataset, CorruptionConfig.of("patch+zero_frames"), 4, **MEMORIES[memory])
-        found[device] = encode_views(made, Histories(dataset, options, N, 0), 2, tmp_path / f"{device}.npy")
+        found[device] = encode_views(made, Histories(dataset, options, N, 0), 2, tmp_path / f"{device}.npy", "name")
         assert found[device].device.type == device
         assert np.array_equal(np.load(tmp_path / f"{device}.npy"), found[device].cpu().numpy())
     torch.testing.assert_close(found["cuda"].cpu(), found["cpu"], atol=1e-2, rtol=0)  # TF32

@@ -45,7 +45,7 @@ def ends_of(frozen: FrozenEncoder, first: int, row: int, last: int) -> tuple[tor
 def test_both_ends_of_every_transition_share_a_history_of_the_drawn_rows(frozen, tmp_path, share, shortest, longest):
     options = HistoryOptions(random_histories=share, shortest_history=shortest, longest_history=longest)
     histories = Histories(frozen.dataset, options, N, 0)
-    features = encode_views(frozen, histories, 2, tmp_path / "features.npy").float()
+    features = encode_views(frozen, histories, 2, tmp_path / "features.npy", "name").float()
     rows = histories.rows.tolist()
     assert histories.random == round(share * len(rows))
     for view in range(2):
@@ -70,7 +70,7 @@ def test_views_draw_their_random_histories_apart_and_the_same_again(frozen):
 
 def test_batches_are_of_the_drawn_histories(frozen, tmp_path):
     histories = Histories(frozen.dataset, HistoryOptions(random_histories=1.0, longest_history=2), N, 0)
-    features = encode_views(frozen, histories, 1, tmp_path / "features.npy")
+    features = encode_views(frozen, histories, 1, tmp_path / "features.npy", "name")
     sampler = FeatureSampler(histories, features, 64, N, 0.99, RandomStream(torch.Generator().manual_seed(0)))
     batch, known = sampler.sample(), features[0].float()
     first, last = histories.of_view(0).numbers()

@@ -50,6 +50,9 @@ def same_but_for_rounding(one: Path, other: Path) -> None:
     for name in ("labels.json", "reference.json", "probe.json", "render.json"):
         if (one / name).exists() and name != "reference.json":
             assert (one / name).read_bytes() == (other / name).read_bytes()
+    critics = [read_json(run / "critic.json") for run in (one, other)]
+    assert [told.pop("moved", None) for told in critics] == [None, None], "too few rows"
+    assert critics[0] == pytest.approx(critics[1], rel=1e-3, abs=1e-4)
     rows = [list(csv.DictReader((run / "episodes.csv").open())) for run in (one, other)]
     for row, theirs in zip(*rows, strict=True):
         for number in ("return", "score"):

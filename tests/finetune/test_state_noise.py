@@ -193,5 +193,5 @@ def test_states_are_kept_in_full_precision(with_states, plain, tmp_path):
     dataset = open_dataset(with_states)
     dataset.physics[:, 3] = 1.3
     histories = Histories(dataset, NO_OPTIONS, 1, 0)
-    features = encode_views(frozen(plain, dataset), histories, 1, tmp_path / "features.npy")
+    features = encode_views(frozen(plain, dataset), histories, 1, tmp_path / "features.npy", "plain")
     assert torch.equal(features[0], dataset.states())

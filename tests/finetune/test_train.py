@@ -23,6 +23,7 @@ from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.data import open_dataset
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.runs.metrics import read_metrics
+from vd4rl_pomdp.runs.results import find_results
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 CORRUPTION = "patch+zero_frames"
@@ -104,6 +105,8 @@ def test_an_encoder_that_is_trained_along_or_reads_states_resumes_to_the_bit(
     assert (trained != (made / "model.safetensors").read_bytes()) == along
     rows = list(csv.DictReader((whole / "episodes.csv").open()))
     assert {row["algorithm"] for row in rows} == {"drqv2_bc" if along else "td3_bc"}
+    critic = json.loads((whole / "critic.json").read_text())
+    assert (critic["value"] != 0, critic["moved"]) == (True, None), "two rows of metrics tell of no movement"
 
 
 def test_the_state_reference_reads_pose_and_velocity_and_needs_a_set_that_has_them(with_states, data, tmp_path):
@@ -210,6 +213,24 @@ def test_scores_are_rows_of_metrics_by_what_was_evaluated_under(encoder, data, t
     assert "eval/score/none" not in rows[0]
 
 
+@pytest.mark.parametrize("algorithm", ["td3_bc", "drqv2_bc", "iql", "bc"])
+def test_a_run_ends_with_what_its_critic_came_to(encoder, data, tmp_path, algorithm):
+    """Of the rows of its metrics; resumed runs and stacks are held against whole and single ones elsewhere."""
+    changes = {"updates": 15, "log_every": 1, "batch_size": 4, "eval_length": 2, "eval_every": 15, "eval_clean": False}
+    changes |= {} if algorithm == "bc" else {"gamma": 0.9, "n_step": 2}
+    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "run", algorithm=algorithm, **changes))
+    told = json.loads((run.path / "critic.json").read_text())
+    if algorithm == "bc":
+        assert told == {}
+        return
+    q = [row["q"] for row in read_metrics(run.path / "metrics.jsonl") if row["step"] > 12 and "q" in row]
+    assert told["value"] == pytest.approx(np.mean(q), abs=1e-4)
+    assert told["moved"] == pytest.approx((q[2] - q[0]) / 2 * 3 / np.mean(q), rel=1e-3)
+    dataset = open_dataset(data)
+    earned = dataset.reward[dataset.t > 0].double().mean()
+    assert told["data"] == pytest.approx(float(earned) / (1 - 0.9), abs=1e-3)
+
+
 def test_a_run_cut_behind_an_evaluation_has_the_metrics_of_a_whole_one(encoder, data, tmp_path, monkeypatch):
     """A cut before is in `test_interruptions.py`."""
     changes = {"updates": 4, "eval_every": 2, "checkpoint_every": 2, "batch_size": 4, "eval_length": 2, "log_every": 1}
@@ -226,6 +247,23 @@ def test_a_run_cut_behind_an_evaluation_has_the_metrics_of_a_whole_one(encoder, 
             run_finetune(cut)
     run_finetune(cut)
     assert contents(cut.out) == contents(whole.path)
+
+
+def test_the_clean_evaluation_may_have_another_number_of_episodes_and_is_made_up_for(encoder, data, tmp_path):
+    """The same rows, whatever else is played; a run that was cut within its last evaluation plays it again."""
+    few = {"updates": 4, "eval_every": 2, "batch_size": 4, "eval_length": 2, "eval_episodes": 3}
+    run = run_finetune(smoke_finetune(encoder, data, tmp_path / "out", **few, eval_clean_episodes=2)).path
+    rows = [(row["step"], row["evaluated_under"]) for row in csv.DictReader((run / "episodes.csv").open())]
+    assert rows == [("2", CORRUPTION)] * 3 + [("4", CORRUPTION)] * 3 + [("4", "none")] * 2
+    whole = run_finetune(smoke_finetune(encoder, data, tmp_path / "whole", **few)).path
+    lines = (whole / "episodes.csv").read_text().splitlines()
+    assert (run / "episodes.csv").read_text().splitlines() == lines[:-1]
+    before = contents(run)
+    (run / "episodes.csv").write_text("\n".join(lines[:-2]) + "\n")  # a clean episode is missing
+    (run / "timing.json").unlink()
+    run_finetune(smoke_finetune(encoder, data, run, **few, eval_clean_episodes=2))
+    assert contents(run) == before
+    assert find_results([run])[0].id == find_results([whole])[0].id
 
 
 def test_the_clean_evaluation_can_be_left_out(encoder, data, tmp_path):

@@ -8,6 +8,7 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.report.gaps import find_gaps
 from vd4rl_pomdp.report.load import Choice, episodes_frame, load_runs, runs_frame
+from vd4rl_pomdp.report.page import unlike
 from vd4rl_pomdp.runs.files import read_json, write_json
 
 
@@ -197,6 +198,46 @@ def test_a_preset_stands_for_what_it_decides(tmp_path):
         describe(run, {"max_k": k, "preset": preset, "steps": len(preset)}, preset=preset)
     labels = {"acro, preset cpu, max_k 15", "acro, preset cpu, max_k 1", "acro, preset smoke, max_k 3"}
     assert set(pooled(tmp_path / "runs")) == labels
+
+
+def on_set(folder, method, seed, content, collected, updates=10, **collection):
+    """A run on a set of some content, whose collection had a seed of its own."""
+    run = write_run(folder / f"{method}-{seed}-{content}-{updates}", method, seed, {10: [1.0]})
+    describe(run, {"data": content}, data=content, seed=seed, updates=updates)
+    told = {"task": "walker_walk", "episodes": 100, "seed": collected} | collection
+    write_json(run / "config.json", read_json(run / "config.json") | {"collection": told})
+
+
+def test_a_set_a_seed_makes_seeds_of_one_method(tmp_path):
+    for method, seeds in (("acro", 3), ("mik+a", 2)):
+        for seed in range(seeds):
+            on_set(tmp_path / "runs", method, seed, f"{seed}" * 24, 100 + seed, rendered_by={"canary": "c", "gl": seed})
+    runs = load_runs([tmp_path / "runs"])
+    assert pooled(tmp_path / "runs") == {"acro": 3, "mik+a": 2}
+    assert unlike(runs) == []
+    for seed in range(3):
+        on_set(tmp_path / "runs", "acro", seed, "a" * 24, 0, updates=20)
+    one, own = "acro, updates 20, data aaaaaaaa", "acro, updates 10, data one a seed"
+    assert pooled(tmp_path / "runs") == {one: 3, own: 3, "mik+a": 2}, "beside one set for all seeds"
+
+
+@pytest.mark.parametrize(
+    "other",
+    [
+        {"seed": 1, "content": "0" * 24, "collected": 101},
+        {"seed": 1, "content": "1" * 24, "collected": 100},
+        {"seed": 0, "content": "1" * 24, "collected": 101},
+        {"seed": 1, "content": "1" * 24, "collected": 101, "episodes": 200},
+        {"seed": 1, "content": "1" * 24, "collected": 101, "rendered_by": {"canary": "another"}},
+    ],
+    ids=["one content", "one collection", "one seed", "collected otherwise", "drawn otherwise"],
+)
+def test_other_contents_of_a_set_stay_variants(tmp_path, other):
+    on_set(tmp_path, "acro", 0, "0" * 24, 100)
+    on_set(tmp_path, "acro", 2, "2" * 24, 102)
+    on_set(tmp_path, "acro", **other)
+    words = {f"acro, data {content * 8}" for content in ("0", "2", other["content"][0])}
+    assert set(pooled(tmp_path)) == words
 
 
 def on_encoder(folder, seed, encoder, quality="expert"):

@@ -139,6 +139,45 @@ def test_an_interval_of_means_of_single_episodes_is_students_and_welchs():
     assert stats.difference_interval(one[:, None], other[:, None]) == pytest.approx(tuple(welch))
 
 
+def test_a_difference_has_welchs_p_value_and_the_smallest_that_would_be_found():
+    rng = np.random.default_rng(0)
+    one, other = rng.normal(3, 1, 5), rng.normal(0, 5, 7)
+    found, welch = stats.difference(one[:, None], other[:, None]), scipy.stats.ttest_ind(one, other, equal_var=False)
+    assert (found.p, found.free) == pytest.approx((welch.pvalue, welch.df))
+    assert found.value / found.error == pytest.approx(welch.statistic)
+    bar = scipy.stats.t.ppf(0.975, found.free)
+    assert scipy.stats.nct.sf(bar, found.free, found.smallest / found.error) == pytest.approx(0.8, abs=0.01)
+    assert stats.difference(one[:1, None], other[:, None]) is None
+
+
+def test_a_difference_adds_the_errors_of_seeds_and_of_paired_episodes():
+    rng = np.random.default_rng(3)
+    one, other = levels(rng, 2, 1, rng.normal(0, 5, 20)) + 4, levels(rng, 1, 1)
+    parts = [(one.mean(1), 3), (other.mean(1), 3), (one.mean(0) - other.mean(0), 20)]
+    squares = [part.var(ddof=1) / n for part, n in parts]
+    free = sum(squares) ** 2 / sum(square**2 / (n - 1) for square, (_, n) in zip(squares, parts, strict=True))
+    found = stats.difference(one, other)
+    value = one.mean() - other.mean()
+    assert (found.value, found.error, found.free) == pytest.approx((value, sum(squares) ** 0.5, free))
+    assert found.p == pytest.approx(2 * scipy.stats.t.sf(abs(value) / sum(squares) ** 0.5, free))
+    assert found.smallest == pytest.approx(
+        (scipy.stats.t.ppf(0.975, free) + scipy.stats.t.ppf(0.8, free)) * found.error
+    )
+    low, high = found.interval
+    assert (low > 0) == (found.p < 0.05)
+    assert stats.difference_interval(one, other) == (low, high)
+
+
+def test_holm_adjusts_a_family():
+    assert stats.holm([0.01, 0.04, 0.03, 0.005]) == pytest.approx([0.03, 0.06, 0.06, 0.02])
+    assert stats.holm([0.6, 0.7]) == [1.0, 1.0]
+    assert stats.holm([0.2]) == [0.2]
+    assert stats.holm([]) == []
+    rng, trials = np.random.default_rng(4), 2000
+    wrong = sum(min(stats.holm(list(rng.uniform(size=4)))) < 0.05 for _ in range(trials))
+    assert wrong / trials == pytest.approx(1 - (1 - 0.05 / 4) ** 4, abs=0.015), "at most 5%, of independent ones"
+
+
 @pytest.mark.parametrize("spreads", [(1.0, 0.0, 0.0), (1.0, 4.5, 1.0), (0.0, 1.0, 0.0), (1.0, 4.5, 9.0)])
 def test_two_levels_cover_what_they_say_wherever_the_spread_comes_from(spreads):
     *own, shared = spreads

@@ -1,5 +1,6 @@
 """Tables of a handful of rows whose entries can be worked out by hand."""
 
+import re
 from typing import Any
 
 import numpy as np
@@ -7,11 +8,12 @@ import pandas as pd
 import pytest
 import scipy.stats
 
-from tests.helpers_report import write_run
+from tests.helpers_report import write_run, write_seeds
 from vd4rl_pomdp.data.reference import Reference
-from vd4rl_pomdp.report import tables
+from vd4rl_pomdp.report import tables, write_report
 from vd4rl_pomdp.report.load import CONDITION, load_runs, runs_frame
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
+from vd4rl_pomdp.runs.files import write_json
 
 SCORES = {
     # (method, task): {seed: scores of the last evaluation's two episodes}
@@ -134,6 +136,28 @@ def test_a_mean_that_a_seed_does_not_know_is_not_told(tmp_path):
     evaluated_clean(runs[0], [400.0], (0.1, 0.2))
     row = control(tmp_path)["acro"]
     assert (row["return"], np.isnan(row["clean_return"]), row["seeds"]) == (305.0, True, 2)
+
+
+def test_critics_stand_beside_the_value_of_the_datas_policy(tmp_path):
+    write_seeds(tmp_path, {("acro", "patch"): (20, 22), ("mik", "patch"): (30,)}, 600.0)
+    write_json(tmp_path / "acro-patch-1-td3_bc" / "critic.json", {"value": 170.0, "moved": -0.05, "data": 162.0})
+    write_seeds(tmp_path, {("random", "patch"): (10,)}, 600.0, moved=None)
+    write_json(write_run(tmp_path / "none", "curl", 0, {10: [1.0]}) / "critic.json", {})
+    frame = runs_frame(load_runs([tmp_path]))
+    found = tables.critics(frame).set_index("method").to_dict("index")
+    names = ("critic_value", "critic_moved", "data_value", "converged", "seeds")
+    assert [round(found["acro"][name], 4) for name in names] == [160, 0.03, 161, 1, 2]
+    assert [round(found["mik"][name], 4) for name in names] == [150, 0.01, 160, 1, 1]
+    assert np.isnan([found["random"][name] for name in names[:4]]).all(), "an early run"
+    assert "curl" not in found, "without a critic"
+    own = frame.set_index(["method", "seed"])[["critic_value", "critic_moved", "data_value", "converged"]]
+    assert own.loc["acro", 1].tolist() == [170.0, -0.05, 162.0, False]
+    assert own["converged"].to_dict()["curl", 0] is True
+    page = write_report([tmp_path], tmp_path / "out").page.read_text()
+    shown = re.findall(r"<td>(.*?)</td>", page.partition("<h2>Critics</h2>")[2].partition("</table>")[0])
+    assert shown[5:10] == ["acro", "160.0", "161.0", "3.0", "1 of 2"]
+    assert shown[-5:] == ["random", "–", "–", "–", "not recorded"]
+    assert ",critic_value,critic_moved,data_value,converged," in (tmp_path / "out" / "runs.csv").read_text()
 
 
 def test_what_was_trained_clean_counts_as_both(tmp_path):

@@ -9,9 +9,12 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 from vd4rl_pomdp.studies.navigation.measures import condition_of, paper_rows
 from vd4rl_pomdp.sweeps.grid import load_grid, names, narrow
-from vd4rl_pomdp.sweeps.stages import check_cells
+from vd4rl_pomdp.sweeps.stages import check_cells, collection_of, recipe_of, recorded
 
-PAGE = Path(__file__).parents[2] / "docs" / "sweeps.md"
+ROOT = Path(__file__).parents[2]
+PAGE = ROOT / "docs" / "sweeps.md"
+COMMITTED = [str(path) for path in sorted((ROOT / "results").rglob("*.toml")) if "[testing]" in path.read_text()]
+"""Grids of results, but for early ones."""
 TOML = """
 title = "a trial"
 seed = [0, 1]
@@ -193,8 +196,8 @@ def test_a_condition_means_a_number_however_it_is_written(file):
 
 
 @pytest.mark.parametrize("testing", [False, True])
-@pytest.mark.parametrize("name", names())
-def test_every_shipped_cell_is_one_that_its_stages_take(name, testing):
+@pytest.mark.parametrize("name", [*names(), *COMMITTED])
+def test_every_cell_of_a_kept_grid_is_one_that_its_stages_take(name, testing):
     cells = load_grid(name, testing=testing).cells()
     assert len(cells) == len({repr((cell.shared, cell.sections)) for cell in cells}) > 0
     check_cells(cells, name)
@@ -208,6 +211,35 @@ def test_the_papers_grids_are_its_figures_over_twelve_methods():
         cells = [c for c in load_grid(name).cells() if c.value("corruption") == corruption]
         found = {(c.value("task"), c.value("quality"), c.value("method"), c.seed) for c in cells}
         assert len(found) == len(cells) == 3 * 3 * 14 * 5, "12 methods, the floor and a ceiling"
+
+
+def test_navigation_at_20000_steps_has_the_published_cells_and_first_seeds_first():
+    cells = load_grid(str(ROOT / "results" / "navigation" / "budget" / "grid.toml")).cells()
+    kept = {repr(recorded(cell, "navigation_train") | {"steps": 2500}) for cell in cells}
+    usual = {repr(recorded(cell, "navigation_train")) for cell in load_grid("navigation").cells()}
+    assert kept <= usual, "all but the steps is as in the rows they stand beside"
+    assert [cell.seed for cell in cells] == [0] * 5 + [1] * 5 + [2] * 5
+    told = {(cell.value("method"), cell.value("max_k")) for cell in cells}
+    assert told == {("ah+a", 15), ("ah+a", 1), ("mik+a", 15), ("mik+a", 1), ("ah", 15)}
+
+
+def test_the_leads_shorter_pretrainings_are_runs_of_the_protocol():
+    def made(name, *only):
+        cells = narrow(load_grid(str(ROOT / "results" / name)).cells(), only)
+        return {(recipe_of(cell, "finetune"), repr(sorted(collection_of(cell).items()))) for cell in cells}
+
+    both = ["method=mik+a,acro", "quality=medium_expert", "corruption=patch+zero_frames"]
+    assert made("lead/grid.toml", "steps=3000") == made("protocol.toml", *both)
+    assert len(made("lead/grid.toml", "steps=20000")) == 2 * 3 * 5
+
+
+def test_the_grid_of_published_files_is_the_protocols_first_layer_without_states():
+    cells, protocol = load_grid("vd4rl").cells(), load_grid(str(ROOT / "results" / "protocol.toml")).cells()
+    assert not {cell.value("method") for cell in cells} & {"state", "supervised", "supervised+a"}
+    assert {cell.seed for cell in cells} == set(range(5))
+    assert len({repr(collection_of(cell)) for cell in cells}) == 4, "two tasks, two qualities: seeds share a set"
+    first, theirs = ({recipe_of(c, "finetune") for c in narrow(grid, ["seed=0"])} for grid in (cells, protocol))
+    assert first < theirs
 
 
 def test_the_navigation_grid_holds_every_condition_of_the_papers_tables():
@@ -254,3 +286,23 @@ def test_a_setting_that_no_stage_takes_is_told_with_its_place(file, section, mes
     path = file(section)
     with pytest.raises(UserError, match=message):
         check_cells(load_grid(path).cells(), "mine.toml")
+
+
+def test_the_protocols_layers_are_what_its_page_says():
+    """Its commands make every policy once, on a set of the seed's own; its table counts them."""
+    page = (ROOT / "results" / "protocol.md").read_text()
+    cells = load_grid(str(ROOT / "results" / "protocol.toml")).cells()
+    commands = re.findall(r"--only (.*(?:\n    .*)?)", page)
+    layers = [narrow(cells, only.replace("\\", " ").split()) for only in commands]
+    counted = [int(count) for count in re.findall(r"^\|.*\| (\d+) \|$", page, re.MULTILINE)]
+    assert [len(layer) for layer in layers] == [56, 56, *(sum(counted[i:j]) for i, j in ((3, 5), (5, 6), (6, 8)))]
+    assert sum(map(len, layers)) == len(cells) == sum(counted)
+    assert len({id(cell) for layer in layers for cell in layer}) == len(cells)
+    for cell in cells:
+        collected, policy = collection_of(cell), recorded(cell, "finetune")
+        assert (collected["seed"], collected["episodes"]) == (100 + cell.seed, 100)
+        played = policy["eval_episodes"], policy["eval_clean_episodes"]
+        assert played == ((60, 30) if cell.value("task") == "walker_walk" else (40, 20))
+        assert policy["eval_every"] > policy["updates"], "at the end alone"
+        assert cell.value("shift_shared") == (True if cell.value("method") == "acro" else None)
+    assert [cell.seed for cell in layers[0]] == sorted(cell.seed for cell in layers[0])

@@ -21,8 +21,8 @@ from vd4rl_pomdp.sweeps import plan as module
 from vd4rl_pomdp.sweeps.folder import SweepFolder
 from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.members import GridMembers
-from vd4rl_pomdp.sweeps.plan import DATA, FoundRun, plan_jobs, runs_kept
-from vd4rl_pomdp.sweeps.stages import recorded
+from vd4rl_pomdp.sweeps.plan import DATA, FoundRun, plan_jobs, runs_below, runs_kept
+from vd4rl_pomdp.sweeps.stages import collection_of, recorded
 
 GRID = """
 seed = 0
@@ -299,11 +299,26 @@ def test_a_longer_task_is_evaluated_over_all_of_it(tmp_path):
         assert recorded(usual, "finetune")["eval_length"] == 700
 
 
-def test_one_folder_is_not_asked_for_two_sets(copy):
-    with (copy / "grid.toml").open("a") as file:
-        file.write('[[where]]\nonly = ["method=acro"]\ncollect = { episodes = 3 }\n')
-    with pytest.raises(UserError, match="walker_walk/expert is asked for with two values of episodes"):
-        plan(copy)
+def test_a_seed_may_have_a_set_of_its_own(copy, tmp_path):
+    wheres = [f'[[where]]\nonly = ["seed={seed}"]\ncollect = {{ seed = {100 + seed} }}\n' for seed in (0, 1)]
+    (copy / "grid.toml").write_text(GRID.replace("seed = 0", "seed = [0, 1]") + "".join(wheres))
+    jobs = [job for job in plan(copy, out=tmp_path / "out") if "/acro/" in job.name or "data/" in job.name]
+    assert {job.name: job.needs for job in jobs if job.section != "finetune"} == {
+        f"data/walker_walk/expert,seed={100 + seed}": [] for seed in (0, 1)
+    } | {
+        f"walker_walk/expert,seed={100 + seed}/patch/acro/seed{seed}/pretrain": [
+            f"data/walker_walk/expert,seed={100 + seed}"
+        ]
+        for seed in (0, 1)
+    }
+    collected = [job.words[job.words.index("--seed") + 1] for job in jobs if job.section == "collect"]
+    assert collected == ["100", "101"]
+    cells = load_grid(str(copy / "grid.toml")).cells()
+    for collected, number in ((100, 4), (101, 0)):  # seed 0's policies count on the set of seed 0 alone
+        wanted = {"collection": collection_of(cells[0]) | {"seed": collected}}
+        kept = [replace(run, record=run.record | wanted) for run in runs_below(copy)]
+        done = [job for job in plan(copy, kept=kept, out=tmp_path / "out") if job.done]
+        assert ({job.section for job in done}, len(done)) == ({"finetune"} if number else set(), number)
 
 
 def test_a_downloaded_set_is_found_below_its_size(copy, tmp_path):
@@ -312,6 +327,16 @@ def test_a_downloaded_set_is_found_below_its_size(copy, tmp_path):
     jobs = plan(copy)
     assert left(jobs) == []
     assert jobs[0].folder == copy / "data" / "walker_walk" / "expert" / "84px"
+
+
+def test_the_grid_of_published_files_takes_downloaded_sets(tmp_path, capsys, own_cache):
+    for task in ("walker_walk", "cheetah_run"):
+        for quality in ("medium_expert", "expert"):
+            write_fake_set(tmp_path / "vd4rl" / task / quality / "84px", [20, 25])
+    main(["sweep", "run", "vd4rl", "--data", str(tmp_path / "vd4rl"), "--out", str(tmp_path / "out"), "--dry-run"])
+    shown = capsys.readouterr().out
+    assert "data collect" not in shown
+    assert f"{4 * 6 * 5 * 2 + 4} jobs, 4 done" in shown, "6 encoders and policies a seed and set, and the sets"
 
 
 def test_a_run_that_added_other_images_is_another(tmp_path):

@@ -225,7 +225,7 @@ def encoding(dataset: Dataset, encoder: Encoder, folder: Path, size: Size) -> di
     frozen = FrozenEncoder(encoder, dataset, CorruptionConfig.of(CORRUPTION), config.shift, config.precision, 0)
     histories = Histories(dataset, NO_OPTIONS, 3, 0)
     start = time.perf_counter()
-    encode_views(frozen, histories, size.views, folder / "features.npy")
+    encode_views(frozen, histories, size.views, folder / "features.npy", "bench")
     wait(device)
     seconds = time.perf_counter() - start
     return {"views": size.views, "episodes": dataset.num_episodes, "seconds": seconds} | peak(device)

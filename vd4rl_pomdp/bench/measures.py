@@ -278,25 +278,29 @@ def _updates_per_s(
 
 
 def against_jax(dataset: Dataset, repeats: int, widths: Sequence[int] = (256, 1024)) -> dict[str, Any]:
-    """Milliseconds of a TD3+BC update, sampling included, and how many times as long the same takes in JAX."""
+    """Milliseconds of a TD3+BC update, sampling included, and how many times as long float32 in JAX takes."""
     if importlib.util.find_spec("jax") is None:
         return {"jax": JAX_MISSING}
     results: dict[str, Any] = {}
     views = FinetuneConfig.of("cpu").views
     features = torch.randn(views, dataset.num_rows, EncoderConfig(6).feature_dim, device=dataset.t.device).half()
     for hidden in widths:
-        pair, updates = _policy_of(dataset, features, hidden, 0), max(2, 2560 // hidden)
+        train, updates = partial(_train, *_policy_of(dataset, features, hidden, 0)), max(2, 2560 // hidden)
         shape = {"hidden_dim": hidden, "batch_size": BATCH, "dim": features.shape[-1], "rows": dataset.num_rows}
         shape |= {"action_dim": dataset.action_dim, "views": views}
-        mine, theirs = [], []
+        ms: dict[str, list[float]] = {"fp32": [], "bf16": [], "jax": []}
         with Worker("jax_updates", shape, updates) as worker:
             worker.answer()
             for _ in range(repeats):
-                mine.append(seconds_of(partial(_train, *pair, updates), 1) / updates * 1e3)
+                for precision in ("fp32", "bf16"):
+                    with torch.autocast(features.device.type, torch.bfloat16, precision == "bf16", cache_enabled=False):
+                        ms[precision].append(seconds_of(partial(train, updates), 1) / updates * 1e3)
                 worker.begin()
-                theirs.append(worker.answer()["ms"])
-        ms = statistics.median(mine)
-        results |= {f"units_{hidden}_ms": ms, f"units_{hidden}_jax_over_ours": statistics.median(theirs) / ms}
+                ms["jax"].append(worker.answer()["ms"])
+        theirs = statistics.median(ms.pop("jax"))
+        for precision, times in ms.items():
+            ours, mine = f"units_{hidden}_{precision}", statistics.median(times)
+            results |= {f"{ours}_ms": mine, f"{ours}_jax_over_ours": theirs / mine}
     return results
 
 

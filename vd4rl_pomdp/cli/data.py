@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import shlex
 from pathlib import Path
 
@@ -28,22 +29,28 @@ def collect(words: list[str], program: str) -> None:
 
 @command
 def download(
-    task: str, quality: str, out: Path = Path("data/vd4rl"), endpoint: str | None = None, verify: bool = False
+    task: tuple[str, ...],
+    quality: tuple[str, ...],
+    out: Path = Path("data/vd4rl"),
+    endpoint: str | None = None,
+    verify: bool = False,
 ) -> None:
     """Fetch published V-D4RL 84-pixel sets: checked by SHA-256, resumable, each unique file once.
 
     Args:
-        task: walker_walk, cheetah_run or humanoid_walk.
-        quality: random, medium_replay, medium, medium_expert or expert.
+        task: walker_walk, cheetah_run or humanoid_walk, or several.
+        quality: random, medium_replay, medium, medium_expert or expert, or several: all of every task are fetched.
         out: Folder to keep sets in, as OUT/TASK/QUALITY/84px.
         endpoint: The mirror's address; default: HF_ENDPOINT, else https://huggingface.co.
         verify: Compute the SHA-256 of files that are already there, too.
     """
     from vd4rl_pomdp.data.download import download
 
-    shards = download(task, quality, out, endpoint, verify)
-    folder = shards[0].parent
-    print(f"{len(shards)} shards in {folder}; check them with `{program_here()} data check {shlex.quote(str(folder))}`")
+    for one, level in itertools.product(task, quality):
+        shards = download(one, level, out, endpoint, verify)
+        folder = shards[0].parent
+        check = f"{program_here()} data check {shlex.quote(str(folder))}"
+        print(f"{len(shards)} shards in {folder}; check them with `{check}`")
 
 
 @command

@@ -22,12 +22,13 @@ RUNTIME_FIELDS = frozenset(
         "data",
         "encoder",
         "eval_clean",
+        "eval_clean_episodes",
         "log_every",
         "checkpoint_every",
     }
 )
 """Config fields that do not change a result, so that a run may go on with other values; data and encoder may be moved,
-and are compared by content; `eval_clean` adds rows that change no other."""
+and are compared by content; `eval_clean` and the number of its episodes add rows that change no other."""
 NO_SETTINGS = RUNTIME_FIELDS | {"seed"}
 """Config fields in which the seeds of one experiment may differ."""
 

@@ -30,11 +30,14 @@ class Reference:
     """`task`, `quality` and `sha256` of the one actor that made all of the data, if its very file ships."""
     path_error: float | None = None
     """The trained policy's mean squared difference from the actor's mean action on rows of the data, as it saw them."""
+    mean_reward: float | None = None
+    """Of the data's decisions."""
 
     @classmethod
     def of(cls, dataset: Dataset) -> Self:
         """What a set tells; the path error is for later."""
-        return cls(round(float(dataset.returns.mean()), 4), _sole_actor(dataset))
+        rewards = float(dataset.returns.sum()) / dataset.num_transitions
+        return cls(round(float(dataset.returns.mean()), 4), _sole_actor(dataset), mean_reward=round(rewards, 6))
 
     @classmethod
     def read(cls, run: Path) -> Self:
@@ -46,7 +49,8 @@ class Reference:
     def parse(cls, path: Path, stored: dict[str, Any]) -> Self:
         """What a file's content tells; raises UserError, naming the file, if it is damaged."""
         try:
-            made = build(cls, {field.name: stored[field.name] for field in fields(cls)})
+            told = {"mean_reward": None} | stored  # which earlier runs do not tell
+            made = build(cls, {field.name: told[field.name] for field in fields(cls)})
             if made.actor is not None and made.actor.keys() != {"task", "quality", "sha256"}:
                 raise ValueError(f"{made.actor!r} names no actor")
             return made

@@ -263,6 +263,42 @@ def profile_plots(profiles: pd.DataFrame, aggregate: pd.DataFrame, looks: dict[s
     return [Plot("profiles", caption, words, figure, shown)]
 
 
+def lead_plots(leads: pd.DataFrame) -> list[Plot]:
+    """Differences against the budget of pretraining, one figure a corruption, a line for each difference."""
+    if leads.empty:
+        return []
+    looks = {name: number for number, name in enumerate(sorted(set(labels(leads))))}
+
+    def draw(axes: Axes, rows: pd.DataFrame) -> None:
+        seen = rows["steps"] * rows["stacks"]
+        for number, (name, mine) in enumerate(_by_label(rows)):
+            look, place = style(looks[name]), seen[mine.index] * 1.05**number
+            middle, low, high = (mine[column].astype(float) for column in ("difference", "low", "high"))
+            reach = [(middle - low).fillna(0), (high - middle).fillna(0)]
+            axes.errorbar(place, middle, reach, lw=1.3, capsize=3, label=plain(name, NAME_WIDTH), **look)
+            for where in place[middle.isna()]:
+                axes.text(where, 0, "missing", color=look["color"], rotation=90, fontsize=7, ha="center", va="bottom")
+        axes.axhline(0, color="black", lw=0.8)
+        axes.set_xscale("log")
+        ticks = dict(zip(seen, rows["steps"].map("{:,}".format) + "\nx " + rows["stacks"].astype(str), strict=True))
+        axes.set_xticks(list(ticks), list(ticks.values()))
+        axes.minorticks_off()
+        axes.set_xlim(min(ticks) / 1.5, 1.5 * max(ticks))
+        axes.set(xlabel="pretraining: steps x stacks in a batch", ylabel="lead, % of the data's return")
+
+    plots = []
+    for corruption, rows, places in _figures(leads):
+        caption = (
+            f"Lead against the budget of pretraining under {corruption}: difference of mean returns, each in % of the "
+            "mean return of its own data, with 95% t intervals over seeds and episodes if both sides have two seeds. "
+            + seeds_note(rows["seeds"])
+        )
+        words = _told([(title, mine[mine["difference"].notna()]) for title, mine in places], "difference")
+        figure = sheet([(title, members, draw) for title, members in places], 2)
+        plots.append(Plot(file_name("lead", corruption), caption, words, figure, rows))
+    return plots
+
+
 DOTS = {
     "probes": (
         dict(zip(PROBES, ("pose", "velocity"), strict=True)),

@@ -1,10 +1,10 @@
 """Whether a setting can tell methods apart at all: what has to hold before its methods are ranked.
 
 The data must suffice for the algorithm where the state is known (`state`) and where nothing is hidden (`acro` under
-`none`), and under the corruption some method must be better than no training (`random`). Where one of these fails,
-differences between returns say more of the data, the algorithm and their budget than of the representations. The three
-are these methods as they are, without what variants add to them, and returns are compared between runs of like settings
-alone.
+`none`, as far as published methods get on pixels), under the corruption some method must be better than no training
+(`random`), and the critics of all these runs must have converged. Where one of these fails, differences between returns
+say more of the data, the algorithm and their budget than of the representations. The three are these methods as they
+are, without what variants add to them, and returns are compared between runs of like settings alone.
 """
 
 from __future__ import annotations
@@ -16,16 +16,23 @@ import numpy as np
 
 from vd4rl_pomdp.core.errors import told_apart
 from vd4rl_pomdp.core.options import settings_of
+from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import STATE
-from vd4rl_pomdp.report.load import REFERENCES, SETTING, Run
+from vd4rl_pomdp.report.load import REFERENCES, SETTING, Run, a_set_a_seed
 from vd4rl_pomdp.report.stats import interval
 from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, PLAIN, PRESETS, groups, of_corruption
 from vd4rl_pomdp.runs.files import Row
 
-STATE_SHARE, ACRO_SHARE = 0.9, 0.7
-"""Least shares of the data's mean return, of `state` and of `acro` under `none`."""
+STATE_SHARE = 0.9
+"""Least share of the data's mean return, of `state`."""
+PUBLISHED_SHARE, ACRO_SHARE = 0.8, 0.7
+"""Least share, of `acro` under `none`: of what the better of BASELINES returns as published, but no more than of the
+data's mean return; and of the data's mean return on sets of whose quality no score is published."""
+BASELINES = {"bc": "BC", "drq_bc": "DrQ+BC"}
+"""V-D4RL's baselines of offline control from pixels, by their columns in `published_scores`."""
 PASSED, FAILED, UNKNOWN = "discriminates", "undecided at this budget", "not known to discriminate"
+NOT_RECORDED = "convergence is not recorded"
 GATED = (*SETTING, "algorithm")
 
 
@@ -43,8 +50,9 @@ def gates(runs: list[Run]) -> list[Row]:
 
     `data_return` is a mean over the sets behind its runs; `state_share`, `acro_share` and `best_share`, the best
     method's, are shares of the return of their own, `state_seeds` and `acro_seeds` how many runs these rest on.
-    `above_random` is the best method's mean return less that of `random`, as `sides` finds them, `low` and `high` its
-    95% interval. What is not known is None.
+    `acro_bar` is the least `acro_share`, `bar_from` the published score that it is made of. `above_random` is the best
+    method's mean return less that of `random`, as `sides` finds them, `low` and `high` its 95% interval. `converged`
+    tells whether the critics of all these runs did. What is not known is None.
     """
     finished = comparable(runs)
     return [_gate(key, finished) for key in sorted({run.of(GATED) for run in finished})]
@@ -76,19 +84,24 @@ def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
     compared = sides(learned, floor)
     above, (low, high) = difference(compared)
     data = {value for run in here if (value := run.reference.data_return) is not None}
+    everyone = {"state": state, "acro under none": acro, "best": compared.left, "random": compared.right}
+    bar, source = pixel_bar(key[0], key[1], [run.reference.data_return for run in acro or here])
     row: Row = dict(zip(GATED, key, strict=True)) | {
         "data_return": float(np.mean(sorted(data))) if data else None,
         "state_share": _share(state),
         "state_seeds": len(state),
         "acro_share": _share(acro),
         "acro_seeds": len(acro),
+        "acro_bar": bar,
+        "bar_from": source,
         "best_share": _share(compared.left),
         **{"above_random": above, "low": low, "high": high},
+        "converged": converged(run for runs in everyone.values() for run in runs),
     }
     missed, unknown = [], []
     for name, least, words, reference in (
         ("state_share", STATE_SHARE, "state", state),
-        ("acro_share", ACRO_SHARE, "acro under none", acro),
+        ("acro_share", row["acro_bar"], "acro under none", acro),
     ):
         if not reference:
             unknown.append(f"{words} was not measured")
@@ -96,8 +109,8 @@ def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
             told = all(run.reference.data_return is not None for run in reference)
             unknown.append(f"the data's return is {'not above 0' if told else 'not known'}")
         elif row[name] < least:
-            share = told_apart(row[name], least, 2)[0]
-            missed.append(f"{words} returns {share} of the data's return, less than {least}")
+            share, asked = told_apart(row[name], least, 2)
+            missed.append(f"{words} returns {share} of the data's return, less than {asked}")
     if compared.unlike:
         unknown.append(f"best and random have other {', '.join(compared.unlike)}")
     elif not floor or not learned:
@@ -106,9 +119,38 @@ def _gate(key: tuple[str, ...], runs: list[Run]) -> Row:
         unknown.append("best and random need two seeds each that differ")
     elif row["low"] <= 0:
         missed.append(f"best minus random is {row['above_random']:.0f} {interval(row['low'], row['high'], 0)}")
+    if row["converged"] is None:
+        unknown.append(NOT_RECORDED)
+    if still := [name for name, mine in everyone.items() if converged(mine) is False]:
+        missed.append(f"critics had not converged ({', '.join(still)})")
     if missed:  # one is enough, whatever is not known of the others
         return row | {"verdict": f"{FAILED}: {'; '.join(missed)}"}
     return row | {"verdict": f"{UNKNOWN}: {'; '.join(dict.fromkeys(unknown))}" if unknown else PASSED}
+
+
+def pixel_bar(task: str, quality: str, data: Sequence[float | None]) -> tuple[float | None, str]:
+    """Least share of its data's return that `acro` under `none` must return, and where that is from.
+
+    Args:
+        task: of a set.
+        quality: of a set.
+        data: mean return of the data of each run that is judged; without any, or one above 0, there is no bar.
+    """
+    scores = [row for row in published_scores() if (row["env"], row["dataset"]) == (task, quality)]
+    if not scores:
+        return ACRO_SHARE, "none published"
+    score, name = max((float(scores[0][column]), name) for column, name in BASELINES.items())
+    returns = [value for value in data if value is not None and value > 0]
+    # Published behaviour returned less than ours on some sets: what counts on them is to keep up with our own data.
+    shares = [min(1.0, 10 * score / value) for value in returns]
+    known = bool(returns) and len(returns) == len(data)
+    return PUBLISHED_SHARE * float(np.mean(shares)) if known else None, f"{name} {score:g}"
+
+
+def converged(runs: Iterable[Run]) -> bool | None:
+    """Whether the critics of all runs did: False if one did not, else None if it is not recorded of one."""
+    told = {run.converged for run in runs}
+    return False if False in told else None if None in told else True
 
 
 def seen_under(corruption: str, runs: Iterable[Run]) -> list[Run]:
@@ -142,7 +184,7 @@ def sides(left: Iterable[Run], right: Iterable[Run]) -> Sides:
     First come pairs of like settings, then those with more than one seed on both sides, then those that return most.
     """
     others = seeds_by_variant(right)
-    pairs = [Sides(one, other, _unlike(one[0], other[0])) for one in seeds_by_variant(left) for other in others]
+    pairs = [Sides(one, other, _unlike(one, other)) for one in seeds_by_variant(left) for other in others]
     alike = [pair for pair in pairs if not pair.unlike]
     return max(alike or pairs, key=lambda pair: _preference(pair.left, pair.right), default=Sides([], [], []))
 
@@ -159,16 +201,21 @@ def _preference(*compared: list[Run]) -> tuple[int, float]:
     return sum(len(seeds) > 1 for seeds in compared), sum(float(returns_of(seeds).mean()) for seeds in compared)
 
 
-def _unlike(one: Run, other: Run) -> list[str]:
-    """Settings that both have, but not alike, other than what a claim is about and what hides pixels.
+def _unlike(left: list[Run], right: list[Run]) -> list[str]:
+    """Settings that seeds of both sides have, but not alike, other than what a claim is about and what hides pixels.
 
-    Of a method that is not pretrained, only settings of fine-tuning count.
+    Of a method that is not pretrained, only settings of fine-tuning count. Where every training seed has a set of its
+    own, that of both sides is the same.
     """
+    one, other = left[0], right[0]
     names = (one.settings.keys() & other.settings.keys()) - PLAIN.keys() - of_corruption(one.settings).keys()
     for run in (one, other):
         if run.method in ("random", STATE):
             names &= settings_of(run.record["config"]).keys() | {DATA[0]}
-    found = [name for name in one.settings if name in names and one.settings[name] != other.settings[name]]
+    found = [name for name in one.settings if name in names - {DATA[0]} and one.settings[name] != other.settings[name]]
+    sets = {run.settings.get(DATA[0]) for run in (*left, *right)}
+    if DATA[0] in names and len(sets) > 1 and not a_set_a_seed([*left, *right]):
+        found.append(DATA[0])
     return [name for name in found if name in PRESETS] or found  # a preset stands for what it decides
 
 

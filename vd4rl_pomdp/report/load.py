@@ -30,6 +30,7 @@ from vd4rl_pomdp.report.variants import (
     without_sets,
 )
 from vd4rl_pomdp.runs import REFERENCE_FILE
+from vd4rl_pomdp.runs.critic import CONVERGED
 from vd4rl_pomdp.runs.episodes import COLUMNS
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.results import Result, find_results, whole_files
@@ -42,6 +43,8 @@ IDENTITY = (*CONDITION, "seed")
 """Columns that tell a run's rows from all others of a report: what its files name it by, and its variant."""
 PROBES = ("probe_pose", "probe_velocity")
 """Errors of linear probes of an encoder."""
+CRITIC = {"critic_value": "value", "critic_moved": "moved", "data_value": "data"}
+"""What a run's critic came to (see `critic_of`): columns, and what critic.json calls them."""
 COSTS = ("pretrain_seconds", "finetune_seconds")
 ACTION_ERRORS = ("path_error", "action_error")
 """Of a policy, on the data's rows and in closed loop."""
@@ -94,7 +97,7 @@ class Run:
     reference: Reference
     """What its policy is held against."""
     measures: dict[str, float | None]
-    """Of its encoder and costs: action_loss, PROBES, COSTS; None where it is not known."""
+    """Of its encoder, critic and costs: action_loss, PROBES, CRITIC, COSTS; None where it is not known."""
     parts: Parts = ("", "")
     """Its settings that differ from those of other runs of its method, by the runs it is compared with."""
 
@@ -170,6 +173,15 @@ class Run:
         return self.finished and bool(self.rows)
 
     @property
+    def converged(self) -> bool | None:
+        """Whether its critic did, by `CONVERGED`; True for an algorithm without one, None if it is not recorded."""
+        told = self.result.files.get("critic", {} if self.labels["algorithm"] == "bc" else None)
+        if told == {}:
+            return True
+        moved = self.measures["critic_moved"]
+        return None if moved is None else abs(moved) < CONVERGED
+
+    @property
     def progress(self) -> str:
         """How far it is: "finished", "diverged at update 20 of 40", or "unfinished at 20 of 40 updates"."""
         if self.finished:
@@ -221,9 +233,11 @@ def _load(result: Result) -> Run:
     """A run of its files; raises UserError for files that are valid JSON, but not what a run writes."""
     with whole_files(result.place):
         probe, stored = result.files.get("probe", {}), result.files.get("reference")
+        critic = result.files.get("critic", {})
         told = {
             "action_loss": result.encoder.get("action_loss"),
             **{name: probe.get(name) for name in PROBES},
+            **{name: critic.get(key) for name, key in CRITIC.items()},
             "pretrain_seconds": result.files.get("pretrain_timing", {}).get("seconds"),
             "finetune_seconds": result.files["timing"]["seconds"] if result.finished else None,
         }
@@ -251,11 +265,34 @@ def _told_apart(runs: list[Run]) -> list[Run]:
     of_methods = differences([without(one, DATA) for one in own], methods)
     # Two sets always differ in their fingerprints; only two contents of one set make another experiment.
     data = [{name: one[name] for name in DATA if name in one} for one in own]
-    of_data = differences(data, list(zip(methods, sets, corruptions, strict=True)))
+    places = list(zip(methods, sets, corruptions, strict=True))
+    for alike in (places, list(zip(places, of_methods, strict=True))):
+        for mine in groups(range(len(runs)), alike.__getitem__).values():
+            if a_set_a_seed([runs[i] for i in mine]):
+                for i in mine:
+                    data[i][DATA[0]] = "one a seed"
+    of_data = differences(data, places)
     return [
         replace(run, labels=run.labels | {"corruption": corruption}, parts=(of_method, of_set))
         for run, corruption, of_method, of_set in zip(runs, corruptions, of_methods, of_data, strict=True)
     ]
+
+
+def a_set_a_seed(runs: Sequence[Run]) -> bool:
+    """Whether each of two or more training seeds has a set of its own, collected alike but for the collection's seed.
+
+    Then sets vary as seeds do, and runs on them are seeds of one method. Two contents for one training seed, or of one
+    collection, make other experiments.
+    """
+    plans = [run.record.get("collection") or {} for run in runs]
+    contents = [run.record.get("inputs", {}).get("data") for run in runs]
+    seeds = [run.labels["seed"] for run in runs]
+    found = set(zip(seeds, contents, [plan.get("seed") for plan in plans], strict=True))
+    if not all(plans) or len(found) < 2 or any(len(set(column)) < len(found) for column in zip(*found, strict=True)):
+        return False
+    drawn = [(plan.get("rendered_by") or {}).get("canary") for plan in plans]
+    told = [without(plan, ("seed", "rendered_by")) | {"drawn": one} for plan, one in zip(plans, drawn, strict=True)]
+    return all(one == told[0] for one in told)
 
 
 def episodes_frame(runs: Iterable[Run]) -> pd.DataFrame:
@@ -275,14 +312,15 @@ def episodes_frame(runs: Iterable[Run]) -> pd.DataFrame:
 def runs_frame(runs: Iterable[Run]) -> pd.DataFrame:
     """One row for every finished and evaluated run: encoder, scores, control, costs and provenance; None is unknown."""
     table = pd.DataFrame([_run_row(run) for run in runs if run.evaluated], columns=[*IDENTITY, *_RUN])
-    return table.astype({name: float for name in _RUN if name not in ("id", "git_commit", "machine", "state")})
+    return table.astype({name: float for name in _RUN if name not in _WORDS})
 
 
 _RUN = (
     *("id", "action_loss", *PROBES, *ACTION_ERRORS, "score", "return", "best_score", "best_step"),
     *("data_return", "share_above_80", *(f"clean_{name}" for name in CONTROL)),
-    *(*COSTS, "git_commit", "machine", "state"),
+    *(*CRITIC, "converged", *COSTS, "git_commit", "machine", "state"),
 )
+_WORDS = ("id", "converged", "git_commit", "machine", "state")
 
 
 def _run_row(run: Run) -> Row:
@@ -290,7 +328,7 @@ def _run_row(run: Run) -> Row:
     scores = {step: np.mean([row["score"] for row in rows]) for step, rows in by_step.items()}
     best = max(scores, key=scores.__getitem__)
     row: Row = {"id": run.result.id, "state": run.progress, "machine": run.result.machine}
-    row |= {"git_commit": run.result.commit, "data_return": run.reference.data_return}
+    row |= {"git_commit": run.result.commit, "data_return": run.reference.data_return, "converged": run.converged}
     row |= {"score": scores[max(scores)], "best_score": scores[best], "best_step": best}
     row |= run.named | run.measures | {"path_error": run.reference.path_error}
     for prefix, episodes in (("", run.last), ("clean_", run.last_clean)):

@@ -26,6 +26,7 @@ from vd4rl_pomdp.report.figures import Plot, seeds_note, to_svg, write_table
 from vd4rl_pomdp.report.films import shown_films
 from vd4rl_pomdp.report.gaps import find_gaps
 from vd4rl_pomdp.report.gates import gates, unranked
+from vd4rl_pomdp.report.lead import leads
 from vd4rl_pomdp.report.load import (
     ALL,
     CONDITION,
@@ -35,6 +36,7 @@ from vd4rl_pomdp.report.load import (
     TOLD_STATES,
     Choice,
     Run,
+    a_set_a_seed,
     episodes_frame,
     label,
     labels,
@@ -126,12 +128,14 @@ def _tables(runs: list[Run], choice: Choice) -> tuple[dict[str, pd.DataFrame], l
         MARK: tables.summary(final, gaps, unranked(judged, SETTING)),
         "gates": pd.DataFrame(judged),
         "claims": pd.DataFrame(claimed),
+        "lead": pd.DataFrame(leads(runs)),
         "curves": tables.curves(evaluated),
         "aggregate": tables.aggregate(final, gaps),
         "runs": every,
         "representations": tables.representations(every),
         "costs": tables.costs(every),
         "control": tables.control(every),
+        "critics": tables.critics(every),
         "improvement": tables.improvement(final),
         "profiles": tables.profiles(final),
         "missing": gaps,
@@ -152,6 +156,14 @@ def _side(side: str) -> Callable[[Row], str]:
     return lambda row: f"{row[side]}: {row[f'{side}_return']:.0f} (n = {row[f'{side}_seeds']})"
 
 
+def _bar(row: Row) -> str:
+    return f"{number(row['acro_bar'], 2)} ({row['bar_from']})"
+
+
+def _converged(row: Row) -> str:
+    return "not recorded" if pd.isna(row["converged"]) else f"{row['converged']:.0f} of {row['seeds']}"
+
+
 def _span(cost: str) -> Callable[[Row], str]:
     """Mean, least and most seconds."""
 
@@ -170,6 +182,24 @@ def _chance(row: Row) -> str:
     return with_interval(row["probability"], row["low"], row["high"], 2) + few
 
 
+def _claim(row: Row) -> str:
+    return row["claim"] + (f" ({row['family']})" if row["family"] else "")
+
+
+def _p(row: Row) -> str:
+    """A p value, and the one that is adjusted for its family."""
+    if pd.isna(row["p"]):
+        return number(None)
+    told = "" if pd.isna(row["adjusted_p"]) else f" ({row['adjusted_p']:.3f})"
+    return f"{row['p']:.3f}{told}"
+
+
+def _smallest(row: Row) -> str:
+    """The difference that would be found, and as a share of the data's return."""
+    share = "" if pd.isna(row["smallest_share"]) else f" ({100 * row['smallest_share']:.0f}%)"
+    return number(row["smallest"], 0) + share
+
+
 SHOWN: dict[str, tuple[int, Columns]] = {
     "gates": (
         2,
@@ -179,6 +209,7 @@ SHOWN: dict[str, tuple[int, Columns]] = {
             "data's return": ("data_return", 0),
             "state": ("state_share", 2),
             "acro, none": ("acro_share", 2),
+            "its bar": _bar,
             "best": ("best_share", 2),
             "best – random": ("above_random", "low", "high", 0),
         },
@@ -186,13 +217,25 @@ SHOWN: dict[str, tuple[int, Columns]] = {
     "claims": (
         4,
         {
-            "claim": "claim",
+            "claim": _claim,
             "setting": setting,
             "verdict": lambda row: row["verdict"] or "–",
             "left": _side("left"),
             "right": _side("right"),
             "difference": ("difference", "low", "high", 0),
+            "p (Holm)": _p,
+            "would be found": _smallest,
             "played clean": ("clean_difference", "clean_low", "clean_high", 0),
+        },
+    ),
+    "lead": (
+        3,
+        {
+            "setting": with_algorithm,
+            "difference": label,
+            "pretraining": lambda row: f"{row['steps']:,} x {row['stacks']}",
+            "% of the data's return": ("difference", "low", "high", 1),
+            "seeds": lambda row: f"{row['left_seeds']}, {row['right_seeds']}",
         },
     ),
     MARK: (
@@ -255,6 +298,17 @@ SHOWN: dict[str, tuple[int, Columns]] = {
             "seeds": ("seeds", 0),
         },
     ),
+    "critics": (
+        1,
+        {
+            "setting": setting,
+            "method": label,
+            "critic's value": ("critic_value", 1),
+            "data's discounted return": ("data_value", 1),
+            "moved, %": lambda row: number(100 * row["critic_moved"]),
+            "converged": _converged,
+        },
+    ),
     "costs": (
         2,
         {
@@ -278,6 +332,8 @@ def _shown(made: dict[str, pd.DataFrame]) -> dict[str, Shown]:
         rows = made[name]
         if name == "control" and rows["data_return"].isna().all() and rows["clean_return"].isna().all():
             rows = rows.iloc[:0]  # nothing is known but the return as trained
+        if name == "critics" and rows["critic_value"].isna().all():
+            rows = rows.iloc[:0]
         table = texts(rows, columns)
         found[name] = Shown(table, list(_blocks(name, table, rows, words)), words)
     return found
@@ -331,6 +387,7 @@ def _plots(runs: list[Run], made: dict[str, pd.DataFrame]) -> dict[str, list[Plo
     return {
         "scores": figures.bar_plots(made[MARK], made["runs"], data, looks),
         "profiles": figures.profile_plots(made["profiles"], made["aggregate"], looks),
+        "lead": figures.lead_plots(made["lead"]),
         "curves": figures.curve_plots(made["curves"], looks),
         **{name: figures.dot_plots(made["runs"], looks, name) for name in figures.DOTS},
         "costs": figures.cost_plots(made["costs"]),
@@ -404,16 +461,19 @@ def _write(out: Path, made: dict[str, pd.DataFrame], shown: dict[str, Shown], pl
 def unlike(runs: list[Run]) -> list[str]:
     """What stands side by side and was not made of the same, in sentences: contents of a set, code of a part."""
     told: dict[str, dict[str, set[str]]] = {}
-    for run in (run for run in runs if run.stage == "finetune" and run.rows):
-        states = {f"the set of {run.set_name} has {{}} contents": run.record.get("inputs", {}).get("data", "")[:12]}
+    played = [run for run in runs if run.stage == "finetune" and run.rows]
+    own = {name for name, mine in groups(played, lambda run: run.set_name).items() if a_set_a_seed(mine)}
+    for run in played:
+        content = "" if run.set_name in own else str(run.record.get("inputs", {}).get("data", ""))[:12]
+        states = {f"the set of {run.set_name} has {{}} contents": content}
         states |= {f"{part} has {{}} states of its code": code for part, code in _code(run).items()}
         for subject, state in states.items():
             if state:
                 told.setdefault(subject, {}).setdefault(state, set()).add(label(run.named))
     sentences = []
-    for subject, states in told.items():
-        words = "; ".join(f"{state} ({', '.join(sorted(methods))})" for state, methods in states.items())
-        sentences += [f"{subject.format(len(states))}: {words}"] if len(states) > 1 else []
+    for subject, known in told.items():
+        words = "; ".join(f"{state} ({', '.join(sorted(methods))})" for state, methods in known.items())
+        sentences += [f"{subject.format(len(known))}: {words}"] if len(known) > 1 else []
     return sentences
 
 
@@ -458,7 +518,7 @@ def print_summary(report: Report, console: Console | None = None) -> None:
     """The verdicts of the gates and claims, then the tables of final scores, one a setting."""
     console = console or Console()
     lines = [f"{with_algorithm(row)}: {row['verdict']}" for row in report.gates]
-    tallies = {claim: tally(rows) for claim, rows in groups(report.claims, lambda row: row["claim"]).items()}
+    tallies = {claim: tally(rows) for claim, rows in groups(report.claims, _claim).items()}
     lines += [f"{claim}: {told}" for claim, told in tallies.items() if told]
     for line in (*lines, f"{tables.SCORE}; mean over seeds [95% t interval]"):
         console.print(line, markup=False, highlight=False)

@@ -11,14 +11,17 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
 
 import numpy as np
-from scipy.special import stdtrit
+from scipy.special import stdtr, stdtrit
 
 FEW_SEEDS = 5
 """Intervals of fewer seeds are flagged."""
 REPLICATES = 20_000
 """Bootstrap samples of an interval."""
+LEVEL, POWER = 0.05, 0.8
+"""Two-sided level of every test and interval, and the power at which the smallest difference is told."""
 _LEVELS = (2.5, 97.5)
 """Percentiles of a 95% interval."""
 
@@ -96,6 +99,33 @@ def by_episode(seeds: Sequence[Sequence[float]]) -> np.ndarray:
     return np.array([[np.mean(episodes)] for episodes in seeds])
 
 
+@dataclass(frozen=True)
+class Estimate:
+    """A mean or a difference of two, as Student's t has it."""
+
+    value: float
+    error: float
+    """Standard error."""
+    free: float
+    """Degrees of freedom."""
+
+    @property
+    def interval(self) -> Interval:
+        """95% interval."""
+        reach = float(stdtrit(self.free, 1 - LEVEL / 2)) * self.error
+        return self.value - reach, self.value + reach
+
+    @property
+    def p(self) -> float:
+        """Two-sided p value against 0."""
+        return 2 * float(stdtr(self.free, -abs(self.value) / self.error))
+
+    @property
+    def smallest(self) -> float:
+        """Smallest true value that a test at 5% finds in 80% of cases, if error and degrees of freedom stay these."""
+        return float(stdtrit(self.free, 1 - LEVEL / 2) + stdtrit(self.free, POWER)) * self.error
+
+
 def mean_interval(scores: np.ndarray) -> Interval | None:
     """95% t interval of the mean of (seeds, episodes) scores, over the seeds and the episodes that they share.
 
@@ -107,21 +137,37 @@ def mean_interval(scores: np.ndarray) -> Interval | None:
         Lower and upper end; None for a single seed, and where no score differs from another, which tells nothing about
         how far the next seed's would be.
     """
-    return _t_interval(scores.mean(), [scores.mean(1)], [scores.mean(0)])
+    found = _estimate(scores.mean(), [scores.mean(1)], [scores.mean(0)])
+    return found.interval if found else None
 
 
 def difference_interval(scores: np.ndarray, others: np.ndarray) -> Interval | None:
-    """The same of the mean of (n, episodes) scores less that of (m, episodes) others.
+    """The same of the mean of (n, episodes) scores less that of (m, episodes) others."""
+    found = difference(scores, others)
+    return found.interval if found else None
+
+
+def difference(scores: np.ndarray, others: np.ndarray) -> Estimate | None:
+    """The mean of (n, episodes) scores less that of (m, episodes) others, over both levels; None as `mean_interval`.
 
     Where both have equally many episodes, these are taken as pairs: evaluations of a task begin at the same states.
     """
     paired = scores.shape[1] == others.shape[1]
     episodes = [scores.mean(0) - others.mean(0)] if paired else [scores.mean(0), others.mean(0)]
-    return _t_interval(scores.mean() - others.mean(), [scores.mean(1), others.mean(1)], episodes)
+    return _estimate(scores.mean() - others.mean(), [scores.mean(1), others.mean(1)], episodes)
 
 
-def _t_interval(middle: float, seeds: list[np.ndarray], episodes: list[np.ndarray]) -> Interval | None:
-    """About a sum of means, one for each array of values; the episodes' count where there are two or more."""
+def holm(values: Sequence[float]) -> list[float]:
+    """p values of a family of tests, adjusted by Holm 1979 in their order: at most 5% where all of them are none."""
+    adjusted, highest = list(values), 0.0
+    for rank, place in enumerate(sorted(range(len(values)), key=values.__getitem__)):
+        highest = max(highest, (len(values) - rank) * values[place])
+        adjusted[place] = min(1.0, highest)
+    return adjusted
+
+
+def _estimate(middle: float, seeds: list[np.ndarray], episodes: list[np.ndarray]) -> Estimate | None:
+    """Of a sum of means, one for each array of values; the episodes' count where there are two or more."""
     # No bootstrap: resampled means of three seeds spread by sqrt(2/3) standard errors, and their percentiles know no
     # t distribution. Its 95% interval would hold the mean three times in four.
     if _single(seeds):
@@ -132,8 +178,7 @@ def _t_interval(middle: float, seeds: list[np.ndarray], episodes: list[np.ndarra
     if not errors.any():
         return None
     # Welch and Satterthwaite: the degrees of freedom of a sum of variances, each known as well as its own count allows.
-    reach = stdtrit(errors.sum() ** 2 / (errors**2 / free).sum(), 0.975) * math.sqrt(errors.sum())
-    return float(middle - reach), float(middle + reach)
+    return Estimate(float(middle), math.sqrt(errors.sum()), float(errors.sum() ** 2 / (errors**2 / free).sum()))
 
 
 def bootstrap_intervals(

@@ -13,7 +13,7 @@ import pandas as pd
 
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import in_words
-from vd4rl_pomdp.report.load import CONDITION, CONTROL, COSTS, IDENTITY, PROBES, REFERENCES, SETTING, labels
+from vd4rl_pomdp.report.load import CONDITION, CONTROL, COSTS, CRITIC, IDENTITY, PROBES, REFERENCES, SETTING, labels
 from vd4rl_pomdp.runs.files import Row
 
 SCORE = "Score = return / 10 or the task's own divisor"
@@ -250,6 +250,18 @@ def control(table: pd.DataFrame) -> pd.DataFrame:
     names = ["data_return", *CONTROL, *(f"clean_{name}" for name in CONTROL), "path_error"]
     found = _means(table[table["score"].notna()], names)
     return _ordered(found, -found["return"])
+
+
+def critics(table: pd.DataFrame) -> pd.DataFrame:
+    """What the critics of every condition came to, beside the data's own discounted return: means over finished seeds.
+
+    `critic_moved` is the mean of how far they moved either way, `converged` how many converged; what one seed does not
+    know is missing. Algorithms without a critic have no row.
+    """
+    known = table["critic_value"].notna() | table["converged"].isna()
+    mine = table[table["score"].notna() & known]
+    found = _means(mine.assign(critic_moved=mine["critic_moved"].abs()), [*CRITIC, "converged"])
+    return _ordered(found.assign(converged=found["converged"] * found["seeds"]))
 
 
 def losses(curves: list[tuple[Row, list[tuple[int, float]]]]) -> pd.DataFrame:

@@ -6,11 +6,12 @@ FORMAT = 3
 CONFIG_FILE, METRICS_FILE, EPISODES_FILE = "config.json", "metrics.jsonl", "episodes.csv"
 LABELS_FILE, MACHINE_FILE, RENDER_FILE, PROBE_FILE = "labels.json", "machine.json", "render.json", "probe.json"
 REFERENCE_FILE, NAVIGATION_FILE, DIVERGED_FILE = "reference.json", "results.json", "diverged.json"
+CRITIC_FILE = "critic.json"
 FILM_FILE, TRAJECTORY_FILE = "film.npz", "trajectory.csv"
 PRETRAIN_TIMING_FILE, TIMING_FILE = "pretrain_timing.json", "timing.json"
 """Names of a run's files; the last is written at its end, and marks it as finished."""
 RECORDS = (
     *(CONFIG_FILE, LABELS_FILE, TIMING_FILE, DIVERGED_FILE, MACHINE_FILE, RENDER_FILE),
-    *(PRETRAIN_TIMING_FILE, PROBE_FILE, REFERENCE_FILE, NAVIGATION_FILE),
+    *(PRETRAIN_TIMING_FILE, PROBE_FILE, REFERENCE_FILE, CRITIC_FILE, NAVIGATION_FILE),
 )
 """Those that a results folder keeps whole, in its order."""

@@ -346,7 +346,7 @@ def add_results(paths: Sequence[Path | str], out: Path | str) -> Added:
         UserError: as `find_results`, or `out` holds something else, is damaged or is in use.
     """
     out = Path(out)
-    refuse_foreign(out, "results", RUNS, "README.md")  # whose page may be there before the first run
+    refuse_foreign(out, "results", RUNS, "README.md", "grid.toml")  # page and grid may be there before the first run
     found = find_results(paths, out)
     with owned(out):
         there = _kept(out)

@@ -49,6 +49,7 @@ MAZES = ("navigation_collect", "navigation_train")
 SECTIONS = (*PIXELS, *MAZES)
 SHARED = ("seed", "preset")
 """Settings outside the sections."""
+_SETS = ("collect", "navigation_collect")
 _TRAININGS = ("pretrain", "finetune", "navigation_train")
 _FOLDERS = {"out", "data", "encoder"}
 """Settings of the stages that a sweep sets."""
@@ -66,7 +67,8 @@ class GridCell:
     sections: Sections
     """Settings by section, without axes."""
     named: Mapping[str, Sequence[str]]
-    """By section, the settings that tell this cell from others of its grid: axes, and what a block says."""
+    """By section, the settings that tell this cell from others of its grid: axes, what a block says, and of a set what
+    a `where` says."""
 
     @property
     def chain(self) -> tuple[str, ...]:
@@ -104,7 +106,10 @@ class Where:
             for section, settings in self.sections.items()
         }
         merged = _merge({"": cell.shared} | cell.sections, own)
-        return GridCell(merged.pop(""), merged, cell.named)
+        # A set is known by its folder's name, which has to tell it from others; a run is found by what it computes.
+        more = {section: own.get(section, {}) if section in _SETS else {} for section in cell.named}
+        named = {section: list(dict.fromkeys([*names, *more[section]])) for section, names in cell.named.items()}
+        return GridCell(merged.pop(""), merged, named)
 
 
 @dataclass(frozen=True)

@@ -237,7 +237,7 @@ def plan_jobs(
         others: jobs of other grids in `out`, begun or not.
 
     Raises:
-        UserError: a folder holds another set, or cells want two sets in one.
+        UserError: a folder holds another set.
     """
     planner = _Planner(out, data, kept, others)
     for cell in cells:
@@ -279,10 +279,7 @@ class _Planner:
         if found.name not in self._sets:
             found.check()
             self._of_other_code.update(of_other_code(read_plan(found.folder), found.wanted))
-        data = self._sets.setdefault(found.name, found)
-        if others := differing(data.wanted, found.wanted):
-            raise UserError(f"{found.name} is asked for with two values of {others[0]}: make it an axis or a block's")
-        return data
+        return self._sets.setdefault(found.name, found)
 
     def _collection(self, cell: GridCell, data: DataSet) -> Job:
         words = [*COMMANDS[data.section], *words_of(told(cell, data.section)), "--out", str(data.folder)]

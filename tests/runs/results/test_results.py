@@ -31,7 +31,8 @@ def whole_run(place: Path, seed: int = 0, score: float = 2.0) -> Path:
     write_json(run / "render.json", {"mujoco": "3.11.0"})
     write_json(run / "probe.json", {"probe_pose": 12.5, "probe_velocity": None})
     write_json(run / "pretrain_timing.json", {"seconds": 7.0, "steps": 20})
-    Reference(500.0, None, 0.01).write(run)
+    Reference(500.0, None, 0.01, 1.0).write(run)
+    write_json(run / "critic.json", {"value": 150.0, "moved": 0.01, "data": 160.0})
     card = read_json(run / "encoder" / "config.json")
     write_json(run / "encoder" / "config.json", {"pretrain": card["pretrain"] | {"seed": seed}})
     return run
@@ -46,7 +47,7 @@ def test_a_run_comes_back_as_its_files_hold_it(tmp_path):
     added = add_results([tmp_path / "runs"], tmp_path / "out")
     assert added.in_words == "2 runs added"
     (one, other) = read_results(str(tmp_path / "out"))
-    for name in ("config", "labels", "timing", "machine", "render", "probe", "pretrain_timing", "reference"):
+    for name in ("config", "labels", "timing", "machine", "render", "probe", "pretrain_timing", "reference", "critic"):
         assert one.files[name] == read_json(run / f"{name}.json"), name
     assert one.files["encoder"] == read_json(run / "encoder" / "config.json")
     assert one.rows == read_episodes(run / "episodes.csv")
@@ -106,6 +107,18 @@ def test_runs_are_there_once_and_stay_as_they_are(tmp_path, capsys):
     main(["results", "add", str(tmp_path / "out"), "--out", str(tmp_path / "copy")])
     main([*words[:3], "--out", str(tmp_path / "copy")])
     assert (tmp_path / "copy" / "runs.jsonl").read_bytes() == (tmp_path / "out" / "runs.jsonl").read_bytes()
+
+
+@pytest.mark.parametrize(("name", "taken"), [("README.md", True), ("grid.toml", True), ("notes.txt", False)])
+def test_rows_may_come_after_their_page_and_their_grid(tmp_path, name, taken):
+    (tmp_path / "out").mkdir()
+    (tmp_path / "out" / name).touch()
+    run = whole_run(tmp_path / "run")
+    if taken:
+        assert add_results([run], tmp_path / "out").added == 1
+    else:
+        with pytest.raises(UserError, match="is not empty and holds no results"):
+            add_results([run], tmp_path / "out")
 
 
 def test_a_run_that_lost_its_last_evaluation_is_not_told_of_by_the_one_before(tmp_path):
