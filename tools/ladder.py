@@ -17,12 +17,9 @@ import subprocess
 import sys
 import time
 from pathlib import Path
-from statistics import fmean
 
 RESULTS = Path(__file__).parent.parent / "results" / "ladder"
 CURVES = ("q", "critic_loss", "actor_loss", "bc_loss")
-CURVE_EVERY = 1000
-"""Updates between two rows of curves.csv, each a mean over the updates since the row before."""
 _PROGRAM = str(Path(sys.executable).parent / "vd4rl-pomdp")
 
 
@@ -56,15 +53,9 @@ def keep_rows(runs: Path) -> int:
 
 
 def curve_of(metrics: Path) -> list[dict[str, str]]:
-    """Rows of curves.csv of a run's metrics.jsonl, each of whose rows is a mean over equally many updates."""
-    parts: dict[int, list[dict[str, float]]] = {}
-    for row in map(json.loads, metrics.read_text().splitlines()):
-        if "q" in row:
-            parts.setdefault(-(-row["step"] // CURVE_EVERY) * CURVE_EVERY, []).append(row)
-    return [
-        {"step": str(step)} | {name: f"{fmean(row[name] for row in rows):.6g}" for name in CURVES}
-        for step, rows in parts.items()
-    ]
+    """Rows of curves.csv of a run's metrics.jsonl, each a mean over the updates since the row before."""
+    rows = [row for row in map(json.loads, metrics.read_text().splitlines()) if "q" in row]
+    return [{"step": row["step"]} | {name: f"{row[name]:.5g}" for name in CURVES} for row in rows]
 
 
 def main() -> int:

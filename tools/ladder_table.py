@@ -22,13 +22,12 @@ from script import run_script
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.report.figures import Draw, looks_of, sheet, style
 from vd4rl_pomdp.report.stats import mean_and_error, number
+from vd4rl_pomdp.runs.critic import CONVERGED, VALUE, critic_of
 from vd4rl_pomdp.runs.results import Result, read_results
 from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.stages import collection_of, recorded
 
 RESULTS = Path(__file__).parents[1] / "results" / "ladder"
-DRIFT = 0.02
-"""A critic has converged if its mean value moves by less than this share over the last fifth of the updates."""
 NEAR = 1.02
 """A held-out cloning loss is near the lowest if it is no more than so many times it."""
 UNTRAINED = ("random", "state")
@@ -107,36 +106,29 @@ class Cell:
 
     def converged(self) -> list[int]:
         """Rungs at which the critic has converged."""
-        return [rung for rung in sorted(self.held_out) if abs(drift(self.q, rung)) < DRIFT]
+        return [rung for rung in sorted(self.held_out) if abs(drift(self.q, rung)) < CONVERGED]
 
 
 def drift(curve: Mapping[int, float], end: int) -> float:
-    """By which share of its mean a curve moves over the last fifth of `end` updates, as if training had ended there.
+    """By which share of its value a critic moved over the last fifth of `end` updates, as if training had ended there.
 
-    By the least-squares line through that fifth: its slope times its length, over its mean. Not a number where the
-    curve has fewer than two values there.
+    As `critic_of` tells it of a whole run; not a number where the curve has too few values for that.
     """
-    steps = np.array([step for step in curve if 0.8 * end < step <= end])
-    if len(steps) < 2:
-        return float("nan")
-    values = np.array([curve[step] for step in steps])
-    return float(np.polyfit(steps, values, 1)[0] * 0.2 * end / values.mean())
+    rows = [{"step": step, VALUE: value} for step, value in curve.items() if step <= end]
+    moved = critic_of(rows, end, None, None).get("moved")
+    return float("nan") if moved is None else moved
 
 
 def budget(cells: Sequence[Cell]) -> int | None:
     """The fewest updates, among the rungs of all cells, that suffice by a rule that looks at no evaluation.
 
-    In every cell the critic has converged there, and the cloning loss on held-out episodes is within 2% of its lowest
-    over the cell's converged rungs. None: no rung is so in all cells.
+    The critics of all cells have converged there, and in each the cloning loss on held-out episodes is within 2% of its
+    lowest over all such rungs. None: there is no such rung.
     """
-    enough = [set(_near_lowest(cell)) for cell in cells]
-    return min(set.intersection(*enough), default=None) if enough else None
-
-
-def _near_lowest(cell: Cell) -> Iterator[int]:
-    rungs = cell.converged()
-    lowest = min((cell.held_out[rung] for rung in rungs), default=0.0)
-    return (rung for rung in rungs if cell.held_out[rung] <= NEAR * lowest)
+    rungs = set.intersection(*(set(cell.converged()) for cell in cells)) if cells else set()
+    lowest = [min((cell.held_out[rung] for rung in rungs), default=0.0) for cell in cells]
+    told = list(zip(cells, lowest, strict=True))
+    return min((rung for rung in rungs if all(cell.held_out[rung] <= NEAR * low for cell, low in told)), default=None)
 
 
 def cells_in(folder: Path = RESULTS) -> list[Cell]:
