@@ -98,11 +98,12 @@ class Cell:
     clean: Sequence[float] = ()
     """Of the last rung, played with nothing hidden."""
     data_return: float = float("nan")
+    gamma: float = float("nan")
 
     @property
     def data_value(self) -> float:
         """The data's own discounted return: their mean reward over 1 - gamma, as no episode ends but by its time."""
-        return self.data_return / TASKS.named(self.key.task).decisions / (1 - 0.99)
+        return self.data_return / TASKS.named(self.key.task).decisions / (1 - self.gamma)
 
     def converged(self) -> list[int]:
         """Rungs at which the critic has converged."""
@@ -159,8 +160,8 @@ def _cell(run: Result, known: Mapping[str, dict[int, float]]) -> Cell:
         if row["evaluated_under"] == row["corruption"]:
             returns[row["step"]][row["episode_seed"]] = row["return"]
     clean = [row["return"] for row in run.rows if row["evaluated_under"] == "none"][-len(returns[max(returns)]) :]
-    data = run.files["reference"]["data_return"]
-    return Cell(_key(run), **known, returns=dict(returns), clean=clean, data_return=data)
+    data, gamma = run.files["reference"]["data_return"], run.record["config"]["gamma"]
+    return Cell(_key(run), **known, returns=dict(returns), clean=clean, data_return=data, gamma=gamma)
 
 
 def asked() -> list[Key]:
