@@ -39,7 +39,14 @@ FILES = {
 """Columns of the files beside a run's rows, and what a cell calls them."""
 LOOKS = looks_of(())
 """Numbers of looks by method."""
-LEVERS = {"": "-", "1,024 units": "--", "fp32": ":", "20,000 steps": "-.", "200 episodes": (0, (4, 1, 1, 1, 1, 1))}
+LEVERS = {
+    "": "-",
+    "1,024 units": "--",
+    "fp32": ":",
+    "20,000 steps": "-.",
+    "200 episodes": (0, (4, 1, 1, 1, 1, 1)),
+    "16 views": (0, (1, 1)),
+}
 """Dashes by what is not as in the first rungs."""
 Look = dict[str, Any]
 
@@ -57,6 +64,7 @@ class Key(NamedTuple):
     """Of pretraining."""
     episodes: int
     """Of the set."""
+    views: int
 
     @property
     def setting(self) -> str:
@@ -65,12 +73,13 @@ class Key(NamedTuple):
 
     @property
     def lever(self) -> str:
-        """What is not as in the first rungs: 256 units, bf16, 3,000 steps, 100 episodes."""
+        """What is not as in the first rungs: 256 units, bf16, 3,000 steps, 100 episodes, 4 views."""
         levers = (
             (f"{self.units:,} units", self.units != 256),
             (self.precision, self.precision != "bf16"),
             (f"{self.steps:,} steps", self.steps != 3000),
             (f"{self.episodes} episodes", self.episodes != 100),
+            (f"{self.views} views", self.views != 4),
         )
         return ", ".join(words for words, other in levers if other)
 
@@ -151,7 +160,8 @@ def cells_in(folder: Path = RESULTS) -> list[Cell]:
 def _key(run: Result) -> Key:
     config, card, made = run.record["config"], run.card, run.record["collection"]
     place = made["task"], made["quality"], card["corruption"]["corruption"], card["method"]
-    return Key(*place, config["hidden_dim"], config["update_precision"], card["steps"], made["episodes"])
+    own = config["hidden_dim"], config["update_precision"], card["steps"], made["episodes"], config["views"]
+    return Key(*place, *own)
 
 
 def _cell(run: Result, known: Mapping[str, dict[int, float]]) -> Cell:
@@ -170,7 +180,8 @@ def asked() -> list[Key]:
     for cell in load_grid(str(RESULTS / "grid.toml")).cells():
         made, before, after = collection_of(cell), recorded(cell, "pretrain"), recorded(cell, "finetune")
         place = made["task"], made["quality"], before["corruption"], before["method"]
-        keys.append(Key(*place, after["hidden_dim"], after["update_precision"], before["steps"], made["episodes"]))
+        own = after["hidden_dim"], after["update_precision"], before["steps"], made["episodes"], after["views"]
+        keys.append(Key(*place, *own))
     return keys
 
 

@@ -123,7 +123,7 @@ def test_a_critic_has_converged_where_its_last_fifth_is_level(scripts):
 
 def test_a_budget_is_the_first_rung_where_every_critic_has_converged_and_held_out_cloning_is_near_its_lowest(scripts):
     script = scripts("ladder_table")
-    key = script.Key("walker_walk", "expert", "patch", "acro", 256, "bf16", 3000, 100)
+    key = script.Key("walker_walk", "expert", "patch", "acro", 256, "bf16", 3000, 100, 4)
 
     def cell(*held_out, rises=0):
         """Rungs at 100 to 400 updates; the critic's value rises until an update, and is level from then on."""
