@@ -48,7 +48,8 @@ def pretrain(config: PretrainConfig) -> RunFolder:
     method, dataset = METHODS.named(config.method), open_dataset(config.data)
     config = replace(config, task=_task_of(dataset, config))
     objective = make_objective(dataset, config).to(pick_device(config.device))
-    inputs, collection = {"data": dataset.fingerprint}, read_plan(config.data)
+    inputs = {"data": dataset.fingerprint} | getattr(objective.encoder.frame, "found", {})
+    collection = read_plan(config.data)
     with RunFolder(config.out, STAGE, config, inputs, FILES_OF_RUN, collection=collection) as run:
         if not run.finished:
             dataset.to(next(objective.parameters()).device)
