@@ -335,8 +335,8 @@ def test_fqls_flow_has_both_modes_of_the_data_and_its_policy_is_the_kept_one_at_
         one_step = algorithm.noise_in.act(algorithm.policy, z, noise)
         at_none = algorithm.noise_in.act(algorithm.policy, z, 0 * noise)
     for found in (flow, one_step):
-        shares = [((found - mode).abs() < 0.25).float().mean().item() for mode in (-0.5, 0.5)]
-        assert shares == pytest.approx([0.75, 0.25], abs=0.12)
+        assert (found < 0).float().mean().item() == pytest.approx(0.75, abs=0.08)
+        assert ((found.abs() - 0.5).abs() < 0.25).float().mean() > 0.65
     assert torch.equal(at_none, algorithm.policy.from_standardised(z))
 
 
