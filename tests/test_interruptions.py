@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import torch
 
-import finetune.train
+import finetune.trainer
 from finetune.algorithms import bc, td3_bc
 from finetune.features import _ENCODED, FrozenEncoder
 from finetune.train import finetune as run_finetune
@@ -339,7 +339,7 @@ def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
 ):
     """Also in the last one, where rows under the run's own corruption alone are not all."""
     config = smoke_finetune(encoder, data, tmp_path / "cut", **FINETUNE)
-    append, evaluations = finetune.train.append_episodes, []
+    append, evaluations = finetune.trainer.append_episodes, []
 
     def cut(path: Path, rows: list[dict[str, Any]]) -> None:
         evaluations.append(rows)
@@ -350,7 +350,7 @@ def test_a_cut_in_an_evaluation_repeats_the_evaluation_alone(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(finetune.train, "append_episodes", cut)
+        patch.setattr(finetune.trainer, "append_episodes", cut)
         with pytest.raises(KeyboardInterrupt):
             run_finetune(config)
     if evaluation == 2:

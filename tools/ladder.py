@@ -5,7 +5,7 @@
 
 Runs `vd4rl-pomdp sweep run results/ladder/grid.toml`, taking finished rows from results/ladder. A fine-tuning
 overwrites its policy at each evaluation; every version is copied to DIR/snapshots, since the cloning loss on held-out
-episodes is measured for each rung. Re-run the same command to resume.
+episodes is measured for each rung (`ladder_cloning.py`). Re-run the same command to resume.
 """
 
 from __future__ import annotations
@@ -13,7 +13,6 @@ from __future__ import annotations
 import argparse
 import csv
 import json
-import shutil
 import subprocess
 import sys
 import time
@@ -21,36 +20,42 @@ from pathlib import Path
 
 RESULTS = Path(__file__).parent.parent / "results" / "ladder"
 CURVES = ("q", "critic_loss", "actor_loss", "bc_loss")
-CURVE_EVERY = 2000
-"""Updates between two rows of curves.csv, each a mean over the updates of a row of metrics."""
 _PROGRAM = str(Path(sys.executable).parent / "vd4rl-pomdp")
 
 
 def keep_policies(runs: Path, snapshots: Path) -> None:
-    """Copy each policy that is not kept yet, under the update of the evaluation that it plays."""
+    """Copy each policy that is not kept yet, under the update that it is of."""
     for weights in runs.rglob("policy/model.safetensors"):
-        run = weights.parent.parent
-        rows = (run / "metrics.jsonl").read_text().splitlines() if (run / "metrics.jsonl").exists() else []
-        steps = [json.loads(row)["step"] for row in rows[-1:]]
-        target = snapshots / run.relative_to(runs) / f"{steps[0] if steps else 0}.safetensors"
-        newest = max((path.stat().st_mtime for path in target.parent.glob("*.safetensors")), default=0.0)
-        if weights.stat().st_mtime > newest:
-            target.parent.mkdir(parents=True, exist_ok=True)
-            shutil.copy2(weights, target)
+        with weights.open(
+            "rb"
+        ) as file:  # opened once: a new version takes the place of this one, and does not change it
+            header = file.read(int.from_bytes(file.read(8), "little"))
+            step = json.loads(header)["__metadata__"]["step"]
+            kept = snapshots / weights.parent.parent.relative_to(runs) / f"{step}.safetensors"
+            if not kept.exists():
+                kept.parent.mkdir(parents=True, exist_ok=True)
+                file.seek(0)
+                fresh = kept.with_suffix(".part")
+                fresh.write_bytes(file.read())
+                fresh.replace(kept)
 
 
 def keep_rows(runs: Path) -> int:
     """Add finished runs to results/ladder, and the curves of their losses and critic values to its curves.csv."""
     code = subprocess.run([_PROGRAM, "results", "add", str(runs), "--out", str(RESULTS)]).returncode
     with (RESULTS / "curves.csv").open("w", newline="") as file:
-        table = csv.DictWriter(file, ["run", "step", *CURVES], extrasaction="ignore", lineterminator="\n")
+        table = csv.DictWriter(file, ["run", "step", *CURVES], lineterminator="\n")
         table.writeheader()
         for metrics in sorted(runs.rglob("finetune-*/metrics.jsonl")):
             if (metrics.parent / "timing.json").exists():
-                rows = [json.loads(line) for line in metrics.read_text().splitlines()]
-                name = metrics.parent.relative_to(runs).as_posix()
-                table.writerows({"run": name} | row for row in rows if "q" in row and row["step"] % CURVE_EVERY == 0)
+                table.writerows({"run": metrics.parent.relative_to(runs).as_posix()} | row for row in curve_of(metrics))
     return code
+
+
+def curve_of(metrics: Path) -> list[dict[str, str]]:
+    """Rows of curves.csv of a run's metrics.jsonl, each a mean over the updates since the row before."""
+    rows = [row for row in map(json.loads, metrics.read_text().splitlines()) if "q" in row]
+    return [{"step": row["step"]} | {name: f"{row[name]:.5g}" for name in CURVES} for row in rows]
 
 
 def main() -> int:
@@ -68,10 +73,12 @@ def main() -> int:
     command += ["--done", str(RESULTS)] if (RESULTS / "runs.jsonl").exists() else []
     command += ["--only", *args.only] if args.only else []
     sweep = subprocess.Popen(command)
-    while sweep.poll() is None:
+    while True:
+        ended = sweep.poll() is not None
+        keep_policies(args.work / "runs", args.work / "snapshots")  # once more at the end: of the last run, too
+        if ended:
+            return sweep.returncode
         time.sleep(20)
-        keep_policies(args.work / "runs", args.work / "snapshots")
-    return sweep.returncode
 
 
 if __name__ == "__main__":

@@ -12,6 +12,7 @@ from collections.abc import Iterable
 from dataclasses import dataclass
 from pathlib import Path
 
+import ladder_table
 import methods_table
 import navigation_table
 import offline_table
@@ -33,11 +34,16 @@ class Config:
 
 def pages() -> dict[str, Tables]:
     """Tables of each page, which is told by its path in the repository."""
-    returns, mazes = offline_table.main_runs(), navigation_table.numbers_in()
+    returns, mazes, rungs = offline_table.main_runs(), navigation_table.numbers_in(), ladder_table.cells_in()
     return {
         "results/control/README.md": {
             "gates": offline_table.gate_lines(returns),
             "ranks": offline_table.rank_lines(returns),
+        },
+        "results/ladder/README.md": {
+            "runs": ladder_table.run_lines(rungs),
+            "rungs": ladder_table.rung_lines(rungs),
+            "budget": ladder_table.budget_lines(rungs),
         },
         "results/methods/README.md": {"methods": methods_table.table_lines(methods_table.main_runs())},
         "results/navigation/README.md": {

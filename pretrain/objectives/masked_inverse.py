@@ -114,7 +114,8 @@ class MaskedInverse(InverseObjective):
     def visible(self, t: int, k: int, rows: int) -> tuple[set[int], set[int]]:
         """Past up to t and future from t+k on; with actions a_j for j < t and j >= t+k."""
         observations, actions = self.past_visible(t)
-        end = rows if self.n is None else min(rows, t + k + self.n + 1)
+        read = (rows if self.n is None else self.n + 1, self.backward_memory.reach or rows)
+        end = min(rows, t + k + min(read))
         observations |= set(range(t + k, end))
         if self.use_actions:
             actions |= set(range(t + k - 1, end - 1) if self.literal_future else range(t + k, end))

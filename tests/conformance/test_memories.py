@@ -25,9 +25,20 @@ from vd4rl_pomdp.testing.memories import (
 
 
 @pytest.mark.parametrize("check", CHECKS, ids=lambda check: check.__name__)
-@pytest.mark.parametrize("options", [{}, {"gru_layers": 2}], ids=["one layer", "two"])
-def test_the_gru_keeps_its_promises(check, options):
-    run_check("memory", check, "gru", **options)
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("gru", {}),
+        ("gru", {"gru_layers": 2}),
+        ("transformer", {}),
+        ("transformer", {"transformer_layers": 3, "transformer_heads": 1, "attention_window": 2}),
+        ("lru", {}),
+        ("lru", {"lru_layers": 1, "lru_units": 5, "r_min": 0.9, "r_max": 0.99, "max_phase": 0.3}),
+    ],
+    ids=str,
+)
+def test_a_memory_keeps_its_promises(check, name, options):
+    run_check("memory", check, name, **options)
 
 
 @pytest.fixture
@@ -55,11 +66,24 @@ def test_mik_a_trains_with_another_memory_and_its_encoder_is_used_and_named(memo
     assert finetune(smoke_finetune(made / "encoder", data, tmp_path / "finetuned", **brief)).finished
 
 
+@pytest.mark.parametrize("history", ["transformer", "lru"])
+def test_a_memory_goes_through_every_stage(data, own_cache, tmp_path, history):
+    made = pretrain(smoke_pretrain(data, tmp_path / "pretrained", method="mik+a", history=history, steps=1)).path
+    brief = {"updates": 1, "batch_size": 4, "eval_length": 2, "random_histories": 0.5, "precision": "bf16"}
+    assert finetune(smoke_finetune(made / "encoder", data, tmp_path / "finetuned", **brief)).finished
+
+
 class Averaged(GRU):
     """Sees the whole window."""
 
     def forward(self, rows, state):
         return super().forward(rows - rows.mean(1, keepdim=True), state)
+
+
+class Short(GRU):
+    """Sees more than it says."""
+
+    reach = 2
 
 
 class Forgetful(GRU):
@@ -99,6 +123,7 @@ class Hidden(GRU):
             a_state_depends_on_its_past_alone,
             r"row 0 of window 1 has gradients to \(window, row\) \[\(1, 0\), ",
         ),
+        (Short, a_state_depends_on_its_past_alone, "only rows 1 to 2 of window 1 may have one"),
         (Forgetful, streaming_equals_batch, "they differ at row 1"),
         (Wide, outputs_have_one_shape, r"\(3, 6, 14\)"),
         (Unused, gradients_reach_all_parameters, "none reaches unused.bias, unused.weight"),

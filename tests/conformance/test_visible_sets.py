@@ -34,6 +34,9 @@ OPTIONS: dict[str, dict] = {
     "n=1": {"n": 1},
     "n=9": {"n": 9},
     "newest": {"future_frames": "newest"},
+    "transformer": {"history": "transformer"},
+    "lru": {"history": "lru"},
+    "narrow": {"history": "transformer", "attention_window": 2, "transformer_layers": 1},
 }
 WINDOWS = {"inside": INSIDE, "end": END, "short": SHORT}
 DRAWN = """
@@ -94,6 +97,16 @@ mik+a             literal        end     0 5     #....#    ....#.
 mik+a             literal        short   1 1     ####..    ###...
 mik+a             literal,n=1    inside  1 2     ##.##.    #.##..
 mik+a             literal,n=0    inside  1 2     ##.#..    #.#...
+mik+a             transformer    inside  2 2     ###.##    ##..##
+mik+a             lru            inside  2 2     ###.##    ##..##
+mik+a             narrow         inside  2 2     .##.##    ##..##
+mik+a             narrow         inside  3 1     ..####    .##.##
+mik+a             narrow         inside  2 1     .####.    ##.##.
+mik+a             narrow,m=0     inside  2 1     ..###.    ...##.
+mik+a             narrow,n=0     inside  2 1     .###..    ##.#..
+ah+a              narrow         inside  1 3     ##.##.    #.##..
+ah+a              narrow         inside  2 3     .##.##    ##.##.
+acro              narrow         inside  3 1     ..###.    ......
 """
 """By hand: # is seen, . is not. Columns: rows j of o_j and indices j of a_j; a_5 exists if the window ends inside."""
 Case = tuple[str, tuple[str, ...]]
@@ -172,14 +185,25 @@ BOUNDED = [
     *(("mik+a", ("literal", *n)) for n in ((), ("n=0",), ("n=1",), ("m=1", "n=1"))),
     *((name, ("newest", *more)) for name in ("mik", "mik+a") for more in ((), ("m=0", "n=0"), ("n=1",), ("layers",))),
     ("mik+a", ("newest", "literal")),
+    *(
+        (name, (memory, *more))
+        for memory in ("transformer", "lru")
+        for name, more in (
+            *((name, ()) for name in METHODS if predicts_actions(name)),
+            ("ah+a", ("m=1",)),
+            ("mik+a", ("m=2", "n=1")),
+            ("mik+a", ("literal",)),
+            ("mik+a", ("newest",)),
+        )
+    ),
 ]
 
 
 def from_the_paper(method: str, words: tuple[str, ...], t: int, k: int, last: int, acts: int) -> tuple:
-    """Table 1's sets: rows up to `last`, actions up to `acts`. A memoryless method with a GRU sees what AH does."""
+    """Table 1's sets: rows up to `last`, actions up to `acts`. A memoryless method with a memory sees what AH does."""
     told = settings(words)
     m, n = told.get("m", JUMPS_PAST if method in ("fj", "fj+a") else FAR), told.get("n", FAR)
-    table = "ah" if told.get("history") == "gru" else method.removesuffix("+a")
+    table = "ah" if "history" in told and METHODS[method].history == "none" else method.removesuffix("+a")
     row = ROW_OF[table]
     action = ACTION_OF.get(method + " literal" * told.get("literal_future", False), lambda *_: False)
     return (

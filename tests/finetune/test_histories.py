@@ -22,10 +22,12 @@ N = 2
 pytestmark = pytest.mark.usefixtures("own_cache")
 
 
-@pytest.fixture
-def frozen(tmp_path) -> FrozenEncoder:
+@pytest.fixture(params=[("gru", {}), ("transformer", {"attention_window": 3}), ("lru", {})], ids=lambda kind: kind[0])
+def frozen(tmp_path, request) -> FrozenEncoder:
     torch.manual_seed(0)
-    encoder = Encoder(EncoderConfig(6, "nature", 16, "gru", use_actions=True, hidden_dim=8)).eval()
+    history, told = request.param
+    config = EncoderConfig(6, "nature", 16, history, use_actions=True, hidden_dim=8, memory_options=told)
+    encoder = Encoder(config).eval()
     return FrozenEncoder(
         encoder.requires_grad_(False), noise_set(tmp_path / "set", 0.9), CorruptionConfig(), 0, "fp32", 0
     )

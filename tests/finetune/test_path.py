@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import torch
 
-from finetune import train
+from finetune import trainer
 from finetune.path import DataPath
 from finetune.train import finetune
 from tests.finetune.conftest import BRIEF
@@ -66,7 +66,7 @@ def test_an_episode_of_one_row_decides_nothing(walked, monkeypatch):
 
 @pytest.mark.parametrize("views", [1, 0])
 def test_a_run_keeps_its_path_error_and_compares_closed_loop_actions(walked, encoder, tmp_path, monkeypatch, views):
-    monkeypatch.setattr(train, "STANDARDISED_BY", 16)
+    monkeypatch.setattr(trainer, "STANDARDISED_BY", 16)
     folder, _, actor = walked
     config = smoke_finetune(encoder, folder, tmp_path / "run", views=views, **BRIEF)
     run = finetune(config).path

@@ -12,7 +12,7 @@ from typing import Any
 import pytest
 import torch
 
-from finetune import end_to_end, train
+from finetune import end_to_end, train, trainer
 from finetune.algorithms import ALGORITHMS, bc, td3_bc
 from finetune.config import FinetuneConfig
 from finetune.features import FeatureSampler, StackedSampler
@@ -192,7 +192,7 @@ def test_methods_of_one_width_stack(encoders, data, tmp_path):
 
 def test_a_run_that_diverges_is_marked_and_the_others_end(encoder, data, tmp_path, capsys, monkeypatch):
     configs = [smoke_finetune(encoder, data, tmp_path / str(seed), **BRIEF, seed=seed) for seed in range(3)]
-    make = train._trainer
+    make = train.make_trainer
 
     def broken(config, *more):
         made = make(config, *more)
@@ -201,7 +201,7 @@ def test_a_run_that_diverges_is_marked_and_the_others_end(encoder, data, tmp_pat
         return made
 
     with monkeypatch.context() as patch:
-        patch.setattr(train, "_trainer", broken)
+        patch.setattr(train, "make_trainer", broken)
         with pytest.raises(FloatingPointError, match=rf"{tmp_path / '1'}: critic_loss is .* in the row of step 3"):
             finetune_all(configs)
     assert "the other runs go on" in capsys.readouterr().err
@@ -304,7 +304,7 @@ def test_replayed_updates_are_those_that_are_run(data, monkeypatch, capsys, name
 def test_replayed_runs_are_those_that_are_run(encoders, data, tmp_path, monkeypatch, capsys, method):
     """On features, on batches that are encoded anew, and where the encoder is trained along; cut and resumed, too."""
     changes = BRIEF | {"updates": 20, "eval_every": 10, "views": 0 if method == "acro" else 1}
-    monkeypatch.setattr(train, "STANDARDISED_BY", 16)
+    monkeypatch.setattr(trainer, "STANDARDISED_BY", 16)
     for folder, capture in (("run", None), ("replayed", record)):
         replays(monkeypatch, train, end_to_end, td3_bc, bc, capture=capture)
         config = smoke_finetune(encoders[method], data, tmp_path / folder, **changes)

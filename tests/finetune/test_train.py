@@ -10,7 +10,7 @@ import pytest
 import torch
 from safetensors.torch import load_file
 
-from finetune import train
+from finetune import train, trainer
 from finetune.features import FrozenEncoder
 from finetune.train import RESULTS
 from finetune.train import finetune as run_finetune
@@ -48,7 +48,7 @@ def test_finetuning_resumes_to_the_bit(encoder, data, tmp_path, monkeypatch, vie
     """On cached features and on exact batches; `check_algorithm` proves it of every algorithm's updates."""
     changes = {"views": views, "eval_length": 2, "updates": 12, "eval_every": 6}
     changes |= {"checkpoint_every": 4, "batch_size": 4}
-    monkeypatch.setattr(train, "STANDARDISED_BY", 16)
+    monkeypatch.setattr(trainer, "STANDARDISED_BY", 16)
     whole = finetune_cut_and_whole(monkeypatch, encoder, data, tmp_path, **changes)
     rows = list(csv.DictReader((whole / "episodes.csv").open()))
     assert [(row["step"], row["evaluated_under"]) for row in rows] == [
@@ -181,7 +181,7 @@ def test_rows_have_the_quality_of_the_policys_set_or_the_encoders_if_both_learne
     encoder, tmp_path, monkeypatch, folder, lengths, quality
 ):
     other = write_fake_set(tmp_path / "walker_walk" / folder, lengths)
-    monkeypatch.setattr(train, "encode_views", lambda *_: (_ for _ in ()).throw(CutError))  # the names come before
+    monkeypatch.setattr(trainer, "encode_views", lambda *_: (_ for _ in ()).throw(CutError))  # the names come before
     with pytest.raises(CutError):
         run_finetune(smoke_finetune(encoder, other, tmp_path / "out", **BRIEF))
     assert json.loads((tmp_path / "out" / "labels.json").read_text())["quality"] == quality

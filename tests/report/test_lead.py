@@ -1,5 +1,6 @@
 """MIK+A's lead against the budget of pretraining, on runs whose returns are given."""
 
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -11,6 +12,7 @@ from tests.helpers_report import describe, write_seeds
 from vd4rl_pomdp.report import write_report
 from vd4rl_pomdp.report.lead import leads
 from vd4rl_pomdp.report.load import load_runs
+from vd4rl_pomdp.runs.files import read_json, write_json
 
 DATA = 800.0
 LEAD, OVER_GRU = "mik+a less acro", "mik+a less acro with a GRU"
@@ -59,6 +61,18 @@ def test_returns_are_shares_of_each_runs_own_data(runs):
     for run in runs.glob("*-1-td3_bc-20000-*"):
         (run / "reference.json").write_text((run / "reference.json").read_text().replace("800.0", "400.0"))
     assert found(runs)[LEAD, 20000]["difference"] == pytest.approx((87.5 + 180 - 37.5 - 80) / 2)
+
+
+def test_sides_on_a_set_a_seed_are_compared_seed_by_seed_or_not(runs):
+    """Each seed's set is its own, and a side may lack a seed."""
+    for run in runs.iterdir():
+        seed = read_json(run / "config.json")["config"]["seed"]
+        made = {"inputs": {"data": f"{seed}" * 24}, "collection": {"task": "walker_walk", "seed": 100 + seed}}
+        write_json(run / "config.json", read_json(run / "config.json") | made)
+    assert found(runs)[LEAD, 3000]["difference"] == pytest.approx(10.0)
+    shutil.rmtree(next(runs.glob("mik+a-patch-0-*-3000-*")))
+    row = found(runs)[LEAD, 3000]
+    assert (row["difference"], row["left_seeds"], row["low"]) == (pytest.approx(55 - 42.5), 1, None)
 
 
 def test_policies_of_other_budgets_are_not_mixed(runs, tmp_path):

@@ -29,7 +29,8 @@ from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd
 from finetune.features import STAGE, FeatureSampler, FrozenEncoder, encode_views
 from finetune.histories import Histories
-from finetune.train import FinetuneTrainer, Updates
+from finetune.train import Updates
+from finetune.trainer import FinetuneTrainer
 from pretrain.config import PretrainConfig
 from vd4rl_pomdp.bench.measures import synthetic_set
 from vd4rl_pomdp.bench.processes import JAX_MISSING, Worker, at_once, make_trainer

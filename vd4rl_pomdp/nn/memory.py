@@ -7,60 +7,37 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, ClassVar
+from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 from torch.nn.functional import pad
 
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.options import Limits, Options, refuse_options
+from vd4rl_pomdp.core.options import refuse_options
 from vd4rl_pomdp.core.registry import Registry
+from vd4rl_pomdp.nn.memories.base import Memory, MemoryOptions
+from vd4rl_pomdp.nn.memories.gru import GRU, GRUOptions
+from vd4rl_pomdp.nn.memories.lru import LRU, LRUOptions
+from vd4rl_pomdp.nn.memories.transformer import Transformer, TransformerOptions
 
-
-@dataclass(frozen=True)
-class MemoryOptions(Options):
-    """Options of every memory."""
-
-    hidden_dim: int = 256
-    """Width of the memory's output s_t."""
-    m: int | None = None
-    """Rows before t that a state is computed from; None: what the method has (fj and fj+a 8, the others all)."""
-
-    limits: ClassVar[Limits] = {"hidden_dim": 1, "m": 0}
-
-
-@dataclass(frozen=True)
-class GRUOptions(MemoryOptions):
-    """Options of the GRU."""
-
-    gru_layers: int = 1
-    """Layers of the GRU."""
-
-    limits: ClassVar[Limits] = {"gru_layers": (1, 64)}
-
-
-class Memory(nn.Module):
-    """A recurrence. What it puts out at row j depends on rows 0..j and on the state before row 0 alone."""
-
-    def initial_state(self, batch: int) -> Tensor:
-        """State before an episode's first row: (L, batch, W) zeros in the precision of its weights."""
-        raise NotImplementedError
-
-    def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
-        """(B, T, I) rows, T > 0, and an (L, B, W) state -> (B, T, hidden_dim), and the state after the last row."""
-        raise NotImplementedError
-
-
-class GRU(nn.GRU, Memory):
-    """Gated recurrent units (Cho et al. 2014, arXiv 1406.1078), batch first."""
-
-    def __init__(self, inputs: int, options: GRUOptions) -> None:
-        super().__init__(inputs, options.hidden_dim, options.gru_layers, batch_first=True)
-
-    def initial_state(self, batch: int) -> Tensor:
-        """(gru_layers, batch, hidden_dim)."""
-        return next(self.parameters()).new_zeros(self.num_layers, batch, self.hidden_size)
+__all__ = [
+    "GRU",
+    "LRU",
+    "MEMORIES",
+    "GRUOptions",
+    "LRUOptions",
+    "Memory",
+    "MemoryOptions",
+    "MemoryPart",
+    "Transformer",
+    "TransformerOptions",
+    "make_memory",
+    "run_backward",
+    "run_memory",
+    "run_over_next",
+    "run_over_versions",
+]
 
 
 @dataclass(frozen=True)
@@ -84,7 +61,11 @@ def _refuse_part(name: str, part: MemoryPart) -> None:
 
 MEMORIES: Registry[MemoryPart] = Registry(
     "memory",
-    {"gru": MemoryPart(GRU, GRUOptions, summary="gated recurrent units, in the paper's methods")},
+    {
+        "gru": MemoryPart(GRU, GRUOptions, summary="gated recurrent units, in the paper's methods"),
+        "transformer": MemoryPart(Transformer, TransformerOptions, summary="causal attention to a window of rows"),
+        "lru": MemoryPart(LRU, LRUOptions, summary="linear recurrent units, in parallel over a window"),
+    },
     lambda part: isinstance(part, MemoryPart),
     "a vd4rl_pomdp.nn.memory.MemoryPart",
     _refuse_part,

@@ -122,11 +122,13 @@ class InverseObjective(Objective):
 
     def past_visible(self, t: int) -> tuple[set[int], set[int]]:
         """Observation rows and action indices that the encoder's state of row t depends on."""
-        shape = self.encoder.config
-        if shape.history == "none":
+        shape, memory = self.encoder.config, self.encoder.memory
+        if memory is None:
             return {t}, set()
-        first = max(0, t + 1 - shape.history_window) if shape.history_window else 0
-        return set(range(first, t + 1)), set(range(first, t)) if shape.use_actions else set()
+        window, reach = shape.history_window or t + 1, memory.reach or t + 1
+        # the first row of a window carries no action before it, that of a memory's reach does
+        actions = range(max(0, t + 1 - window, t - reach), t) if shape.use_actions else ()
+        return set(range(max(0, t + 1 - window, t + 1 - reach), t + 1)), set(actions)
 
     def pairs(self, rows: int) -> Tensor:
         """The (t, k) that are scored in a window of `rows` rows: (P, 2) int64 on the CPU, not to be changed."""

@@ -36,17 +36,20 @@ class PolicyBudget(NamedTuple):
 def leads(runs: list[Run]) -> list[Row]:
     """One row for every setting, policy's budget, difference and pretraining's budget.
 
-    Only where the two methods have at least two budgets of pretraining. `difference` is the leader's mean return less
-    the other method's, every run's in % of the mean return of its own data; `low` and `high` are the ends of its 95%
-    interval over seeds and episodes. It is of runs of like settings; where there are none, it is None. `left_seeds` and
-    `right_seeds` count both sides' seeds, whether they can be compared or not.
+    Only where these methods have at least two budgets of pretraining, and each a run. `difference` is the leader's mean
+    return less the other method's, every run's in % of the mean return of its own data; `low` and `high` are the ends
+    of its 95% interval over seeds and episodes. It is of runs of like settings; where there are none, it is None.
+    `left_seeds` and `right_seeds` count both sides' seeds, whether they can be compared or not.
     """
-    told = [run for run in comparable(runs) if run.method in (LEADER, OTHER) and (run.reference.data_return or 0) > 0]
-    known = [(run, *budgets) for run in told if (budgets := _budgets(run))]
+    finished = [run for run in comparable(runs) if (run.reference.data_return or 0) > 0]
+    sides_of = [as_it_is(LEADER, finished), *(as_it_is(OTHER, finished, history) for history in OTHERS.values())]
+    known = [(run, *budgets) for side in sides_of for run in side if (budgets := _budgets(run))]
     rows: list[Row] = []
     for (place, policy), here in sorted(groups(known, lambda one: (one[0].of(GATED), one[1])).items()):
-        by_budget = groups(here, lambda one: one[2])
-        for name, history in OTHERS.items() if len(by_budget) > 1 else ():
+        by_budget, everyone = groups(here, lambda one: one[2]), [run for run, *_ in here]
+        for name, history in OTHERS.items():
+            if len(by_budget) < 2 or not (as_it_is(LEADER, everyone) and as_it_is(OTHER, everyone, history)):
+                continue
             for budget in sorted(by_budget, key=lambda one: one.steps * one.stacks):
                 row = dict(zip(GATED, place, strict=True)) | {"method": name, "variant": ""}
                 row |= policy._asdict() | budget._asdict()

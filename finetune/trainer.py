@@ -1,0 +1,262 @@
+"""One fine-tuning: what is trained on which batches, how it is evaluated, and what its folder keeps."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Callable
+from contextlib import AbstractContextManager
+from dataclasses import asdict
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from finetune.algorithms import ALGORITHMS, Algorithm
+from finetune.algorithms.algorithm import ReturnOptions
+from finetune.config import FinetuneConfig
+from finetune.end_to_end import EndToEnd
+from finetune.evaluation import episode_rows, evaluate, jobs_of, own_and_none
+from finetune.features import STAGE, ExactSampler, FeatureSampler, FrozenEncoder, encode_views
+from finetune.histories import Histories, HistoryOptions
+from finetune.path import DataPath
+from vd4rl_pomdp.core.seeding import seed_networks
+from vd4rl_pomdp.core.streams import random_stream
+from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import Dataset, TransitionSampler, View
+from vd4rl_pomdp.data.parity import render_info
+from vd4rl_pomdp.data.reference import Reference
+from vd4rl_pomdp.envs.make import layout_of
+from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard
+from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, copy_encoder, save_encoder, tell_probe
+from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.nn.probes import probe_state
+from vd4rl_pomdp.policies.actor import read_actor
+from vd4rl_pomdp.runs import (
+    CRITIC_FILE,
+    EPISODES_FILE,
+    FILM_FILE,
+    LABELS_FILE,
+    METRICS_FILE,
+    PRETRAIN_TIMING_FILE,
+    PROBE_FILE,
+    RENDER_FILE,
+    TIMING_FILE,
+    interrupt,
+)
+from vd4rl_pomdp.runs.critic import critic_of
+from vd4rl_pomdp.runs.episodes import append_episodes, drop_episodes_after, read_episodes
+from vd4rl_pomdp.runs.files import Row, read_json, replacing_file, write_json
+from vd4rl_pomdp.runs.loop import Loop, training
+from vd4rl_pomdp.runs.metrics import EVALUATION, read_metrics
+from vd4rl_pomdp.runs.run import RunFolder
+
+RESULTS = ("policy/config.json", "policy/model.safetensors", EPISODES_FILE, *FILES_OF_RUN)
+"""What a finished run holds."""
+FEATURES_FILE = "features.npy"
+STANDARDISED_BY = 1024
+"""Least transitions whose representations give their means and deviations, where none are kept (`--views 0`)."""
+
+
+def labels_of(config: FinetuneConfig, card: EncoderCard) -> dict[str, Any]:
+    """The columns that name a run's rows."""
+    labels = {name: getattr(card, name) for name in ("method", "task", "quality")}
+    return labels | {
+        "corruption": card.corruption["corruption"],
+        "algorithm": config.algorithm,
+        "seed": config.seed,
+    }
+
+
+def make_trainer(
+    config: FinetuneConfig, dataset: Dataset, encoder: Encoder, card: EncoderCard, run: RunFolder
+) -> FinetuneTrainer:
+    """What a run trains and on which batches: cached features, features encoded anew, or pixels.
+
+    Args:
+        config: settings of the run.
+        dataset: its set, on the device.
+        encoder: on the device, too.
+        card: of the encoder, with the set's quality.
+        run: its folder, which is owned; labels, encoder and features are written there.
+    """
+    write_json(run.path / LABELS_FILE, labels_of(config, card))
+    _keep_encoder(config, run.path)
+    seed_networks(config.seed, STAGE)
+    policy = Policy(encoder.dim, dataset.action_dim, config.hidden_dim).to(dataset.t.device)
+    draws = random_stream(config.seed, STAGE, "batches", device=dataset.t.device)
+    corruption = CorruptionConfig.fill(card.corruption)  # as in pretraining: what is hidden belongs to the world
+    returns = config.options if isinstance(config.options, ReturnOptions) else ReturnOptions()
+    frozen = FrozenEncoder(encoder, dataset, corruption, config.shift, config.precision, config.seed_of_views)
+    encode = partial(frozen.episode, view=frozen.view(0))
+    sampler: FeatureSampler | ExactSampler | TransitionSampler
+    if card.end_to_end:
+        view = View(dataset, corruption, config.shift, config.seed_of_views, STAGE)
+        sampler = TransitionSampler(view, config.batch_size, draws, returns.n_step, returns.gamma)
+    elif config.views:
+        histories = Histories(dataset, config.memory, returns.n_step, config.seed_of_views)
+        features = encode_views(frozen, histories, config.views, run.path / FEATURES_FILE, run.inputs["encoder"])
+        policy.standardise.fit(features)
+        _probe(features, dataset, run)
+        encode = partial(_cached, features, dataset)
+        sampler = FeatureSampler(histories, features, config.batch_size, returns.n_step, returns.gamma, draws)
+    else:
+        sampler = ExactSampler(frozen, config.memory, config.batch_size, returns.n_step, returns.gamma, draws)
+        batches = math.ceil(STANDARDISED_BY / config.batch_size)
+        policy.standardise.fit(torch.cat([sampler.sample().z for _ in range(batches)]))
+    noise = random_stream(config.seed, STAGE, "noise", device=dataset.t.device)
+    algorithm = ALGORITHMS.named(config.algorithm)(policy, config.options, config.learning_rate, config.updates, noise)
+    reference = Reference.of(dataset)
+    actor = reference.actor_file
+    path = DataPath(dataset, read_actor(actor), encode) if actor and dataset.physics is not None else None
+    return FinetuneTrainer(
+        EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm,
+        sampler,
+        config,
+        card,
+        run,
+        reference,
+        path,
+    )
+
+
+def _keep_encoder(config: FinetuneConfig, run: Path) -> None:
+    """Copy the encoder into the run, so that the run can be evaluated wherever it is moved; its timing, too."""
+    source = config.encoder
+    if all((run / name).exists() for name in FILES_OF_RUN):
+        return
+    timing = source.parent / TIMING_FILE
+    if timing.exists():
+        write_json(run / PRETRAIN_TIMING_FILE, read_json(timing))
+    changes = config.memory.encoder_changes if isinstance(config.memory, HistoryOptions) else {}
+    copy_encoder(source, run / "encoder", changes)
+
+
+def _cached(features: torch.Tensor, dataset: Dataset, number: int) -> torch.Tensor:
+    """Representations (rows, D) of an episode in the first view."""
+    return features[0, dataset.rows_of(number)].float()
+
+
+def _probe(features: torch.Tensor, dataset: Dataset, run: RunFolder) -> None:
+    """Write how well the first view tells the simulator state, if the set stores it and has an episode to hold out."""
+    if dataset.physics is None or dataset.task is None or dataset.num_episodes < 2:
+        return
+    if (run.path / PROBE_FILE).exists():
+        tell_probe(run.path / "encoder", read_json(run.path / PROBE_FILE))
+        return
+    arrays = features[0, : dataset.num_rows].float().cpu().numpy(), dataset.physics, dataset.episode.cpu().numpy()
+    errors = probe_state(*arrays, layout_of(TASKS.named(dataset.task)))
+    tell_probe(run.path / "encoder", errors)
+    write_json(run.path / PROBE_FILE, errors)
+
+
+class FinetuneTrainer:
+    """One run: an algorithm, its stream of batches, and where the results go."""
+
+    loop: Loop
+    """While it is trained."""
+
+    def __init__(
+        self,
+        algorithm: Algorithm | EndToEnd,
+        sampler: FeatureSampler | ExactSampler | TransitionSampler,
+        config: FinetuneConfig,
+        card: EncoderCard,
+        run: RunFolder,
+        reference: Reference,
+        path: DataPath | None,
+    ) -> None:
+        self.algorithm, self.sampler = algorithm, sampler
+        self.config, self.card, self.folder = config, card, run
+        self.reference, self.path = reference, path
+        self.step = 0
+        self.settle: Callable[[], None] = lambda: None
+        """Brings algorithm and sampler to the last update's state, where others make the updates."""
+
+    def begin(self, title: str) -> AbstractContextManager[Loop]:
+        """Open the loop, from the newest checkpoint if there is one; a run without a title shows no progress."""
+        self.reference.write(self.folder.path)
+        labels, total = labels_of(self.config, self.card), self.config.updates
+        return training(self.folder, self, title, total, "updates", labels=labels, card=asdict(self.card))
+
+    def resume(self) -> None:
+        """Drop what is newer than the checkpoint, and make up for an evaluation that was cut off behind it."""
+        drop_episodes_after(self.folder.path / EPISODES_FILE, self.step)  # of a checkpoint that is gone
+        if self.step and self.loop.due(self.config.eval_every):
+            self.evaluate()
+
+    def finish(self) -> None:
+        """Write what a trained run ends with."""
+        path = self.folder.path
+        if self.path:
+            error = self.path.action_error(self.algorithm.policy)
+            self.reference.with_path_error(error).write(path)
+        (path / FEATURES_FILE).unlink(missing_ok=True)
+        write_json(path / RENDER_FILE, render_info(self.card.task))
+        gamma = getattr(self.config.options, "gamma", None)
+        critic = critic_of(read_metrics(path / METRICS_FILE), self.step, self.reference.mean_reward, gamma)
+        write_json(path / CRITIC_FILE, critic)
+        self.folder.finish(updates=self.step)
+
+    def evaluate(self) -> None:
+        """Keep this step's policy, play its episodes unless their rows are there, and log the scores.
+
+        The step's checkpoint is kept: while it plays, a signal need not wait.
+
+        Raises:
+            FloatingPointError: a weight is not finite.
+        """
+        run, loop, config = self.folder, self.loop, self.config
+        own = CorruptionConfig.fill(self.card.corruption)
+        counts = config.eval_episodes, config.eval_clean_episodes or config.eval_episodes
+        clean = config.eval_clean and self.step == config.updates
+        under = list(zip(own_and_none(own) if clean else [own], counts, strict=False))
+        with interrupt.deferred(False):
+            loop.require_finite(self.algorithm.policy)
+            self.algorithm.policy.save(run.path / "policy", self.step)
+            if isinstance(self.algorithm, EndToEnd):
+                loop.require_finite(self.algorithm.encoder)
+                save_encoder(run.path / "encoder", self.algorithm.encoder, self.card)
+            rows = [row for row in read_episodes(run.path / EPISODES_FILE) if row["step"] == self.step]
+            played = Counter(row["evaluated_under"] for row in rows)
+            if any(played[one.corruption] < episodes for one, episodes in under):
+                rows = self._play(run, under)
+        scores = {
+            f"{EVALUATION}{measure}/{name}": float(np.mean([r[measure] for r in rows if r["evaluated_under"] == name]))
+            for name in dict.fromkeys(row["evaluated_under"] for row in rows)
+            for measure in ("return", "score")
+        }
+        loop.log_evaluation(scores)
+        loop.show(score=scores[f"{EVALUATION}score/{own.corruption}"])
+
+    def _play(self, run: RunFolder, under: list[tuple[CorruptionConfig, int]]) -> list[Row]:
+        """Play so many episodes under each, keep a film of the first, then append the rows of all: the result."""
+        config, task = self.config, TASKS.named(self.card.task)
+        drop_episodes_after(run.path / EPISODES_FILE, self.step - 1)
+        jobs = [
+            job
+            for number, (one, count) in enumerate(under)
+            for job in jobs_of(run.path, task, [one], count, config.eval_length, film=not number)
+        ]
+        episodes = evaluate(jobs, config.workers)
+        rows = episode_rows(episodes, labels_of(config, self.card) | {"step": self.step})
+        if episodes[0].film is not None:
+            with replacing_file(run.path / FILM_FILE) as fresh, fresh.open("wb") as file:
+                np.savez_compressed(file, **episodes[0].film)  # type: ignore[arg-type]
+        append_episodes(run.path / EPISODES_FILE, rows)
+        return rows
+
+    def state(self) -> dict[str, Any]:
+        """Everything needed to resume to the bit."""
+        self.settle()
+        parts = {"algorithm": self.algorithm.state_dict(), "sampler": self.sampler.state_dict()}
+        return {"step": self.step} | parts
+
+    def restore(self, state: dict[str, Any]) -> None:
+        """Continue from `state`."""
+        self.step = state["step"]
+        self.algorithm.load_state_dict(state["algorithm"])
+        self.sampler.load_state_dict(state["sampler"])

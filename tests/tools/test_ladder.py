@@ -1,0 +1,142 @@
+"""The ladder of budgets: what it keeps of its runs, the cloning loss of their policies, and the rule for a budget."""
+
+import csv
+import importlib
+import json
+import shutil
+
+import numpy as np
+import pytest
+import torch
+
+from finetune.evaluation import Agent
+from finetune.train import finetune
+from tests.helpers_data import write_fake_set
+from tests.helpers_stages import smoke_finetune
+from tests.tools.test_scripts import SCRIPTS
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import View, open_dataset
+from vd4rl_pomdp.nn.encoder_folder import load_encoder
+from vd4rl_pomdp.nn.policy import load_policy
+from vd4rl_pomdp.runs.files import read_json, write_json
+
+
+@pytest.fixture
+def scripts(monkeypatch):
+    monkeypatch.syspath_prepend(SCRIPTS)
+    return importlib.import_module
+
+
+@pytest.fixture
+def ran(scripts, data, encoder, tmp_path):
+    """Folder of a ladder with one run of two rungs, both of whose policies were kept as they came."""
+    work = tmp_path / "work"
+    out = work / "runs" / "walker_walk" / "finetune-td3_bc"
+    keep = scripts("ladder").keep_policies
+    for updates in (2, 4):
+        settings = {"updates": updates, "eval_every": 2, "batch_size": 4, "eval_length": 2, "checkpoint_every": 2}
+        shutil.rmtree(out, ignore_errors=True)
+        finetune(smoke_finetune(encoder, data, out, **settings))
+        keep(work / "runs", work / "snapshots")
+    record = read_json(out / "config.json")
+    write_json(out / "config.json", record | {"collection": {"task": "walker_walk", "quality": "expert"}})
+    return work
+
+
+def test_every_policy_is_kept_under_its_own_update(ran):
+    kept = ran / "snapshots" / "walker_walk" / "finetune-td3_bc"
+    assert sorted(path.name for path in kept.iterdir()) == ["2.safetensors", "4.safetensors"]
+    last = ran / "runs" / "walker_walk" / "finetune-td3_bc" / "policy" / "model.safetensors"
+    assert (kept / "4.safetensors").read_bytes() == last.read_bytes() != (kept / "2.safetensors").read_bytes()
+
+
+def test_a_curve_has_the_rows_that_training_logged(scripts, tmp_path):
+    losses = {"critic_loss": 1, "actor_loss": 2, "bc_loss": 3}
+    rows = [
+        {"step": 500, "q": 1 / 3} | losses,
+        {"step": 500, "eval/score/none": 3.0},
+        {"step": 1000, "q": 2.0} | losses,
+    ]
+    (tmp_path / "metrics.jsonl").write_text("".join(json.dumps(row) + "\n" for row in rows))
+    curve = scripts("ladder").curve_of(tmp_path / "metrics.jsonl")
+    assert [(row["step"], row["q"]) for row in curve] == [(500, "0.33333"), (1000, "2")]
+
+
+def test_cloning_losses_are_to_the_actions_of_the_data_as_an_agent_would_see_them(scripts, ran, encoder, monkeypatch):
+    script, asked = scripts("ladder_cloning"), []
+
+    def collect(config):
+        asked.append(config)
+        write_fake_set(config.out, [12, 9])
+        write_json(config.out / "provenance.json", {})
+
+    run = ran / "runs" / "walker_walk" / "finetune-td3_bc"
+    record = read_json(run / "encoder" / "config.json")
+    assert record["encoder"].pop("memory_options") == {"gru_layers": 1}
+    record["encoder"]["gru_layers"] = 1  # as the first runs have it
+    write_json(run / "encoder" / "config.json", record)
+    monkeypatch.setattr(script, "collect", collect)
+    config = script.Config(ran, ran / "cloning.csv")
+    script.main(config)
+    first = config.out.read_text()
+    rows = list(csv.DictReader(first.splitlines()))
+    assert [(row["run"], row["step"]) for row in rows] == [("walker_walk/finetune-td3_bc", step) for step in "24"]
+    assert [(one.task, one.quality, one.episodes, one.seed) for one in asked] == [("walker_walk", "expert", 20, 10_000)]
+    own = read_json(run / "config.json")["config"]["data"]
+    for name, data in (("trained_on", own), ("held_out", ran / "held_out" / "walker_walk" / "expert")):
+        assert float(rows[1][name]) == pytest.approx(_loss(encoder, run / "policy", data), rel=1e-4)
+    assert all(row["trained_on"] != row["held_out"] for row in rows)
+
+    config.out.write_text("".join(first.splitlines(keepends=True)[:2]))
+    script.main(config)
+    assert config.out.read_text() == first
+    assert len(asked) == 1, "held-out episodes are collected once"
+
+
+def _loss(encoder, policy, data) -> float:
+    """Row by row: what an agent does in the episodes of a set, told the actions that the data took."""
+    network, card = load_encoder(encoder)
+    agent, dataset = Agent(network, load_policy(policy)), open_dataset(data)
+    view = View(dataset, CorruptionConfig.fill(card.corruption), 0, 0, "finetune", 1)  # it learned from one
+    obs = view.observe(torch.arange(dataset.num_rows))
+    squares = []
+    for first, end in zip(dataset.episode_start.tolist(), dataset.episode_end.tolist(), strict=True):
+        agent.reset()
+        for row in range(first, end - 1):
+            squares.append(np.square(agent.act(obs[row]) - dataset.action[row + 1].numpy()).mean())
+            agent.set_last_action(dataset.action[row + 1].numpy())
+    return float(np.mean(squares))
+
+
+def test_a_critic_has_converged_where_its_last_fifth_is_level(scripts):
+    script = scripts("ladder_table")
+    rising = {step: 100.0 + step for step in range(1, 101)}
+    assert script.drift(rising, 100) == pytest.approx(20 / 190.5, rel=1e-4), (
+        "a line's slope times its length, over its mean"
+    )
+    assert script.drift(rising, 50) == pytest.approx(10 / 145.5, rel=1e-4), "as if training had ended there"
+    assert script.drift({step: -100.0 - step for step in rising}, 100) == pytest.approx(20 / 190.5, rel=1e-4)
+    wavy = {step: 100.0 + (-1) ** step for step in range(1, 101)}
+    assert abs(script.drift(wavy, 100)) < 0.02
+    assert np.isnan(script.drift({90: 1.0, 100: 1.0}, 100)), "two values lie on any line"
+
+
+def test_a_budget_is_the_first_rung_where_every_critic_has_converged_and_held_out_cloning_is_near_its_lowest(scripts):
+    script = scripts("ladder_table")
+    key = script.Key("walker_walk", "expert", "patch", "acro", 256, "bf16", 3000, 100, 4)
+
+    def cell(*held_out, rises=0):
+        """Rungs at 100 to 400 updates; the critic's value rises until an update, and is level from then on."""
+        rising = {step: min(step, rises) + 1.0 for step in range(1, 401)}
+        return script.Cell(key, rising, dict(zip((100, 200, 300, 400), held_out, strict=True)))
+
+    assert script.budget([cell(0.5, 0.3, 0.2, 0.21)]) == 300, "the lowest"
+    assert script.budget([cell(0.5, 0.203, 0.2, 0.21)]) == 200, "within 2% of it, and earlier"
+    assert script.budget([cell(0.5, 0.203, 0.2, 0.21), cell(0.5, 0.4, 0.3, 0.3)]) == 300, "in every cell"
+    assert script.budget([cell(0.2, 0.3, 0.4, 0.5), cell(0.5, 0.4, 0.3, 0.2)]) is None
+    assert script.budget([]) is None
+    both = [cell(0.2, 0.3, 0.31, 0.4), cell(0.4, 0.4, 0.305, 0.3, rises=200)]
+    assert script.budget(both) == 300, "the lowest of the rungs at which all critics have converged"
+    assert script.budget([cell(0.1, 0.2, 0.3, 0.4, rises=300)]) == 400, (
+        "what a rising critic has cloned counts for nothing"
+    )

@@ -1,0 +1,37 @@
+"""What a memory is."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import ClassVar
+
+from torch import Tensor, nn
+
+from vd4rl_pomdp.core.options import Limits, Options
+
+
+@dataclass(frozen=True)
+class MemoryOptions(Options):
+    """Options of every memory."""
+
+    hidden_dim: int = 256
+    """Width of the memory's output s_t."""
+    m: int | None = None
+    """Rows before t that a state is computed from; None: what the method has (fj and fj+a 8, the others all)."""
+
+    limits: ClassVar[Limits] = {"hidden_dim": 1, "m": 0}
+
+
+class Memory(nn.Module):
+    """A recurrence. What it puts out at row j depends on rows 0..j and on the state before row 0 alone."""
+
+    reach: int | None = None
+    """Rows that an output depends on, its own among them; None: all."""
+
+    def initial_state(self, batch: int) -> Tensor:
+        """State before an episode's first row: (L, batch, W) zeros in the precision of its weights."""
+        raise NotImplementedError
+
+    def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+        """(B, T, I) rows, T > 0, and an (L, B, W) state -> (B, T, hidden_dim), and the state after the last row."""
+        raise NotImplementedError
