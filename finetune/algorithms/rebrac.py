@@ -25,7 +25,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 
 from finetune.algorithms.algorithm import Loss, ReturnOptions
-from finetune.algorithms.td3_bc import TD3BC
+from finetune.algorithms.td3_bc import TD3BC, TwinCritic
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options
 from vd4rl_pomdp.core.streams import RandomStream
@@ -49,27 +49,20 @@ class ReBRACOptions(ReturnOptions):
     limits: ClassVar[Limits] = {"actor_bc": 0, "critic_bc": 0, "critic_layers": (1, 16)}
 
 
-class NormedCritics(nn.Module):
+class NormedCritics(TwinCritic):
     """Two independent Q functions with LayerNorm behind every hidden layer: (B, D), (B, A) -> two (B,)."""
 
-    def __init__(
-        self, dim: int, action_dim: int, hidden: int, layers: int, kind: nn.Module | None = None, eps: float = 1e-5
-    ) -> None:
-        """`kind` is the nonlinearity, a rectifier unless told; `eps` is LayerNorm's."""
-        super().__init__()
+    def __init__(self, dim: int, action_dim: int, hidden: int, layers: int, kind: nn.Module, eps: float) -> None:
+        """`kind` is the nonlinearity, `eps` LayerNorm's."""
+        nn.Module.__init__(self)  # in place of the other's networks
 
         def network() -> nn.Sequential:
             modules: list[nn.Module] = []
             for width in [dim + action_dim] + [hidden] * (layers - 1):
-                modules += [nn.Linear(width, hidden), kind or nn.ReLU(), nn.LayerNorm(hidden, eps)]
+                modules += [nn.Linear(width, hidden), kind, nn.LayerNorm(hidden, eps)]
             return nn.Sequential(*modules, ExactLinear(hidden, 1))
 
         self.first, self.second = network(), network()
-
-    def forward(self, z: Tensor, action: Tensor) -> tuple[Tensor, Tensor]:
-        """Both values."""
-        both = torch.cat([z, action], dim=-1)
-        return self.first(both)[:, 0], self.second(both)[:, 0]
 
 
 class ReBRAC(TD3BC):
@@ -82,7 +75,8 @@ class ReBRAC(TD3BC):
         self, policy: Policy, options: ReBRACOptions, learning_rate: float, updates: int, draws: RandomStream
     ) -> None:
         super().__init__(policy, options, learning_rate, updates, draws)
-        self.critic = NormedCritics(**policy.shape, layers=options.critic_layers).to(policy.standardise.mean.device)
+        critic = NormedCritics(**policy.shape, layers=options.critic_layers, kind=nn.ReLU(), eps=1e-5)
+        self.critic = critic.to(policy.standardise.mean.device)
         self.target_critic = copy.deepcopy(self.critic)
         self.critic_optimiser = Adam(self.critic.parameters(), learning_rate, fused=True)
 
@@ -99,10 +93,10 @@ class ReBRAC(TD3BC):
         logs = {"critic_loss": loss.detach(), "q": first.detach().mean(), "next_bc_loss": away.mean()}
         return Loss(loss, logs)
 
-    def actor_loss(self, batch: FeatureBatch) -> Loss:
+    def actor_loss(self, batch: FeatureBatch, *noise: Tensor) -> Loss:
         """Weighted cloning less the value, in units of the value's own size."""
         z = self.policy.standardise(batch.z.detach())
-        chosen = self._policy_action(z)
+        chosen = self._policy_action(z, *noise)
         value = self._policy_value(z, chosen)
         cloning = F.mse_loss(chosen, batch.action)
         loss = self.settings.actor_bc * cloning - value.mean() / value.abs().mean().detach()
