@@ -13,10 +13,10 @@ import numpy as np
 import torch
 
 from vd4rl_pomdp.core.errors import UserError, refuse_number
-from vd4rl_pomdp.core.options import LABELS
+from vd4rl_pomdp.core.options import LABELS, flat
 from vd4rl_pomdp.core.registry import warn_of_other_code
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, MOST_EPISODES, TASKS, Task
-from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption_fits
 from vd4rl_pomdp.data.reference import Reference, action_error
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn, Observation
 from vd4rl_pomdp.envs.make import layout_of
@@ -87,6 +87,8 @@ class EpisodeJob:
     length: int | None = None
     actor: Path | None = None
     """File of the actor that made the data; None: it is not known."""
+    evaluated_under: str = ""
+    """What its rows say of the corruption; empty for its name."""
 
 
 @dataclass(frozen=True)
@@ -94,7 +96,7 @@ class Episode:
     """What an evaluation episode gave."""
 
     evaluated_under: str
-    """Name of the corruption that it was played under."""
+    """The corruption that it was played under: its name, and the options in which it is not the run's own."""
     episode: int
     rewards: list[float]
     """One a decision."""
@@ -177,7 +179,8 @@ def _play(agent: Agent, env: CorruptedEnv, job: EpisodeJob) -> Episode:
         rewards.append(now.time_step.reward)
         if job.film and len(rewards) % FILM_EVERY == 0:
             film.append((now, float(np.cumsum(rewards)[-1])))
-    return Episode(job.corruption.corruption, job.episode, rewards, _film(film) if job.film else None, errors)
+    under = job.evaluated_under or job.corruption.corruption
+    return Episode(under, job.episode, rewards, _film(film) if job.film else None, errors)
 
 
 def _film(shots: list[tuple[Observation, float]]) -> dict[str, np.ndarray]:
@@ -222,7 +225,13 @@ def own_and_none(corruption: CorruptionConfig) -> list[CorruptionConfig]:
 
 
 def jobs_of(
-    run: Path, task: Task, under: list[CorruptionConfig], episodes: int, length: int, film: bool = False
+    run: Path,
+    task: Task,
+    under: list[CorruptionConfig],
+    episodes: int,
+    length: int,
+    film: bool = False,
+    evaluated_under: str = "",
 ) -> list[EpisodeJob]:
     """The episodes of an evaluation of a run's policy, under each corruption in turn; a film is of the very first."""
     actor = Reference.read(run).actor_file
@@ -230,15 +239,23 @@ def jobs_of(
     return [
         EpisodeJob(
             run / "encoder", run / "policy", task, corruption, episode, film and corruption is under[0] and not episode,
-            length, actor,
+            length, actor, evaluated_under,
         )
         for corruption in under
         for episode in range(episodes)
     ]  # fmt: skip
 
 
+def told_options(chosen: CorruptionConfig, own: CorruptionConfig) -> str:
+    """A corruption's name, and the options in which it differs from another of this name: "patch, patch_size 24"."""
+    before = flat(own)
+    changed = {name: value for name, value in flat(chosen).items() if value != before[name]}
+    words = {name: ("no", "yes")[value] if isinstance(value, bool) else value for name, value in changed.items()}
+    return ", ".join([chosen.corruption, *(f"{name} {word}" for name, word in words.items())])
+
+
 def evaluate_run(
-    run: Path, corruption: str | None, episodes: int, workers: int
+    run: Path, corruption: str | None, episodes: int, workers: int, **options: Any
 ) -> tuple[list[dict[str, Any]], list[Episode]]:
     """Evaluate a fine-tuning run's policy again.
 
@@ -248,27 +265,33 @@ def evaluate_run(
             the run's own, and for none at all, too.
         episodes: how many under each corruption, as long as those of the run's own evaluations.
         workers: processes, 0 for every core.
+        options: values of that corruption's options that need not be the run's own; the rows' `evaluated_under` tells
+            of those that are not.
 
     Returns:
         Rows of `episodes.csv` (`corruption` is that of training, `step` that of the policy), and their episodes.
 
     Raises:
-        UserError: an unknown corruption, no episode, or a folder without an evaluated run.
+        UserError: an unknown corruption or option, one that does not fit, no episode, or a folder without an evaluated
+            run.
     """
     refuse_number("episodes", episodes, 1, MOST_EPISODES)
     refuse_number("workers", workers, 0)
     evaluated = read_episodes(run / EPISODES_FILE)
     if not evaluated:
         raise UserError(f"{run}: holds no evaluated run; name a folder that `vd4rl-pomdp finetune` wrote")
-    card, record = load_encoder(run / "encoder")[1], read_json(run / CONFIG_FILE)
+    (encoder, card), record = load_encoder(run / "encoder"), read_json(run / CONFIG_FILE)
     what = "this policy was trained, and it plays by the new; take the earlier code, or train it again"
     warn_of_other_code(run, record, read_record(run / "encoder").parts, what)
-    under = own_and_none(CorruptionConfig.fill(card.corruption))
+    under, told = own_and_none(CorruptionConfig.fill(card.corruption)), ""
     if corruption is not None:
-        under = [CorruptionConfig.fill(card.corruption | {"corruption": corruption})]
+        own = CorruptionConfig.fill(card.corruption | {"corruption": corruption})
+        under = [CorruptionConfig.of(**(flat(own) | options))]
+        told = told_options(under[0], own)
     for one in under:
-        one.check()
+        check_corruption_fits(one, FRAME_SIZE if encoder.reads_state else encoder.config.size)
     labels = {name: evaluated[0][name] for name in LABELS} | {"step": policy_step(run / "policy")}
-    jobs = jobs_of(run, TASKS.named(card.task), under, episodes, record["config"]["eval_length"])
+    length = record["config"]["eval_length"]
+    jobs = jobs_of(run, TASKS.named(card.task), under, episodes, length, evaluated_under=told)
     played = evaluate(jobs, workers)
     return episode_rows(played, labels), played

@@ -52,8 +52,8 @@ class TrainingConfig(StageConfig):
     learning_rate: float = 3e-4
     """Adam's learning rate."""
     frame_encoder: str = "drq"
-    """Frame encoder: drq, nature (a fraction of its cost), nature_half (half the resolution), small or mixer; or
-    state, the simulator's, in place of pixels."""
+    """Frame encoder: drq, nature (a fraction of its cost), nature_half (half the resolution), small, mixer, or
+    pretrained (a frozen image model); or state, the simulator's, in place of pixels."""
     precision: Precision = "fp32"
     """Precision of products: fp32, tf32 (on a GPU), or bf16 autocast."""
     device: str = "auto"

@@ -48,7 +48,8 @@ def pretrain(config: PretrainConfig) -> RunFolder:
     method, dataset = METHODS.named(config.method), open_dataset(config.data)
     config = replace(config, task=_task_of(dataset, config))
     objective = make_objective(dataset, config).to(pick_device(config.device))
-    inputs, collection = {"data": dataset.fingerprint}, read_plan(config.data)
+    inputs = {"data": dataset.fingerprint} | getattr(objective.encoder.frame, "found", {})
+    collection = read_plan(config.data)
     with RunFolder(config.out, STAGE, config, inputs, FILES_OF_RUN, collection=collection) as run:
         if not run.finished:
             dataset.to(next(objective.parameters()).device)
@@ -133,7 +134,7 @@ def _card(config: PretrainConfig, dataset: Dataset, run: RunFolder) -> EncoderCa
         method=config.method,
         task=config.task,
         quality=dataset.quality or UNKNOWN_QUALITY,
-        corruption=flat(config.corruption),
+        corruption=settings_of(flat(config.corruption)),
         seed=config.seed,
         steps=config.steps,
         preset=config.preset,

@@ -52,6 +52,8 @@ NOT_RUN = {
     "vd4rl-pomdp results add": "tests/runs/results adds runs",
     "vd4rl-pomdp pretrain --method": "pretrain/test_train runs every method in its smoke size",
     "vd4rl-pomdp finetune --encoder RUN": "as above",
+    "vd4rl-pomdp evaluate RUN": "tests/finetune/test_evaluation plays a scripted environment",
+    "hf download": "fetches weights; nn/test_pretrained makes some",
     "vd4rl-pomdp finetune --seeds": "tests/finetune/test_stack trains less",
     "vd4rl-pomdp sweep": "trains for minutes; tests/sweeps trains less",
 }

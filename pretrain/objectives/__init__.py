@@ -6,7 +6,20 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Literal
 
-from baselines import ACRO, CURL, DRIML, HOMER, ACROOptions, DRIMLOptions, HOMEROptions, OneStepInverse
+from baselines import (
+    ACDF,
+    ACRO,
+    CURL,
+    DRIML,
+    HOMER,
+    SMWM,
+    ACDFOptions,
+    ACROOptions,
+    DRIMLOptions,
+    HOMEROptions,
+    OneStepInverse,
+    SMWMOptions,
+)
 from pretrain.objectives.all_history import AllHistory
 from pretrain.objectives.forward_jump import ForwardJump
 from pretrain.objectives.masked_inverse import MaskedActionOptions, MaskedInverse, MaskedOptions
@@ -93,6 +106,12 @@ _OWN = {
     ),
     "one_step_inverse": Method(
         OneStepInverse, options=ActionOptions, summary="inverse model on the observations t and t+1"
+    ),
+    "acdf": Method(
+        ACDF, options=ACDFOptions, summary="memoryless multi-step inverse model with a latent forward model"
+    ),
+    "smwm": Method(
+        SMWM, options=SMWMOptions, summary="one-step inverse model with a latent forward model that moves both its ends"
     ),
     "curl": Method(
         CURL, shift="own", least_batch=2, summary="contrastive: two augmentations of one observation find each other"

@@ -6,9 +6,10 @@ import math
 import pytest
 import torch
 
-from baselines import CURL, DRIML, HOMER, DRIMLOptions, HOMEROptions
+from baselines import ACDF, CURL, DRIML, HOMER, SMWM, ACDFOptions, DRIMLOptions, HOMEROptions, SMWMOptions
 from vd4rl_pomdp.core.options import Options
 from vd4rl_pomdp.core.types import Windows
+from vd4rl_pomdp.nn.action_target import MSETarget
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
 from vd4rl_pomdp.nn.heads import info_nce, share_found
 
@@ -249,3 +250,55 @@ def test_curl_tells_states_apart_up_to_their_copies():
     states = [finite_windows(batch, rows, 0.0, g)[1][:, 0] for _ in range(20)]
     copies = torch.stack([(s[:, None] == s[None, :]).sum(1).float().log().mean() for s in states]).mean().item()
     assert train(CURL(encoder(), None, Options(), 0), 400, 0.0, batch, rows) == pytest.approx(copies, rel=0.03)
+
+
+def with_forward_model(kind: type, weight: float) -> torch.nn.Module:
+    """The same at every call but for the weight of the forward loss."""
+    options = ACDFOptions(max_k=1, forward_weight=weight) if kind is ACDF else SMWMOptions(forward_weight=weight)
+    return kind(encoder(), MSETarget(1, False), options, 0)
+
+
+@pytest.mark.parametrize("kind", [ACDF, SMWM])
+def test_latent_forward_models_foresee_a_ring_and_the_inverse_model_keeps_its_states_apart(kind: type):
+    """Without noise each action is told by two states, and each state by the one before and the action."""
+    objective = with_forward_model(kind, 1.0)
+    assert train(objective, 400, 0.0) < 0.02
+    with torch.no_grad():
+        states = objective.encoder.frame((torch.eye(STATES) * 255).to(torch.uint8)[:, :, None, None])
+    apart = torch.cdist(states, states)[~torch.eye(STATES, dtype=torch.bool)]
+    assert apart.min() > 0.5, "a constant state would be foreseen best"
+
+
+@pytest.mark.parametrize("kind", [ACDF, SMWM])
+def test_the_forward_loss_is_the_mean_error_of_all_next_states_that_are_real(kind: type):
+    objective, (window, _) = with_forward_model(kind, 0.5), finite_windows(3, 4, 0.0, torch.Generator().manual_seed(0))
+    window = window.replace(length=torch.tensor([4, 2, 3]))
+    loss, logs = objective.loss(window, 0.0)
+    states = objective.encoder.encode(window)
+    errors = [
+        (objective.forward_model(torch.cat([states[b, t], window.action[b, t]])) - states[b, t + 1]).square().mean()
+        for b, length in enumerate(window.length.tolist())
+        for t in range(length - 1)
+    ]
+    torch.testing.assert_close(logs["forward_loss"], torch.stack(errors).mean().detach())
+    torch.testing.assert_close(loss.detach(), logs["action_loss"] + 0.5 * logs["forward_loss"])
+
+
+def test_acdfs_forward_loss_moves_no_target_and_its_source_in_every_fifth_update_smwms_both_always():
+    window, _ = finite_windows(2, 4, 0.0, torch.Generator().manual_seed(0))
+    for kind, expected in (
+        (ACDF, [[True, True, True, False], *[[False] * 4] * 4, [True, True, True, False]]),
+        (SMWM, [[True] * 4] * 6),
+    ):
+        pair, moved = [with_forward_model(kind, weight) for weight in (0.0, 1.0)], []
+        for _ in range(6):
+            grads = []
+            for objective in pair:
+                states = objective.encoder.encode(window).detach().requires_grad_()
+                objective.representations = lambda w, states=states: (states, states)
+                (grad,) = torch.autograd.grad(objective.loss(window, 0.0)[0], states)
+                objective.after_step()
+                del objective.representations
+                grads.append(grad)
+            moved.append(((grads[1] - grads[0]).abs().amax((0, 2)) > 1e-7).tolist())
+        assert moved == expected, kind

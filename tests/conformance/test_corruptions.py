@@ -7,7 +7,7 @@ import torch
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import Options
-from vd4rl_pomdp.corruptions import CORRUPTIONS, STAGES, Patch
+from vd4rl_pomdp.corruptions import CORRUPTIONS, STAGES, FrameDrop, Patch
 from vd4rl_pomdp.testing import check_corruption
 from vd4rl_pomdp.testing.contract import run_check
 from vd4rl_pomdp.testing.corruptions import (
@@ -35,6 +35,38 @@ def test_a_corruption_keeps_its_promises(name, check):
 )
 def test_patches_and_zeroed_frames_keep_them_with_other_options(options, zeroed):
     check_corruption("patch+zero_frames", zeroed_frames=zeroed, **options)
+
+
+@pytest.mark.parametrize(
+    ("name", "options"),
+    [
+        ("zero_frames", {"keep_newest": True, "zeroed_frames": 1}),
+        ("patch+zero_frames", {"keep_newest": True}),
+        ("truncate", {"kept": "oldest"}),
+        ("patch+truncate", {"kept": "newest"}),
+    ],
+)
+def test_other_ways_to_drop_frames_keep_them(name, options):
+    check_corruption(name, **options)
+
+
+@dataclass(frozen=True)
+class Alternating(FrameDrop):
+    """One frame of its own choice: even keys lose the newest."""
+
+    def dropped(self, stack):
+        return 1
+
+    def order(self, key, stack):
+        return torch.arange(stack) * torch.where(key % 2 == 0, -1, 1)[:, None]
+
+
+def test_a_drop_of_ones_own_keeps_them_and_ends_a_name(stages):
+    stages.register("mine", Alternating)
+    for name in ("mine", "patch+mine"):
+        check_corruption(name)
+    with pytest.raises(UserError, match="zero_frames or truncate or mine may only end it"):
+        check_corruption("mine+patch")
 
 
 @dataclass(frozen=True)

@@ -18,7 +18,10 @@ from vd4rl_pomdp.testing.methods import ROWS, build_inverse
 
 MEMORIES: list[tuple[str, dict]] = [
     *((name, {}) for name in METHODS if not METHODS.named(name).reads_state),
-    *((name, {"history": "gru"}) for name in ("no_history", "acro", "one_step_inverse", "curl", "driml", "homer")),
+    *(
+        (name, {"history": "gru"})
+        for name in ("no_history", "acro", "one_step_inverse", "acdf", "smwm", "curl", "driml", "homer")
+    ),
     *((name, {"history": memory}) for name in ("acro", "fj+a", "mik+a") for memory in ("transformer", "lru")),
     *((name, {"m": m}) for name in ("ah+a", "fj", "fj+a", "mik", "mik+a", "supervised+a") for m in (0, 2)),
 ]

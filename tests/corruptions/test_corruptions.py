@@ -6,6 +6,7 @@ import torch
 
 from tests.helpers_data import fake_rows
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import flat, settings_of
 from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.corruptions import (
     CORRUPTIONS,
@@ -218,6 +219,48 @@ def test_a_stage_is_not_called_as_none_or_several_are(name):
         pytest.raises(UserError, match=re.escape(f"corruption '{name}': 'none' and names with '+'")),
     ):
         STAGES.register(name, type("Bars", (Patch,), {}))
+
+
+@pytest.mark.parametrize(("zeroed", "older"), [(1, 1 / 2), (2, 1)])
+def test_the_newest_frame_can_be_kept_and_the_older_ones_are_zeroed_equally_often(zeroed, older):
+    config = CorruptionConfig.of("zero_frames", zeroed_frames=zeroed, keep_newest=True)
+    out = make_corruption(config)(stacks(1).expand(3000, -1, -1, -1), torch.arange(3000))
+    blank = (out.view(3000, 3, -1) == 0).all(2).float()
+    assert (blank.sum(1) == zeroed).all()
+    assert blank.mean(0).tolist() == pytest.approx([older, older, 0], abs=0.03)
+    config = CorruptionConfig.of("zero_frames", zeroed_frames=3, keep_newest=True)
+    with pytest.raises(UserError, match="cannot zero 3 of 3 stacked frames and keep the newest"):
+        make_corruption(config)(stacks(1), torch.zeros(1, dtype=torch.int64))
+
+
+@pytest.mark.parametrize(("kept", "age"), [("newest", 0), ("oldest", 2)])
+@pytest.mark.parametrize("name", ["truncate", "patch+truncate"])
+def test_what_a_truncated_row_shows_is_one_frame_of_its_age(dataset, name, kept, age):
+    """In frames: row t shows frame t, or t - 2 alone, an episode's first frame standing for those before it."""
+    view = View(dataset, CorruptionConfig.of(name, "emission", kept=kept))
+    rows, plain = torch.arange(dataset.num_rows), dataset.frames
+    before = view.observe(rows).clone()
+    first = dataset.episode_start[dataset.episode]
+    for frame in rows.tolist():
+        dataset.frames = plain.clone()
+        dataset.frames[frame] = 255 - plain[frame]
+        changed = (view.observe(rows) != before).flatten(1).any(1)
+        assert torch.equal(changed, torch.maximum(rows - age, first) == frame), frame
+    dataset.frames = plain
+
+
+def test_truncation_ends_a_name_and_knows_two_frames():
+    with pytest.raises(UserError, match="--kept 'middle': choose one of newest, oldest"):
+        make_corruption(CorruptionConfig.of("truncate", kept="middle"))
+    for name in ("truncate+patch", "zero_frames+truncate", "truncate+zero_frames"):
+        with pytest.raises(UserError, match="zero_frames or truncate may only end it"):
+            CorruptionConfig.of(name)
+
+
+def test_what_was_recorded_before_frames_could_be_kept_has_the_same_settings():
+    old = {"corruption": "zero_frames", "corruption_mode": "resample", "zeroed_frames": 2}
+    assert settings_of(flat(CorruptionConfig.of("zero_frames"))) == old
+    assert settings_of(flat(CorruptionConfig.of("zero_frames", keep_newest=True))) == old | {"keep_newest": True}
 
 
 @pytest.mark.parametrize("name", CORRUPTIONS)

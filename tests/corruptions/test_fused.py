@@ -59,6 +59,20 @@ def test_one_pass_makes_the_same_observations(dataset, monkeypatch, name, option
             expected_and_painted(dataset, monkeypatch, config, shift=pad, shared=shared)
 
 
+DROPS = [
+    ("zero_frames", {"zeroed_frames": 1, "keep_newest": True}),
+    ("patch+zero_frames", {"zeroed_frames": 2, "keep_newest": True, "patch_size": 5, "patch_fill": 7}),
+    ("truncate", {}),
+    ("patch+truncate", {"kept": "oldest", "patch_size": 5, "patch_fill": 255}),
+]
+
+
+@pytest.mark.parametrize(("name", "options"), DROPS)
+def test_one_pass_drops_the_same_frames(dataset, monkeypatch, name, options):
+    for pad in (0, 4):
+        expected_and_painted(dataset, monkeypatch, CorruptionConfig.of(name, **options), shift=pad)
+
+
 def test_stacks_of_any_number_of_frames_are_made_in_one_pass(dataset, monkeypatch):
     config = CorruptionConfig.of("patch+zero_frames", zeroed_frames=1, patch_size=4)
     for stack in (1, 2, 5):
@@ -69,18 +83,19 @@ def test_equal_draws_zero_the_same_frames_by_ranks_as_by_sorting(monkeypatch):
     """They hardly ever are equal: of 31 bits each."""
     draws = torch.cartesian_prod(*[torch.arange(3)] * 3)
     for module in (fused, corruption):
-        monkeypatch.setattr(module, "zero_draws", lambda key, stages, stack: draws)
+        monkeypatch.setattr(module, "drop_order", lambda drop, key, stages, stack: draws)
     key = torch.arange(len(draws))
     for zeroed in (1, 2, 3):
-        kept = corruption.Corruption([], zeroed).kept(key, 3)
-        by_rank = fused.drawn((), zeroed, 0, key, key, 3, (1, 1)).kept
+        drop = corruption.ZeroFrames(zeroed)
+        kept = corruption.Corruption([], drop).kept(key, 3)
+        by_rank = fused.drawn((), drop, zeroed, 0, key, key, 3, (1, 1)).kept
         assert torch.equal(torch.zeros_like(by_rank).scatter_(1, kept, True), by_rank)
 
 
 def test_torch_compiles_one_pass_as_a_whole_and_to_the_same_bits(dataset, monkeypatch):
     """A GPU compiles all of it; here its operators are traced, and those on pixels compiled if there is a compiler."""
     monkeypatch.setattr(buffers, "in_host_memory", lambda x: False)
-    config = CorruptionConfig.of("patch+zero_frames", patch_size=5, patch_count=2, patch_fill=7)
+    config = CorruptionConfig.of("patch+zero_frames", patch_size=5, patch_count=2, patch_fill=7, keep_newest=True)
     rows = torch.arange(24).view(4, 6)
     expected = View(dataset, config, 4).observe(rows)
     backend = "inductor" if shutil.which("g++") else "aot_eager"
@@ -104,8 +119,7 @@ def test_what_cannot_be_compiled_runs_as_it_is_written_and_that_is_told_once(mon
 
 
 @pytest.mark.gpu
-@pytest.mark.parametrize("name", CORRUPTIONS)
-@pytest.mark.parametrize("options", OPTIONS)
+@pytest.mark.parametrize(("name", "options"), [*((name, one) for name in CORRUPTIONS for one in OPTIONS), *DROPS])
 def test_a_gpu_makes_the_observations_of_a_cpu(dataset, capsys, name, options):
     config = CorruptionConfig.fill({"corruption": name} | options)
     for settings in ({"shift": 0}, {"shift": 4}, {"shift": 4, "shared": "observation"}, {"shift": 16}):

@@ -11,9 +11,14 @@ from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn
 ROWS = 40
 
 
-def episode(name: str, draws: Drawn, task: str = "walker_walk") -> tuple[list[torch.Tensor], list[float], int]:
+def episode(
+    name: str, draws: Drawn, task: str = "walker_walk", **options
+) -> tuple[list[torch.Tensor], list[float], int]:
     """What an agent sees, its rewards, and how many frames were drawn."""
-    env, rng = CorruptedEnv(TASKS[task], CorruptionConfig.of(name), length=ROWS, draws=draws), np.random.default_rng(0)
+    env, rng = (
+        CorruptedEnv(TASKS[task], CorruptionConfig.of(name, **options), length=ROWS, draws=draws),
+        np.random.default_rng(0),
+    )
     shown, drawn = [env.reset(5, 6, 7)], 0
     while not shown[-1].time_step.last:
         drawn += shown[-1].time_step.frame is not None
@@ -30,6 +35,15 @@ def test_what_is_seen_does_not_depend_on_what_else_is_drawn(name):
     assert rewards == same_rewards
     assert drawn == ROWS + 1
     assert fewer < 0.85 * drawn if "zero_frames" in name else fewer == drawn, "a third of the stacks show a frame"
+
+
+@pytest.mark.parametrize("options", [{"kept": "newest"}, {"kept": "oldest"}])
+def test_a_stack_of_one_frame_is_seen_whole_and_draws_that_frame_alone(options):
+    """The newest of a row, or the one of two rows before: each frame is seen once, an episode's first twice more."""
+    everything, seen = (episode("truncate", draws, **options) for draws in ("all", "seen"))
+    assert torch.equal(torch.stack(seen[0]), torch.stack(everything[0]))
+    assert [int(obs.flatten(1).any(1).view(3, 3).any(1).sum()) for obs in seen[0]] == [1] * (ROWS + 1)
+    assert seen[2] <= everything[2]
 
 
 def test_nothing_is_drawn_where_nothing_is_looked_at():

@@ -180,6 +180,44 @@ def test_a_run_is_evaluated_as_it_was_trained_and_under_none_or_as_one_says(worl
     assert (only[0], only[1]["episodes"]) == ("none", written[1:])
 
 
+def test_options_of_a_corruption_are_flags_and_its_rows_tell_of_those_that_are_not_the_runs_own(
+    world, run, tmp_path, capsys, monkeypatch
+):
+    """The run was trained under patch+zero_frames, patches of 16 pixels."""
+    jobs, play_all = [], evaluation.evaluate
+    monkeypatch.setattr(evaluation, "evaluate", lambda given, workers: jobs.extend(given) or play_all(given, workers))
+    played = {
+        "patch": "patch",
+        "patch --patch-size 24": "patch, patch_size 24",
+        "patch --patch-size 16": "patch",
+        "patch --patch-count 2 --patch-shared": "patch, patch_count 2, patch_shared yes",
+        "patch+zero_frames --keep-newest": "patch+zero_frames, keep_newest yes",
+        "truncate --kept oldest": "truncate, kept oldest",
+        "patch+truncate": "patch+truncate",
+    }
+    rest = ["--episodes", "1", "--workers", "1", "--out", str(tmp_path / "rows.csv")]
+    for words in played:
+        main(["evaluate", str(run), "--corruption", *words.split(), *rest])
+    rows = read_episodes(tmp_path / "rows.csv")
+    assert [row["evaluated_under"] for row in rows] == list(played.values())
+    assert {row["corruption"] for row in rows} == {"patch+zero_frames"}, "what it was trained under"
+    assert (jobs[1].corruption.stages[0].patch_size, jobs[5].corruption.stages[0].kept) == (24, "oldest")
+    for words, told in (
+        ("patch --kept oldest", "Unrecognized options: --kept"),
+        ("patch --patch-size 85", "patch size 85 exceeds the image"),
+        ("patch --patch-size 0", "--patch-size is 0"),
+        ("truncate --kept middle", "--kept"),
+    ):
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main(["evaluate", str(run), "--corruption", *words.split()])
+        assert end.value.code == 2
+        assert told in (error := capsys.readouterr().err)
+        assert error.count("\n") == 1
+    with pytest.raises(UserError, match="--patch-sise is not read by the corruption patch"):
+        evaluate_run(run, "patch", 1, 1, patch_sise=3)
+
+
 def test_another_corruption_is_played_with_the_runs_own_options_over_its_own_length(world, run, monkeypatch):
     card = read_json(run / "encoder" / "config.json")
     card["pretrain"]["corruption"] |= {"patch_size": 40, "corruption_mode": "emission"}

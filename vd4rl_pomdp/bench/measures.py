@@ -34,6 +34,7 @@ from vd4rl_pomdp.data.parity import canary_frames, compare
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.envs.mazes import PICTURE_SIZE
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.nn.memory import MEMORIES
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.runs.device import Precision, pick_device
 from vd4rl_pomdp.runs.workers import run_jobs
@@ -238,6 +239,26 @@ def methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
         repeats, *(make_trainer(dataset, config.altered(frame_encoder=name)).update for name in encoders)
     )
     return results | {"k_30_over_k_15": twice / once, "half_over_whole_resolution": half / whole}
+
+
+def memories(dataset: Dataset, folder: Path, repeats: int) -> dict[str, float]:
+    """A step of MIK+A in the cpu preset, and a row that its encoder streams, with every other memory over the GRU's."""
+    config = PretrainConfig.of("cpu", data=folder, out=folder, corruption="patch+zero_frames")
+    trainers = [make_trainer(dataset, config.altered(history=name)) for name in MEMORIES]
+    obs, action = View(dataset).stacks(torch.tensor([3], device=dataset.t.device)), dataset.action[3:4]
+
+    @torch.no_grad()
+    def stream(encoder: Encoder) -> None:
+        state = encoder.initial_state(1)
+        for _ in range(10):
+            _, state = encoder.step(obs, action, state)
+
+    rounds, gru = max(3, repeats // 3), list(MEMORIES).index("gru")
+    steps = alternating(rounds, *(trainer.update for trainer in trainers))
+    rows = alternating(repeats, *(partial(stream, trainer.objective.encoder) for trainer in trainers))
+    measured = {f"{name}_step_over_gru": seconds / steps[gru] for name, seconds in zip(MEMORIES, steps, strict=True)}
+    measured |= {f"{name}_row_over_gru": seconds / rows[gru] for name, seconds in zip(MEMORIES, rows, strict=True)}
+    return {name: ratio for name, ratio in measured.items() if not name.startswith("gru_")}
 
 
 def finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:

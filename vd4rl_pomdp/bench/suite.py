@@ -17,6 +17,7 @@ from vd4rl_pomdp.bench.measures import (
     finetuning,
     maze_pictures,
     maze_training,
+    memories,
     methods,
     pretraining,
     sampling,
@@ -37,6 +38,10 @@ GOALS: dict[str, tuple[str, float]] = {
     "pretraining.bf16_overhead_share": ("<=", 0.2),
     "pretraining.bf16_over_fp32": (">=", 1.4),
     "methods.k_30_over_k_15": ("<=", 1.25),
+    "memories.transformer_step_over_gru": ("<=", 1.3),
+    "memories.lru_step_over_gru": ("<=", 1.3),
+    "memories.transformer_row_over_gru": ("<=", 1.5),
+    "memories.lru_row_over_gru": ("<=", 1.5),
     "finetuning.fp32_cached_over_exact": (">=", 20.0),
     "finetuning.bf16_cached_over_exact": (">=", 20.0),
     "finetuning.history_bf16_cached_over_exact": (">=", 20.0),
@@ -79,6 +84,7 @@ def bench(quick: bool = False, device: str = "auto") -> dict[str, Any]:
             "jax": against_jax(dataset, max(2, repeats // 3)),
             "stacking": stacking(dataset, max(2, repeats // 3)),
             "methods": methods(dataset, Path(folder), repeats),
+            "memories": memories(dataset, Path(folder), repeats),
             "memory": memory(Path(folder), dataset.frames.numel()),
         }
     results["collection"] = collection(60 if quick else 200)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -11,9 +12,10 @@ import tyro
 
 from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.core.errors import UserError, flag_of, refuse_number
-from vd4rl_pomdp.core.options import LABELS
-from vd4rl_pomdp.core.parsing import parse_stage
+from vd4rl_pomdp.core.options import LABELS, Options, flat
+from vd4rl_pomdp.core.parsing import chosen_by, parse, parse_stage
 from vd4rl_pomdp.core.registry import REGISTRIES, Registry
+from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.runs import EPISODES_FILE
 
 
@@ -64,40 +66,59 @@ def _of_seeds(words: list[str]) -> list[list[str]]:
     return [[*rest, "--seed", number, "--out", str(Path(told.out) / f"seed{number}")] for number in numbers]
 
 
-@command
-def evaluate(
-    run: tyro.conf.Positional[Path],
-    corruption: str | None = None,
-    episodes: int = 10,
-    parts: int = 1,
-    workers: int = 0,
-    out: Path | None = None,
-    json: bool = False,
-) -> None:
-    """Evaluate a fine-tuned run again, as it was trained and under no corruption, or under a given one alone.
+@dataclass(frozen=True)
+class Evaluation:
+    """Evaluate a fine-tuned run again, as it was trained and under no corruption, or under a given one alone, whose
+    options are flags, too: name it before --help."""
 
-    Args:
-        run: A fine-tuning run's folder.
-        corruption: Corruption at evaluation, with the run's own options (a patch's size) where it reads them; default:
-            the one that it was trained under, and then none, which takes as long again.
-        episodes: Episodes under each corruption.
-        parts: Also tell reward and action error in so many equal parts of the episodes: when a policy loses its way.
-        workers: Processes; 0 uses every core.
-        out: Append the raw rows to this CSV file.
-        json: Print one JSON object.
-    """
+    run: tyro.conf.Positional[Path]
+    """A fine-tuning run's folder."""
+    corruption: str | None = None
+    """Corruption at evaluation, with the run's own options (a patch's size) where it reads them and none are given;
+    default: the one that it was trained under, and then none, which takes as long again."""
+    stages: tuple[Options, ...] = ()
+    """Options of the corruption."""
+    episodes: int = 10
+    """Episodes under each corruption."""
+    parts: int = 1
+    """Also tell reward and action error in so many equal parts of the episodes: when a policy loses its way."""
+    workers: int = 0
+    """Processes; 0 uses every core."""
+    out: Path | None = None
+    """Append the raw rows to this CSV file."""
+    json: bool = False
+    """Print one JSON object."""
+
+
+def _evaluation(words: list[str], program: str, own: dict[str, Any]) -> Evaluation:
+    """Parse the command's words; what a corruption's options are where none are given is taken from `own`."""
+    name = chosen_by(words, ["corruption"]).get("corruption")
+    stages = CorruptionConfig.fill(own | {"corruption": name}).stages if name else ()
+    asked: Evaluation = parse(Evaluation, words, program, Evaluation(tyro.MISSING, name, stages))
+    return asked
+
+
+def evaluate(words: list[str], program: str) -> None:
+    """Evaluate a fine-tuned run again, as it was trained and under no corruption, or under a given one alone."""
     from finetune.evaluation import by_part, evaluate_run
     from vd4rl_pomdp.data.reference import Reference, summarise
+    from vd4rl_pomdp.nn.encoder_folder import read_record
     from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
     from vd4rl_pomdp.runs.files import flatten
     from vd4rl_pomdp.runs.outputs import refuse_inside
 
+    asked = _evaluation(words, program, {})
+    run, out, parts, json = asked.run, asked.out, asked.parts, asked.json
     refuse_number("parts", parts, 1)
+    there = read_episodes(run / EPISODES_FILE)  # what is no run is refused below
+    if there and asked.stages:
+        asked = _evaluation(words, program, read_record(run / "encoder").pretrain.corruption)
     if out is not None:
         refuse_inside(out)
-        if read_episodes(run / EPISODES_FILE):  # what is no run is refused below
+        if there:
             append_episodes(out, [])  # a path that cannot be written is known before any episode is played
-    rows, played = evaluate_run(run, corruption, episodes, workers)
+    options = {name: value for stage in asked.stages for name, value in flat(stage).items()}
+    rows, played = evaluate_run(run, asked.corruption, asked.episodes, asked.workers, **options)
     if out is not None:
         append_episodes(out, rows)
     reference = Reference.read(run)

@@ -50,7 +50,7 @@ def parse(config: Any, words: list[str], program: str, default: Any = None) -> A
 
 def parse_stage(config: type[Stage], words: list[str], program: str) -> Stage:
     """Parse a stage's config: preset, method and the like decide which flags there are, and their defaults."""
-    chosen = _chosen(words, (*config.choosers, *["preset"] * (len(config.presets) > 1)))
+    chosen = chosen_by(words, (*config.choosers, *["preset"] * (len(config.presets) > 1)))
     required = {f.name: tyro.MISSING for f in fields(config) if f.default == Path()}
     parsed: Stage = parse(config, words, program, config.of(**chosen, **required))
     parsed.check()
@@ -59,14 +59,14 @@ def parse_stage(config: type[Stage], words: list[str], program: str) -> Stage:
 
 def with_presets(config: type, presets: dict[str, Any], words: list[str], program: str) -> Any:
     """Parse a config whose flag `--preset` chooses the defaults of all others."""
-    name = _chosen(words, ["preset"]).get("preset", next(iter(presets)))
+    name = chosen_by(words, ["preset"]).get("preset", next(iter(presets)))
     refuse_unknown("preset", name, presets)
     default = presets[name]
     missing = {f.name: tyro.MISSING for f in fields(config) if getattr(default, f.name) in (Path(), "")}
     return parse(config, words, program, replace(default, **missing))
 
 
-def _chosen(words: list[str], names: Iterable[str]) -> dict[str, str]:
+def chosen_by(words: list[str], names: Iterable[str]) -> dict[str, str]:
     """The values that a command line gives some flags."""
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False, argument_default=argparse.SUPPRESS)
     for name in names:

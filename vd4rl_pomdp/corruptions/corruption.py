@@ -1,4 +1,4 @@
-"""What makes the pixels a POMDP (Wu et al. 2024, section 4.2): patches and zeroed frames of the stack.
+"""What makes the pixels a POMDP: patches and zeroed frames (Wu et al. 2024, section 4.2), stacks of one frame.
 
 A corruption is a pure function of a batch of frame stacks and their keys. The same object serves batches of a data set
 (on any device) and the environment at evaluation, and equal keys give equal masks on both.
@@ -6,6 +6,7 @@ A corruption is a pure function of a batch of frame stacks and their keys. The s
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Mapping
 from dataclasses import dataclass, fields
 from typing import Any, ClassVar, Literal, Protocol, Self, get_args
@@ -19,8 +20,8 @@ from vd4rl_pomdp.core.options import Limits, Options, flat, refuse_options
 from vd4rl_pomdp.core.registry import Registry
 from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
-from vd4rl_pomdp.corruptions.fused import drawn, painted, tells_pixels, zero_draws
-from vd4rl_pomdp.corruptions.keys import KeyStream, derive_keys, draw_numbered, hash_keys
+from vd4rl_pomdp.corruptions.fused import drawn, drop_order, painted, tells_pixels
+from vd4rl_pomdp.corruptions.keys import DRAWS, KeyStream, derive_keys, draw_integers, draw_numbered, hash_keys
 
 Mode = Literal["resample", "emission"]
 _CHANNELS = 3
@@ -107,24 +108,83 @@ class Patch(Options):
 
 
 @dataclass(frozen=True)
-class ZeroFrames(Options):
+class FrameDrop(Options, ABC):
+    """Whole frames of every stack become 0. No stage sees them any more: it may only end a corruption's name."""
+
+    @abstractmethod
+    def dropped(self, stack: int) -> int:
+        """How many frames of a stack of `stack` become 0; raises UserError where it cannot be."""
+
+    @abstractmethod
+    def order(self, key: Tensor, stack: int) -> Tensor:
+        """In which order they do: (N, stack) int64, the frame of the lowest number first; (N,) int64 keys to draw from.
+
+        A frame's place in its stack is that in the row, the newest last; of equal numbers the older frame comes first.
+        """
+
+
+@dataclass(frozen=True)
+class ZeroFrames(FrameDrop):
     """Frames of every stack, chosen uniformly, become 0, the newest perhaps among them."""
 
     zeroed_frames: int = 2
     """Frames of a stack that are blanked."""
+    keep_newest: bool = False
+    """Whether they are chosen among the older frames alone, so that the newest is always seen."""
 
     summary: ClassVar[str] = (
         "frames of every stack, chosen uniformly, become 0; it must come last, as in patch+zero_frames"
     )
     limits: ClassVar[Limits] = {"zeroed_frames": 1}
 
+    def dropped(self, stack: int) -> int:
+        """See `FrameDrop`."""
+        if self.zeroed_frames > stack - self.keep_newest:
+            kept = " and keep the newest" if self.keep_newest else ""
+            raise UserError(
+                f"cannot zero {self.zeroed_frames} of {stack} stacked frames{kept}: choose a smaller --zeroed-frames"
+            )
+        return self.zeroed_frames
 
-ZERO_FRAMES = "zero_frames"
-"""It drops whole frames, which no stage sees any more: it may only end a corruption's name."""
+    def order(self, key: Tensor, stack: int) -> Tensor:
+        """See `FrameDrop`: numbers sorted by random draws are a uniform permutation."""
+        draws = draw_integers(key, DRAWS, stack)
+        if self.keep_newest:
+            draws[:, -1] = DRAWS  # above all draws
+        return draws
+
+
+@dataclass(frozen=True)
+class Truncate(FrameDrop):
+    """All frames of a stack but one become 0: the newest, or the oldest, which was seen two steps before."""
+
+    kept: Literal["newest", "oldest"] = "newest"
+    """The frame of a stack that stays: newest or oldest."""
+
+    summary: ClassVar[str] = "all frames of every stack but the newest, or the oldest, become 0; it must come last"
+
+    def check(self) -> None:
+        """Raise UserError for another frame."""
+        refuse_unknown("--kept", self.kept, ("newest", "oldest"))
+        super().check()
+
+    def dropped(self, stack: int) -> int:
+        """See `FrameDrop`."""
+        return stack - 1
+
+    def order(self, key: Tensor, stack: int) -> Tensor:
+        """See `FrameDrop`: nothing is drawn."""
+        place = torch.arange(stack, device=key.device)
+        return (place if self.kept == "newest" else -place).expand(len(key), stack)
 
 
 def _is_stage(part: Any) -> bool:
-    return isinstance(part, type) and issubclass(part, Options) and any("__call__" in vars(c) for c in part.__mro__)
+    changes = isinstance(part, type) and issubclass(part, Options) and any("__call__" in vars(c) for c in part.__mro__)
+    return changes or _drops(part)
+
+
+def _drops(part: Any) -> bool:
+    return isinstance(part, type) and issubclass(part, FrameDrop)
 
 
 def _refuse_stage(name: str, kind: type[Options]) -> None:
@@ -136,25 +196,28 @@ def _refuse_stage(name: str, kind: type[Options]) -> None:
 
 STAGES: Registry[type[Options]] = Registry(
     "corruption",
-    {"patch": Patch, ZERO_FRAMES: ZeroFrames},
+    {"patch": Patch, "zero_frames": ZeroFrames, "truncate": Truncate},
     _is_stage,
-    "a class of vd4rl_pomdp.core.options.Options with the method of a Stage",
+    "a class of vd4rl_pomdp.core.options.Options with the method of a Stage, or a FrameDrop",
     _refuse_stage,
 )
-"""Every stage by name: a dataclass of its options that is a `Stage`. A corruption's name joins its stages with `+`, in
-the order in which they are applied. Packages offer theirs in the group of entry points `vd4rl_pomdp.corruptions`."""
+"""Every stage by name: a dataclass of its options that is a `Stage`, or a `FrameDrop`. A corruption's name joins its
+stages with `+`, in the order in which they are applied. Packages offer theirs in the group of entry points
+`vd4rl_pomdp.corruptions`."""
 CORRUPTIONS = ("none", "patch", "zero_frames", "patch+zero_frames")
-"""The benchmark's settings."""
+"""The paper's settings, and the fully observed control."""
 
 
 def _kinds(corruption: str) -> list[type[Options]]:
     """Classes of a corruption's stages; an unknown or a repeated name raises UserError."""
     names = [] if corruption == "none" else corruption.split("+")
-    if len(set(names)) < len(names) or ZERO_FRAMES in names[:-1]:
+    kinds = [STAGES.named(name) for name in dict.fromkeys(names)]
+    if len(kinds) < len(names) or any(map(_drops, kinds[:-1])):
+        last = " or ".join(name for name, kind in STAGES.items() if _drops(kind))
         raise UserError(
-            f"unknown corruption {corruption!r}: a name joins stages by +, each once, and {ZERO_FRAMES} may only end it"
+            f"unknown corruption {corruption!r}: a name joins stages by +, each once, and {last} may only end it"
         )
-    return [STAGES.named(name) for name in names]
+    return kinds
 
 
 @dataclass(frozen=True)
@@ -162,7 +225,7 @@ class CorruptionConfig(Options):
     """Which corruption, and its stages with their options; `of` makes one from names and values."""
 
     corruption: str = "none"
-    """none, patch, zero_frames or patch+zero_frames."""
+    """none, or names of stages joined by +: patch, zero_frames, truncate, patch+zero_frames, ..."""
     corruption_mode: Mode = "resample"
     """resample: drawn anew whenever a row enters a batch, as in the paper (where features are cached: once a view);
     emission: a row is hidden in the same way each time it is read, in all runs of one seed."""
@@ -215,14 +278,11 @@ def corruption_settings(corruption: str) -> set[str]:
 
 
 class Corruption:
-    """Stages that change frames, and a number of frames of each stack, chosen uniformly, that become 0.
+    """Stages that change frames, and what makes whole frames of each stack 0."""
 
-    The newest frame may be among the zeroed ones.
-    """
-
-    def __init__(self, stages: list[Stage], zeroed: int = 0) -> None:
-        self._stages, self._zeroed = stages, zeroed
-        self._nothing = not stages and not zeroed
+    def __init__(self, stages: list[Stage], drop: FrameDrop | None = None) -> None:
+        self._stages, self._drop = stages, drop
+        self._nothing = not stages and drop is None
         self._by_pixel = all(tells_pixels(stage) for stage in stages)
 
     def __call__(self, obs: Tensor, key: Tensor) -> Tensor:
@@ -253,7 +313,7 @@ class Corruption:
             )
         stacks, key = obs.view(-1, obs.shape[-3] // _CHANNELS, _CHANNELS, *obs.shape[-2:]), key.reshape(-1)
         kept = self.kept(key, stacks.shape[1])
-        if not self._zeroed:
+        if self._drop is None:
             self.change_(stacks, key, kept)
             return obs
         sample = torch.arange(len(stacks), device=obs.device)[:, None]
@@ -275,25 +335,19 @@ class Corruption:
         Returns:
             (N, S * C, H, W) uint8; None where there is nothing to change, or a stage that only knows whole stacks.
         """
-        if not self._by_pixel or not len(index) or not (pad or self._stages or self._zeroed):
+        if not self._by_pixel or not len(index) or (self._nothing and not pad):
             return None
-        self._refuse_too_many(index.shape[1])
-        stages = tuple(self._stages)
-        size = frames.shape[-2], frames.shape[-1]
-        made = drawn(stages, self._zeroed, pad, key, shift_key, index.shape[1], size)
+        stages, stack, size = tuple(self._stages), index.shape[1], (frames.shape[-2], frames.shape[-1])
+        dropped = self._drop.dropped(stack) if self._drop else 0
+        made = drawn(stages, self._drop, dropped, pad, key, shift_key, stack, size)
         return painted(stages, frames, index, *made)
 
     def kept(self, key: Tensor, stack: int) -> Tensor:
         """Numbers of the frames that are not zeroed, (N, K) int64, in stacks of `stack` frames with (N,) int64 keys."""
-        if not self._zeroed:
+        if self._drop is None:
             return torch.arange(stack, device=key.device).expand(len(key), stack)
-        self._refuse_too_many(stack)
-        # Numbers sorted by random draws are a uniform permutation.
-        return zero_draws(key, len(self._stages), stack).argsort(dim=1)[:, self._zeroed :]
-
-    def _refuse_too_many(self, stack: int) -> None:
-        if self._zeroed > stack:
-            raise UserError(f"cannot zero {self._zeroed} of {stack} stacked frames: choose a smaller --zeroed-frames")
+        dropped = self._drop.dropped(stack)
+        return drop_order(self._drop, key, len(self._stages), stack).argsort(dim=1)[:, dropped:]
 
     def change_(self, frames: Tensor, key: Tensor, kept: Tensor) -> None:
         """Apply the stages, in place, to the (N, K, 3, H, W) frames that (N, K) `kept` names."""
@@ -307,9 +361,9 @@ def make_corruption(config: CorruptionConfig | str) -> Corruption:
     if isinstance(config, str):
         config = CorruptionConfig.of(config)
     config.check()
-    zeroed = sum(stage.zeroed_frames for stage in config.stages if isinstance(stage, ZeroFrames))
-    stages = [stage for stage in config.stages if not isinstance(stage, ZeroFrames)]
-    return Corruption(stages, zeroed)  # type: ignore[arg-type]
+    stages = [stage for stage in config.stages if not isinstance(stage, FrameDrop)]
+    drop = config.stages[-1] if config.stages and isinstance(config.stages[-1], FrameDrop) else None
+    return Corruption(stages, drop)  # type: ignore[arg-type]
 
 
 def check_corruption_fits(config: CorruptionConfig, size: int = FRAME_SIZE) -> None:

@@ -13,7 +13,7 @@ from torch import Tensor
 
 from vd4rl_pomdp.core.compiling import compiled_on_gpu
 from vd4rl_pomdp.corruptions.augmentation import draw_offset
-from vd4rl_pomdp.corruptions.keys import DRAWS, derive_keys, draw_integers, hash_keys
+from vd4rl_pomdp.corruptions.keys import derive_keys, hash_keys
 
 
 @runtime_checkable
@@ -53,26 +53,34 @@ class StackDraws(NamedTuple):
     offset: Tensor | None
     """(N, 2) int64, as `augmentation.draw_offset` has it; None: nothing is shifted."""
     kept: Tensor | None
-    """(N, S) bool: frames that are not zeroed; None: all are kept."""
+    """(N, S) bool: frames that are not dropped; None: all are kept."""
     places: tuple[Tensor, ...]
     """One of each stage."""
 
 
-def zero_draws(key: Tensor, stages: int, stack: int) -> Tensor:
-    """(N, stack) int64 draws, by which the frames of stacks with (N,) keys are put in the order in which they zero."""
-    # A stream beside those of the stages, so that which frames are zeroed tells nothing of where patches are.
-    return draw_integers(hash_keys(derive_keys(stages, key) ^ 1), DRAWS, stack)
+def drop_order(drop: Any, key: Tensor, stages: int, stack: int) -> Tensor:
+    """`FrameDrop.order` (N, stack) of stacks with (N,) keys, after so many stages."""
+    # A stream beside those of the stages, so that which frames are dropped tells nothing of where patches are.
+    return drop.order(hash_keys(derive_keys(stages, key) ^ 1), stack)
 
 
 @compiled_on_gpu(training=True)
 def drawn(
-    stages: tuple[Any, ...], zeroed: int, pad: int, key: Tensor, shift_key: Tensor, stack: int, size: tuple[int, int]
+    stages: tuple[Any, ...],
+    drop: Any,
+    dropped: int,
+    pad: int,
+    key: Tensor,
+    shift_key: Tensor,
+    stack: int,
+    size: tuple[int, int],
 ) -> StackDraws:
     """Draws for stacks of `stack` frames.
 
     Args:
         stages: each `Hiding`.
-        zeroed: frames of a stack that are zeroed.
+        drop: a `FrameDrop`, None for none.
+        dropped: frames of a stack that it drops.
         pad: largest shift.
         key: (N,) int64, what the corruption is drawn from.
         shift_key: (M,) int64, what the shifts are drawn from, each for N / M stacks that follow one another.
@@ -82,12 +90,12 @@ def drawn(
     offset = kept = None
     if pad:
         offset = draw_offset(shift_key, pad).repeat_interleave(len(key) // len(shift_key), 0)
-    if zeroed:
-        draws, place = zero_draws(key, len(stages), stack), torch.arange(stack, device=key.device)
+    if dropped:
+        draws, place = drop_order(drop, key, len(stages), stack), torch.arange(stack, device=key.device)
         one, other = draws[:, :, None], draws[:, None]
         # ranks by comparison, equal draws in order: what sorting gives
         before = (other < one) | ((other == one) & (place < place[:, None]))
-        kept = before.sum(2) >= zeroed
+        kept = before.sum(2) >= dropped
     number = torch.arange(stack, device=key.device).expand(len(key), stack)
     places = tuple(stage.places(derive_keys(n, key), number, *size) for n, stage in enumerate(stages))
     return StackDraws(offset, kept, places)

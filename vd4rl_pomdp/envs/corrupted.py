@@ -80,7 +80,7 @@ class CorruptedEnv:
         return self._undrawn if time_step.frame is None else time_step.frame
 
     def _choose_whether_to_draw(self) -> None:
-        """Turn drawing on for frames that will be seen: what is zeroed in a stack is known before it is drawn."""
+        """Turn drawing on for frames that will be seen: what is dropped of a stack is known before it is drawn."""
         if self._draws == "seen":
             if self._t % _AHEAD == 0:
                 self._seen = self._seen_from(self._t)

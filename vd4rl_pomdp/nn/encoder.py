@@ -147,7 +147,8 @@ class Encoder(nn.Module):
             config = self.config = replace(config, feature_dim=config.channels)
             self.frame: FrameEncoder | StateFrame = StateFrame(config.channels, **config.frame_options)
         else:
-            self.frame = build_frame_encoder(config)
+            self.frame = frame = build_frame_encoder(config)
+            self.config = config = replace(config, frame_options=config.frame_options | frame.found)
         if config.history == "none":
             return
         if hasattr(self, config.history):

@@ -15,6 +15,7 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import Limits, Options, refuse_options
 from vd4rl_pomdp.core.registry import Registry
 from vd4rl_pomdp.corruptions.keys import DRAWS, derive_keys, draw_integers, draw_normals
+from vd4rl_pomdp.nn.pretrained import Pretrained
 
 
 @dataclass(frozen=True)
@@ -39,7 +40,8 @@ class FrameEncoderPart:
 
     build: Callable[[int, int, Any], nn.Module]
     """From channels and size of a picture, and options: a module (N, C, size, size) -> (N, C', H', W'), of pixels in
-    [-0.5, 0.5]; a linear layer, a layer norm and a tanh follow."""
+    [-0.5, 0.5]; a linear layer, a layer norm and a tanh follow. What the module finds out when it is built, such as
+    which weights a name stands for, is its attribute `found`: values of options, which the encoder's record keeps."""
     options: type[FrameOptions] = FrameOptions
     """Class of its options."""
     summary: str = ""
@@ -55,6 +57,8 @@ class FrameEncoder(nn.Module):
     def __init__(self, convolutions: nn.Module, channels: int, size: int, feature_dim: int) -> None:
         super().__init__()
         self.convolutions = convolutions
+        self.found: dict[str, Any] = getattr(convolutions, "found", {})
+        """See `FrameEncoderPart.build`."""
         with torch.no_grad():
             maps = convolutions(torch.zeros(1, channels, size, size))
         if not isinstance(maps, Tensor):
@@ -190,6 +194,25 @@ def _flat(channels: int, size: int, options: FrameOptions) -> nn.Sequential:
     return nn.Sequential()
 
 
+@dataclass(frozen=True)
+class PretrainedOptions(FrameOptions):
+    """Options of a frozen image model."""
+
+    model: str = "facebook/dinov2-small"
+    """Name of a model in transformers' cache on this machine, or a folder that its save_pretrained wrote."""
+    model_size: int = 224
+    """Height and width to which frames are resized for it."""
+    weights: str = ""
+    """Content hash that its weights must have; empty: any, and the encoder's record tells which they were."""
+
+    limits: ClassVar[Limits] = {"model_size": (1, 4096)}
+
+
+def _pretrained(channels: int, size: int, options: PretrainedOptions) -> Pretrained:
+    """Frozen features of each frame by a model of transformers; the linear layer behind them is trained."""
+    return Pretrained(options.model, options.model_size, options.weights, channels)
+
+
 STATE = "state"
 """Frame encoder of the `state` reference, which is no part: it reads no pixels."""
 
@@ -213,6 +236,9 @@ FRAME_ENCODERS: Registry[FrameEncoderPart] = Registry(
             _small, summary="three strided convolutions of few channels, for grey 50x50 pictures"
         ),
         "mixer": FrameEncoderPart(_mixer, summary="MLP-Mixer on patches of 10x10 pixels: the paper's on mazes"),
+        "pretrained": FrameEncoderPart(
+            _pretrained, PretrainedOptions, "a frozen image model that transformers knows by name, DINOv2 by default"
+        ),
         "flat": FrameEncoderPart(_flat, summary="no convolution, for observations of a few numbers"),
     },
     lambda part: isinstance(part, FrameEncoderPart),

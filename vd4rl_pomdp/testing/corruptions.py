@@ -14,9 +14,16 @@ from pretrain.config import PretrainConfig
 from vd4rl_pomdp.core.seeding import stream_seed
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.core.types import StepType, row_key
-from vd4rl_pomdp.corruptions import BatchCorruption, Corruption, CorruptionConfig, derive_keys, make_corruption
+from vd4rl_pomdp.corruptions import (
+    BatchCorruption,
+    Corruption,
+    CorruptionConfig,
+    FrameDrop,
+    derive_keys,
+    make_corruption,
+)
 from vd4rl_pomdp.corruptions.augmentation import random_shift
-from vd4rl_pomdp.corruptions.corruption import ZERO_FRAMES, Mode
+from vd4rl_pomdp.corruptions.corruption import Mode
 from vd4rl_pomdp.data import Dataset, View, open_dataset
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.testing.contract import Check, claim, run_checks
@@ -88,10 +95,11 @@ def draws_depend_on_keys_alone(name: str, **options: Any) -> None:
 
 
 def frames_that_are_dropped_stay_dropped(name: str, **options: Any) -> None:
-    """Where `zero_frames` drops a frame, nothing is drawn into it, and what it held changes no other frame."""
+    """Where a frame is dropped, nothing is drawn into it, and what it held changes no other frame."""
     if name == "none":
         return
-    corruption = _make(name if ZERO_FRAMES in name.split("+") else f"{name}+{ZERO_FRAMES}", options)
+    drops = isinstance(CorruptionConfig.of(name, **options).stages[-1], FrameDrop)
+    corruption = _make(name if drops else f"{name}+zero_frames", options)
     obs, key = stacks(), torch.arange(STACKS)
     dropped = torch.ones(STACKS, FRAME_STACK, dtype=torch.bool).scatter_(1, corruption.kept(key, FRAME_STACK), False)
     out = corruption(obs, key)

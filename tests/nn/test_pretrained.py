@@ -1,0 +1,120 @@
+"""A frozen image model as frame encoder: loaded by name or folder, never trained, saved or downloaded."""
+
+import json
+import sys
+from pathlib import Path
+
+import pytest
+import torch
+import torch.nn.functional as F
+
+from tests.helpers_data import write_fake_set
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.nn import load_encoder
+from vd4rl_pomdp.testing import check_frame_encoder, check_method
+from vd4rl_pomdp.testing.frame_encoders import make, pictures
+
+SIZE = 28
+
+
+@pytest.fixture(scope="module")
+def model(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A tiny DINOv2 with random weights, as transformers saves it."""
+    transformers = pytest.importorskip("transformers", reason="needs the extra `pretrained`")
+    folder = tmp_path_factory.mktemp("models") / "tiny"
+    save(transformers, folder, 0)
+    return folder
+
+
+def save(transformers, folder: Path, seed: int) -> None:
+    torch.manual_seed(seed)
+    shape = {"hidden_size": 16, "num_hidden_layers": 1, "num_attention_heads": 2, "mlp_ratio": 1}
+    config = transformers.Dinov2Config(**shape, image_size=SIZE, patch_size=14)
+    transformers.Dinov2Model(config).save_pretrained(folder)
+
+
+def test_it_keeps_the_promises_of_frame_encoders_and_methods_keep_theirs_on_it(model: Path):
+    told = {"model": str(model), "model_size": SIZE}
+    check_frame_encoder("pretrained", size=20, **told)
+    check_method("random", frame_encoder="pretrained", history="gru", **told)
+
+
+def test_each_frame_is_resized_standardised_and_encoded_by_itself(model: Path):
+    from transformers import Dinov2Model
+
+    frozen, obs = Dinov2Model.from_pretrained(model).eval(), pictures(2, 20)
+    maps = make("pretrained", size=20, model=str(model), model_size=SIZE).frame.maps(obs)
+    assert maps.shape == (2, 3 * 16, 1, 1)
+    mean, std = (torch.tensor(x)[:, None, None] for x in ((0.485, 0.456, 0.406), (0.229, 0.224, 0.225)))
+    for i in range(2):
+        for frame in range(3):
+            picture = obs[i : i + 1, 3 * frame : 3 * frame + 3].float() / 255
+            picture = F.interpolate(picture, (SIZE, SIZE), mode="bilinear")
+            expected = frozen((picture - mean) / std).pooler_output[0]
+            found = maps[i, 16 * frame : 16 * (frame + 1), 0, 0]
+            torch.testing.assert_close(found, expected, atol=1e-5, rtol=1e-4)
+
+
+def test_the_command_line_trains_what_stands_behind_it_and_a_folder_says_which_weights(
+    model: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+):
+    import transformers
+
+    data = write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25])
+    words = ["--frame-encoder", "pretrained", "--model", str(model), "--model-size", str(SIZE), "--preset", "smoke"]
+    words += ["--data", str(data), "--steps", "2", "--checkpoint-every", "1"]
+    main(["pretrain", "--method", "mik+a", *words, "--out", str(tmp_path / "run")])
+    folder = tmp_path / "run" / "encoder"
+    told = json.loads((folder / "config.json").read_text())["encoder"]["frame_options"]
+    assert (told["model"], told["model_size"], len(told["weights"])) == (str(model), SIZE, 32)
+    encoder, _ = load_encoder(folder)
+    before = make("pretrained", model=str(model), model_size=SIZE)
+    names = {name for name, _ in encoder.named_parameters()}
+    assert {name for name in names if name.startswith("frame.")} == {
+        f"frame.project.{layer}.{kind}" for layer in (0, 1) for kind in ("weight", "bias")
+    }, "the model is no part of what is trained or saved"
+    obs = pictures(2)
+    assert torch.equal(encoder.frame.maps(obs), before.frame.maps(obs))
+
+    other = tmp_path / "other"
+    save(transformers, other, 1)
+    (model / "model.safetensors").rename(model / "kept")
+    try:
+        with pytest.raises(UserError, match=r"--model .*: cannot be loaded from this machine .* run `hf download"):
+            load_encoder(folder)
+        (other / "model.safetensors").rename(model / "model.safetensors")
+        with pytest.raises(UserError, match=rf"its weights are \w+ by content, not {told['weights']}"):
+            load_encoder(folder)
+        capsys.readouterr()
+        with pytest.raises(SystemExit) as end:
+            main(["pretrain", "--method", "mik+a", *words, "--out", str(tmp_path / "run")])
+        assert end.value.code == 2
+        assert "weights" in (error := capsys.readouterr().err)
+        assert error.count("\n") == 1, "a run goes on with the weights that it began with"
+    finally:
+        (model / "kept").replace(model / "model.safetensors")
+    load_encoder(folder)
+
+
+def test_an_absent_library_is_one_line(monkeypatch, tmp_path, capsys):
+    data = write_fake_set(tmp_path / "walker_walk" / "expert", [20, 25])
+    monkeypatch.setitem(sys.modules, "transformers", None)
+    words = ["--method", "random", "--frame-encoder", "pretrained", "--preset", "smoke", "--data", str(data)]
+    words += ["--out", str(tmp_path / "run")]
+    with pytest.raises(SystemExit) as end:
+        main(["pretrain", *words])
+    assert end.value.code == 2
+    assert "--frame-encoder pretrained needs transformers: pip install" in (error := capsys.readouterr().err)
+    assert error.count("\n") == 1
+
+
+def test_absent_weights_and_other_channels_are_one_line(model: Path):
+    with pytest.raises(
+        UserError, match=r"--model nobody/nothing: cannot be loaded .*: run `hf download nobody/nothing`"
+    ):
+        make("pretrained", model="nobody/nothing")
+    from vd4rl_pomdp.nn.pretrained import Pretrained
+
+    with pytest.raises(UserError, match="4 are no frames"):
+        Pretrained(str(model), SIZE, "", 4)
