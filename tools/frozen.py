@@ -10,6 +10,7 @@ packages, so that the same script runs before and after a move. Bits depend on t
 
 from __future__ import annotations
 
+import argparse
 import csv
 import hashlib
 import json
@@ -150,10 +151,13 @@ def runs(work: Path) -> dict[str, dict[str, str]]:
 
 
 if __name__ == "__main__":
-    place = Path(sys.argv[1])
-    collect(place)
-    now = runs(place)
-    if "--write" in sys.argv:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("work", type=Path, help="folder of sets and runs")
+    parser.add_argument("--write", action="store_true", help="freeze what this code computes")
+    args = parser.parse_args()
+    collect(args.work)
+    now = runs(args.work)
+    if args.write:
         FROZEN.write_text(json.dumps(now, indent=1) + "\n")
     then = json.loads(FROZEN.read_text())
     other = [f"{run}: {part}" for run in {**then, **now} for part in {**then.get(run, {}), **now.get(run, {})} if then.get(run, {}).get(part) != now.get(run, {}).get(part)]  # fmt: skip # noqa: E501

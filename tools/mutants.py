@@ -8,6 +8,7 @@ First the named tests must pass without an error. Exit code 1 if one of them doe
 
 from __future__ import annotations
 
+import argparse
 import multiprocessing
 import os
 import subprocess
@@ -71,8 +72,12 @@ def _pytest(tree: Path, tests: list[str]) -> None:
 
 def main() -> int:
     """Try the mutants that the words choose."""
-    words = [word.lower() for word in sys.argv[1:]] or [""]
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("words", nargs="*", default=[""], help="parts of names or files; none: all mutants")
+    words = [word.lower() for word in parser.parse_args().words]
     mutants = [m for m in load_mutants() if any(word in f"{m['name']} {m['file']}".lower() for word in words)]
+    if not mutants:
+        parser.error(f"no mutant is called {' or '.join(words)}")
     torch.set_num_threads(1)
     with tempfile.TemporaryDirectory() as scratch:
         tree, survivors = Path(scratch, "tree"), 0

@@ -43,6 +43,13 @@ def test_every_method_that_random_pictures_can_train_is_measured(tmp_path):
     assert all(value > 0 for value in flatten(measured).values())
 
 
+def test_every_memory_is_measured_against_the_gru(tmp_path):
+    dataset, _ = measures.synthetic_set(tmp_path, 2)
+    measured = measures.memories(dataset, tmp_path, 1)
+    assert {f"memories.{name}" for name in measured} == {name for name in GOALS if name.startswith("memories.")}
+    assert all(value > 0 for value in measured.values())
+
+
 def test_two_runs_side_by_side_are_measured_against_one(monkeypatch):
     measured = {"sharing": processes.sharing(0.05, rounds=1)}
     assert all(value > 0 for value in flatten(measured).values())
@@ -58,7 +65,7 @@ def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
     def section(name):
         return lambda dataset, *_: seen.setdefault(name, {"device": dataset.t.device.type})
 
-    named = ("sampling", "pretraining", "finetuning", "methods")
+    named = ("sampling", "pretraining", "finetuning", "methods", "memories")
     monkeypatch.setattr(suite, "against_jax", lambda *_: {})
     monkeypatch.setattr(suite, "stacking", lambda *_: {})
     for name in named:
@@ -68,7 +75,7 @@ def test_what_trains_is_measured_on_the_device_that_is_picked(monkeypatch):
     monkeypatch.setattr(suite, "synthetic_set", lambda folder, episodes: measures.synthetic_set(folder, 1))
     monkeypatch.setattr(suite, "pick_device", lambda name: torch.device("meta"))
     results = suite.bench()
-    assert [results[name]["device"] for name in named] == ["cpu", "meta", "meta", "meta"]
+    assert [results[name]["device"] for name in named] == ["cpu", *["meta"] * 4]
 
 
 def test_policies_are_measured_stacked_and_against_jax(tmp_path, monkeypatch):

@@ -233,6 +233,15 @@ def test_the_leads_shorter_pretrainings_are_runs_of_the_protocol():
     assert len(made("lead/grid.toml", "steps=20000")) == 2 * 3 * 5
 
 
+def test_memories_are_compared_with_runs_of_the_protocol():
+    cells = load_grid(str(ROOT / "results" / "memories" / "grid.toml")).cells()
+    protocol = {recipe_of(cell, "finetune") for cell in load_grid(str(ROOT / "results" / "protocol.toml")).cells()}
+    assert [cell.value("history") for cell in cells] == [None, "transformer", "lru"] * 3
+    for gru, *others in zip(cells[::3], cells[1::3], cells[2::3], strict=True):
+        assert recipe_of(gru, "finetune") in protocol
+        assert all(collection_of(other) == collection_of(gru) for other in others), "from one set"
+
+
 def test_the_grid_of_published_files_is_the_protocols_first_layer_without_states():
     cells, protocol = load_grid("vd4rl").cells(), load_grid(str(ROOT / "results" / "protocol.toml")).cells()
     assert not {cell.value("method") for cell in cells} & {"state", "supervised", "supervised+a"}

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from finetune.algorithms import TD3BC
+from finetune.algorithms import ALGORITHMS, Algorithm
 from finetune.config import FinetuneConfig
 from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder, StackedSampler
 from finetune.histories import Histories
@@ -34,6 +34,7 @@ from vd4rl_pomdp.data.parity import canary_frames, compare
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.envs.mazes import PICTURE_SIZE
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderConfig
+from vd4rl_pomdp.nn.memory import MEMORIES
 from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.runs.device import Precision, pick_device
 from vd4rl_pomdp.runs.workers import run_jobs
@@ -240,8 +241,28 @@ def methods(dataset: Dataset, folder: Path, repeats: int) -> dict[str, Any]:
     return results | {"k_30_over_k_15": twice / once, "half_over_whole_resolution": half / whole}
 
 
+def memories(dataset: Dataset, folder: Path, repeats: int) -> dict[str, float]:
+    """A step of MIK+A in the cpu preset, and a row that its encoder streams, with every other memory over the GRU's."""
+    config = PretrainConfig.of("cpu", data=folder, out=folder, corruption="patch+zero_frames")
+    trainers = [make_trainer(dataset, config.altered(history=name)) for name in MEMORIES]
+    obs, action = View(dataset).stacks(torch.tensor([3], device=dataset.t.device)), dataset.action[3:4]
+
+    @torch.no_grad()
+    def stream(encoder: Encoder) -> None:
+        state = encoder.initial_state(1)
+        for _ in range(10):
+            _, state = encoder.step(obs, action, state)
+
+    rounds, gru = max(3, repeats // 3), list(MEMORIES).index("gru")
+    steps = alternating(rounds, *(trainer.update for trainer in trainers))
+    rows = alternating(repeats, *(partial(stream, trainer.objective.encoder) for trainer in trainers))
+    measured = {f"{name}_step_over_gru": seconds / steps[gru] for name, seconds in zip(MEMORIES, steps, strict=True)}
+    measured |= {f"{name}_row_over_gru": seconds / rows[gru] for name, seconds in zip(MEMORIES, rows, strict=True)}
+    return {name: ratio for name, ratio in measured.items() if not name.startswith("gru_")}
+
+
 def finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
-    """Updates on cached features against updates that encode every batch, for both kinds of encoder.
+    """Updates on cached features against updates that encode every batch, for both kinds of encoder; ReBRAC's cost.
 
     The history is cut to a window: encoding whole episodes for every batch would take longer still.
     """
@@ -252,7 +273,12 @@ def finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
         "bf16": _updates_per_s(dataset, memoryless, "bf16", repeats),
         "history_bf16": _updates_per_s(dataset, history, "bf16", 1),
     }
-    return {f"{kind}_{name}": value for kind, values in results.items() for name, value in values.items()}
+    rates = {f"{kind}_{name}": value for kind, values in results.items() for name, value in values.items()}
+    features = torch.randn(1, dataset.num_rows, EncoderConfig(6).feature_dim, device=dataset.t.device).half()
+    hidden, both = FinetuneConfig.of("cpu").hidden_dim, ("td3_bc", "rebrac")
+    trained = (partial(_train, *_policy_of(dataset, features, hidden, 0, name), 20) for name in both)
+    td3_bc, rebrac = alternating(max(1, repeats), *trained)
+    return rates | {"rebrac_over_td3_bc": rebrac / td3_bc}
 
 
 def _updates_per_s(
@@ -322,17 +348,19 @@ def stacking(dataset: Dataset, repeats: int) -> dict[str, float]:
     return results
 
 
-def _train(algorithm: TD3BC | Stack, sampler: FeatureSampler | ExactSampler | StackedSampler, updates: int) -> None:
+def _train(algorithm: Algorithm | Stack, sampler: FeatureSampler | ExactSampler | StackedSampler, updates: int) -> None:
     for _ in range(updates):
         algorithm.update(sampler.sample())
 
 
-def _policy_of(dataset: Dataset, features: torch.Tensor, hidden: int, seed: int) -> tuple[TD3BC, FeatureSampler]:
-    """TD3+BC on cached features, and its batches."""
-    config = FinetuneConfig.of("cpu")
+def _policy_of(
+    dataset: Dataset, features: torch.Tensor, hidden: int, seed: int, name: str = "td3_bc"
+) -> tuple[Algorithm, FeatureSampler]:
+    """An algorithm on cached features, and its batches."""
+    config = FinetuneConfig.of("cpu", algorithm=name)
     batches, noise = (random_stream(seed, "bench", name, device=features.device) for name in ("batches", "noise"))
     policy = Policy(features.shape[-1], dataset.action_dim, hidden).to(features.device)
-    algorithm = TD3BC(policy, config.options, config.learning_rate, config.updates, noise)  # type: ignore[arg-type]
+    algorithm = ALGORITHMS[name](policy, config.options, config.learning_rate, config.updates, noise)
     return algorithm, FeatureSampler(Histories(dataset, NO_OPTIONS, 3, 0), features, BATCH, 3, 0.99, batches)
 
 

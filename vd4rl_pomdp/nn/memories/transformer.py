@@ -46,13 +46,14 @@ class Transformer(Memory):
         super().__init__()
         layers, heads, self.window = options.transformer_layers, options.transformer_heads, options.attention_window
         self.reach = layers * (self.window - 1) + 1
+        width = heads * max(1, options.hidden_dim // (4 * heads))
+        self._sizes = [self.window - 1, *[(self.window - 1) * 2 * width] * layers]
         self.read = nn.Linear(inputs, options.hidden_dim)
-        self.layers = nn.ModuleList(_Layer(options.hidden_dim, heads) for _ in range(layers))
+        self.layers = nn.ModuleList(_Layer(options.hidden_dim, heads, width) for _ in range(layers))
         slopes = 2.0 ** (-8 * torch.arange(1, heads + 1) / heads)
         self.bias = nn.Parameter((-slopes[:, None] * torch.arange(self.window).flip(0)).repeat(layers, 1, 1))
         """(L, heads, window): of every distance, the farthest first."""
         self.norm = nn.LayerNorm(options.hidden_dim)
-        self._sizes = [self.window - 1, *((self.window - 1) * 2 * layer.width for layer in self.layers)]
 
     def initial_state(self, batch: int) -> Tensor:
         """(1, batch, (window - 1) * (1 + L * (key and value)))."""
@@ -81,10 +82,9 @@ class Transformer(Memory):
 
 
 class _Layer(nn.Module):
-    def __init__(self, dim: int, heads: int) -> None:
+    def __init__(self, dim: int, heads: int, width: int) -> None:
         super().__init__()
-        self.heads = heads
-        self.width = heads * max(1, dim // (4 * heads))
+        self.heads, self.width = heads, width
         units = max(1, 3 * dim // 4)
         self.norm, self.mlp_norm = nn.LayerNorm(dim), nn.LayerNorm(dim)
         self.qkv, self.out = nn.Linear(dim, 3 * self.width, bias=False), nn.Linear(self.width, dim)
