@@ -43,7 +43,7 @@ class EndToEnd:
             z = self.encoder.frame(batch.obs).float()
             with torch.no_grad():  # the target's side; V-D4RL has no slow copy of the encoder either
                 next_z = self.encoder.frame(batch.next_obs).float()
-        features = FeatureBatch(z, batch.action, batch.reward, batch.discount, next_z)
+        features = FeatureBatch(z, batch.action, batch.reward, batch.discount, next_z, batch.next_action)
         return self.algorithm.update(features, self.optimiser)
 
     def state_dict(self) -> dict[str, Any]:

@@ -25,7 +25,7 @@ from vd4rl_pomdp.nn.encoder_folder import load_encoder, read_record
 from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
 from vd4rl_pomdp.policies.actor import read_actor
-from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE
+from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
 from vd4rl_pomdp.runs.workers import run_jobs
@@ -246,12 +246,33 @@ def jobs_of(
     ]  # fmt: skip
 
 
-def told_options(chosen: CorruptionConfig, own: CorruptionConfig) -> str:
-    """A corruption's name, and the options in which it differs from another of this name: "patch, patch_size 24"."""
+def another(trained: dict[str, Any], corruption: str, options: dict[str, Any]) -> tuple[CorruptionConfig, str]:
+    """A corruption to evaluate under, and what rows say of it.
+
+    Args:
+        trained: settings of the corruption that a policy was trained under.
+        corruption: name of the other.
+        options: its options by name; those that are not here are as in training, or the defaults.
+
+    Returns:
+        The corruption, and its name with the given options that differ: "patch, patch_size 24".
+    """
+    own = CorruptionConfig.fill(trained | {"corruption": corruption})
     before = flat(own)
+    chosen = CorruptionConfig.of(**(before | options))
     changed = {name: value for name, value in flat(chosen).items() if value != before[name]}
     words = {name: ("no", "yes")[value] if isinstance(value, bool) else value for name, value in changed.items()}
-    return ", ".join([chosen.corruption, *(f"{name} {word}" for name, word in words.items())])
+    return chosen, ", ".join([corruption, *(f"{name} {word}" for name, word in words.items())])
+
+
+def refuse_kept(run: Path, evaluated_under: str) -> None:
+    """Raise UserError where rows under a corruption cannot be added to those of a run: it goes on, or has some."""
+    if not (run / TIMING_FILE).exists():
+        raise UserError(f"{run}: has not finished, and writes {EPISODES_FILE} itself; leave --keep out until then")
+    step = policy_step(run / "policy")
+    rows = [row for row in read_episodes(run / EPISODES_FILE) if row["step"] == step]
+    if there := sum(row["evaluated_under"] == evaluated_under for row in rows):
+        raise UserError(f"{run}: {EPISODES_FILE} has {there} episodes under {evaluated_under}; leave --keep out")
 
 
 def evaluate_run(
@@ -285,9 +306,8 @@ def evaluate_run(
     warn_of_other_code(run, record, read_record(run / "encoder").parts, what)
     under, told = own_and_none(CorruptionConfig.fill(card.corruption)), ""
     if corruption is not None:
-        own = CorruptionConfig.fill(card.corruption | {"corruption": corruption})
-        under = [CorruptionConfig.of(**(flat(own) | options))]
-        told = told_options(under[0], own)
+        one, told = another(card.corruption, corruption, options)
+        under = [one]
     for one in under:
         check_corruption_fits(one, FRAME_SIZE if encoder.reads_state else encoder.config.size)
     labels = {name: evaluated[0][name] for name in LABELS} | {"step": policy_step(run / "policy")}

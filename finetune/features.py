@@ -51,6 +51,8 @@ class FeatureBatch(Batch):
     """(B,)."""
     next_z: Tensor
     """(B, D)."""
+    next_action: Tensor
+    """(B, A): the set's action at next_z; zero at an episode's last row, which has none."""
 
 
 class FrozenEncoder:
@@ -176,8 +178,10 @@ class FeatureSampler:
         self.features, self.batch_size, self.draws = features, batch_size, draws
         dataset, rows = histories.dataset, histories.rows
         reward, discount, _ = dataset.n_step_returns(rows, n_step, gamma)
-        self.told = torch.cat([dataset.action_after(rows), reward[:, None], discount[:, None]], dim=1)
-        """(M, A + 2): action, reward and discount of every transition. Few tensors: a GPU is asked for each apart."""
+        actions = dataset.action_after(rows), dataset.action_or_zero(histories.ends)
+        self.told = torch.cat([*actions, reward[:, None], discount[:, None]], dim=1)
+        """(M, 2 A + 2): actions at both ends, reward and discount of every transition. Few tensors: a GPU is asked for
+        each apart."""
         # z and z' are both read from the cache, for the critics' target, too: the encoder never changes
         ends = [torch.stack(histories.of_view(view).numbers()) for view in range(len(features))]
         self.ends = torch.stack([number + view * features.shape[1] for view, number in enumerate(ends)], dim=1)
@@ -228,9 +232,10 @@ class StackedSampler:
 
 
 def _batch(both: Tensor, told: Tensor) -> FeatureBatch:
-    """A batch of (2, ..., D) features of both ends, and (..., A + 2) of what else is known."""
+    """A batch of (2, ..., D) features of both ends, and (..., 2 A + 2) of what else is known."""
     z, next_z = both.float()
-    return FeatureBatch(z, told[..., :-2], told[..., -2], told[..., -1], next_z)
+    action, next_action = told[..., :-2].chunk(2, dim=-1)
+    return FeatureBatch(z, action, told[..., -2], told[..., -1], next_z, next_action)
 
 
 class ExactSampler(Sampler):
@@ -251,7 +256,8 @@ class ExactSampler(Sampler):
         rows = self._starts[self._draw(len(self._starts))]
         reward, discount, next_rows = dataset.n_step_returns(rows, self._n_step, self._gamma)
         z, next_z = self._encode(rows, next_rows)
-        return FeatureBatch(z, dataset.action_after(rows), reward, discount, next_z)
+        next_action = dataset.action_or_zero(next_rows)
+        return FeatureBatch(z, dataset.action_after(rows), reward, discount, next_z, next_action)
 
     @torch.no_grad()
     def _encode(self, rows: Tensor, next_rows: Tensor) -> tuple[Tensor, Tensor]:

@@ -5,7 +5,9 @@ from __future__ import annotations
 from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
 from finetune.algorithms.bc import BC
 from finetune.algorithms.drqv2_bc import DrQv2BC
+from finetune.algorithms.fql import FQL, FQLOptions
 from finetune.algorithms.iql import IQL, IQLOptions
+from finetune.algorithms.rebrac import ReBRAC, ReBRACOptions
 from finetune.algorithms.td3_bc import TD3BC, TD3BCOptions
 from vd4rl_pomdp.core.options import refuse_options
 from vd4rl_pomdp.core.registry import Registry
@@ -13,19 +15,23 @@ from vd4rl_pomdp.core.registry import Registry
 __all__ = [
     "ALGORITHMS",
     "BC",
+    "FQL",
     "IQL",
     "TD3BC",
     "Algorithm",
     "DrQv2BC",
+    "FQLOptions",
     "IQLOptions",
     "Loss",
+    "ReBRAC",
+    "ReBRACOptions",
     "ReturnOptions",
     "TD3BCOptions",
 ]
 
 ALGORITHMS: Registry[type[Algorithm]] = Registry(
     "algorithm",
-    {"td3_bc": TD3BC, "drqv2_bc": DrQv2BC, "iql": IQL, "bc": BC},
+    {"td3_bc": TD3BC, "rebrac": ReBRAC, "drqv2_bc": DrQv2BC, "iql": IQL, "fql": FQL, "bc": BC},
     lambda part: isinstance(part, type) and issubclass(part, Algorithm),
     "a class of finetune.algorithms.Algorithm",
     lambda name, part: refuse_options(part.options),

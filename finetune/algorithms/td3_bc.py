@@ -65,7 +65,7 @@ class TD3BC(Algorithm):
     """Updates of the critics to one of the actor."""
 
     def __init__(
-        self, policy: Policy, options: TD3BCOptions, learning_rate: float, updates: int, draws: RandomStream
+        self, policy: Policy, options: ReturnOptions, learning_rate: float, updates: int, draws: RandomStream
     ) -> None:
         super().__init__(policy, options, learning_rate, updates, draws)
         shape = policy.shape

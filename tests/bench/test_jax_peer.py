@@ -33,7 +33,7 @@ def test_the_peer_in_jax_makes_the_same_updates():
     for i, v in zip(index, view, strict=True):
         ends = [table["features"][v, table[end][v, i]].float() for end in ("first", "last")]
         told = [table[name][i] for name in ("action", "reward", "discount")]
-        ours.append(algorithm.update(FeatureBatch(ends[0], *told, ends[1])))
+        ours.append(algorithm.update(FeatureBatch(ends[0], *told, ends[1], told[0])))
     arrays = {name: jax_peer.as_jax(tensor) for name, tensor in table.items()}
     arrays |= {name: jax_peer.as_jax(getattr(policy.standardise, name)) for name in ("mean", "std")}
     draws = jax_peer.BatchDraws(*map(jax_peer.as_jax, (index, view, noise)))

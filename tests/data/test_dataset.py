@@ -73,6 +73,8 @@ def test_n_step_returns_stop_at_the_episodes_end(dataset, n):
     assert frame_identity(batch.next_obs).tolist() == [stack_identity(e, t) for e, t in ends]
     assert batch.next_key.tolist() == [(e << 20) + t for e, t in ends]
     np.testing.assert_array_equal(batch.action, np.stack([fake_action(e, t) for e, t in STARTS]))
+    there = [fake_action(e, t) * (t < LENGTHS[e] - 1) for e, t in ends]
+    np.testing.assert_array_equal(batch.next_action, np.stack(there))
 
 
 def test_stored_discounts_are_multiplied_and_may_be_zero(tmp_path):

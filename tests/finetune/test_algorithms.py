@@ -11,6 +11,7 @@ import torch.nn.functional as F
 from finetune.algorithms import ALGORITHMS, noise, td3_bc
 from finetune.algorithms.bc import BC
 from finetune.algorithms.drqv2_bc import DrQv2BC
+from finetune.algorithms.fql import FQL, FQLOptions
 from finetune.algorithms.iql import IQL, IQLOptions, expectile_loss
 from finetune.algorithms.td3_bc import TD3BC, TwinCritic
 from finetune.features import FeatureBatch
@@ -40,7 +41,8 @@ def batch(seed: int = 0) -> FeatureBatch:
     g = torch.Generator().manual_seed(seed)
     z, next_z = (5 + 3 * torch.randn(SIZE, DIM, generator=g) for _ in range(2))
     action = torch.rand(SIZE, ACTIONS, generator=g) * 2 - 1
-    return FeatureBatch(z, action, torch.randn(SIZE, generator=g), torch.arange(SIZE) % 2 * 0.8, next_z)
+    reward, next_action = torch.randn(SIZE, generator=g), torch.rand(SIZE, ACTIONS, generator=g) * 2 - 1
+    return FeatureBatch(z, action, reward, torch.arange(SIZE) % 2 * 0.8, next_z, next_action)
 
 
 @pytest.fixture
@@ -249,7 +251,8 @@ def test_iqls_fixed_point_on_a_bandit_is_known():
     algorithm = IQL(policy, IQLOptions(), 1e-2, updates, RandomStream(torch.Generator()))
     algorithm.tau = 0.05
     reward = (torch.arange(8) % 4 == 0).float()
-    given = FeatureBatch(torch.zeros(8, 2), reward[:, None] - 0.5, reward, torch.zeros(8), torch.zeros(8, 2))
+    action = reward[:, None] - 0.5
+    given = FeatureBatch(torch.zeros(8, 2), action, reward, torch.zeros(8), torch.zeros(8, 2), action)
     for _ in range(updates):
         found = algorithm.update(given)
     v = 0.25 * 0.7 / (0.25 * 0.7 + 0.75 * 0.3)
@@ -270,7 +273,8 @@ def chain() -> FeatureBatch:
     paid = following == 4
     places = torch.eye(4)
     action = torch.where(right, 0.5, -0.5)[:, None]
-    return FeatureBatch(places[place], action, paid.float(), (~paid).float(), places[following.clamp(0, 3)])
+    next_z, next_action = places[following.clamp(0, 3)], torch.full_like(action, -0.25)  # the mean
+    return FeatureBatch(places[place], action, paid.float(), (~paid).float(), next_z, next_action)
 
 
 def test_iql_finds_the_way_that_few_go_and_cloning_follows_the_many():
@@ -298,26 +302,45 @@ def test_policies_read_standardised_representations():
 
 
 def test_what_reads_rewards_finds_the_better_action_and_bc_the_common_one():
-    """One state, two actions: the rarer one is paid. TD3+BC, DrQ-v2+BC and IQL must lean to it, BC to their mean."""
+    """One state, two actions: the rarer one is paid. What learns values must lean to it, BC to their mean."""
     chosen = {}
     for name, build in ALGORITHMS.items():
         torch.manual_seed(0)
-        policy, options = Policy(2, 1, 32), build.options.fill({"alpha": 25.0})
+        policy, options = Policy(2, 1, 32), build.options.fill({"alpha": 25.0, "actor_bc": 0.04, "distillation": 0.1})
         algorithm = build(policy, options, 3e-3, 300, RandomStream(torch.Generator().manual_seed(0)))
         action = torch.where(torch.arange(64) % 4 == 0, 0.5, -0.5)[:, None]
-        batch = FeatureBatch(
-            torch.zeros(64, 2), action, (action[:, 0] > 0).float(), torch.zeros(64), torch.zeros(64, 2)
-        )
+        paid = (action[:, 0] > 0).float()
+        batch = FeatureBatch(torch.zeros(64, 2), action, paid, torch.zeros(64), torch.zeros(64, 2), action)
         for _ in range(300):
             algorithm.update(batch)
         chosen[name] = policy(torch.zeros(1, 2)).item()
     assert chosen["bc"] == pytest.approx(-0.25, abs=0.02)
-    assert chosen["td3_bc"] > 0.2
-    assert chosen["drqv2_bc"] > 0.2
+    assert all(chosen[name] > 0.2 for name in ("td3_bc", "rebrac", "drqv2_bc", "fql")), chosen
     assert chosen["iql"] > 0.1
 
 
-@pytest.mark.parametrize("name", ["td3_bc", "drqv2_bc", "iql", "bc"])
+def test_fqls_flow_has_both_modes_of_the_data_and_its_policy_is_the_kept_one_at_no_noise():
+    """One state, a quarter of whose actions are 0.5 and the others -0.5: a regression would be at -0.25."""
+    torch.manual_seed(0)
+    action = torch.where(torch.arange(128) % 4 == 0, 0.5, -0.5)[:, None]
+    zeros = torch.zeros(128, 2)
+    given = FeatureBatch(zeros, action, zeros[:, 0], zeros[:, 0], zeros, action)
+    draws = RandomStream(torch.Generator().manual_seed(0))
+    algorithm = FQL(Policy(2, 1, 32), FQLOptions(distillation=10.0), 3e-3, 400, draws)
+    for _ in range(400):
+        algorithm.update(given)
+    z, noise = torch.zeros(1000, 2), torch.linspace(0.0005, 0.9995, 1000)[:, None].mul(2).sub(1).erfinv() * 2**0.5
+    with torch.no_grad():
+        flow = algorithm.flow.act(z, noise)
+        one_step = algorithm.noise_in.act(algorithm.policy, z, noise)
+        at_none = algorithm.noise_in.act(algorithm.policy, z, 0 * noise)
+    for found in (flow, one_step):
+        assert (found < 0).float().mean().item() == pytest.approx(0.75, abs=0.08)
+        assert ((found.abs() - 0.5).abs() < 0.25).float().mean() > 0.65
+    assert torch.equal(at_none, algorithm.policy.from_standardised(z))
+
+
+@pytest.mark.parametrize("name", ["td3_bc", "rebrac", "drqv2_bc", "iql", "fql", "bc"])
 def test_bf16_halves_the_digits_of_matrix_products_and_nothing_else(name):
     full, half = make(ALGORITHMS[name]), make(ALGORITHMS[name])
     for seed in range(4):

@@ -23,6 +23,8 @@ from vd4rl_pomdp.envs.pixels import TimeStep
 from vd4rl_pomdp.nn import Encoder, EncoderConfig, save_encoder
 from vd4rl_pomdp.nn.policy import Policy, load_policy
 from vd4rl_pomdp.policies.actor import ASSETS, load_actor
+from vd4rl_pomdp.report import tables
+from vd4rl_pomdp.report.load import episodes_frame, load_runs
 from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
 from vd4rl_pomdp.runs.files import read_json, write_json
 
@@ -216,6 +218,30 @@ def test_options_of_a_corruption_are_flags_and_its_rows_tell_of_those_that_are_n
         assert error.count("\n") == 1
     with pytest.raises(UserError, match="--patch-sise is not read by the corruption patch"):
         evaluate_run(run, "patch", 1, 1, patch_sise=3)
+
+
+def test_rows_under_another_corruption_are_kept_once_and_reported_apart(world, run, tmp_path, capsys):
+    before = read_episodes(run / "episodes.csv")
+    words = ["evaluate", str(run), "--episodes", "2", "--workers", "1", "--keep"]
+    for option in ([], ["--patch-size", "24"]):
+        main([*words, "--corruption", "patch", *option])
+    rows = read_episodes(run / "episodes.csv")
+    assert rows[: len(before)] == before
+    assert [row["evaluated_under"] for row in rows[len(before) :]] == ["patch"] * 2 + ["patch, patch_size 24"] * 2
+    for wrong, told in (
+        (["--corruption", "patch"], "episodes.csv has 2 episodes under patch; leave --keep out"),
+        ([], "--keep is for a corruption that --corruption names"),
+    ):
+        with pytest.raises(SystemExit) as end:
+            main([*words, *wrong])
+        assert end.value.code == 2
+        assert told in capsys.readouterr().err
+    found = tables.elsewhere(episodes_frame(load_runs([run])))
+    assert found["evaluated_under"].tolist() == ["patch", "patch, patch_size 24"]
+    assert found["score"].tolist() == pytest.approx([1.175, 1.175])
+    (run / "timing.json").unlink()
+    with pytest.raises(UserError, match="has not finished"):
+        evaluation.refuse_kept(run, "truncate")
 
 
 def test_another_corruption_is_played_with_the_runs_own_options_over_its_own_length(world, run, monkeypatch):

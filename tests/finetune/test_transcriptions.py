@@ -8,6 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from finetune.algorithms import ALGORITHMS, Algorithm
+from finetune.algorithms.fql import FQL
 from finetune.algorithms.td3_bc import TD3BC
 from finetune.config import FinetuneConfig
 from finetune.end_to_end import EndToEnd
@@ -17,7 +18,7 @@ from vd4rl_pomdp.core.types import Transitions
 from vd4rl_pomdp.nn.policy import Policy
 
 DIM, ACTIONS, SIZE, UPDATES, PIXELS = 3, 2, 64, 20, 12
-BEGUN = {"drqv2_bc": 249_990, "bc": 249_990, "td3_bc": 0}
+BEGUN = {"drqv2_bc": 249_990, "bc": 249_990, "td3_bc": 0, "rebrac": 0, "fql": 0}
 """Updates before the first: the noise of V-D4RL ends to fall at the tenth of those made here."""
 
 
@@ -33,7 +34,8 @@ def batch(number: int) -> FeatureBatch:
     g = torch.Generator().manual_seed(number)
     z, next_z = (torch.randn(SIZE, DIM, generator=g) for _ in range(2))
     action = torch.rand(SIZE, ACTIONS, generator=g) * 2 - 1
-    return FeatureBatch(z, action, torch.randn(SIZE, generator=g), torch.rand(SIZE, generator=g), next_z)
+    reward, discount = torch.randn(SIZE, generator=g), torch.rand(SIZE, generator=g)
+    return FeatureBatch(z, action, reward, discount, next_z, torch.rand(SIZE, ACTIONS, generator=g) * 2 - 1)
 
 
 def started(name: str) -> TD3BC:
@@ -42,7 +44,8 @@ def started(name: str) -> TD3BC:
     policy = Policy(DIM, ACTIONS, 16)
     with torch.no_grad():
         policy.net[-1].weight.mul_(30)
-    options = ALGORITHMS[name].options.fill({"gamma": 0.9, "alpha": 1.5})
+    told = {"gamma": 0.9, "alpha": 1.5, "actor_bc": 0.3, "critic_bc": 0.7, "distillation": 2.0}
+    options = ALGORITHMS[name].options.fill(told)
     algorithm = ALGORITHMS[name](policy, options, 1e-3, 550_000, RandomStream(torch.Generator().manual_seed(7)))
     algorithm.updates = BEGUN[name]
     return algorithm
@@ -65,11 +68,11 @@ class Nets:
     def normal(self) -> Tensor:
         return torch.randn(SIZE, ACTIONS, generator=self.noise)
 
-    def learn_values(self, b: FeatureBatch, next_action: Tensor) -> None:
+    def learn_values(self, b: FeatureBatch, next_action: Tensor, penalty: Tensor | float = 0.0) -> None:
         with torch.no_grad():
             following = torch.cat([b.next_z, next_action], 1)
             q1, q2 = (q(following)[:, 0] for q in self.target_critics)
-            target = b.reward + 0.9 * b.discount * torch.min(q1, q2)
+            target = b.reward + 0.9 * b.discount * (torch.min(q1, q2) - penalty)
         values = [q(torch.cat([b.z, b.action], 1))[:, 0] for q in self.critics]
         loss = sum(((q - target) ** 2).mean() for q in values)
         self.critic_steps.zero_grad()
@@ -130,7 +133,21 @@ def td3_bc(nets: Nets, b: FeatureBatch, step: int) -> None:
     nets.follow(nets.target_actor, nets.actor, 0.005)
 
 
-@pytest.mark.parametrize("theirs", [drqv2_bc, bc, td3_bc])
+def rebrac(nets: Nets, b: FeatureBatch, step: int) -> None:
+    with torch.no_grad():
+        noise = (nets.normal() * 0.2).clamp(-0.5, 0.5)
+        next_action = (torch.tanh(nets.target_actor(b.next_z)) + noise).clamp(-1, 1)
+    nets.learn_values(b, next_action, 0.7 * ((next_action - b.next_action) ** 2).sum(1))
+    if (step + 1) % 2:
+        return
+    action = torch.tanh(nets.actor(b.z))
+    q = nets.critics[0](torch.cat([b.z, action], 1))
+    nets.improve(-q.mean() / q.abs().mean().detach() + 0.3 * ((action - b.action) ** 2).mean())
+    nets.follow(nets.target_critics, nets.critics, 0.005)
+    nets.follow(nets.target_actor, nets.actor, 0.005)
+
+
+@pytest.mark.parametrize("theirs", [drqv2_bc, bc, td3_bc, rebrac])
 def test_updates_end_in_the_weights_of_the_authors_rule(theirs: Callable):
     name = theirs.__name__
     algorithm = started(name)
@@ -156,6 +173,85 @@ def check_equal(mine: nn.Module, their: nn.Module) -> None:
         torch.testing.assert_close(p, q, atol=1e-12, rtol=1e-12)
 
 
+def gelu(x: Tensor) -> Tensor:
+    return 0.5 * x * (1 + torch.tanh((2 / torch.pi) ** 0.5 * (x + 0.044715 * x**3)))
+
+
+def layered(weights: list[Tensor], x: Tensor, last: Callable, norm: bool = False) -> Tensor:
+    """A perceptron of GELU, each hidden layer normalised behind it if told."""
+    while len(weights) > 2:
+        weight, bias, *weights = weights
+        x = gelu(x @ weight.T + bias)
+        if norm:
+            scale, shift, *weights = weights
+            x = (x - x.mean(1, keepdim=True)) / (x.var(1, correction=0, keepdim=True) + 1e-6).sqrt() * scale + shift
+    return last(x @ weights[0].T + weights[1])
+
+
+class FlowNets:
+    """Copies of FQL's weights, and its networks written out: a state, its action and a time are one input."""
+
+    def __init__(self, algorithm: FQL) -> None:
+        def copies(module: nn.Module) -> list[Tensor]:
+            return [p.detach().clone().requires_grad_() for p in module.parameters()]
+
+        self.policy, self.flow = copies(algorithm.policy.net), copies(algorithm.flow)
+        self.noise, self.critics = copies(algorithm.noise_in), [copies(q) for q in algorithm.critic.children()]
+        self.targets = [[p.detach() for p in copies(q)] for q in algorithm.target_critic.children()]
+        self.actors = [*self.policy, *self.noise, *self.flow]
+        self.adam = torch.optim.Adam([*self.actors, *self.critics[0], *self.critics[1]], lr=1e-3)
+
+    def mu(self, z: Tensor, noise: Tensor) -> Tensor:
+        w0, b0, w1, b1, w2, b2 = self.policy
+        hidden = torch.relu(torch.cat([z, noise], 1) @ torch.cat([w0, self.noise[0]], 1).T + b0)
+        return torch.tanh(torch.relu(hidden @ w1.T + b1) @ w2.T + b2)
+
+    def velocity(self, z: Tensor, x: Tensor, t: Tensor) -> Tensor:
+        state, bias, moving, *deeper = self.flow
+        return layered([torch.cat([state, moving], 1), bias, *deeper], torch.cat([z, x, t], 1), lambda x: x)
+
+    def value(self, critics: list[list[Tensor]], z: Tensor, action: Tensor) -> Tensor:
+        both = [layered(q, torch.cat([z, action], 1), lambda x: x[:, 0], norm=True) for q in critics]
+        return torch.stack(both)
+
+    def update(self, b: FeatureBatch, next_noise: Tensor, x0: Tensor, noise: Tensor, t: Tensor) -> None:
+        with torch.no_grad():
+            next_value = self.value(self.targets, b.next_z, self.mu(b.next_z, next_noise)).mean(0)
+            target = b.reward + 0.9 * b.discount * next_value
+            cloned = noise
+            for step in range(10):
+                cloned = cloned + 0.1 * self.velocity(b.z, cloned, torch.full((SIZE, 1), 0.1 * step))
+            cloned = cloned.clamp(-1, 1)
+        bellman = ((self.value(self.critics, b.z, b.action) - target) ** 2).mean()
+        flow = ((self.velocity(b.z, (1 - t) * x0 + t * b.action, t) - (b.action - x0)) ** 2).mean()
+        action = self.mu(b.z, noise)
+        q = self.value(self.critics, b.z, action).mean(0)
+        policy = 2.0 * ((action - cloned) ** 2).mean() - q.mean() / q.abs().mean().detach()
+        for parameters, loss in (([*self.critics[0], *self.critics[1]], bellman), (self.actors, flow + policy)):
+            for p, gradient in zip(parameters, torch.autograd.grad(loss, parameters, retain_graph=True), strict=True):
+                p.grad = gradient
+        self.adam.step()
+        for target_critic, critic in zip(self.targets, self.critics, strict=True):
+            for p, q in zip(target_critic, critic, strict=True):
+                p.copy_(0.005 * q.detach() + 0.995 * p)
+
+
+def test_fqls_updates_end_in_the_weights_of_the_authors_rule():
+    """One step of all networks along one loss, in which none but its own loss moves each (Park et al., algorithm 1)."""
+    algorithm = started("fql")
+    nets, drawn = FlowNets(algorithm), torch.Generator().manual_seed(7)
+    for number in range(UPDATES):
+        algorithm.update(batch(number))
+        noises = [torch.randn(SIZE, ACTIONS, generator=drawn) for _ in range(3)]
+        nets.update(batch(number), *noises, torch.rand(SIZE, 1, generator=drawn))
+    ours = [algorithm.policy.net, algorithm.noise_in, algorithm.flow]
+    ours += [*algorithm.critic.children(), *algorithm.target_critic.children()]
+    theirs = [nets.policy, nets.noise, nets.flow, *nets.critics, *nets.targets]
+    for module, weights in zip(ours, theirs, strict=True):
+        for p, q in zip(module.parameters(), weights, strict=True):
+            torch.testing.assert_close(p, q, atol=1e-12, rtol=1e-12)
+
+
 class Eye(nn.Module):
     """The part of an encoder that a memoryless method without a frozen stage has."""
 
@@ -168,7 +264,7 @@ def transitions(number: int) -> Transitions:
     g, b = torch.Generator().manual_seed(100 + number), batch(number)
     obs, next_obs = (torch.randn(SIZE, PIXELS, generator=g) for _ in range(2))
     keys = torch.zeros(SIZE, dtype=torch.int64)
-    return Transitions(obs, b.action, b.reward, b.discount, next_obs, keys, keys)
+    return Transitions(obs, b.action, b.reward, b.discount, next_obs, keys, keys, b.next_action)
 
 
 @pytest.mark.parametrize("theirs", [drqv2_bc, bc])
@@ -182,7 +278,7 @@ def test_without_a_frozen_stage_the_encoder_ends_in_the_authors_weights_too(thei
     for number in range(UPDATES):
         t = transitions(number)
         mine.update(t)
-        features = FeatureBatch(eye(t.obs), t.action, t.reward, t.discount, eye(t.next_obs).detach())
+        features = FeatureBatch(eye(t.obs), t.action, t.reward, t.discount, eye(t.next_obs).detach(), t.next_action)
         theirs(nets, features, BEGUN[name] + number)
     check_equal_weights(algorithm, nets)
     check_equal(encoder.frame, eye)

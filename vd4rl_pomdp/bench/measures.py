@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from finetune.algorithms import TD3BC
+from finetune.algorithms import ALGORITHMS, Algorithm
 from finetune.config import FinetuneConfig
 from finetune.features import ExactSampler, FeatureSampler, FrozenEncoder, StackedSampler
 from finetune.histories import Histories
@@ -262,7 +262,7 @@ def memories(dataset: Dataset, folder: Path, repeats: int) -> dict[str, float]:
 
 
 def finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
-    """Updates on cached features against updates that encode every batch, for both kinds of encoder.
+    """Updates on cached features against updates that encode every batch, for both kinds of encoder; ReBRAC's cost.
 
     The history is cut to a window: encoding whole episodes for every batch would take longer still.
     """
@@ -273,7 +273,12 @@ def finetuning(dataset: Dataset, repeats: int) -> dict[str, float]:
         "bf16": _updates_per_s(dataset, memoryless, "bf16", repeats),
         "history_bf16": _updates_per_s(dataset, history, "bf16", 1),
     }
-    return {f"{kind}_{name}": value for kind, values in results.items() for name, value in values.items()}
+    rates = {f"{kind}_{name}": value for kind, values in results.items() for name, value in values.items()}
+    features = torch.randn(1, dataset.num_rows, EncoderConfig(6).feature_dim, device=dataset.t.device).half()
+    hidden, both = FinetuneConfig.of("cpu").hidden_dim, ("td3_bc", "rebrac")
+    trained = (partial(_train, *_policy_of(dataset, features, hidden, 0, name), 20) for name in both)
+    td3_bc, rebrac = alternating(max(1, repeats), *trained)
+    return rates | {"rebrac_over_td3_bc": rebrac / td3_bc}
 
 
 def _updates_per_s(
@@ -343,17 +348,19 @@ def stacking(dataset: Dataset, repeats: int) -> dict[str, float]:
     return results
 
 
-def _train(algorithm: TD3BC | Stack, sampler: FeatureSampler | ExactSampler | StackedSampler, updates: int) -> None:
+def _train(algorithm: Algorithm | Stack, sampler: FeatureSampler | ExactSampler | StackedSampler, updates: int) -> None:
     for _ in range(updates):
         algorithm.update(sampler.sample())
 
 
-def _policy_of(dataset: Dataset, features: torch.Tensor, hidden: int, seed: int) -> tuple[TD3BC, FeatureSampler]:
-    """TD3+BC on cached features, and its batches."""
-    config = FinetuneConfig.of("cpu")
+def _policy_of(
+    dataset: Dataset, features: torch.Tensor, hidden: int, seed: int, name: str = "td3_bc"
+) -> tuple[Algorithm, FeatureSampler]:
+    """An algorithm on cached features, and its batches."""
+    config = FinetuneConfig.of("cpu", algorithm=name)
     batches, noise = (random_stream(seed, "bench", name, device=features.device) for name in ("batches", "noise"))
     policy = Policy(features.shape[-1], dataset.action_dim, hidden).to(features.device)
-    algorithm = TD3BC(policy, config.options, config.learning_rate, config.updates, noise)  # type: ignore[arg-type]
+    algorithm = ALGORITHMS[name](policy, config.options, config.learning_rate, config.updates, noise)
     return algorithm, FeatureSampler(Histories(dataset, NO_OPTIONS, 3, 0), features, BATCH, 3, 0.99, batches)
 
 

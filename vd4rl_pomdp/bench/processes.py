@@ -201,7 +201,8 @@ def training(seconds: float) -> Callable[[], dict[str, float]]:
     draws = RandomStream(torch.Generator().manual_seed(0))
     algorithm = TD3BC(policy, config.options, config.learning_rate, config.updates, draws)  # type: ignore[arg-type]
     z, action, next_z = (torch.randn(256, width) for width in (dim, actions, dim))
-    batch = FeatureBatch(z, action.tanh(), torch.rand(256), torch.ones(256), next_z)
+    action = action.tanh()
+    batch = FeatureBatch(z, action, torch.rand(256), torch.ones(256), next_z, action)
     for _ in range(_WARM_UP):
         algorithm.update(batch)
 

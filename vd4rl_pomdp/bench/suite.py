@@ -45,6 +45,7 @@ GOALS: dict[str, tuple[str, float]] = {
     "finetuning.fp32_cached_over_exact": (">=", 20.0),
     "finetuning.bf16_cached_over_exact": (">=", 20.0),
     "finetuning.history_bf16_cached_over_exact": (">=", 20.0),
+    "finetuning.rebrac_over_td3_bc": ("<=", 1.5),
     "jax.units_256_fp32_jax_over_ours": (">=", 1.0),
     "jax.units_256_bf16_jax_over_ours": (">=", 1.0),
     "jax.units_1024_fp32_jax_over_ours": (">=", 1.0),

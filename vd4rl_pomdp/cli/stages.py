@@ -86,6 +86,8 @@ class Evaluation:
     """Processes; 0 uses every core."""
     out: Path | None = None
     """Append the raw rows to this CSV file."""
+    keep: bool = False
+    """Append the rows under a given corruption to the run's own episodes.csv, where reports find them."""
     json: bool = False
     """Print one JSON object."""
 
@@ -100,7 +102,7 @@ def _evaluation(words: list[str], program: str, own: dict[str, Any]) -> Evaluati
 
 def evaluate(words: list[str], program: str) -> None:
     """Evaluate a fine-tuned run again, as it was trained and under no corruption, or under a given one alone."""
-    from finetune.evaluation import by_part, evaluate_run
+    from finetune.evaluation import another, by_part, evaluate_run, refuse_kept
     from vd4rl_pomdp.data.reference import Reference, summarise
     from vd4rl_pomdp.nn.encoder_folder import read_record
     from vd4rl_pomdp.runs.episodes import append_episodes, read_episodes
@@ -111,16 +113,20 @@ def evaluate(words: list[str], program: str) -> None:
     run, out, parts, json = asked.run, asked.out, asked.parts, asked.json
     refuse_number("parts", parts, 1)
     there = read_episodes(run / EPISODES_FILE)  # what is no run is refused below
-    if there and asked.stages:
-        asked = _evaluation(words, program, read_record(run / "encoder").pretrain.corruption)
+    trained = read_record(run / "encoder").pretrain.corruption if there else {}
+    asked = _evaluation(words, program, trained)
     if out is not None:
         refuse_inside(out)
         if there:
             append_episodes(out, [])  # a path that cannot be written is known before any episode is played
     options = {name: value for stage in asked.stages for name, value in flat(stage).items()}
+    if asked.keep and asked.corruption is None:
+        raise UserError("--keep is for a corruption that --corruption names: a run's own evaluations are kept already")
+    if asked.keep and there:
+        refuse_kept(run, another(trained, asked.corruption or "", options)[1])
     rows, played = evaluate_run(run, asked.corruption, asked.episodes, asked.workers, **options)
-    if out is not None:
-        append_episodes(out, rows)
+    for file in [*([out] if out else []), *([run / EPISODES_FILE] if asked.keep else [])]:
+        append_episodes(file, rows)
     reference = Reference.read(run)
     labels = {k: rows[0][k] for k in (*LABELS, "step")}
     known = {"data_return": reference.data_return, "path_error": reference.path_error}

@@ -91,6 +91,8 @@ class Transitions(Batch):
     """(B,) int64: `row_key` of row t, which keys `emission` corruptions."""
     next_key: Tensor
     """(B,) int64: `row_key` of next_obs."""
+    next_action: Tensor
+    """(B, A) float32: the action at next_obs; zero at the episode's last row, which has none."""
 
 
 @dataclass(frozen=True)

@@ -174,6 +174,11 @@ class Dataset:
         """a_t (..., A) float32 of (...,) int64 rows t that have a successor."""
         return self.action[rows + 1]
 
+    def action_or_zero(self, rows: Tensor) -> Tensor:
+        """a_t (..., A) float32 of any (...,) int64 rows t; zero at an episode's last, which has none."""
+        last = (self.episode_end - 1)[self.episode[rows]]
+        return self.action[torch.minimum(rows + 1, last)] * (rows < last)[..., None]
+
     def actions_before(self, rows: Tensor) -> Tensor:
         """a_{t-1} (..., T, A) float32 of (..., T) consecutive rows; zero in the first: a history begins without one."""
         actions = self.action[rows]

@@ -130,6 +130,7 @@ class View:
             next_obs=self.observe(next_rows),
             key=data.keys(rows),
             next_key=data.keys(next_rows),
+            next_action=data.action_or_zero(next_rows),
         )
 
     def state_dict(self) -> dict[str, Any]:

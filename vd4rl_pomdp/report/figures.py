@@ -30,7 +30,7 @@ DASHES, MARKERS, HATCHES = ("-", "--", ":", "-."), "osD^", ("", "////", "....", 
 """As many as there are rounds through the colours before looks repeat."""
 LOOKS = (
     *("mik+a", "mik", "acro", "ah+a", "fj+a", "supervised+a", "random", "ah", "fj", "supervised", "state"),
-    *("curl", "driml", "homer", "one_step_inverse", "no_history", "bc", "drq_bc"),
+    *("curl", "driml", "homer", "one_step_inverse", "no_history", "bc", "drq_bc", "acdf", "smwm"),
 )
 """The package's methods in the order of their looks, which are the same in every report: the first differ in colour."""
 QUALITIES = ("expert", "medium_expert", "medium")

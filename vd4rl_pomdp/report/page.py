@@ -135,6 +135,7 @@ def _tables(runs: list[Run], choice: Choice) -> tuple[dict[str, pd.DataFrame], l
         "representations": tables.representations(every),
         "costs": tables.costs(every),
         "control": tables.control(every),
+        "elsewhere": tables.elsewhere(episodes_frame(run for run in runs if run.finished)),
         "critics": tables.critics(every),
         "improvement": tables.improvement(final),
         "profiles": tables.profiles(final),
@@ -296,6 +297,17 @@ SHOWN: dict[str, tuple[int, Columns]] = {
             "in loop": ("action_error", 4),
             "in loop, clean": ("clean_action_error", 4),
             "seeds": ("seeds", 0),
+        },
+    ),
+    "elsewhere": (
+        2,
+        {
+            "setting": setting,
+            "method": label,
+            "played under": "evaluated_under",
+            "score": ("score", "low", "high", 1),
+            "seeds": _count,
+            "episodes": "episodes",
         },
     ),
     "critics": (

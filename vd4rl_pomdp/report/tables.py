@@ -252,6 +252,23 @@ def control(table: pd.DataFrame) -> pd.DataFrame:
     return _ordered(found, -found["return"])
 
 
+def elsewhere(episodes: pd.DataFrame) -> pd.DataFrame:
+    """Scores of the last policies under corruptions that they were not trained under, but for none: mean over seeds.
+
+    Args:
+        episodes: of finished runs, as `episodes_frame` has them.
+    """
+    last = episodes["step"] == episodes.groupby("id")["step"].transform("max")
+    others = episodes[last & ~episodes["as_trained"] & (episodes["evaluated_under"] != "none")]
+    rows = []
+    for named, runs in others.groupby([*CONDITION, "evaluated_under"], sort=False):
+        seeds = list(runs.groupby("seed", sort=False)["score"].agg(list))
+        row = dict(zip((*CONDITION, "evaluated_under"), named, strict=True))
+        rows.append(row | mean_and_ends(stats.by_episode(seeds)) | {"seeds": len(seeds), "episodes": len(runs)})
+    columns = [*CONDITION, "evaluated_under", "score", "low", "high", "seeds", "episodes"]
+    return pd.DataFrame(rows, columns=columns)
+
+
 def critics(table: pd.DataFrame) -> pd.DataFrame:
     """What the critics of every condition came to, beside the data's own discounted return: means over finished seeds.
 

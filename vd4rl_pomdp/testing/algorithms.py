@@ -44,7 +44,8 @@ def batch(number: int = 0) -> FeatureBatch:
     g = torch.Generator().manual_seed(number)
     z, next_z = (5 + 3 * torch.randn(SIZE, DIM, generator=g) for _ in range(2))
     action = torch.rand(SIZE, ACTIONS, generator=g) * 2 - 1
-    return FeatureBatch(z, action, torch.randn(SIZE, generator=g), torch.arange(SIZE) % 2 * 0.8, next_z)
+    reward, next_action = torch.randn(SIZE, generator=g), torch.rand(SIZE, ACTIONS, generator=g) * 2 - 1
+    return FeatureBatch(z, action, reward, torch.arange(SIZE) % 2 * 0.8, next_z, next_action)
 
 
 def make(name: str, seed: int = 0, **options: Any) -> Algorithm:

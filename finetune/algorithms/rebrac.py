@@ -1,0 +1,103 @@
+"""ReBRAC: revisiting the minimalist approach to offline reinforcement learning (Tarasov et al. 2023, arXiv 2305.09836).
+
+    critics   y = r + gamma d (min_i Q'_i(z', a~) - beta_2 |a~ - a'|^2),   a~ = pi'(z') + clipped noise
+    actor     max  Q_1(z, pi(z)) / mean |Q_1| - beta_1 (pi(z) - a)^2
+
+TD3+BC whose target, too, is charged for leaving the data: a' is the action that the set has at z'. Critics have three
+hidden layers, each followed by LayerNorm. This is the authors' version for V-D4RL's pixels.
+
+Authors' code: github.com/DT6A/ReBRAC (src/algorithms/rebrac_torch_vis.py).
+
+Differences: states are frozen representations, standardised, and go straight into the networks: the authors' actor and
+critics each begin with a trunk (Linear, LayerNorm, Tanh), with which memoryless encoders here end. The actor has two
+hidden layers as that of every algorithm here (theirs: three). Initial weights are PyTorch's (theirs: orthogonal). The
+n-step return is cut short at an episode's end, where they leave transitions of fewer steps out.
+"""
+
+from __future__ import annotations
+
+import copy
+from dataclasses import dataclass
+from typing import ClassVar
+
+import torch
+import torch.nn.functional as F
+from torch import Tensor, nn
+
+from finetune.algorithms.algorithm import Loss, ReturnOptions
+from finetune.algorithms.td3_bc import TD3BC, TwinCritic
+from finetune.features import FeatureBatch
+from vd4rl_pomdp.core.options import Limits, Options
+from vd4rl_pomdp.core.streams import RandomStream
+from vd4rl_pomdp.nn.adam import Adam
+from vd4rl_pomdp.nn.heads import ExactLinear
+from vd4rl_pomdp.nn.policy import Policy
+
+
+@dataclass(frozen=True)
+class ReBRACOptions(ReturnOptions):
+    """Options of ReBRAC; the defaults are the authors' for walker_walk `medium_expert`."""
+
+    actor_bc: float = 0.3
+    """ReBRAC's beta_1: weight of behaviour cloning against the normalised critic."""
+    critic_bc: float = 0.005
+    """ReBRAC's beta_2: what the target value pays for the squared distance of its action from the set's."""
+
+    critic_layers: int = 3
+    """Hidden layers of each critic."""
+
+    limits: ClassVar[Limits] = {"actor_bc": 0, "critic_bc": 0, "critic_layers": (1, 16)}
+
+
+class NormedCritics(TwinCritic):
+    """Two independent Q functions with LayerNorm behind every hidden layer: (B, D), (B, A) -> two (B,)."""
+
+    def __init__(self, dim: int, action_dim: int, hidden: int, layers: int, kind: nn.Module, eps: float) -> None:
+        """`kind` is the nonlinearity, `eps` LayerNorm's."""
+        nn.Module.__init__(self)  # in place of the other's networks
+
+        def network() -> nn.Sequential:
+            modules: list[nn.Module] = []
+            for width in [dim + action_dim] + [hidden] * (layers - 1):
+                modules += [nn.Linear(width, hidden), kind, nn.LayerNorm(hidden, eps)]
+            return nn.Sequential(*modules, ExactLinear(hidden, 1))
+
+        self.first, self.second = network(), network()
+
+
+class ReBRAC(TD3BC):
+    """See the module."""
+
+    options: type[Options] = ReBRACOptions
+    summary = "TD3+BC with a second penalty in the target, and LayerNorm in deeper critics"
+
+    def __init__(
+        self, policy: Policy, options: ReBRACOptions, learning_rate: float, updates: int, draws: RandomStream
+    ) -> None:
+        super().__init__(policy, options, learning_rate, updates, draws)
+        critic = NormedCritics(**policy.shape, layers=options.critic_layers, kind=nn.ReLU(), eps=1e-5)
+        self.critic = critic.to(policy.standardise.mean.device)
+        self.target_critic = copy.deepcopy(self.critic)
+        self.critic_optimiser = Adam(self.critic.parameters(), learning_rate, fused=True)
+
+    def critic_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:
+        """Squared error of both critics, to the same target y."""
+        z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
+        with torch.no_grad():
+            chosen = self._next_action(next_z, noise)
+            away = (chosen - batch.next_action).square().sum(-1)
+            value = torch.minimum(*self.target_critic(next_z, chosen)) - self.settings.critic_bc * away
+            target = batch.reward + self.settings.gamma * batch.discount * value
+        first, second = self.critic(z, batch.action)
+        loss = F.mse_loss(first, target) + F.mse_loss(second, target)
+        logs = {"critic_loss": loss.detach(), "q": first.detach().mean(), "next_bc_loss": away.mean()}
+        return Loss(loss, logs)
+
+    def actor_loss(self, batch: FeatureBatch, *noise: Tensor) -> Loss:
+        """Weighted cloning less the value, in units of the value's own size."""
+        z = self.policy.standardise(batch.z.detach())
+        chosen = self._policy_action(z, *noise)
+        value = self._policy_value(z, chosen)
+        cloning = F.mse_loss(chosen, batch.action)
+        loss = self.settings.actor_bc * cloning - value.mean() / value.abs().mean().detach()
+        return Loss(loss, {"actor_loss": loss.detach(), "bc_loss": cloning.detach()})
