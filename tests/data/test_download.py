@@ -118,6 +118,16 @@ def test_what_cannot_be_fetched_or_is_wrong_is_one_line_and_what_came_before_sta
     assert fetched(mirror) == ["1_a_expert.hdf5"]
 
 
+def test_a_bad_word_is_told_before_anything_is_fetched(mirror, tmp_path, capsys):
+    for words in (["walker_walk", "foo", "--quality", "expert"], ["walker_walk", "--quality", "expert", "foo"]):
+        with pytest.raises(SystemExit) as end:
+            main(["data", "download", "--out", str(tmp_path), "--endpoint", mirror.endpoint, "--task", *words])
+        assert end.value.code == 2
+        assert "'foo': choose one of" in capsys.readouterr().err
+    assert not mirror.requests
+    assert not list(tmp_path.iterdir())
+
+
 def test_where_nobody_is_is_one_line(tmp_path, monkeypatch):
     monkeypatch.setenv("NO_PROXY", "*")
     monkeypatch.setattr("huggingface_hub.utils._http.time.sleep", lambda _: None)

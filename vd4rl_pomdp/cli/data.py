@@ -44,8 +44,9 @@ def download(
         endpoint: The mirror's address; default: HF_ENDPOINT, else https://huggingface.co.
         verify: Compute the SHA-256 of files that are already there, too.
     """
-    from vd4rl_pomdp.data.download import download
+    from vd4rl_pomdp.data.download import check_published, download
 
+    check_published(task, quality)  # all of them, before hours of downloading the first
     for one, level in itertools.product(task, quality):
         shards = download(one, level, out, endpoint, verify)
         folder = shards[0].parent

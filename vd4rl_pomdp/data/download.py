@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import shutil
+from collections.abc import Iterable
 from contextlib import suppress
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -35,6 +36,15 @@ def check_endpoint(endpoint: str, name: str) -> None:
     raise UserError(f"{name} {endpoint!r} is no address; it starts with https:// or http://")
 
 
+def check_published(tasks: Iterable[str], qualities: Iterable[str]) -> None:
+    """Raise UserError for a task or a quality of which no set is published."""
+    published = list(dict.fromkeys(file.path.split("/")[2] for file in manifest()))
+    for task in tasks:
+        refuse_unknown("task of published sets", task, published)
+    for quality in qualities:
+        refuse_unknown("quality", quality, QUALITIES)
+
+
 def download(
     task: str, quality: str, destination: Path, endpoint: str | None = None, verify: bool = False
 ) -> list[Path]:
@@ -54,9 +64,7 @@ def download(
         UserError: unknown task or quality, no answer from the mirror, a wrong checksum, a full disk, or a set that
             another process downloads.
     """
-    published = list(dict.fromkeys(file.path.split("/")[2] for file in manifest()))
-    refuse_unknown("task of published sets", task, published)
-    refuse_unknown("quality", quality, QUALITIES)
+    check_published([task], [quality])
     endpoint = default_endpoint() if endpoint is None else endpoint
     check_endpoint(endpoint, "endpoint")
     refuse_kept(destination)
