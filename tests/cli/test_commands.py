@@ -38,6 +38,8 @@ SLIPS = [
     (["pretrain", "--data", "x", "--out", ""], "--out is empty: is a variable of the shell not set?"),
     (["report", "x", "--out="], "--out is empty: is a variable of the shell not set?"),
     (["data", "check", ""], "a word is empty: is a variable of the shell not set?"),
+    (["sweep", "run", "quick", "--out", "x", "--only"], "--only has no value: is a variable of the shell not set?"),
+    (["report", "x", "--only", "--out", "y"], "--only has no value: is a variable of the shell not set?"),
     (["finetune", "--encoder", "a", "--data", "b", "--out", "c", "--veiws", "3"], "Perhaps you meant: --views"),
     (["finetune", "--encoder", "nowhere", "--data", "nowhere", "--out", "x"], "nowhere"),
     (["data", "collect", "--task", "ant", "--quality", "random", "--out", "x"], "unknown task 'ant'"),

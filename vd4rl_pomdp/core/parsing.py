@@ -9,6 +9,8 @@ import os
 import re
 from collections.abc import Iterable
 from dataclasses import fields, replace
+from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -39,13 +41,19 @@ def parse(config: Any, words: list[str], program: str, default: Any = None) -> A
     shown = io.StringIO()
     try:
         with contextlib.redirect_stderr(shown):
-            return tyro.cli(config, args=words, prog=program, config=(tyro.conf.OmitArgPrefixes,), **options)
+            parsed = tyro.cli(config, args=words, prog=program, config=(tyro.conf.OmitArgPrefixes,), **options)
     except SystemExit as end:
         if end.code != 2:
             raise
         lines = (line for line in shown.getvalue().splitlines() if not line.startswith(("╭", "╰")))
         text = re.sub(r"[\u2500-\u257f]+|-{5,}", " ", " ".join(lines).partition("For full helptext")[0])
         raise UserError(f"{' '.join(text.split())} (see `{program} --help`)") from None
+    told = parsed.keywords if isinstance(parsed, partial) else vars(parsed)
+    for word, after in pairwise([*words, "--"]):
+        # a list may be empty for tyro, and `sweep run GRID --only $UNSET` would run everything
+        if after.startswith("--") and told.get(word.removeprefix("--").replace("-", "_")) in ([], ()):
+            raise UserError(f"{word} has no value: is a variable of the shell not set? (see `{program} --help`)")
+    return parsed
 
 
 def parse_stage(config: type[Stage], words: list[str], program: str) -> Stage:
