@@ -20,7 +20,6 @@ import copy
 from dataclasses import dataclass
 from typing import ClassVar
 
-import torch
 import torch.nn.functional as F
 from torch import Tensor, nn
 
@@ -80,18 +79,11 @@ class ReBRAC(TD3BC):
         self.target_critic = copy.deepcopy(self.critic)
         self.critic_optimiser = Adam(self.critic.parameters(), learning_rate, fused=True)
 
-    def critic_loss(self, batch: FeatureBatch, noise: Tensor) -> Loss:
-        """Squared error of both critics, to the same target y."""
-        z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
-        with torch.no_grad():
-            chosen = self._next_action(next_z, noise)
-            away = (chosen - batch.next_action).square().sum(-1)
-            value = torch.minimum(*self.target_critic(next_z, chosen)) - self.settings.critic_bc * away
-            target = batch.reward + self.settings.gamma * batch.discount * value
-        first, second = self.critic(z, batch.action)
-        loss = F.mse_loss(first, target) + F.mse_loss(second, target)
-        logs = {"critic_loss": loss.detach(), "q": first.detach().mean(), "next_bc_loss": away.mean()}
-        return Loss(loss, logs)
+    def _next_value(self, batch: FeatureBatch, next_z: Tensor, chosen: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """The smaller value, less what leaving the data costs."""
+        value, _ = super()._next_value(batch, next_z, chosen)
+        away = (chosen - batch.next_action).square().sum(-1)
+        return value - self.settings.critic_bc * away, {"next_bc_loss": away.mean()}
 
     def actor_loss(self, batch: FeatureBatch, *noise: Tensor) -> Loss:
         """Weighted cloning less the value, in units of the value's own size."""

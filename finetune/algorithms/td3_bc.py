@@ -98,13 +98,12 @@ class TD3BC(Algorithm):
         """Squared error of both critics, to the same target y."""
         z, next_z = self.policy.standardise(batch.z), self.policy.standardise(batch.next_z)
         with torch.no_grad():
-            # the smaller of two: the policy seeks out what a critic overrates, and no new data would correct it
-            value = torch.minimum(*self.target_critic(next_z, self._next_action(next_z, noise)))
+            value, logs = self._next_value(batch, next_z, self._next_action(next_z, noise))
             # `discount` is 0 if the task itself ended within the n steps; a time limit ends nothing, so it bootstraps
             target = batch.reward + self.settings.gamma * batch.discount * value
         first, second = self.critic(z, batch.action)
         loss = F.mse_loss(first, target) + F.mse_loss(second, target)
-        return Loss(loss, {"critic_loss": loss.detach(), "q": first.detach().mean()})
+        return Loss(loss, {"critic_loss": loss.detach(), "q": first.detach().mean()} | logs)
 
     def actor_loss(self, batch: FeatureBatch, *noise: Tensor) -> Loss:
         """Cloning less the value, in units of the value's own size."""
@@ -116,6 +115,11 @@ class TD3BC(Algorithm):
         cloning = F.mse_loss(chosen, batch.action)
         loss = cloning - weight * value.mean()
         return Loss(loss, {"actor_loss": loss.detach(), "bc_loss": cloning.detach()})
+
+    def _next_value(self, batch: FeatureBatch, next_z: Tensor, chosen: Tensor) -> tuple[Tensor, dict[str, Tensor]]:
+        """What the target bootstraps from at the next actions (B, A), (B,), and what there is to log of it."""
+        # the smaller of two: the policy seeks out what a critic overrates, and no new data would correct it
+        return torch.minimum(*self.target_critic(next_z, chosen)), {}
 
     def _next_action(self, next_z: Tensor, noise: Tensor) -> Tensor:
         """Action of the target policy, smoothed by noise."""
