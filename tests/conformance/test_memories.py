@@ -32,6 +32,8 @@ from vd4rl_pomdp.testing.memories import (
         ("gru", {"gru_layers": 2}),
         ("transformer", {}),
         ("transformer", {"transformer_layers": 3, "transformer_heads": 1, "attention_window": 2}),
+        ("integrator", {}),
+        ("integrator", {"gru_layers": 2}),
         ("lru", {}),
         ("lru", {"lru_layers": 1, "lru_units": 5, "r_min": 0.9, "r_max": 0.99, "max_phase": 0.3}),
     ],

@@ -28,7 +28,7 @@ from vd4rl_pomdp.testing.methods import ROWS, build, windows
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 LAYOUT = TASKS.named("walker_walk").layout
-METHOD_NAMES = ["supervised", "supervised+a"]
+METHOD_NAMES = ["supervised", "supervised+a", "supervised_picture", "integrator"]
 
 
 @pytest.fixture
