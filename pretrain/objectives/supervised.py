@@ -61,7 +61,7 @@ class Supervised(Objective):
         self.head = mlp(encoder.dim, options.head_dim, len(columns))
 
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean squared error over real rows with a state and coordinates; `pose_loss` and `velocity_loss` are those of one kind."""
+        """Mean squared error over coordinates and real rows whose state is told; `pose_loss` is that of poses alone."""
         assert isinstance(window, StateWindows), "windows without states train no supervised reference"
         truth = (window.state[..., self.columns] - self.mean) / self.std
         told = window.real & ~truth.isnan().any(-1)
