@@ -24,6 +24,7 @@ COMMANDS = {
     "data collect": ("data.collect", "render a set in V-D4RL's format from the shipped actors"),
     "data download": ("data.download", "fetch a published V-D4RL set"),
     "data card": ("data.card", "describe a set: returns, origin, film strip"),
+    "data view": ("data.view", "a page to browse a set's episodes, clean and corrupted"),
     "data check": ("data.check", "validate a set and replay its actions"),
     "data parity": ("data.parity", "compare rendered pixels with the data's"),
     "hub push": ("hub.push", "write an encoder or a data set to the Hugging Face Hub"),
