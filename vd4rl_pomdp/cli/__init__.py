@@ -23,6 +23,8 @@ COMMANDS = {
     "list": ("stages.list_parts", "all parts that have a name: methods, corruptions, algorithms and the like"),
     "data collect": ("data.collect", "render a set in V-D4RL's format from the shipped actors"),
     "data download": ("data.download", "fetch a published V-D4RL set"),
+    "data import": ("data.import_set", "a set of another format, such as Minari's, as one of this package's"),
+    "data export": ("data.export_set", "a set in another format"),
     "data card": ("data.card", "describe a set: returns, origin, film strip"),
     "data view": ("data.view", "a page to browse a set's episodes, clean and corrupted"),
     "data check": ("data.check", "validate a set and replay its actions"),
