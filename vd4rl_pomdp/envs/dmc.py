@@ -202,6 +202,14 @@ def _load(task: DMCTask, random: np.random.RandomState) -> Any:
         tasks = ", ".join(name for domain, name in suite.ALL_TASKS if domain == task.domain)
         choices = tasks or ", ".join(sorted({domain for domain, _ in suite.ALL_TASKS}))
         raise UserError(f"dm_control has no task {task.domain!r}, {task.task!r}: choose one of {choices}")
-    env = suite.load(task.domain, task.task, task_kwargs={"random": random, "time_limit": float("inf")})
+    try:
+        env = suite.load(task.domain, task.task, task_kwargs={"random": random, "time_limit": float("inf")})
+    except AttributeError as error:
+        if "MjModel" not in str(error):
+            raise
+        raise UserError(
+            f"dm-control does not go with mujoco {mujoco.__version__} ({error}): install a pair that was tried, "
+            "`pip install 'dm-control==1.0.44' 'mujoco==3.11.0'`"
+        ) from error
     check_bounds(f"dm_control's {task.domain} {task.task}", env.action_spec().minimum, env.action_spec().maximum)
     return env
