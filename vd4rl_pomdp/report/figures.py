@@ -30,6 +30,7 @@ DASHES, MARKERS, HATCHES = ("-", "--", ":", "-."), "osD^", ("", "////", "....", 
 LOOKS = (
     *("mik+a", "mik", "acro", "ah+a", "fj+a", "supervised+a", "random", "ah", "fj", "supervised", "state"),
     *("curl", "driml", "homer", "one_step_inverse", "no_history", "bc", "drq_bc", "acdf", "smwm"),
+    *("supervised_picture", "integrator"),
 )
 """The package's methods in the order of their looks, which are the same in every report: the first differ in colour."""
 FORMATS: dict[str, dict[str, Any]] = {"png": {"dpi": 150}, "pdf": {"metadata": {"CreationDate": None}}}
