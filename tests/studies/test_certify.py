@@ -62,7 +62,7 @@ def test_a_certificate_is_trained_for_kept_and_read_by_reports_and_cards(
     assert f"patch: {told['verdict']} ({told['why']})" in capsys.readouterr().out
 
     before, carried[:] = contents(out / MEMORY), []
-    main([*words, "--returns", *POLICIES.split()])
+    main([*words, *POLICIES.split(), "--returns"])
     assert [line[0] for line in carried].count("pretrain") == 2, "of the state alone"
     assert [line[0] for line in carried].count("finetune") == 8
     kept = contents(out / MEMORY)

@@ -234,7 +234,8 @@ def _blocks(name: str, table: pd.DataFrame, rows: pd.DataFrame, words: int) -> I
             if name == "representations" and told:
                 # A linear probe reads easily what the encoder was trained to tell.
                 names = " and ".join(told)
-                note += f" {names}: trained on the states of all episodes, those that the probe holds out, too."
+                note += f" {names}: trained on the states of all episodes, those that the probe holds out, too, but for"
+                note += " --hold-out."
             if name == MARK:
                 note += f" Memory: {mine['memory'].iloc[0]}."
             if "not there" in shown and not shown["not there"].any():
