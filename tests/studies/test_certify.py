@@ -1,6 +1,7 @@
 """Certificates: what they rest on, what they say, and where they are read."""
 
 import json
+from html import unescape
 
 import numpy as np
 import pytest
@@ -41,8 +42,10 @@ def carried(monkeypatch):
     return done
 
 
-SMALL = "preset=smoke seed=0,1 pretrain.steps=1 pretrain.patch_size=24"
-POLICIES = "finetune.updates=5 finetune.eval_every=5 finetune.eval_episodes=2 finetune.eval_length=2"
+SMALL = "preset=smoke seed=0 pretrain.steps=1 pretrain.patch_size=24"
+POLICIES = (
+    "finetune.updates=5 finetune.eval_every=5 finetune.eval_episodes=2 finetune.eval_length=2 finetune.eval_clean=false"
+)
 
 
 def test_a_certificate_is_trained_for_kept_and_read_by_reports_and_cards(
@@ -51,20 +54,20 @@ def test_a_certificate_is_trained_for_kept_and_read_by_reports_and_cards(
     out = tmp_path / "certified"
     words = ["certify", str(states), "patch", "--out", str(out), "--change", *SMALL.split()]
     main(words)
-    trained = [f"{method}/seed{seed}/pretrain" for seed in (0, 1) for method in (MEMORY, *FLOORS)]
+    trained = [f"{method}/seed0/pretrain" for method in (MEMORY, *FLOORS)]
     assert [line[-1].removeprefix(f"{out}/") for line in carried] == trained
     assert all("--hold-out" in line and "24" in line for line in carried)
     (told,) = json.loads((out / "certificates.json").read_text()).values()
     assert told["name"] == "patch, patch_size 24"
-    assert told["why"].startswith("R2: supervised+a less supervised_picture ")
-    assert told["why"].endswith("; no returns")
+    assert told["why"].startswith("R2: supervised+a -")
+    assert told["why"].endswith(", too few seeds, too little itself to tell; no returns")
     assert (states / "certificates.json").read_bytes() == (out / "certificates.json").read_bytes()
     assert f"patch: {told['verdict']} ({told['why']})" in capsys.readouterr().out
 
     before, carried[:] = contents(out / MEMORY), []
     main([*words, *POLICIES.split(), "--returns"])
-    assert [line[0] for line in carried].count("pretrain") == 2, "of the state alone"
-    assert [line[0] for line in carried].count("finetune") == 8
+    assert [line[0] for line in carried].count("pretrain") == 1, "of the state alone"
+    assert [line[0] for line in carried].count("finetune") == 4
     kept = contents(out / MEMORY)
     assert {name: kept[name] for name in before} == before, "what is there is not trained again"
     (told,) = json.loads((out / "certificates.json").read_text()).values()
@@ -82,11 +85,11 @@ def test_a_certificate_is_trained_for_kept_and_read_by_reports_and_cards(
         capsys.readouterr()
         main(["report", str(source), "--out", str(tmp_path / target)])
         assert line in " ".join(capsys.readouterr().out.split())
-        assert line.replace("memory", "Memory") in (tmp_path / target / "index.html").read_text()
+        assert line.replace("memory", "Memory") in unescape((tmp_path / target / "index.html").read_text())
     capsys.readouterr()
     main(["report", "compare", str(tmp_path / "kept"), str(out), "--out", str(tmp_path / "both")])
     assert line in " ".join(capsys.readouterr().out.split())
-    assert line.replace("memory", "Memory") in (tmp_path / "both" / "index.html").read_text()
+    assert line.replace("memory", "Memory") in unescape((tmp_path / "both" / "index.html").read_text())
 
 
 def test_where_there_is_none_for_the_very_set_and_corruption_it_says_so(tmp_path, monkeypatch, capsys):
@@ -110,9 +113,9 @@ def test_where_there_is_none_for_the_very_set_and_corruption_it_says_so(tmp_path
 
 
 def test_a_certificate_follows_from_the_intervals_of_both_differences():
-    def verdict(over_picture, over_integrator, seeds=3, spread=0.01, unit=1.0):
+    def verdict(over_picture, over_integrator, seeds=3, spread=0.01, unit=1.0, level=0.9):
         g = np.random.default_rng(0)
-        levels = {MEMORY: 0.0, FLOORS[0]: -over_picture, FLOORS[1]: -over_integrator}
+        levels = {MEMORY: level, FLOORS[0]: level - over_picture, FLOORS[1]: level - over_integrator}
         values = {name: unit * (level + spread * g.normal(size=(seeds, 20))) for name, level in levels.items()}
         return judge(values, unit, 2)["verdict"]
 
@@ -122,6 +125,8 @@ def test_a_certificate_follows_from_the_intervals_of_both_differences():
     assert verdict(0.0, 0.4) == NEEDS_NOT, "one observation is as good"
     assert verdict(0.4, 0.03) == NEEDS_NOT, "less than the margin"
     assert verdict(0.4, -0.3) == NEEDS_NOT
+    assert verdict(0.4, 0.0, level=0.45) == OPEN, "it knows little itself: for want of budget?"
+    assert verdict(0.4, 0.3, level=0.45) == NEEDS
     assert verdict(0.4, 0.1, spread=1) == OPEN
     assert verdict(0.4, 0.3, seeds=1) == OPEN
 

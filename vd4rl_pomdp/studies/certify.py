@@ -49,6 +49,8 @@ MEMORY, FLOORS, STATE = "supervised+a", ("supervised_picture", "integrator"), "s
 NEEDS, NEEDS_NOT, OPEN = "needs a memory of what was seen", "needs no memory of what was seen", "undecided"
 MARGIN = 0.05
 """A memory that is known to add less, in R^2 or as a share of the data's mean return, is not needed."""
+ENOUGH = 0.5
+"""A memory that is worth less itself, likewise, may lack budget: that it adds nothing is then no verdict."""
 R2_FILE = "r2.json"
 """R^2 in every held-out episode, in the folder of a pretraining."""
 
@@ -179,7 +181,7 @@ def judge(values: Mapping[str, np.ndarray], unit: float, digits: int) -> Row:
 
     Args:
         values: (seeds, episodes) by method.
-        unit: what MARGIN is a share of.
+        unit: what MARGIN and ENOUGH are shares of.
         digits: of numbers in words.
     """
     row: Row = {"methods": {}, "above": {}}
@@ -190,10 +192,11 @@ def judge(values: Mapping[str, np.ndarray], unit: float, digits: int) -> Row:
         ends = stats.difference_interval(values[MEMORY], values[floor]) or (None, None)
         row["above"][floor] = [difference, *ends]
     above = row["above"].values()
-    known = all(low is not None for _, low, _ in above)
+    known, weak = all(low is not None for _, low, _ in above), row["methods"][MEMORY][0] < ENOUGH * unit
+    verdict = NEEDS if known and all(low > 0 for _, low, _ in above) else OPEN
     if known and any(high < MARGIN * unit for *_, high in above):
-        verdict = NEEDS_NOT
-    else:
-        verdict = NEEDS if known and all(low > 0 for _, low, _ in above) else OPEN
-    told = ", ".join(f"less {floor} {with_interval(*ends, digits)}" for floor, ends in row["above"].items())
-    return row | {"verdict": verdict, "why": f"{MEMORY} {told}" + " (too few seeds)" * (not known)}
+        verdict = OPEN if weak else NEEDS_NOT
+    told = [f"{MEMORY} {with_interval(*row['methods'][MEMORY], digits)}"]
+    told += [f"less {floor} {with_interval(*ends, digits)}" for floor, ends in row["above"].items()]
+    told += ["too few seeds"] * (not known) + ["too little itself to tell"] * (weak and verdict == OPEN)
+    return row | {"verdict": verdict, "why": ", ".join(told)}
