@@ -26,6 +26,7 @@ COMMANDS = {
     "data import": ("data.import_set", "a set of another format, such as Minari's, as one of this package's"),
     "data export": ("data.export_set", "a set in another format"),
     "data card": ("data.card", "describe a set: returns, origin, film strip"),
+    "data view": ("data.view", "a page to browse a set's episodes, clean and corrupted"),
     "data check": ("data.check", "validate a set and replay its actions"),
     "data parity": ("data.parity", "compare rendered pixels with the data's"),
     "hub push": ("hub.push", "write an encoder or a data set to the Hugging Face Hub"),

@@ -10,7 +10,7 @@ import tyro
 
 from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.parsing import parse
+from vd4rl_pomdp.core.parsing import parse, parse_stage
 from vd4rl_pomdp.sweeps.own_file import program_here
 
 REPLAY_TOLERANCE = 1e-6
@@ -114,6 +114,13 @@ def card(path: tyro.conf.Positional[Path]) -> None:
     from vd4rl_pomdp.data.card import write_card
 
     print(f"card: {write_card(path)}")
+
+
+def view(words: list[str], program: str) -> None:
+    """Write a page to browse episodes."""
+    from vd4rl_pomdp.report.browse import ViewConfig, write_view
+
+    print(f"page: {write_view(parse_stage(ViewConfig, words, program))}")
 
 
 @command
