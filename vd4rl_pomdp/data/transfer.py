@@ -9,13 +9,15 @@ from __future__ import annotations
 import shutil
 import sys
 from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
-from vd4rl_pomdp.core.errors import UserError, disk_errors, refuse_no_folder, refuse_number
+from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_no_folder, refuse_number, system_error
 from vd4rl_pomdp.core.tasks import FRAME_SIZES
 from vd4rl_pomdp.data.format import FRAMES_KEY
 from vd4rl_pomdp.data.formats import FORMATS
@@ -60,8 +62,8 @@ def import_set(
             something else.
     """
     refuse_inside(out)
-    opened = FORMATS.named(name).read(source, picture)
-    opened = _resized(source, opened, size)
+    with _telling(source):
+        opened = _resized(FORMATS.named(name).read(source, picture), size)
     label = task or opened.task or _label(opened, name)
     _tell(opened.notes)
     settings: dict[str, Any] = {
@@ -89,6 +91,8 @@ def import_set(
     collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
     if episodes.clipped:
         _tell([f"{episodes.clipped} actions lay outside their bounds and were clipped"])
+    if episodes.still and episodes.still == episodes.read:
+        _tell(["in every episode all pictures are equal: was a buffer recorded that the environment draws into?"])
     from vd4rl_pomdp.data.card import write_card  # draws
 
     write_card(out)
@@ -109,7 +113,7 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
     refuse_no_folder(out)
     if holds_anything(out):
         raise UserError(f"{out}: is not empty; choose another folder to export to")
-    opened = _resized(str(path), read_shards(str(path)), size)
+    opened = _resized(read_shards(str(path)), size)
     hidden = out.with_name(f".{out.name}.export")
     with disk_errors(out):
         out.parent.mkdir(parents=True, exist_ok=True)
@@ -129,25 +133,38 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
     _tell(lost)
 
 
+@contextmanager
+def _telling(place: str) -> Iterator[None]:
+    """What a format's reader or its library raises, as a sentence that says where."""
+    try:
+        yield
+    except UserError as error:
+        raise type(error)(str(error) if str(error).startswith(place) else f"{place}: {error}") from error
+    except (OSError, ValueError, KeyError, IndexError, RuntimeError, AssertionError, BadZipFile) as error:
+        raise system_error(Path(place), error) or UserError(
+            f"{place}: cannot be read as this format ({in_one_line(error) or type(error).__name__})"
+        ) from error
+
+
 class _Reader:
     """Rows of an episode by its number; they are asked for in order, but for those that are there already."""
 
     def __init__(self, name: str, source: SourceSet, clip: bool) -> None:
         self._name, self._source, self._clip = name, source, clip
         self._next, self._episodes = -1, iter(())
-        self.clipped = 0
+        self.clipped = self.read = self.still = 0
 
     def __call__(self, number: int) -> EpisodeArrays:
-        try:
+        with _telling(f"{self._name}: episode {number}"):
             if number != self._next:
                 self._episodes = self._source.read(number)
             rows = next(self._episodes, None)
             if rows is None:
                 raise UserError("is missing")
-            self._next = number + 1
+            self._next, frames = number + 1, rows[FRAMES_KEY]
+            self.read += 1
+            self.still += len(frames) > 1 and bool((frames[1:] == frames[0]).all())
             return rows | {"action": self._scaled(rows["action"])}
-        except UserError as error:
-            raise UserError(f"{self._name}: episode {number}: {error}") from error
 
     def _scaled(self, action: np.ndarray) -> np.ndarray:
         """Actions in [-1, 1]; those of a first row stay zero."""
@@ -167,13 +184,13 @@ class _Reader:
         return scaled if most <= 1 else scaled.clip(-1, 1)
 
 
-def _resized(name: str, source: SourceSet, size: int | None) -> SourceSet:
+def _resized(source: SourceSet, size: int | None) -> SourceSet:
     """A source of square pictures, made so where `size` says how large."""
     (height, width), (low, high) = source.frame_shape, FRAME_SIZES
     if size is None:
         if height != width or not low <= height <= high:
             raise UserError(
-                f"{name}: has pictures of {height}x{width} pixels, frames are square, of {low} to {high}: pass --size, "
+                f"has pictures of {height}x{width} pixels, frames are square, of {low} to {high}: pass --size, "
                 "such as --size 84"
             )
         return source

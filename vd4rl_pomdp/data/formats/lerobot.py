@@ -14,7 +14,6 @@ from __future__ import annotations
 import io
 import re
 from collections.abc import Iterator
-from contextlib import contextmanager
 from functools import partial
 from itertools import groupby
 from pathlib import Path
@@ -23,10 +22,10 @@ from typing import Any
 import numpy as np
 from PIL import Image
 
-from vd4rl_pomdp.core.errors import UserError, disk_error, in_one_line, refuse_unknown
+from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.format import FRAMES_KEY
-from vd4rl_pomdp.data.formats.base import DataFormat, SourceSet, library, picture_axes, rows_of
+from vd4rl_pomdp.data.formats.base import DataFormat, SourceSet, chosen, library, rows_of
 from vd4rl_pomdp.data.shards import EpisodeArrays
 from vd4rl_pomdp.runs.files import read_json, write_json
 
@@ -47,74 +46,66 @@ def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
     folder = Path(path)
     if not (folder / "meta" / "info.json").is_file():
         raise UserError(
-            f"{folder}: has no meta/info.json, so it is no LeRobot set on this disk; `hf download --repo-type dataset "
-            "NAME --local-dir FOLDER` fetches one"
+            "has no meta/info.json, so it is no LeRobot set on this disk; `hf download --repo-type dataset NAME "
+            "--local-dir FOLDER` fetches one"
         )
     arrow, pq = library("pyarrow", _EXTRA), library("pyarrow.parquet", _EXTRA)
     info = read_json(folder / "meta" / "info.json")
-    with _damaged(folder):
-        if not str(info["codebase_version"]).startswith("v3."):
-            raise UserError(
-                f"{folder}: is in LeRobot's format {info['codebase_version']}, not v3; LeRobot's "
-                "convert_dataset_v21_to_v30 converts it"
-            )
-        features = info["features"]
-        cameras = [name for name, told in features.items() if told["dtype"] in ("image", "video")]
-        if picture is None and len(cameras) != 1:
-            raise UserError(f"{folder}: has {len(cameras)} cameras ({', '.join(cameras)}); choose one with --picture")
-        key = picture or cameras[0]
-        refuse_unknown("camera", key, cameras)
-        shape = tuple(features[key]["shape"])
-        video, own = features[key]["dtype"] == "video", _OWN in features
-        index = [pq.read_table(file) for file in sorted(folder.glob("meta/episodes/*/*.parquet"))]
-        if not index or sum(map(len, index)) != info["total_episodes"]:
-            raise UserError(
-                f"{folder}: is not whole: meta/episodes has {sum(map(len, index))} episodes; fetch it again"
-            )
-        names = [name for name in index[0].column_names if not name.startswith("stats/")]
-        episodes = arrow.concat_tables([part.select(names) for part in index]).sort_by("episode_index").to_pydict()
+    if not str(info["codebase_version"]).startswith("v3."):
+        raise UserError(
+            f"is in LeRobot's format {info['codebase_version']}, not v3: LeRobot's convert_dataset_v21_to_v30 converts it"
+        )
+    features = info["features"]
+    cameras = {name: tuple(one["shape"]) for name, one in features.items() if one["dtype"] in ("image", "video")}
+    key, shape = chosen(cameras, picture)
+    video, own = features[key]["dtype"] == "video", _OWN in features
+    index = sorted(folder.glob("meta/episodes/*/*.parquet"))
+    names = [name for name in pq.read_schema(index[0]).names if not name.startswith("stats/")]
+    table = arrow.concat_tables([pq.read_table(file, columns=names) for file in index])
+    if len(table) != info["total_episodes"]:
+        raise UserError(f"meta/episodes has {len(table)} of {info['total_episodes']} episodes; fetch it again")
+    episodes = table.sort_by("episode_index").to_pydict()
 
-        def files(kind: str, template: str) -> list[Path]:
-            numbers = zip(episodes[f"{kind}/chunk_index"], episodes[f"{kind}/file_index"], strict=True)
-            return [folder / template.format(chunk_index=c, file_index=f, video_key=key) for c, f in numbers]
+    def files(kind: str, template: str) -> list[Path]:
+        numbers = zip(episodes[f"{kind}/chunk_index"], episodes[f"{kind}/file_index"], strict=True)
+        return [folder / template.format(chunk_index=c, file_index=f, video_key=key) for c, f in numbers]
 
-        data, lengths = files("data", info["data_path"]), episodes["length"]
-        films = files(f"videos/{key}", info["video_path"]) if video else []
-        size = sum(file.stat().st_size for file in {*data, *films})
-        wanted = [name for name in ("next.reward", "next.done", "next.truncated", _OWN, "physics") if name in features]
-        columns = ["episode_index", "timestamp", "action", *wanted, *([] if video else [key])]
-        low, high, notes = (None, None, []) if own else _survey(pq, list(dict.fromkeys(data)), wanted)
-        tasks = [str(one) for one in pq.read_table(folder / "meta" / "tasks.parquet").to_pandas().index]
+    data, lengths = files("data", info["data_path"]), episodes["length"]
+    films = files(f"videos/{key}", info["video_path"]) if video else []
+    size = sum(file.stat().st_size for file in {*data, *films})
+    wanted = [name for name in ("next.reward", "next.done", "next.truncated", _OWN, "physics") if name in features]
+    columns = ["episode_index", "timestamp", "action", *wanted, *([] if video else [key])]
+    low, high, notes = (None, None, []) if own else _survey(pq, list(dict.fromkeys(data)), wanted)
+    tasks = [str(one) for one in pq.read_table(folder / "meta" / "tasks.parquet").to_pandas().index]
     named = len(tasks) == 1 and re.fullmatch(r"[\w.-]+", tasks[0])
     if len(tasks) == 1 and not named:
         notes.append(f"its task is {tasks[0]!r}")
 
     def read(first: int) -> Iterator[EpisodeArrays]:
-        with _damaged(folder):
-            for path, numbers in groupby(range(data.index(data[first]), len(data)), data.__getitem__):
-                with pq.ParquetFile(path) as file:
-                    batches = file.iter_batches(256, columns=columns)
-                    held = file.schema_arrow.empty_table().select(columns)
-                    for number in numbers:
-                        while len(held) < lengths[number] and (batch := next(batches, None)):
-                            held = arrow.concat_tables([held, arrow.Table.from_batches([batch])])
-                        table, held = held.slice(0, lengths[number]), held.slice(lengths[number])
-                        if number < first:
-                            continue
-                        told = {name: _dense(table[name].combine_chunks()) for name in columns}
-                        if len(table) < lengths[number] or (told["episode_index"] != number).any():
-                            raise UserError(f"{path}: has not the rows of it that meta/episodes tells; fetch it again")
-                        if video:
-                            start = episodes[f"videos/{key}/from_timestamp"][number]
-                            frames = _filmed(films[number], start + told["timestamp"].astype(float), info["fps"])
-                        else:
-                            frames = np.stack([_decoded(one) for one in told[key]])
-                        yield _rows(told, frames.transpose(0, 3, 1, 2), own)
+        for path, numbers in groupby(range(data.index(data[first]), len(data)), data.__getitem__):
+            with pq.ParquetFile(path) as file:
+                batches = file.iter_batches(256, columns=columns)
+                held = file.schema_arrow.empty_table().select(columns)
+                for number in numbers:
+                    while len(held) < lengths[number] and (batch := next(batches, None)):
+                        held = arrow.concat_tables([held, arrow.Table.from_batches([batch])])
+                    table, held = held.slice(0, lengths[number]), held.slice(lengths[number])
+                    if number < first:
+                        continue
+                    told = {name: _dense(table[name].combine_chunks()) for name in columns}
+                    if len(table) < lengths[number] or (told["episode_index"] != number).any():
+                        raise UserError(f"{path.name} has not the rows of it that meta/episodes tells; fetch it again")
+                    if video:
+                        times = episodes[f"videos/{key}/from_timestamp"][number] + told["timestamp"].astype(float)
+                        frames = _filmed(films[number], times, info["fps"])
+                    else:
+                        frames = np.stack([_decoded(one) for one in told[key]])
+                    yield _rows(told, frames.transpose(0, 3, 1, 2), own)
 
     return SourceSet(
         len(lengths),
         sum(lengths),
-        shape[:2] if picture_axes(shape)[0] else shape[1:],
+        shape,
         read,
         {"set": folder.resolve().name, "picture": key, "bytes": size},
         low,
@@ -132,7 +123,7 @@ def _survey(pq: Any, files: list[Path], wanted: list[str]) -> tuple[np.ndarray |
         table = pq.read_table(file, columns=["episode_index", "action", *wanted])
         action = _dense(table["action"].combine_chunks())
         if action.dtype.kind != "f":
-            raise UserError(f"{file}: its actions are {action.dtype}; only those of floating point are read")
+            raise UserError(f"its actions are {action.dtype}; only those of floating point are read")
         lows.append(action.min(0))
         highs.append(action.max(0))
         last = np.flatnonzero(np.diff(table["episode_index"].to_numpy(), append=-1))
@@ -183,7 +174,7 @@ def _filmed(path: Path, times: np.ndarray, fps: float) -> np.ndarray:
                 pictures.append(converter.reformat(frame, format="rgb24").to_ndarray())
             if len(pictures) == len(times):
                 return np.stack(pictures)
-    raise UserError(f"{path}: has no picture at {times[len(pictures)]:.3f} s; fetch it again")
+    raise UserError(f"{path.name} has no picture at {times[len(pictures)]:.3f} s; fetch it again")
 
 
 def _rows(told: dict[str, np.ndarray], frames: np.ndarray, own: bool) -> EpisodeArrays:
@@ -195,19 +186,6 @@ def _rows(told: dict[str, np.ndarray], frames: np.ndarray, own: bool) -> Episode
     reward, action = told.get("next.reward", np.zeros(count))[:-1], told["action"].reshape(count, -1)[:-1]
     rows = rows_of(frames, action, reward, done and not truncated, done or not own, told.get("physics"))
     return rows | ({"discount": np.append(1.0, told[_OWN][:-1])} if own else {})
-
-
-@contextmanager
-def _damaged(folder: Path) -> Iterator[None]:
-    """Whatever cannot be read becomes a sentence."""
-    try:
-        yield
-    except UserError:
-        raise
-    except (OSError, ValueError, LookupError, TypeError, NotImplementedError) as error:
-        if type(error) in (FileNotFoundError, PermissionError):
-            raise disk_error(folder, error) from error
-        raise UserError(f"{folder}: is damaged or not whole ({in_one_line(error)}); fetch it again") from error
 
 
 def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = False) -> list[str]:
