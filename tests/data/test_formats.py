@@ -1,7 +1,6 @@
 """Sets of other libraries in and out: what those libraries write is read, what is written they read."""
 
 import os
-import zipfile
 
 import gymnasium
 import numpy as np
@@ -12,9 +11,8 @@ from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data import open_dataset
-from vd4rl_pomdp.data.folder import read_plan, shard_paths
+from vd4rl_pomdp.data.folder import shard_paths
 from vd4rl_pomdp.data.format import write_shard
-from vd4rl_pomdp.data.formats import FORMATS
 from vd4rl_pomdp.data.transfer import export_set, import_set
 from vd4rl_pomdp.envs.gymnasium_task import area_means
 
@@ -41,7 +39,7 @@ def assert_equal(left, right, but=()):
 
 
 class Screen(gymnasium.Env):
-    """Shows (episode, t) as `fake_frame` does, in any layout; the task ends every second episode, a limit the others."""
+    """Shows (episode, t) as `fake_frame` does, in any layout; the task ends every second episode, a limit others."""
 
     def __init__(self, layout=lambda frame: frame, actions=None, steps=6, buffer=False):
         self.layout, self.steps, self.episode, self.shown = layout, steps, -1, None
@@ -195,3 +193,145 @@ def test_minari_says_what_it_cannot_keep(minari, tmp_path, capsys):
     with pytest.raises(UserError, match="call the folder walker-v0"):
         export_set("minari", tmp_path / "own", tmp_path / "walker")
     assert not (tmp_path / "walker").exists()
+
+
+def write_ogbench(path, episodes):
+    """What OGBench's generating scripts save of episodes of (T + 1, 64, 64, 3) pictures and (T + 1, A) actions."""
+    pictures, actions = ([one[part] for one in episodes] for part in (0, 1))
+    terminals = np.concatenate([np.arange(len(one)) == len(one) - 1 for one in actions])
+    np.savez_compressed(
+        path, observations=np.concatenate(pictures), actions=np.concatenate(actions), terminals=terminals
+    )
+    return path
+
+
+def test_ogbenchs_own_transitions_are_ours(tmp_path):
+    ogbench = pytest.importorskip("ogbench.utils")
+    rng = np.random.default_rng(0)
+    sizes = [5, 8, 3]
+    episodes = [
+        (rng.integers(0, 256, (n, 64, 64, 3), np.uint8), rng.uniform(-1, 1, (n, 4)).astype(np.float32)) for n in sizes
+    ]
+    path = write_ogbench(tmp_path / "visual-x-play-v0.npz", episodes)
+    theirs = ogbench.load_dataset(path, ob_dtype=np.uint8)
+    import_set("ogbench", str(path), tmp_path / "set")
+    dataset = open_dataset(tmp_path / "set", tmp_path / "cache")
+    rows = dataset.transition_rows
+    assert len(rows) == len(theirs["actions"])
+    np.testing.assert_array_equal(dataset.frames[rows].permute(0, 2, 3, 1), theirs["observations"])
+    np.testing.assert_array_equal(dataset.frames[rows + 1].permute(0, 2, 3, 1), theirs["next_observations"])
+    np.testing.assert_array_equal(dataset.action_after(rows), theirs["actions"])
+    ends = dataset.step_type[rows + 1] == StepType.LAST
+    np.testing.assert_array_equal(ends, theirs["terminals"])
+    assert (dataset.discount == 1).all()  # a time limit
+    assert (dataset.task, dataset.frame_size) == ("visual-x-play-v0", 64)
+
+
+def test_an_ogbench_set_of_states_or_a_cut_file_is_refused(tmp_path):
+    states = write_ogbench(tmp_path / "cube-v0.npz", [(np.zeros((3, 28), np.float32), np.zeros((3, 5), np.float32))])
+    with pytest.raises(UserError, match="holds no pictures"):
+        import_set("ogbench", str(states), tmp_path / "set")
+    states.write_bytes(states.read_bytes()[:200])
+    with pytest.raises(UserError, match=r"cube-v0.npz: cannot be read as this format"):
+        import_set("ogbench", str(states), tmp_path / "set")
+
+
+def test_npz_episodes_out_and_in_lose_nothing_but_states(tmp_path, capsys):
+    folder = write_fake_set(tmp_path / "walker_walk" / "expert", LENGTHS, complete_last=False, physics_dim=18)
+    main(["data", "export", "vd4rl_npz", str(folder), str(tmp_path / "npz")])
+    assert "simulator states" in capsys.readouterr().err
+    names = sorted(os.listdir(tmp_path / "npz"))
+    assert [name.rpartition("-")[2] for name in names] == [f"{length}.npz" for length in LENGTHS]
+    with np.load(tmp_path / "npz" / names[0]) as first:
+        assert first["image"].shape == (20, 84, 84, 3)
+        assert [first[key].nonzero()[0].tolist() for key in ("is_first", "is_last", "is_terminal")] == [[0], [19], []]
+    main(["data", "import", "vd4rl_npz", str(tmp_path / "npz"), str(tmp_path / "cheetah_run")])
+    assert_equal(rows_of_set(folder), rows_of_set(tmp_path / "cheetah_run"), but=["physics"])
+
+
+def test_published_64_pixel_sets_are_told_to_be_cut_short(tmp_path, capsys):
+    folder = write_fake_set(tmp_path / "own", [5, 5], attributes={"task": "walker_walk"})
+    place = tmp_path / "main" / "walker_walk" / "medium_expert" / "64px"
+    export_set("vd4rl_npz", folder, place, size=64)
+    import_set("vd4rl_npz", str(place), tmp_path / "set")
+    told = capsys.readouterr().err
+    assert "the published 64-pixel sets are cut short" in told
+    assert "2 episodes of the expert alone" in told
+    dataset = open_dataset(tmp_path / "set", tmp_path / "cache")
+    assert (dataset.task, dataset.quality, dataset.frame_size) == ("walker_walk", "medium_expert", 64)
+
+
+def test_resized_frames_are_area_means(tmp_path, capsys):
+    rng, rows = np.random.default_rng(0), fake_episode(0, 6)
+    rows["observation"] = rng.integers(0, 256, (6, 3, 84, 84), np.uint8)
+    (tmp_path / "own").mkdir()
+    write_shard(tmp_path / "own" / "0_a.hdf5", rows, {"task": "walker_walk", "set": "expert"})
+    import_set("vd4rl", str(tmp_path / "own"), tmp_path / "small", size=50)
+    assert "pictures of 84x84 pixels become 50x50 (area means)" in capsys.readouterr().err
+    frames = rows_of_set(tmp_path / "small")["observation"]
+    np.testing.assert_array_equal(
+        frames, [area_means(one.transpose(1, 2, 0), 50).transpose(2, 0, 1) for one in rows["observation"]]
+    )
+    assert_equal(rows_of_set(tmp_path / "own"), rows_of_set(tmp_path / "small"), but=["observation"])
+
+
+def test_a_cut_import_goes_on_and_ends_in_the_same_files(tmp_path, monkeypatch):
+    folder = write_fake_set(tmp_path / "own", [7, 9, 8, 12, 5], attributes={"task": "walker_walk"})
+    monkeypatch.setattr("vd4rl_pomdp.data.transfer._SHARD_ROWS", 20)
+    whole = import_set("vd4rl", str(folder), tmp_path / "whole")
+    written = []
+
+    def write(path, rows, attributes):
+        if written:
+            raise KeyboardInterrupt
+        written.append(path)
+        write_shard(path, rows, attributes)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("vd4rl_pomdp.data.shards.write_shard", write)
+        with pytest.raises(KeyboardInterrupt):
+            import_set("vd4rl", str(folder), tmp_path / "set")
+    with pytest.raises(UserError, match="collection is not finished"):
+        open_dataset(tmp_path / "set")
+    changed = written[0].stat().st_mtime_ns
+    shards = import_set("vd4rl", str(folder), tmp_path / "set")
+    assert written[0].stat().st_mtime_ns == changed
+    assert [shard.read_bytes() for shard in shards] == [shard.read_bytes() for shard in whole]
+    other = write_fake_set(tmp_path / "other" / "own", [7, 9, 8, 12, 6], attributes={"task": "walker_walk"})
+    with pytest.raises(UserError, match="with another source"):
+        import_set("vd4rl", str(other), tmp_path / "set")
+
+
+def test_a_cut_export_leaves_nothing_and_begins_anew(tmp_path, monkeypatch):
+    folder, save, saved = write_fake_set(tmp_path / "own", LENGTHS), np.savez_compressed, []
+
+    def cut(path, **rows):
+        saved.append(path)
+        if len(saved) == 2:
+            raise KeyboardInterrupt
+        save(path, **rows)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "savez_compressed", cut)
+        with pytest.raises(KeyboardInterrupt):
+            export_set("vd4rl_npz", folder, tmp_path / "npz")
+    assert not (tmp_path / "npz").exists()
+    export_set("vd4rl_npz", folder, tmp_path / "npz")
+    assert len(os.listdir(tmp_path / "npz")) == 3
+    assert {name for name in os.listdir(tmp_path) if "npz" in name} == {"npz"}
+    with pytest.raises(UserError, match="is not empty"):
+        export_set("vd4rl_npz", folder, tmp_path / "npz")
+    with pytest.raises(UserError, match="only imported: choose one of minari, vd4rl_npz"):
+        export_set("ogbench", folder, tmp_path / "b")
+
+
+def test_actions_outside_their_bounds_are_refused_or_clipped(tmp_path, capsys):
+    rows = fake_episode(0, 5)
+    rows["action"][2] = 1.5
+    (tmp_path / "own").mkdir()
+    write_shard(tmp_path / "own" / "0_a.hdf5", rows, {})
+    with pytest.raises(UserError, match=r"episode 0: has actions outside .*\(up to 1.5 .*--clip-actions"):
+        import_set("vd4rl", str(tmp_path / "own"), tmp_path / "set")
+    import_set("vd4rl", str(tmp_path / "own"), tmp_path / "set", clip_actions=True)
+    assert "1 actions lay outside their bounds and were clipped" in capsys.readouterr().err
+    assert rows_of_set(tmp_path / "set")["action"].max() == 1

@@ -73,7 +73,6 @@ def import_set(
         "task": label,
         "set": quality or opened.quality,
         "frame_size": opened.frame_shape[0],
-        "clip_actions": clip_actions,
     }
     per_shard = max(1, _SHARD_ROWS * opened.episodes // max(1, opened.rows))
     attributes = {key: settings[key] for key in ("task", "set") if settings[key]} | {

@@ -6,8 +6,6 @@ Held out from the probe, not from pretraining: an encoder that was trained on th
 from __future__ import annotations
 
 import numpy as np
-from sklearn.linear_model import Ridge
-from sklearn.preprocessing import StandardScaler
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.state_scale import LEAST_VARIANCE
@@ -57,6 +55,9 @@ def probe_r2(features: np.ndarray, targets: np.ndarray, episode: np.ndarray) -> 
 
 def _errors(features: np.ndarray, targets: np.ndarray, test: np.ndarray) -> np.ndarray:
     """Errors on the (N,) rows `test`, of the targets that vary, in their standard deviations; fitted on the others."""
+    from sklearn.linear_model import Ridge  # 110 MB that a training, which asks `held_out` alone, does not pay
+    from sklearn.preprocessing import StandardScaler
+
     scale = StandardScaler().fit(targets[~test])
     varying = scale.var_ > LEAST_VARIANCE
     if not varying.any():

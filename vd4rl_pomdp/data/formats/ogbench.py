@@ -60,7 +60,7 @@ def read(source: str, picture: str | None) -> SourceSet:
 @contextmanager
 def _observations(path: Path) -> Iterator[tuple[IO[bytes], tuple[int, ...], np.dtype]]:
     """The stream of the pictures' bytes, their shape and dtype; `np.load` would hold all of them."""
-    with zipfile.ZipFile(path) as file, file.open("observations.npy") as stream:
+    with zipfile.ZipFile(path) as archive, archive.open("observations.npy") as stream:
         version = np.lib.format.read_magic(stream)
         header = np.lib.format.read_array_header_1_0 if version == (1, 0) else np.lib.format.read_array_header_2_0
         shape, fortran, dtype = header(stream)
