@@ -165,16 +165,19 @@ def _filmed(path: Path, times: np.ndarray, fps: float) -> np.ndarray:
     av = library("av", _EXTRA)
     # One for all frames: `frame.to_ndarray(format=...)` makes a new one each time, which is four times as slow.
     pictures, converter = [], av.video.reformatter.VideoReformatter()
-    with av.open(str(path)) as file:
-        stream = file.streams.video[0]
-        file.seek(max(0, int((times[0] - 0.5 / fps) / stream.time_base)), stream=stream)
-        for frame in file.decode(stream):
-            if frame.time > times[len(pictures)] + 0.5 / fps:
-                break
-            if frame.time > times[len(pictures)] - 0.5 / fps:
-                pictures.append(converter.reformat(frame, format="rgb24").to_ndarray())
-            if len(pictures) == len(times):
-                return np.stack(pictures)
+    try:
+        with av.open(str(path)) as file:
+            stream = file.streams.video[0]
+            file.seek(max(0, int((times[0] - 0.5 / fps) / stream.time_base)), stream=stream)
+            for frame in file.decode(stream):
+                if frame.time > times[len(pictures)] + 0.5 / fps:
+                    break
+                if frame.time > times[len(pictures)] - 0.5 / fps:
+                    pictures.append(converter.reformat(frame, format="rgb24").to_ndarray())
+                if len(pictures) == len(times):
+                    return np.stack(pictures)
+    except av.error.InvalidDataError as error:
+        raise UserError(f"{path.name} is damaged or no video; fetch it again") from error
     raise UserError(f"{path.name} has no picture at {times[len(pictures)]:.3f} s; fetch it again")
 
 
