@@ -30,6 +30,7 @@ from vd4rl_pomdp.nn.encoder import EncoderCard
 from vd4rl_pomdp.nn.encoder_folder import FILES_OF_RUN, save_encoder
 from vd4rl_pomdp.nn.frame import STATE, StateFrame
 from vd4rl_pomdp.nn.objective import Objective
+from vd4rl_pomdp.nn.probes import held_out
 from vd4rl_pomdp.runs import METRICS_FILE
 from vd4rl_pomdp.runs.device import autocast, pick_device, set_products
 from vd4rl_pomdp.runs.loop import training
@@ -57,7 +58,7 @@ def pretrain(config: PretrainConfig) -> RunFolder:
             labels = {name: run.config[name] for name in ("method", "task", "corruption")}
             labels["quality"] = dataset.quality or UNKNOWN_QUALITY
             trainer.run(run, config.steps if method.trained else 0, f"pretrain {config.method}", labels)
-            frames = trainer.step * config.batch_size * config.window
+            frames = trainer.step * config.batch_size * (1 if method.histories else config.window)
             save_encoder(run.path / "encoder", objective.encoder, _card(config, dataset, run), frames)
             run.finish(steps=trainer.step, frames=frames)
     return run
@@ -87,21 +88,47 @@ def make_batches(dataset: Dataset, config: PretrainConfig, objective: Objective)
     else:
         view = view_of(dataset, config)
     given = view, config.batch_size, config.window, draws
-    return StateWindowSampler(*given) if method.regresses_state else WindowSampler(*given)
+    told = method.histories, getattr(config.options, "hold_out", False)
+    return StateWindowSampler(*given, *told) if method.regresses_state else WindowSampler(*given)
 
 
 class StateWindowSampler(WindowSampler):
     """Windows with the simulator's states of their rows, for losses that are told them."""
 
-    def __init__(self, source: View, batch_size: int, length: int, draws: RandomStream) -> None:
+    def __init__(
+        self, source: View, batch_size: int, length: int, draws: RandomStream, histories: bool, hold_out: bool
+    ) -> None:
+        """See the class.
+
+        Args:
+            source: what is seen of a set.
+            batch_size: windows in a batch.
+            length: rows of a window.
+            draws: where they begin.
+            histories: whether they are histories instead, as `Method` says.
+            hold_out: whether the states of the episodes that a probe is tested on are NaN.
+        """
         super().__init__(source, batch_size, length, draws)
+        data = source.dataset
         # kept apart from the windows of other methods, so that none of them can read a state by mistake
-        self._states = source.dataset.states()
+        self._states = data.states()
+        if hold_out:
+            test = torch.from_numpy(held_out(data.episode.cpu().numpy())).to(data.t.device)
+            self._states = self._states.masked_fill(test[:, None], torch.nan)
+        self._longest = int((data.episode_end - data.episode_start).max()) if histories else 0
 
     def sample(self) -> StateWindows:
         """The next batch."""
-        window = super().sample()
+        window = self._histories() if self._longest else super().sample()
         return StateWindows(**window, state=self._states[self.view.dataset.rows(window.key)])
+
+    def _histories(self) -> Windows:
+        """From first rows, which are what an episode is played from, and from random ones, which are many more."""
+        data = self.view.dataset
+        row = data.transition_rows[self._draw(data.num_transitions)]
+        whole = self.draws.uniform(len(row)) < 0.5
+        first = torch.where(whole, data.episode_start[data.episode[row]], row)
+        return self.view.histories(first, self._longest)
 
 
 def view_of(dataset: Dataset, config: PretrainConfig) -> View:

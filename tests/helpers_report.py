@@ -108,7 +108,7 @@ def write_seeds(
 def without_figures(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports draw no figures, which takes most of their time."""
     sections = ("scores", "lead", "profiles", "curves", "probes", "errors", "costs", "losses")
-    monkeypatch.setattr(page, "_plots", lambda runs, made: {name: [] for name in sections})
+    monkeypatch.setattr(page, "draw_plots", lambda runs, made: {name: [] for name in sections})
 
 
 def pretraining(place: Path) -> Path:

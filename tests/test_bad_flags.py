@@ -22,6 +22,7 @@ OUT = ["--out", "new"]
 VALID = {
     "data check": [SET],
     "data parity": [SET],
+    "data view": [SET, *OUT],
     "data collect": ["--task", "walker_walk", "--quality", "random", "--episodes", "1", *OUT],
     "pretrain": ["--data", SET, "--corruption", "patch+zero_frames", *OUT, *PRETRAIN],
     "pretrain --method homer": ["--data", SET, *OUT, *PRETRAIN],

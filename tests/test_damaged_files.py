@@ -13,6 +13,7 @@ OUT = ["--out", "new"]
 READERS = [
     (["data", "check", SET], f"{SET}/*"),
     (["data", "card", SET], f"{SET}/*"),
+    (["data", "view", SET, *OUT], f"{SET}/*"),
     (["report", "runs", *OUT], f"{RUN}/*.*"),
     (["report", "runs", *OUT], "runs/pretrained/*.*"),
     (["report", "compare", "runs", "results", *OUT], "results/*"),

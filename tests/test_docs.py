@@ -40,6 +40,7 @@ NOT_RUN = {
     **{f"python {file}": "test_own_parts and test_own_task run them" for file in EXAMPLES},
     "vd4rl-pomdp data collect": "renders whole episodes; data/test_collect runs shorter ones",
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
+    "vd4rl-pomdp data view": "report/test_browse writes pages",
     "vd4rl-pomdp hub": "needs a Hub; test_hub has one of its own",
     **dict.fromkeys(
         ("python tools/card", "tar xf card", "python3 card/run.py"), "fetches packages; tests/tools has a stub"

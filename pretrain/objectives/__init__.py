@@ -57,6 +57,9 @@ class Method:
     """Whether it is given the simulator state in place of pixels."""
     regresses_state: bool = False
     """Whether its loss, and nothing else of it, is told the simulator states: its windows are `StateWindows`."""
+    histories: bool = False
+    """Whether these are histories up to their episodes' ends, shown by their first observation alone, whatever --window
+    is; half of them begin with an episode, the others at a random row."""
     least_batch: int = 1
     """Windows that a batch holds at least: 2 where a loss tells those of one window from those of another."""
     options: type[Options] = Options
@@ -139,6 +142,21 @@ _OWN = {
         regresses_state=True,
         options=SupervisedOptions,
         summary="supervised whose past holds actions, as mik+a's does",
+    ),
+    "supervised_picture": Method(
+        Supervised,
+        regresses_state=True,
+        options=SupervisedOptions,
+        summary="supervised without a memory: a reference for what one observation tells",
+    ),
+    "integrator": Method(
+        Supervised,
+        "integrator",
+        use_actions=True,
+        regresses_state=True,
+        histories=True,
+        options=SupervisedOptions,
+        summary="supervised on the first observation, the actions since and the time: a floor for memory",
     ),
     "bc": Method(Untrained, trained=False, end_to_end="bc", summary="end to end by behaviour cloning, no frozen stage"),
     "drq_bc": Method(

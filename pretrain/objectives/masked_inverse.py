@@ -116,7 +116,8 @@ class MaskedInverse(InverseObjective):
         observations, actions = self.past_visible(t)
         read = (rows if self.n is None else self.n + 1, self.backward_memory.reach or rows)
         end = min(rows, t + k + min(read))
-        observations |= set(range(t + k, end))
+        future = range(t + k, end)
+        observations |= set(future[-1:] if self.backward_memory.first_only else future)
         if self.use_actions:
             actions |= set(range(t + k - 1, end - 1) if self.literal_future else range(t + k, end))
         return observations, actions

@@ -1,10 +1,13 @@
 """References that are told the true state in training: what a memory could give, were its objective perfect.
 
-supervised     the encoder of mik, a GRU over the past observations
-supervised+a   the encoder of mik+a, which reads past actions, too
+supervised          the encoder of mik, a GRU over the past observations
+supervised+a        the encoder of mik+a, which reads past actions, too
+supervised_picture  no memory: the encoder of acro
+integrator          a GRU of the first observation, the actions since and the time: what adding up actions could give
 
 A head regresses the simulator's pose and velocity at row t from s_t, which the encoder computes from corrupted pixels
-as ever; the encoder never sees a state itself, and is then frozen like every other.
+as ever; the encoder never sees a state itself, and is then frozen like every other. The integrator trains on histories
+up to their episode's end: what it adds up over an episode it could not learn from windows.
 """
 
 from __future__ import annotations
@@ -31,6 +34,9 @@ class SupervisedOptions(Options):
     head_dim: int = 256
     """Units of the regression head's two hidden layers."""
 
+    hold_out: bool = False
+    """Leave out the episodes that a probe is tested on, every fifth, whose states no loss is then told."""
+
     limits: ClassVar[Limits] = {"head_dim": 1}
 
 
@@ -55,11 +61,13 @@ class Supervised(Objective):
         self.head = mlp(encoder.dim, options.head_dim, len(columns))
 
     def loss(self, window: Windows, progress: float | Tensor) -> tuple[Tensor, dict[str, Tensor]]:
-        """Mean squared error over real rows and coordinates; `pose_loss` and `velocity_loss` are those of one kind."""
+        """Mean squared error over coordinates and real rows whose state is told; `pose_loss` is that of poses alone."""
         assert isinstance(window, StateWindows), "windows without states train no supervised reference"
         truth = (window.state[..., self.columns] - self.mean) / self.std
+        told = window.real & ~truth.isnan().any(-1)
+        truth = truth.nan_to_num()  # before the loss: NaN times zero would be NaN
         errors = (self.head(self.encoder.encode(window)).to(truth) - truth).square()
-        real = window.real.to(errors)[..., None]
-        error = (errors * real).sum((0, 1)) / real.sum()
+        real = told.to(errors)[..., None]
+        error = (errors * real).sum((0, 1)) / real.sum().clamp(min=1)  # a batch may be of held-out episodes alone
         loss, parts = error.mean(), {"pose_loss": error[: self.pose], "velocity_loss": error[self.pose :]}
         return loss, {"loss": loss.detach()} | {name: e.mean().detach() for name, e in parts.items() if len(e)}

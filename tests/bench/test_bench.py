@@ -38,7 +38,7 @@ def test_every_method_that_random_pictures_can_train_is_measured(tmp_path):
     measured = measures.methods(dataset, tmp_path, 1)
     ratios = {"k_30_over_k_15", "half_over_whole_resolution"}
     assert measured.keys() - ratios == {name for name, method in METHODS.items() if method.trained} - {
-        *("supervised", "supervised+a"),
+        *("supervised", "supervised+a", "supervised_picture", "integrator"),
     }
     assert all(value > 0 for value in flatten(measured).values())
 

@@ -185,7 +185,7 @@ def test_every_part_has_a_line_that_says_what_it_is_and_where_it_comes_from(caps
         main(["list"])
     shown = capsys.readouterr().out
     lines = {line.split()[0]: line.split(maxsplit=1)[1:] for line in shown.splitlines() if line.startswith("  ")}
-    assert set(REGISTRIES) == {"method", "corruption", "algorithm", "frame_encoder", "history", "task"}
+    assert set(REGISTRIES) == {"method", "corruption", "algorithm", "format", "frame_encoder", "history", "task"}
     for registry in REGISTRIES.values():
         assert f"--{registry.setting.replace('_', '-')}   " in shown
         assert registry.group in shown

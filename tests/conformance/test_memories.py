@@ -19,6 +19,7 @@ from vd4rl_pomdp.testing.memories import (
     a_folder_gives_back_the_encoder,
     a_state_depends_on_its_past_alone,
     gradients_reach_all_parameters,
+    observations_are_read_where_it_says,
     outputs_have_one_shape,
     streaming_equals_batch,
 )
@@ -32,6 +33,8 @@ from vd4rl_pomdp.testing.memories import (
         ("gru", {"gru_layers": 2}),
         ("transformer", {}),
         ("transformer", {"transformer_layers": 3, "transformer_heads": 1, "attention_window": 2}),
+        ("integrator", {}),
+        ("integrator", {"gru_layers": 2}),
         ("lru", {}),
         ("lru", {"lru_layers": 1, "lru_units": 5, "r_min": 0.9, "r_max": 0.99, "max_phase": 0.3}),
     ],
@@ -93,6 +96,12 @@ class Forgetful(GRU):
         return super().forward(rows, torch.zeros_like(state))
 
 
+class Peeking(GRU):
+    """Says that it reads the first observation alone, and reads all."""
+
+    first_only = True
+
+
 class Wide(GRU):
     def forward(self, rows, state):
         out, state = super().forward(rows, state)
@@ -125,6 +134,7 @@ class Hidden(GRU):
         ),
         (Short, a_state_depends_on_its_past_alone, "only rows 1 to 2 of window 1 may have one"),
         (Forgetful, streaming_equals_batch, "they differ at row 1"),
+        (Peeking, observations_are_read_where_it_says, "o_1 moves rows"),
         (Wide, outputs_have_one_shape, r"\(3, 6, 14\)"),
         (Unused, gradients_reach_all_parameters, "none reaches unused.bias, unused.weight"),
         (Hidden, a_folder_gives_back_the_encoder, "its states differ"),

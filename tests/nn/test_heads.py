@@ -1,5 +1,9 @@
 """Heads and action targets give what their formulas say."""
 
+import subprocess
+import sys
+
+import numpy as np
 import pytest
 import torch
 import torch.nn.functional as F
@@ -48,6 +52,20 @@ def test_pairs_that_do_not_count_are_as_if_left_out():
     for told in (None, group):
         left = info_nce(scores[:, real][:, :, real], None if told is None else told[real])
         torch.testing.assert_close(info_nce(scores, told, real), left)
+
+
+def test_a_training_fits_the_same_codebook_without_importing_scikit_learn():
+    pytest.importorskip("sklearn")  # it is fitted here, then
+    actions = np.random.default_rng(0).uniform(-1, 1, (300, 2)).astype(np.float32)
+    program = f"""
+import sys, numpy as np, pretrain.train
+from vd4rl_pomdp.nn.action_target import KMeansTarget
+actions = np.frombuffer(bytes.fromhex("{actions.tobytes().hex()}"), np.float32).reshape(-1, 2)
+print(KMeansTarget(actions, 5, 3).centers.numpy().tobytes().hex())
+print({{"sklearn", "scipy", "pandas", "matplotlib", "mujoco"}} & set(sys.modules))
+"""
+    told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
+    assert told == [KMeansTarget(actions, 5, 3).centers.numpy().tobytes().hex(), "set()"]
 
 
 def test_k_means_asks_for_the_nearest_centre():

@@ -4,7 +4,7 @@ import pytest
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.envs.rendering import suite
-from vd4rl_pomdp.nn.probes import probe_error, probe_state
+from vd4rl_pomdp.nn.probes import probe_error, probe_r2, probe_state
 
 
 @pytest.fixture
@@ -21,6 +21,17 @@ def test_a_linear_function_of_the_state_is_found_and_noise_is_not(random):
     assert probe_error(np.where(episode[:, None] % 5 == 4, 0, features), states, episode) > 60, (
         "tested on unseen episodes"
     )
+
+
+def test_r2_is_told_of_every_held_out_episode(random):
+    episode = np.arange(2000) // 100
+    states = random.normal(size=(2000, 2))
+    assert probe_r2(states, states, episode) == pytest.approx([1] * 4, abs=1e-4)
+    assert np.mean(probe_r2(random.normal(size=(2000, 2)), states, episode)) == pytest.approx(0, abs=0.05)
+    assert np.mean(probe_r2(states[:, :1], states, episode)) == pytest.approx(0.5, abs=0.05), "one of two coordinates"
+    noise = np.where(episode == 9, 1, 0)[:, None] * random.normal(size=(2000, 2))
+    apart = probe_r2(states + noise, states, episode)
+    assert apart[1] < 0.3 < 0.9 < min(apart[0], *apart[2:])
 
 
 def test_constant_states_are_left_out_and_one_episode_is_enough_to_test():

@@ -10,7 +10,7 @@ from finetune.features import FrozenEncoder
 from pretrain.objectives import METHODS
 from pretrain.train import make_batches, make_objective
 from pretrain.train import pretrain as run_pretrain
-from tests.helpers_data import fake_rows, write_fake_set
+from tests.helpers_data import fake_action, fake_rows, frame_identity, write_fake_set
 from tests.helpers_stages import smoke_pretrain
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
@@ -28,7 +28,7 @@ from vd4rl_pomdp.testing.methods import ROWS, build, windows
 
 pytestmark = pytest.mark.usefixtures("own_cache")
 LAYOUT = TASKS.named("walker_walk").layout
-METHOD_NAMES = ["supervised", "supervised+a"]
+METHOD_NAMES = ["supervised", "supervised+a", "supervised_picture", "integrator"]
 
 
 @pytest.fixture
@@ -106,6 +106,44 @@ def test_a_head_that_predicts_the_mean_has_a_loss_of_one_whatever_the_units(with
     assert logs["pose_loss"].item() == pytest.approx(10, rel=1e-3)
     assert logs["velocity_loss"].item() == pytest.approx(1, rel=1e-3)
     assert logs["loss"].item() == pytest.approx((8 * 10 + 8) / 16, rel=1e-3)
+
+
+def test_the_states_of_held_out_episodes_are_told_to_no_loss(tmp_path):
+    dataset = open_dataset(write_fake_set(tmp_path / "own" / "walker_walk" / "expert", [9] * 11, physics_dim=18))
+    dataset.physics = np.random.default_rng(0).normal(size=(99, 18))
+    for method in METHOD_NAMES:
+        objective, batches = made(dataset, tmp_path, method, hold_out=True, batch_size=40)
+        window = batches.sample()
+        held_out = (window.key >> 20) % 5 == 4
+        assert 0 < held_out[:, 0].float().mean() < 1
+        assert torch.equal(window.state.isnan().all(-1), held_out)
+        told = window.replace(state=torch.where(held_out[..., None], torch.nan, window.state).requires_grad_())
+        (felt,) = torch.autograd.grad(objective.loss(told, 0.0)[0], told.state)
+        assert torch.equal(felt.abs().amax(-1) > 0, window.real & ~held_out)
+
+
+def test_the_integrators_histories_reach_to_an_episodes_end_and_half_begin_with_one(tmp_path):
+    """A history is shown by its first observation alone."""
+    dataset = open_dataset(write_fake_set(tmp_path / "own" / "walker_walk" / "expert", [20, 12], physics_dim=18))
+    dataset.physics = np.random.default_rng(0).normal(size=(32, 18))
+    _, batches = made(dataset, tmp_path, "integrator", shift=0, corruption="none", batch_size=400)
+    window = batches.sample()
+    episode, t = window.key >> 20, window.key & 0xFFFFF
+    last = torch.tensor([19, 11])[episode]
+    assert torch.equal(t, torch.minimum(t[:, :1] + torch.arange(20), last))
+    assert torch.equal(window.length, last[:, 0] + 1 - t[:, 0])
+    assert torch.equal(window.has_action, t[:, :1] + torch.arange(20) < last)
+    assert 0.4 < (t[:, 0] == 0).float().mean() < 0.65
+    for b in range(4):
+        stack = frame_identity(window.obs[b, 0])
+        assert stack[-1].tolist() == [episode[b, 0], t[b, 0]]
+        actions = [fake_action(int(episode[b, 0]), int(t[b, 0]) + i) for i in range(int(window.length[b]) - 1)]
+        np.testing.assert_array_equal(window.action[b, : len(actions)], actions)
+        np.testing.assert_array_equal(window.prev_action[b, 1 : len(actions) + 1], actions)
+    assert not window.prev_action[:, 0].any()
+    assert not window.prev_action[~window.real].any()
+    assert not window.action[~window.has_action].any()
+    assert torch.equal(window.obs, window.obs[:, :1].expand_as(window.obs))
 
 
 def test_a_set_without_states_or_with_one_only_is_refused_in_a_line(data, with_states, tmp_path, capsys):

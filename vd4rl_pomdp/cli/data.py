@@ -10,7 +10,7 @@ import tyro
 
 from vd4rl_pomdp.cli.parsing import command, show
 from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.parsing import parse
+from vd4rl_pomdp.core.parsing import parse, parse_stage
 from vd4rl_pomdp.sweeps.own_file import program_here
 
 REPLAY_TOLERANCE = 1e-6
@@ -55,6 +55,56 @@ def download(
 
 
 @command
+def import_set(
+    format: tyro.conf.Positional[str],
+    source: tyro.conf.Positional[str],
+    out: tyro.conf.Positional[Path],
+    task: str | None = None,
+    quality: str | None = None,
+    size: int | None = None,
+    picture: str | None = None,
+    clip_actions: bool = False,
+) -> None:
+    """Write a set of another format as one of this package's; the same command resumes a cut import.
+
+    Args:
+        format: The format's name, as `vd4rl-pomdp list` shows them.
+        source: Path or name of the set.
+        out: Folder of the new set.
+        task: The task's name, where the source does not tell it; one that no task has trains encoders and nothing else.
+        quality: What to call the behaviour that made the data.
+        size: Height and width to which pictures are resized, by area; default: their own.
+        picture: Which observation holds the pictures, where there are several.
+        clip_actions: Clip actions that lie outside the source's bounds instead of refusing them.
+    """
+    from vd4rl_pomdp.data.transfer import import_set
+
+    shards = import_set(format, source, out, task, quality, size, picture, clip_actions)
+    print(f"{len(shards)} shards in {out}, described in {out / 'card.md'}")
+
+
+@command
+def export_set(
+    format: tyro.conf.Positional[str],
+    path: tyro.conf.Positional[Path],
+    out: tyro.conf.Positional[Path],
+    size: int | None = None,
+) -> None:
+    """Write a set in another format, whole or not at all; what the format cannot keep is said.
+
+    Args:
+        format: The format's name, as `vd4rl-pomdp list` shows them.
+        path: Folder of shards.
+        out: Folder to write.
+        size: Height and width to which frames are resized, by area; default: their own.
+    """
+    from vd4rl_pomdp.data.transfer import export_set
+
+    export_set(format, path, out, size)
+    print(f"exported to {out}")
+
+
+@command
 def card(path: tyro.conf.Positional[Path]) -> None:
     """Write a set's data card, card.md and card.png, into its folder; `data collect` does so itself.
 
@@ -64,6 +114,13 @@ def card(path: tyro.conf.Positional[Path]) -> None:
     from vd4rl_pomdp.data.card import write_card
 
     print(f"card: {write_card(path)}")
+
+
+def view(words: list[str], program: str) -> None:
+    """Write a page to browse episodes."""
+    from vd4rl_pomdp.report.browse import ViewConfig, write_view
+
+    print(f"page: {write_view(parse_stage(ViewConfig, words, program))}")
 
 
 @command

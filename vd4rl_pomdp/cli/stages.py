@@ -146,7 +146,8 @@ def list_parts() -> None:
     """List methods, corruptions, algorithms, frame encoders, memories and tasks, one line each."""
     import finetune.algorithms  # noqa: F401 (a kind's registry is made where its parts are)
     import pretrain.objectives  # noqa: F401
-    import vd4rl_pomdp.core.tasks  # noqa: F401
+    import vd4rl_pomdp.core.tasks
+    import vd4rl_pomdp.data.formats  # noqa: F401
 
     for setting, registry in sorted(REGISTRIES.items()):
         print(f"{flag_of(setting)}   (packages offer theirs as entry points of {registry.group})")

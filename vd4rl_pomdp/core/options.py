@@ -32,7 +32,7 @@ and are compared by content; `eval_clean` and the number of its episodes add row
 NO_SETTINGS = RUNTIME_FIELDS | {"seed"}
 """Config fields in which the seeds of one experiment may differ."""
 
-LATER = {"future_frames": "all", "view_seed": None, "keep_newest": False}
+LATER = {"future_frames": "all", "view_seed": None, "keep_newest": False, "hold_out": False}
 """Settings that earlier versions did not record, with what they did: having this value is the same as not having it."""
 
 LABELS = ("method", "task", "quality", "corruption", "algorithm", "seed")

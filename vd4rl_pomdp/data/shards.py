@@ -41,7 +41,7 @@ def collect_set(
     roll_out: Callable[[Any], EpisodeArrays],
     workers: int,
     title: tuple[str, str],
-    task: str,
+    task: str | None,
 ) -> None:
     """Write what is missing of a set: collection.json first, which says what it is, then shards, provenance.json last.
 
@@ -52,7 +52,7 @@ def collect_set(
         roll_out: plays a job; its rows by key.
         workers: processes, 0 for every core.
         title: what is going on, and the unit of a job.
-        task: name of the task or maze, for what rendered it.
+        task: name of the task or maze, for what rendered it; None: nothing is rendered.
 
     Raises:
         UserError: the folder holds something else, or shards that another machine or other code of its parts made.
@@ -63,7 +63,7 @@ def collect_set(
         _claim(out, settings, stored, whole)
         if whole and not missing:
             return
-        rendered = _rendered_by(out, task, stored if len(missing) < len(shards) else {})
+        rendered = _rendered_by(out, task, stored if len(missing) < len(shards) else {}) if task else {}
         code = {name: told for name, told in code_of(settings).items() if told}
         write_json(out / PLAN, settings | code | {"rendered_by": rendered})
         started, frames = time.monotonic(), 0

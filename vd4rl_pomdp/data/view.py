@@ -107,6 +107,24 @@ class View:
             key=data.keys(rows),
         )
 
+    def histories(self, first: Tensor, length: int) -> Windows:
+        """From (B,) int64 rows `first` on to the ends of their episodes, at most `length` rows, the rest is padding.
+
+        They are shown by their first observation alone: `obs` repeats it, in the memory of one.
+        """
+        data = self.dataset
+        end = data.episode_end[data.episode[first], None]
+        there = first[:, None] + torch.arange(length, device=first.device)
+        rows, obs = torch.minimum(there, end - 1), self.observe(first[:, None])
+        return Windows(
+            obs=obs.expand(-1, length, *obs.shape[2:]),
+            prev_action=data.actions_before(rows) * (there < end)[..., None],
+            action=data.action_or_zero(rows),
+            has_action=there + 1 < end,
+            length=(end[:, 0] - first).clamp(max=length),
+            key=data.keys(rows),
+        )
+
     def transitions(self, index: Index, n_step: int = 1, gamma: float = 0.99) -> Transitions:
         """The n-step transitions that `index` numbers, as the agent sees them.
 

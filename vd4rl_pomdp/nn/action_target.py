@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from dataclasses import dataclass
+from pathlib import Path
 from typing import ClassVar, Protocol
 
 import numpy as np
@@ -108,13 +112,24 @@ def make_action_target(name: str, actions: np.ndarray, codes: int, seed: int) ->
 
 def _fit_centers(actions: np.ndarray, codes: int, seed: int) -> np.ndarray:
     """K-means centres, (codes, A) float32, of at most 50,000 of the actions."""
-    from sklearn.cluster import KMeans
-
     distinct = len(np.unique(actions, axis=0))
     if distinct < codes:
         raise UserError(f"the data set has {distinct} distinct actions, fewer than --codes {codes}: lower --codes")
     rng = np.random.default_rng(stream_seed(seed, "kmeans", "sample"))
     sample = actions if len(actions) <= 50_000 else actions[rng.choice(len(actions), 50_000, replace=False)]
     start = stream_seed(seed, "kmeans", "centres") % 2**32  # the largest that scikit-learn takes
-    fitted = KMeans(codes, n_init=3, random_state=start).fit(sample.astype(np.float64))
-    return fitted.cluster_centers_.astype(np.float32)
+    if "sklearn" in sys.modules:
+        from vd4rl_pomdp.nn.codebook import fit_centers
+
+        return fit_centers(sample.astype(np.float64), codes, start).astype(np.float32)
+    # a file by its path imports nothing of this package and not the caller's main module, and Ctrl-C is for the caller
+    program = [sys.executable, "-P", str(Path(__file__).with_name("codebook.py")), str(codes), str(start)]
+    fitted = subprocess.run(
+        [*program, str(sample.shape[1])],
+        input=sample.astype(np.float64).tobytes(),
+        stdout=subprocess.PIPE,
+        env=os.environ | {"OMP_NUM_THREADS": "1"},  # not faster with more, and the last digits depend on their number
+        start_new_session=True,
+        check=True,
+    )
+    return np.frombuffer(fitted.stdout).reshape(codes, -1).astype(np.float32)

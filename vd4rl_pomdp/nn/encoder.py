@@ -10,6 +10,7 @@ from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
+from torch.nn.functional import pad
 
 from vd4rl_pomdp.core.errors import UserError, first_line, refuse_unknown
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
@@ -168,7 +169,7 @@ class Encoder(nn.Module):
     def make_memory(self, inputs: int) -> Memory:
         """Another memory of the encoder's kind and options for rows of width `inputs`, such as one of the future."""
         told = {"hidden_dim": self.config.hidden_dim} | self.config.memory_options
-        return make_memory(self.config.history, inputs, told)
+        return make_memory(self.config.history, inputs, told, self.config.feature_dim)
 
     @property
     def dim(self) -> int:
@@ -193,7 +194,16 @@ class Encoder(nn.Module):
     def encode(self, window: Windows) -> Tensor:
         """Representations of every row: (B, T, C, H, W) uint8 -> (B, T, dim); raises UserError for other pictures."""
         self._refuse_other(window.obs)
-        return self.from_features(self.frame(window.obs), window.prev_action)
+        if (
+            self.memory is None
+            or not self.memory.first_only
+            or self.config.readout != "state"
+            or self.config.history_window
+        ):
+            return self.from_features(self.frame(window.obs), window.prev_action)
+        # the frame encoder's work on rows that are not read would be most of a step's
+        features = self.frame(window.obs[:, :1])
+        return self.from_features(pad(features, (0, 0, 0, window.obs.shape[1] - 1)), window.prev_action)
 
     def from_features(self, features: Tensor, prev_action: Tensor) -> Tensor:
         """Representations from (B, T, F) frame features and (B, T, A) previous actions."""

@@ -18,6 +18,7 @@ from vd4rl_pomdp.core.options import refuse_options
 from vd4rl_pomdp.core.registry import Registry
 from vd4rl_pomdp.nn.memories.base import Memory, MemoryOptions
 from vd4rl_pomdp.nn.memories.gru import GRU, GRUOptions
+from vd4rl_pomdp.nn.memories.integrator import Integrator
 from vd4rl_pomdp.nn.memories.lru import LRU, LRUOptions
 from vd4rl_pomdp.nn.memories.transformer import Transformer, TransformerOptions
 
@@ -26,6 +27,7 @@ __all__ = [
     "LRU",
     "MEMORIES",
     "GRUOptions",
+    "Integrator",
     "LRUOptions",
     "Memory",
     "MemoryOptions",
@@ -65,6 +67,9 @@ MEMORIES: Registry[MemoryPart] = Registry(
         "gru": MemoryPart(GRU, GRUOptions, summary="gated recurrent units, in the paper's methods"),
         "transformer": MemoryPart(Transformer, TransformerOptions, summary="causal attention to a window of rows"),
         "lru": MemoryPart(LRU, LRUOptions, summary="linear recurrent units, in parallel over a window"),
+        "integrator": MemoryPart(
+            Integrator, GRUOptions, summary="a floor: a GRU of the first observation, the actions since, and the time"
+        ),
     },
     lambda part: isinstance(part, MemoryPart),
     "a vd4rl_pomdp.nn.memory.MemoryPart",
@@ -75,8 +80,15 @@ MEMORIES: Registry[MemoryPart] = Registry(
 """All memories. Packages offer theirs in the group of entry points `vd4rl_pomdp.memories`."""
 
 
-def make_memory(name: str, inputs: int, settings: Mapping[str, Any]) -> Memory:
-    """Build a memory by name for rows of a width; a name or a setting that is unknown raises UserError."""
+def make_memory(name: str, inputs: int, settings: Mapping[str, Any], features: int | None = None) -> Memory:
+    """Build a memory by name for rows of a width; a name or a setting that is unknown raises UserError.
+
+    Args:
+        name: of the memory in MEMORIES.
+        inputs: width of a row.
+        settings: values of its options.
+        features: how many of a row's numbers, the first ones, are the observation's; None: all.
+    """
     part = MEMORIES.named(name)
     options = part.options.fill(settings)
     if unknown := settings.keys() - vars(options).keys():
@@ -84,6 +96,7 @@ def make_memory(name: str, inputs: int, settings: Mapping[str, Any]) -> Memory:
     memory = part.build(inputs, options)
     if not isinstance(memory, Memory):
         raise UserError(f"memory {name!r} builds a {type(memory).__name__}, not a vd4rl_pomdp.nn.memory.Memory")
+    memory.features = inputs if features is None else features
     return memory
 
 

@@ -128,7 +128,8 @@ class InverseObjective(Objective):
         window, reach = shape.history_window or t + 1, memory.reach or t + 1
         # the first row of a window carries no action before it, that of a memory's reach does
         actions = range(max(0, t + 1 - window, t - reach), t) if shape.use_actions else ()
-        return set(range(max(0, t + 1 - window, t + 1 - reach), t + 1)), set(actions)
+        seen = range(max(0, t + 1 - window, t + 1 - reach), t + 1)
+        return set(seen[:1] if memory.first_only else seen), set(actions)
 
     def pairs(self, rows: int) -> Tensor:
         """The (t, k) that are scored in a window of `rows` rows: (P, 2) int64 on the CPU, not to be changed."""

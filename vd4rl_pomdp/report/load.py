@@ -52,7 +52,7 @@ CONTROL = {"return": "return_mean", "share_above_80": "share_above_80", "action_
 """Columns that tell of the last evaluation, also as `clean_` under no corruption, and what `summarise` calls them."""
 END_TO_END = ("bc", "drq_bc")
 """References that bring their own algorithm."""
-TOLD_STATES = ("supervised", "supervised+a")
+TOLD_STATES = ("integrator", "supervised_picture", "supervised", "supervised+a")
 """Methods whose encoders are trained on the simulator's states, those of the episodes that a probe holds out, too."""
 REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, "state")
 """Methods that are references, floors and ceilings: last in a table."""

@@ -39,9 +39,9 @@ def check_memory(name: str, **options: Any) -> None:
 
 
 def make(name: str, **options: Any) -> Memory:
-    """The memory, for rows of INPUTS numbers; the same at every call."""
+    """The memory, for rows of INPUTS numbers, the last two an action; the same at every call."""
     torch.manual_seed(0)
-    return make_memory(name, INPUTS, {"hidden_dim": _WIDTH} | options)
+    return make_memory(name, INPUTS, {"hidden_dim": _WIDTH} | options, INPUTS - 2)
 
 
 def encoder_of(name: str, **settings: Any) -> Encoder:
@@ -124,6 +124,23 @@ def actions_are_read_where_a_method_has_them(name: str, **options: Any) -> None:
         )
 
 
+def observations_are_read_where_it_says(name: str, **options: Any) -> None:
+    """s_t changes with o_t or, of a memory with `first_only`, with o_0 alone; never with a later observation."""
+    for method in ("mik+a", "mik"):
+        encoder, window = encoder_of(name, method=method, **options), windows()
+        memory = encoder.memory
+        assert memory is not None
+        for row in range(ROWS):
+            changed = window.obs.clone()
+            changed[:, row] = 255 - changed[:, row]
+            with torch.no_grad():
+                moved = encoder.encode(window) != encoder.encode(window.replace(obs=changed))
+            rows = moved.any(2).any(0).tolist()
+            told = f"o_{row} moves rows {rows} of {method}"
+            claim(not any(rows[:row]), told)
+            claim(all(rows) == (row == 0) and any(rows) == (row == 0) if memory.first_only else rows[row], told)
+
+
 def padding_is_not_read(name: str, **options: Any) -> None:
     """Read backwards, as MIK's future, a padded window gives what it gives without its padding."""
     memory, x, length = make(name, **options), rows(), torch.tensor([ROWS, 4, 1])
@@ -161,6 +178,7 @@ CHECKS: tuple[Check, ...] = (
     streaming_equals_batch,
     a_state_depends_on_its_past_alone,
     actions_are_read_where_a_method_has_them,
+    observations_are_read_where_it_says,
     padding_is_not_read,
     gradients_reach_all_parameters,
     a_folder_gives_back_the_encoder,

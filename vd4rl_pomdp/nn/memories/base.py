@@ -27,6 +27,10 @@ class Memory(nn.Module):
 
     reach: int | None = None
     """Rows that an output depends on, its own among them; None: all."""
+    first_only: bool = False
+    """Whether of row 0 alone it reads the observation's features; of later rows then the actions."""
+    features: int
+    """Numbers at the beginning of a row that are the observation's features; `make_memory` tells."""
 
     def initial_state(self, batch: int) -> Tensor:
         """State before an episode's first row: (L, batch, W) zeros in the precision of its weights."""

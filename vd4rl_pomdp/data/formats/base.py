@@ -1,0 +1,143 @@
+"""What a foreign format is to `data import` and `data export`: a reader of episodes, and where one can be, a writer."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field
+from importlib import import_module
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.types import StepType
+from vd4rl_pomdp.data.shards import EpisodeArrays
+
+
+@dataclass(frozen=True)
+class SourceSet:
+    """An opened set, whose episodes are read one at a time."""
+
+    episodes: int
+    rows: int
+    """Rows in all, or about as many: they decide how many episodes a shard gets."""
+    frame_shape: tuple[int, int]
+    """Height and width of the pictures."""
+    read: Callable[[int], Iterator[EpisodeArrays]]
+    """Yields the rows of all episodes from a number on, as `rows_of` makes them, but for pictures of any height and
+    width, and actions in the source's own units."""
+    record: dict[str, Any]
+    """JSON values that tell this source from another, its name first, such as size: a cut import goes on only with
+    equal ones."""
+    action_low: np.ndarray | None = None
+    action_high: np.ndarray | None = None
+    """(A,) bounds of the actions; None where nothing tells them: then they must lie in [-1, 1]."""
+    task: str | None = None
+    quality: str | None = None
+    notes: list[str] = field(default_factory=list)
+    """What a user must know of it, one line each."""
+
+
+@dataclass(frozen=True)
+class DataFormat:
+    """A format of other libraries."""
+
+    summary: str
+    """One line that says what it is."""
+    read: Callable[[str, str | None], SourceSet]
+    """Opens a source: its path or name, and which of its observations holds the pictures (None: the only one)."""
+    write: Callable[[Path, Path, SourceSet], list[str]] | None = None
+    """Writes a set into a folder that is not there yet, and that will be renamed to the second: (folder, final place,
+    set). Pictures are square, actions in [-1, 1]. Returns what the format could not keep, one line each."""
+
+
+def rows_of(
+    frames: np.ndarray,
+    action: np.ndarray,
+    reward: np.ndarray,
+    terminated: bool | np.ndarray,
+    complete: bool = True,
+    physics: np.ndarray | None = None,
+) -> EpisodeArrays:
+    """An episode whose a_t and r_t are numbered like the o_t that they follow, as rows, which hold a_{t-1} and r_{t-1}.
+
+    Args:
+        frames: (T + 1, 3, H, W) uint8, o_0 to o_T.
+        action: (T, A), a_0 to a_{T-1}.
+        reward: (T,).
+        terminated: whether the task itself ended (discount 0, which is 1 after a time limit): with the last of the
+            steps, or (T,) for each.
+        complete: whether the episode ended at all; False: its source was cut.
+        physics: (T + 1, P) simulator states.
+    """
+    steps = len(action)
+    if len(frames) != steps + 1 or len(reward) != steps:
+        raise UserError(
+            f"has {len(frames)} pictures, {steps} actions and {len(reward)} rewards, expected one picture more"
+        )
+    discount, step_type = np.ones(steps + 1), np.full(steps + 1, StepType.MID, np.int64)
+    step_type[0] = StepType.FIRST
+    if complete and steps:
+        step_type[-1] = StepType.LAST
+    if isinstance(terminated, np.ndarray):
+        discount[1:] = 1 - terminated
+    else:
+        discount[steps:] = not terminated or not steps
+    return {
+        "observation": frames,
+        "action": np.concatenate([np.zeros_like(action[:1], shape=(1, *action.shape[1:])), action]),
+        "reward": np.concatenate([[0.0], reward]),
+        "discount": discount,
+        "step_type": step_type,
+        **({} if physics is None else {"physics": physics}),
+    }
+
+
+def one_hot(action: np.ndarray, number: int) -> np.ndarray:
+    """(T,) actions from 0 to number - 1 as (T, number) float32: 1 for the one that was taken, -1 for all others."""
+    return np.where(np.arange(number) == action[:, None], np.float32(1), np.float32(-1))
+
+
+_CHANNELS = (1, 3, 6, 9, 12)
+"""Grey, or red, green and blue of each frame of a stack."""
+
+
+def picture_size(shape: tuple[int, ...]) -> tuple[int, int] | None:
+    """Height and width of a picture (H, W), (H, W, C) or (C, H, W), None for other shapes."""
+    if len(shape) == 2 or (len(shape) == 3 and shape[2] in _CHANNELS):
+        return shape[0], shape[1]
+    return (shape[1], shape[2]) if len(shape) == 3 and shape[0] in _CHANNELS else None
+
+
+def as_frames(pictures: np.ndarray) -> np.ndarray:
+    """(T, ...) uint8 pictures whose size `picture_size` tells as (T, 3, H, W): of a stack the newest frame."""
+    if pictures.ndim == 3:
+        pictures = pictures[..., None]
+    frames = np.moveaxis(pictures, -1, 1) if pictures.shape[-1] in _CHANNELS else pictures
+    return np.repeat(frames, 3, axis=1) if frames.shape[1] == 1 else frames[:, -3:]
+
+
+def chosen(shapes: Mapping[str, tuple[int, ...]], picture: str | None) -> tuple[str, tuple[int, int]]:
+    """Which observation holds the pictures, and their size: the one that the user names, else the only one that can.
+
+    Args:
+        shapes: of all uint8 observations, by name.
+        picture: the user's choice.
+    """
+    known = {name: size for name, shape in shapes.items() if (size := picture_size(shape))}
+    if not known:
+        raise UserError("holds no pictures: those are uint8 observations of the shape (H, W), (H, W, 3) or (3, H, W)")
+    if picture in known or (picture is None and len(known) == 1):
+        return next((name, size) for name, size in known.items() if picture in (name, None))
+    raise UserError(f"which observation holds its pictures? Pass --picture, one of {', '.join(known)}")
+
+
+def library(name: str, extra: str) -> Any:
+    """A module that only one format needs; UserError, naming the extra that brings it, if it is not installed."""
+    try:
+        return import_module(name)
+    except ImportError as error:
+        raise UserError(
+            f"this format needs {name.partition('.')[0]} ({error}): `pip install '.[{extra}]'` in the package's folder"
+        ) from error

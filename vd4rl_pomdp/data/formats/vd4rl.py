@@ -1,0 +1,130 @@
+"""V-D4RL's two formats: HDF5 shards, which are this package's own, and the `.npz` episodes of its 64-pixel sets.
+
+An episode's file holds `image` (T + 1, S, S, 3) uint8, `action`, `reward`, `discount`, `is_first`, `is_last` and
+`is_terminal`, as DreamerV2 reads them; rows are numbered as in the shards. Its name ends in the number of rows.
+"""
+
+from __future__ import annotations
+
+import re
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from vd4rl_pomdp.core.errors import UserError, in_one_line
+from vd4rl_pomdp.core.types import StepType
+from vd4rl_pomdp.data.folder import join_shards, shard_paths, task_and_quality
+from vd4rl_pomdp.data.format import FRAMES_KEY, read_attributes, read_frame_size, read_frames, read_rows
+from vd4rl_pomdp.data.formats.base import DataFormat, SourceSet, as_frames, chosen
+from vd4rl_pomdp.data.shards import EpisodeArrays
+
+
+def read_shards(path: str, picture: str | None = None) -> SourceSet:
+    """A set of this package's own format, of which no more than an episode and a block is held."""
+    folder = Path(path)
+    shards = shard_paths(folder)
+    size = read_frame_size(shards)
+    chosen({FRAMES_KEY: (3, size, size)}, picture)
+    rows = join_shards(folder, shards, [read_rows(shard) for shard in shards])
+    starts = np.flatnonzero(rows["step_type"] == StepType.FIRST)
+    ends = np.append(starts[1:], len(rows["reward"]))
+
+    def read(first: int) -> Iterator[EpisodeArrays]:
+        episode, begin, held = 0, 0, np.zeros((0, 3, size, size), np.uint8)
+        for block in (block for shard in shards for block in read_frames(shard)):
+            held = np.concatenate([held, block]) if len(held) else block
+            while episode < len(ends) and ends[episode] <= begin + len(held):
+                start, end = starts[episode], ends[episode]
+                if episode >= first:
+                    told = {key: value[start:end] for key, value in rows.items()}
+                    yield {FRAMES_KEY: held[start - begin : end - begin]} | told
+                held, begin, episode = held[end - begin :], end, episode + 1
+
+    attributes = [read_attributes(shard) for shard in shards]
+    task, quality = task_and_quality(folder, attributes)
+    record = {"set": folder.resolve().name, "bytes": sum(shard.stat().st_size for shard in shards)}
+    return SourceSet(len(starts), len(rows["reward"]), (size, size), read, record, task=task, quality=quality)
+
+
+def read_npz(path: str, picture: str | None = None) -> SourceSet:
+    """A folder of episodes, one file each, in the order of their names."""
+    folder = Path(path)
+    files = sorted(folder.glob("*.npz"))
+    if not files:
+        raise UserError(f"{folder}: holds no .npz episodes; name the folder that holds them, such as TASK/QUALITY/64px")
+    shape = _episode(files[0])[FRAMES_KEY].shape
+    _, frame_shape = chosen({"image": shape[1:]}, picture)
+    named = [re.search(r"-(\d+)$", file.stem) for file in files]
+    rows = sum(int(one[1]) if one else shape[0] for one in named)
+    task, quality = task_and_quality(folder, [])
+    record = {"folder": folder.resolve().name, "bytes": sum(file.stat().st_size for file in files)}
+    return SourceSet(
+        len(files),
+        rows,
+        frame_shape,
+        lambda first: map(_episode, files[first:]),
+        record,
+        task=task,
+        quality=quality,
+        notes=_cut_short(folder, len(files), task, quality),
+    )
+
+
+def _cut_short(folder: Path, episodes: int, task: str | None, quality: str | None) -> list[str]:
+    """A warning for a 64-pixel set as V-D4RL's mirror has it: not all episodes of the set that its paper describes."""
+    if "64px" not in folder.resolve().parts or episodes > 100 or None in (task, quality):
+        return []
+    expert = " of the expert alone" if quality == "medium_expert" else ""
+    return [
+        f"the published 64-pixel sets are cut short: {folder} has {episodes} episodes{expert}, the 84-pixel one all: "
+        f"`vd4rl-pomdp data download --task {task} --quality {quality}`, then `data import vd4rl SET OUT --size 64`"
+    ]
+
+
+def _episode(path: Path) -> EpisodeArrays:
+    """The rows of one file."""
+    try:
+        with np.load(path) as file:
+            stored = {key: file[key] for key in file.files}
+    except (OSError, ValueError, zipfile.BadZipFile, EOFError, KeyError) as error:
+        raise UserError(f"{path}: is damaged or no .npz file ({in_one_line(error)}); fetch it again") from error
+    if lacking := [key for key in ("image", "action", "reward") if key not in stored]:
+        raise UserError(f"{path}: has no {lacking[0]!r}, so it is no episode of V-D4RL (keys: {', '.join(stored)})")
+    rows = len(stored["reward"])
+    step_type = np.full(rows, StepType.MID, np.int64)
+    step_type[-1] = StepType.LAST if stored.get("is_last", np.ones(1))[-1] else StepType.MID
+    step_type[0] = StepType.FIRST
+    return {
+        FRAMES_KEY: as_frames(stored["image"]),
+        "action": stored["action"],
+        "reward": stored["reward"],
+        "discount": stored["discount"] if "discount" in stored else 1.0 - stored.get("is_terminal", np.zeros(rows)),
+        "step_type": step_type,
+    }
+
+
+def write_npz(folder: Path, out: Path, source: SourceSet) -> list[str]:
+    """One file for each episode; the names sort in their order."""
+    folder.mkdir()
+    lost: dict[str, None] = {}
+    for number, rows in enumerate(source.read(0)):
+        step_type = rows["step_type"]
+        if "physics" in rows:
+            lost["simulator states"] = None
+        np.savez_compressed(
+            folder / f"{number:06d}-{len(step_type)}.npz",
+            image=rows[FRAMES_KEY].transpose(0, 2, 3, 1),
+            action=rows["action"],
+            reward=rows["reward"],
+            discount=rows["discount"],
+            is_first=step_type == StepType.FIRST,
+            is_last=step_type == StepType.LAST,
+            is_terminal=rows["discount"] == 0,
+        )
+    return [f"{what}: the format has no place for them" for what in lost]
+
+
+VD4RL = DataFormat("V-D4RL's HDF5 shards, which are this package's own: to change the size of frames", read_shards)
+VD4RL_NPZ = DataFormat("V-D4RL's 64-pixel .npz episodes, as DreamerV2 reads them", read_npz, write_npz)

@@ -1,0 +1,219 @@
+"""Sets of other formats in and out, episode by episode: `data import` and `data export`.
+
+An import writes shards as `data collect` does, each of them whole, and goes on where it was cut. An export is written
+into a hidden folder beside the named one and renamed when it is whole; a cut one begins anew.
+"""
+
+from __future__ import annotations
+
+import shutil
+import sys
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+from zipfile import BadZipFile
+
+import numpy as np
+
+from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_no_folder, refuse_number, system_error
+from vd4rl_pomdp.core.tasks import FRAME_SIZES
+from vd4rl_pomdp.data.format import FRAMES_KEY
+from vd4rl_pomdp.data.formats import FORMATS
+from vd4rl_pomdp.data.formats.base import SourceSet
+from vd4rl_pomdp.data.formats.vd4rl import read_shards
+from vd4rl_pomdp.data.shards import EpisodeArrays, Shard, collect_set
+from vd4rl_pomdp.envs.gymnasium_task import area_means
+from vd4rl_pomdp.runs.files import holds_anything
+from vd4rl_pomdp.runs.outputs import owned, refuse_inside
+from vd4rl_pomdp.runs.progress import ProgressLine
+
+_SHARD_ROWS = 10_000
+"""Rows of a shard, about: as many are in memory at once."""
+_ROUNDING = 1e-5
+"""By how much actions may pass their bounds unseen: float32 rounds on the way."""
+
+
+def import_set(
+    name: str,
+    source: str,
+    out: Path,
+    task: str | None = None,
+    quality: str | None = None,
+    size: int | None = None,
+    picture: str | None = None,
+    clip_actions: bool = False,
+) -> list[Path]:
+    """Write a set of another format as one of this package's, or what is missing of it; returns its shards.
+
+    Args:
+        name: the format's, in `FORMATS`.
+        source: path or name of the set.
+        out: folder to write.
+        task: the task's name, where the source does not tell it or tells another one.
+        quality: name of the behaviour that made the data.
+        size: height and width to which pictures are resized, by area; None: their own.
+        picture: which observation holds the pictures, where there are several.
+        clip_actions: whether actions outside the source's bounds are clipped; otherwise they are refused.
+
+    Raises:
+        UserError: the source is missing, damaged or holds no pictures, actions pass their bounds, or the folder holds
+            something else.
+    """
+    refuse_inside(out)
+    with _telling(source):
+        opened = _resized(FORMATS.named(name).read(source, picture), size)
+    label = task or opened.task or _label(opened, name)
+    _tell(opened.notes)
+    settings: dict[str, Any] = {
+        "format": name,
+        "source": opened.record,
+        "episodes": opened.episodes,
+        "task": label,
+        "set": quality or opened.quality,
+        "frame_size": opened.frame_shape[0],
+    }
+    per_shard = max(1, _SHARD_ROWS * opened.episodes // max(1, opened.rows))
+    attributes = {key: settings[key] for key in ("task", "set") if settings[key]} | {
+        "imported": {"format": name, **opened.record}
+    }
+    shards = [
+        Shard(
+            out / f"{number}_{label}.hdf5",
+            list(range(start, min(start + per_shard, opened.episodes))),
+            attributes,
+        )
+        for number, start in enumerate(range(0, opened.episodes, per_shard))
+    ]
+    episodes = _Reader(source, opened, clip_actions)
+    collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
+    if episodes.clipped:
+        _tell([f"{episodes.clipped} actions lay outside their bounds and were clipped"])
+    if episodes.still and episodes.still == episodes.read:
+        _tell(["in every episode all pictures are equal: was a buffer recorded that the environment draws into?"])
+    from vd4rl_pomdp.data.card import write_card  # draws
+
+    write_card(out)
+    return [shard.path for shard in shards]
+
+
+def export_set(name: str, path: Path, out: Path, size: int | None = None) -> None:
+    """Write a set of this package's in another format; `size` as in `import_set`.
+
+    Raises:
+        UserError: the format can only be read, the set is damaged, or something is in the way.
+    """
+    form = FORMATS.named(name)
+    if form.write is None:
+        writable = [other for other, one in FORMATS.items() if one.write]
+        raise UserError(f"the format {name!r} is only imported: choose one of {', '.join(writable)}")
+    refuse_inside(out)
+    refuse_no_folder(out)
+    if holds_anything(out):
+        raise UserError(f"{out}: is not empty; choose another folder to export to")
+    opened = _resized(read_shards(str(path)), size)
+    hidden = out.with_name(f".{out.name}.export")
+    with disk_errors(out):
+        out.parent.mkdir(parents=True, exist_ok=True)
+        with owned(hidden), ProgressLine("export", opened.episodes, "episodes") as progress:
+
+            def read(first: int) -> Iterator[EpisodeArrays]:
+                for rows in opened.read(first):
+                    yield rows
+                    progress.advance(1, ret=float(rows["reward"][1:].sum()))
+
+            shutil.rmtree(hidden / "set", ignore_errors=True)  # of one that was cut
+            lost = form.write(hidden / "set", out, replace(opened, read=read))
+            if out.is_dir():
+                out.rmdir()
+            (hidden / "set").rename(out)
+        shutil.rmtree(hidden, ignore_errors=True)
+    _tell(lost)
+
+
+@contextmanager
+def _telling(place: str) -> Iterator[None]:
+    """What a format's reader or its library raises, as a sentence that says where."""
+    try:
+        yield
+    except UserError as error:
+        raise type(error)(str(error) if str(error).startswith(place) else f"{place}: {error}") from error
+    except (OSError, ValueError, KeyError, IndexError, RuntimeError, AssertionError, BadZipFile) as error:
+        raise system_error(Path(place), error) or UserError(
+            f"{place}: cannot be read as this format ({in_one_line(error) or type(error).__name__})"
+        ) from error
+
+
+class _Reader:
+    """Rows of an episode by its number; they are asked for in order, but for those that are there already."""
+
+    def __init__(self, name: str, source: SourceSet, clip: bool) -> None:
+        self._name, self._source, self._clip = name, source, clip
+        self._next, self._episodes = -1, iter(())
+        self.clipped = self.read = self.still = 0
+
+    def __call__(self, number: int) -> EpisodeArrays:
+        with _telling(f"{self._name}: episode {number}"):
+            if number != self._next:
+                self._episodes = self._source.read(number)
+            rows = next(self._episodes, None)
+            if rows is None:
+                raise UserError("is missing")
+            self._next, frames = number + 1, rows[FRAMES_KEY]
+            self.read += 1
+            self.still += len(frames) > 1 and bool((frames[1:] == frames[0]).all())
+            return rows | {"action": self._scaled(rows["action"])}
+
+    def _scaled(self, action: np.ndarray) -> np.ndarray:
+        """Actions in [-1, 1]; those of a first row stay zero."""
+        low, high = self._source.action_low, self._source.action_high
+        scaled = action.astype(np.float32)
+        if low is not None and high is not None and not ((low == -1).all() and (high == 1).all()):
+            scaled = ((action.astype(np.float64) - low) / (high - low) * 2 - 1).astype(np.float32)
+            scaled[0] = 0
+        most = float(np.abs(scaled).max())
+        if most > 1 + _ROUNDING:
+            if not self._clip:
+                told = "its bounds" if low is not None else "[-1, 1], and the source tells no bounds"
+                raise UserError(
+                    f"has actions outside {told} (up to {most:.4g} after scaling); --clip-actions clips them"
+                )
+            self.clipped += int((np.abs(scaled) > 1 + _ROUNDING).any(1).sum())
+        return scaled if most <= 1 else scaled.clip(-1, 1)
+
+
+def _resized(source: SourceSet, size: int | None) -> SourceSet:
+    """A source of square pictures, made so where `size` says how large."""
+    (height, width), (low, high) = source.frame_shape, FRAME_SIZES
+    if size is None:
+        if height != width or not low <= height <= high:
+            raise UserError(
+                f"has pictures of {height}x{width} pixels, frames are square, of {low} to {high}: pass --size, "
+                "such as --size 84"
+            )
+        return source
+    refuse_number("size", size, low, high)
+    if (height, width) == (size, size):
+        return source
+
+    def read(first: int) -> Iterator[EpisodeArrays]:
+        for rows in source.read(first):
+            pictures = rows[FRAMES_KEY].transpose(0, 2, 3, 1)
+            small = np.stack([area_means(np.ascontiguousarray(one), size) for one in pictures])
+            yield rows | {FRAMES_KEY: small.transpose(0, 3, 1, 2)}
+
+    stretched = "" if height == width else "; height and width are scaled apart"
+    note = f"pictures of {height}x{width} pixels become {size}x{size} (area means{stretched})"
+    return replace(source, read=read, frame_shape=(size, size), notes=[*source.notes, note])
+
+
+def _label(source: SourceSet, name: str) -> str:
+    """What stands for the task where nothing tells it: the source's own name, as a file can be called."""
+    told = next((str(value) for value in source.record.values() if isinstance(value, str)), name)
+    return "".join(sign if sign.isalnum() or sign in "_-." else "_" for sign in told).strip("._") or name
+
+
+def _tell(notes: list[str]) -> None:
+    for note in notes:
+        print(f"note: {note}", file=sys.stderr)

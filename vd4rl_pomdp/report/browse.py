@@ -1,0 +1,173 @@
+"""A set's episodes as one HTML page that needs no network: frames, clean and corrupted, actions, rewards."""
+
+from __future__ import annotations
+
+import base64
+import io
+import os
+from collections.abc import Mapping
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+import tyro
+from PIL import Image
+
+from vd4rl_pomdp.core.errors import MAX_SEED, UserError, disk_errors, refuse_no_folder, refuse_outside
+from vd4rl_pomdp.core.options import Options, StageConfig, flat
+from vd4rl_pomdp.core.reading import read_bytes
+from vd4rl_pomdp.core.tasks import FRAME_STACK
+from vd4rl_pomdp.corruptions import NO_CORRUPTION, CorruptionConfig, check_corruption_fits
+from vd4rl_pomdp.data import View, open_dataset
+from vd4rl_pomdp.report.render import render
+from vd4rl_pomdp.runs.files import Row, write_bytes
+from vd4rl_pomdp.runs.outputs import refuse_inside
+
+MOST_BYTES = 4_900_000
+"""Of a page: as many rows of each episode are shown as fit."""
+COLUMNS = 32
+"""Frames beside each other in a picture."""
+_QUALITY = 50
+_POINTS = 600
+"""Points of a curve, at most."""
+_LARGEST = 128
+"""Pixels of a shown frame's side, at most: of larger ones every second, third ... pixel is taken."""
+_MARK = b"<title>vd4rl-pomdp data view"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ViewConfig(StageConfig):
+    """Write a set's episodes as one HTML page, clean and corrupted; name --corruption before --help for its options."""
+
+    data: tyro.conf.Positional[Path] = Path()
+    """Folder of shards."""
+    out: Path = Path("view.html")
+    """File to write."""
+    episodes: int = 100
+    """Episodes to show, evenly spaced; the fewer, the more rows of each find room."""
+    seed: int = 0
+    """Seed of the corruption."""
+    corruption: CorruptionConfig = NO_CORRUPTION
+    """What is switched on and off; with `emission`, as runs of this seed see it."""
+
+    preset: tyro.conf.Suppress[str] = "paper"
+    presets: ClassVar[Mapping[str, Mapping[str, Any]]] = {
+        "paper": {"corruption": "patch+zero_frames", "corruption_mode": "emission"}
+    }
+    choosers: ClassVar[tuple[str, ...]] = ("corruption",)
+
+    @classmethod
+    def parts(cls, values: Mapping[str, Any]) -> dict[str, Options]:
+        """Options of the corruption."""
+        return {"corruption": CorruptionConfig.fill(values)}
+
+    def check(self) -> None:
+        """Raise UserError for settings that cannot work, or another file in the page's place."""
+        super().check()
+        refuse_outside(self, episodes=(1, 500), seed=(0, MAX_SEED))
+        refuse_inside(self.out)
+        refuse_no_folder(self.out.parent)
+        if os.path.lexists(self.out) and not (self.out.exists() and _MARK in read_bytes(self.out)[:1000]):
+            raise UserError(f"{self.out}: is no page of `data view`; choose another --out")
+
+
+def write_view(config: ViewConfig) -> Path:
+    """Write the page; returns its file.
+
+    Raises:
+        UserError: the set is damaged, the corruption does not fit its frames, or the file cannot be written.
+    """
+    config.check()
+    data = open_dataset(config.data)
+    check_corruption_fits(config.corruption, data.frame_size)
+    view = View(data, config.corruption, seed=config.seed)
+    count = min(config.episodes, data.num_episodes)
+    shown = np.linspace(0, data.num_episodes - 1, count).round().astype(int).tolist()
+    longest = int((data.episode_end - data.episode_start).max())
+    rows = min(longest, 16)  # a trial of few, to tell how many will fit
+    few = shown[:: -(-count // 5)]
+    trial = len(_page(config, view, few, rows)) / len(few) / rows
+    rows = min(longest, max(2, int(MOST_BYTES / count / trial)))
+    while len(page := _page(config, view, shown, rows)) > MOST_BYTES and rows > 2:
+        rows = max(2, int(0.95 * rows * MOST_BYTES / len(page)))
+    with disk_errors(config.out):
+        config.out.parent.mkdir(parents=True, exist_ok=True)
+    write_bytes(config.out, page)
+    return config.out
+
+
+def _page(config: ViewConfig, view: View, shown: list[int], rows: int) -> bytes:
+    """The page with so many rows of each of some episodes."""
+    data = view.dataset
+    longest = int((data.episode_end - data.episode_start).max())
+    told = {
+        "size": -(-data.frame_size // -(-data.frame_size // _LARGEST)),
+        "columns": COLUMNS,
+        "stack": FRAME_STACK,
+        "every": -(-longest // _POINTS),
+        "action": [float(data.action.min()), float(data.action.max())],
+        "reward": [float(data.reward.min()), float(data.reward.max())],
+    }
+    episodes = [_episode(view, number, rows, told) for number in shown]
+    settings = flat(config.corruption)
+    name = settings.pop("corruption")
+    return render(
+        "browse.html",
+        data=data,
+        name=" ".join(filter(None, (data.task, data.quality))) or config.data.name,
+        corruption=", ".join([name, *(f"{key} {value}" for key, value in settings.items()), f"seed {config.seed}"]),
+        rows=min(rows, longest),
+        longest=longest,
+        quality=_QUALITY,
+        corrupted=name != "none",
+        told=told | {"episodes": episodes},
+    ).encode(errors="backslashreplace")
+
+
+def _episode(view: View, number: int, rows: int, told: Row) -> Row:
+    """What the page's script reads of an episode."""
+    data, place = view.dataset, view.dataset.rows_of(number)
+    chosen = torch.from_numpy(np.unique(np.linspace(place.start, place.stop - 1, rows).astype(int)))
+    stacks, keys = view.stacks(chosen), view.corruption.keys(data.keys(chosen))
+    seen = view.corruption.corruption(stacks, keys)
+    frames, index = data.stack_rows(chosen, FRAME_STACK).unique(return_inverse=True)
+    # What the corruption has changed lies over the clean picture, whose own pixels are lossy: these are exact.
+    before, after = (_pictures(x.reshape(-1, 3, *x.shape[-2:])) for x in (stacks, seen))
+    changed = 255 * (before != after).any(-1, keepdims=True).astype(np.uint8)
+    over = np.concatenate([np.where(changed, after, 0), changed], -1)
+    return {
+        "number": number,
+        "return": round(float(data.returns[number]), 2),
+        "rows": (chosen - place.start).tolist(),
+        "length": place.stop - place.start,
+        "keys": list(map(str, keys.tolist())),  # more digits than JavaScript's numbers have
+        "frames": index.tolist(),
+        "clean": _sheet(_pictures(data.frames[frames]), quality=_QUALITY),
+        "over": _sheet(over, lossless=True) if changed.any() else "",
+        "action": _bytes(data.action[place][:: told["every"]].T, *told["action"]),
+        "reward": _bytes(data.reward[place][:: told["every"]], *told["reward"]),
+    }
+
+
+def _pictures(frames: torch.Tensor) -> np.ndarray:
+    """(N, 3, S, S) frames as (N, S', S', 3), every k-th pixel of large ones."""
+    return frames.numpy().transpose(0, 2, 3, 1)[:, :: (step := -(-frames.shape[-1] // _LARGEST)), ::step]
+
+
+def _sheet(pictures: np.ndarray, **options: Any) -> str:
+    """(N, S, S, C) pictures as one WebP, COLUMNS beside each other, in base64."""
+    count, size, _, channels = pictures.shape
+    across, down = min(count, COLUMNS), -(-count // COLUMNS)
+    filled = np.concatenate([pictures, np.zeros((across * down - count, *pictures.shape[1:]), np.uint8)])
+    sheet = filled.reshape(down, across, size, size, channels).swapaxes(1, 2)
+    buffer = io.BytesIO()
+    Image.fromarray(sheet.reshape(down * size, across * size, channels)).save(buffer, "WEBP", **options)
+    return base64.b64encode(buffer.getvalue()).decode()
+
+
+def _bytes(values: torch.Tensor, low: float, high: float) -> str:
+    """Numbers as 255ths of their range, a byte each, in base64."""
+    scaled = (values - low) / (high - low or 1) * 255
+    return base64.b64encode(scaled.round().byte().numpy().tobytes()).decode()
