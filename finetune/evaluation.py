@@ -17,6 +17,7 @@ from vd4rl_pomdp.core.options import LABELS, flat
 from vd4rl_pomdp.core.registry import warn_of_other_code
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, MOST_EPISODES, TASKS, Task
 from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption_fits
+from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.data.reference import Reference, action_error
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn, Observation
 from vd4rl_pomdp.envs.make import layout_of
@@ -28,6 +29,8 @@ from vd4rl_pomdp.policies.actor import read_actor
 from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.episodes import read_episodes
 from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.provenance import machine
+from vd4rl_pomdp.runs.results import Result, read_run
 from vd4rl_pomdp.runs.workers import run_jobs
 
 EVALUATION_SEED = 20_000
@@ -315,3 +318,44 @@ def evaluate_run(
     jobs = jobs_of(run, TASKS.named(card.task), under, episodes, length, evaluated_under=told)
     played = evaluate(jobs, workers)
     return episode_rows(played, labels), played
+
+
+REPLAYED = ("return", "length", "score", "action_error")
+"""Columns of `episodes.csv` that a replay gives again."""
+
+
+def replay(run: Path, results: Iterable[Result]) -> dict[str, Any]:
+    """Play the first episode of a run's last evaluation again, and hold it against the row that tells of it.
+
+    Args:
+        run: the run's folder, with encoder and policy.
+        results: among which its row is looked for, by its id.
+
+    Returns:
+        `recorded` and `replayed`, rows of `episodes.csv`, `differ`, the columns among REPLAYED that differ, and
+        `row` and `here`, what drew and computed, in words.
+
+    Raises:
+        UserError: as `evaluate_run`, or none of the results tells of this run, or of its policy's last evaluation.
+    """
+    own, step = read_run(run), policy_step(run / "policy")
+    told = next((result for result in results if result.id == own.id), None)
+    if told is None:
+        raise UserError(f"{run}: is the run {own.id}, which has no row there; name the folder of one that has")
+    of_policy = [row for row in told.rows if row["step"] == step and row["evaluated_under"] == row["corruption"]]
+    recorded = next((row for row in of_policy if row["episode"] == 0), None)
+    if recorded is None:
+        raise UserError(f"{run}: its policy is of update {step}, of which run {own.id} has no first episode there")
+    (replayed,), _ = evaluate_run(run, recorded["corruption"], 1, 1)
+    return {
+        "recorded": recorded,
+        "replayed": replayed,
+        "differ": [name for name in REPLAYED if recorded[name] != replayed[name]],
+        "row": _drawn_by(told.files.get("render", {}), told.parts[-1]),
+        "here": _drawn_by(render_info(recorded["task"]), machine("cpu")),
+    }
+
+
+def _drawn_by(render: dict[str, Any], hardware: dict[str, Any]) -> str:
+    words = [f"{name} {render[name]}" for name in ("mujoco", "gymnasium") if name in render]
+    return ", ".join(filter(None, [*words, render.get("gl_renderer"), hardware.get("processor")])) or "not recorded"

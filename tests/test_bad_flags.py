@@ -32,6 +32,7 @@ VALID = {
     "report": ["runs", *OUT],
     "report compare": ["runs", "results", *OUT],
     "results add": ["runs", *OUT],
+    "results verify": ["results"],
     "navigation collect": ["--maze", "no_curtain", "--preset", "smoke", *OUT],
     "sweep run": ["quick", "--testing", "--dry-run", *OUT],
     "theory": OUT,

@@ -53,7 +53,7 @@ NOT_RUN = {
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
     "vd4rl-pomdp navigation": "trains for minutes to days; vd4rl_pomdp/studies/navigation/test_train trains less",
     "vd4rl-pomdp report": "the README's is run; tests/report makes all others",
-    "vd4rl-pomdp results add": "tests/runs/results adds runs",
+    "vd4rl-pomdp results": "tests/runs/results adds and verifies runs",
     "vd4rl-pomdp pretrain --method": "pretrain/test_train runs every method in its smoke size",
     "vd4rl-pomdp finetune --encoder RUN": "as above",
     "vd4rl-pomdp evaluate RUN": "tests/finetune/test_evaluation plays a scripted environment",

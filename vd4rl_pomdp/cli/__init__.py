@@ -46,6 +46,7 @@ COMMANDS = {
     "report": ("studies.report", "an HTML page, tables and figures about runs"),
     "report compare": ("studies.compare", "two result sets side by side"),
     "results add": ("studies.add", "append finished runs to a results folder"),
+    "results verify": ("studies.verify", "check rows against their own records, and replay an episode"),
     "theory": ("studies.theory", "the paper's claims on finite worlds, by enumeration"),
     "bench": ("studies.bench", "speed and memory on this machine"),
 }
