@@ -39,6 +39,9 @@ NOT_RUN = {
     "nvidia-cuda-mps-control": "needs a GPU; results/gpu was measured with it",
     **{f"python {file}": "test_own_parts and test_own_task run them" for file in EXAMPLES},
     "vd4rl-pomdp data collect": "renders whole episodes; data/test_collect runs shorter ones",
+    **dict.fromkeys(
+        ("vd4rl-pomdp data import", "vd4rl-pomdp data export"), "need sets of others; data/test_formats makes some"
+    ),
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
     "vd4rl-pomdp data view": "report/test_browse writes pages",
     "vd4rl-pomdp hub": "needs a Hub; test_hub has one of its own",

@@ -150,6 +150,8 @@ def _text(
     lines = {name: markdown(str(value)) for name, value in rows.items()} | _origin(path, attributes)
     table = "\n".join(f"| {name} | {value} |" for name, value in lines.items())
     how = HOW.get(names[1] or "", "") if attributes[0] else "A published set, or one that records no origin."
+    if told := dict(attributes[0].get("imported", {})):
+        how = f"Imported from {told.pop('format')}: {markdown(', '.join(f'{k} {v}' for k, v in told.items()))}."
     return (
         f"# {markdown(_title(names))}\n\n{how}\n\n| | |\n|---|---|\n{table}\n\n![Returns and a film strip](card.png)\n"
     )

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import shutil
 import sys
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -29,7 +29,7 @@ from vd4rl_pomdp.runs.files import holds_anything
 from vd4rl_pomdp.runs.outputs import owned, refuse_inside
 from vd4rl_pomdp.runs.progress import ProgressLine
 
-_SHARD_ROWS = 10_000
+_SHARD_ROWS = 5_000
 """Rows of a shard, about: as many are in memory at once."""
 _ROUNDING = 1e-5
 """By how much actions may pass their bounds unseen: float32 rounds on the way."""
@@ -88,10 +88,7 @@ def import_set(
     ]
     episodes = _Reader(source, opened, clip_actions)
     collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
-    if episodes.clipped:
-        _tell([f"{episodes.clipped} actions lay outside their bounds and were clipped"])
-    if episodes.still and episodes.still == episodes.read:
-        _tell(["in every episode all pictures are equal: was a buffer recorded that the environment draws into?"])
+    _tell(episodes.notes())
     from vd4rl_pomdp.data.card import write_card  # draws
 
     write_card(out)
@@ -151,7 +148,8 @@ class _Reader:
     def __init__(self, name: str, source: SourceSet, clip: bool) -> None:
         self._name, self._source, self._clip = name, source, clip
         self._next, self._episodes = -1, iter(())
-        self.clipped = self.read = self.still = 0
+        self._last: np.ndarray | None = None
+        self._clipped = self._read = self._still = self._joined = 0
 
     def __call__(self, number: int) -> EpisodeArrays:
         with _telling(f"{self._name}: episode {number}"):
@@ -160,10 +158,21 @@ class _Reader:
             rows = next(self._episodes, None)
             if rows is None:
                 raise UserError("is missing")
-            self._next, frames = number + 1, rows[FRAMES_KEY]
-            self.read += 1
-            self.still += len(frames) > 1 and bool((frames[1:] == frames[0]).all())
+            frames = rows[FRAMES_KEY]
+            self._read += 1
+            self._still += len(frames) > 1 and bool((frames[1:] == frames[0]).all())
+            self._joined += number == self._next and np.array_equal(frames[0], self._last)
+            self._next, self._last = number + 1, frames[-1]
             return rows | {"action": self._scaled(rows["action"])}
+
+    def notes(self) -> Iterator[str]:
+        """What the episodes that were read have in common."""
+        if self._clipped:
+            yield f"{self._clipped} actions lay outside their bounds and were clipped"
+        if self._still and self._still == self._read:
+            yield "in every episode all pictures are equal: was a buffer recorded that the environment draws into?"
+        elif self._joined and self._joined == self._read - 1:
+            yield "every episode begins with the last picture of the one before: its first step crosses a reset"
 
     def _scaled(self, action: np.ndarray) -> np.ndarray:
         """Actions in [-1, 1]; those of a first row stay zero."""
@@ -179,7 +188,7 @@ class _Reader:
                 raise UserError(
                     f"has actions outside {told} (up to {most:.4g} after scaling); --clip-actions clips them"
                 )
-            self.clipped += int((np.abs(scaled) > 1 + _ROUNDING).any(1).sum())
+            self._clipped += int((np.abs(scaled) > 1 + _ROUNDING).any(1).sum())
         return scaled if most <= 1 else scaled.clip(-1, 1)
 
 
@@ -214,6 +223,6 @@ def _label(source: SourceSet, name: str) -> str:
     return "".join(sign if sign.isalnum() or sign in "_-." else "_" for sign in told).strip("._") or name
 
 
-def _tell(notes: list[str]) -> None:
+def _tell(notes: Iterable[str]) -> None:
     for note in notes:
         print(f"note: {note}", file=sys.stderr)

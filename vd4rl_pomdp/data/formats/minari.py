@@ -59,7 +59,7 @@ def read(source: str, picture: str | None) -> SourceSet:
 
     def episode(number: int) -> EpisodeArrays:
         stored = dataset[number]
-        if len(stored) != lengths[number]:  # Arrow's reader stops after a batch of 131,072 rows
+        if len(stored) != lengths[number]:  # Arrow's reader stops after 32,768 rows, its largest batch
             raise UserError(f"Minari reads {len(stored)} of its {lengths[number]} steps")
         frames = stored.observations
         for part in key.split("/") if key else ():
