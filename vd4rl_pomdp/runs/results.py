@@ -145,6 +145,8 @@ def read_run(folder: Path | str) -> Result:
     """What a run folder holds; raises UserError for damaged files."""
     folder = Path(folder)
     files = {name: read_json(folder / place) for name, place in FILES.items() if (folder / place).exists()}
+    if "config" not in files:
+        raise UserError(f"{folder}: is no run, which has a {CONFIG_FILE}; name a folder that a training wrote")
     if "encoder" in files and not isinstance(files["encoder"].get("pretrain"), dict):
         raise UserError(f"{folder / FILES['encoder']}: does not say how the encoder was pretrained; pretrain it again")
     metrics, path = read_metrics(folder / METRICS_FILE), folder / EPISODES_FILE
