@@ -98,6 +98,7 @@ def _names_no_encoding(call: ast.Call) -> bool:
         "Image.open",
         "archive.open",
         "os.open",
+        "av.open",
     ):
         return False
     words = [node.value for a in call.args for node in ast.walk(a) if isinstance(node, ast.Constant)]

@@ -6,7 +6,10 @@ import gymnasium
 import numpy as np
 import pytest
 
+from finetune.train import finetune
+from pretrain.train import pretrain
 from tests.helpers_data import fake_episode, fake_frame, fake_reward, read_shard, write_fake_set
+from tests.helpers_stages import smoke_finetune, smoke_pretrain
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.types import StepType
@@ -15,6 +18,7 @@ from vd4rl_pomdp.data.folder import shard_paths
 from vd4rl_pomdp.data.format import write_shard
 from vd4rl_pomdp.data.transfer import export_set, import_set
 from vd4rl_pomdp.envs.gymnasium_task import area_means
+from vd4rl_pomdp.sweeps.plan import DataSet
 
 LENGTHS = [20, 25, 9]
 BOUNDS = np.array([-2.0, 0.0], np.float32), np.array([2.0, 10.0], np.float32)
@@ -192,7 +196,9 @@ def test_minari_says_what_it_cannot_keep(minari, tmp_path, capsys):
     assert "discounts other than" in told
     with pytest.raises(UserError, match="call the folder walker-v0"):
         export_set("minari", tmp_path / "own", tmp_path / "walker")
-    assert not (tmp_path / "walker").exists()
+    assert [name for name in os.listdir(tmp_path) if "walker" in name] == []
+    with pytest.raises(UserError, match="test/none-v0: is neither a folder of Minari's nor a set it has"):
+        import_set("minari", "test/none-v0", tmp_path / "set")
 
 
 def write_ogbench(path, episodes):
@@ -321,7 +327,7 @@ def test_a_cut_export_leaves_nothing_and_begins_anew(tmp_path, monkeypatch):
     assert {name for name in os.listdir(tmp_path) if "npz" in name} == {"npz"}
     with pytest.raises(UserError, match="is not empty"):
         export_set("vd4rl_npz", folder, tmp_path / "npz")
-    with pytest.raises(UserError, match="only imported: choose one of minari, vd4rl_npz"):
+    with pytest.raises(UserError, match="only imported: choose one of lerobot, lerobot_video, minari, vd4rl_npz"):
         export_set("ogbench", folder, tmp_path / "b")
 
 
@@ -335,3 +341,39 @@ def test_actions_outside_their_bounds_are_refused_or_clipped(tmp_path, capsys):
     import_set("vd4rl", str(tmp_path / "own"), tmp_path / "set", clip_actions=True)
     assert "1 actions lay outside their bounds and were clipped" in capsys.readouterr().err
     assert rows_of_set(tmp_path / "set")["action"].max() == 1
+
+
+def test_a_recording_through_autoreset_is_told(minari, tmp_path, capsys):
+    pytest.importorskip("jax")
+    collector = minari.DataCollector(gymnasium.wrappers.Autoreset(Screen(steps=3)))
+    collector.reset(seed=0)
+    for _ in range(7):
+        collector.step(collector.action_space.sample())
+    collector.create_dataset("test/auto-v0")
+    import_set("minari", "test/auto-v0", tmp_path / "set")
+    assert "every episode begins with the last picture of the one before" in capsys.readouterr().err
+
+
+def test_the_environment_tells_the_task(minari, tmp_path, capsys):
+    env = Screen()
+    env.spec = gymnasium.spec("vd4rl_pomdp/WalkerWalk-Patch16-v0")
+    record(minari, env)
+    import_set("minari", "test/screen-v0", tmp_path / "set")
+    assert "recorded under the corruption patch" in capsys.readouterr().err
+    assert open_dataset(tmp_path / "set", tmp_path / "cache").task == "walker_walk"
+
+
+def test_a_set_without_a_task_pretrains_and_is_not_evaluated(tmp_path, own_cache):
+    folder = import_set("vd4rl", str(write_fake_set(tmp_path / "own", LENGTHS)), tmp_path / "pushing")[0].parent
+    pretrain(smoke_pretrain(folder, tmp_path / "run"))
+    assert "Imported from vd4rl: bytes" in (folder / "card.md").read_text()
+    with pytest.raises(UserError, match="unknown task 'own': choose one of"):
+        finetune(smoke_finetune(tmp_path / "run" / "encoder", folder, tmp_path / "policy"))
+
+
+def test_a_grid_takes_an_imported_set_as_it_is(tmp_path):
+    own = write_fake_set(tmp_path / "own", LENGTHS, attributes={"task": "walker_walk"})
+    import_set("vd4rl", str(own), tmp_path / "set")
+    DataSet("set", tmp_path / "set", "collect", {"task": "walker_walk"}).check()
+    with pytest.raises(UserError, match="holds a set of walker_walk, the grid says cheetah_run"):
+        DataSet("set", tmp_path / "set", "collect", {"task": "cheetah_run"}).check()
