@@ -18,11 +18,14 @@ from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_pages import PAGES as EXAMPLES
 from tests.helpers_pages import isolated_registries, load_example
+from vd4rl_pomdp.agents import AgentCard, write_card, write_rounded
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.registry import REGISTRIES
 from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
 from vd4rl_pomdp.corruptions import make_corruption
 from vd4rl_pomdp.envs.mazes import get_maze
+from vd4rl_pomdp.nn import load_encoder
+from vd4rl_pomdp.nn.policy import Policy
 from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.stages import check_cells
 
@@ -44,6 +47,7 @@ NOT_RUN = {
     ),
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
     "vd4rl-pomdp data view": "report/test_browse writes pages",
+    "vd4rl-pomdp agents": "test_agents exports one",
     "vd4rl-pomdp hub": "needs a Hub; test_hub has one of its own",
     **dict.fromkeys(
         ("python tools/card", "tar xf card", "python3 card/run.py"), "fetches packages; tests/tools has a stub"
@@ -59,6 +63,7 @@ NOT_RUN = {
     "vd4rl-pomdp evaluate RUN": "tests/finetune/test_evaluation plays a scripted environment",
     "hf download": "fetches weights; nn/test_pretrained makes some",
     "vd4rl-pomdp finetune --seeds": "tests/finetune/test_stack trains less",
+    "vd4rl-pomdp certify": "trains for hours; tests/studies trains less",
     "vd4rl-pomdp sweep": "trains for minutes; tests/sweeps trains less",
 }
 """How a line begins that is parsed, if it is ours, but not run, and why."""
@@ -195,11 +200,24 @@ PYTHON = [page for page in PAGES if blocks(page, "python")]
 @pytest.mark.parametrize("page", PYTHON, ids=lambda page: page.stem)
 def test_python_blocks_run_one_after_the_other(page, encoder):
     namespace = {"__name__": page.stem}
+    if page.stem == "use_an_encoder":
+        write_agent(Path("runs/mik+a/pretrain"), Path("agents/mik-walker"))
     if page.stem == "reports":
         Path("results").symlink_to(ROOT / "results")  # the repository's rows, in the folder that the fixture entered
     for number, code in enumerate(blocks(page, "python")):
         exec(compile(code, f"{page.name}, block {number}", "exec"), namespace)
     check_results(page.stem, namespace)
+
+
+def write_agent(run: Path, folder: Path) -> None:
+    """What `agents export` writes, of a policy that was never trained."""
+    encoder, card = load_encoder(run / "encoder")
+    Policy(encoder.dim, 6, 8).save(run / "policy")
+    write_rounded(run, folder)
+    told = {"task": card.task, "quality": card.quality, "data": card.data, "corruption": card.corruption}
+    told |= {"method": card.method, "algorithm": "td3_bc", "seed": 0, "budget": {}, "run": "", "length": 20}
+    told |= {"episodes": [], "commit": "", "render": {}, "processor": "", "sha256": {}}
+    write_card(folder, AgentCard(**told))
 
 
 def check_results(page: str, names: dict) -> None:
@@ -208,6 +226,7 @@ def check_results(page: str, names: dict) -> None:
         assert (names["card"].method, names["card"].corruption["corruption"]) == ("mik+a", "patch+zero_frames")
         assert names["windows"].obs.shape == (2, 16, 9, 84, 84)
         assert names["z"].shape == (1, names["encoder"].dim)
+        assert names["agent"].card.method == "mik+a"
         assert names["truncated"]
     elif page == "add_a_task":
         assert names["obs"].shape == (9, 64, 64)

@@ -5,6 +5,7 @@ from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from vd4rl_pomdp.agents import load_agent
     from vd4rl_pomdp.data import open_dataset
 
 # Threads that wait for each other sleep. Else they spin, and where another process is on one of the cores, each of the
@@ -17,7 +18,7 @@ try:
 except PackageNotFoundError:  # a source tree that was never installed
     __version__ = "0+unknown"
 
-__all__ = ["__version__", "open_dataset"]
+__all__ = ["__version__", "load_agent", "open_dataset"]
 
 
 def __getattr__(name: str) -> object:
@@ -25,4 +26,8 @@ def __getattr__(name: str) -> object:
         from vd4rl_pomdp.data import open_dataset
 
         return open_dataset
+    if name == "load_agent":
+        from vd4rl_pomdp.agents import load_agent
+
+        return load_agent
     raise AttributeError(f"module 'vd4rl_pomdp' has no attribute {name!r}")

@@ -196,7 +196,9 @@ def test_minari_says_what_it_cannot_keep(minari, tmp_path, capsys):
     assert "discounts other than" in told
     with pytest.raises(UserError, match="call the folder walker-v0"):
         export_set("minari", tmp_path / "own", tmp_path / "walker")
-    assert not (tmp_path / "walker").exists()
+    assert [name for name in os.listdir(tmp_path) if "walker" in name] == []
+    with pytest.raises(UserError, match="test/none-v0: is neither a folder of Minari's nor a set it has"):
+        import_set("minari", "test/none-v0", tmp_path / "set")
 
 
 def write_ogbench(path, episodes):

@@ -6,10 +6,12 @@ into a hidden folder beside the named one and renamed when it is whole; a cut on
 
 from __future__ import annotations
 
+import re
 import shutil
 import sys
+import zlib
 from collections.abc import Iterable, Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -64,7 +66,9 @@ def import_set(
     refuse_inside(out)
     with _telling(source):
         opened = _resized(FORMATS.named(name).read(source, picture), size)
-    label = task or opened.task or _label(opened, name)
+    own = next((value for value in opened.record.values() if isinstance(value, str)), name)
+    # the name of what nothing tells a task of; of files, too
+    label = re.sub(r"[^\w.-]+", "_", task or opened.task or own).strip("._") or name
     _tell(opened.notes)
     settings: dict[str, Any] = {
         "format": name,
@@ -78,13 +82,10 @@ def import_set(
     attributes = {key: settings[key] for key in ("task", "set") if settings[key]} | {
         "imported": {"format": name, **opened.record}
     }
+    numbers = list(range(opened.episodes))
     shards = [
-        Shard(
-            out / f"{number}_{label}.hdf5",
-            list(range(start, min(start + per_shard, opened.episodes))),
-            attributes,
-        )
-        for number, start in enumerate(range(0, opened.episodes, per_shard))
+        Shard(out / f"{start // per_shard}_{label}.hdf5", numbers[start : start + per_shard], attributes)
+        for start in range(0, opened.episodes, per_shard)
     ]
     episodes = _Reader(source, opened, clip_actions)
     collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
@@ -111,21 +112,26 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
         raise UserError(f"{out}: is not empty; choose another folder to export to")
     opened = _resized(read_shards(str(path)), size)
     hidden = out.with_name(f".{out.name}.export")
-    with disk_errors(out):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with owned(hidden), ProgressLine("export", opened.episodes, "episodes") as progress:
+    progress = ProgressLine("export", opened.episodes, "episodes")
 
-            def read(first: int) -> Iterator[EpisodeArrays]:
-                for rows in opened.read(first):
-                    yield rows
-                    progress.advance(1, ret=float(rows["reward"][1:].sum()))
+    def read(first: int) -> Iterator[EpisodeArrays]:
+        for rows in opened.read(first):
+            yield rows
+            progress.advance(1, ret=float(rows["reward"][1:].sum()))
 
-            shutil.rmtree(hidden / "set", ignore_errors=True)  # of one that was cut
-            lost = form.write(hidden / "set", out, replace(opened, read=read))
-            if out.is_dir():
-                out.rmdir()
-            (hidden / "set").rename(out)
-        shutil.rmtree(hidden, ignore_errors=True)
+    try:
+        with disk_errors(out), owned(hidden), progress:
+            shutil.rmtree(hidden / "set", ignore_errors=True)  # of one that was killed
+            try:
+                lost = form.write(hidden / "set", out, replace(opened, read=read))
+                if out.is_dir():
+                    out.rmdir()
+                (hidden / "set").rename(out)
+            finally:
+                shutil.rmtree(hidden / "set", ignore_errors=True)
+    finally:
+        with suppress(OSError):
+            hidden.rmdir()  # not another process's, which holds its lock
     _tell(lost)
 
 
@@ -136,7 +142,17 @@ def _telling(place: str) -> Iterator[None]:
         yield
     except UserError as error:
         raise type(error)(str(error) if str(error).startswith(place) else f"{place}: {error}") from error
-    except (OSError, ValueError, KeyError, IndexError, RuntimeError, AssertionError, BadZipFile) as error:
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        IndexError,
+        RuntimeError,
+        EOFError,
+        AssertionError,
+        BadZipFile,
+        zlib.error,
+    ) as error:
         raise system_error(Path(place), error) or UserError(
             f"{place}: cannot be read as this format ({in_one_line(error) or type(error).__name__})"
         ) from error
@@ -179,7 +195,9 @@ class _Reader:
         low, high = self._source.action_low, self._source.action_high
         scaled = action.astype(np.float32)
         if low is not None and high is not None and not ((low == -1).all() and (high == 1).all()):
-            scaled = ((action.astype(np.float64) - low) / (high - low) * 2 - 1).astype(np.float32)
+            scaled = ((action.astype(np.float64) - low) / np.where(high > low, high - low, 1) * 2 - 1).astype(
+                np.float32
+            )
             scaled[0] = 0
         most = float(np.abs(scaled).max())
         if most > 1 + _ROUNDING:
@@ -215,12 +233,6 @@ def _resized(source: SourceSet, size: int | None) -> SourceSet:
     stretched = "" if height == width else "; height and width are scaled apart"
     note = f"pictures of {height}x{width} pixels become {size}x{size} (area means{stretched})"
     return replace(source, read=read, frame_shape=(size, size), notes=[*source.notes, note])
-
-
-def _label(source: SourceSet, name: str) -> str:
-    """What stands for the task where nothing tells it: the source's own name, as a file can be called."""
-    told = next((str(value) for value in source.record.values() if isinstance(value, str)), name)
-    return "".join(sign if sign.isalnum() or sign in "_-." else "_" for sign in told).strip("._") or name
 
 
 def _tell(notes: Iterable[str]) -> None:

@@ -38,7 +38,10 @@ def read(source: str, picture: str | None) -> SourceSet:
     """Open a set by its folder or its name."""
     minari, storage = library("minari", "minari"), library("minari.dataset.minari_storage", "minari")
     folder = next((f for f in (Path(source), Path(source, "data")) if (f / "metadata.json").is_file()), None)
-    dataset = minari.MinariDataset(folder) if folder else minari.load_dataset(source)
+    try:
+        dataset = minari.MinariDataset(folder) if folder else minari.load_dataset(source)
+    except FileNotFoundError as error:
+        raise UserError(f"is neither a folder of Minari's nor a set it has: `minari download {source}`?") from error
     actions = dataset.action_space
     discrete = isinstance(actions, gymnasium.spaces.Discrete)
     if not discrete and not isinstance(actions, gymnasium.spaces.Box):
