@@ -63,6 +63,7 @@ NOT_RUN = {
     "vd4rl-pomdp evaluate RUN": "tests/finetune/test_evaluation plays a scripted environment",
     "hf download": "fetches weights; nn/test_pretrained makes some",
     "vd4rl-pomdp finetune --seeds": "tests/finetune/test_stack trains less",
+    "vd4rl-pomdp certify": "trains for hours; tests/studies trains less",
     "vd4rl-pomdp sweep": "trains for minutes; tests/sweeps trains less",
 }
 """How a line begins that is parsed, if it is ours, but not run, and why."""

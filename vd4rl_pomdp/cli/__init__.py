@@ -35,6 +35,7 @@ COMMANDS = {
     "pretrain": ("stages.pretrain", "train an encoder"),
     "finetune": ("stages.finetune", "train a policy on a frozen encoder, by TD3+BC or another algorithm"),
     "evaluate": ("stages.evaluate", "evaluate a fine-tuned run again"),
+    "certify": ("studies.certify", "whether a set under a corruption needs a memory of what was seen"),
     "navigation collect": ("studies.navigation_collect", "a maze's data, with true states"),
     "navigation train": ("studies.navigation_train", "an objective on a maze, beside a state probe"),
     "navigation policy": ("studies.navigation_policy", "train the first-person policy (PPO) that ships"),

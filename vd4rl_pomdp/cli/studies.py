@@ -169,6 +169,47 @@ def bench(json: bool = False, quick: bool = False, gpu: bool = False, device: st
         print_table(results, GOALS, "speed and memory, ratios within one run")
 
 
+@command
+def certify(
+    data: tyro.conf.Positional[Path],
+    corruption: tyro.conf.Positional[str],
+    out: Path,
+    returns: bool = False,
+    change: tuple[str, ...] = (),
+    jobs: int = 0,
+) -> None:
+    """Train supervised encoders with and without a memory, and tell whether a set needs one. Re-run to resume.
+
+    Args:
+        data: Folder of a set with simulator states; the certificate is kept there, too.
+        corruption: What makes the observations partial.
+        out: Folder of the runs.
+        returns: Also train and evaluate policies, beside what linear probes find.
+        change: Settings of the trainings: seed=0,1,2,3,4 preset=cpu pretrain.patch_size=24 finetune.updates=60000.
+        jobs: Commands at a time; 0: as many as the GPUs take, or one without a GPU.
+    """
+    from vd4rl_pomdp.cli.sweeps import carry_out
+    from vd4rl_pomdp.core.errors import refuse_no_folder
+    from vd4rl_pomdp.runs.certificates import CERTIFICATES, in_words
+    from vd4rl_pomdp.runs.outputs import refuse_kept
+    from vd4rl_pomdp.studies.certify import GRID, certify, planned
+    from vd4rl_pomdp.sweeps.folder import SweepFolder
+    from vd4rl_pomdp.sweeps.options import LocalOptions
+    from vd4rl_pomdp.sweeps.own_file import own_program, refuse_unknown_to_jobs
+
+    refuse_no_folder(out)
+    refuse_kept(out)
+    options = LocalOptions(jobs=jobs)
+    options.check()
+    dataset, cells, trainings = planned(data, corruption, out, returns, change)
+    for training in trainings:
+        refuse_unknown_to_jobs(training.settings)
+    folder = SweepFolder(out)
+    carry_out([folder.keep_plan(GRID, trainings, own_program())], folder, "local", options)
+    print(f"{corruption}: {in_words(certify(dataset, cells, out, returns))}")
+    print(f"certificate: {out / CERTIFICATES}")
+
+
 def navigation_collect(words: list[str], program: str) -> None:
     """Collect a maze's data."""
     from vd4rl_pomdp.studies.navigation.collect import PRESETS, MazeCollectConfig, collect

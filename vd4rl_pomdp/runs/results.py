@@ -23,6 +23,7 @@ from vd4rl_pomdp.core.options import LABELS, settings_of
 from vd4rl_pomdp.core.reading import fits, parse_json, read_bytes
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.runs import CONFIG_FILE, CRITIC_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
+from vd4rl_pomdp.runs.certificates import certificate_id, keep_certificates, read_certificates
 from vd4rl_pomdp.runs.critic import TOLD, VALUE
 from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json, replacing_file, write_csv
@@ -103,6 +104,11 @@ class Result:
     def labels(self) -> dict[str, Any]:
         """Values of LABELS; the task is empty until the run has opened its data."""
         return {name: self.files["labels"][name] for name in LABELS}
+
+    @property
+    def certificate(self) -> str:
+        """Id of the certificate that would speak of its set and corruption."""
+        return certificate_id(self.record.get("inputs", {}).get("data", ""), self.encoder.get("corruption") or {})
 
     @property
     def measured(self) -> list[Row]:
@@ -367,9 +373,23 @@ def add_results(paths: Sequence[Path | str], out: Path | str) -> Added:
         fresh = {run.id: run for run in settled if run.id not in there or run.ending > there[run.id].ending}
         if fresh:
             write_results(out, (there | fresh).values())
+        keep_certificates(out, certificates_of(found, map(Path, paths), out))
     again = [run for run in settled if run.id not in fresh]
     known = sum(run.measured == there[run.id].measured for run in again)
     return Added(len(fresh), known, len(again) - known, len(found) - len(settled))
+
+
+def certificates_of(runs: Sequence[Result], places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
+    """The certificates that speak of some runs, by id.
+
+    Args:
+        runs: of those whose own folders are named, the set's folder is looked into, too, where it is there.
+        places: folders at or below which they are looked for.
+        but: a folder whose own file is not read.
+    """
+    sets = {Path(run.record["config"].get("data") or "-") for run in runs if run.folder}
+    known = read_certificates([*places, *(one for one in sorted(sets) if one.is_dir())], but)
+    return {name: known[name] for name in dict.fromkeys(run.certificate for run in runs) if name in known}
 
 
 def _kept(out: Path) -> dict[str, Result]:
