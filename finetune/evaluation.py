@@ -10,67 +10,30 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-import torch
 
+from vd4rl_pomdp.agents import Agent
 from vd4rl_pomdp.core.errors import UserError, refuse_number
 from vd4rl_pomdp.core.options import LABELS, flat
 from vd4rl_pomdp.core.registry import warn_of_other_code
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, MOST_EPISODES, TASKS, Task
 from vd4rl_pomdp.corruptions import CorruptionConfig, check_corruption_fits
+from vd4rl_pomdp.data.parity import render_info
 from vd4rl_pomdp.data.reference import Reference, action_error
 from vd4rl_pomdp.envs.corrupted import CorruptedEnv, Drawn, Observation
-from vd4rl_pomdp.envs.make import layout_of
-from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import load_encoder, read_record
-from vd4rl_pomdp.nn.frame import StateFrame
-from vd4rl_pomdp.nn.policy import Policy, load_policy, policy_step
+from vd4rl_pomdp.nn.policy import load_policy, policy_step
 from vd4rl_pomdp.policies.actor import read_actor
 from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.episodes import read_episodes
-from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.files import Row, read_json
+from vd4rl_pomdp.runs.provenance import machine
+from vd4rl_pomdp.runs.results import Result, read_run
 from vd4rl_pomdp.runs.workers import run_jobs
 
 EVALUATION_SEED = 20_000
 """Evaluation episode i starts from environment seed EVALUATION_SEED + i, for every method and training seed."""
 FILM_EVERY = 4
 """Rows between two pictures of a film."""
-
-
-class Agent:
-    """Encoder and policy, fed one row at a time; its own past actions are part of the history."""
-
-    def __init__(self, encoder: Encoder, policy: Policy) -> None:
-        self.encoder, self.policy = encoder, policy
-        self.reset()
-
-    def reset(self) -> None:
-        """Forget everything: an episode begins."""
-        self._state = self.encoder.initial_state(1)
-        self._action = torch.zeros(1, self.encoder.config.action_dim)  # what first rows carry in training
-
-    @property
-    def picture_size(self) -> int:
-        """Height and width of the pictures it is shown; one that reads states is watched in the benchmark's."""
-        return FRAME_SIZE if self.encoder.reads_state else self.encoder.config.size
-
-    def encoder_input(self, now: Observation, task: Task) -> torch.Tensor:
-        """What the encoder reads: the corrupted stack, or the simulator state for the `state` reference."""
-        if not isinstance(self.encoder.frame, StateFrame):
-            return now.obs
-        state = torch.from_numpy(layout_of(task).visible_state(now.time_step.physics))
-        return self.encoder.frame.observe(state[None], now.key)[0]
-
-    @torch.no_grad()
-    def act(self, obs: torch.Tensor) -> np.ndarray:
-        """Mean action (A,) float32 for a (C, S, S) uint8 observation."""
-        # one row at a time is all that an environment gives; training read the same states from whole windows
-        z, self._state = self.encoder.step(obs[None], self._action, self._state)
-        self._action = self.policy(z)
-        return self._action[0].numpy()
-
-    def set_last_action(self, action: np.ndarray) -> None:
-        """Tell that another (A,) action than the last answer was executed."""
-        self._action = torch.from_numpy(action)[None]
 
 
 @dataclass(frozen=True)
@@ -315,3 +278,37 @@ def evaluate_run(
     jobs = jobs_of(run, TASKS.named(card.task), under, episodes, length, evaluated_under=told)
     played = evaluate(jobs, workers)
     return episode_rows(played, labels), played
+
+
+REPLAYED = ("return", "length", "score", "action_error")
+"""Columns of `episodes.csv` that a replay gives again."""
+
+
+def replay(run: Path, results: Iterable[Result]) -> tuple[Row, Row, str]:
+    """Play the first episode of a run's last evaluation again.
+
+    Args:
+        run: the run's folder, with encoder and policy.
+        results: among which its row is looked for, by its id.
+
+    Returns:
+        The row that tells of the episode, what it gives here, and what drew and computed both, in words.
+
+    Raises:
+        UserError: as `evaluate_run`, or none of the results tells of this run, or of its policy's last evaluation.
+    """
+    own, step = read_run(run), policy_step(run / "policy")
+    told = next((result for result in results if result.id == own.id), None)
+    if told is None:
+        raise UserError(f"{run}: is the run {own.id}, which has no row there; name the folder of one that has")
+    of_policy = [row for row in told.rows if row["step"] == step and row["evaluated_under"] == row["corruption"]]
+    recorded = next((row for row in of_policy if row["episode"] == 0), None)
+    if recorded is None:
+        raise UserError(f"{run}: its policy is of update {step}, of which run {own.id} has no first episode there")
+    (replayed,), _ = evaluate_run(run, recorded["corruption"], 1, 1)
+    made = told.files.get("render", {}), told.parts[-1].get("processor")
+    row, here = (
+        f"mujoco {render.get('mujoco')}, {render.get('gl_renderer')}, {processor}"
+        for render, processor in (made, (render_info(recorded["task"]), machine("cpu")["processor"]))
+    )
+    return recorded, replayed, f"the row was made with {row}, this is {here}"

@@ -147,6 +147,8 @@ def _task_of(dataset: Dataset, config: PretrainConfig) -> str:
         raise UserError(f"{config.data}: cannot tell the task of this set; pass --task")
     if dataset.task is not None and name != dataset.task:
         raise UserError(f"{config.data}: is a set of {dataset.task}, not of {name}; leave --task out")
+    if dataset.imported and name not in TASKS:
+        return name  # an encoder needs no environment; what evaluates refuses the name
     if (width := layout_of(TASKS.named(name)).action_dim) != dataset.action_dim:
         raise UserError(
             f"{config.data}: has {dataset.action_dim} action dimensions, {name} has {width}; pass the right --task"

@@ -18,6 +18,8 @@ READERS = [
     (["report", "runs", *OUT], "runs/pretrained/*.*"),
     (["report", "compare", "runs", "results", *OUT], "results/*"),
     (["results", "add", "runs", "--out", "results"], "results/*"),
+    (["results", "verify", "results"], "results/*"),
+    (["results", "verify", "results", "--replay", RUN], f"{RUN}/**/*.*"),
     (["evaluate", RUN, "--episodes", "1", "--workers", "1"], f"{RUN}/**/*.*"),
     (["finetune", "--encoder", ENCODER, "--data", SET, *OUT, *FINETUNE], f"{ENCODER}/*"),
     (["pretrain", "--data", SET, "--out", "cut/pretrained", *PRETRAIN], "cut/pretrained/**/*.*"),

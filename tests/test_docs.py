@@ -18,11 +18,15 @@ from pretrain.train import pretrain as run_pretrain
 from tests.helpers_data import write_fake_set
 from tests.helpers_pages import PAGES as EXAMPLES
 from tests.helpers_pages import isolated_registries, load_example
+from vd4rl_pomdp.agents import checksums, write_rounded
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.registry import REGISTRIES
 from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
 from vd4rl_pomdp.corruptions import make_corruption
 from vd4rl_pomdp.envs.mazes import get_maze
+from vd4rl_pomdp.nn import load_encoder
+from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.runs.files import write_json
 from vd4rl_pomdp.sweeps.grid import load_grid
 from vd4rl_pomdp.sweeps.stages import check_cells
 
@@ -39,8 +43,12 @@ NOT_RUN = {
     "nvidia-cuda-mps-control": "needs a GPU; results/gpu was measured with it",
     **{f"python {file}": "test_own_parts and test_own_task run them" for file in EXAMPLES},
     "vd4rl-pomdp data collect": "renders whole episodes; data/test_collect runs shorter ones",
+    **dict.fromkeys(
+        ("vd4rl-pomdp data import", "vd4rl-pomdp data export"), "need sets of others; data/test_formats makes some"
+    ),
     "vd4rl-pomdp data download": "fetches files; data/test_download has a server of its own",
     "vd4rl-pomdp data view": "report/test_browse writes pages",
+    "vd4rl-pomdp agents": "test_agents exports one",
     "vd4rl-pomdp hub": "needs a Hub; test_hub has one of its own",
     **dict.fromkeys(
         ("python tools/card", "tar xf card", "python3 card/run.py"), "fetches packages; tests/tools has a stub"
@@ -50,12 +58,13 @@ NOT_RUN = {
     "vd4rl-pomdp data parity": "needs a downloaded set; envs/test_rendering compares rendered ones",
     "vd4rl-pomdp navigation": "trains for minutes to days; vd4rl_pomdp/studies/navigation/test_train trains less",
     "vd4rl-pomdp report": "the README's is run; tests/report makes all others",
-    "vd4rl-pomdp results add": "tests/runs/results adds runs",
+    "vd4rl-pomdp results": "tests/runs/results adds and verifies runs",
     "vd4rl-pomdp pretrain --method": "pretrain/test_train runs every method in its smoke size",
     "vd4rl-pomdp finetune --encoder RUN": "as above",
     "vd4rl-pomdp evaluate RUN": "tests/finetune/test_evaluation plays a scripted environment",
     "hf download": "fetches weights; nn/test_pretrained makes some",
     "vd4rl-pomdp finetune --seeds": "tests/finetune/test_stack trains less",
+    "vd4rl-pomdp certify": "trains for hours; tests/studies trains less",
     "vd4rl-pomdp sweep": "trains for minutes; tests/sweeps trains less",
 }
 """How a line begins that is parsed, if it is ours, but not run, and why."""
@@ -192,11 +201,22 @@ PYTHON = [page for page in PAGES if blocks(page, "python")]
 @pytest.mark.parametrize("page", PYTHON, ids=lambda page: page.stem)
 def test_python_blocks_run_one_after_the_other(page, encoder):
     namespace = {"__name__": page.stem}
+    if page.stem == "use_an_encoder":
+        write_agent(Path("runs/mik+a/pretrain"), Path("agents/mik-walker"))
     if page.stem == "reports":
         Path("results").symlink_to(ROOT / "results")  # the repository's rows, in the folder that the fixture entered
     for number, code in enumerate(blocks(page, "python")):
         exec(compile(code, f"{page.name}, block {number}", "exec"), namespace)
     check_results(page.stem, namespace)
+
+
+def write_agent(run: Path, folder: Path) -> None:
+    """What `agents export` writes, of a policy that was never trained."""
+    encoder, card = load_encoder(run / "encoder")
+    Policy(encoder.dim, 6, 8).save(run / "policy")
+    write_rounded(run, folder)
+    told = {"task": card.task, "method": card.method, "corruption": card.corruption, "sha256": checksums(folder)}
+    write_json(folder / "card.json", told)
 
 
 def check_results(page: str, names: dict) -> None:
@@ -205,6 +225,7 @@ def check_results(page: str, names: dict) -> None:
         assert (names["card"].method, names["card"].corruption["corruption"]) == ("mik+a", "patch+zero_frames")
         assert names["windows"].obs.shape == (2, 16, 9, 84, 84)
         assert names["z"].shape == (1, names["encoder"].dim)
+        assert names["agent"].card["method"] == "mik+a"
         assert names["truncated"]
     elif page == "add_a_task":
         assert names["obs"].shape == (9, 64, 64)

@@ -13,6 +13,7 @@ import pytest
 
 import finetune.algorithms  # noqa: F401 (registers its kind of part)
 import pretrain.objectives  # noqa: F401
+import vd4rl_pomdp.data.formats
 import vd4rl_pomdp.envs
 import vd4rl_pomdp.nn.frame  # noqa: F401 (registers its kind of part)
 from finetune.config import FinetuneConfig

@@ -94,7 +94,12 @@ def test_nothing_is_read_by_pickle_or_eval():
 
 def _names_no_encoding(call: ast.Call) -> bool:
     name = getattr(call.func, "attr", getattr(call.func, "id", ""))
-    if name not in ("open", "read_text", "write_text") or ast.unparse(call.func) in ("Image.open", "os.open"):
+    if name not in ("open", "read_text", "write_text") or ast.unparse(call.func) in (
+        "Image.open",
+        "archive.open",
+        "os.open",
+        "av.open",
+    ):
         return False
     words = [node.value for a in call.args for node in ast.walk(a) if isinstance(node, ast.Constant)]
     binary = any(isinstance(word, str) and "b" in word and set(word) <= set("abrwx+") for word in words)

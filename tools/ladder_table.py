@@ -321,6 +321,9 @@ def _draw_losses(axes: Axes, cell: Cell, look: Look) -> None:
         (cell.held_out, {}), (cell.trained_on, {"alpha": 0.5} | unmarked), (cell.batches, {"alpha": 0.25} | unmarked)
     ):  # fmt: skip
         axes.plot(np.array(sorted(losses)) / 1000, [losses[rung] for rung in sorted(losses)], **(look | faint))
+    if not axes.texts:
+        key = "dots: held-out episodes\nfainter: episodes of the set\nfaintest: batches of training"
+        axes.text(0.03, 0.05, key, transform=axes.transAxes, fontsize="small", color="0.3")
 
 
 PANELS = {"return": _draw_returns, "critic": _draw_critic, "cloning loss": _draw_losses}

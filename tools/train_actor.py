@@ -122,6 +122,7 @@ _STEADY = PolicyConfig(
 """What all tasks but walker_walk share."""
 _GENERAL = replace(_STEADY, decisions=600_000, envs=4, temperature=0.1, replay_size=800_000, eval_every=4_000)
 """What a task without a recipe of its own gets: cheetah_run's."""
+_SMALL = replace(_GENERAL, decisions=60_000, hidden=64, replay_size=100_000, eval_every=500, eval_episodes=2)
 RECIPES: dict[str, PolicyConfig] = {
     "walker_walk": PolicyConfig("walker_walk", Path()),
     "cheetah_run": replace(_GENERAL, task="cheetah_run"),
@@ -134,6 +135,8 @@ RECIPES: dict[str, PolicyConfig] = {
         temperature=0.01,
         eval_every=24_000,
     ),
+    "reacher_jump": replace(_SMALL, task="reacher_jump"),
+    "point_mass_cue": replace(_SMALL, task="point_mass_cue"),
 }
 """Defaults by task. Plain SAC is enough for walker_walk. The others get standardised observations, layer norms in the
 critics and three-step returns; humanoid_walk also more fresh decisions for each update: physics is far cheaper than

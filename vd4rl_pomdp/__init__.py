@@ -1,10 +1,12 @@
 """Which representations survive partial observability in offline visual reinforcement learning."""
 
 import os
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
 
+from vd4rl_pomdp.core.version import __version__
+
 if TYPE_CHECKING:
+    from vd4rl_pomdp.agents import load_agent
     from vd4rl_pomdp.data import open_dataset
 
 # Threads that wait for each other sleep. Else they spin, and where another process is on one of the cores, each of the
@@ -12,12 +14,7 @@ if TYPE_CHECKING:
 # reads this when torch loads it, so it comes before torch; what the user has set stays.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
 
-try:
-    __version__ = version("vd4rl-pomdp")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0+unknown"
-
-__all__ = ["__version__", "open_dataset"]
+__all__ = ["__version__", "load_agent", "open_dataset"]
 
 
 def __getattr__(name: str) -> object:
@@ -25,4 +22,8 @@ def __getattr__(name: str) -> object:
         from vd4rl_pomdp.data import open_dataset
 
         return open_dataset
+    if name == "load_agent":
+        from vd4rl_pomdp.agents import load_agent
+
+        return load_agent
     raise AttributeError(f"module 'vd4rl_pomdp' has no attribute {name!r}")

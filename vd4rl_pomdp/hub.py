@@ -1,12 +1,14 @@
-"""Encoders and data sets on the Hugging Face Hub, by huggingface_hub's own transfers.
+"""Encoders, agents and data sets on the Hugging Face Hub, by huggingface_hub's own transfers.
 
 A repository that `push` wrote holds a listing beside the files: their kind, their licence, and the SHA-256 of each, by
-which `pull` judges what it was sent. Encoders are model repositories, OWNER/NAME; data sets are datasets/OWNER/NAME, as
-in the Hub's own addresses. Endpoint and token are those of huggingface_hub: HF_ENDPOINT, HF_TOKEN, `hf auth login`.
+which `pull` judges what it was sent. Encoders and agents are model repositories, OWNER/NAME; data sets are
+datasets/OWNER/NAME, as in the Hub's own addresses. Endpoint and token are those of huggingface_hub: HF_ENDPOINT,
+HF_TOKEN, `hf auth login`.
 """
 
 from __future__ import annotations
 
+import json
 import os
 import shutil
 import sys
@@ -20,7 +22,7 @@ from huggingface_hub import HfApi
 from huggingface_hub.errors import HfHubHTTPError, HTTPError, LocalEntryNotFoundError, OfflineModeIsEnabled
 from huggingface_hub.utils import disable_progress_bars
 
-from vd4rl_pomdp import __version__
+from vd4rl_pomdp import __version__, agents
 from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line
 from vd4rl_pomdp.core.reading import read_bytes
 from vd4rl_pomdp.core.text import code, code_block, one_line
@@ -42,18 +44,20 @@ from vd4rl_pomdp.runs.outputs import kept_in, refuse_inside
 
 LISTING = "vd4rl_pomdp.json"
 """Name of the listing beside the files."""
-ENCODER, SET = "an encoder", "a data set"
+ENCODER, AGENT, SET = "an encoder", "an agent", "a data set"
 """What a repository holds, in the words of `runs.outputs.kept_in`."""
 _FORMAT = 1
-_PATTERNS = {ENCODER: [CONFIG, WEIGHTS], SET: ["*.hdf5", "*.HDF5", "*.h5", "*.H5", "*.json", "*.md", "*.png"]}
+_FILES = {ENCODER: (CONFIG, WEIGHTS), AGENT: (*agents.FILES, agents.CARD)}
+_MODEL = [name for names in _FILES.values() for name in names]
+_PATTERNS = {ENCODER: _MODEL, AGENT: _MODEL, SET: ["*.hdf5", "*.HDF5", "*.h5", "*.H5", "*.json", "*.md", "*.png"]}
 """Files of each kind: a push replaces all of them, and leaves whatever else its owner keeps there."""
 
 
 def push(folder: Path, repository: str, private: bool = False, revision: str = "main", license: str = LICENSE) -> str:
-    """Write an encoder or a data set as one commit; returns its address.
+    """Write an encoder, an agent or a data set as one commit; returns its address.
 
     Args:
-        folder: an encoder's or a set's folder, which is checked first.
+        folder: an encoder's, an agent's or a set's folder, which is checked first.
         repository: OWNER/NAME or datasets/OWNER/NAME, made if there is none; one of something else is refused.
         private: make it private.
         revision: branch to write to, made if there is none.
@@ -64,14 +68,19 @@ def push(folder: Path, repository: str, private: bool = False, revision: str = "
     """
     name, kind = _repository(repository)
     held = kept_in(folder) or (SET if shard_files(folder) else None)  # a damaged shard is told what is wrong with it
+    kind = AGENT if (kind, held) == (ENCODER, AGENT) else kind
     if held != kind:
         raise UserError(
             f"{folder}: holds {held or 'nothing of the kind'}, not {kind}, which {repository} is the name for; name "
-            "RUN/encoder and OWNER/NAME, or a folder of shards and datasets/OWNER/NAME"
+            "RUN/encoder or an exported agent and OWNER/NAME, or a folder of shards and datasets/OWNER/NAME"
         )
     files = _checked(folder, kind)
-    card = model_card(read_record(folder), name, license) if kind == ENCODER else _set_card(folder, name, license)
-    listing = {"format": _FORMAT, "kind": kind, "sha256": {f.name: sha256(f) for f in files}, "license": license}
+    if kind == ENCODER:
+        card = model_card(read_record(folder), name, license)
+    else:
+        card = (_set_card if kind == SET else _agent_card)(folder, name, license)
+    names = {file: file.relative_to(folder).as_posix() for file in files}
+    listing = {"format": _FORMAT, "kind": kind, "sha256": {n: sha256(f) for f, n in names.items()}, "license": license}
     with _hub(repository) as (api, where), tempfile.TemporaryDirectory() as staged:
         api.create_repo(**where, private=private or None, exist_ok=True)
         there = set(api.list_repo_files(**where)) - {".gitattributes", CARD}
@@ -79,9 +88,10 @@ def push(folder: Path, repository: str, private: bool = False, revision: str = "
             raise UserError(f"{repository}: holds files that were not pushed by vd4rl-pomdp; choose another name")
         if revision != "main":
             api.create_branch(**where, branch=revision, exist_ok=True)
-        for file in files:
+        for file, place in names.items():
+            (Path(staged) / place).parent.mkdir(exist_ok=True)
             # A link: a set may be larger than what is free for temporary files.
-            (Path(staged) / file.name).symlink_to(file.resolve())
+            (Path(staged) / place).symlink_to(file.resolve())
         write_bytes(Path(staged) / CARD, card.encode())
         write_json(Path(staged) / LISTING, listing)
         message = f"{kind.split()[-1].capitalize()} of vd4rl-pomdp {__version__}"
@@ -92,7 +102,7 @@ def push(folder: Path, repository: str, private: bool = False, revision: str = "
 
 
 def pull(repository: str, folder: Path, revision: str = "main") -> bool:
-    """Fetch an encoder or a data set; returns whether anything was fetched: what is there and right is left as it is.
+    """Fetch an encoder, an agent or a data set; returns whether anything was: what is there and right is left as it is.
 
     A pull that was cut is resumed; `folder` appears when all of it is there and right.
 
@@ -110,7 +120,7 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
     staged = folder.with_name(f".{folder.name}.pull")
     with _hub(repository) as (api, where), tempfile.TemporaryDirectory() as scratch:
         told = api.hf_hub_download(**where, filename=LISTING, revision=revision, local_dir=scratch)
-        listing, license = _read_listing(Path(told), kind, repository)
+        listing, license, kind = _read_listing(Path(told), kind, repository)
         if folder.is_symlink() or (folder.exists() and (not folder.is_dir() or any(folder.iterdir()))):
             others = {shard.name for shard in shard_files(folder)} - listing.keys()  # would make it another set
             if folder.is_dir() and not others and not _wrong(folder, listing):
@@ -124,8 +134,9 @@ def pull(repository: str, folder: Path, revision: str = "main") -> bool:
             raise UserError(
                 f"{repository}: {wrong[0]} has a wrong SHA-256 and was removed; pull again, or ask its owner"
             )
+        kept = {name.partition("/")[0] for name in listing}
         for path in list(staged.iterdir()):
-            if path.name not in listing:  # of huggingface_hub, or of a cut pull of another repository
+            if path.name not in kept:  # of huggingface_hub, or of a cut pull of another repository
                 shutil.rmtree(path) if path.is_dir() else path.unlink()
         _checked(staged, kind)
         if kind == ENCODER:
@@ -164,17 +175,18 @@ def _hub(repository: str) -> Iterator[tuple[HfApi, dict[str, Any]]]:
         ) from error
 
 
-def _read_listing(path: Path, kind: str, repository: str) -> tuple[dict[str, str], str]:
-    """SHA-256 by name of the files that a repository lists, and its licence; UserError if the listing is damaged."""
+def _read_listing(path: Path, kind: str, repository: str) -> tuple[dict[str, str], str, str]:
+    """SHA-256 by name of what a repository lists, its licence and its kind; UserError if the listing is damaged."""
     listing = read_json(path)
     files = listing.get("sha256")
     files = files if isinstance(files, dict) else {}
     names = set(files)
-    fits = names == {CONFIG, WEIGHTS} if kind == ENCODER else any(map(is_shard_name, names))
+    kind = AGENT if (kind, listing.get("kind")) == (ENCODER, AGENT) else kind
     plain = all(Path(name).name == name and not name.startswith(".") and name != CARD for name in names)
-    if (listing.get("format"), listing.get("kind")) != (_FORMAT, kind) or not (fits and plain):
+    fits = names == set(_FILES[kind]) if kind in _FILES else plain and any(map(is_shard_name, names))
+    if (listing.get("format"), listing.get("kind")) != (_FORMAT, kind) or not fits:
         raise UserError(f"{repository}: its {LISTING} is of another version or damaged; ask its owner")
-    return files, str(listing.get("license", ""))
+    return files, str(listing.get("license", "")), kind
 
 
 def _wrong(folder: Path, listing: dict[str, str]) -> list[str]:
@@ -184,14 +196,34 @@ def _wrong(folder: Path, listing: dict[str, str]) -> list[str]:
 
 def _checked(folder: Path, kind: str) -> list[Path]:
     """Files of a kind in a folder; UserError if the encoder does not load, or the set's rows are not whole."""
-    if kind == ENCODER:
-        load_encoder(folder)
-        return [folder / CONFIG, folder / WEIGHTS]
+    if kind in _FILES:
+        (load_encoder if kind == ENCODER else agents.load_agent)(folder)
+        return [folder / name for name in _FILES[kind]]
     shards = shard_paths(folder)
     read_frame_size(shards)
     join_shards(folder, shards, [read_rows(shard) for shard in shards])
     kept = [p for p in folder.iterdir() if p.suffix in (".json", ".md", ".png") and not p.name.startswith(".")]
     return sorted([*shards, *(path for path in kept if path.name not in (CARD, LISTING))])
+
+
+def _agent_card(folder: Path, repository: str, license: str) -> str:
+    """README.md of an agent: its card, and how to load it."""
+    card = read_json(folder / agents.CARD)
+    names = [str(card.get(name)) for name in ("method", "algorithm", "task")]
+    values = {
+        "license": license,
+        "library_name": "vd4rl-pomdp",
+        "pipeline_tag": TAGS[0],
+        "tags": [*TAGS, *map(one_line, names)],
+    }
+    title = "# {} and {} on {}".format(*map(code, names))
+    what = "Encoder and policy, trained offline by `vd4rl-pomdp`; weights in half precision."
+    get = code_block([f"vd4rl-pomdp hub pull {repository} FOLDER"], "bash")
+    use = ["from vd4rl_pomdp import load_agent", "", 'agent = load_agent("FOLDER")  # agent.reset(), agent.act(obs)']
+    told = code_block(json.dumps(card, indent=2).splitlines(), "json")
+    return "\n".join(
+        [*front_matter(values), "", title, "", what, "", *get, "", *code_block(use, "python"), "", *told, ""]
+    )
 
 
 def _set_card(folder: Path, repository: str, license: str) -> str:

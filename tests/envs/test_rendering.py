@@ -13,7 +13,6 @@ from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.envs import rendering
 from vd4rl_pomdp.envs.make import make_env
 from vd4rl_pomdp.envs.maze import MazeEnv
-from vd4rl_pomdp.envs.rendering import suite
 
 
 def test_a_mujoco_that_was_not_tried_is_refused_with_what_to_install():
@@ -99,7 +98,7 @@ def test_a_process_that_has_drawn_ends_without_a_word():
 def test_pictures_do_not_depend_on_the_size_of_the_buffer_they_are_drawn_in(task):
     env = make_env(TASKS[task], "exact")
     frame = env.reset(1).frame
-    other = suite.load(TASKS[task].domain, TASKS[task].task).physics
+    other = make_env(TASKS[task], size=None).physics
     rendering.prepare(other, "exact", 480)
     start = env.physics.get_state()
     with other.reset_context():

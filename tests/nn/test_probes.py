@@ -49,7 +49,7 @@ def test_pose_and_velocity_are_apart(random):
     assert found["probe_pose"] > 70
 
 
-@pytest.mark.parametrize("name", TASKS)
+@pytest.mark.parametrize("name", ["walker_walk", "cheetah_run", "humanoid_walk"])
 def test_tasks_name_the_columns_of_their_simulators(name: str):
     task = TASKS[name]
     physics = suite.load(task.domain, task.task).physics

@@ -274,8 +274,6 @@ def test_the_pages_grid_is_one(file):
     cells = load_grid(file(block)).cells()
     assert len(cells) == 3 * 2 * 2 * 2 + 3 * 2 * 2
     check_cells([*cells, *load_grid(file(block), testing=True).cells()], "the page's")
-    table = {name for line in PAGE.read_text().splitlines() if line.startswith("| `") for name in line.split("`")[1::2]}
-    assert set(names()) <= table
 
 
 SET = '[collect]\ntask = "walker_walk"\nquality = "expert"\n[pretrain]\n'

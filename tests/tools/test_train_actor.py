@@ -22,6 +22,10 @@ AT_LEAST = {
     "cheetah_run_medium": 400,
     "humanoid_walk_expert": 700,
     "humanoid_walk_medium": 350,
+    "reacher_jump_expert": 800,
+    "reacher_jump_medium": 400,
+    "point_mass_cue_expert": 850,
+    "point_mass_cue_medium": 500,
 }
 PLAYED = 8
 """Episodes of a card that are played again."""

@@ -71,7 +71,7 @@ def import_set(
         format: The format's name, as `vd4rl-pomdp list` shows them.
         source: Path or name of the set.
         out: Folder of the new set.
-        task: The task's name, where the source does not tell it; one that no task has trains encoders and nothing else.
+        task: Its task, where the source does not tell; without one of that name here the set trains encoders alone.
         quality: What to call the behaviour that made the data.
         size: Height and width to which pictures are resized, by area; default: their own.
         picture: Which observation holds the pictures, where there are several.

@@ -92,6 +92,30 @@ def add(runs: tyro.conf.Positional[list[Path]], out: Path) -> None:
 
 
 @command
+def verify(folder: tyro.conf.Positional[Path], replay: Path | None = None) -> None:
+    """Check the rows of a results folder against their own records, and replay an episode of one of its runs.
+
+    Args:
+        folder: The results folder.
+        replay: A run's folder, with encoder and policy: the first episode of its last evaluation is played again.
+    """
+    from finetune.evaluation import REPLAYED
+    from finetune.evaluation import replay as play_again
+    from vd4rl_pomdp.runs.results import verify_results
+
+    runs, wrong = verify_results(folder)
+    print("\n".join([*wrong, f"{len(runs)} runs, {len(wrong)} contradictions between rows and records"]))
+    if replay is not None:
+        row, now, where = play_again(replay, runs)
+        print(f"episode 0 under {row['evaluated_under']} replays to a return of {now['return']}")
+        if differ := [f"{name} {now[name]} where it says {row[name]}" for name in REPLAYED if now[name] != row[name]]:
+            same = "digits are the same only where these are"
+            raise UserError(f"{replay}: replays to {', '.join(differ)}; {where}: {same}")
+    if wrong:
+        raise UserError(f"{folder}: {len(wrong)} contradictions, see above; ask who made the rows")
+
+
+@command
 def theory(json: bool = False, out: Path | None = None) -> None:
     """Compute the paper's claims on finite worlds by enumeration, and list where its text differs.
 
@@ -138,6 +162,47 @@ def bench(json: bool = False, quick: bool = False, gpu: bool = False, device: st
         print_table(results, claims, "one GPU, medians of one run" if claims else "a trial of the code: no claims")
     else:
         print_table(results, GOALS, "speed and memory, ratios within one run")
+
+
+@command
+def certify(
+    data: tyro.conf.Positional[Path],
+    corruption: tyro.conf.Positional[str],
+    out: Path,
+    returns: bool = False,
+    change: tuple[str, ...] = (),
+    jobs: int = 0,
+) -> None:
+    """Train supervised encoders with and without a memory, and tell whether a set needs one. Re-run to resume.
+
+    Args:
+        data: Folder of a set with simulator states; the certificate is kept there, too.
+        corruption: What makes the observations partial.
+        out: Folder of the runs.
+        returns: Also train and evaluate policies, beside what linear probes find.
+        change: Settings of the trainings: seed=0,1,2,3,4 preset=cpu pretrain.patch_size=24 finetune.updates=60000.
+        jobs: Commands at a time; 0: as many as the GPUs take, or one without a GPU.
+    """
+    from vd4rl_pomdp.cli.sweeps import carry_out
+    from vd4rl_pomdp.core.errors import refuse_no_folder
+    from vd4rl_pomdp.runs.certificates import CERTIFICATES, in_words
+    from vd4rl_pomdp.runs.outputs import refuse_kept
+    from vd4rl_pomdp.studies.certify import GRID, certify, planned
+    from vd4rl_pomdp.sweeps.folder import SweepFolder
+    from vd4rl_pomdp.sweeps.options import LocalOptions
+    from vd4rl_pomdp.sweeps.own_file import own_program, refuse_unknown_to_jobs
+
+    refuse_no_folder(out)
+    refuse_kept(out)
+    options = LocalOptions(jobs=jobs)
+    options.check()
+    dataset, cells, trainings = planned(data, corruption, out, returns, change)
+    for training in trainings:
+        refuse_unknown_to_jobs(training.settings)
+    folder = SweepFolder(out)
+    carry_out([folder.keep_plan(GRID, trainings, own_program())], folder, "local", options)
+    print(f"{corruption}: {in_words(certify(dataset, cells, out, returns))}")
+    print(f"certificate: {out / CERTIFICATES}")
 
 
 def navigation_collect(words: list[str], program: str) -> None:

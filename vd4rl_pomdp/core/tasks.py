@@ -57,6 +57,8 @@ class Layout:
     """First of the four positions of every unit quaternion: one of the other sign looks the same."""
     beside: tuple[int, ...] = ()
     """First of the two positions along the ground of other bodies, which are seen from where the travelling one is."""
+    unseen: tuple[int, ...] = ()
+    """Positions of bodies without a shape, which no picture shows: what an episode has still to come."""
 
     def pose(self, physics: np.ndarray) -> np.ndarray:
         """What (..., P) simulator states look like, in coordinates without winding: equal for equal looks.
@@ -69,7 +71,7 @@ class Layout:
             positions[..., first : first + 2] -= positions[..., list(self.travel)]
         rotations = [_two_columns(positions[..., first : first + 4]) for first in self.quaternions]
         replaced = [column for first in self.quaternions for column in range(first, first + 4)]
-        plain = np.delete(positions, [*self.travel, *self.turning, *replaced], axis=-1)
+        plain = np.delete(positions, [*self.travel, *self.turning, *replaced, *self.unseen], axis=-1)
         return np.concatenate([plain, np.sin(turning), np.cos(turning), *rotations], axis=-1)
 
     def velocity(self, physics: np.ndarray) -> np.ndarray:
@@ -116,6 +118,8 @@ class DMCTask(Task):
     """A task of dm_control's suite; its simulator states are stored, and its rewards replay from them."""
 
     domain: str
+    """Of the suite, or the dotted name of a module that is written like one of its: its `SUITE` maps names of tasks to
+    functions of `random` and `time_limit`."""
     task: str
     camera: int = 0
     """Number of the camera that shows it."""
@@ -125,7 +129,8 @@ class DMCTask(Task):
     @property
     def summary(self) -> str:
         """One line that says what it is."""
-        return f"dm_control's {self.domain} {self.task}, camera {self.camera}, {super().summary}"
+        where = self.domain if "." in self.domain else f"dm_control's {self.domain}"
+        return f"{where} {self.task}, camera {self.camera}, {super().summary}"
 
 
 @dataclass(frozen=True)
@@ -179,6 +184,10 @@ TASKS: Registry[Task] = Registry(
         "humanoid_walk": DMCTask(
             "humanoid", "walk", layout=Layout(21, 67, 28, travel=(0, 1), quaternions=(3,)), action_noise=0.3
         ),
+        "reacher_jump": DMCTask(
+            "vd4rl_pomdp.envs.glimpses", "reacher_jump", layout=Layout(2, 7, 7, turning=(0,), unseen=(5, 6))
+        ),
+        "point_mass_cue": DMCTask("vd4rl_pomdp.envs.glimpses", "point_mass_cue", layout=Layout(2, 6, 7, unseen=(5, 6))),
     },
     lambda part: isinstance(part, DMCTask | GymnasiumTask),
     "a vd4rl_pomdp.core.tasks.DMCTask or GymnasiumTask",

@@ -24,6 +24,7 @@ from vd4rl_pomdp.data.folder import (
     task_and_quality,
 )
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size, read_rows, read_some_frames
+from vd4rl_pomdp.runs.certificates import NOT_CERTIFIED, in_words, read_certificates
 from vd4rl_pomdp.runs.files import read_json
 
 FILM_FRAMES = 10
@@ -147,9 +148,13 @@ def _text(
         "return, quartiles": ", ".join(f"{q:.1f}" for q in np.quantile(returns, (0.25, 0.5, 0.75))),
         "published return of plain BC on V-D4RL's set": "none" if published is None else f"{published:.0f}",
     }
+    memory = {f"memory under {one['name']}": in_words(one) for one in read_certificates([path]).values()}
+    rows |= memory or {"memory": NOT_CERTIFIED}
     lines = {name: markdown(str(value)) for name, value in rows.items()} | _origin(path, attributes)
     table = "\n".join(f"| {name} | {value} |" for name, value in lines.items())
     how = HOW.get(names[1] or "", "") if attributes[0] else "A published set, or one that records no origin."
+    if told := dict(attributes[0].get("imported", {})):
+        how = f"Imported from {told.pop('format')}: {markdown(', '.join(f'{k} {v}' for k, v in told.items()))}."
     return (
         f"# {markdown(_title(names))}\n\n{how}\n\n| | |\n|---|---|\n{table}\n\n![Returns and a film strip](card.png)\n"
     )

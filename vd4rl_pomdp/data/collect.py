@@ -49,7 +49,7 @@ class CollectConfig:
     """Settings of `vd4rl-pomdp data collect`."""
 
     task: str
-    """walker_walk, cheetah_run or humanoid_walk, or a task that was added."""
+    """walker_walk, cheetah_run, humanoid_walk, reacher_jump or point_mass_cue, or a task that was added."""
     quality: Quality | NoisyQuality
     """Whose episodes: random actions, actors saved on the way to the medium one, the medium actor, half of medium and
     expert each, or the expert actor; the noisy ones, which V-D4RL has not, add the task's noise to every action."""

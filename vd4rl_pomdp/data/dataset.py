@@ -53,6 +53,8 @@ class Dataset:
         """Name of the set's content, the same for copies of the set."""
         self.task, self.quality = task_and_quality(path, store.meta["attributes"])
         """Names as in `tasks`, None where neither the shards nor the folders tell."""
+        self.imported = all("imported" in one for one in store.meta["attributes"])
+        """Whether `data import` wrote it: its task may then be a mere name."""
         step_type, reward = store.array("step_type"), store.array("reward")
         with warnings.catch_warnings():
             warnings.filterwarnings("ignore", "The given NumPy array is not writable")  # nor is it to be written

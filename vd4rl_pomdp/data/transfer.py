@@ -6,16 +6,20 @@ into a hidden folder beside the named one and renamed when it is whole; a cut on
 
 from __future__ import annotations
 
+import re
 import shutil
 import sys
-from collections.abc import Iterator
+import zlib
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from zipfile import BadZipFile
 
 import numpy as np
 
-from vd4rl_pomdp.core.errors import UserError, disk_errors, refuse_no_folder, refuse_number
+from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_no_folder, refuse_number, system_error
 from vd4rl_pomdp.core.tasks import FRAME_SIZES
 from vd4rl_pomdp.data.format import FRAMES_KEY
 from vd4rl_pomdp.data.formats import FORMATS
@@ -27,7 +31,7 @@ from vd4rl_pomdp.runs.files import holds_anything
 from vd4rl_pomdp.runs.outputs import owned, refuse_inside
 from vd4rl_pomdp.runs.progress import ProgressLine
 
-_SHARD_ROWS = 10_000
+_SHARD_ROWS = 5_000
 """Rows of a shard, about: as many are in memory at once."""
 _ROUNDING = 1e-5
 """By how much actions may pass their bounds unseen: float32 rounds on the way."""
@@ -60,9 +64,11 @@ def import_set(
             something else.
     """
     refuse_inside(out)
-    opened = FORMATS.named(name).read(source, picture)
-    opened = _resized(source, opened, size)
-    label = task or opened.task or _label(opened, name)
+    with _telling(source):
+        opened = _resized(FORMATS.named(name).read(source, picture), size)
+    own = next((value for value in opened.record.values() if isinstance(value, str)), name)
+    # the name of what nothing tells a task of; of files, too
+    label = re.sub(r"[^\w.-]+", "_", task or opened.task or own).strip("._") or name
     _tell(opened.notes)
     settings: dict[str, Any] = {
         "format": name,
@@ -71,24 +77,19 @@ def import_set(
         "task": label,
         "set": quality or opened.quality,
         "frame_size": opened.frame_shape[0],
-        "clip_actions": clip_actions,
     }
     per_shard = max(1, _SHARD_ROWS * opened.episodes // max(1, opened.rows))
     attributes = {key: settings[key] for key in ("task", "set") if settings[key]} | {
         "imported": {"format": name, **opened.record}
     }
+    numbers = list(range(opened.episodes))
     shards = [
-        Shard(
-            out / f"{number}_{label}.hdf5",
-            list(range(start, min(start + per_shard, opened.episodes))),
-            attributes,
-        )
-        for number, start in enumerate(range(0, opened.episodes, per_shard))
+        Shard(out / f"{start // per_shard}_{label}.hdf5", numbers[start : start + per_shard], attributes)
+        for start in range(0, opened.episodes, per_shard)
     ]
     episodes = _Reader(source, opened, clip_actions)
     collect_set(out, settings, shards, episodes, 1, ("import", "episodes"), None)
-    if episodes.clipped:
-        _tell([f"{episodes.clipped} actions lay outside their bounds and were clipped"])
+    _tell(episodes.notes())
     from vd4rl_pomdp.data.card import write_card  # draws
 
     write_card(out)
@@ -109,24 +110,52 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
     refuse_no_folder(out)
     if holds_anything(out):
         raise UserError(f"{out}: is not empty; choose another folder to export to")
-    opened = _resized(str(path), read_shards(str(path)), size)
+    opened = _resized(read_shards(str(path)), size)
     hidden = out.with_name(f".{out.name}.export")
-    with disk_errors(out):
-        out.parent.mkdir(parents=True, exist_ok=True)
-        with owned(hidden), ProgressLine("export", opened.episodes, "episodes") as progress:
+    progress = ProgressLine("export", opened.episodes, "episodes")
 
-            def read(first: int) -> Iterator[EpisodeArrays]:
-                for rows in opened.read(first):
-                    yield rows
-                    progress.advance(1, ret=float(rows["reward"][1:].sum()))
+    def read(first: int) -> Iterator[EpisodeArrays]:
+        for rows in opened.read(first):
+            yield rows
+            progress.advance(1, ret=float(rows["reward"][1:].sum()))
 
-            shutil.rmtree(hidden / "set", ignore_errors=True)  # of one that was cut
-            lost = form.write(hidden / "set", out, replace(opened, read=read))
-            if out.is_dir():
-                out.rmdir()
-            (hidden / "set").rename(out)
-        shutil.rmtree(hidden, ignore_errors=True)
+    try:
+        with disk_errors(out), owned(hidden), progress:
+            shutil.rmtree(hidden / "set", ignore_errors=True)  # of one that was killed
+            try:
+                lost = form.write(hidden / "set", out, replace(opened, read=read))
+                if out.is_dir():
+                    out.rmdir()
+                (hidden / "set").rename(out)
+            finally:
+                shutil.rmtree(hidden / "set", ignore_errors=True)
+    finally:
+        with suppress(OSError):
+            hidden.rmdir()  # not another process's, which holds its lock
     _tell(lost)
+
+
+@contextmanager
+def _telling(place: str) -> Iterator[None]:
+    """What a format's reader or its library raises, as a sentence that says where."""
+    try:
+        yield
+    except UserError as error:
+        raise type(error)(str(error) if str(error).startswith(place) else f"{place}: {error}") from error
+    except (
+        OSError,
+        ValueError,
+        KeyError,
+        IndexError,
+        RuntimeError,
+        EOFError,
+        AssertionError,
+        BadZipFile,
+        zlib.error,
+    ) as error:
+        raise system_error(Path(place), error) or UserError(
+            f"{place}: cannot be read as this format ({in_one_line(error) or type(error).__name__})"
+        ) from error
 
 
 class _Reader:
@@ -135,26 +164,40 @@ class _Reader:
     def __init__(self, name: str, source: SourceSet, clip: bool) -> None:
         self._name, self._source, self._clip = name, source, clip
         self._next, self._episodes = -1, iter(())
-        self.clipped = 0
+        self._last: np.ndarray | None = None
+        self._clipped = self._read = self._still = self._joined = 0
 
     def __call__(self, number: int) -> EpisodeArrays:
-        try:
+        with _telling(f"{self._name}: episode {number}"):
             if number != self._next:
                 self._episodes = self._source.read(number)
             rows = next(self._episodes, None)
             if rows is None:
                 raise UserError("is missing")
-            self._next = number + 1
+            frames = rows[FRAMES_KEY]
+            self._read += 1
+            self._still += len(frames) > 1 and bool((frames[1:] == frames[0]).all())
+            self._joined += number == self._next and np.array_equal(frames[0], self._last)
+            self._next, self._last = number + 1, frames[-1]
             return rows | {"action": self._scaled(rows["action"])}
-        except UserError as error:
-            raise UserError(f"{self._name}: episode {number}: {error}") from error
+
+    def notes(self) -> Iterator[str]:
+        """What the episodes that were read have in common."""
+        if self._clipped:
+            yield f"{self._clipped} actions lay outside their bounds and were clipped"
+        if self._still and self._still == self._read:
+            yield "in every episode all pictures are equal: was a buffer recorded that the environment draws into?"
+        elif self._joined and self._joined == self._read - 1:
+            yield "every episode begins with the last picture of the one before: its first step crosses a reset"
 
     def _scaled(self, action: np.ndarray) -> np.ndarray:
         """Actions in [-1, 1]; those of a first row stay zero."""
         low, high = self._source.action_low, self._source.action_high
         scaled = action.astype(np.float32)
         if low is not None and high is not None and not ((low == -1).all() and (high == 1).all()):
-            scaled = ((action.astype(np.float64) - low) / (high - low) * 2 - 1).astype(np.float32)
+            scaled = ((action.astype(np.float64) - low) / np.where(high > low, high - low, 1) * 2 - 1).astype(
+                np.float32
+            )
             scaled[0] = 0
         most = float(np.abs(scaled).max())
         if most > 1 + _ROUNDING:
@@ -163,17 +206,17 @@ class _Reader:
                 raise UserError(
                     f"has actions outside {told} (up to {most:.4g} after scaling); --clip-actions clips them"
                 )
-            self.clipped += int((np.abs(scaled) > 1 + _ROUNDING).any(1).sum())
+            self._clipped += int((np.abs(scaled) > 1 + _ROUNDING).any(1).sum())
         return scaled if most <= 1 else scaled.clip(-1, 1)
 
 
-def _resized(name: str, source: SourceSet, size: int | None) -> SourceSet:
+def _resized(source: SourceSet, size: int | None) -> SourceSet:
     """A source of square pictures, made so where `size` says how large."""
     (height, width), (low, high) = source.frame_shape, FRAME_SIZES
     if size is None:
         if height != width or not low <= height <= high:
             raise UserError(
-                f"{name}: has pictures of {height}x{width} pixels, frames are square, of {low} to {high}: pass --size, "
+                f"has pictures of {height}x{width} pixels, frames are square, of {low} to {high}: pass --size, "
                 "such as --size 84"
             )
         return source
@@ -192,12 +235,6 @@ def _resized(name: str, source: SourceSet, size: int | None) -> SourceSet:
     return replace(source, read=read, frame_shape=(size, size), notes=[*source.notes, note])
 
 
-def _label(source: SourceSet, name: str) -> str:
-    """What stands for the task where nothing tells it: the source's own name, as a file can be called."""
-    told = next((str(value) for value in source.record.values() if isinstance(value, str)), name)
-    return "".join(sign if sign.isalnum() or sign in "_-." else "_" for sign in told).strip("._") or name
-
-
-def _tell(notes: list[str]) -> None:
+def _tell(notes: Iterable[str]) -> None:
     for note in notes:
         print(f"note: {note}", file=sys.stderr)

@@ -2,8 +2,9 @@
 
 Importing this package registers every task and corruption with Gymnasium, as `vd4rl_pomdp/WalkerWalk-v0`,
 `vd4rl_pomdp/WalkerWalk-Patch16-v0`, `vd4rl_pomdp/WalkerWalk-ZeroFrames-v0`,
-`vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0`, and likewise for `CheetahRun`, `HumanoidWalk` and every other
-task that a call has registered by then (for others there is `vd4rl_pomdp.envs.gym.GymEnv("its_name")`); the mazes as
+`vd4rl_pomdp/WalkerWalk-Patch16-ZeroFrames-v0`, and likewise for `CheetahRun`, `HumanoidWalk`, `ReacherJump`,
+`PointMassCue` and every other task that a call has registered by then (for others there is
+`vd4rl_pomdp.envs.gym.GymEnv("its_name")`); the mazes as
 `vd4rl_pomdp/MazeNoCurtain-v0`, `MazeOneCurtain`, `MazeThreeCurtains`, `MazeFirstPerson` and their variants; and the
 paper's finite counterexample, `vd4rl_pomdp/ForwardJumpCounterexample-v0`.
 

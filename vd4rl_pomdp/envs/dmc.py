@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import importlib
 from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
-from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.errors import UserError, first_line
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, TASKS, DMCTask, Layout
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.envs import rendering
@@ -54,7 +55,7 @@ class DMCEnv(PixelEnv):
         travel, beside = _ground_travel(model, camera)
         turning, quaternions = _free_joints(model)
         widths = self.simulator.action_spec().shape[0], len(state), model.nq
-        return Layout(*widths, travel, turning, quaternions, beside)
+        return Layout(*widths, travel, turning, quaternions, beside, _unseen(model))
 
     @property
     def rate(self) -> float:
@@ -186,6 +187,13 @@ def _ground_positions(model: Any, joint: int) -> Iterator[int]:
         yield start
 
 
+def _unseen(model: Any) -> tuple[int, ...]:
+    """Positions of bodies that stand in the world and have no shape, nor has any that hangs on them."""
+    shown = set(model.body_rootid[model.geom_bodyid].tolist())
+    joints = zip(model.body_rootid[model.jnt_bodyid], model.jnt_qposadr, strict=True)
+    return tuple(int(start) for root, start in joints if int(root) not in shown)
+
+
 def _free_joints(model: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
     """Positions that are angles of hinges without limits, and the first position of every quaternion."""
     joints = list(zip(model.jnt_type, model.jnt_qposadr, model.jnt_limited, strict=True))
@@ -198,18 +206,30 @@ def _free_joints(model: Any) -> tuple[tuple[int, ...], tuple[int, ...]]:
 def _load(task: DMCTask, random: np.random.RandomState) -> Any:
     """The dm_control environment; its own time limit never ends an episode, ours does."""
     rendering.check_mujoco()
-    if (task.domain, task.task) not in suite.ALL_TASKS:
+    arguments = {"random": random, "time_limit": float("inf")}
+    if "." in task.domain:
+        env = _of_a_module(task)(**arguments)
+    elif (task.domain, task.task) in suite.ALL_TASKS:
+        try:
+            env = suite.load(task.domain, task.task, task_kwargs=arguments)
+        except AttributeError as error:
+            if "MjModel" not in str(error):
+                raise
+            raise UserError(
+                f"dm-control does not go with mujoco {mujoco.__version__} ({error}): install a pair that was tried, "
+                "`pip install 'dm-control==1.0.44' 'mujoco==3.11.0'`"
+            ) from error
+    else:
         tasks = ", ".join(name for domain, name in suite.ALL_TASKS if domain == task.domain)
         choices = tasks or ", ".join(sorted({domain for domain, _ in suite.ALL_TASKS}))
         raise UserError(f"dm_control has no task {task.domain!r}, {task.task!r}: choose one of {choices}")
-    try:
-        env = suite.load(task.domain, task.task, task_kwargs={"random": random, "time_limit": float("inf")})
-    except AttributeError as error:
-        if "MjModel" not in str(error):
-            raise
-        raise UserError(
-            f"dm-control does not go with mujoco {mujoco.__version__} ({error}): install a pair that was tried, "
-            "`pip install 'dm-control==1.0.44' 'mujoco==3.11.0'`"
-        ) from error
     check_bounds(f"dm_control's {task.domain} {task.task}", env.action_spec().minimum, env.action_spec().maximum)
     return env
+
+
+def _of_a_module(task: DMCTask) -> Any:
+    """What makes the environment, in a module that is written like one of the suite's."""
+    try:
+        return importlib.import_module(task.domain).SUITE[task.task]
+    except (ImportError, AttributeError, KeyError) as error:
+        raise UserError(f"{task.domain} offers no task {task.task!r} in a SUITE ({first_line(error)})") from error

@@ -13,13 +13,15 @@ from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.text import write_text
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.figures import seeds_note, write_table
-from vd4rl_pomdp.report.load import CONDITION, Run, label, load_runs, setting
+from vd4rl_pomdp.report.gates import verdicts
+from vd4rl_pomdp.report.load import CONDITION, SETTING, Run, label, load_runs, setting
 from vd4rl_pomdp.report.page import made_with
 from vd4rl_pomdp.report.render import Columns, block, render, terminal, texts, write_latex
 from vd4rl_pomdp.report.tables import SCORE, mean_and_ends
 from vd4rl_pomdp.report.variants import groups
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.outputs import refuse_foreign
+from vd4rl_pomdp.runs.results import certificates_of
 
 FILE = "comparison"
 """Its files' name, which tells a comparison's folder."""
@@ -44,7 +46,8 @@ class SideBySide(NamedTuple):
 
     sides: tuple[Side, Side]
     rows: list[Row]
-    """One a condition: scores with intervals and n of both, difference with interval, settings that differ."""
+    """One a condition: scores with intervals and n of both, difference with interval, settings that differ, and what is
+    certified of memory."""
 
 
 def compare_results(one: Path, other: Path) -> SideBySide:
@@ -58,9 +61,12 @@ def compare_results(one: Path, other: Path) -> SideBySide:
         UserError: a path holds no evaluated run, or a file is damaged.
     """
     (mine, first), (theirs, second) = _loaded(one), _loaded(other)
+    runs = [run for side in (first, second) for seeds in side.values() for run in seeds]
+    memory = verdicts(runs, certificates_of([run.result for run in runs], [one, other]))
     partners = _partners(first, second)
     rows = [_row(key, runs, second.get(partners.get(key, ()), [])) for key, runs in first.items()]
     rows += [_row(key, [], runs) for key, runs in second.items() if key not in partners.values()]
+    rows = [row | {"memory": memory[tuple(row[name] for name in SETTING)]} for row in rows]
     return SideBySide((mine, theirs), sorted(rows, key=lambda row: [str(row[name]) for name in CONDITION]))
 
 
@@ -147,6 +153,7 @@ def print_comparison(comparison: SideBySide, console: Console | None = None) -> 
     shown = texts(pd.DataFrame(comparison.rows), _COLUMNS)
     method = shown["method"] + "\n  " + shown.pop("settings, A → B")
     for place, part in shown.assign(method=method).groupby("setting", sort=False):
+        console.print(f"memory: {comparison.rows[part.index[0]]['memory']}", markup=False, highlight=False)
         console.print(terminal(str(place), part.drop(columns="setting").replace(r" \[", "\n[", regex=True)))
 
 
@@ -166,7 +173,8 @@ def write_comparison(comparison: SideBySide, out: Path) -> Path:
             str(place),
             part.drop(columns="setting"),
             2,
-            seeds_note(rows.loc[part.index, ["seeds_a", "seeds_b"]].stack()),
+            seeds_note(rows.loc[part.index, ["seeds_a", "seeds_b"]].stack())
+            + f" Memory: {rows['memory'][part.index[0]]}.",
         )
         for place, part in shown.groupby("setting", sort=False)
     ]

@@ -33,7 +33,8 @@ LOOKS = (
     *("supervised_picture", "integrator"),
 )
 """The package's methods in the order of their looks, which are the same in every report: the first differ in colour."""
-FORMATS: dict[str, dict[str, Any]] = {"png": {"dpi": 150}, "pdf": {"metadata": {"CreationDate": None}}}
+DPI = 150
+FORMATS: dict[str, dict[str, Any]] = {"png": {"dpi": DPI}, "pdf": {"metadata": {"CreationDate": None}}}
 """Files of a figure, beside the SVG in the page."""
 WIDTH = 10.0
 """Of a figure, in inches."""
@@ -82,7 +83,8 @@ def sheet(panels: Sequence[tuple[str, pd.DataFrame, Draw]], columns: int = 3, he
     columns = min(columns, len(panels))
     sizes = list(heights) or [2.1] * len(panels)
     height = [max(sizes[i : i + columns]) for i in range(0, len(panels), columns)]
-    figure = Figure(figsize=(WIDTH if columns > 1 else 0.66 * WIDTH, sum(height) + 0.6 * len(height)))
+    size = WIDTH if columns > 1 else 0.66 * WIDTH, sum(height) + 0.6 * len(height)
+    figure = Figure(figsize=size, dpi=DPI)  # laid out as saved: hinted text has another width at another resolution
     figure.set_layout_engine("constrained")
     grid = figure.subplots(len(height), columns, squeeze=False, height_ratios=height)
     for axes, (title, rows, draw) in zip(grid.flat, panels, strict=False):

@@ -9,7 +9,7 @@ are, without what variants add to them, and returns are compared between runs of
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -22,6 +22,7 @@ from vd4rl_pomdp.report.gaps import STATE
 from vd4rl_pomdp.report.load import REFERENCES, SETTING, Run, a_set_a_seed
 from vd4rl_pomdp.report.stats import interval
 from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, PLAIN, PRESETS, groups, of_corruption
+from vd4rl_pomdp.runs.certificates import NOT_CERTIFIED, in_words
 from vd4rl_pomdp.runs.files import Row
 
 STATE_SHARE = 0.9
@@ -56,6 +57,22 @@ def gates(runs: list[Run]) -> list[Row]:
     """
     finished = comparable(runs)
     return [_gate(key, finished) for key in sorted({run.of(GATED) for run in finished})]
+
+
+def verdicts(runs: Iterable[Run], certificates: Mapping[str, Row]) -> dict[tuple[str, ...], str]:
+    """What certificates say of memory in every setting with an evaluated run; where its runs are of several sets, of
+    each.
+
+    Args:
+        runs: those of a report.
+        certificates: by id.
+    """
+    found = {}
+    for place, mine in groups((run for run in runs if run.rows), lambda run: run.of(SETTING)).items():
+        names = dict.fromkeys(run.result.certificate for run in mine)
+        told = (in_words(certificates[name]) if name in certificates else NOT_CERTIFIED for name in names)
+        found[place] = "; ".join(dict.fromkeys(told))
+    return found
 
 
 def comparable(runs: Iterable[Run]) -> list[Run]:

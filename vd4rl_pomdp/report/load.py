@@ -176,7 +176,7 @@ class Run:
     def converged(self) -> bool | None:
         """Whether its critic did, by `CONVERGED`; True for an algorithm without one, None if it is not recorded."""
         told = self.result.files.get("critic", {} if self.labels["algorithm"] == "bc" else None)
-        if told == {}:
+        if told == {} and "gamma" not in self.record["config"]:  # what discounts returns has a critic
             return True
         moved = self.measures["critic_moved"]
         return None if moved is None else abs(moved) < CONVERGED

@@ -24,7 +24,7 @@ from vd4rl_pomdp.report.claims import judge_claims, tally
 from vd4rl_pomdp.report.figures import Plot
 from vd4rl_pomdp.report.films import shown_films
 from vd4rl_pomdp.report.gaps import find_gaps
-from vd4rl_pomdp.report.gates import gates, unranked
+from vd4rl_pomdp.report.gates import gates, unranked, verdicts
 from vd4rl_pomdp.report.lead import leads
 from vd4rl_pomdp.report.load import ALL, CONDITION, SETTING, Choice, Run, a_set_a_seed, label, load_runs, title
 from vd4rl_pomdp.report.plots import draw_plots
@@ -33,9 +33,10 @@ from vd4rl_pomdp.report.shown import MARK, NOTES, SHOWN, WHOLE, Shown, claim_of,
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.theory import load_section
 from vd4rl_pomdp.report.variants import groups
+from vd4rl_pomdp.runs.certificates import NOT_CERTIFIED, keep_certificates
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
-from vd4rl_pomdp.runs.results import RUNS, refuse_loss, write_results
+from vd4rl_pomdp.runs.results import RUNS, certificates_of, refuse_loss, write_results
 
 SEEDS = 12
 """Seeds that are named one by one, at most."""
@@ -73,7 +74,8 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
         mazes = all(run.stage == "navigation" for run in runs)
         told = "`vd4rl-pomdp navigation report` reports its mazes" if mazes else "`vd4rl-pomdp finetune` evaluates"
         raise UserError(f"{paths[0]}: holds no evaluated run yet; {told}")
-    made, judged, claimed = _tables(runs, choice)
+    certificates = certificates_of(results, paths, None if out in paths else out)
+    made, judged, claimed = _tables(runs, choice, verdicts(runs, certificates))
     shown = shown_tables(made)
     plots = draw_plots(runs, made)
     mixed = unlike(runs)
@@ -82,21 +84,27 @@ def write_report(paths: list[Path], out: Path, choice: Choice = ALL) -> Report:
         refuse_loss(results, out)  # of runs that were added while this was drawn
         _write(out, made, shown, plots)
         write_results(out, results)
+        keep_certificates(out, certificates)
         write_text(out / "index.html", page)  # last: whoever sees it finds what it links to
     return Report(out / "index.html", made[MARK], judged, claimed, mixed)
 
 
-def _tables(runs: list[Run], choice: Choice) -> tuple[dict[str, pd.DataFrame], list[Row], list[Row]]:
+def _tables(
+    runs: list[Run], choice: Choice, memory: dict[tuple[str, ...], str]
+) -> tuple[dict[str, pd.DataFrame], list[Row], list[Row]]:
     """All tables of a report as its CSV files hold them, by name; and the rows of gates and claims."""
     evaluated = tables.evaluations(load.episodes_frame(runs))
     finished = load.episodes_frame(run for run in runs if run.finished)
     final = tables.evaluations(finished)
     gaps = pd.DataFrame(find_gaps(runs, choice), columns=[*CONDITION, "seed", "state"])
-    judged = gates(runs)
+    judged = [row | {"memory": memory[tuple(row[name] for name in SETTING)]} for row in gates(runs)]
     claimed = judge_claims(runs, unranked(judged))
+    summary = tables.summary(final, gaps, unranked(judged, SETTING))
+    places = summary[list(SETTING)].itertuples(index=False, name=None)
+    summary["memory"] = [memory.get(place, NOT_CERTIFIED) for place in places]
     every = tables.all_runs(load.runs_frame(runs), gaps)
     made = {
-        MARK: tables.summary(final, gaps, unranked(judged, SETTING)),
+        MARK: summary,
         "gates": pd.DataFrame(judged),
         "claims": pd.DataFrame(claimed),
         "lead": pd.DataFrame(leads(runs)),
@@ -245,4 +253,5 @@ def print_summary(report: Report, console: Console | None = None) -> None:
     shown = texts(report.summary, SHOWN[MARK])
     for place, part in shown.groupby("setting", sort=False):
         missing = ["not there"] if part["not there"].any() else []
+        console.print(f"memory: {report.summary.loc[part.index[0], 'memory']}", markup=False, highlight=False)
         console.print(terminal(str(place), part[["method", "last evaluation", "seeds", "episodes", *missing]]))

@@ -93,6 +93,7 @@ SHOWN: dict[str, Columns] = {
     "gates": {
         "setting": with_algorithm,
         "verdict": "verdict",
+        "memory": "memory",
         "data's return": ("data_return", 0),
         "state": ("state_share", 2),
         "acro, none": ("acro_share", 2),
@@ -189,7 +190,7 @@ SHOWN: dict[str, Columns] = {
 }
 """Columns of the tables that the page shows. All but those of WHOLE are cut into one table for each value of the first
 column."""
-WORDS = {"gates": 2, "claims": 4, "lead": 3, "elsewhere": 2, "costs": 2}
+WORDS = {"gates": 3, "claims": 4, "lead": 3, "elsewhere": 2, "costs": 2}
 """Columns at the left that hold words, where there is more than one."""
 WHOLE = ("gates", "costs")
 
@@ -233,7 +234,10 @@ def _blocks(name: str, table: pd.DataFrame, rows: pd.DataFrame, words: int) -> I
             if name == "representations" and told:
                 # A linear probe reads easily what the encoder was trained to tell.
                 names = " and ".join(told)
-                note += f" {names}: trained on the states of all episodes, those that the probe holds out, too."
+                note += f" {names}: trained on the states of all episodes, those that the probe holds out, too, but for"
+                note += " --hold-out."
+            if name == MARK:
+                note += f" Memory: {mine['memory'].iloc[0]}."
             if "not there" in shown and not shown["not there"].any():
                 shown = shown.drop(columns="not there")
             yield block(str(heading), shown, words, note)

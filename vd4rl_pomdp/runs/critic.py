@@ -10,6 +10,8 @@ from vd4rl_pomdp.runs.metrics import Metrics
 
 VALUE = "q"
 """What algorithms with a critic call its mean value over a batch in their logs."""
+TOLD = {"value", "moved", "data"}
+"""What critic.json tells of an algorithm with a critic; of others nothing."""
 CONVERGED = 0.02
 """A critic has converged if it moved by less than this share of its value over the last fifth of the updates."""
 FEWEST = 3

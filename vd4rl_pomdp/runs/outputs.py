@@ -53,8 +53,10 @@ def refuse_foreign(out: Path, what: str, *marks: str) -> None:
 
 
 def kept_in(folder: Path) -> str | None:
-    """What a folder keeps, by its files: "a run", "a policy", "an encoder", "a data set", or None for nothing."""
+    """What a folder keeps, by its files: "a run", "a policy", "an encoder", "an agent", "a data set", or None."""
     names = set(_names(folder))
+    if {"card.json", "encoder", "policy"} <= names:
+        return "an agent"
     if CONFIG_FILE in names:
         if "model.safetensors" in names:
             return "an encoder"

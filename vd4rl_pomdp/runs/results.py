@@ -10,6 +10,7 @@ rows first: rows of a run that runs.jsonl does not name were left by a cut writi
 from __future__ import annotations
 
 import json
+import math
 import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
@@ -19,8 +20,11 @@ from typing import Any, NamedTuple
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.options import LABELS, settings_of
-from vd4rl_pomdp.core.reading import parse_json, read_bytes
-from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
+from vd4rl_pomdp.core.reading import fits, parse_json, read_bytes
+from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.runs import CONFIG_FILE, CRITIC_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
+from vd4rl_pomdp.runs.certificates import certificate_id, keep_certificates, read_certificates
+from vd4rl_pomdp.runs.critic import TOLD, VALUE
 from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
 from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json, replacing_file, write_csv
 from vd4rl_pomdp.runs.metrics import read_metrics
@@ -31,6 +35,9 @@ from vd4rl_pomdp.runs.run import identity, remedy
 RUNS = "runs.jsonl"
 FILES = {Path(file).stem: file for file in RECORDS} | {"encoder": f"encoder/{CONFIG_FILE}"}
 """A run's small files: the name of their content in runs.jsonl, and their place in the run folder."""
+
+_ROUNDING = 1e-4
+"""Of a score, which is kept to four digits, as its return is."""
 
 
 @dataclass(frozen=True)
@@ -99,6 +106,11 @@ class Result:
         return {name: self.files["labels"][name] for name in LABELS}
 
     @property
+    def certificate(self) -> str:
+        """Id of the certificate that would speak of its set and corruption."""
+        return certificate_id(self.record.get("inputs", {}).get("data", ""), self.encoder.get("corruption") or {})
+
+    @property
     def measured(self) -> list[Row]:
         """What it found: evaluation rows, or the measures of a navigation run."""
         return self.rows or self.files.get("results", {}).get("rows", [])
@@ -139,6 +151,8 @@ def read_run(folder: Path | str) -> Result:
     """What a run folder holds; raises UserError for damaged files."""
     folder = Path(folder)
     files = {name: read_json(folder / place) for name, place in FILES.items() if (folder / place).exists()}
+    if "config" not in files:
+        raise UserError(f"{folder}: is no run, which has a {CONFIG_FILE}; name a folder that a training wrote")
     if "encoder" in files and not isinstance(files["encoder"].get("pretrain"), dict):
         raise UserError(f"{folder / FILES['encoder']}: does not say how the encoder was pretrained; pretrain it again")
     metrics, path = read_metrics(folder / METRICS_FILE), folder / EPISODES_FILE
@@ -152,6 +166,8 @@ def read_run(folder: Path | str) -> Result:
         run = Result("", folder, files, step, losses if pretraining else [], rows, True)
         _check(run)
         _check_last_evaluation(run)
+        if files.get("critic") == {} and any(VALUE in row for row in metrics):
+            raise UserError(f"{folder / CRITIC_FILE}: tells of no critic, {METRICS_FILE} of one; {remedy(folder)}")
         files["labels"] = files.get("labels", {}) | _labels(run)
         return replace(run, id=_id(run))
 
@@ -193,6 +209,9 @@ def _check(run: Result) -> None:
         raise TypeError("its record holds no settings")
     if not isinstance(run.record["stage"], str):
         raise TypeError(f"its stage is {run.record['stage']!r}")
+    critic = run.files.get("critic", {})
+    if critic.keys() - TOLD or any(not (fits(v, float | None) and math.isfinite(v or 0)) for v in critic.values()):
+        raise TypeError(f"its {CRITIC_FILE} is {critic}")
 
 
 @contextmanager
@@ -354,14 +373,59 @@ def add_results(paths: Sequence[Path | str], out: Path | str) -> Added:
         fresh = {run.id: run for run in settled if run.id not in there or run.ending > there[run.id].ending}
         if fresh:
             write_results(out, (there | fresh).values())
+        keep_certificates(out, certificates_of(found, map(Path, paths), out))
     again = [run for run in settled if run.id not in fresh]
     known = sum(run.measured == there[run.id].measured for run in again)
     return Added(len(fresh), known, len(again) - known, len(found) - len(settled))
 
 
+def certificates_of(runs: Sequence[Result], places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
+    """The certificates that speak of some runs, by id.
+
+    Args:
+        runs: of those whose own folders are named, the set's folder is looked into, too, where it is there.
+        places: folders at or below which they are looked for.
+        but: a folder whose own file is not read.
+    """
+    sets = {Path(run.record["config"].get("data") or "-") for run in runs if run.folder}
+    known = read_certificates([*places, *(one for one in sorted(sets) if one.is_dir())], but)
+    return {name: known[name] for name in dict.fromkeys(run.certificate for run in runs) if name in known}
+
+
 def _kept(out: Path) -> dict[str, Result]:
     """The runs of a results folder by id, none before the first."""
     return {run.id: run for run in read_results(out)} if (out / RUNS).exists() else {}
+
+
+def verify_results(folder: Path | str) -> tuple[list[Result], list[str]]:
+    """The runs of a results folder, and a sentence for each thing in them that their own records contradict.
+
+    An id is computed anew from settings, seed, data and format as the row records them; its episodes must be of the
+    run that it names, each once, and their scores what their returns make them.
+
+    Raises:
+        UserError: as `read_results`.
+    """
+    runs = read_results(folder)
+    return runs, [f"run {run.id}: {told}" for run in runs for told in _contradictions(run)]
+
+
+def _contradictions(run: Result) -> Iterator[str]:
+    with whole_files(run.place):
+        if (computed := _id(run)) != run.id:
+            yield f"its record computes {computed}"
+        config = run.record["config"]
+        known = {"seed": config["seed"], "algorithm": config.get("algorithm"), "method": run.card.get("method")}
+        known |= {"task": run.card.get("task"), "corruption": run.card.get("corruption", {}).get("corruption")}
+        for name, value in known.items() if run.rows else ():
+            if wrong := [row[name] for row in run.rows if value is not None and row[name] != value]:
+                yield f"{len(wrong)} episodes have the {name} {wrong[0]}, its record {value}"
+        places = [(row["step"], row["evaluated_under"], row["episode"]) for row in run.rows]
+        if len(set(places)) < len(places):
+            yield f"{len(places) - len(set(places))} episodes stand there twice"
+        divisor = TASKS[run.labels["task"]].score_divisor if run.labels["task"] in TASKS else None
+        if wrong := [row for row in run.rows if divisor and abs(row["score"] - row["return"] / divisor) > _ROUNDING]:
+            yield f"{len(wrong)} scores are not their returns / {divisor:g}"
 
 
 def refuse_loss(runs: Sequence[Result], out: Path) -> None:

@@ -59,8 +59,9 @@ class DataSet:
 
     @property
     def foreign(self) -> bool:
-        """Whether shards are there that nothing here collected, such as a downloaded set."""
-        return not (self.folder / PLAN).exists() and bool(shard_files(self.folder))
+        """Whether shards are there that nothing here collected, such as a downloaded or an imported set."""
+        collected = (self.folder / PLAN).exists() and "format" not in read_plan(self.folder)
+        return not collected and bool(shard_files(self.folder))
 
     @property
     def there(self) -> bool:

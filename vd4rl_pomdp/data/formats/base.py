@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field
 from importlib import import_module
 from pathlib import Path
@@ -56,7 +56,7 @@ def rows_of(
     frames: np.ndarray,
     action: np.ndarray,
     reward: np.ndarray,
-    terminated: bool,
+    terminated: bool | np.ndarray,
     complete: bool = True,
     physics: np.ndarray | None = None,
 ) -> EpisodeArrays:
@@ -66,7 +66,8 @@ def rows_of(
         frames: (T + 1, 3, H, W) uint8, o_0 to o_T.
         action: (T, A), a_0 to a_{T-1}.
         reward: (T,).
-        terminated: whether the task itself ended: the last discount is 0, and 1 after a time limit.
+        terminated: whether the task itself ended (discount 0, which is 1 after a time limit): with the last of the
+            steps, or (T,) for each.
         complete: whether the episode ended at all; False: its source was cut.
         physics: (T + 1, P) simulator states.
     """
@@ -78,7 +79,11 @@ def rows_of(
     discount, step_type = np.ones(steps + 1), np.full(steps + 1, StepType.MID, np.int64)
     step_type[0] = StepType.FIRST
     if complete and steps:
-        step_type[-1], discount[-1] = StepType.LAST, not terminated
+        step_type[-1] = StepType.LAST
+    if isinstance(terminated, np.ndarray):
+        discount[1:] = 1 - terminated
+    else:
+        discount[steps:] = not terminated or not steps
     return {
         "observation": frames,
         "action": np.concatenate([np.zeros_like(action[:1], shape=(1, *action.shape[1:])), action]),
@@ -94,26 +99,38 @@ def one_hot(action: np.ndarray, number: int) -> np.ndarray:
     return np.where(np.arange(number) == action[:, None], np.float32(1), np.float32(-1))
 
 
-def picture_axes(shape: tuple[int, ...]) -> tuple[bool, int]:
-    """Whether a picture's channels come last, and how many they are; UserError for a shape that is no picture's.
+_CHANNELS = (1, 3, 6, 9, 12)
+"""Grey, or red, green and blue of each frame of a stack."""
 
-    Height and width are no channels: 1, 3, or 3 for each frame of a stack.
-    """
-    for last, channels in ((True, shape[-1]), (False, shape[0])) if len(shape) == 3 else ():
-        if channels == 1 or (channels % 3 == 0 and channels <= 12):
-            return last, channels
-    if len(shape) == 2:
-        return True, 0
-    raise UserError(f"observations of shape {shape} are no pictures: (H, W), (H, W, 3) or (3, H, W) are")
+
+def picture_size(shape: tuple[int, ...]) -> tuple[int, int] | None:
+    """Height and width of a picture (H, W), (H, W, C) or (C, H, W), None for other shapes."""
+    if len(shape) == 2 or (len(shape) == 3 and shape[2] in _CHANNELS):
+        return shape[0], shape[1]
+    return (shape[1], shape[2]) if len(shape) == 3 and shape[0] in _CHANNELS else None
 
 
 def as_frames(pictures: np.ndarray) -> np.ndarray:
-    """(T, ...) uint8 pictures of any layout that `picture_axes` tells as (T, 3, H, W): of a stack the newest frame."""
-    last, channels = picture_axes(pictures.shape[1:])
-    if not channels:
+    """(T, ...) uint8 pictures whose size `picture_size` tells as (T, 3, H, W): of a stack the newest frame."""
+    if pictures.ndim == 3:
         pictures = pictures[..., None]
-    frames = np.moveaxis(pictures, -1, 1) if last else pictures
+    frames = np.moveaxis(pictures, -1, 1) if pictures.shape[-1] in _CHANNELS else pictures
     return np.repeat(frames, 3, axis=1) if frames.shape[1] == 1 else frames[:, -3:]
+
+
+def chosen(shapes: Mapping[str, tuple[int, ...]], picture: str | None) -> tuple[str, tuple[int, int]]:
+    """Which observation holds the pictures, and their size: the one that the user names, else the only one that can.
+
+    Args:
+        shapes: of all uint8 observations, by name.
+        picture: the user's choice.
+    """
+    known = {name: size for name, shape in shapes.items() if (size := picture_size(shape))}
+    if not known:
+        raise UserError("holds no pictures: those are uint8 observations of the shape (H, W), (H, W, 3) or (3, H, W)")
+    if picture in known or (picture is None and len(known) == 1):
+        return next((name, size) for name, size in known.items() if picture in (name, None))
+    raise UserError(f"which observation holds its pictures? Pass --picture, one of {', '.join(known)}")
 
 
 def library(name: str, extra: str) -> Any:

@@ -17,7 +17,7 @@ from vd4rl_pomdp.core.errors import UserError, in_one_line
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.folder import join_shards, shard_paths, task_and_quality
 from vd4rl_pomdp.data.format import FRAMES_KEY, read_attributes, read_frame_size, read_frames, read_rows
-from vd4rl_pomdp.data.formats.base import DataFormat, SourceSet, as_frames
+from vd4rl_pomdp.data.formats.base import DataFormat, SourceSet, as_frames, chosen
 from vd4rl_pomdp.data.shards import EpisodeArrays
 
 
@@ -26,6 +26,7 @@ def read_shards(path: str, picture: str | None = None) -> SourceSet:
     folder = Path(path)
     shards = shard_paths(folder)
     size = read_frame_size(shards)
+    chosen({FRAMES_KEY: (3, size, size)}, picture)
     rows = join_shards(folder, shards, [read_rows(shard) for shard in shards])
     starts = np.flatnonzero(rows["step_type"] == StepType.FIRST)
     ends = np.append(starts[1:], len(rows["reward"]))
@@ -54,6 +55,7 @@ def read_npz(path: str, picture: str | None = None) -> SourceSet:
     if not files:
         raise UserError(f"{folder}: holds no .npz episodes; name the folder that holds them, such as TASK/QUALITY/64px")
     shape = _episode(files[0])[FRAMES_KEY].shape
+    _, frame_shape = chosen({"image": shape[1:]}, picture)
     named = [re.search(r"-(\d+)$", file.stem) for file in files]
     rows = sum(int(one[1]) if one else shape[0] for one in named)
     task, quality = task_and_quality(folder, [])
@@ -61,7 +63,7 @@ def read_npz(path: str, picture: str | None = None) -> SourceSet:
     return SourceSet(
         len(files),
         rows,
-        shape[-2:],
+        frame_shape,
         lambda first: map(_episode, files[first:]),
         record,
         task=task,
@@ -106,11 +108,10 @@ def _episode(path: Path) -> EpisodeArrays:
 def write_npz(folder: Path, out: Path, source: SourceSet) -> list[str]:
     """One file for each episode; the names sort in their order."""
     folder.mkdir()
-    lost: dict[str, None] = {}
+    states = False
     for number, rows in enumerate(source.read(0)):
         step_type = rows["step_type"]
-        if "physics" in rows:
-            lost["simulator states"] = None
+        states |= "physics" in rows
         np.savez_compressed(
             folder / f"{number:06d}-{len(step_type)}.npz",
             image=rows[FRAMES_KEY].transpose(0, 2, 3, 1),
@@ -121,7 +122,7 @@ def write_npz(folder: Path, out: Path, source: SourceSet) -> list[str]:
             is_last=step_type == StepType.LAST,
             is_terminal=rows["discount"] == 0,
         )
-    return [f"{what}: the format has no place for them" for what in lost]
+    return ["simulator states are not kept"] if states else []
 
 
 VD4RL = DataFormat("V-D4RL's HDF5 shards, which are this package's own: to change the size of frames", read_shards)

@@ -1,0 +1,79 @@
+"""From a finished fine-tuning to an agent's folder (`vd4rl_pomdp.agents`), its episodes played as it was rounded."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from finetune.evaluation import episode_rows, evaluate, jobs_of, own_and_none
+from vd4rl_pomdp.agents import CARD, checksums, write_rounded
+from vd4rl_pomdp.core.errors import UserError, refuse_number
+from vd4rl_pomdp.core.options import LABELS
+from vd4rl_pomdp.core.tasks import MOST_EPISODES, TASKS
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data.parity import render_info
+from vd4rl_pomdp.nn.encoder_folder import read_record
+from vd4rl_pomdp.runs.files import Row, holds_anything, read_json, write_json
+from vd4rl_pomdp.runs.outputs import refuse_inside
+from vd4rl_pomdp.runs.provenance import machine
+from vd4rl_pomdp.runs.results import read_run
+
+KEPT = ("episode", "episode_seed", "return", "length", "score", "evaluated_under")
+"""Columns of `episodes.csv` in a card."""
+
+
+def export_agent(run: Path, out: Path, episodes: int = 10, workers: int = 0) -> Row:
+    """Round a run's encoder and policy to half precision, play them, and write both and the card as an agent's folder.
+
+    Args:
+        run: folder of a finished fine-tuning.
+        out: folder to make; an empty one will do.
+        episodes: how many to play, under the corruption of training and under none.
+        workers: processes, 0 for every core.
+
+    Raises:
+        UserError: `run` is no finished fine-tuning or is damaged, or `out` holds something.
+    """
+    refuse_number("episodes", episodes, 1, MOST_EPISODES)
+    refuse_number("workers", workers, 0)
+    refuse_inside(out)
+    if holds_anything(out):
+        raise UserError(f"{out}: is not empty; choose another --out")
+    told = read_run(run)
+    if told.record["stage"] != "finetune" or not told.finished or told.diverged:
+        raise UserError(f"{run}: is no finished fine-tuning; name a folder that `vd4rl-pomdp finetune` wrote")
+    encoder, config = read_record(run / "encoder"), told.record["config"]
+    about = encoder.pretrain
+    write_rounded(run, out)
+    length = min(config["eval_length"], TASKS.named(about.task).decisions)
+    under = own_and_none(CorruptionConfig.fill(about.corruption))
+    card = {name: told.labels[name] for name in LABELS} | {
+        "data": told.record["inputs"]["data"],
+        "corruption": about.corruption,
+        "budget": {
+            "pretraining": {"preset": about.preset, "steps": about.steps, "frames": encoder.frames, "seed": about.seed},
+            "finetuning": {"preset": config["preset"], "updates": told.files["timing"].get("updates")},
+        },
+        "run": told.id,
+        "commit": told.commit,
+        "length": length,
+        "episodes": _played(out, told.labels, length, under, episodes, workers),
+        "render": render_info(about.task),
+        "processor": machine("cpu")["processor"],
+        "sha256": checksums(out),
+    }
+    write_json(out / CARD, card)
+    return card
+
+
+def replay_agent(folder: Path) -> Row:
+    """What the first episode of an agent's card gives here."""
+    card = read_json(folder / CARD)
+    return _played(folder, card, card["length"], [CorruptionConfig.fill(card["corruption"])], 1, 1)[0]
+
+
+def _played(
+    folder: Path, labels: Row, length: int, under: list[CorruptionConfig], episodes: int, workers: int
+) -> list[Row]:
+    """Rows of a card: so many episodes under each corruption in turn."""
+    jobs = jobs_of(folder, TASKS.named(labels["task"]), under, episodes, length)
+    return [{name: row[name] for name in KEPT} for row in episode_rows(evaluate(jobs, workers), labels)]

@@ -1,0 +1,379 @@
+"""Sets of other libraries in and out: what those libraries write is read, what is written they read."""
+
+import os
+
+import gymnasium
+import numpy as np
+import pytest
+
+from finetune.train import finetune
+from pretrain.train import pretrain
+from tests.helpers_data import fake_episode, fake_frame, fake_reward, read_shard, write_fake_set
+from tests.helpers_stages import smoke_finetune, smoke_pretrain
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.types import StepType
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data.folder import shard_paths
+from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.data.transfer import export_set, import_set
+from vd4rl_pomdp.envs.gymnasium_task import area_means
+from vd4rl_pomdp.sweeps.plan import DataSet
+
+LENGTHS = [20, 25, 9]
+BOUNDS = np.array([-2.0, 0.0], np.float32), np.array([2.0, 10.0], np.float32)
+
+
+@pytest.fixture
+def minari(tmp_path, monkeypatch):
+    """The library, whose own folder is the test's."""
+    monkeypatch.setenv("MINARI_DATASETS_PATH", str(tmp_path / "minari"))
+    return pytest.importorskip("minari")
+
+
+def rows_of_set(folder):
+    shards = [read_shard(shard) for shard in shard_paths(folder)]
+    return {key: np.concatenate([shard[key] for shard in shards]) for key in shards[0]}
+
+
+def assert_equal(left, right, but=()):
+    assert left.keys() - set(but) == right.keys() - set(but)
+    for key in left.keys() - set(but):
+        np.testing.assert_array_equal(left[key], right[key], err_msg=key)
+
+
+class Screen(gymnasium.Env):
+    """Shows (episode, t) as `fake_frame` does, in any layout; the task ends every second episode, a limit others."""
+
+    def __init__(self, layout=lambda frame: frame, actions=None, steps=6, buffer=False):
+        self.layout, self.steps, self.episode, self.shown = layout, steps, -1, None
+        self.buffer = buffer
+        self.action_space = actions or gymnasium.spaces.Box(*BOUNDS, (2,), np.float32)
+        self.observation_space = self.space(layout(fake_frame(0, 0)))
+
+    def space(self, value):
+        if isinstance(value, dict):
+            return gymnasium.spaces.Dict({key: self.space(part) for key, part in value.items()})
+        high = 255 if value.dtype == np.uint8 else np.inf
+        return gymnasium.spaces.Box(0, high, value.shape, value.dtype)
+
+    def reset(self, *, seed=None, options=None):
+        self.episode, self.t = self.episode + 1, 0
+        return self.picture(), {}
+
+    def picture(self):
+        fresh = self.layout(fake_frame(self.episode, self.t))
+        if self.buffer and self.shown is not None:
+            self.shown[:] = fresh
+        else:
+            self.shown = {key: part.copy() for key, part in fresh.items()} if isinstance(fresh, dict) else fresh.copy()
+        return self.shown
+
+    def step(self, action):
+        self.t += 1
+        end = self.t == self.steps
+        return self.picture(), fake_reward(self.episode, self.t - 1), end and self.episode % 2 == 0, end, {}
+
+
+def record(minari, env, name="test/screen-v0", episodes=2, cut=False, **options):
+    """What Minari's collector writes of an environment, and the actions that were taken."""
+    pytest.importorskip("jax")  # which the collector needs
+    collector = minari.DataCollector(env, **options)
+    taken = []
+    for _ in range(episodes):
+        collector.reset(seed=0)
+        ended = False
+        while not ended:
+            taken.append(env.action_space.sample())
+            *_, terminated, truncated, _ = collector.step(taken[-1])
+            ended = terminated or truncated
+    if cut:
+        collector.reset(seed=0)
+        collector.step(env.action_space.sample())
+    author = {"author": "a", "author_email": "a@example.org", "code_permalink": "none", "algorithm_name": "none"}
+    collector.create_dataset(name, **author)
+    return np.array(taken)
+
+
+LAYOUTS = {
+    "channels first": lambda frame: frame,
+    "channels last": lambda frame: frame.transpose(1, 2, 0),
+    "stack of three": lambda frame: np.concatenate([0 * frame, 0 * frame, frame]),
+    "in a dict": lambda frame: {"pixels": frame, "state": np.zeros(4, np.float32)},
+}
+
+
+@pytest.mark.parametrize("storage", ["hdf5", "arrow"])
+@pytest.mark.parametrize("layout", LAYOUTS)
+def test_minaris_recordings_come_in_to_the_byte(minari, layout, storage, tmp_path):
+    if storage == "arrow":
+        pytest.importorskip("pyarrow")
+    taken = record(minari, Screen(LAYOUTS[layout]), data_format=storage, jpeg_encoding=False)
+    import_set("minari", "test/screen-v0", tmp_path / "set")
+    rows = rows_of_set(tmp_path / "set")
+    wanted = [fake_episode(number, 7, 2) for number in range(2)]
+    for key in ("observation", "reward", "step_type"):
+        np.testing.assert_array_equal(rows[key], np.concatenate([one[key] for one in wanted]))
+    # a_t stood beside o_t: here it stands with o_{t+1}, in units of its bounds
+    action = rows["action"].reshape(2, 7, 2)
+    assert not action[:, 0].any()
+    scaled = (taken.astype(float) - BOUNDS[0]) / (BOUNDS[1] - BOUNDS[0]) * 2 - 1
+    np.testing.assert_allclose(action[:, 1:].reshape(-1, 2), scaled, atol=1e-6)
+    # the task ended the first episode, a time limit the second
+    assert rows["discount"].tolist() == [1] * 6 + [0] + [1] * 7
+
+
+def test_a_recording_that_reset_cuts_ends_by_truncation(minari, tmp_path):
+    record(minari, Screen(), cut=True)
+    import_set("minari", str(tmp_path / "minari" / "test" / "screen-v0"), tmp_path / "set")
+    rows = rows_of_set(tmp_path / "set")
+    assert rows["step_type"][-2:].tolist() == [StepType.FIRST, StepType.LAST]
+    assert rows["discount"][-1] == 1
+
+
+def test_minaris_jpeg_is_told(minari, tmp_path, capsys):
+    record(minari, Screen(LAYOUTS["channels last"]))
+    import_set("minari", "test/screen-v0", tmp_path / "set")
+    assert "its pictures are JPEG" in capsys.readouterr().err
+
+
+def test_a_buffer_that_minari_kept_is_told(minari, tmp_path, capsys):
+    record(minari, Screen(buffer=True))
+    import_set("minari", "test/screen-v0", tmp_path / "set")
+    assert "in every episode all pictures are equal" in capsys.readouterr().err
+
+
+def test_discrete_actions_become_columns(minari, tmp_path, capsys):
+    taken = record(minari, Screen(actions=gymnasium.spaces.Discrete(4, start=1)))
+    import_set("minari", "test/screen-v0", tmp_path / "set")
+    action = rows_of_set(tmp_path / "set")["action"].reshape(2, 7, 4)[:, 1:].reshape(-1, 4)
+    np.testing.assert_array_equal(action, np.where(np.arange(1, 5) == taken[:, None], 1, -1))
+    assert "the 4 discrete actions become as many columns" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(
+    ("layout", "message"),
+    [
+        (lambda frame: {"left": frame, "right": frame}, "Pass --picture, one of left, right"),
+        (lambda frame: frame[:2], "holds no pictures"),
+        (lambda frame: frame.astype(np.float32), "holds no pictures"),
+        (lambda frame: frame[:, :60], "pictures of 60x84 pixels.*pass --size"),
+    ],
+)
+def test_what_is_no_set_of_pictures_is_refused(minari, layout, message, tmp_path):
+    record(minari, Screen(layout))
+    with pytest.raises(UserError, match=message):
+        import_set("minari", "test/screen-v0", tmp_path / "set")
+    assert not (tmp_path / "set").exists()
+
+
+def test_minari_out_and_in_loses_nothing(minari, tmp_path):
+    attributes = {"task": "walker_walk", "set": "mine"}
+    folder = write_fake_set(tmp_path / "own", LENGTHS, complete_last=False, physics_dim=18, attributes=attributes)
+    main(["data", "export", "minari", str(folder), str(tmp_path / "minari" / "walker" / "mine-v0")])
+    loaded = minari.load_dataset("walker/mine-v0")
+    assert (len(loaded), loaded.total_steps) == (3, sum(LENGTHS) - 3)
+    episode = loaded[1]
+    np.testing.assert_array_equal(episode.observations, fake_episode(1, 25)["observation"])
+    np.testing.assert_array_equal(episode.actions, fake_episode(1, 25)["action"][1:])
+    assert episode.truncations[-1]
+    assert not episode.terminations.any()
+    main(["data", "import", "minari", "walker/mine-v0", str(tmp_path / "back")])
+    assert_equal(rows_of_set(folder), rows_of_set(tmp_path / "back"))
+    dataset = open_dataset(tmp_path / "back", tmp_path / "cache")
+    assert (dataset.task, dataset.quality, dataset.incomplete_episodes) == ("walker_walk", "mine", 1)
+
+
+def test_minari_says_what_it_cannot_keep(minari, tmp_path, capsys):
+    episodes = [fake_episode(0, 5), fake_episode(1, 1), fake_episode(2, 5)]
+    episodes[0]["discount"][2], episodes[1]["step_type"][0] = 0.5, StepType.FIRST
+    (tmp_path / "own").mkdir()
+    rows = {key: np.concatenate([one[key] for one in episodes]) for key in episodes[0]}
+    write_shard(tmp_path / "own" / "0_a.hdf5", rows, {"task": "walker_walk"})
+    export_set("minari", tmp_path / "own", tmp_path / "a-v0")
+    told = capsys.readouterr().err
+    assert "episodes of a single row" in told
+    assert "discounts other than" in told
+    with pytest.raises(UserError, match="call the folder walker-v0"):
+        export_set("minari", tmp_path / "own", tmp_path / "walker")
+    assert [name for name in os.listdir(tmp_path) if "walker" in name] == []
+    with pytest.raises(UserError, match="test/none-v0: is neither a folder of Minari's nor a set it has"):
+        import_set("minari", "test/none-v0", tmp_path / "set")
+
+
+def write_ogbench(path, episodes):
+    """What OGBench's generating scripts save of episodes of (T + 1, 64, 64, 3) pictures and (T + 1, A) actions."""
+    pictures, actions = ([one[part] for one in episodes] for part in (0, 1))
+    terminals = np.concatenate([np.arange(len(one)) == len(one) - 1 for one in actions])
+    np.savez_compressed(
+        path, observations=np.concatenate(pictures), actions=np.concatenate(actions), terminals=terminals
+    )
+    return path
+
+
+def test_ogbenchs_own_transitions_are_ours(tmp_path):
+    ogbench = pytest.importorskip("ogbench.utils")
+    rng = np.random.default_rng(0)
+    sizes = [5, 8, 3]
+    episodes = [
+        (rng.integers(0, 256, (n, 64, 64, 3), np.uint8), rng.uniform(-1, 1, (n, 4)).astype(np.float32)) for n in sizes
+    ]
+    path = write_ogbench(tmp_path / "visual-x-play-v0.npz", episodes)
+    theirs = ogbench.load_dataset(path, ob_dtype=np.uint8)
+    import_set("ogbench", str(path), tmp_path / "set")
+    dataset = open_dataset(tmp_path / "set", tmp_path / "cache")
+    rows = dataset.transition_rows
+    assert len(rows) == len(theirs["actions"])
+    np.testing.assert_array_equal(dataset.frames[rows].permute(0, 2, 3, 1), theirs["observations"])
+    np.testing.assert_array_equal(dataset.frames[rows + 1].permute(0, 2, 3, 1), theirs["next_observations"])
+    np.testing.assert_array_equal(dataset.action_after(rows), theirs["actions"])
+    ends = dataset.step_type[rows + 1] == StepType.LAST
+    np.testing.assert_array_equal(ends, theirs["terminals"])
+    assert (dataset.discount == 1).all()  # a time limit
+    assert (dataset.task, dataset.frame_size) == ("visual-x-play-v0", 64)
+
+
+def test_an_ogbench_set_of_states_or_a_cut_file_is_refused(tmp_path):
+    states = write_ogbench(tmp_path / "cube-v0.npz", [(np.zeros((3, 28), np.float32), np.zeros((3, 5), np.float32))])
+    with pytest.raises(UserError, match="holds no pictures"):
+        import_set("ogbench", str(states), tmp_path / "set")
+    states.write_bytes(states.read_bytes()[:200])
+    with pytest.raises(UserError, match=r"cube-v0.npz: cannot be read as this format"):
+        import_set("ogbench", str(states), tmp_path / "set")
+
+
+def test_npz_episodes_out_and_in_lose_nothing_but_states(tmp_path, capsys):
+    folder = write_fake_set(tmp_path / "walker_walk" / "expert", LENGTHS, complete_last=False, physics_dim=18)
+    main(["data", "export", "vd4rl_npz", str(folder), str(tmp_path / "npz")])
+    assert "simulator states" in capsys.readouterr().err
+    names = sorted(os.listdir(tmp_path / "npz"))
+    assert [name.rpartition("-")[2] for name in names] == [f"{length}.npz" for length in LENGTHS]
+    with np.load(tmp_path / "npz" / names[0]) as first:
+        assert first["image"].shape == (20, 84, 84, 3)
+        assert [first[key].nonzero()[0].tolist() for key in ("is_first", "is_last", "is_terminal")] == [[0], [19], []]
+    main(["data", "import", "vd4rl_npz", str(tmp_path / "npz"), str(tmp_path / "cheetah_run")])
+    assert_equal(rows_of_set(folder), rows_of_set(tmp_path / "cheetah_run"), but=["physics"])
+
+
+def test_published_64_pixel_sets_are_told_to_be_cut_short(tmp_path, capsys):
+    folder = write_fake_set(tmp_path / "own", [5, 5], attributes={"task": "walker_walk"})
+    place = tmp_path / "main" / "walker_walk" / "medium_expert" / "64px"
+    export_set("vd4rl_npz", folder, place, size=64)
+    import_set("vd4rl_npz", str(place), tmp_path / "set")
+    told = capsys.readouterr().err
+    assert "the published 64-pixel sets are cut short" in told
+    assert "2 episodes of the expert alone" in told
+    dataset = open_dataset(tmp_path / "set", tmp_path / "cache")
+    assert (dataset.task, dataset.quality, dataset.frame_size) == ("walker_walk", "medium_expert", 64)
+
+
+def test_resized_frames_are_area_means(tmp_path, capsys):
+    rng, rows = np.random.default_rng(0), fake_episode(0, 6)
+    rows["observation"] = rng.integers(0, 256, (6, 3, 84, 84), np.uint8)
+    (tmp_path / "own").mkdir()
+    write_shard(tmp_path / "own" / "0_a.hdf5", rows, {"task": "walker_walk", "set": "expert"})
+    import_set("vd4rl", str(tmp_path / "own"), tmp_path / "small", size=50)
+    assert "pictures of 84x84 pixels become 50x50 (area means)" in capsys.readouterr().err
+    frames = rows_of_set(tmp_path / "small")["observation"]
+    np.testing.assert_array_equal(
+        frames, [area_means(one.transpose(1, 2, 0), 50).transpose(2, 0, 1) for one in rows["observation"]]
+    )
+    assert_equal(rows_of_set(tmp_path / "own"), rows_of_set(tmp_path / "small"), but=["observation"])
+
+
+def test_a_cut_import_goes_on_and_ends_in_the_same_files(tmp_path, monkeypatch):
+    folder = write_fake_set(tmp_path / "own", [7, 9, 8, 12, 5], attributes={"task": "walker_walk"})
+    monkeypatch.setattr("vd4rl_pomdp.data.transfer._SHARD_ROWS", 20)
+    whole = import_set("vd4rl", str(folder), tmp_path / "whole")
+    written = []
+
+    def write(path, rows, attributes):
+        if written:
+            raise KeyboardInterrupt
+        written.append(path)
+        write_shard(path, rows, attributes)
+
+    with monkeypatch.context() as patch:
+        patch.setattr("vd4rl_pomdp.data.shards.write_shard", write)
+        with pytest.raises(KeyboardInterrupt):
+            import_set("vd4rl", str(folder), tmp_path / "set")
+    with pytest.raises(UserError, match="collection is not finished"):
+        open_dataset(tmp_path / "set")
+    changed = written[0].stat().st_mtime_ns
+    shards = import_set("vd4rl", str(folder), tmp_path / "set")
+    assert written[0].stat().st_mtime_ns == changed
+    assert [shard.read_bytes() for shard in shards] == [shard.read_bytes() for shard in whole]
+    other = write_fake_set(tmp_path / "other" / "own", [7, 9, 8, 12, 6], attributes={"task": "walker_walk"})
+    with pytest.raises(UserError, match="with another source"):
+        import_set("vd4rl", str(other), tmp_path / "set")
+
+
+def test_a_cut_export_leaves_nothing_and_begins_anew(tmp_path, monkeypatch):
+    folder, save, saved = write_fake_set(tmp_path / "own", LENGTHS), np.savez_compressed, []
+
+    def cut(path, **rows):
+        saved.append(path)
+        if len(saved) == 2:
+            raise KeyboardInterrupt
+        save(path, **rows)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(np, "savez_compressed", cut)
+        with pytest.raises(KeyboardInterrupt):
+            export_set("vd4rl_npz", folder, tmp_path / "npz")
+    assert not (tmp_path / "npz").exists()
+    export_set("vd4rl_npz", folder, tmp_path / "npz")
+    assert len(os.listdir(tmp_path / "npz")) == 3
+    assert {name for name in os.listdir(tmp_path) if "npz" in name} == {"npz"}
+    with pytest.raises(UserError, match="is not empty"):
+        export_set("vd4rl_npz", folder, tmp_path / "npz")
+    with pytest.raises(UserError, match="only imported: choose one of lerobot, lerobot_video, minari, vd4rl_npz"):
+        export_set("ogbench", folder, tmp_path / "b")
+
+
+def test_actions_outside_their_bounds_are_refused_or_clipped(tmp_path, capsys):
+    rows = fake_episode(0, 5)
+    rows["action"][2] = 1.5
+    (tmp_path / "own").mkdir()
+    write_shard(tmp_path / "own" / "0_a.hdf5", rows, {})
+    with pytest.raises(UserError, match=r"episode 0: has actions outside .*\(up to 1.5 .*--clip-actions"):
+        import_set("vd4rl", str(tmp_path / "own"), tmp_path / "set")
+    import_set("vd4rl", str(tmp_path / "own"), tmp_path / "set", clip_actions=True)
+    assert "1 actions lay outside their bounds and were clipped" in capsys.readouterr().err
+    assert rows_of_set(tmp_path / "set")["action"].max() == 1
+
+
+def test_a_recording_through_autoreset_is_told(minari, tmp_path, capsys):
+    pytest.importorskip("jax")
+    collector = minari.DataCollector(gymnasium.wrappers.Autoreset(Screen(steps=3)))
+    collector.reset(seed=0)
+    for _ in range(7):
+        collector.step(collector.action_space.sample())
+    collector.create_dataset("test/auto-v0")
+    import_set("minari", "test/auto-v0", tmp_path / "set")
+    assert "every episode begins with the last picture of the one before" in capsys.readouterr().err
+
+
+def test_the_environment_tells_the_task(minari, tmp_path, capsys):
+    env = Screen()
+    env.spec = gymnasium.spec("vd4rl_pomdp/WalkerWalk-Patch16-v0")
+    record(minari, env)
+    import_set("minari", "test/screen-v0", tmp_path / "set")
+    assert "recorded under the corruption patch" in capsys.readouterr().err
+    assert open_dataset(tmp_path / "set", tmp_path / "cache").task == "walker_walk"
+
+
+def test_a_set_without_a_task_pretrains_and_is_not_evaluated(tmp_path, own_cache):
+    folder = import_set("vd4rl", str(write_fake_set(tmp_path / "own", LENGTHS)), tmp_path / "pushing")[0].parent
+    pretrain(smoke_pretrain(folder, tmp_path / "run"))
+    assert "Imported from vd4rl: bytes" in (folder / "card.md").read_text()
+    with pytest.raises(UserError, match="unknown task 'own': choose one of"):
+        finetune(smoke_finetune(tmp_path / "run" / "encoder", folder, tmp_path / "policy"))
+
+
+def test_a_grid_takes_an_imported_set_as_it_is(tmp_path):
+    own = write_fake_set(tmp_path / "own", LENGTHS, attributes={"task": "walker_walk"})
+    import_set("vd4rl", str(own), tmp_path / "set")
+    DataSet("set", tmp_path / "set", "collect", {"task": "walker_walk"}).check()
+    with pytest.raises(UserError, match="holds a set of walker_walk, the grid says cheetah_run"):
+        DataSet("set", tmp_path / "set", "collect", {"task": "cheetah_run"}).check()

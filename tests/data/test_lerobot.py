@@ -1,0 +1,190 @@
+"""LeRobot's format out and in. What LeRobot itself makes of it: `tools/lerobot_check.py`."""
+
+import json
+
+import numpy as np
+import pytest
+
+from tests.helpers_data import fake_episode, fake_reward, read_shard, write_fake_set
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.types import StepType
+from vd4rl_pomdp.data import open_dataset
+from vd4rl_pomdp.data.folder import shard_paths
+from vd4rl_pomdp.data.format import FRAMES_KEY, write_shard
+from vd4rl_pomdp.data.formats.lerobot import LEROBOT, _encode
+from vd4rl_pomdp.data.transfer import export_set, import_set
+
+arrow = pytest.importorskip("pyarrow")
+pytest.importorskip("av")
+pq = pytest.importorskip("pyarrow.parquet")
+LENGTHS = [20, 25, 9]
+DATA, INDEX = (f"{part}/chunk-000/file-000.parquet" for part in ("data", "meta/episodes"))
+
+
+def rows_of_set(folder):
+    shards = [read_shard(shard) for shard in shard_paths(folder)]
+    return {key: np.concatenate([shard[key] for shard in shards]) for key in shards[0]}
+
+
+def assert_equal(left, right, but=()):
+    assert left.keys() == right.keys()
+    for key in left.keys() - set(but):
+        np.testing.assert_array_equal(left[key], right[key], err_msg=key)
+
+
+@pytest.fixture
+def exported(tmp_path):
+    """A set of noise in LeRobot's format, and where it came from."""
+    rng, episodes = np.random.default_rng(0), [fake_episode(number, length) for number, length in enumerate(LENGTHS)]
+    rows = {key: np.concatenate([one[key] for one in episodes]) for key in episodes[0]}
+    rows[FRAMES_KEY] = rng.integers(0, 256, rows[FRAMES_KEY].shape, np.uint8)
+    (tmp_path / "own").mkdir()
+    write_shard(tmp_path / "own" / "0_a.hdf5", rows, {"task": "walker_walk", "set": "mine"})
+    export_set("lerobot", tmp_path / "own", tmp_path / "out")
+    return tmp_path / "out", tmp_path / "own"
+
+
+def rewrite(folder, change, name=DATA):
+    """Change a table of a set."""
+    pq.write_table(change(pq.read_table(folder / name)), folder / name, row_group_size=7)
+
+
+def tell(folder, change):
+    """Change info.json."""
+    info = json.loads((folder / "meta" / "info.json").read_text())
+    change(info)
+    (folder / "meta" / "info.json").write_text(json.dumps(info))
+
+
+def as_others_write(folder, scale=1.0):
+    """A set without this package's marks: one row for each action, whose units and last rewards are its own."""
+
+    def without_last(table):
+        numbers = table["episode_index"].to_numpy()
+        table = table.filter(arrow.array(np.diff(numbers, append=-1) == 0)).drop(["next.discount"])
+        done = np.diff(table["episode_index"].to_numpy(), append=-1) != 0
+        action = arrow.array(list(np.array(table["action"].to_pylist(), np.float32) * np.float32(scale)))
+        table = table.set_column(table.schema.get_field_index("action"), "action", action)
+        return table.set_column(table.schema.get_field_index("next.done"), "next.done", arrow.array(done))
+
+    rewrite(folder, without_last)
+    shorter = arrow.array([length - 1 for length in LENGTHS])
+    rewrite(folder, lambda t: t.set_column(t.schema.get_field_index("length"), "length", shorter), INDEX)
+    tell(folder, lambda info: info["features"].pop("next.discount"))
+
+
+def test_pictures_in_the_rows_lose_nothing(tmp_path, capsys):
+    attributes = {"task": "walker_walk", "set": "mine"}
+    own = write_fake_set(tmp_path / "own", LENGTHS, 1, complete_last=False, physics_dim=2, attributes=attributes)
+    main(["data", "export", "lerobot", str(own), str(tmp_path / "out")])
+    assert "20 a second" in capsys.readouterr().err
+    main(["data", "import", "lerobot", str(tmp_path / "out"), str(tmp_path / "back")])
+    assert capsys.readouterr().err.count("note:") == 0
+    assert_equal(rows_of_set(own), rows_of_set(tmp_path / "back"))
+    dataset = open_dataset(tmp_path / "back", tmp_path / "cache")
+    assert (dataset.task, dataset.quality, dataset.incomplete_episodes) == ("walker_walk", "mine", 1)
+
+
+def test_rows_are_lerobots(exported):
+    rows = pq.read_table(exported[0] / DATA).slice(LENGTHS[0], LENGTHS[1]).to_pydict()
+    action = fake_episode(1, 25)["action"]
+    np.testing.assert_array_equal(rows["action"], [*action[1:], action[-1]])  # a_t beside o_t, the last one twice
+    assert rows["next.reward"] == [*(fake_reward(1, t) for t in range(24)), 0]
+    assert rows["next.done"] == [False] * 23 + [True] * 2
+    np.testing.assert_array_equal(rows["timestamp"], (np.arange(25) / 20).astype(np.float32))
+    assert rows["index"] == list(range(20, 45))
+    episodes = pq.read_table(exported[0] / INDEX).to_pydict()
+    assert (episodes["dataset_from_index"], episodes["dataset_to_index"]) == ([0, 20, 45], [20, 45, 54])
+    assert [row["tasks"] for row in pq.read_table(exported[0] / INDEX).to_pylist()] == [["walker_walk"]] * 3
+    stats = json.loads((exported[0] / "meta" / "stats.json").read_text())
+    whole = np.array(pq.read_table(exported[0] / DATA)["action"].to_pylist())
+    np.testing.assert_allclose(stats["action"]["std"], whole.std(0), rtol=1e-6)
+    assert (np.shape(stats["observation.image"]["mean"]), stats["action"]["count"]) == ((3, 1, 1), [54])
+
+
+def test_video_changes_pictures_alone_and_says_by_how_much(tmp_path, capsys):
+    own, rows = tmp_path / "own", fake_episode(0, 25)
+    grey = np.arange(25, dtype=np.uint8) * 10
+    rows[FRAMES_KEY] = np.broadcast_to(grey[:, None, None, None], (25, 3, 84, 84))
+    own.mkdir()
+    write_shard(own / "0_a.hdf5", rows, {"task": "walker_walk", "set": "mine"})
+    export_set("lerobot_video", own, tmp_path / "out")
+    assert "values are off by" in capsys.readouterr().err
+    import_set("lerobot", str(tmp_path / "out"), tmp_path / "back")
+    back = rows_of_set(tmp_path / "back")
+    assert_equal(rows_of_set(own), back, but=[FRAMES_KEY])
+    assert np.abs(back[FRAMES_KEY].astype(int) - rows[FRAMES_KEY]).max() <= 2
+    # LeRobot puts many episodes into one video: here the same one begins at 0.4 seconds
+    film = tmp_path / "out" / "videos" / "observation.image" / "chunk-000" / "file-000.mp4"
+    _encode(film, np.concatenate([rows[FRAMES_KEY][:8], rows[FRAMES_KEY]]).transpose(0, 2, 3, 1))
+    column = "videos/observation.image/from_timestamp"
+    later = arrow.array([0.4])
+    rewrite(tmp_path / "out", lambda t: t.set_column(t.schema.get_field_index(column), column, later), INDEX)
+    again = next(LEROBOT.read(str(tmp_path / "out"), None).read(0))[FRAMES_KEY]
+    assert np.abs(again.astype(int) - rows[FRAMES_KEY]).max() <= 2
+    film.write_bytes(film.read_bytes()[:300])
+    with pytest.raises(UserError, match=r"out: episode 0: file-000.mp4 is damaged"):
+        import_set("lerobot", str(tmp_path / "out"), tmp_path / "damaged")
+
+
+def test_a_set_without_a_last_picture_is_read_up_to_there(exported, tmp_path, capsys):
+    out, own = exported
+    as_others_write(out, scale=100)
+    import_set("lerobot", str(out), tmp_path / "back")
+    told = capsys.readouterr().err
+    assert "rewards (3.048 in all) of 3 episodes lead to no stored picture" in told
+    assert "the least and the greatest of each dimension become -1 and 1" in told
+    rows, given = rows_of_set(tmp_path / "back"), rows_of_set(own)
+    kept = np.concatenate([np.arange(19), 20 + np.arange(24), 45 + np.arange(8)])
+    np.testing.assert_array_equal(rows[FRAMES_KEY], given[FRAMES_KEY][kept])
+    np.testing.assert_array_equal(rows["reward"], given["reward"][kept])
+    assert (rows["step_type"][[18, 42, 50]] == StepType.LAST).all()
+    assert (rows["discount"] == 1).all()
+    action, theirs = rows["action"][rows["step_type"] != 0], given["action"][kept][rows["step_type"] != 0]
+    slope, _ = np.polyfit(theirs[:, 0], action[:, 0], 1)
+    np.testing.assert_allclose(action[:, 0] - slope * theirs[:, 0], (action - slope * theirs)[0, 0], atol=1e-4)
+
+
+def test_reading_from_an_episode_on_gives_the_same_rows(exported):
+    opened = LEROBOT.read(str(exported[0]), None)
+    for first in range(3):
+        for late, whole in zip(opened.read(first), list(opened.read(0))[first:], strict=True):
+            assert_equal(late, whole)
+
+
+def test_one_of_several_cameras(exported, tmp_path):
+    def second(table):
+        return table.append_column("observation.images.top", table["observation.image"].take(list(range(53, -1, -1))))
+
+    rewrite(exported[0], second)
+    tell(exported[0], lambda i: i["features"].update({"observation.images.top": i["features"]["observation.image"]}))
+    with pytest.raises(UserError, match=r"Pass --picture, one of observation.image, observation.images.top"):
+        import_set("lerobot", str(exported[0]), tmp_path / "back")
+    import_set("lerobot", str(exported[0]), tmp_path / "back", picture="observation.images.top")
+    frames = rows_of_set(exported[1])[FRAMES_KEY]
+    np.testing.assert_array_equal(rows_of_set(tmp_path / "back")[FRAMES_KEY], frames[::-1])
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        (lambda out: (out / "meta" / "info.json").unlink(), "no LeRobot set on this disk"),
+        (lambda out: tell(out, lambda info: info.update(codebase_version="v2.1")), "convert_dataset_v21_to_v30"),
+        (lambda out: tell(out, lambda info: info.update(total_episodes=4)), "has 3 of 4 episodes"),
+        (lambda out: (out / DATA).unlink(), "No such file"),
+        (lambda out: (out / DATA).write_bytes((out / DATA).read_bytes()[:5000]), "cannot be read as this format"),
+        (lambda out: rewrite(out, lambda table: table.slice(0, 30)), "has not the rows"),
+        (lambda out: tell(out, lambda info: info["features"].pop("observation.image")), "holds no pictures"),
+    ],
+)
+def test_what_cannot_be_read_is_told(exported, damage, message, tmp_path):
+    damage(exported[0])
+    with pytest.raises(UserError, match=message):
+        import_set("lerobot", str(exported[0]), tmp_path / "back")
+
+
+def test_video_of_an_odd_size_is_refused(exported, tmp_path):
+    with pytest.raises(UserError, match="even height and width, not 63"):
+        export_set("lerobot_video", exported[1], tmp_path / "film", size=63)
+    assert not (tmp_path / "film").exists()

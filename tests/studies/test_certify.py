@@ -1,0 +1,148 @@
+"""Certificates: what they rest on, what they say, and where they are read."""
+
+import json
+from html import unescape
+
+import numpy as np
+import pytest
+
+from tests.helpers_data import fake_rows
+from tests.helpers_report import describe, without_figures, write_run
+from tests.helpers_stages import contents
+from vd4rl_pomdp.cli import main, sweeps
+from vd4rl_pomdp.data.format import write_shard
+from vd4rl_pomdp.runs.certificates import certificate_id, keep_certificates
+from vd4rl_pomdp.studies.certify import FLOORS, MEMORY, NEEDS, NEEDS_NOT, OPEN, judge
+
+pytestmark = pytest.mark.usefixtures("own_cache")
+
+
+@pytest.fixture
+def states(tmp_path):
+    """A set of ten short episodes with states."""
+    rows = fake_rows([9] * 10, physics_dim=18)
+    rows["physics"] = np.random.default_rng(0).normal(size=(90, 18))
+    folder = tmp_path / "walker_walk" / "expert"
+    folder.mkdir(parents=True)
+    write_shard(folder / "0_set.hdf5", rows, {})
+    return folder
+
+
+@pytest.fixture
+def carried(monkeypatch):
+    """Words of the commands that sweeps carry out, here in this process."""
+    done = []
+
+    def carry_out(plans, *_):
+        for job in (job for job in plans[0].jobs if not job.finished):
+            done.append(job.words)
+            main(job.words)
+
+    monkeypatch.setattr(sweeps, "carry_out", carry_out)
+    return done
+
+
+SMALL = "preset=smoke seed=0 pretrain.steps=1 pretrain.patch_size=24"
+POLICIES = (
+    "finetune.updates=5 finetune.eval_every=5 finetune.eval_episodes=2 finetune.eval_length=2 finetune.eval_clean=false"
+)
+
+
+def test_a_certificate_is_trained_for_kept_and_read_by_reports_and_cards(
+    states, carried, tmp_path, monkeypatch, capsys
+):
+    out = tmp_path / "certified"
+    words = ["certify", str(states), "patch", "--out", str(out), "--change", *SMALL.split()]
+    main(words)
+    trained = [f"{method}/seed0/pretrain" for method in (MEMORY, *FLOORS)]
+    assert [line[-1].removeprefix(f"{out}/") for line in carried] == trained
+    assert all("--hold-out" in line and "24" in line for line in carried)
+    (told,) = json.loads((out / "certificates.json").read_text()).values()
+    assert told["name"] == "patch, patch_size 24"
+    assert told["why"].startswith("R2: supervised+a -")
+    assert told["why"].endswith(", too few seeds, too little itself to tell; no returns")
+    assert (states / "certificates.json").read_bytes() == (out / "certificates.json").read_bytes()
+    assert f"patch: {told['verdict']} ({told['why']})" in capsys.readouterr().out
+
+    before, carried[:] = contents(out / MEMORY), []
+    main([*words, *POLICIES.split(), "--returns"])
+    assert [line[0] for line in carried].count("pretrain") == 1, "of the state alone"
+    assert [line[0] for line in carried].count("finetune") == 4
+    kept = contents(out / MEMORY)
+    assert {name: kept[name] for name in before} == before, "what is there is not trained again"
+    (told,) = json.loads((out / "certificates.json").read_text()).values()
+    assert "returns: state returns " in told["why"]
+    assert "critics are not known to have converged" in told["why"]
+    assert told["measured"]["returns"]["verdict"] == OPEN
+
+    main(["data", "card", str(states)])
+    assert f"| memory under patch, patch_size 24 | {told['verdict']} (" in (states / "card.md").read_text()
+    without_figures(monkeypatch)
+    line = f"memory: {told['verdict']} ({told['why']})"
+    (states / "certificates.json").unlink()
+    main(["results", "add", str(out), "--out", str(tmp_path / "kept")])
+    for source, target in ((out, "first"), (tmp_path / "kept", "second"), (tmp_path / "first", "third")):
+        capsys.readouterr()
+        main(["report", str(source), "--out", str(tmp_path / target)])
+        assert line in " ".join(capsys.readouterr().out.split())
+        assert line.replace("memory", "Memory") in unescape((tmp_path / target / "index.html").read_text())
+    capsys.readouterr()
+    main(["report", "compare", str(tmp_path / "kept"), str(out), "--out", str(tmp_path / "both")])
+    assert line in " ".join(capsys.readouterr().out.split())
+    assert line.replace("memory", "Memory") in unescape((tmp_path / "both" / "index.html").read_text())
+
+
+def test_where_there_is_none_for_the_very_set_and_corruption_it_says_so(tmp_path, monkeypatch, capsys):
+    without_figures(monkeypatch)
+    for method in ("acro", "mik+a"):
+        describe(write_run(tmp_path / "runs" / method, method, 0, {10: [20.0]}), {}, data="f00")
+    certificate = {"data": "f00", "corruption": {}, "name": "patch", "verdict": NEEDS, "why": "it does", "made": "2026"}
+    hidden = {"corruption": "patch", "patch_size": 16}
+    for data, corruption in (("f01", hidden), ("f00", hidden | {"patch_size": 24})):
+        keep_certificates(tmp_path / "runs", {certificate_id(data, corruption): certificate})
+    report = ["report", str(tmp_path / "runs"), "--out", str(tmp_path / "report")]
+    main(report)
+    assert "memory: not certified\n" in capsys.readouterr().out
+    assert not (tmp_path / "report" / "certificates.json").exists()
+    for year in ("2027", "2026"):  # of two for one set and corruption the newest counts
+        (tmp_path / "runs" / year).mkdir()
+        told = certificate | {"made": year, "why": f"in {year}"}
+        keep_certificates(tmp_path / "runs" / year, {certificate_id("f00", hidden): told})
+    main(report)
+    assert f"memory: {NEEDS} (in 2027)\n" in capsys.readouterr().out
+
+
+def test_a_certificate_follows_from_the_intervals_of_both_differences():
+    def verdict(over_picture, over_integrator, seeds=3, spread=0.01, unit=1.0, level=0.9):
+        g = np.random.default_rng(0)
+        levels = {MEMORY: level, FLOORS[0]: level - over_picture, FLOORS[1]: level - over_integrator}
+        values = {name: unit * (level + spread * g.normal(size=(seeds, 20))) for name, level in levels.items()}
+        return judge(values, unit, 2)["verdict"]
+
+    assert verdict(0.4, 0.3) == NEEDS
+    assert verdict(40, 30, unit=100) == NEEDS
+    assert verdict(0.4, 0.0) == NEEDS_NOT, "the integrator is as good"
+    assert verdict(0.0, 0.4) == NEEDS_NOT, "one observation is as good"
+    assert verdict(0.4, 0.03) == NEEDS_NOT, "less than the margin"
+    assert verdict(0.4, -0.3) == NEEDS_NOT
+    assert verdict(0.4, 0.0, level=0.45) == OPEN, "it knows little itself: for want of budget?"
+    assert verdict(0.4, 0.3, level=0.45) == NEEDS
+    assert verdict(0.4, 0.1, spread=1) == OPEN
+    assert verdict(0.4, 0.3, seeds=1) == OPEN
+
+
+@pytest.mark.parametrize(
+    ("words", "line"),
+    [
+        (["--change", "finetune.updates=3"], "are trained with --returns: add it"),
+        (["--change", "pretrain.steps=1,2"], "lists several values of a setting"),
+        (["--change", "pretrain.nonsense=1"], "nonsense"),
+        (["--jobs", "-1"], "--jobs is -1"),
+    ],
+)
+def test_bad_input_is_one_line_and_trains_nothing(states, carried, tmp_path, capsys, words, line):
+    with pytest.raises(SystemExit) as end:
+        main(["certify", str(states), "patch", "--out", str(tmp_path / "out"), *words])
+    assert end.value.code == 2
+    assert line in capsys.readouterr().err
+    assert carried == []

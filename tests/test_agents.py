@@ -1,0 +1,91 @@
+"""An exported agent, loaded in one line, plays its card's episodes to the digit; what is damaged or unknown is told."""
+
+import numpy as np
+import pytest
+import torch
+from safetensors.torch import load_file
+
+from finetune.evaluation import EVALUATION_SEED
+from finetune.export import replay_agent
+from finetune.train import finetune
+from tests.helpers_report import pretraining
+from tests.helpers_stages import smoke_finetune
+from tests.runs.results.test_results import whole_run
+from vd4rl_pomdp import load_agent
+from vd4rl_pomdp.agents import FILES, SHIPPED
+from vd4rl_pomdp.cli import main
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data.parity import render_info
+from vd4rl_pomdp.envs.corrupted import CorruptedEnv
+from vd4rl_pomdp.runs.files import read_json, write_json
+from vd4rl_pomdp.runs.provenance import machine
+from vd4rl_pomdp.runs.results import read_run
+
+
+def test_an_exported_agent_plays_its_cards_episodes_to_the_digit_in_anyones_loop(data, encoder, tmp_path, capsys):
+    run = finetune(smoke_finetune(encoder, data, tmp_path / "run", eval_length=6)).path
+    out = tmp_path / "agents" / "mine"
+    main(["agents", "export", str(run), "--out", str(out), "--episodes", "2", "--workers", "1"])
+    assert f'agent: {out}, loaded by vd4rl_pomdp.load_agent("{out}")' in capsys.readouterr().out
+    agent = load_agent(str(out))
+    card = agent.card
+    told = read_run(run)
+    assert (card["run"], card["seed"], card["method"]) == (told.id, 0, "mik+a")
+    assert card["data"] == told.record["inputs"]["data"]
+    assert card["budget"]["finetuning"]["updates"] == told.files["timing"]["updates"]
+    assert [row["evaluated_under"] for row in card["episodes"]] == ["patch+zero_frames"] * 2 + ["none"] * 2
+    for row in card["episodes"]:
+        corruption = CorruptionConfig.fill(card["corruption"] | {"corruption": row["evaluated_under"]})
+        env = CorruptedEnv(TASKS[card["task"]], corruption, length=card["length"])
+        now, rewards = env.reset(row["episode_seed"], EVALUATION_SEED, row["episode"]), []
+        agent.reset()
+        while not now.time_step.last:
+            now = env.step(agent.act(now.obs.numpy()))
+            rewards.append(now.time_step.reward)
+        assert (round(float(np.cumsum(rewards)[-1]), 4), len(rewards)) == (row["return"], row["length"])
+    for name in FILES:
+        if name.endswith(".safetensors"):
+            whole, half = load_file(run / name), load_file(out / name)
+            assert all(torch.equal(half[key], value.half()) for key, value in whole.items())
+            assert (out / name).stat().st_size < 0.55 * (run / name).stat().st_size
+    with pytest.raises(SystemExit):
+        main(["agents", "export", str(run), "--out", str(out)])
+    assert f"{out}: is not empty; choose another --out" in capsys.readouterr().err
+    for name in FILES:
+        whole = (out / name).read_bytes()
+        (out / name).write_bytes(whole + b" ")
+        with pytest.raises(UserError, match=r"its files are not those that card\.json tells of"):
+            load_agent(out)
+        (out / name).write_bytes(whole)
+    write_json(out / "card.json", {"task": card["task"]})
+    with pytest.raises(UserError, match=r"its files are not those that card\.json tells of"):
+        load_agent(out)
+
+
+def test_only_a_finished_fine_tuning_becomes_an_agent(tmp_path, capsys):
+    (tmp_path / "empty").mkdir()
+    (whole_run(tmp_path / "cut") / "timing.json").unlink()
+    pretraining(tmp_path / "pretrained")
+    for name, told in (("cut", "is no finished fine-tuning"), ("pretrained", "is no finished"), ("empty", "is no run")):
+        with pytest.raises(SystemExit) as ended:
+            main(["agents", "export", str(tmp_path / name), "--out", str(tmp_path / "new")])
+        assert ended.value.code == 2
+        assert told in capsys.readouterr().err
+    assert not (tmp_path / "new").exists()
+
+
+def test_an_unknown_name_lists_what_ships(tmp_path):
+    with pytest.raises(UserError) as told:
+        load_agent("walker_walk/medium_expert/patch/mine")
+    assert f"those that ship are {', '.join(read_json(SHIPPED / 'index.json')) or 'none'}" in str(told.value)
+    assert "\n" not in str(told.value)
+
+
+def test_those_that_ship_play_their_first_episode_to_the_digit():
+    for name, place in read_json(SHIPPED / "index.json").items():
+        card = read_json(SHIPPED / place / "card.json")
+        assert load_agent(name).card == card
+        if (card["render"], card["processor"]) == (render_info(card["task"]), machine("cpu")["processor"]):
+            assert replay_agent(SHIPPED / place) == card["episodes"][0]

@@ -1,0 +1,119 @@
+"""An agent, encoder and policy, and its folder: both in half precision, and a card that says what it returns.
+
+    FOLDER/  encoder/  policy/  card.json
+
+The card tells task, quality and fingerprint of the set, corruption, method, algorithm, seed, budget, the run's id and
+commit, the episodes of the rounded weights, what drew and computed them (digits are the same where renderer and kind of
+processor are), and the SHA-256 of the other files. What ships lies in this package's folder; index.json beside it tells
+the folder of every name.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from safetensors import SafetensorError
+from safetensors.torch import save
+
+from vd4rl_pomdp.core.errors import UserError, disk_errors
+from vd4rl_pomdp.core.reading import read_bytes, read_tensors, safetensors_metadata
+from vd4rl_pomdp.core.tasks import FRAME_SIZE, Task
+from vd4rl_pomdp.envs.corrupted import Observation
+from vd4rl_pomdp.envs.make import layout_of
+from vd4rl_pomdp.nn.encoder import Encoder
+from vd4rl_pomdp.nn.encoder_folder import load_encoder
+from vd4rl_pomdp.nn.frame import StateFrame
+from vd4rl_pomdp.nn.policy import Policy, load_policy
+from vd4rl_pomdp.runs.files import read_json, sha256, write_bytes
+
+CARD = "card.json"
+FILES = tuple(f"{part}/{name}" for part in ("encoder", "policy") for name in ("config.json", "model.safetensors"))
+"""An agent's files beside its card."""
+SHIPPED = Path(__file__).parent
+
+
+class Agent:
+    """Encoder and policy, fed one row at a time; its own past actions are part of the history."""
+
+    def __init__(self, encoder: Encoder, policy: Policy, card: dict[str, Any] | None = None) -> None:
+        self.encoder, self.policy, self.card = encoder, policy, card or {}
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget everything: an episode begins."""
+        self._state = self.encoder.initial_state(1)
+        self._action = torch.zeros(1, self.encoder.config.action_dim)  # what first rows carry in training
+
+    @property
+    def picture_size(self) -> int:
+        """Height and width of the pictures it is shown; one that reads states is watched in the benchmark's."""
+        return FRAME_SIZE if self.encoder.reads_state else self.encoder.config.size
+
+    def encoder_input(self, now: Observation, task: Task) -> torch.Tensor:
+        """What the encoder reads: the corrupted stack, or the simulator state for the `state` reference."""
+        if not isinstance(self.encoder.frame, StateFrame):
+            return now.obs
+        state = torch.from_numpy(layout_of(task).visible_state(now.time_step.physics))
+        return self.encoder.frame.observe(state[None], now.key)[0]
+
+    @torch.no_grad()
+    def act(self, obs: torch.Tensor | np.ndarray) -> np.ndarray:
+        """Mean action (A,) float32 for a (C, S, S) uint8 observation."""
+        # one row at a time is all that an environment gives; training read the same states from whole windows
+        z, self._state = self.encoder.step(torch.as_tensor(obs)[None], self._action, self._state)
+        self._action = self.policy(z)
+        return self._action[0].numpy()
+
+    def set_last_action(self, action: np.ndarray) -> None:
+        """Tell that another (A,) action than the last answer was executed."""
+        self._action = torch.from_numpy(action)[None]
+
+
+def load_agent(name: Path | str) -> Agent:
+    """An agent that ships, by name, or one's own from its folder, at the beginning of an episode.
+
+    Raises:
+        UserError: there is none, or its files are damaged.
+    """
+    index = read_json(SHIPPED / "index.json")
+    folder = SHIPPED / index[str(name)] if str(name) in index else Path(name)
+    if not (folder / CARD).exists():
+        raise UserError(
+            f"unknown agent {str(name)!r}: it is no folder with {CARD}, as `agents export` and `hub pull` write, and "
+            f"those that ship are {', '.join(index) or 'none'}"
+        )
+    card = read_json(folder / CARD)
+    if not {"task", "corruption"} <= card.keys() or card.get("sha256") != checksums(folder):
+        raise UserError(f"{folder}: its files are not those that {CARD} tells of; take another copy")
+    return Agent(load_encoder(folder / "encoder", card["task"])[0], load_policy(folder / "policy"), card)
+
+
+def checksums(folder: Path) -> dict[str, str]:
+    """SHA-256 of an agent's FILES, by name; raises UserError if one is missing."""
+    with disk_errors(folder):
+        return {name: sha256(folder / name) for name in FILES}
+
+
+def write_rounded(run: Path, folder: Path) -> None:
+    """Write a run's encoder and policy in half precision, which is all the rounding that there is: loaded as float32.
+
+    Raises:
+        UserError: a file is missing or damaged, a weight is too large, or the folder cannot be written.
+    """
+    for name in FILES:
+        with disk_errors(folder):
+            (folder / name).parent.mkdir(parents=True, exist_ok=True)
+        try:
+            content = read_bytes(run / name)
+            if name.endswith(".safetensors"):
+                weights = read_tensors(run / name)
+                rounded = {key: value.half() if value.is_floating_point() else value for key, value in weights.items()}
+                if large := [key for key, value in rounded.items() if not value.isfinite().all()]:
+                    raise UserError(f"{run / name}: {large[0]} is too large for half precision")
+                content = save(rounded, safetensors_metadata(content) or None)
+        except (FileNotFoundError, SafetensorError) as error:
+            raise UserError(f"{run / name}: cannot be read; name the folder of a finished fine-tuning") from error
+        write_bytes(folder / name, content)

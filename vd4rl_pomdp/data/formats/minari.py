@@ -1,0 +1,146 @@
+"""Minari's sets, by its own library: any of its storages is read, HDF5 is written.
+
+A set is a folder with a `data` folder in it, or the name that Minari knows it by. An episode has one observation more
+than actions, a_t standing beside the o_t that it follows. Pictures are written as (3, S, S), which Minari keeps to the
+byte; (H, W, 3), what most environments show, it stores as JPEG unless `jpeg_encoding=False` was passed.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import gymnasium
+import numpy as np
+
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.tasks import TASKS, GymnasiumTask
+from vd4rl_pomdp.core.types import StepType
+from vd4rl_pomdp.data.format import FRAMES_KEY
+from vd4rl_pomdp.data.formats.base import DataFormat, SourceSet, as_frames, chosen, library, one_hot, rows_of
+from vd4rl_pomdp.data.shards import EpisodeArrays
+
+_KEY = "vd4rl_pomdp"
+"""What an export adds to Minari's metadata: task and quality of the set."""
+
+
+def read(source: str, picture: str | None) -> SourceSet:
+    """Open a set by its folder or its name."""
+    minari, storage = library("minari", "minari"), library("minari.dataset.minari_storage", "minari")
+    folder = next((f for f in (Path(source), Path(source, "data")) if (f / "metadata.json").is_file()), None)
+    try:
+        dataset = minari.MinariDataset(folder) if folder else minari.load_dataset(source)
+    except FileNotFoundError as error:
+        raise UserError(f"is neither a folder of Minari's nor a set it has: `minari download {source}`?") from error
+    actions = dataset.action_space
+    discrete = isinstance(actions, gymnasium.spaces.Discrete)
+    if not discrete and not isinstance(actions, gymnasium.spaces.Box):
+        raise UserError(f"has actions of {actions}, not Box or Discrete")
+    spaces = dict(_leaves(dataset.observation_space))
+    key, size = chosen({name: space.shape for name, space in spaces.items() if space.dtype == np.uint8}, picture)
+    told, spec = json.loads(dataset.storage.metadata.get(_KEY, "{}")), dataset.env_spec
+    notes = []
+    if discrete:
+        notes.append(f"the {actions.n} discrete actions become as many columns: 1 for the one taken, -1 for the others")
+    if storage.is_image_space(spaces[key]) and dataset.storage.jpeg_encoding:
+        notes.append(
+            "its pictures are JPEG, not what the environment drew; DataCollector(jpeg_encoding=False) keeps it"
+        )
+    if spec and spec.kwargs.get("corruption", "none") != "none":
+        notes.append(f"its pictures were recorded under the corruption {spec.kwargs['corruption']}")
+    lengths = [int(one["total_steps"]) for one in dataset.storage.get_episode_metadata(dataset.episode_indices)]
+
+    def episode(number: int) -> EpisodeArrays:
+        stored = dataset[number]
+        if len(stored) != lengths[number]:  # Arrow's reader stops after 32,768 rows, its largest batch
+            raise UserError(f"Minari reads {len(stored)} of its {lengths[number]} steps")
+        frames = stored.observations
+        for part in key.split("/") if key else ():
+            frames = frames[int(part) if isinstance(frames, tuple) else part]
+        action = stored.actions
+        action = one_hot(action - actions.start, actions.n) if discrete else action.reshape(len(action), -1)
+        return rows_of(
+            as_frames(frames),
+            action,
+            stored.rewards,
+            stored.terminations,
+            bool(stored.terminations[-1] or stored.truncations[-1]),
+            stored.infos["physics"] if told.get("physics") else None,
+        )
+
+    bounded = not discrete and actions.is_bounded()
+    return SourceSet(
+        len(lengths),
+        sum(lengths) + len(lengths),
+        size,
+        lambda first: map(episode, range(first, len(lengths))),
+        {"id": dataset.id, "steps": sum(lengths), "minari": dataset.minari_version},
+        actions.low.ravel() if bounded else None,
+        actions.high.ravel() if bounded else None,
+        told.get("task") or _task(spec),
+        told.get("set"),
+        notes,
+    )
+
+
+def _leaves(space: gymnasium.Space[Any], name: str = "") -> Iterator[tuple[str, gymnasium.Space[Any]]]:
+    """Spaces of single arrays within a space, by the keys that lead to them."""
+    if isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple):
+        parts = space.spaces.items() if isinstance(space, gymnasium.spaces.Dict) else enumerate(space.spaces)
+        for key, part in parts:
+            yield from _leaves(part, f"{name}/{key}".strip("/"))
+    if isinstance(space, gymnasium.spaces.Box):
+        yield name, space
+
+
+def _task(spec: gymnasium.envs.registration.EnvSpec | None) -> str | None:
+    """The task whose environment recorded a set."""
+    if spec is None:
+        return None
+    own = {name for name, task in TASKS.items() if isinstance(task, GymnasiumTask) and task.environment == spec.id}
+    told = spec.kwargs.get("task") if spec.id.startswith("vd4rl_pomdp/") else None
+    return told or next(iter(own), None)
+
+
+def write(folder: Path, out: Path, source: SourceSet) -> list[str]:
+    """Write a set that Minari loads by its name where `out` lies in Minari's own folder, and by its path elsewhere."""
+    minari, storage = library("minari", "minari"), library("minari.dataset.minari_storage", "minari")
+    home = library("minari.storage.datasets_root_dir", "minari").get_dataset_path().resolve()
+    name = out.resolve().relative_to(home).as_posix() if out.resolve().is_relative_to(home) else out.name
+    matched = library("minari.dataset.minari_dataset", "minari").DATASET_ID_RE.fullmatch(name)
+    if not matched or not matched["version"]:
+        raise UserError(f"{out}: Minari's names end in a version: call the folder {out.name or 'walker'}-v0")
+    folder.mkdir()
+    # An episode's first row is all that tells widths; (3, S, S) is no picture for any version, so it is never encoded.
+    first = next(source.read(0))
+    pictures = gymnasium.spaces.Box(0, 255, first[FRAMES_KEY].shape[1:], np.uint8)
+    actions = gymnasium.spaces.Box(-1.0, 1.0, first["action"].shape[1:], np.float32)
+    made = storage.MinariStorage.new(folder / "data", pictures, actions)
+    told = {"task": source.task, "set": source.quality, "physics": "physics" in first}
+    made.update_metadata({"dataset_id": name, "minari_version": minari.__version__, _KEY: json.dumps(told)})
+    lost: dict[str, None] = {}
+    for rows in source.read(0):
+        discount, steps = rows["discount"], len(rows["reward"]) - 1
+        if not steps:
+            lost["episodes of a single row are left out: Minari has none"] = None
+            continue
+        if not np.isin(discount[1:], (0, 1)).all() or discount[0] != 1:
+            lost["discounts other than 1, and 0 where the task ended, are not kept"] = None
+        truncations = (rows["step_type"] == StepType.LAST)[1:] & (discount[1:] != 0)
+        episode = minari.data_collector.EpisodeBuffer(
+            observations=rows[FRAMES_KEY],
+            actions=rows["action"][1:],
+            rewards=rows["reward"][1:],
+            terminations=discount[1:] == 0,
+            truncations=truncations,
+            infos={"physics": rows["physics"]} if told["physics"] else None,
+        )
+        made.update_episodes([episode])
+    return list(lost)
+
+
+MINARI = DataFormat(
+    "Minari's sets, HDF5 or Arrow; what its DataCollector records of a Gymnasium environment", read, write
+)

@@ -1,0 +1,202 @@
+"""`vd4rl-pomdp certify`: does a set under a corruption need a memory of what was seen?
+
+The grid `certify` trains, each told the simulator's states:
+
+    supervised+a          a memory of pixels and actions
+    supervised_picture    one observation, no memory
+    integrator            the first observation, the actions since and the time
+    state                 nothing is hidden: whether data and budget suffice
+
+What each is worth is R^2 of the states in episodes that neither encoder nor probe was trained on, and, if asked for,
+what a policy on it returns. A memory of what was seen is needed where the first exceeds the second and the third.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import replace
+from datetime import UTC, datetime
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from finetune.features import FrozenEncoder
+from finetune.histories import read_whole
+from vd4rl_pomdp import __version__
+from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import flat, settings_of, words_of
+from vd4rl_pomdp.core.tasks import UNKNOWN_QUALITY
+from vd4rl_pomdp.corruptions import CorruptionConfig
+from vd4rl_pomdp.data import Dataset, open_dataset
+from vd4rl_pomdp.nn.encoder_folder import load_encoder, read_record
+from vd4rl_pomdp.nn.probes import probe_r2
+from vd4rl_pomdp.report import stats
+from vd4rl_pomdp.report.gates import STATE_SHARE, converged, episodes_of
+from vd4rl_pomdp.report.load import load_runs
+from vd4rl_pomdp.report.stats import with_interval
+from vd4rl_pomdp.report.variants import groups
+from vd4rl_pomdp.runs.certificates import certificate_id, keep_certificates
+from vd4rl_pomdp.runs.device import pick_device
+from vd4rl_pomdp.runs.files import Row, read_json, write_json
+from vd4rl_pomdp.runs.provenance import git_commit
+from vd4rl_pomdp.sweeps.grid import GridCell, load_grid
+from vd4rl_pomdp.sweeps.plan import Job
+from vd4rl_pomdp.sweeps.stages import COMMANDS, check_cells, recipe_of, recorded, told
+
+GRID = "certify"
+MEMORY, FLOORS, STATE = "supervised+a", ("supervised_picture", "integrator"), "state"
+NEEDS, NEEDS_NOT, OPEN = "needs a memory of what was seen", "needs no memory of what was seen", "undecided"
+MARGIN = 0.05
+"""A memory that is known to add less, in R^2 or as a share of the data's mean return, is not needed."""
+ENOUGH = 0.5
+"""A memory that is worth less itself, likewise, may lack budget: that it adds nothing is then no verdict."""
+R2_FILE = "r2.json"
+"""R^2 in every held-out episode, in the folder of a pretraining."""
+
+
+def planned(
+    data: Path, corruption: str, out: Path, returns: bool, changes: Sequence[str]
+) -> tuple[Dataset, list[GridCell], list[Job]]:
+    """The set, the grid's cells for it, and their trainings, each after the one that it needs.
+
+    Args:
+        data: folder of a set with simulator states.
+        corruption: name of a corruption.
+        out: folder of the runs, OUT/METHOD/seedN/STAGE.
+        returns: whether policies are trained, too.
+        changes: settings of the grid's trainings, "pretrain.steps=100" or "seed=0,1".
+    """
+    dataset = open_dataset(data)
+    dataset.require_states()
+    about = [
+        f"collect.task={dataset.task}",
+        f"collect.quality={dataset.quality or UNKNOWN_QUALITY}",
+        f"pretrain.corruption={corruption}",
+    ]
+    cells = load_grid(GRID, [*about, *changes]).cells()
+    check_cells(cells, GRID)
+    if not returns:
+        if any(change.startswith("finetune.") for change in changes):
+            raise UserError("--change finetune.* is of policies, which are trained with --returns: add it")
+        without = [replace(c, sections={n: s for n, s in c.sections.items() if n != "finetune"}) for c in cells]
+        cells = [cell for cell in without if cell.value("method") != STATE]
+    jobs = [job for cell in cells for job in _jobs(cell, data, out)]
+    if len({job.name for job in jobs}) < len(jobs):
+        raise UserError("--change lists several values of a setting: a certificate is of one, but for seeds")
+    return dataset, cells, jobs
+
+
+def place_of(cell: GridCell) -> str:
+    """Where the runs of a cell go, below the folder of all."""
+    return f"{cell.value('method')}/seed{cell.seed}"
+
+
+def _jobs(cell: GridCell, data: Path, out: Path) -> Iterator[Job]:
+    before, values = list[str](), dict[str, object]()
+    for section in cell.chain[1:]:
+        name = f"{place_of(cell)}/{section}"
+        folders = {"data": data} | ({"encoder": out / before[-1] / "encoder"} if before else {}) | {"out": out / name}
+        words = [*COMMANDS[section], *words_of(told(cell, section) | folders)]
+        values |= recorded(cell, section)
+        settings = {key: str(value) for key, value in settings_of(values).items()}
+        yield Job(name, section, out / name, words, list(before), settings=settings, recipe=recipe_of(cell, section))
+        before.append(name)
+
+
+def certify(dataset: Dataset, cells: Sequence[GridCell], out: Path, returns: bool) -> Row:
+    """The certificate of finished runs; it is kept in their folder and in the set's."""
+    places = {method: [place_of(cell) for cell in mine] for method, mine in groups(cells, _method).items()}
+    measured = {
+        "R2": judge({name: _r2(dataset, [out / place for place in places[name]]) for name in (MEMORY, *FLOORS)}, 1, 2)
+    }
+    if returns:
+        measured["returns"] = _returns([out / place / "finetune" for mine in places.values() for place in mine])
+    record = read_record(out / places[MEMORY][0] / "pretrain" / "encoder")
+    hidden, usual = record.pretrain.corruption, flat(CorruptionConfig.of(record.pretrain.corruption["corruption"]))
+    options = (f"{name} {value}" for name, value in hidden.items() if usual.get(name) != value)
+    verdicts = {row["verdict"] for row in measured.values()}
+    certificate = {
+        "data": dataset.fingerprint,
+        **{"task": dataset.task, "quality": dataset.quality, "corruption": hidden},
+        "name": ", ".join([hidden["corruption"], *options]),
+        "verdict": verdicts.pop() if len(verdicts) == 1 else OPEN,
+        "why": "; ".join(f"{kind}: {row['why']}" for kind, row in measured.items()) + "; no returns" * (not returns),
+        "measured": measured,
+        "seeds": sorted({cell.seed for cell in cells}),
+        **{"version": __version__, "commit": git_commit(), "made": datetime.now(UTC).isoformat(timespec="seconds")},
+    }
+    for folder in (out, dataset.path if dataset.path.is_dir() else dataset.path.parent):
+        keep_certificates(folder, {certificate_id(dataset.fingerprint, hidden): certificate})
+    return certificate
+
+
+def _method(cell: GridCell) -> str:
+    return str(cell.value("method"))
+
+
+def _r2(dataset: Dataset, places: Sequence[Path]) -> np.ndarray:
+    """(seeds, held-out episodes) of the encoders at some places."""
+    for place in places:
+        if not (file := place / "pretrain" / R2_FILE).exists():
+            write_json(file, {"r2": held_out_r2(place / "pretrain" / "encoder", dataset)})
+    return np.array([read_json(place / "pretrain" / R2_FILE)["r2"] for place in places])
+
+
+def held_out_r2(folder: Path, dataset: Dataset) -> list[float]:
+    """R^2 of poses and velocities in every held-out episode, by a linear probe of an encoder's states.
+
+    Args:
+        folder: the encoder's, which was pretrained on the set with `hold_out`.
+        dataset: the set; it is moved to a GPU if there is one.
+    """
+    encoder, card = load_encoder(folder, dataset.task, dataset.action_dim, dataset.frame_size)
+    device = pick_device("auto")
+    corruption, precision = CorruptionConfig.fill(card.corruption), card.settings["precision"]
+    frozen = FrozenEncoder(encoder.to(device), dataset.to(device), corruption, 0, precision, card.seed)
+    view = frozen.view(0)
+    with torch.no_grad():
+        parts = [read_whole(encoder, frozen.frames(some, view), dataset, some).cpu() for some in frozen.groups()]
+    return probe_r2(torch.cat(parts).numpy(), dataset.states().cpu().numpy(), dataset.episode.cpu().numpy())
+
+
+def _returns(folders: Sequence[Path]) -> Row:
+    """What the policies of some folders return, and what that says."""
+    runs = load_runs(folders)
+    data = np.mean([run.reference.data_return for run in runs])
+    found = {method: episodes_of(mine) for method, mine in groups(runs, lambda run: run.method).items()}
+    row = judge({name: found[name] for name in (MEMORY, *FLOORS)}, float(data), 0)
+    share = float(found[STATE].mean() / data)
+    row |= {"data_return": float(data), "state_share": share, "converged": converged(runs)}
+    missed = []
+    if not share >= STATE_SHARE:
+        missed.append(f"state returns {share:.2f} of the data's return, less than {STATE_SHARE}")
+    if not row["converged"]:
+        missed.append(f"critics are {'not known to have' if row['converged'] is None else 'not'} converged")
+    return row | ({"verdict": OPEN, "why": "; ".join([*missed, row["why"]])} if missed else {})
+
+
+def judge(values: Mapping[str, np.ndarray], unit: float, digits: int) -> Row:
+    """Whether the memory is above both floors.
+
+    Args:
+        values: (seeds, episodes) by method.
+        unit: what MARGIN and ENOUGH are shares of.
+        digits: of numbers in words.
+    """
+    row: Row = {"methods": {}, "above": {}}
+    for name, scores in values.items():
+        row["methods"][name] = [float(scores.mean()), *(stats.mean_interval(scores) or (None, None))]
+    for floor in FLOORS:
+        difference = float(values[MEMORY].mean() - values[floor].mean())
+        ends = stats.difference_interval(values[MEMORY], values[floor]) or (None, None)
+        row["above"][floor] = [difference, *ends]
+    above = row["above"].values()
+    known, weak = all(low is not None for _, low, _ in above), row["methods"][MEMORY][0] < ENOUGH * unit
+    verdict = NEEDS if known and all(low > 0 for _, low, _ in above) else OPEN
+    if known and any(high < MARGIN * unit for *_, high in above):
+        verdict = OPEN if weak else NEEDS_NOT
+    told = [f"{MEMORY} {with_interval(*row['methods'][MEMORY], digits=digits)}"]
+    told += [f"less {floor} {with_interval(*ends, digits=digits)}" for floor, ends in row["above"].items()]
+    told += ["too few seeds"] * (not known) + ["too little itself to tell"] * (weak and verdict == OPEN)
+    return row | {"verdict": verdict, "why": ", ".join(told)}
