@@ -76,7 +76,7 @@ def as_others_write(folder, scale=1.0):
 
 def test_pictures_in_the_rows_lose_nothing(tmp_path, capsys):
     attributes = {"task": "walker_walk", "set": "mine"}
-    own = write_fake_set(tmp_path / "own", LENGTHS, 1, complete_last=False, physics_dim=18, attributes=attributes)
+    own = write_fake_set(tmp_path / "own", LENGTHS, 1, complete_last=False, physics_dim=2, attributes=attributes)
     main(["data", "export", "lerobot", str(own), str(tmp_path / "out")])
     assert "20 a second" in capsys.readouterr().err
     main(["data", "import", "lerobot", str(tmp_path / "out"), str(tmp_path / "back")])

@@ -112,7 +112,7 @@ def read_lerobot(path: str, picture: str | None = None) -> SourceSet:
         low,
         high,
         task=tasks[0] if named else None,
-        quality=features[_OWN].get("info", {}).get("quality") if own else None,
+        quality=(features[_OWN].get("info") or {}).get("quality") if own else None,
         notes=notes,
     )
 
@@ -131,7 +131,8 @@ def _survey(pq: Any, files: list[Path], wanted: list[str]) -> tuple[np.ndarray |
         if "next.done" in wanted:  # a row after the one that ended the episode is there for its picture alone
             last = last[~table["next.done"].to_numpy()[np.maximum(last - 1, 0)]]
         unused += len(last)
-        lost += float(table["next.reward"].to_numpy()[last].sum()) if "next.reward" in wanted else 0.0
+        if "next.reward" in wanted:
+            lost += float(_dense(table["next.reward"].combine_chunks())[last].sum())
     if unused:
         rewards = f" and rewards ({lost:g} in all)" if "next.reward" in wanted else ""
         notes.append(f"the last actions{rewards} of {unused} episodes lead to no stored picture and are left out")
@@ -164,7 +165,8 @@ def _filmed(path: Path, times: np.ndarray, fps: float) -> np.ndarray:
     """(T, H, W, 3) uint8 pictures of a video at increasing times, in seconds of the file."""
     av = library("av", _EXTRA)
     # One for all frames: `frame.to_ndarray(format=...)` makes a new one each time, which is four times as slow.
-    pictures, converter = [], av.video.reformatter.VideoReformatter()
+    converter = av.video.reformatter.VideoReformatter()
+    pictures: list[np.ndarray] = []
     try:
         with av.open(str(path)) as file:
             stream = file.streams.video[0]
@@ -187,8 +189,12 @@ def _rows(told: dict[str, np.ndarray], frames: np.ndarray, own: bool) -> Episode
     done, truncated = (
         bool(told[name][-2:-1].any()) if name in told else False for name in ("next.done", "next.truncated")
     )
-    reward, action = told.get("next.reward", np.zeros(count))[:-1], told["action"].reshape(count, -1)[:-1]
-    rows = rows_of(frames, action, reward, done and not truncated, done or not own, told.get("physics"))
+    reward, action = (
+        told.get("next.reward", np.zeros(count)).reshape(count)[:-1],
+        told["action"].reshape(count, -1)[:-1],
+    )
+    physics = told["physics"].reshape(count, -1) if "physics" in told else None
+    rows = rows_of(frames, action, reward, done and not truncated, done or not own, physics)
     return rows | ({"discount": np.append(1.0, told[_OWN][:-1])} if own else {})
 
 
@@ -215,7 +221,8 @@ def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = Fals
     told: list[dict[str, Any]] = []
     data: Any = None
     index: Any = None
-    begin, files, filled, unkept, changes, most = 0, 0, 0, False, [], 0
+    changes: list[float] = []
+    begin, files, filled, unkept, most = 0, 0, 0, False, 0
     for number, rows in enumerate(source.read(0)):
         count = len(rows["reward"])
         unkept |= bool(rows["action"][0].any() or rows["reward"][0] or rows["discount"][0] != 1)
@@ -251,7 +258,8 @@ def write_lerobot(folder: Path, out: Path, source: SourceSet, video: bool = Fals
             _encode(film, pictures)
             if number % 10 == 0:
                 change = np.abs(_filmed(film, np.arange(count) / _FPS, _FPS).astype(np.int16) - pictures)
-                changes, most = [*changes, change.mean()], max(most, int(change.max()))
+                changes.append(float(change.mean()))
+                most = max(most, int(change.max()))
             where |= {"from_timestamp": 0.0, "to_timestamp": count / _FPS}
             place |= {f"videos/{_PICTURE}/{name}": value for name, value in where.items()}
         stats = {name: _stats(values) for name, values in columns.items()} | {_PICTURE: _stats(pictures[::10])}

@@ -19,15 +19,7 @@ from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.tasks import TASKS, GymnasiumTask
 from vd4rl_pomdp.core.types import StepType
 from vd4rl_pomdp.data.format import FRAMES_KEY
-from vd4rl_pomdp.data.formats.base import (
-    DataFormat,
-    SourceSet,
-    as_frames,
-    chosen,
-    library,
-    one_hot,
-    rows_of,
-)
+from vd4rl_pomdp.data.formats.base import DataFormat, SourceSet, as_frames, chosen, library, one_hot, rows_of
 from vd4rl_pomdp.data.shards import EpisodeArrays
 
 _KEY = "vd4rl_pomdp"
@@ -95,12 +87,10 @@ def read(source: str, picture: str | None) -> SourceSet:
 
 def _leaves(space: gymnasium.Space[Any], name: str = "") -> Iterator[tuple[str, gymnasium.Space[Any]]]:
     """Spaces of single arrays within a space, by the keys that lead to them."""
-    inner = {
-        gymnasium.spaces.Dict: lambda: space.spaces.items(),
-        gymnasium.spaces.Tuple: lambda: enumerate(space.spaces),
-    }.get(type(space))
-    for key, part in inner() if inner else ():
-        yield from _leaves(part, f"{name}/{key}".strip("/"))
+    if isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple):
+        parts = space.spaces.items() if isinstance(space, gymnasium.spaces.Dict) else enumerate(space.spaces)
+        for key, part in parts:
+            yield from _leaves(part, f"{name}/{key}".strip("/"))
     if isinstance(space, gymnasium.spaces.Box):
         yield name, space
 
@@ -117,7 +107,6 @@ def _task(spec: gymnasium.envs.registration.EnvSpec | None) -> str | None:
 def write(folder: Path, out: Path, source: SourceSet) -> list[str]:
     """Write a set that Minari loads by its name where `out` lies in Minari's own folder, and by its path elsewhere."""
     minari, storage = library("minari", "minari"), library("minari.dataset.minari_storage", "minari")
-    library("h5py", "minari")
     home = library("minari.storage.datasets_root_dir", "minari").get_dataset_path().resolve()
     name = out.resolve().relative_to(home).as_posix() if out.resolve().is_relative_to(home) else out.name
     matched = library("minari.dataset.minari_dataset", "minari").DATASET_ID_RE.fullmatch(name)
@@ -135,10 +124,10 @@ def write(folder: Path, out: Path, source: SourceSet) -> list[str]:
     for rows in source.read(0):
         discount, steps = rows["discount"], len(rows["reward"]) - 1
         if not steps:
-            lost["episodes of a single row, which Minari cannot have"] = None
+            lost["episodes of a single row are left out: Minari has none"] = None
             continue
         if not np.isin(discount[1:], (0, 1)).all() or discount[0] != 1:
-            lost["discounts other than 1, and 0 where the task ended"] = None
+            lost["discounts other than 1, and 0 where the task ended, are not kept"] = None
         truncations = (rows["step_type"] == StepType.LAST)[1:] & (discount[1:] != 0)
         episode = minari.data_collector.EpisodeBuffer(
             observations=rows[FRAMES_KEY],

@@ -108,11 +108,10 @@ def _episode(path: Path) -> EpisodeArrays:
 def write_npz(folder: Path, out: Path, source: SourceSet) -> list[str]:
     """One file for each episode; the names sort in their order."""
     folder.mkdir()
-    lost: dict[str, None] = {}
+    states = False
     for number, rows in enumerate(source.read(0)):
         step_type = rows["step_type"]
-        if "physics" in rows:
-            lost["simulator states"] = None
+        states |= "physics" in rows
         np.savez_compressed(
             folder / f"{number:06d}-{len(step_type)}.npz",
             image=rows[FRAMES_KEY].transpose(0, 2, 3, 1),
@@ -123,7 +122,7 @@ def write_npz(folder: Path, out: Path, source: SourceSet) -> list[str]:
             is_last=step_type == StepType.LAST,
             is_terminal=rows["discount"] == 0,
         )
-    return [f"{what}: the format has no place for them" for what in lost]
+    return ["simulator states are not kept"] if states else []
 
 
 VD4RL = DataFormat("V-D4RL's HDF5 shards, which are this package's own: to change the size of frames", read_shards)
