@@ -25,7 +25,7 @@ from vd4rl_pomdp.nn.policy import load_policy, policy_step
 from vd4rl_pomdp.policies.actor import read_actor
 from vd4rl_pomdp.runs import CONFIG_FILE, EPISODES_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.episodes import read_episodes
-from vd4rl_pomdp.runs.files import read_json
+from vd4rl_pomdp.runs.files import Row, read_json
 from vd4rl_pomdp.runs.provenance import machine
 from vd4rl_pomdp.runs.results import Result, read_run
 from vd4rl_pomdp.runs.workers import run_jobs
@@ -284,16 +284,15 @@ REPLAYED = ("return", "length", "score", "action_error")
 """Columns of `episodes.csv` that a replay gives again."""
 
 
-def replay(run: Path, results: Iterable[Result]) -> dict[str, Any]:
-    """Play the first episode of a run's last evaluation again, and hold it against the row that tells of it.
+def replay(run: Path, results: Iterable[Result]) -> tuple[Row, Row, str]:
+    """Play the first episode of a run's last evaluation again.
 
     Args:
         run: the run's folder, with encoder and policy.
         results: among which its row is looked for, by its id.
 
     Returns:
-        `recorded` and `replayed`, rows of `episodes.csv`, `differ`, the columns among REPLAYED that differ, and
-        `row` and `here`, what drew and computed, in words.
+        The row that tells of the episode, what it gives here, and what drew and computed both, in words.
 
     Raises:
         UserError: as `evaluate_run`, or none of the results tells of this run, or of its policy's last evaluation.
@@ -307,15 +306,9 @@ def replay(run: Path, results: Iterable[Result]) -> dict[str, Any]:
     if recorded is None:
         raise UserError(f"{run}: its policy is of update {step}, of which run {own.id} has no first episode there")
     (replayed,), _ = evaluate_run(run, recorded["corruption"], 1, 1)
-    return {
-        "recorded": recorded,
-        "replayed": replayed,
-        "differ": [name for name in REPLAYED if recorded[name] != replayed[name]],
-        "row": _drawn_by(told.files.get("render", {}), told.parts[-1]),
-        "here": _drawn_by(render_info(recorded["task"]), machine("cpu")),
-    }
-
-
-def _drawn_by(render: dict[str, Any], hardware: dict[str, Any]) -> str:
-    words = [f"{name} {render[name]}" for name in ("mujoco", "gymnasium") if name in render]
-    return ", ".join(filter(None, [*words, render.get("gl_renderer"), hardware.get("processor")])) or "not recorded"
+    made = told.files.get("render", {}), told.parts[-1].get("processor")
+    row, here = (
+        f"mujoco {render.get('mujoco')}, {render.get('gl_renderer')}, {processor}"
+        for render, processor in (made, (render_info(recorded["task"]), machine("cpu")["processor"]))
+    )
+    return recorded, replayed, f"the row was made with {row}, this is {here}"

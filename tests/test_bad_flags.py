@@ -33,6 +33,7 @@ VALID = {
     "report compare": ["runs", "results", *OUT],
     "results add": ["runs", *OUT],
     "results verify": ["results"],
+    "agents export": [RUN, "--episodes", "1", "--workers", "1", *OUT],
     "navigation collect": ["--maze", "no_curtain", "--preset", "smoke", *OUT],
     "sweep run": ["quick", "--testing", "--dry-run", *OUT],
     "theory": OUT,

@@ -16,12 +16,13 @@ from tests.helpers_data import write_fake_set
 from tests.helpers_hub import TOKEN, Hub, Repo
 from tests.nn.test_encoder import CARD, make
 from vd4rl_pomdp import load_agent
-from vd4rl_pomdp.agents import AgentCard, write_card, write_rounded
+from vd4rl_pomdp.agents import checksums, write_rounded
 from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.hub import LISTING, pull, push
 from vd4rl_pomdp.nn import load_encoder, save_encoder
 from vd4rl_pomdp.nn.policy import Policy
+from vd4rl_pomdp.runs.files import write_json
 
 ENCODER, SET = "lab/encoder", "datasets/lab/set"
 WHERE = {ENCODER: "models/lab/encoder", SET: "datasets/lab/set"}
@@ -120,26 +121,19 @@ def test_cards_on_the_hub_say_how_to_load_what_they_describe_and_under_which_lic
 def test_an_agent_comes_back_as_it_was_and_does_not_pass_for_an_encoder(hub, encoder, tmp_path):
     Policy(12, 6, 8).save(encoder.parent / "policy")
     write_rounded(encoder.parent, tmp_path / "agent")
-    about = {
-        "task": CARD.task,
-        "quality": "expert",
-        "data": "f00",
-        "corruption": CARD.corruption,
-        "method": CARD.method,
-    }
-    about |= {"algorithm": "td3_bc", "seed": 0, "budget": {}, "run": "r00", "length": 5, "episodes": [], "commit": ""}
-    write_card(tmp_path / "agent", AgentCard(**about, render={}, processor="", sha256={}))
+    about = {"task": CARD.task, "corruption": CARD.corruption, "run": "r00", "sha256": checksums(tmp_path / "agent")}
+    write_json(tmp_path / "agent" / "card.json", about)
     push(encoder, ENCODER)
     push(tmp_path / "agent", ENCODER)  # replaces the encoder
     assert set(hub.files(WHERE[ENCODER])) == {*content(tmp_path / "agent"), "README.md", LISTING, ".gitattributes"}
     assert pull(ENCODER, tmp_path / "new")
     assert not pull(ENCODER, tmp_path / "new")
     assert content(tmp_path / "new") == content(tmp_path / "agent")
-    assert load_agent(tmp_path / "new").card.run == "r00"
+    assert load_agent(tmp_path / "new").card["run"] == "r00"
     readme = hub.files(WHERE[ENCODER])["README.md"].decode()
     assert yaml.safe_load(readme.split("---\n")[1])["license"] == "mit"
     (tmp_path / "agent" / "policy" / "config.json").write_text("{}")
-    with pytest.raises(UserError, match=r"is not what card\.json tells of"):
+    with pytest.raises(UserError, match=r"its files are not those that card\.json tells of"):
         push(tmp_path / "agent", ENCODER)
 
 

@@ -1,8 +1,9 @@
 """Which representations survive partial observability in offline visual reinforcement learning."""
 
 import os
-from importlib.metadata import PackageNotFoundError, version
 from typing import TYPE_CHECKING
+
+from vd4rl_pomdp.core.version import __version__
 
 if TYPE_CHECKING:
     from vd4rl_pomdp.agents import load_agent
@@ -12,11 +13,6 @@ if TYPE_CHECKING:
 # many short waits in a step of training lasts until the system takes the core from a thread that only spins. OpenMP
 # reads this when torch loads it, so it comes before torch; what the user has set stays.
 os.environ.setdefault("OMP_WAIT_POLICY", "PASSIVE")
-
-try:
-    __version__ = version("vd4rl-pomdp")
-except PackageNotFoundError:  # a source tree that was never installed
-    __version__ = "0+unknown"
 
 __all__ = ["__version__", "load_agent", "open_dataset"]
 

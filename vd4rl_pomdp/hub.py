@@ -15,7 +15,6 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -209,14 +208,19 @@ def _checked(folder: Path, kind: str) -> list[Path]:
 
 def _agent_card(folder: Path, repository: str, license: str) -> str:
     """README.md of an agent: its card, and how to load it."""
-    card = agents.read_card(folder)
-    tags = [*TAGS, *(one_line(name) for name in (card.method, card.algorithm, card.task))]
-    values = {"license": license, "library_name": "vd4rl-pomdp", "pipeline_tag": TAGS[0], "tags": tags}
-    title = f"# {code(card.method)} and {code(card.algorithm)} on {code(card.task)}"
+    card = read_json(folder / agents.CARD)
+    names = [str(card.get(name)) for name in ("method", "algorithm", "task")]
+    values = {
+        "license": license,
+        "library_name": "vd4rl-pomdp",
+        "pipeline_tag": TAGS[0],
+        "tags": [*TAGS, *map(one_line, names)],
+    }
+    title = "# {} and {} on {}".format(*map(code, names))
     what = "Encoder and policy, trained offline by `vd4rl-pomdp`; weights in half precision."
     get = code_block([f"vd4rl-pomdp hub pull {repository} FOLDER"], "bash")
     use = ["from vd4rl_pomdp import load_agent", "", 'agent = load_agent("FOLDER")  # agent.reset(), agent.act(obs)']
-    told = code_block(json.dumps(asdict(card), indent=2).splitlines(), "json")
+    told = code_block(json.dumps(card, indent=2).splitlines(), "json")
     return "\n".join(
         [*front_matter(values), "", title, "", what, "", *get, "", *code_block(use, "python"), "", *told, ""]
     )

@@ -49,7 +49,7 @@ SLIPS = [
     (["report", "nowhere"], "nowhere: no such folder"),
     (["theory", "--out", "file/below"], "file/below: cannot be used (not a directory)"),
     (["demo", "--preset", "huge"], "unknown preset 'huge': choose one of cpu, smoke"),
-    (["sweep", "run", "huge", "--out", "x"], "unknown grid 'huge': choose one of control,"),
+    (["sweep", "run", "huge", "--out", "x"], "unknown grid 'huge': choose one of certify, control,"),
     ([*SWEEP, "--change", "pretrain.method=acor"], "'acor': choose one of"),
     ([*SWEEP, "--executor", "cloud"], "unknown executor 'cloud': choose one of local"),
     (["sweep", "status", "file"], "file: holds no sweep"),

@@ -38,6 +38,16 @@ def test_mik_a_never_sees_the_masked_actions():
         assert actions.isdisjoint(range(t, t + k))
 
 
+@pytest.mark.parametrize(
+    ("method", "options"), [("mik+a", {}), ("mik+a", {"m": 2, "n": 2}), ("mik", {}), ("ah+a", {}), ("fj+a", {"m": 1})]
+)
+def test_with_the_integrators_memory_a_state_sees_one_observation_and_all_actions_since(method, options):
+    objective = inverse(method, history="integrator", **options)
+    claim_visibility(objective, [ROWS, ROWS, 4], ROWS)
+    first = max(0, 4 - options.get("m", ROWS))
+    assert objective.past_visible(4) == ({first}, set(range(first, 4)) if method.endswith("+a") else set())
+
+
 @pytest.mark.parametrize("row", [0, 1])
 def test_a_frame_too_many_in_the_futures_first_rows_is_caught(row: int):
     """The rows that are seen stay the same: only the count of frames tells."""

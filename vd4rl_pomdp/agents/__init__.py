@@ -2,12 +2,14 @@
 
     FOLDER/  encoder/  policy/  card.json
 
-What ships lies in this package's folder; index.json beside it tells the folder of every name.
+The card tells task, quality and fingerprint of the set, corruption, method, algorithm, seed, budget, the run's id and
+commit, the episodes of the rounded weights, what drew and computed them (digits are the same where renderer and kind of
+processor are), and the SHA-256 of the other files. What ships lies in this package's folder; index.json beside it tells
+the folder of every name.
 """
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -17,7 +19,7 @@ from safetensors import SafetensorError
 from safetensors.torch import save
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
-from vd4rl_pomdp.core.reading import build, read_bytes, read_tensors, safetensors_metadata
+from vd4rl_pomdp.core.reading import read_bytes, read_tensors, safetensors_metadata
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, Task
 from vd4rl_pomdp.envs.corrupted import Observation
 from vd4rl_pomdp.envs.make import layout_of
@@ -25,7 +27,7 @@ from vd4rl_pomdp.nn.encoder import Encoder
 from vd4rl_pomdp.nn.encoder_folder import load_encoder
 from vd4rl_pomdp.nn.frame import StateFrame
 from vd4rl_pomdp.nn.policy import Policy, load_policy
-from vd4rl_pomdp.runs.files import Row, read_json, sha256, write_bytes, write_json
+from vd4rl_pomdp.runs.files import read_json, sha256, write_bytes
 
 CARD = "card.json"
 FILES = tuple(f"{part}/{name}" for part in ("encoder", "policy") for name in ("config.json", "model.safetensors"))
@@ -33,44 +35,11 @@ FILES = tuple(f"{part}/{name}" for part in ("encoder", "policy") for name in ("c
 SHIPPED = Path(__file__).parent
 
 
-@dataclass(frozen=True, kw_only=True)
-class AgentCard:
-    """What an agent does, how it was made, and the digits that it gave where it was exported."""
-
-    task: str
-    quality: str
-    """Of the set that it was trained on."""
-    data: str
-    """That set's fingerprint."""
-    corruption: dict[str, Any]
-    """Settings of the corruption under which it was trained."""
-    method: str
-    algorithm: str
-    seed: int
-    """Of the fine-tuning."""
-    budget: dict[str, Any]
-    """Steps and frames of the pretraining, updates of the fine-tuning, and the preset of each."""
-    run: str
-    """Id of the run, whose policy it is before rounding."""
-    length: int
-    """Decisions of an episode, at most."""
-    episodes: list[Row]
-    """Evaluation episodes of the rounded weights: episode, episode_seed, return, length, score, evaluated_under."""
-    commit: str
-    """That the run began with."""
-    render: dict[str, Any]
-    """What drew the episodes, see `data.parity.render_info`."""
-    processor: str
-    """What computed them: digits are the same where renderer and kind of processor are."""
-    sha256: dict[str, str]
-    """Of FILES, by name."""
-
-
 class Agent:
     """Encoder and policy, fed one row at a time; its own past actions are part of the history."""
 
-    def __init__(self, encoder: Encoder, policy: Policy, card: AgentCard | None = None) -> None:
-        self.encoder, self.policy, self.card = encoder, policy, card
+    def __init__(self, encoder: Encoder, policy: Policy, card: dict[str, Any] | None = None) -> None:
+        self.encoder, self.policy, self.card = encoder, policy, card or {}
         self.reset()
 
     def reset(self) -> None:
@@ -116,19 +85,16 @@ def load_agent(name: Path | str) -> Agent:
             f"unknown agent {str(name)!r}: it is no folder with {CARD}, as `agents export` and `hub pull` write, and "
             f"those that ship are {', '.join(index) or 'none'}"
         )
-    card = read_card(folder)
-    for file in FILES:
-        if not (folder / file).is_file() or sha256(folder / file) != card.sha256.get(file):
-            raise UserError(f"{folder / file}: is not what {CARD} tells of; take another copy")
-    return Agent(load_encoder(folder / "encoder", card.task)[0], load_policy(folder / "policy"), card)
+    card = read_json(folder / CARD)
+    if not {"task", "corruption"} <= card.keys() or card.get("sha256") != checksums(folder):
+        raise UserError(f"{folder}: its files are not those that {CARD} tells of; take another copy")
+    return Agent(load_encoder(folder / "encoder", card["task"])[0], load_policy(folder / "policy"), card)
 
 
-def read_card(folder: Path) -> AgentCard:
-    """An agent's card; raises UserError if it is missing or damaged."""
-    try:
-        return build(AgentCard, read_json(folder / CARD))
-    except TypeError as error:
-        raise UserError(f"{folder / CARD}: is no agent's card ({error}); take another copy") from error
+def checksums(folder: Path) -> dict[str, str]:
+    """SHA-256 of an agent's FILES, by name; raises UserError if one is missing."""
+    with disk_errors(folder):
+        return {name: sha256(folder / name) for name in FILES}
 
 
 def write_rounded(run: Path, folder: Path) -> None:
@@ -151,8 +117,3 @@ def write_rounded(run: Path, folder: Path) -> None:
         except (FileNotFoundError, SafetensorError) as error:
             raise UserError(f"{run / name}: cannot be read; name the folder of a finished fine-tuning") from error
         write_bytes(folder / name, content)
-
-
-def write_card(folder: Path, card: AgentCard) -> None:
-    """Complete an agent's folder, with the checksums of the files that lie there."""
-    write_json(folder / CARD, asdict(replace(card, sha256={name: sha256(folder / name) for name in FILES})))

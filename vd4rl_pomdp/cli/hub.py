@@ -56,7 +56,7 @@ def export(run: tyro.conf.Positional[Path], out: Path, episodes: int = 10, worke
     from finetune.export import export_agent
 
     card = export_agent(run, out, episodes, workers)
-    for under in dict.fromkeys(row["evaluated_under"] for row in card.episodes):
-        returns = [row["return"] for row in card.episodes if row["evaluated_under"] == under]
+    for under in dict.fromkeys(row["evaluated_under"] for row in card["episodes"]):
+        returns = [row["return"] for row in card["episodes"] if row["evaluated_under"] == under]
         print(f"{len(returns)} episodes under {under}: mean return {sum(returns) / len(returns):.4f}")
     print(f'agent: {out}, loaded by vd4rl_pomdp.load_agent("{out}")')

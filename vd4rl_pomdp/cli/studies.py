@@ -99,23 +99,18 @@ def verify(folder: tyro.conf.Positional[Path], replay: Path | None = None) -> No
         folder: The results folder.
         replay: A run's folder, with encoder and policy: the first episode of its last evaluation is played again.
     """
+    from finetune.evaluation import REPLAYED
     from finetune.evaluation import replay as play_again
     from vd4rl_pomdp.runs.results import verify_results
 
     runs, wrong = verify_results(folder)
-    for sentence in wrong:
-        print(sentence)
-    print(f"{len(runs)} runs, {len(wrong)} contradictions between rows and records")
+    print("\n".join([*wrong, f"{len(runs)} runs, {len(wrong)} contradictions between rows and records"]))
     if replay is not None:
-        told = play_again(replay, runs)
-        recorded, replayed = told["recorded"], told["replayed"]
-        print(f"episode 0 under {recorded['evaluated_under']} replays to a return of {replayed['return']}")
-        if told["differ"]:
-            differ = ", ".join(f"{name} {replayed[name]} where it says {recorded[name]}" for name in told["differ"])
-            raise UserError(
-                f"{replay}: replays to {differ}; the row was made with {told['row']}, this is {told['here']}: digits "
-                "are the same only where these are"
-            )
+        row, now, where = play_again(replay, runs)
+        print(f"episode 0 under {row['evaluated_under']} replays to a return of {now['return']}")
+        if differ := [f"{name} {now[name]} where it says {row[name]}" for name in REPLAYED if now[name] != row[name]]:
+            same = "digits are the same only where these are"
+            raise UserError(f"{replay}: replays to {', '.join(differ)}; {where}: {same}")
     if wrong:
         raise UserError(f"{folder}: {len(wrong)} contradictions, see above; ask who made the rows")
 

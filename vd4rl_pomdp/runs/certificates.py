@@ -45,7 +45,7 @@ def read_certificates(places: Iterable[Path], but: Path | None = None) -> dict[s
     return found
 
 
-def keep_certificates(folder: Path, certificates: Mapping[str, Row]) -> None:
+def keep_certificates(folder: Path, certificates: dict[str, Row]) -> None:
     """Add certificates to a folder's own; those of an id that is there take its place. None: nothing is written."""
     file = folder / CERTIFICATES
     there = read_json(file) if file.exists() else {}

@@ -27,7 +27,7 @@ class Integrator(GRU):
         """(gru_layers, batch, hidden_dim + 1 + F)."""
         return next(self.parameters()).new_zeros(self.num_layers, batch, self.hidden_size + 1 + self.features)
 
-    def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
+    def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:  # type: ignore[override]
         """See `Memory`."""
         hidden, count, first = state.split([self.hidden_size, 1, self.features], dim=2)
         t = count[0] + torch.arange(rows.shape[1], device=rows.device)  # (B, T)
