@@ -22,7 +22,7 @@ AT_LEAST = {
     "cheetah_run_medium": 400,
     "humanoid_walk_expert": 700,
     "humanoid_walk_medium": 350,
-    "reacher_jump_expert": 800,
+    "reacher_jump_expert": 850,
     "reacher_jump_medium": 400,
     "point_mass_cue_expert": 850,
     "point_mass_cue_medium": 500,

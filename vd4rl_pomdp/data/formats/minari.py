@@ -85,7 +85,7 @@ def read(source: str, picture: str | None) -> SourceSet:
     )
 
 
-def _leaves(space: gymnasium.Space[Any], name: str = "") -> Iterator[tuple[str, gymnasium.Space[Any]]]:
+def _leaves(space: gymnasium.Space[Any], name: str = "") -> Iterator[tuple[str, gymnasium.spaces.Box]]:
     """Spaces of single arrays within a space, by the keys that lead to them."""
     if isinstance(space, gymnasium.spaces.Dict | gymnasium.spaces.Tuple):
         parts = space.spaces.items() if isinstance(space, gymnasium.spaces.Dict) else enumerate(space.spaces)
