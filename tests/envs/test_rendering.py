@@ -16,9 +16,9 @@ from vd4rl_pomdp.envs.maze import MazeEnv
 
 
 def test_a_mujoco_that_was_not_tried_is_refused_with_what_to_install():
-    for version in ("3.3.0", "3.11.0", "3.11.2"):
+    for version in ("3.3.0", "3.11.0", "3.17.0"):
         rendering.check_mujoco(version)
-    for version in ("3.1.6", "3.2.7", "3.12.0", "4.0.0"):
+    for version in ("3.1.6", "3.2.7", "3.18.0", "4.0.0"):
         with pytest.raises(UserError, match=r"pip install .*mujoco==3\.11\.0"):
             rendering.check_mujoco(version)
 

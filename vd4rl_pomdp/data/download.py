@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import shutil
 from collections.abc import Iterable
@@ -102,6 +103,7 @@ def _provide(file: RemoteFile, destination: Path, beside: Path, endpoint: str) -
 def _fetch(file: RemoteFile, folder: Path, endpoint: str) -> Path:
     """Download a file into a folder, where a cut download is resumed, and verify it."""
     url = hf_hub_url(REPOSITORY, file.path, repo_type="dataset", endpoint=endpoint)
+    logging.getLogger("huggingface_hub.utils._http").setLevel(logging.ERROR)  # its retries: what comes of them is said
     try:
         fetched = hf_hub_download(
             REPOSITORY,

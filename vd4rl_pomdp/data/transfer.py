@@ -164,8 +164,8 @@ class _Reader:
     def __init__(self, name: str, source: SourceSet, clip: bool) -> None:
         self._name, self._source, self._clip = name, source, clip
         self._next = -1
-        self._episodes: Iterator[EpisodeArrays] = iter([])
-        self._last: Any = None
+        self._episodes: Iterator[EpisodeArrays] = iter(())
+        self._last = np.zeros(0, np.uint8)  # the last picture of the episode before
         self._clipped = self._read = self._still = self._joined = 0
 
     def __call__(self, number: int) -> EpisodeArrays:

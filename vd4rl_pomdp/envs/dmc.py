@@ -210,7 +210,15 @@ def _load(task: DMCTask, random: np.random.RandomState) -> Any:
     if "." in task.domain:
         env = _of_a_module(task)(**arguments)
     elif (task.domain, task.task) in suite.ALL_TASKS:
-        env = suite.load(task.domain, task.task, task_kwargs=arguments)
+        try:
+            env = suite.load(task.domain, task.task, task_kwargs=arguments)
+        except AttributeError as error:
+            if "MjModel" not in str(error):
+                raise
+            raise UserError(
+                f"dm-control does not go with mujoco {mujoco.__version__} ({error}): install a pair that was tried, "
+                "`pip install 'dm-control==1.0.44' 'mujoco==3.11.0'`"
+            ) from error
     else:
         tasks = ", ".join(name for domain, name in suite.ALL_TASKS if domain == task.domain)
         choices = tasks or ", ".join(sorted({domain for domain, _ in suite.ALL_TASKS}))

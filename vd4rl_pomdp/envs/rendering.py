@@ -1,7 +1,8 @@
 """Rendering as V-D4RL's frames show it: the old skybox restored, a cheaper shadow map, headless by default.
 
 From mujoco 3.2.0 on the random stars of dm_control's sky are drawn from another seed, so an encoder pretrained on
-V-D4RL would be evaluated under another sky. The sky of mujoco 3.1.6 is written back before the first render.
+V-D4RL would be evaluated under another sky. The sky of mujoco 3.1.6 is written back before the first render. From 3.12
+on the texture of a floor begins at the floor's corner, no longer at its centre; it is moved back as well.
 
 This module alone imports mujoco and dm_control, after what must happen before OpenGL is loaded.
 """
@@ -43,8 +44,10 @@ __all__ = [
 ]
 
 _SKYBOX = Path(__file__).parent / "assets" / "skybox.npz"
-TRIED_MUJOCO = ((3, 3), (3, 12))
-"""Lowest version and first version not supported: from 3.12 on floor textures are anchored elsewhere."""
+TRIED_MUJOCO = ((3, 3), (3, 18))
+"""Lowest version and first version not supported: no dm_control starts with mujoco 4."""
+_TEXTURE_AT_CORNER = (3, 12)
+_FAR = 50.0
 _FAST_SHADOW_SIZE = 512
 
 
@@ -53,7 +56,7 @@ def check_mujoco(version: str = mujoco.__version__) -> None:
     low, high = TRIED_MUJOCO
     if not low <= tuple(int(part) for part in version.split(".")[:2]) < high:
         raise UserError(
-            f"mujoco {version} renders other pixels than the data (tried: {low[0]}.{low[1]} to below "
+            f"mujoco {version} was never compared with the data's pixels (tried: {low[0]}.{low[1]} to below "
             f"{high[0]}.{high[1]}); install the tried pair with `pip install 'dm-control==1.0.44' 'mujoco==3.11.0'`"
         )
 
@@ -70,9 +73,41 @@ def prepare(physics: Any, render: Render, size: int) -> None:
     stored = model.tex_width[number] * model.tex_height[number] * model.tex_nchannel[number]
     assert stored == sky.size, "the skybox has another size than the one to restore"
     model.tex_data[start : start + stored] = sky
+    if tuple(int(part) for part in mujoco.__version__.split(".")[:2]) >= _TEXTURE_AT_CORNER:
+        _center_floors(model)
     model.vis.global_.offwidth = model.vis.global_.offheight = size
     if render == "fast":
         model.vis.quality.shadowsize = _FAST_SHADOW_SIZE
+
+
+def _center_floors(model: Any) -> None:
+    """Textures of planes as mujoco drew them before 3.12.
+
+    Along a side of half-length h, with r repeats per unit of length, a texture then began at its middle in the plane's
+    centre, and now begins at its edge in the plane's corner: it has to move by (r h + 1) / 2 of itself. Rolled by that,
+    its smaller copies for distant pixels differ a little from those of the original, so a square floor that ends out
+    of sight is lengthened instead, to where that number is whole.
+    """
+    moved = set()
+    for plane in np.flatnonzero(np.asarray(model.geom_type) == mujoco.mjtGeom.mjGEOM_PLANE):
+        material, half = model.geom_matid[plane], model.geom_size[plane, :2]
+        texture = model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB] if material >= 0 else -1
+        repeats = model.mat_texrepeat[material]
+        if texture < 0 or texture in moved or model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D:
+            continue
+        if (half <= 0).any() or (repeats <= 0).any():
+            continue  # an infinite one is drawn as before
+        uniform = model.mat_texuniform[material]
+        if uniform and (repeats == 1).all() and half.min() > _FAR and not model.geom_pos[plane, :2].any():
+            model.geom_size[plane, :2] = 2 * np.ceil((half - 1) / 2) + 1
+            continue
+        across, down = (repeats * (half if uniform else 1.0) + 1) / 2
+        shape = model.tex_height[texture], model.tex_width[texture], model.tex_nchannel[texture]
+        start = model.tex_adr[texture]
+        pixels = model.tex_data[start : start + np.prod(shape)]
+        shift = round(down * shape[0]), round(across * shape[1])
+        pixels[:] = np.roll(pixels.reshape(shape), shift, (0, 1)).ravel()
+        moved.add(texture)
 
 
 class FrameCamera:
