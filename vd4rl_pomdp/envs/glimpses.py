@@ -37,6 +37,8 @@ _TARGET, _HIDDEN, _CLOCK, _PLAN = slice(2, 4), 4, 5, 6
 class _Glimpsed:
     """A task whose target is placed and shown by the plan of its episode."""
 
+    random: np.random.RandomState
+
     def initialize_episode(self, physics: Any) -> None:
         """Draw positions as dm_control does, and the plan."""
         suite.reacher.randomizers.randomize_limited_and_rotational_joints(physics, self.random)
@@ -46,7 +48,7 @@ class _Glimpsed:
 
     def before_step(self, action: np.ndarray, physics: Any) -> None:
         """Change the target before the step: no force acts on it, and what the step computes is then of one state."""
-        super().before_step(action, physics)
+        super().before_step(action, physics)  # type: ignore[misc]  # of the task that it is mixed into
         self.plan(physics, round(physics.data.qpos[_CLOCK] / physics.timestep()) + 1)
 
     def plan(self, physics: Any, step: int) -> None:
@@ -116,7 +118,7 @@ def _model(domain: Any) -> tuple[bytes, dict[str, bytes]]:
     """dm_control's model, its target on joints, and a body without a shape that holds clock and plan."""
     xml, assets = domain.get_model_and_assets()
     root = ElementTree.fromstring(xml)
-    world = root.find("worldbody")
+    world: Any = root.find("worldbody")
     geom = world.find("geom[@name='target']")
     world.remove(geom)
     geom.set("size", str(_TARGET_SIZE))

@@ -196,7 +196,11 @@ def judge(values: Mapping[str, np.ndarray], unit: float, digits: int) -> Row:
     verdict = NEEDS if known and all(low > 0 for _, low, _ in above) else OPEN
     if known and any(high < MARGIN * unit for *_, high in above):
         verdict = OPEN if weak else NEEDS_NOT
-    told = [f"{MEMORY} {with_interval(*row['methods'][MEMORY], digits=digits)}"]
-    told += [f"less {floor} {with_interval(*ends, digits=digits)}" for floor, ends in row["above"].items()]
+
+    def told_of(three: Sequence[float | None]) -> str:
+        return with_interval(three[0], three[1], three[2], digits)
+
+    told = [f"{MEMORY} {told_of(row['methods'][MEMORY])}"]
+    told += [f"less {floor} {told_of(ends)}" for floor, ends in row["above"].items()]
     told += ["too few seeds"] * (not known) + ["too little itself to tell"] * (weak and verdict == OPEN)
     return row | {"verdict": verdict, "why": ", ".join(told)}

@@ -39,7 +39,7 @@ def read(source: str, picture: str | None) -> SourceSet:
     if not discrete and not isinstance(actions, gymnasium.spaces.Box):
         raise UserError(f"has actions of {actions}, not Box or Discrete")
     spaces = dict(_leaves(dataset.observation_space))
-    key, size = chosen({name: space.shape for name, space in spaces.items() if space.dtype == np.uint8}, picture)
+    key, size = chosen({name: space.shape or () for name, space in spaces.items() if space.dtype == np.uint8}, picture)
     told, spec = json.loads(dataset.storage.metadata.get(_KEY, "{}")), dataset.env_spec
     notes = []
     if discrete:
