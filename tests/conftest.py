@@ -18,6 +18,7 @@ from contextlib import suppress
 from pathlib import Path
 
 import pytest
+import sklearn.cluster  # noqa: F401  loaded once here, and not by a process for each codebook
 import torch
 
 from tests.helpers_data import write_fake_set

@@ -18,6 +18,7 @@ def test_the_environment_shows_the_golden_frames(exact, task):
         pytest.skip("another renderer draws other edges")
     result = compare(exact[task], parity._golden()[f"{task}/frames"])
     assert result["equal"]
+    # the smaller copies of a floor's texture, for distant pixels, differ a little from 3.12 on
     rolled = tuple(int(part) for part in rendering.mujoco.__version__.split(".")[:2]) >= (3, 12)
     assert result["mean_difference"] < (0.2 if rolled else 0.05)
     assert result["share_off_by_8"] < 0.002

@@ -23,6 +23,17 @@ def test_a_mujoco_that_was_not_tried_is_refused_with_what_to_install():
             rendering.check_mujoco(version)
 
 
+@pytest.mark.parametrize("task", ["walker_walk", "reacher_jump"])
+def test_a_dm_control_of_another_mujoco_is_one_line(task, monkeypatch):
+    def load(*arguments, **options):
+        raise AttributeError("'MjModel' object has no attribute 'flex_evpair'")  # as of 1.0.44 with mujoco 3.17.0
+
+    monkeypatch.setattr("dm_control.mujoco.Physics.from_xml_string", load)
+    with pytest.raises(UserError, match=r"does not go with mujoco .*flex_evpair.*dm-control==1\.0\.44") as caught:
+        make_env(TASKS[task])
+    assert "\n" not in str(caught.value)
+
+
 WITHOUT = """
 import os, sys
 from vd4rl_pomdp.core.errors import UserError

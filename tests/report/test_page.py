@@ -304,7 +304,7 @@ def test_figures_show_returns_below_zero_best_evaluations_and_gaps(tmp_path, mon
     write_run(tmp_path / "runs/bc", "bc", 2, {10: [-50.0]})
     write_report([tmp_path / "runs"], tmp_path / "out")
     (scores,) = plots["scores_patch"].figure.axes
-    assert scores.get_title() == "walker_walk expert (data return 512)"
+    assert scores.get_title() == "walker_walk expert (data score 51.2)"
     assert [text.get_text() for text in scores.get_yticklabels()] == ["mik+a (×1)", "acro (×1)", "bc (×2)"]
     low, high = scores.get_xlim()
     assert low < -60 < 0 <= high

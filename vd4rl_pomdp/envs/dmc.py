@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import importlib
 from collections.abc import Iterator
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -208,21 +209,22 @@ def _load(task: DMCTask, random: np.random.RandomState) -> Any:
     rendering.check_mujoco()
     arguments = {"random": random, "time_limit": float("inf")}
     if "." in task.domain:
-        env = _of_a_module(task)(**arguments)
+        make = partial(_of_a_module(task), **arguments)
     elif (task.domain, task.task) in suite.ALL_TASKS:
-        try:
-            env = suite.load(task.domain, task.task, task_kwargs=arguments)
-        except AttributeError as error:
-            if "MjModel" not in str(error):
-                raise
-            raise UserError(
-                f"dm-control does not go with mujoco {mujoco.__version__} ({error}): install a pair that was tried, "
-                "`pip install 'dm-control==1.0.44' 'mujoco==3.11.0'`"
-            ) from error
+        make = partial(suite.load, task.domain, task.task, task_kwargs=arguments)
     else:
         tasks = ", ".join(name for domain, name in suite.ALL_TASKS if domain == task.domain)
         choices = tasks or ", ".join(sorted({domain for domain, _ in suite.ALL_TASKS}))
         raise UserError(f"dm_control has no task {task.domain!r}, {task.task!r}: choose one of {choices}")
+    try:
+        env = make()
+    except AttributeError as error:
+        if "MjModel" not in str(error):
+            raise
+        raise UserError(
+            f"dm-control does not go with mujoco {mujoco.__version__} ({error}): install a pair that was tried, "
+            "`pip install 'dm-control==1.0.44' 'mujoco==3.11.0'`"
+        ) from error
     check_bounds(f"dm_control's {task.domain} {task.task}", env.action_spec().minimum, env.action_spec().maximum)
     return env
 

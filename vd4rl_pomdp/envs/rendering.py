@@ -91,8 +91,9 @@ def _center_floors(model: Any) -> None:
     moved = set()
     for plane in np.flatnonzero(np.asarray(model.geom_type) == mujoco.mjtGeom.mjGEOM_PLANE):
         material, half = model.geom_matid[plane], model.geom_size[plane, :2]
-        texture = model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB] if material >= 0 else -1
-        repeats = model.mat_texrepeat[material]
+        if material < 0:
+            continue
+        texture, repeats = model.mat_texid[material, mujoco.mjtTextureRole.mjTEXROLE_RGB], model.mat_texrepeat[material]
         if texture < 0 or texture in moved or model.tex_type[texture] != mujoco.mjtTexture.mjTEXTURE_2D:
             continue
         if (half <= 0).any() or (repeats <= 0).any():

@@ -9,6 +9,7 @@ import numpy as np
 import pandas as pd
 from matplotlib.axes import Axes
 
+from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.core.text import plain
 from vd4rl_pomdp.report import tables
 from vd4rl_pomdp.report.figures import COLOURS, HATCHES, Draw, Plot, file_name, looks_of, seeds_note, sheet, style
@@ -27,8 +28,11 @@ def draw_plots(runs: list[Run], made: dict[str, pd.DataFrame]) -> dict[str, list
     finished = [run for run in runs if run.finished and run.result.losses]
     losses = tables.losses([(run.named, run.result.losses) for run in finished])
     looks = looks_of(name for table in (made["summary"], made["curves"], losses) for name in labels(table))
-    judged = made["gates"].to_dict("records")
-    data = {(row["task"], row["quality"]): row["data_return"] for row in judged if pd.notna(row["data_return"])}
+    data = {
+        (row["task"], row["quality"]): row["data_return"] / TASKS[row["task"]].score_divisor
+        for row in made["gates"].to_dict("records")
+        if pd.notna(row["data_return"]) and row["task"] in TASKS
+    }
     return {
         "scores": bar_plots(made["summary"], made["runs"], data, looks),
         "profiles": profile_plots(made["profiles"], made["aggregate"], looks),
@@ -69,7 +73,7 @@ def bar_plots(
     Args:
         summary: scores of every condition.
         runs: table of runs, whose final scores are the dots.
-        data: the data's return by task and quality, which stands beside their names.
+        data: the data's score by task and quality, which stands beside their names.
         looks: numbers of all labels in `style`.
     """
     seeds = runs[runs["score"].notna()].assign(label=lambda table: labels(table), kind="seed")
@@ -100,7 +104,7 @@ def bar_plots(
         panels = []
         for title, members in places:
             known = data.get((members["task"].iloc[0], members["quality"].iloc[0]))
-            panels.append((title if known is None else f"{title} (data return {known:.0f})", members, draw))
+            panels.append((title if known is None else f"{title} (data score {known:.1f})", members, draw))
         figure = sheet(panels, 2, [0.3 + 0.2 * max(len(members), 4) for _, members in places])
         shown = pd.concat([rows.assign(kind="mean"), seeds[seeds["corruption"] == corruption]])
         columns = ["kind", *SETTING, "label", "seed", "score", "low", "high", "seeds", "best_score", "missing"]

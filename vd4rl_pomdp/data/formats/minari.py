@@ -117,8 +117,7 @@ def write(folder: Path, out: Path, source: SourceSet) -> list[str]:
     first = next(source.read(0))
     pictures = gymnasium.spaces.Box(0, 255, first[FRAMES_KEY].shape[1:], np.uint8)
     actions = gymnasium.spaces.Box(-1.0, 1.0, first["action"].shape[1:], np.float32)
-    # Absolute: Minari sizes an HDF5 file by its folder's path joined to the file's, which holds that folder already.
-    made = storage.MinariStorage.new(folder.resolve() / "data", pictures, actions)
+    made = storage.MinariStorage.new(folder / "data", pictures, actions)
     told = {"task": source.task, "set": source.quality, "physics": "physics" in first}
     made.update_metadata({"dataset_id": name, "minari_version": minari.__version__, _KEY: json.dumps(told)})
     lost: dict[str, None] = {}
