@@ -79,7 +79,7 @@ def test_only_a_finished_fine_tuning_becomes_an_agent(tmp_path, capsys):
 def test_an_unknown_name_lists_what_ships(tmp_path):
     with pytest.raises(UserError) as told:
         load_agent("walker_walk/medium_expert/patch/mine")
-    assert f"those that ship are {', '.join(read_json(SHIPPED / 'index.json')) or 'none'}" in str(told.value)
+    assert f"the package ships {', '.join(read_json(SHIPPED / 'index.json')) or 'none'}" in str(told.value)
     assert "\n" not in str(told.value)
 
 

@@ -1,6 +1,7 @@
 """Code blocks of the README and of docs/: Python is executed, commands are parsed, and run where that takes seconds."""
 
 import functools
+import json
 import re
 import shlex
 import subprocess
@@ -208,6 +209,20 @@ def test_python_blocks_run_one_after_the_other(page, encoder):
     for number, code in enumerate(blocks(page, "python")):
         exec(compile(code, f"{page.name}, block {number}", "exec"), namespace)
     check_results(page.stem, namespace)
+
+
+def test_the_notebook_runs_cell_by_cell_and_is_kept_without_outputs(tmp_path, own_cache, monkeypatch):
+    monkeypatch.setattr("tempfile.mkdtemp", lambda: str(tmp_path / "study"))
+    cells = json.loads((ROOT / "docs/notebooks/tour.ipynb").read_text())["cells"]
+    namespace = {"__name__": "tour"}
+    for number, cell in enumerate(cells):
+        if cell["cell_type"] == "code":
+            assert (cell["outputs"], cell["execution_count"]) == ([], None)
+            exec(compile("".join(cell["source"]), f"tour.ipynb, cell {number}", "exec"), namespace)
+    assert namespace["z"].shape == (5 * 31, namespace["encoder"].dim)
+    shown = [panel.get_images()[0].get_array() for panel in namespace["panels"].flat]
+    assert any((clean != seen).any() for clean, seen in zip(shown[:3], shown[3:6], strict=True))
+    assert (tmp_path / "study/report/index.html").exists()
 
 
 def write_agent(run: Path, folder: Path) -> None:

@@ -7,6 +7,7 @@ import torch
 
 from pretrain.objectives import METHODS, Method
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.nn.draws import Draws
 from vd4rl_pomdp.nn.objective import InverseOptions, Objective, StateInverse
 from vd4rl_pomdp.testing import check_method
 from vd4rl_pomdp.testing.contract import run_check
@@ -143,6 +144,18 @@ class Looking(Mean):
         self.encoder.from_features = lambda f, a: encode(f + f[:, -1:], a)
 
 
+class DrawingInverse(StateInverse):
+    """Predicts from noisy states, by draws that move on with every call."""
+
+    def __init__(self, encoder, target, options, seed):
+        super().__init__(encoder, target, options, seed)
+        self.draws = Draws(seed, "noise")
+
+    def representations(self, window):
+        past, future = super().representations(window)
+        return past + self.draws.uniform(*past.shape), future
+
+
 class Undeclared(StateInverse):
     def visible(self, t, k, rows):
         return {t, t + k - 1}, set()
@@ -190,5 +203,7 @@ def test_a_method_that_keeps_all_promises_passes_and_unknown_ones_and_settings_a
     check_method("mine", feature_dim=5)
     with pytest.raises(UserError, match="--max-k is not read by the method mine"):
         check_method("mine", max_k=2)
+    methods.register("drawing", Method(DrawingInverse, options=InverseOptions))
+    check_method("drawing")
     with pytest.raises(UserError, match="unknown method 'yours'"):
         check_method("yours")

@@ -1,6 +1,7 @@
 """Sets of other libraries in and out: what those libraries write is read, what is written they read."""
 
 import os
+from pathlib import Path
 
 import gymnasium
 import numpy as np
@@ -182,6 +183,35 @@ def test_minari_out_and_in_loses_nothing(minari, tmp_path):
     assert_equal(rows_of_set(folder), rows_of_set(tmp_path / "back"))
     dataset = open_dataset(tmp_path / "back", tmp_path / "cache")
     assert (dataset.task, dataset.quality, dataset.incomplete_episodes) == ("walker_walk", "mine", 1)
+
+
+def test_minari_writes_to_a_relative_path_and_a_damaged_set_is_told(minari, tmp_path, monkeypatch):
+    folder = write_fake_set(tmp_path / "own", [4])
+    monkeypatch.chdir(tmp_path)
+    export_set("minari", folder, Path("out-v0"))
+    import_set("minari", "out-v0", Path("again"))
+    Path("out-v0/data/metadata.json").write_text("[]")
+    with pytest.raises(UserError, match="out-v0: cannot be read as this format"):
+        import_set("minari", "out-v0", Path("set"))
+
+
+@pytest.mark.parametrize(
+    ("changed", "message"),
+    [
+        ({"reward": np.full(5, np.nan)}, "'reward' is not finite"),
+        ({"reward": np.zeros(4)}, r"'reward' has shape \(4,\)"),
+        ({"action": np.zeros((5, 3), np.float32)}, "not those of the episodes before"),
+        ({"image": np.zeros((5, 84, 84, 3), np.float32)}, "float32 pictures"),
+        ({"image": np.zeros((5, 32, 32, 3), np.uint8)}, "not those of the episodes before"),
+    ],
+)
+def test_a_damaged_episode_is_named_before_anything_of_it_is_written(changed, message, tmp_path):
+    export_set("vd4rl_npz", write_fake_set(tmp_path / "own", [5, 5]), tmp_path / "npz")
+    with np.load(file := tmp_path / "npz" / "000001-5.npz") as stored:
+        np.savez(file, **(dict(stored) | changed))
+    with pytest.raises(UserError, match=f"npz: episode 1: .*{message}"):
+        import_set("vd4rl_npz", str(tmp_path / "npz"), tmp_path / "set")
+    assert not list((tmp_path / "set").glob("*.hdf5"))
 
 
 def test_minari_says_what_it_cannot_keep(minari, tmp_path, capsys):

@@ -64,8 +64,12 @@ actions = np.frombuffer(bytes.fromhex("{actions.tobytes().hex()}"), np.float32).
 print(KMeansTarget(actions, 5, 3).centers.numpy().tobytes().hex())
 print({{"sklearn", "scipy", "pandas", "matplotlib", "mujoco"}} & set(sys.modules))
 """
+    centers = KMeansTarget(actions, 5, 3).centers.numpy().tobytes().hex()
     told = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True).stdout.split()
-    assert told == [KMeansTarget(actions, 5, 3).centers.numpy().tobytes().hex(), "set()"]
+    assert told == [centers, "set()"]
+    failing = "import sys; sys.executable = '/nowhere'" + program  # where none of its own can run, it fits here
+    told = subprocess.run([sys.executable, "-c", failing], capture_output=True, text=True, check=True).stdout.split()
+    assert told[0] == centers
 
 
 def test_k_means_asks_for_the_nearest_centre():

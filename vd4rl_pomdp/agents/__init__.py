@@ -83,7 +83,7 @@ def load_agent(name: Path | str) -> Agent:
     if not (folder / CARD).exists():
         raise UserError(
             f"unknown agent {str(name)!r}: it is no folder with {CARD}, as `agents export` and `hub pull` write, and "
-            f"those that ship are {', '.join(index) or 'none'}"
+            f"the package ships {', '.join(index) or 'none'}"
         )
     card = read_json(folder / CARD)
     if not {"task", "corruption"} <= card.keys() or card.get("sha256") != checksums(folder):

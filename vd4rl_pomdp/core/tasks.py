@@ -129,8 +129,9 @@ class DMCTask(Task):
     @property
     def summary(self) -> str:
         """One line that says what it is."""
-        where = self.domain if "." in self.domain else f"dm_control's {self.domain}"
-        return f"{where} {self.task}, camera {self.camera}, {super().summary}"
+        own = "." in self.domain
+        shown = f"{self.task} of {self.domain}" if own else f"dm_control's {self.domain} {self.task}"
+        return f"{shown}, camera {self.camera}, {super().summary}"
 
 
 @dataclass(frozen=True)

@@ -95,7 +95,7 @@ def collect(config: CollectConfig, length: int | None = None) -> list[Path]:
 
     Args:
         config: what to collect.
-        length: most decisions of an episode; everything but tests keeps the task's.
+        length: most decisions of an episode; tests and the tour shorten it, all else keeps the task's.
     """
     check_config(config)
     refuse_inside(config.out)

@@ -123,16 +123,21 @@ def read_rows(path: Path) -> dict[str, np.ndarray]:
         keys = _keys(path, file)
         rows = {key: file[key][()] for key in keys if key != FRAMES_KEY}
         count = len(file[FRAMES_KEY])
+    check_rows(path, rows, count)
+    dtypes = {"action": "float32", "step_type": "uint8"}
+    return {key: value.astype(dtypes.get(key, "float64"), copy=False) for key, value in rows.items()}
+
+
+def check_rows(place: Path | str, rows: Mapping[str, np.ndarray], count: int) -> None:
+    """Raise UserError, which names the place, unless `count` rows have the shapes, dtypes and values of a shard's."""
     for key, value in rows.items():
-        _check_column(path, key, value, count)
+        _check_column(place, key, value, count)
     # an episode's first row, which no step led to, may store any discount
     outside = ((rows["discount"] < 0) | (rows["discount"] > 1)) & (rows["step_type"] != StepType.FIRST)
     if outside.any():
         row = int(outside.argmax())
         told = rows["discount"][row]
-        raise UserError(f"{path}: 'discount' is {told!s} in row {row}, not within 0 and 1; {_REPAIR}")
-    dtypes = {"action": "float32", "step_type": "uint8"}
-    return {key: value.astype(dtypes.get(key, "float64"), copy=False) for key, value in rows.items()}
+        raise UserError(f"{place}: 'discount' is {told!s} in row {row}, not within 0 and 1; {_REPAIR}")
 
 
 def read_frames(path: Path) -> Iterator[np.ndarray]:
@@ -195,7 +200,7 @@ def _keys(path: Path, file: h5py.File) -> list[str]:
     return keys
 
 
-def _check_column(path: Path, key: str, value: np.ndarray, count: int) -> None:
+def _check_column(path: Path | str, key: str, value: np.ndarray, count: int) -> None:
     """Refuse a wrong shape, dtype or value of one key."""
     if value.ndim != _ROW_KEYS[key] or len(value) != count or not value.size:
         expected = f"({count},)" if _ROW_KEYS[key] == 1 else f"({count}, width)"

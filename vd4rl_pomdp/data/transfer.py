@@ -6,22 +6,21 @@ into a hidden folder beside the named one and renamed when it is whole; a cut on
 
 from __future__ import annotations
 
+import os
 import re
 import shutil
 import sys
-import zlib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
-from zipfile import BadZipFile
 
 import numpy as np
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors, in_one_line, refuse_no_folder, refuse_number, system_error
 from vd4rl_pomdp.core.tasks import FRAME_SIZES
-from vd4rl_pomdp.data.format import FRAMES_KEY
+from vd4rl_pomdp.data.format import FRAMES_KEY, check_rows
 from vd4rl_pomdp.data.formats import FORMATS
 from vd4rl_pomdp.data.formats.base import SourceSet
 from vd4rl_pomdp.data.formats.vd4rl import read_shards
@@ -111,7 +110,8 @@ def export_set(name: str, path: Path, out: Path, size: int | None = None) -> Non
     if holds_anything(out):
         raise UserError(f"{out}: is not empty; choose another folder to export to")
     opened = _resized(read_shards(str(path)), size)
-    hidden = out.with_name(f".{out.name}.export")
+    whole = Path(os.path.abspath(out))  # Minari loses the files of a relative path
+    hidden = whole.with_name(f".{whole.name}.export")
     progress = ProgressLine("export", opened.episodes, "episodes")
 
     def read(first: int) -> Iterator[EpisodeArrays]:
@@ -142,17 +142,7 @@ def _telling(place: str) -> Iterator[None]:
         yield
     except UserError as error:
         raise type(error)(str(error) if str(error).startswith(place) else f"{place}: {error}") from error
-    except (
-        OSError,
-        ValueError,
-        KeyError,
-        IndexError,
-        RuntimeError,
-        EOFError,
-        AssertionError,
-        BadZipFile,
-        zlib.error,
-    ) as error:
+    except Exception as error:  # of any kind: libraries trust what they read
         raise system_error(Path(place), error) or UserError(
             f"{place}: cannot be read as this format ({in_one_line(error) or type(error).__name__})"
         ) from error
@@ -165,6 +155,7 @@ class _Reader:
         self._name, self._source, self._clip = name, source, clip
         self._next = -1
         self._episodes: Iterator[EpisodeArrays] = iter(())
+        self._layout: dict[str, tuple[int, ...]] = {}
         self._last = np.zeros(0, np.uint8)  # the last picture of the episode before
         self._clipped = self._read = self._still = self._joined = 0
 
@@ -175,12 +166,19 @@ class _Reader:
             rows = next(self._episodes, None)
             if rows is None:
                 raise UserError("is missing")
+            rows = rows | {"action": self._scaled(rows["action"])}
             frames = rows[FRAMES_KEY]
+            layout = {key: values.shape[1:] for key, values in rows.items()}
+            if frames.dtype != np.uint8 or layout != (self._layout or layout):
+                raise UserError(f"has {frames.dtype} pictures and rows of {layout}, not those of the episodes before")
+            self._layout = layout
+            told = {key: values for key, values in rows.items() if key != FRAMES_KEY}
+            check_rows(f"{self._name}: episode {number}", told, len(frames))
             self._read += 1
             self._still += len(frames) > 1 and bool((frames[1:] == frames[0]).all())
             self._joined += number == self._next and np.array_equal(frames[0], self._last)
             self._next, self._last = number + 1, frames[-1]
-            return rows | {"action": self._scaled(rows["action"])}
+            return rows
 
     def notes(self) -> Iterator[str]:
         """What the episodes that were read have in common."""

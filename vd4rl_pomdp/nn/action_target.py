@@ -2,9 +2,9 @@
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, Protocol
@@ -118,18 +118,19 @@ def _fit_centers(actions: np.ndarray, codes: int, seed: int) -> np.ndarray:
     rng = np.random.default_rng(stream_seed(seed, "kmeans", "sample"))
     sample = actions if len(actions) <= 50_000 else actions[rng.choice(len(actions), 50_000, replace=False)]
     start = stream_seed(seed, "kmeans", "centres") % 2**32  # the largest that scikit-learn takes
-    if "sklearn" in sys.modules:
-        from vd4rl_pomdp.nn.codebook import fit_centers
-
-        return fit_centers(sample.astype(np.float64), codes, start).astype(np.float32)
     # a file by its path imports nothing of this package and not the caller's main module, and Ctrl-C is for the caller
     program = [sys.executable, "-P", str(Path(__file__).with_name("codebook.py")), str(codes), str(start)]
-    fitted = subprocess.run(
-        [*program, str(sample.shape[1])],
-        input=sample.astype(np.float64).tobytes(),
-        stdout=subprocess.PIPE,
-        env=os.environ | {"OMP_NUM_THREADS": "1"},  # not faster with more, and the last digits depend on their number
-        start_new_session=True,
-        check=True,
-    )
-    return np.frombuffer(fitted.stdout).reshape(codes, -1).astype(np.float32)
+    content = sample.astype(np.float64)
+    if "sklearn" not in sys.modules:
+        with suppress(OSError, subprocess.SubprocessError):  # it is killed, or finds other packages than this process
+            fitted = subprocess.run(
+                [*program, str(sample.shape[1])],
+                input=content.tobytes(),
+                capture_output=True,
+                start_new_session=True,
+                check=True,
+            )
+            return np.frombuffer(fitted.stdout).reshape(codes, -1).astype(np.float32)
+    from vd4rl_pomdp.nn.codebook import fit_centers
+
+    return fit_centers(content, codes, start).astype(np.float32)

@@ -4,11 +4,13 @@ import sys
 
 import numpy as np
 from sklearn.cluster import KMeans
+from threadpoolctl import threadpool_limits
 
 
 def fit_centers(sample: np.ndarray, codes: int, start: int) -> np.ndarray:
     """Centres, (codes, A) float64, of (N, A) float64; `start` seeds scikit-learn's three beginnings."""
-    centers: np.ndarray = KMeans(codes, n_init=3, random_state=start).fit(sample).cluster_centers_
+    with threadpool_limits(1):  # not faster with more, and the last digits depend on their number
+        centers: np.ndarray = KMeans(codes, n_init=3, random_state=start).fit(sample).cluster_centers_
     return centers
 
 

@@ -11,6 +11,7 @@ also be asked for single frames, through the stacking.
 
 from __future__ import annotations
 
+import copy
 from collections.abc import Iterator, Sequence
 
 import torch
@@ -65,7 +66,7 @@ def dependence(
     """(window, t, k) -> what the prediction has a gradient to, for all real pairs; see `wrong_pairs`."""
     objective = objective.double()
     inputs = obs, actions = [x.requires_grad_() for x in _inputs(objective, lengths, rows, frames, seed=0)]
-    logits = objective.action_logits(_window(obs, actions, lengths))
+    logits = _logits(objective, _window(obs, actions, lengths))
     weights = torch.randn(logits.shape[-1], generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     found = {}
     for p, (b, t, k) in _real_pairs(objective, lengths, rows):
@@ -83,13 +84,15 @@ def response(
     """(window, t, k) -> what the prediction changes with, for all real pairs; see `wrong_pairs`."""
     objective = objective.double()
     (obs, actions), (new_obs, new_actions) = (_inputs(objective, lengths, rows, frames, seed) for seed in (0, 2))
-    plain = objective.action_logits(_window(obs, actions, lengths))
+    plain = _logits(objective, _window(obs, actions, lengths))
 
     def changed(obs: Tensor, actions: Tensor) -> Tensor:
-        return (objective.action_logits(_window(obs, actions, lengths)) != plain).any(-1)
+        return (_logits(objective, _window(obs, actions, lengths)) != plain).any(-1)
 
     if changed(obs, actions).any():
-        raise ValueError("predictions differ from call to call: put the objective into eval mode")
+        raise ValueError(
+            "predictions differ from call to call: put the objective into eval mode, or draw from nn.draws.Draws"
+        )
     for b in range(len(lengths)):
         touched = changed(_exchange(obs, new_obs, 0, b), _exchange(actions, new_actions, 0, b))
         if touched[torch.arange(len(lengths)) != b].any():
@@ -107,6 +110,11 @@ def response(
             if touched[pair[0], p]:
                 found[pair][1].add(row)
     return found
+
+
+def _logits(objective: InverseObjective, window: Windows) -> Tensor:
+    """Predictions by a copy, so that a method whose `Draws` move on makes the same draws at every call."""
+    return copy.deepcopy(objective).action_logits(window)
 
 
 def _real_pairs(objective: InverseObjective, lengths: Sequence[int], rows: int) -> Iterator[tuple[int, Pair]]:

@@ -224,7 +224,7 @@ def optional_terms_are_added(name: str, **settings: Any) -> None:
 def the_action_loss_is_that_of_each_pairs_first_action(name: str, **settings: Any) -> None:
     """`action_loss` is the mean of -log P(a_t | ...) over all real pairs (t, t+k), and `loss_kNN` over those of a k."""
     objective, window = cast(InverseObjective, build(name, **settings)), batch()
-    logits = objective.action_logits(window)
+    logits = copy.deepcopy(objective).action_logits(window)  # of the same draws as the loss below
     alone: dict[int, list[torch.Tensor]] = {}
     for p, (t, k) in enumerate(objective.pairs(ROWS).tolist()):
         for b, length in enumerate(window.length.tolist()):

@@ -99,7 +99,7 @@ def _episode(path: Path) -> EpisodeArrays:
     return {
         FRAMES_KEY: as_frames(stored["image"]),
         "action": stored["action"],
-        "reward": stored["reward"],
+        "reward": stored["reward"].astype(float),
         "discount": stored["discount"] if "discount" in stored else 1.0 - stored.get("is_terminal", np.zeros(rows)),
         "step_type": step_type,
     }
