@@ -73,9 +73,11 @@ def commands(data: Path, run: Path) -> dict[str, list[str]]:
         "demo": ["demo"],
         "data collect": ["data", "collect", "--task", "walker_walk", "--quality", "random", "--episodes", "1"],
         "data download": ["data", "download", "--task", "walker_walk", "--quality", "random"],
+        "data view": ["data", "view", str(data)],
         "pretrain": ["pretrain", *preset, "--data", str(data)],
         "finetune": ["finetune", *preset, "--data", str(data), "--encoder", str(run / "encoder")],
         "evaluate": ["evaluate", str(run)],
+        "agents export": ["agents", "export", str(run)],
         "navigation collect": ["navigation", "collect", *preset, "--maze", "no_curtain"],
         "navigation train": ["navigation", "train", *preset, "--data", str(data)],
         "navigation policy": ["navigation", "policy", "--decisions", "1"],
@@ -84,12 +86,13 @@ def commands(data: Path, run: Path) -> dict[str, list[str]]:
         "report": ["report", str(run)],
         "report compare": ["report", "compare", str(run), str(run)],
         "results add": ["results", "add", str(run)],
+        "certify": ["certify", str(data), "patch"],
         "theory": ["theory"],
     }
 
 
 NAMES = list(commands(Path(), Path()))
-FILES = ("evaluate", "navigation policy")
+FILES = ("evaluate", "data view", "navigation policy")
 """Commands whose --out is a file."""
 
 
