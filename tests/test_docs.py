@@ -24,6 +24,7 @@ from vd4rl_pomdp.cli import main
 from vd4rl_pomdp.core.registry import REGISTRIES
 from vd4rl_pomdp.core.tasks import SET_QUALITIES, TASKS
 from vd4rl_pomdp.corruptions import make_corruption
+from vd4rl_pomdp.data.formats import FORMATS
 from vd4rl_pomdp.envs.mazes import get_maze
 from vd4rl_pomdp.nn import load_encoder
 from vd4rl_pomdp.nn.policy import Policy
@@ -256,6 +257,7 @@ def check_results(page: str, names: dict) -> None:
 
 def test_toml_blocks_are_read_and_name_what_exists():
     pages = [page for page in PAGES if page.name not in ("README.md", "sweeps.md")]  # whose blocks are grids
+    assert FORMATS in REGISTRIES.values()
     found = [tomllib.loads(code)["project"]["entry-points"] for page in pages for code in blocks(page, "toml")]
     assert sorted(group for groups in found for group in groups) == sorted(
         registry.group for registry in REGISTRIES.values()
