@@ -115,7 +115,7 @@ class StateWindowSampler(WindowSampler):
         if hold_out:
             test = torch.from_numpy(held_out(data.episode.cpu().numpy())).to(data.t.device)
             self._states = self._states.masked_fill(test[:, None], torch.nan)
-        self._longest = int((data.episode_end - data.episode_start).max()) if histories else 0
+        self._longest = data.longest_episode if histories else 0
 
     def sample(self) -> StateWindows:
         """The next batch."""

@@ -20,6 +20,8 @@ import torch
 from safetensors import safe_open
 from safetensors.torch import load_file, save_file
 
+from vd4rl_pomdp.runs.files import write_csv
+
 TABLE = Path(__file__).parents[1] / "results" / "ladder" / "averaged.csv"
 COLUMNS = ("run", "step", "rungs", "episode", "return")
 _PROGRAM = str(Path(sys.executable).parent / "vd4rl-pomdp")
@@ -43,10 +45,7 @@ def main() -> None:
             for episode in episodes_of(timing.parent, files, work / "averaged"):
                 rows.append(dict(zip(COLUMNS, (name, step, len(files), *episode), strict=True)))
             rows.sort(key=lambda row: (row["run"], int(row["step"]), int(row["episode"])))
-            with TABLE.open("w", newline="") as file:
-                table = csv.DictWriter(file, COLUMNS, lineterminator="\n")
-                table.writeheader()
-                table.writerows(rows)
+            write_csv(TABLE, COLUMNS, rows)
 
 
 def episodes_of(run: Path, policies: list[Path], scratch: Path) -> list[tuple[int, float]]:

@@ -273,6 +273,11 @@ class Dataset:
                 "them out of the set"
             )
 
+    @property
+    def longest_episode(self) -> int:
+        """Rows of the longest episode."""
+        return int(self.t.max()) + 1
+
     def windows_per_episode(self, length: int) -> Tensor:
         """(E,) rows from which `length` consecutive rows stay inside the episode: transitions for 2."""
         return (self.episode_end - self.episode_start - (length - 1)).clamp(min=0)

@@ -54,11 +54,16 @@ _FAST_SHADOW_SIZE = 512
 def check_mujoco(version: str = mujoco.__version__) -> None:
     """Refuse a mujoco whose pixels were never compared with the data's."""
     low, high = TRIED_MUJOCO
-    if not low <= tuple(int(part) for part in version.split(".")[:2]) < high:
+    if not low <= _numbers(version) < high:
         raise UserError(
             f"mujoco {version} was never compared with the data's pixels (tried: {low[0]}.{low[1]} to below "
             f"{high[0]}.{high[1]}); install the tried pair with `pip install 'dm-control==1.0.44' 'mujoco==3.11.0'`"
         )
+
+
+def _numbers(version: str) -> tuple[int, ...]:
+    """Major and minor."""
+    return tuple(int(part) for part in version.split(".")[:2])
 
 
 def prepare(physics: Any, render: Render, size: int) -> None:
@@ -73,7 +78,7 @@ def prepare(physics: Any, render: Render, size: int) -> None:
     stored = model.tex_width[number] * model.tex_height[number] * model.tex_nchannel[number]
     assert stored == sky.size, "the skybox has another size than the one to restore"
     model.tex_data[start : start + stored] = sky
-    if tuple(int(part) for part in mujoco.__version__.split(".")[:2]) >= _TEXTURE_AT_CORNER:
+    if _numbers(mujoco.__version__) >= _TEXTURE_AT_CORNER:
         _center_floors(model)
     model.vis.global_.offwidth = model.vis.global_.offheight = size
     if render == "fast":

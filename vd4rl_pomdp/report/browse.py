@@ -85,7 +85,7 @@ def write_view(config: ViewConfig) -> Path:
     view = View(data, config.corruption, seed=config.seed)
     count = min(config.episodes, data.num_episodes)
     shown = np.linspace(0, data.num_episodes - 1, count).round().astype(int).tolist()
-    longest = int((data.episode_end - data.episode_start).max())
+    longest = data.longest_episode
     rows = min(longest, 16)  # a trial of few, to tell how many will fit
     few = shown[:: -(-count // 5)]
     trial = len(_page(config, view, few, rows)) / len(few) / rows
@@ -101,7 +101,7 @@ def write_view(config: ViewConfig) -> Path:
 def _page(config: ViewConfig, view: View, shown: list[int], rows: int) -> bytes:
     """The page with so many rows of each of some episodes."""
     data = view.dataset
-    longest = int((data.episode_end - data.episode_start).max())
+    longest = data.longest_episode
     told = {
         "size": -(-data.frame_size // -(-data.frame_size // _LARGEST)),
         "columns": COLUMNS,
