@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.optim import Optimizer
 
 from finetune.features import FeatureBatch
@@ -130,9 +130,9 @@ class Algorithm(ABC):
         for optimiser in optimisers:
             optimiser.step()
 
-    @abstractmethod
     def parts(self) -> dict[str, Any]:
-        """Networks, targets and optimisers by name: what has a state of its own. The target of `x` is `target_x`."""
+        """The networks, targets and optimisers among its attributes, by name. The target of `x` is `target_x`."""
+        return {name: part for name, part in vars(self).items() if isinstance(part, nn.Module | Optimizer)}
 
     def state_dict(self) -> dict[str, Any]:
         """Everything needed to resume: the state of all parts, the updates made, the noise."""

@@ -16,8 +16,6 @@ Differences:
 
 from __future__ import annotations
 
-from typing import Any
-
 import torch.nn.functional as F
 from torch import Tensor
 from torch.optim import Optimizer
@@ -54,7 +52,3 @@ class BC(Algorithm):
         chosen = with_noise(self.policy(batch.z), noise)
         loss = F.mse_loss(chosen, batch.action)
         return Loss(loss, {"bc_loss": loss.detach()})
-
-    def parts(self) -> dict[str, Any]:
-        """The policy and its optimiser."""
-        return {"policy": self.policy, "optimiser": self.optimiser}
