@@ -17,7 +17,7 @@ from typing import Any
 from script import run_script
 
 from finetune.features import FrozenEncoder
-from finetune.path import DataPath
+from finetune.trainer import path_error
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.corruptions import CorruptionConfig
@@ -28,7 +28,7 @@ from vd4rl_pomdp.nn.policy import load_policy
 from vd4rl_pomdp.policies.actor import read_actor
 from vd4rl_pomdp.runs.files import Row, write_csv
 from vd4rl_pomdp.runs.outputs import refuse_inside
-from vd4rl_pomdp.sweeps.plan import run_at
+from vd4rl_pomdp.runs.results import read_records
 
 
 @dataclass(frozen=True)
@@ -43,7 +43,7 @@ class Config:
 
 def errors(folder: Path) -> list[Row]:
     """One row for a view that the policy was trained on, and one for a view that it has not seen."""
-    config = run_at(folder).record["config"]
+    config = read_records(folder).record["config"]
     actor = Reference.read(folder).actor_file
     if actor is None or not config.get("views"):
         raise UserError(f"{folder}: has no cached features, or no single actor made its set")
@@ -59,7 +59,7 @@ def errors(folder: Path) -> list[Row]:
     def row(view: int) -> Row:
         drawn = frozen.view(view)
         seen = [frozen.episode(number, drawn) for number in range(dataset.num_episodes)]  # draws follow one another
-        error = DataPath(dataset, shown, seen.__getitem__).action_error(policy)
+        error = path_error(dataset, shown, seen.__getitem__, policy)
         told: dict[str, Any] = {"views": config["views"], "trained_on": view < config["views"], "view": view}
         return named | told | {"action_error": round(error, 6)}
 

@@ -34,8 +34,7 @@ from vd4rl_pomdp.report.gates import (
     sides,
 )
 from vd4rl_pomdp.report.load import REFERENCES, Run, label
-from vd4rl_pomdp.report.variants import groups
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.files import Row, groups
 
 HOLDS, FAILS, OPEN, FEW = "holds", "does not hold", "undecided", "too few seeds"
 PRIMARY, SECOND, EXPLORATORY = "primary", "second family", "exploratory"

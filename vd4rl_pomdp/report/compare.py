@@ -18,8 +18,7 @@ from vd4rl_pomdp.report.load import CONDITION, SETTING, Run, label, load_runs, s
 from vd4rl_pomdp.report.page import made_with
 from vd4rl_pomdp.report.render import Columns, block, render, terminal, texts, write_latex
 from vd4rl_pomdp.report.tables import SCORE, mean_and_ends
-from vd4rl_pomdp.report.variants import groups
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.outputs import refuse_foreign
 from vd4rl_pomdp.runs.results import certificates_of
 

@@ -7,8 +7,8 @@ from operator import attrgetter
 
 from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.report.load import ALL, CONDITION, SETTING, Choice, Run, without_options
-from vd4rl_pomdp.report.variants import ENCODER_SEED, groups
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.report.variants import ENCODER_SEED
+from vd4rl_pomdp.runs.files import Row, groups
 
 MISSING = "missing"
 STATE = "state"

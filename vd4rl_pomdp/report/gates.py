@@ -21,9 +21,9 @@ from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gaps import STATE
 from vd4rl_pomdp.report.load import REFERENCES, SETTING, Run, a_set_a_seed
 from vd4rl_pomdp.report.stats import interval
-from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, PLAIN, PRESETS, groups, of_corruption
+from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, PLAIN, PRESETS, of_corruption
 from vd4rl_pomdp.runs.certificates import NOT_CERTIFIED, in_words
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.files import Row, groups
 
 STATE_SHARE = 0.9
 """Least share of the data's mean return, of `state`."""

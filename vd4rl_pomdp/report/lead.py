@@ -9,8 +9,7 @@ import numpy as np
 from vd4rl_pomdp.report import stats
 from vd4rl_pomdp.report.gates import GATED, as_it_is, comparable, episodes_of, sides
 from vd4rl_pomdp.report.load import Run
-from vd4rl_pomdp.report.variants import groups
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.files import Row, groups
 
 LEADER, OTHER = "mik+a", "acro"
 OTHERS = {"mik+a less acro": "method", "mik+a less acro with a GRU": "gru"}

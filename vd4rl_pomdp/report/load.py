@@ -23,7 +23,6 @@ from vd4rl_pomdp.report.variants import (
     Parts,
     Settings,
     differences,
-    groups,
     of_corruption,
     read_settings,
     without,
@@ -32,7 +31,7 @@ from vd4rl_pomdp.report.variants import (
 from vd4rl_pomdp.runs import REFERENCE_FILE
 from vd4rl_pomdp.runs.critic import CONVERGED
 from vd4rl_pomdp.runs.episodes import COLUMNS
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.results import Result, find_results, whole_files
 
 SETTING = ("task", "quality", "corruption")

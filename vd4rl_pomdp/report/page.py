@@ -32,9 +32,8 @@ from vd4rl_pomdp.report.render import block, render, terminal, texts, write_late
 from vd4rl_pomdp.report.shown import MARK, NOTES, SHOWN, WHOLE, Shown, claim_of, shown_tables, with_algorithm
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.theory import load_section
-from vd4rl_pomdp.report.variants import groups
 from vd4rl_pomdp.runs.certificates import NOT_CERTIFIED, keep_certificates
-from vd4rl_pomdp.runs.files import Row
+from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.results import RUNS, certificates_of, refuse_loss, write_results
 

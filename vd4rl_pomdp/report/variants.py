@@ -6,11 +6,12 @@ run has its own config, its encoder's, and the data of both.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Hashable, Iterable, Mapping, Sequence
-from typing import Any, TypeVar
+from collections.abc import Collection, Hashable, Mapping, Sequence
+from typing import Any
 
 from vd4rl_pomdp.core.options import LATER, settings_of
 from vd4rl_pomdp.corruptions import corruption_settings
+from vd4rl_pomdp.runs.files import groups
 
 Settings = dict[str, str]
 """Values as words, by the name that is shown beside them."""
@@ -41,17 +42,6 @@ PLAIN = {
     **{name: _words(value) for name, value in LATER.items()},
 }
 """Values that add nothing to a method: what has them goes by the method's name, and others are its variants."""
-
-Member = TypeVar("Member")
-Key = TypeVar("Key", bound=Hashable)
-
-
-def groups(members: Iterable[Member], key: Callable[[Member], Key]) -> dict[Key, list[Member]]:
-    """Members by key, keys in the order in which they first come."""
-    found: dict[Key, list[Member]] = {}
-    for member in members:
-        found.setdefault(key(member), []).append(member)
-    return found
 
 
 def read_settings(record: Mapping[str, Any], card: Mapping[str, Any]) -> Settings:

@@ -3,20 +3,23 @@
 from __future__ import annotations
 
 import csv
+import fcntl
 import hashlib
 import json
 import os
 import secrets
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
-from typing import IO, Any
+from typing import IO, Any, TypeVar
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.reading import parse_json, read_bytes
 
 Row = dict[str, Any]
 """One row of a table, its values by column."""
+Member = TypeVar("Member")
+Key = TypeVar("Key", bound=Hashable)
 
 
 def jsonable(value: Any) -> Any:
@@ -106,10 +109,8 @@ def appending(path: Path) -> Iterator[IO[str]]:
         UserError: the system refuses.
     """
     with disk_errors(path), path.open("a", newline="", encoding="utf-8") as file:
-        with suppress(ImportError, OSError):
-            import fcntl  # not on Windows
-
-            fcntl.flock(file.fileno(), fcntl.LOCK_EX)  # not on every file system
+        with suppress(OSError):  # not on every file system
+            fcntl.flock(file.fileno(), fcntl.LOCK_EX)
         yield file
         file.flush()
         os.fsync(file.fileno())
@@ -143,6 +144,14 @@ def holds_anything(folder: Path) -> bool:
     """Whether a folder exists and holds a file or folder that is not hidden; hidden ones are left by cut commands."""
     with disk_errors(folder):
         return folder.is_dir() and any(not file.name.startswith(".") for file in folder.iterdir())
+
+
+def groups(members: Iterable[Member], key: Callable[[Member], Key]) -> dict[Key, list[Member]]:
+    """Members by key, keys in the order in which they first come."""
+    found: dict[Key, list[Member]] = {}
+    for member in members:
+        found.setdefault(key(member), []).append(member)
+    return found
 
 
 def flatten(value: dict[str, Any], prefix: str = "") -> dict[str, Any]:

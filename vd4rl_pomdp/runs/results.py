@@ -15,6 +15,7 @@ import sys
 from collections.abc import Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -30,7 +31,7 @@ from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json, re
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.provenance import CONTINUED
-from vd4rl_pomdp.runs.run import identity, remedy
+from vd4rl_pomdp.runs.run import identity, recipe, remedy
 
 RUNS = "runs.jsonl"
 FILES = {Path(file).stem: file for file in RECORDS} | {"encoder": f"encoder/{CONFIG_FILE}"}
@@ -78,12 +79,16 @@ class Result:
     @property
     def machine(self) -> str:
         """What it was computed on: its GPU, or its processor and cores; "A then B" if it moved, empty if unknown."""
-        return _in_turn(map(_hardware, self.parts))
+        told = []
+        for part in self.parts:
+            processor, cores = part.get("processor"), part.get("cores")
+            told.append(part.get("gpu") or (f"{processor}, {cores} cores" if processor and cores else processor))
+        return " then ".join(dict.fromkeys(str(one) for one in told if one))
 
     @property
     def commit(self) -> str:
         """The commit it was computed with, likewise."""
-        return _in_turn(part.get("git_commit") for part in self.parts)
+        return " then ".join(dict.fromkeys(str(one) for part in self.parts if (one := part.get("git_commit"))))
 
     @property
     def encoder(self) -> dict[str, Any]:
@@ -106,9 +111,24 @@ class Result:
         return {name: self.files["labels"][name] for name in LABELS}
 
     @property
+    def data(self) -> str:
+        """Fingerprint of its set, empty where it tells none."""
+        return self.record.get("inputs", {}).get("data", "")
+
+    @cached_property
+    def recipe(self) -> str:
+        """What it computes, but for its data's content."""
+        return recipe(self.record, self.card if {"settings", "seed"} <= self.card.keys() else {})
+
+    @property
+    def on_one_set(self) -> bool:
+        """Whether its encoder, if it was given one, was pretrained on its own data, as a grid's are."""
+        return self.card.get("data") in (None, self.data)
+
+    @property
     def certificate(self) -> str:
         """Id of the certificate that would speak of its set and corruption."""
-        return certificate_id(self.record.get("inputs", {}).get("data", ""), self.encoder.get("corruption") or {})
+        return certificate_id(self.data, self.encoder.get("corruption") or {})
 
     @property
     def measured(self) -> list[Row]:
@@ -136,25 +156,20 @@ class Result:
         return self.settled + self.finished
 
 
-def _in_turn(words: Iterable[Any]) -> str:
-    return " then ".join(dict.fromkeys(str(word) for word in words if word))
-
-
-def _hardware(part: dict[str, Any]) -> str | None:
-    if part.get("gpu"):
-        return str(part["gpu"])
-    processor, cores = part.get("processor"), part.get("cores")
-    return f"{processor}, {cores} cores" if processor and cores else processor
+def read_records(folder: Path) -> Result:
+    """A run folder without metrics and rows: what its small files hold; raises UserError for a damaged one."""
+    files = {name: read_json(folder / place) for name, place in FILES.items() if (folder / place).exists()}
+    if "encoder" in files and not isinstance(files["encoder"].get("pretrain"), dict):
+        raise UserError(f"{folder / FILES['encoder']}: does not say how the encoder was pretrained; pretrain it again")
+    return Result("", folder, files, 0, [], [], True)
 
 
 def read_run(folder: Path | str) -> Result:
     """What a run folder holds; raises UserError for damaged files."""
     folder = Path(folder)
-    files = {name: read_json(folder / place) for name, place in FILES.items() if (folder / place).exists()}
+    files = read_records(folder).files
     if "config" not in files:
         raise UserError(f"{folder}: is no run, which has a {CONFIG_FILE}; name a folder that a training wrote")
-    if "encoder" in files and not isinstance(files["encoder"].get("pretrain"), dict):
-        raise UserError(f"{folder / FILES['encoder']}: does not say how the encoder was pretrained; pretrain it again")
     metrics, path = read_metrics(folder / METRICS_FILE), folder / EPISODES_FILE
     # A row that was cut with its run is left out; a finished run has none.
     found = read_episodes(path) if "timing" in files else episodes_until(path, sys.maxsize)
@@ -165,20 +180,15 @@ def read_run(folder: Path | str) -> Result:
         pretraining = files["config"]["stage"] == "pretrain"
         run = Result("", folder, files, step, losses if pretraining else [], rows, True)
         _check(run)
-        _check_last_evaluation(run)
+        last, episodes = files.get("timing", {}).get("updates"), run.record["config"].get("eval_episodes")
+        played = sum(row["step"] == last and row["evaluated_under"] == row["corruption"] for row in rows)
+        if last is not None and episodes is not None and played < episodes:
+            what = f"{played} of {episodes} episodes of the last evaluation"
+            raise UserError(f"{path}: has {what}; {remedy(folder)}")
         if files.get("critic") == {} and any(VALUE in row for row in metrics):
             raise UserError(f"{folder / CRITIC_FILE}: tells of no critic, {METRICS_FILE} of one; {remedy(folder)}")
         files["labels"] = files.get("labels", {}) | _labels(run)
         return replace(run, id=_id(run))
-
-
-def _check_last_evaluation(run: Result) -> None:
-    """Raise UserError if a finished fine-tuning's folder lacks episodes of its last evaluation."""
-    last, episodes = run.files.get("timing", {}).get("updates"), run.record["config"].get("eval_episodes")
-    found = [row for row in run.rows if row["step"] == last and row["evaluated_under"] == row["corruption"]]
-    if last is not None and episodes is not None and len(found) < episodes:
-        what = f"{len(found)} of {episodes} episodes of the last evaluation"
-        raise UserError(f"{run.path / EPISODES_FILE}: has {what}; {remedy(run.path)}")
 
 
 def _labels(run: Result) -> dict[str, Any]:
@@ -229,22 +239,7 @@ def read_results(folder: Path | str) -> list[Result]:
     """All runs of a results folder; raises UserError if it is none, or damaged."""
     folder = Path(folder)
     path, by_run = folder / RUNS, dict[str, list[Row]]()
-    lines = read_lines(path)  # before the rows, which are written first: one that is written meanwhile lacks none
-    for row in read_episodes(folder / EPISODES_FILE):
-        if "id" not in row:
-            raise UserError(f"{folder / EPISODES_FILE}: has no column 'id'; it was not written beside {RUNS}")
-        # Rows by the hundred thousand repeat a few dozen words: each word is in memory once.
-        shared = {name: sys.intern(row[name]) if isinstance(row[name], str) else row[name] for name in COLUMNS}
-        by_run.setdefault(row["id"], []).append(shared)
-    runs = [_parse(path, number, line, by_run) for number, line in enumerate(lines, 1)]
-    if len({run.id for run in runs}) != len(runs):
-        raise UserError(f"{path}: names a run twice; remove one of the two lines")
-    return runs
-
-
-def read_lines(path: Path) -> list[str]:
-    """The lines of a runs.jsonl; raises UserError for one that is missing, empty or no text."""
-    try:
+    try:  # before the rows, which are written first: one that is written meanwhile lacks none
         lines = read_bytes(path).decode().splitlines()
     except FileNotFoundError as error:
         raise UserError(f"{path.parent}: holds no {RUNS}, so it is no results folder") from error
@@ -252,22 +247,29 @@ def read_lines(path: Path) -> list[str]:
         raise UserError(f"{path}: is no UTF-8 ({error}); take another copy") from error
     if not lines:
         raise UserError(f"{path}: is empty; take another copy, or remove it")
-    return lines
-
-
-def _parse(path: Path, number: int, line: str, by_run: dict[str, list[Row]]) -> Result:
-    """A line's run, with the rows that it had when the line was written: a cut writing may have added later ones."""
-    with whole_files(f"{path}: line {number}"):
-        told = parse_json(line)
-        files = {name: told[name] for name in FILES if name in told}
-        losses = [(int(step), float(loss)) for step, loss in told.get("losses", [])]
-        rows, count = by_run.get(told["id"], []), int(told["episodes"])
-        if len(rows) < count:
-            where = path.parent / EPISODES_FILE
-            raise UserError(f"{where}: has {len(rows)} of {count} rows of run {told['id']}; take another copy")
-        run = Result(told["id"], path.parent, files, int(told["step"]), losses, rows[:count])
-        _check(run)
-        return run
+    for row in read_episodes(folder / EPISODES_FILE):
+        if "id" not in row:
+            raise UserError(f"{folder / EPISODES_FILE}: has no column 'id'; it was not written beside {RUNS}")
+        # Rows by the hundred thousand repeat a few dozen words: each word is in memory once.
+        shared = {name: sys.intern(row[name]) if isinstance(row[name], str) else row[name] for name in COLUMNS}
+        by_run.setdefault(row["id"], []).append(shared)
+    runs: dict[str, Result] = {}
+    for number, line in enumerate(lines, 1):
+        with whole_files(f"{path}: line {number}"):
+            told = parse_json(line)
+            name, count = told["id"], int(told["episodes"])
+            rows = by_run.get(name, [])
+            if name in runs:
+                raise UserError(f"{path}: names a run twice; remove one of the two lines")
+            if len(rows) < count:
+                where = folder / EPISODES_FILE
+                raise UserError(f"{where}: has {len(rows)} of {count} rows of run {name}; take another copy")
+            files = {key: told[key] for key in FILES if key in told}
+            losses = [(int(step), float(loss)) for step, loss in told.get("losses", [])]
+            # those that it had when the line was written: a cut writing may have added later ones
+            runs[name] = Result(name, folder, files, int(told["step"]), losses, rows[:count])
+            _check(runs[name])
+    return list(runs.values())
 
 
 def write_results(out: Path, runs: Iterable[Result]) -> None:
@@ -299,36 +301,31 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
     """
     if not paths:
         raise UserError("name at least one run folder, or a folder that contains some")
-    found: dict[str, Result] = {}
-    for run in _found([Path(path) for path in paths], but):
-        found[run.id] = _better(found[run.id], run) if run.id in found else run
-    if not found:
-        raise UserError(
-            f"{paths[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl) and no results "
-            f"folder (which holds {RUNS})"
-        )
-    return list(found.values())
-
-
-def _found(paths: Sequence[Path], but: Path | None) -> Iterator[Result]:
+    paths = [Path(path) for path in paths]
     if missing := [path for path in paths if not path.exists()]:
         raise UserError(f"{missing[0]}: no such folder")
-    files = [file for path in paths for file in files_below(path, CONFIG_FILE)]
-    yield from (read_run(file.parent) for file in dict.fromkeys(files) if "stage" in read_json(file))
+    files = dict.fromkeys(file for path in paths for file in files_below(path, CONFIG_FILE))
+    runs = [read_run(file.parent) for file in files if "stage" in read_json(file)]
     places: dict[Path, None] = {}
     for path in paths:
         below = {file.parent for file in files_below(path, RUNS)}
         places |= dict.fromkeys(place for place in sorted(below) if below.isdisjoint(place.parents))
     for place in places:
         if but is None or place in paths or place.resolve() != but.resolve():
-            yield from read_results(place)
-
-
-def _better(one: Result, other: Result) -> Result:
-    """Of two tales of one run the one that finished, else diverged; then that of its folder, then the one ahead."""
-    if one.settled and one.ending == other.ending and one.measured != other.measured:
-        raise UserError(f"{other.path} and {one.path}: two runs of one method, setting and seed; name one of them")
-    return max(one, other, key=lambda run: (run.ending, run.folder, len(run.measured), run.step))
+            runs += read_results(place)
+    if not runs:
+        raise UserError(
+            f"{paths[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl) and no results "
+            f"folder (which holds {RUNS})"
+        )
+    found: dict[str, Result] = {}
+    for run in runs:
+        other = found.setdefault(run.id, run)
+        if other.settled and other.ending == run.ending and other.measured != run.measured:
+            raise UserError(f"{run.path} and {other.path}: two runs of one method, setting and seed; name one of them")
+        # Of two tales of one run the one that finished, else diverged; then that of its folder, then the one ahead.
+        found[run.id] = max(other, run, key=lambda one: (one.ending, one.folder, len(one.measured), one.step))
+    return list(found.values())
 
 
 class Added(NamedTuple):
@@ -406,26 +403,24 @@ def verify_results(folder: Path | str) -> tuple[list[Result], list[str]]:
     Raises:
         UserError: as `read_results`.
     """
-    runs = read_results(folder)
-    return runs, [f"run {run.id}: {told}" for run in runs for told in _contradictions(run)]
-
-
-def _contradictions(run: Result) -> Iterator[str]:
-    with whole_files(run.place):
-        if (computed := _id(run)) != run.id:
-            yield f"its record computes {computed}"
-        config = run.record["config"]
-        known = {"seed": config["seed"], "algorithm": config.get("algorithm"), "method": run.card.get("method")}
-        known |= {"task": run.card.get("task"), "corruption": run.card.get("corruption", {}).get("corruption")}
-        for name, value in known.items() if run.rows else ():
-            if wrong := [row[name] for row in run.rows if value is not None and row[name] != value]:
-                yield f"{len(wrong)} episodes have the {name} {wrong[0]}, its record {value}"
-        places = [(row["step"], row["evaluated_under"], row["episode"]) for row in run.rows]
-        if len(set(places)) < len(places):
-            yield f"{len(places) - len(set(places))} episodes stand there twice"
-        divisor = TASKS[run.labels["task"]].score_divisor if run.labels["task"] in TASKS else None
-        if wrong := [row for row in run.rows if divisor and abs(row["score"] - row["return"] / divisor) > _ROUNDING]:
-            yield f"{len(wrong)} scores are not their returns / {divisor:g}"
+    runs, told = read_results(folder), []
+    for run in runs:
+        with whole_files(run.place):
+            if (computed := _id(run)) != run.id:
+                told.append(f"run {run.id}: its record computes {computed}")
+            config = run.record["config"]
+            known = {"seed": config["seed"], "algorithm": config.get("algorithm"), "method": run.card.get("method")}
+            known |= {"task": run.card.get("task"), "corruption": run.card.get("corruption", {}).get("corruption")}
+            for name, value in known.items():
+                if wrong := [row[name] for row in run.rows if value is not None and row[name] != value]:
+                    told.append(f"run {run.id}: {len(wrong)} episodes have the {name} {wrong[0]}, its record {value}")
+            places = [(row["step"], row["evaluated_under"], row["episode"]) for row in run.rows]
+            if twice := len(places) - len(set(places)):
+                told.append(f"run {run.id}: {twice} episodes stand there twice")
+            divisor = TASKS[run.labels["task"]].score_divisor if run.labels["task"] in TASKS else math.nan
+            if wrong := [row for row in run.rows if abs(row["score"] - row["return"] / divisor) > _ROUNDING]:
+                told.append(f"run {run.id}: {len(wrong)} scores are not their returns / {divisor:g}")
+    return runs, told
 
 
 def refuse_loss(runs: Sequence[Result], out: Path) -> None:

@@ -13,7 +13,7 @@ from vd4rl_pomdp.report.load import Choice, without_options
 from vd4rl_pomdp.runs.files import Row
 from vd4rl_pomdp.runs.results import Result
 from vd4rl_pomdp.sweeps.grid import GridCell
-from vd4rl_pomdp.sweeps.plan import DataSet, FoundRun, found_in, set_of
+from vd4rl_pomdp.sweeps.plan import DataSet, set_of, with_collections
 from vd4rl_pomdp.sweeps.stages import check_cells, config_of, recipe_of, recorded
 
 _NOWHERE = Path()
@@ -48,7 +48,7 @@ class GridMembers(Choice):
 
     def among(self, results: list[Result]) -> list[Result]:
         """Those of some runs that are the grid's, in their order; UserError if none is."""
-        found = [run for run, seen in zip(results, found_in(results), strict=True) if self._has(run, seen)]
+        found = [run for run in with_collections(results) if self._has(run)]
         if not found:
             raise UserError(f"none of {len(results)} runs is {self._asked}; `sweep run --dry-run` lists the cells")
         return found
@@ -62,13 +62,13 @@ class GridMembers(Choice):
         """Labels of the policies that the cells ask for."""
         return [dict(zip(LABELS, policy, strict=True)) for policy in sorted(self._policies)]
 
-    def _has(self, run: Result, seen: FoundRun) -> bool:
+    def _has(self, run: Result) -> bool:
         """Whether some cell asks for it; one on a set that nobody collected is told by task and quality."""
-        sets = self._sets.get(seen.recipe, ())
-        if seen.record.get("collection"):
-            return seen.on_one_set and any(data.alike(seen.record) for data in sets)
+        sets = self._sets.get(run.recipe, ())
+        if run.record.get("collection"):
+            return run.on_one_set and any(data.alike(run.record) for data in sets)
         labels = {name: run.labels[name] for name in ("task", "quality")}
-        return seen.on_one_set and any(labels.items() <= data.wanted.items() for data in sets)
+        return run.on_one_set and any(labels.items() <= data.wanted.items() for data in sets)
 
 
 def _policy(cell: GridCell, data: DataSet) -> tuple[Any, ...]:
