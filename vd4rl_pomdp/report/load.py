@@ -6,9 +6,10 @@ A number of a table goes this way: rows of `episodes.csv` (`runs.results`), a `R
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from operator import attrgetter
 from pathlib import Path
 from typing import Any
 
@@ -16,9 +17,11 @@ import numpy as np
 import pandas as pd
 
 from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.options import LABELS
 from vd4rl_pomdp.data.reference import Reference, summarise
 from vd4rl_pomdp.report.variants import (
     DATA,
+    ENCODER_SEED,
     OF_CORRUPTION,
     Parts,
     Settings,
@@ -49,11 +52,14 @@ ACTION_ERRORS = ("path_error", "action_error")
 """Of a policy, on the data's rows and in closed loop."""
 CONTROL = {"return": "return_mean", "share_above_80": "share_above_80", "action_error": "action_error"}
 """Columns that tell of the last evaluation, also as `clean_` under no corruption, and what `summarise` calls them."""
+MISSING = "missing"
+STATE = "state"
+"""The method that sees the simulator's state, whatever a setting hides."""
 END_TO_END = ("bc", "drq_bc")
 """References that bring their own algorithm."""
 TOLD_STATES = ("integrator", "supervised_picture", "supervised", "supervised+a")
 """Methods whose encoders are trained on the simulator's states, those of the episodes that a probe holds out, too."""
-REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, "state")
+REFERENCES = ("random", "bc", "drq_bc", *TOLD_STATES, STATE)
 """Methods that are references, floors and ceilings: last in a table."""
 
 
@@ -334,3 +340,59 @@ def _run_row(run: Run) -> Row:
         summed = summarise(episodes, run.reference) if episodes else {}
         row |= {prefix + name: summed.get(key) for name, key in CONTROL.items()}
     return row
+
+
+def find_gaps(runs: list[Run], choice: Choice = ALL) -> list[Row]:
+    """One row for each run that is missing or unfinished: CONDITION, seed and `state`.
+
+    Expected in a setting are all methods of the report with all their variants, each with every seed that any other
+    run has in that setting, and what the choice wants there.
+    """
+    grid = [run for run in runs if run.stage == "finetune" and run.labels["task"]]
+    rows = []
+    for place, here in groups(grid, lambda run: run.of(SETTING)).items():
+        there = {run.of((*CONDITION, "seed")): run for run in sorted(here, key=attrgetter("evaluated"))}
+        seeds = sorted({run.labels["seed"] for run in here})
+        for method, mine in groups(grid, lambda run: run.of(("algorithm", "method"))).items():
+            for variant in _expected(mine, place):
+                # A seed on the encoder of its own is one of the method, not of the variant that shares it.
+                own = {seed for seed in seeds if f"{ENCODER_SEED} {seed}" in variant.split(", ")}
+                for seed in (seed for seed in seeds if seed not in own):
+                    run = there.get((*place, *method, variant, seed))
+                    if run is None or not run.evaluated:
+                        state = MISSING if run is None or run.finished else run.progress
+                        values = (*place, *method, variant)
+                        rows.append(dict(zip(CONDITION, values, strict=True)) | {"seed": seed, "state": state})
+    rows = [row for row in rows if choice.asks(row)]
+    known = {without_options(row, LABELS) for row in (*(run.labels for run in grid), *rows)}
+    settings = {without_options(run.labels, SETTING): run.labels["corruption"] for run in grid}
+    for row in choice.wanted:  # what was never begun, in settings of any run
+        if without_options(row, LABELS) not in known and without_options(row, SETTING) in settings:
+            named = {name: row.get(name, "") for name in CONDITION}
+            named["corruption"] = settings[without_options(row, SETTING)]
+            rows.append(named | {"seed": row["seed"], "state": MISSING})
+    return rows
+
+
+def _expected(mine: list[Run], setting: tuple[str, ...]) -> Iterator[str]:
+    """Variants of a method that are expected in a setting: those of all settings that share a variant with it.
+
+    Where each setting has variants of its own, such as a budget for every task, nothing is missing; nor is `state`
+    where other pixels of the same set are hidden. Those by data are expected where they are found.
+    """
+    by_setting = groups(mine, lambda run: run.of(SETTING))
+    here = by_setting.get(setting, [])
+    if not here and mine[0].method == STATE and any(there[:2] == setting[:2] for there in by_setting):
+        return
+    own = {run.parts[0] for run in here}
+    shared = [there for there in by_setting.values() if not own or own & {run.parts[0] for run in there}]
+    for variant in dict.fromkeys(run.parts[0] for there in shared for run in there):
+        for data in dict.fromkeys(run.parts[1] for run in here if run.parts[0] == variant) or [""]:
+            yield ", ".join(filter(None, (variant, data)))
+
+
+def gaps_in_words(gaps: Iterable[Row]) -> str:
+    """Gaps of one condition: "seeds 1, 2 missing; seed 3 unfinished at 20 of 40 updates"."""
+    by_state = groups(sorted(gaps, key=lambda row: row["state"]), lambda row: str(row["state"]))
+    told = {state: [str(row["seed"]) for row in members] for state, members in by_state.items()}
+    return "; ".join(f"seed{'s' * (len(seeds) > 1)} {', '.join(seeds)} {state}" for state, seeds in told.items())
