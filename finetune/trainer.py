@@ -64,12 +64,8 @@ STANDARDISED_BY = 1024
 
 def labels_of(config: FinetuneConfig, card: EncoderCard) -> dict[str, Any]:
     """The columns that name a run's rows."""
-    labels = {name: getattr(card, name) for name in ("method", "task", "quality")}
-    return labels | {
-        "corruption": card.corruption["corruption"],
-        "algorithm": config.algorithm,
-        "seed": config.seed,
-    }
+    before = {"method": card.method, "task": card.task, "quality": card.quality}
+    return before | {"corruption": card.corruption["corruption"], "algorithm": config.algorithm, "seed": config.seed}
 
 
 def make_trainer(
@@ -118,15 +114,8 @@ def make_trainer(
     reference = Reference.of(dataset)
     actor = reference.actor_file
     path = partial(path_error, dataset, read_actor(actor), encode) if actor and dataset.physics is not None else None
-    return FinetuneTrainer(
-        EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm,
-        sampler,
-        config,
-        card,
-        run,
-        reference,
-        path,
-    )
+    trained = EndToEnd(algorithm, encoder, config) if card.end_to_end else algorithm
+    return FinetuneTrainer(trained, sampler, config, card, run, reference, path)
 
 
 @torch.no_grad()
