@@ -148,3 +148,10 @@ class Algorithm(ABC):
         else:
             self.updates = state["updates"]
         self.draws.set_state(state["noise"])
+
+
+def share_of(done: int | Tensor, whole: float) -> float | Tensor:
+    """How much of a whole is done, 1 at most: a number of a number, a tensor of one."""
+    if isinstance(done, Tensor):
+        return (done.double() / whole).clamp(max=1.0)
+    return min(1.0, done / whole)

@@ -30,8 +30,7 @@ import torch.nn.functional as F
 from torch import Tensor, nn
 from torch.optim import Optimizer
 
-from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions
-from finetune.algorithms.noise import share_of
+from finetune.algorithms.algorithm import Algorithm, Loss, ReturnOptions, share_of
 from finetune.algorithms.td3_bc import TwinCritic
 from finetune.features import FeatureBatch
 from vd4rl_pomdp.core.options import Limits, Options

@@ -1,4 +1,4 @@
-"""What a memory is."""
+"""What a memory is, and gated recurrent units."""
 
 from __future__ import annotations
 
@@ -39,3 +39,24 @@ class Memory(nn.Module):
     def forward(self, rows: Tensor, state: Tensor) -> tuple[Tensor, Tensor]:
         """(B, T, I) rows, T > 0, and an (L, B, W) state -> (B, T, hidden_dim), and the state after the last row."""
         raise NotImplementedError
+
+
+@dataclass(frozen=True)
+class GRUOptions(MemoryOptions):
+    """Options of the GRU."""
+
+    gru_layers: int = 1
+    """Layers of the GRU."""
+
+    limits: ClassVar[Limits] = {"gru_layers": (1, 64)}
+
+
+class GRU(nn.GRU, Memory):
+    """Gated recurrent units (Cho et al. 2014, arXiv 1406.1078), batch first."""
+
+    def __init__(self, inputs: int, options: GRUOptions) -> None:
+        super().__init__(inputs, options.hidden_dim, options.gru_layers, batch_first=True)
+
+    def initial_state(self, batch: int) -> Tensor:
+        """(gru_layers, batch, hidden_dim)."""
+        return next(self.parameters()).new_zeros(self.num_layers, batch, self.hidden_size)

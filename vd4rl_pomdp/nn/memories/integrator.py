@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from vd4rl_pomdp.nn.memories.gru import GRU, GRUOptions
+from vd4rl_pomdp.nn.memories.base import GRU, GRUOptions
 
 
 class Integrator(GRU):
