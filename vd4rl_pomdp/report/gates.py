@@ -18,9 +18,19 @@ from vd4rl_pomdp.core.errors import told_apart
 from vd4rl_pomdp.core.options import settings_of
 from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import stats
-from vd4rl_pomdp.report.load import REFERENCES, SETTING, STATE, Run, a_set_a_seed
+from vd4rl_pomdp.report.load import (
+    DATA,
+    ENCODER_SEED,
+    PLAIN,
+    PRESETS,
+    REFERENCES,
+    SETTING,
+    STATE,
+    Run,
+    a_set_a_seed,
+    of_corruption,
+)
 from vd4rl_pomdp.report.stats import interval
-from vd4rl_pomdp.report.variants import DATA, ENCODER_SEED, PLAIN, PRESETS, of_corruption
 from vd4rl_pomdp.runs.certificates import NOT_CERTIFIED, in_words
 from vd4rl_pomdp.runs.files import Row, groups
 
