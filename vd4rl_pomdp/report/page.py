@@ -21,7 +21,7 @@ from vd4rl_pomdp.core.text import write_text
 from vd4rl_pomdp.data.folder import published_scores
 from vd4rl_pomdp.report import figures, load, tables
 from vd4rl_pomdp.report.claims import judge_claims, leads, tally
-from vd4rl_pomdp.report.figures import Plot
+from vd4rl_pomdp.report.figures import Plot, draw_plots
 from vd4rl_pomdp.report.films import shown_films
 from vd4rl_pomdp.report.gates import gates, unranked, verdicts
 from vd4rl_pomdp.report.load import (
@@ -36,7 +36,6 @@ from vd4rl_pomdp.report.load import (
     load_runs,
     title,
 )
-from vd4rl_pomdp.report.plots import draw_plots
 from vd4rl_pomdp.report.render import block, render, terminal, texts, write_latex
 from vd4rl_pomdp.report.shown import MARK, NOTES, SHOWN, WHOLE, Shown, claim_of, shown_tables, with_algorithm
 from vd4rl_pomdp.report.stats import FEW_SEEDS
