@@ -107,7 +107,17 @@ class Driver:
                 self._collect()
                 interrupt.check("the sweep's jobs have ended")
         except BaseException:
-            self._stop()
+            # Every job is asked to end where nothing is lost; all at once, so that they share the patience.
+            for one in self._running:
+                one.process.terminate()
+            until = time.monotonic() + PATIENCE_S
+            for one in self._running:
+                try:
+                    one.process.wait(max(0.0, until - time.monotonic()))
+                except subprocess.TimeoutExpired:
+                    one.process.kill()
+                    one.process.wait()
+            self._collect()
             raise
         return all(map(is_finished, self._left.values()))  # others may have finished what was given up here
 
@@ -146,19 +156,17 @@ class Driver:
                 self._widths[job.name] = width_of(job, plan.made_in)
             return plan.made_in, tuple(plan.program), self._widths[job.name], kind
 
-        now: list[list[Job]] = []
-        small: list[list[Job]] = []
-        for jobs in in_stacks(ready, self._stack, attempts, alike):
-            grows = len(jobs) < self._stack and kind_of(jobs[0]) and not runs_alone(attempts[jobs[0].name])
-            (small if grows else now).append(jobs)
+        def small(jobs: list[Job]) -> bool:
+            return bool(len(jobs) < self._stack and kind_of(jobs[0]) and not runs_alone(attempts[jobs[0].name]))
+
+        # Only for what comes when a job that runs or starts here ends: else a place would be idle too long.
+        coming = running | {job.name for job in ready}
+        waiting = [(job, self._left.keys() & job.needs) for job in self._left.values() if job.name not in lost]
+        soon = {kind_of(job) for job, needs in waiting if needs and needs <= coming}
+        found = in_stacks(ready, self._stack, attempts, alike)
         if self._helps:
-            for some in (now, small):
-                random.shuffle(some)  # or all drivers would start the same one
-        # Only for what comes when a job that runs here ends: for anything else a place would be idle too long.
-        run = running | {job.name for jobs in now[: len(self._free)] for job in jobs}
-        waiting = {job.name: self._left.keys() & job.needs for job in self._left.values() if job.name not in lost}
-        soon = {kind_of(self._left[name]) for name, needs in waiting.items() if needs and needs <= run}
-        return now + [jobs for jobs in small if kind_of(jobs[0]) not in soon]
+            random.shuffle(found)  # or all drivers would start the same one
+        return sorted((jobs for jobs in found if not (small(jobs) and kind_of(jobs[0]) in soon)), key=small)
 
     def _is_anothers(self, job: Job) -> bool:
         """Whether another process is at a job, or has finished it; asked in this order, it cannot end in between."""
@@ -226,19 +234,6 @@ class Driver:
             except UnavailableError as error:
                 print(f"warning: {error}", file=sys.stderr)
             say(row, len(self._jobs) - len(self._left), len(self._jobs))
-
-    def _stop(self) -> None:
-        """Ask every job to end where nothing is lost, and wait for it."""
-        for one in self._running:  # all at once, so that they share the patience
-            one.process.terminate()
-        until = time.monotonic() + PATIENCE_S
-        for one in self._running:
-            try:
-                one.process.wait(max(0.0, until - time.monotonic()))
-            except subprocess.TimeoutExpired:
-                one.process.kill()
-                one.process.wait()
-        self._collect()
 
 
 def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -> subprocess.Popen:

@@ -157,13 +157,17 @@ def load_grid(name: str, changes: Sequence[str] = (), testing: bool = False) -> 
     told = _read(path, name)
     try:
         title, tests = told.pop("title", path.stem), told.pop("testing", {})
-        blocks = [_sections(block) for block in _tables(told, "block") or [{}]]
-        wheres, common = _tables(told, "where"), _sections(told)
+        tables = {name: told.pop(name, []) for name in ("block", "where")}
+        for kind, found in tables.items():
+            if not isinstance(found, list):
+                raise UserError(f"its {kind}s are no list of tables: write [[{kind}]]")
+        blocks, common = [_sections(block) for block in tables["block"] or [{}]], _sections(told)
         last = _merge({"": {}}, *([_sections(tests)] if testing else []), *map(_change, changes))
         whole = [_merge(common, block) for block in blocks]
         for block in whole:
             _check_block(_merge(block, last))
-        return Grid(path.stem, str(title), common, blocks, [_where(table, whole) for table in wheres], last)
+        wheres = [_where(table, whole) for table in tables["where"]]
+        return Grid(path.stem, str(title), common, blocks, wheres, last)
     except UserError as error:
         raise UserError(f"{name}: {error}") from error
 
@@ -196,13 +200,6 @@ def _read(path: Path, name: str) -> Values:
     if not isinstance(told, dict):
         raise UserError(f"{path}: defines no dict called GRID; see the grids that ship for its form")
     return dict(told)
-
-
-def _tables(told: Values, name: str) -> list[Any]:
-    tables = told.pop(name, [])
-    if not isinstance(tables, list):
-        raise UserError(f"its {name}s are no list of tables: write [[{name}]]")
-    return tables
 
 
 def _sections(table: Any) -> Sections:

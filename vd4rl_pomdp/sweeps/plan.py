@@ -74,8 +74,16 @@ class DataSet:
 
     def check(self) -> None:
         """Raise UserError unless its folder holds the set, or the set can be collected there."""
-        if self.foreign:
-            self._check_foreign()
+        if self.foreign and self.section == "collect":  # shards that nothing here collected
+            shards = shard_paths(self.folder)
+            task, _ = task_and_quality(self.folder, [read_attributes(shard) for shard in shards])
+            asked = self.wanted["task"], self.wanted.get("frame_size") or FRAME_SIZE
+            for has, wanted in zip((task, read_frame_size(shards)), asked, strict=True):
+                if has not in (None, wanted):
+                    what = f"frames of {has}x{has} pixels" if isinstance(has, int) else f"a set of {has}"
+                    raise UserError(f"{self.folder}: holds {what}, the grid says {wanted}; choose another --data")
+        elif self.foreign:
+            shard_paths(self.folder)
         elif (self.folder / PLAN).exists():
             stored = read_json(self.folder / PLAN)
             for name in differing(stored, self.wanted)[:1]:
@@ -89,18 +97,6 @@ class DataSet:
                     f"{self.folder}: holds no set, and the quality {self.wanted['quality']!r} cannot be collected: "
                     f"put the set there, or choose one of {', '.join(SET_QUALITIES)}"
                 )
-
-    def _check_foreign(self) -> None:
-        """Raise UserError if shards that nothing here collected tell another task, or frames of another size."""
-        shards = shard_paths(self.folder)
-        if self.section != "collect":
-            return
-        task, _ = task_and_quality(self.folder, [read_attributes(shard) for shard in shards])
-        asked = self.wanted["task"], self.wanted.get("frame_size") or FRAME_SIZE
-        for has, wanted in zip((task, read_frame_size(shards)), asked, strict=True):
-            if has not in (None, wanted):
-                what = f"frames of {has}x{has} pixels" if isinstance(has, int) else f"a set of {has}"
-                raise UserError(f"{self.folder}: holds {what}, the grid says {wanted}; choose another --data")
 
     def made(self, record: Mapping[str, Any]) -> bool:
         """Whether a run, as its config.json tells it, was trained on this set."""
