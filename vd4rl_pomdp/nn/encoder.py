@@ -5,17 +5,17 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, get_args
 
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import pad
 
-from vd4rl_pomdp.core.errors import UserError, first_line, refuse_unknown
+from vd4rl_pomdp.core.errors import UserError, refuse_unknown
 from vd4rl_pomdp.core.tasks import FRAME_SIZE, FRAME_STACK
 from vd4rl_pomdp.core.types import Windows
-from vd4rl_pomdp.nn.frame import FRAME_ENCODERS, STATE, FrameEncoder, StateFrame, make_frame_encoder
+from vd4rl_pomdp.nn.frame import STATE, FrameEncoder, StateFrame, make_frame_encoder
 from vd4rl_pomdp.nn.memory import Memory, make_memory, run_memory
 
 Readout = Literal["state", "frame", "frame+state"]
@@ -96,7 +96,7 @@ class EncoderRecord:
     probe: dict[str, float] = field(default_factory=dict)
     """Errors of linear probes, as `vd4rl_pomdp.nn.probes.probe_state` gives them; empty if none was fitted."""
     plugins: dict[str, str] = field(default_factory=dict)
-    """Where parts come from that are not this package's, as `registry.origins` tells."""
+    """Where parts come from that are not this package's, as `registry.code_of` tells."""
     sources: dict[str, str] = field(default_factory=dict)
     """Their files, as `registry.code_of` tells."""
 
@@ -122,21 +122,6 @@ class StreamState(NamedTuple):
     """(B, L', F + A): the memory's last inputs under a history window, else empty."""
 
 
-def build_frame_encoder(config: EncoderConfig) -> FrameEncoder:
-    """The frame encoder of a config; raises UserError if it cannot read pictures of that size."""
-    told = {"feature_dim": config.feature_dim} | config.frame_options
-    options = FRAME_ENCODERS.named(config.frame_encoder).options.fill(told)
-    if unknown := told.keys() - asdict(options).keys():
-        raise UserError(f"frame encoder {config.frame_encoder!r} has no option {min(unknown)!r}")
-    try:
-        return make_frame_encoder(config.frame_encoder, config.channels, config.size, options)
-    except RuntimeError as error:
-        raise UserError(
-            f"frame encoder {config.frame_encoder!r} cannot read pictures of {config.size}x{config.size} pixels "
-            f"({first_line(error)}): choose another --frame-encoder, or a set of larger frames"
-        ) from error
-
-
 class Encoder(nn.Module):
     """Maps observations and past actions to the representation s_t of width `dim`."""
 
@@ -148,7 +133,8 @@ class Encoder(nn.Module):
             config = self.config = replace(config, feature_dim=config.channels)
             self.frame: FrameEncoder | StateFrame = StateFrame(config.channels, **config.frame_options)
         else:
-            self.frame = frame = build_frame_encoder(config)
+            told = {"feature_dim": config.feature_dim} | config.frame_options
+            self.frame = frame = make_frame_encoder(config.frame_encoder, config.channels, config.size, told)
             self.config = config = replace(config, frame_options=config.frame_options | frame.found)
         if config.history == "none":
             return

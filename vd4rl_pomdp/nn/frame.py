@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from typing import Any, ClassVar
 
@@ -11,7 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from vd4rl_pomdp.core.compiling import compiled_on_gpu
-from vd4rl_pomdp.core.errors import UserError
+from vd4rl_pomdp.core.errors import UserError, first_line
 from vd4rl_pomdp.core.options import Limits, Options, refuse_options
 from vd4rl_pomdp.core.registry import Registry
 from vd4rl_pomdp.corruptions.keys import DRAWS, derive_keys, draw_integers, draw_normals
@@ -310,14 +310,28 @@ class StateFrame(nn.Module):
         return state[..., None, None]
 
 
-def make_frame_encoder(name: str, channels: int, size: int, options: FrameOptions) -> FrameEncoder:
-    """Build a frame encoder by name; an unknown name, or one whose module makes no maps, raises UserError."""
-    maps = FRAME_ENCODERS.named(name).build(channels, size, options)
-    if not isinstance(maps, nn.Module):
+def make_frame_encoder(name: str, channels: int, size: int, settings: Mapping[str, Any]) -> FrameEncoder:
+    """Build a frame encoder by name for pictures (channels, size, size), with values of its options.
+
+    Raises:
+        UserError: an unknown name or option, a module that makes no maps, or cannot read pictures of this size.
+    """
+    part = FRAME_ENCODERS.named(name)
+    options = part.options.fill(settings)
+    if unknown := settings.keys() - vars(options).keys():
+        raise UserError(f"frame encoder {name!r} has no option {min(unknown)!r}")
+    try:
+        maps = part.build(channels, size, options)
+        if not isinstance(maps, nn.Module):
+            raise UserError(
+                f"frame encoder {name!r} builds a {type(maps).__name__}, not a module: return what makes the maps"
+            )
+        encoder = FrameEncoder(maps, channels, size, options.feature_dim)
+    except RuntimeError as error:
         raise UserError(
-            f"frame encoder {name!r} builds a {type(maps).__name__}, not a module: return what makes the maps"
-        )
-    encoder = FrameEncoder(maps, channels, size, options.feature_dim)
+            f"frame encoder {name!r} cannot read pictures of {size}x{size} pixels ({first_line(error)}): choose "
+            "another --frame-encoder, or a set of larger frames"
+        ) from error
     if len(encoder.map_shape) != 3:
         raise UserError(
             f"frame encoder {name!r} makes {('N', *encoder.map_shape)} of N pictures, not maps (N, C', H', W'): "
