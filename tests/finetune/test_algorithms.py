@@ -9,6 +9,7 @@ import torch
 import torch.nn.functional as F
 
 from finetune.algorithms import ALGORITHMS, td3_bc
+from finetune.algorithms import bc as noise_module
 from finetune.algorithms.bc import BC, noise_at, with_noise
 from finetune.algorithms.drqv2_bc import DrQv2BC
 from finetune.algorithms.fql import FQL, FQLOptions
@@ -49,8 +50,8 @@ def batch(seed: int = 0) -> FeatureBatch:
 def silent(monkeypatch):
     """No noise on any action."""
     monkeypatch.setattr(td3_bc, "TARGET_NOISE", 0.0)
-    monkeypatch.setattr(noise, "NOISE_START", 0.0)
-    monkeypatch.setattr(noise, "NOISE_END", 0.0)
+    monkeypatch.setattr(noise_module, "NOISE_START", 0.0)
+    monkeypatch.setattr(noise_module, "NOISE_END", 0.0)
 
 
 @pytest.mark.parametrize("kind", [TD3BC, DrQv2BC])
@@ -74,7 +75,7 @@ def test_critics_learn_the_reward_and_the_smaller_discounted_value_of_the_next_a
 @pytest.mark.parametrize(("kind", "clip"), [(TD3BC, 0.5), (DrQv2BC, 0.3)])
 def test_noise_on_the_next_action_is_clipped_and_so_is_the_action(monkeypatch, kind, clip):
     monkeypatch.setattr(td3_bc, "TARGET_NOISE", 1e6)
-    monkeypatch.setattr(noise, "NOISE_START", 1e6)
+    monkeypatch.setattr(noise_module, "NOISE_START", 1e6)
     algorithm, given, seen = make(kind), batch(), []
     real = algorithm.target_critic.forward
     algorithm.target_critic.forward = lambda z, action: (seen.append(action), real(z, action))[1]
