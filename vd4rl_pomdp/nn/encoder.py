@@ -107,11 +107,6 @@ class EncoderRecord:
         named = {"method": card.method, "task": card.task, "corruption": card.corruption["corruption"]}
         return named | {"frame_encoder": self.encoder.frame_encoder, "history": self.encoder.history}
 
-    @property
-    def code(self) -> dict[str, dict[str, str]]:
-        """What it says of their code, as `registry.code_of` does."""
-        return {"plugins": self.plugins, "sources": self.sources}
-
 
 class StreamState(NamedTuple):
     """What an encoder remembers between rows."""
@@ -180,16 +175,13 @@ class Encoder(nn.Module):
     def encode(self, window: Windows) -> Tensor:
         """Representations of every row: (B, T, C, H, W) uint8 -> (B, T, dim); raises UserError for other pictures."""
         self._refuse_other(window.obs)
-        if (
-            self.memory is None
-            or not self.memory.first_only
-            or self.config.readout != "state"
-            or self.config.history_window
-        ):
-            return self.from_features(self.frame(window.obs), window.prev_action)
-        # the frame encoder's work on rows that are not read would be most of a step's
-        features = self.frame(window.obs[:, :1])
-        return self.from_features(pad(features, (0, 0, 0, window.obs.shape[1] - 1)), window.prev_action)
+        whole = self.config.readout == "state" and not self.config.history_window
+        if self.memory is not None and self.memory.first_only and whole:
+            # the frame encoder's work on rows that are not read would be most of a step's
+            features = pad(self.frame(window.obs[:, :1]), (0, 0, 0, window.obs.shape[1] - 1))
+        else:
+            features = self.frame(window.obs)
+        return self.from_features(features, window.prev_action)
 
     def from_features(self, features: Tensor, prev_action: Tensor) -> Tensor:
         """Representations from (B, T, F) frame features and (B, T, A) previous actions."""
@@ -199,8 +191,11 @@ class Encoder(nn.Module):
         rows, span = self._rows(features, prev_action), self.config.history_window
         if span == 0 or rows.shape[1] <= span:
             return self._read(features, run_memory(self.memory, rows)[0])
-        states = torch.cat([run_memory(self.memory, rows[:, :span])[0], self._over_last_rows(rows, span)], dim=1)
-        return self._read(features, states)
+        first = run_memory(self.memory, rows[:, :span])[0]
+        # Every later state is computed anew from the last `span` rows, the row itself among them.
+        recent = rows.unfold(1, span, 1)[:, 1:].transpose(2, 3)  # (B, T - span, span, I)
+        later = run_memory(self.memory, self._forget_first_action(recent.flatten(0, 1)))[0][:, -1]
+        return self._read(features, torch.cat([first, later.view(*recent.shape[:2], -1)], dim=1))
 
     def initial_state(self, batch: int) -> StreamState:
         """State before an episode's first row."""
@@ -255,14 +250,6 @@ class Encoder(nn.Module):
 
     def _rows(self, features: Tensor, prev_action: Tensor) -> Tensor:
         return torch.cat([features, prev_action.to(features)], dim=-1) if self.config.use_actions else features
-
-    def _over_last_rows(self, rows: Tensor, span: int) -> Tensor:
-        """States of rows span.. of (B, T, I), each computed anew from the last `span` rows: (B, T - span, H)."""
-        assert self.memory is not None
-        # The first of these windows ends in row span - 1, whose state the plain pass over the first rows gives.
-        recent = rows.unfold(1, span, 1)[:, 1:].transpose(2, 3)
-        states, _ = run_memory(self.memory, self._forget_first_action(recent.flatten(0, 1)))
-        return states[:, -1].view(*recent.shape[:2], -1)
 
     def _forget_first_action(self, rows: Tensor) -> Tensor:
         """A window's first row carries no earlier action."""
