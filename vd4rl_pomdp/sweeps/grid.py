@@ -62,10 +62,8 @@ Sections = dict[str, Values]
 class GridCell:
     """One point of a grid: a set, an encoder and a policy, or whatever of the chain a grid asks for."""
 
-    shared: Values
-    """Values of SHARED, as far as they are told."""
     sections: Sections
-    """Settings by section, without axes."""
+    """Settings without axes."""
     named: Mapping[str, Sequence[str]]
     """By section, the settings that tell this cell from others of its grid: axes, what a block says, and of a set what
     a `where` says."""
@@ -74,6 +72,11 @@ class GridCell:
     def chain(self) -> tuple[str, ...]:
         """Its sections, in the order in which they depend on one another."""
         return tuple(name for name in SECTIONS if name in self.sections)
+
+    @property
+    def shared(self) -> Values:
+        """Values of SHARED, as far as they are told."""
+        return self.sections[""]
 
     @property
     def seed(self) -> int:
@@ -86,7 +89,7 @@ class GridCell:
         Raises:
             UserError: sections set that name to different values.
         """
-        return _value_of({"": self.shared} | self.sections, name)
+        return _value_of(self.sections, name)
 
 
 @dataclass(frozen=True)
@@ -105,11 +108,10 @@ class Where:
             section: {name: value for name, value in settings.items() if name not in last.get(section, {})}
             for section, settings in self.sections.items()
         }
-        merged = _merge({"": cell.shared} | cell.sections, own)
         # A set is known by its folder's name, which has to tell it from others; a run is found by what it computes.
         more = {section: own.get(section, {}) if section in _SETS else {} for section in cell.named}
         named = {section: list(dict.fromkeys([*names, *more[section]])) for section, names in cell.named.items()}
-        return GridCell(merged.pop(""), merged, named)
+        return GridCell(_merge(cell.sections, own), named)
 
 
 @dataclass(frozen=True)
@@ -133,7 +135,7 @@ class Grid:
             for cell in _product(_merge(self.common, block, self.last), block):
                 for where in self.wheres:
                     cell = where.applied(cell, self.last)
-                cells.setdefault(repr((cell.shared, cell.sections)), cell)
+                cells.setdefault(repr(cell.sections), cell)
         return sorted(cells.values(), key=lambda cell: cell.seed)
 
 
@@ -291,7 +293,7 @@ def _product(block: Sections, own: Sections) -> Iterator[GridCell]:
         sections = {section: dict(settings) for section, settings in block.items()}
         for (section, name), value in zip(axes, values, strict=True):
             sections[section][name] = value
-        yield GridCell(sections.pop(""), sections, named)
+        yield GridCell(sections, named)
 
 
 def _merge(*parts: Sections) -> Sections:
