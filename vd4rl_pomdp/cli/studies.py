@@ -88,7 +88,7 @@ def add(runs: tyro.conf.Positional[list[Path]], out: Path) -> None:
     """
     from vd4rl_pomdp.runs.results import add_results
 
-    print(f"{out}: {add_results(_named(runs), out).in_words}")
+    print(f"{out}: {add_results(_named(runs), out)}")
 
 
 @command

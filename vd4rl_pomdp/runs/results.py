@@ -17,7 +17,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.options import LABELS, settings_of
@@ -328,32 +328,10 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
     return list(found.values())
 
 
-class Added(NamedTuple):
-    """What became of some runs."""
+def add_results(paths: Sequence[Path | str], out: Path | str) -> str:
+    """Append the runs at or below some paths to a results folder, each once; says what became of them.
 
-    added: int
-    known: int
-    """There already with the same rows."""
-    kept: int
-    """There already with other rows, which stay."""
-    unfinished: int
-    """Neither finished nor diverged, so left out."""
-
-    @property
-    def in_words(self) -> str:
-        """One line: "2 runs added, 1 there already"."""
-        told = (
-            (self.known, "there already"),
-            (self.kept, "there already with other rows, which stay (remove their lines to replace them)"),
-            (self.unfinished, "unfinished and left out"),
-        )
-        return ", ".join(
-            [f"{self.added} run{'s' * (self.added != 1)} added", *(f"{n} {what}" for n, what in told if n)]
-        )
-
-
-def add_results(paths: Sequence[Path | str], out: Path | str) -> Added:
-    """Append the runs at or below some paths to a results folder, each once; no row that is there changes.
+    No row that is there changes.
 
     An unfinished run of the folder, such as a report of that time keeps, gives way to the same run when it is settled,
     and one that diverged to the same run when it has finished after all.
@@ -373,7 +351,13 @@ def add_results(paths: Sequence[Path | str], out: Path | str) -> Added:
         keep_certificates(out, certificates_of(found, map(Path, paths), out))
     again = [run for run in settled if run.id not in fresh]
     known = sum(run.measured == there[run.id].measured for run in again)
-    return Added(len(fresh), known, len(again) - known, len(found) - len(settled))
+    told = {
+        "there already": known,
+        "there already with other rows, which stay (remove their lines to replace them)": len(again) - known,
+        "unfinished and left out": len(found) - len(settled),
+    }
+    more = [f"{number} {what}" for what, number in told.items() if number]
+    return ", ".join([f"{len(fresh)} run{'s' * (len(fresh) != 1)} added", *more])
 
 
 def certificates_of(runs: Sequence[Result], places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
