@@ -40,10 +40,9 @@ from vd4rl_pomdp.report.render import block, render, terminal, texts, write_late
 from vd4rl_pomdp.report.shown import MARK, NOTES, SHOWN, WHOLE, Shown, claim_of, shown_tables, with_algorithm
 from vd4rl_pomdp.report.stats import FEW_SEEDS
 from vd4rl_pomdp.report.theory import load_section
-from vd4rl_pomdp.runs.certificates import NOT_CERTIFIED, keep_certificates
 from vd4rl_pomdp.runs.files import Row, groups
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
-from vd4rl_pomdp.runs.results import RUNS, certificates_of, refuse_loss, write_results
+from vd4rl_pomdp.runs.results import NOT_CERTIFIED, RUNS, certificates_of, keep_certificates, refuse_loss, write_results
 
 SEEDS = 12
 """Seeds that are named one by one, at most."""

@@ -1,7 +1,9 @@
 """Results that outlive their run folders: one folder an experiment, small enough to commit.
 
-    runs.jsonl     one JSON object a run: its id, and what its small files hold, by their names
-    episodes.csv   raw evaluation rows, the run's id first
+    runs.jsonl           one JSON object a run: its id, and what its small files hold, by their names
+    episodes.csv         raw evaluation rows, the run's id first
+    certificates.json    whether a set under a corruption needs a memory of what was seen, by ids that name the set's
+                         content and the corruption, as `vd4rl-pomdp certify` found; it lies in the set's folder, too
 
 A report of a results folder is the same as one of the run folders, but for films. Both files are written whole, the
 rows first: rows of a run that runs.jsonl does not name were left by a cut writing, and are ignored.
@@ -12,7 +14,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from functools import cached_property
@@ -24,10 +26,9 @@ from vd4rl_pomdp.core.options import LABELS, settings_of
 from vd4rl_pomdp.core.reading import fits, parse_json, read_bytes
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.runs import CONFIG_FILE, CRITIC_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
-from vd4rl_pomdp.runs.certificates import certificate_id, keep_certificates, read_certificates
 from vd4rl_pomdp.runs.critic import TOLD, VALUE
 from vd4rl_pomdp.runs.episodes import COLUMNS, episodes_until, read_episodes
-from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json, replacing_file, write_csv
+from vd4rl_pomdp.runs.files import Row, content_hash, files_below, read_json, replacing_file, write_csv, write_json
 from vd4rl_pomdp.runs.metrics import read_metrics
 from vd4rl_pomdp.runs.outputs import owned, refuse_foreign
 from vd4rl_pomdp.runs.provenance import CONTINUED
@@ -37,6 +38,9 @@ RUNS = "runs.jsonl"
 FILES = {Path(file).stem: file for file in RECORDS} | {"encoder": f"encoder/{CONFIG_FILE}"}
 """A run's small files: the name of their content in runs.jsonl, and their place in the run folder."""
 
+CERTIFICATES = "certificates.json"
+NOT_CERTIFIED = "not certified"
+_HOLDS = {"data", "corruption", "name", "verdict", "why", "made"}
 _ROUNDING = 1e-4
 """Of a score, which is kept to four digits, as its return is."""
 
@@ -358,6 +362,45 @@ def add_results(paths: Sequence[Path | str], out: Path | str) -> str:
     }
     more = [f"{number} {what}" for what, number in told.items() if number]
     return ", ".join([f"{len(fresh)} run{'s' * (len(fresh) != 1)} added", *more])
+
+
+def certificate_id(data: str, corruption: Mapping[str, Any]) -> str:
+    """Name of what a certificate is about: the set's fingerprint, and the settings of a corruption."""
+    return content_hash([data, dict(corruption)])
+
+
+def read_certificates(places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:
+    """All certificates at or below some folders, by id; of several for one id the newest.
+
+    Args:
+        places: folders.
+        but: a folder whose own file is not read.
+
+    Raises:
+        UserError: a file is damaged.
+    """
+    found: dict[str, Row] = {}
+    for file in dict.fromkeys(file for place in places for file in files_below(place, CERTIFICATES)):
+        told = {} if but is not None and file.parent.resolve() == but.resolve() else read_json(file)
+        for name, one in told.items():
+            if not (isinstance(one, dict) and one.keys() >= _HOLDS):
+                raise UserError(f"{file}: is damaged; remove it, or write it again with `vd4rl-pomdp certify`")
+            if name not in found or str(one["made"]) > str(found[name]["made"]):
+                found[name] = one
+    return found
+
+
+def keep_certificates(folder: Path, certificates: dict[str, Row]) -> None:
+    """Add certificates to a folder's own; those of an id that is there take its place. None: nothing is written."""
+    file = folder / CERTIFICATES
+    there = read_json(file) if file.exists() else {}
+    if there | certificates != there:
+        write_json(file, there | certificates)
+
+
+def certificate_in_words(certificate: Row) -> str:
+    """The verdict and what it rests on."""
+    return f"{certificate['verdict']} ({certificate['why']})"
 
 
 def certificates_of(runs: Sequence[Result], places: Iterable[Path], but: Path | None = None) -> dict[str, Row]:

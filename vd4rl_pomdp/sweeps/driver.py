@@ -205,7 +205,11 @@ class Driver:
         for one in [one for one in self._running if one.process.poll() is not None]:
             self._running.remove(one)
             self._free += one.places
-            cause = cause_of(one.process.returncode)
+            code = one.process.returncode  # negative for a signal
+            if code in (-signal.SIGINT, -signal.SIGTERM, 128 + signal.SIGINT, 128 + signal.SIGTERM):
+                cause = INTERRUPTED
+            else:
+                cause = KILLED if code < 0 else {0: DONE, TEMPORARY: UNAVAILABLE}.get(code, FAILED)
             line = "" if cause == DONE else _line_of_end(one.log, one.log_size)
             self._end(one.jobs, cause, time.monotonic() - one.began, line)
 
@@ -274,13 +278,6 @@ def start(words: list[str], plan: Plan, log: Path, place: Place, threads: int) -
         if place.cores:
             os.sched_setaffinity(0, mine)
         signal.pthread_sigmask(signal.SIG_SETMASK, blocked)
-
-
-def cause_of(code: int) -> str:
-    """How a job's process ended, by its exit code, negative for a signal, as `subprocess` has it."""
-    if code in (-signal.SIGINT, -signal.SIGTERM, 128 + signal.SIGINT, 128 + signal.SIGTERM):
-        return INTERRUPTED
-    return KILLED if code < 0 else {0: DONE, TEMPORARY: UNAVAILABLE}.get(code, FAILED)
 
 
 def _line_of_end(log: Path, start: int) -> str:
