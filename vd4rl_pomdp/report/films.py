@@ -4,16 +4,13 @@ from __future__ import annotations
 
 import base64
 import io
-import zlib
 from collections.abc import Iterable
 from pathlib import Path
-from zipfile import BadZipFile
 
 import numpy as np
 from PIL import Image
 
-from vd4rl_pomdp.core.errors import UserError
-from vd4rl_pomdp.core.reading import read_bytes
+from vd4rl_pomdp.core.reading import damaged, read_bytes
 from vd4rl_pomdp.report.load import CONDITION, Run, title
 from vd4rl_pomdp.runs import FILM_FILE
 from vd4rl_pomdp.runs.files import Row
@@ -30,16 +27,12 @@ Film = dict[str, np.ndarray]
 
 def read_film(path: Path) -> Film:
     """Pictures of an evaluation episode; raises UserError for a damaged file."""
-    try:
+    with damaged(path, "cannot be read", "remove it, and the report goes without"):
         with np.load(io.BytesIO(read_bytes(path))) as file:
             film = dict(file)
         if [film[name].ndim for name in FILM] != list(FILM.values()):
             raise ValueError("its arrays have other shapes")
         return film
-    except UserError:
-        raise
-    except (OSError, ValueError, KeyError, EOFError, BadZipFile, zlib.error) as error:
-        raise UserError(f"{path}: cannot be read ({error}); remove it, and the report goes without") from error
 
 
 def shown_films(runs: Iterable[Run]) -> tuple[list[Row], int]:

@@ -22,13 +22,14 @@ import pandas as pd
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import LABELS, LATER, settings_of
+from vd4rl_pomdp.core.reading import damaged
 from vd4rl_pomdp.corruptions import corruption_settings
 from vd4rl_pomdp.data.reference import Reference, summarise
 from vd4rl_pomdp.runs import REFERENCE_FILE
 from vd4rl_pomdp.runs.critic import CONVERGED
 from vd4rl_pomdp.runs.episodes import COLUMNS
 from vd4rl_pomdp.runs.files import Row, groups
-from vd4rl_pomdp.runs.results import Result, find_results, whole_files
+from vd4rl_pomdp.runs.results import DAMAGED, Result, find_results
 
 SETTING = ("task", "quality", "corruption")
 """Columns of what methods are compared in."""
@@ -259,7 +260,7 @@ def load_runs(paths: Sequence[Path | str], but: Path | None = None, choice: Choi
 
 def _load(result: Result) -> Run:
     """A run of its files; raises UserError for files that are valid JSON, but not what a run writes."""
-    with whole_files(result.place):
+    with damaged(result.place, *DAMAGED):
         probe, stored = result.files.get("probe", {}), result.files.get("reference")
         critic = result.files.get("critic", {})
         told = {

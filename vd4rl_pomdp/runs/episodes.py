@@ -10,7 +10,7 @@ from pathlib import Path
 
 from vd4rl_pomdp.core.errors import UserError
 from vd4rl_pomdp.core.options import LABELS
-from vd4rl_pomdp.core.reading import read_bytes, regular
+from vd4rl_pomdp.core.reading import damaged, read_bytes, regular
 from vd4rl_pomdp.runs.files import Row, appending, write_csv
 
 _WHOLE = ("seed", "step", "episode", "episode_seed", "length")
@@ -64,7 +64,7 @@ def drop_episodes_after(path: Path, step: int) -> None:
 def _parse(path: Path, content: bytes) -> list[Row]:
     if not content:
         return []
-    try:
+    with damaged(path, "a row is not whole", "remove it"):
         if not content.endswith(b"\n"):
             raise ValueError("the last line has no end")
         reader = csv.DictReader(io.StringIO(content.decode(), newline=""))
@@ -86,7 +86,3 @@ def _parse(path: Path, content: bytes) -> list[Row]:
                 raise ValueError(f"its action error is {error}")
             rows.append(row | numbers | {name: int(row[name]) for name in _WHOLE} | {"action_error": error})
         return rows
-    except UserError:
-        raise
-    except (ValueError, TypeError, csv.Error) as error:
-        raise UserError(f"{path}: a row is not whole ({error}); remove it") from error

@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import IO, Any, TypeVar
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
-from vd4rl_pomdp.core.reading import parse_json, read_bytes
+from vd4rl_pomdp.core.reading import damaged, parse_json, read_bytes
 
 Row = dict[str, Any]
 """One row of a table, its values by column."""
@@ -33,12 +33,8 @@ def jsonable(value: Any) -> Any:
 
 def read_json(path: Path) -> dict[str, Any]:
     """Read a JSON object; raises UserError if it is missing, not readable or damaged."""
-    try:
+    with damaged(path, "cannot be read as JSON"):
         value = parse_json(read_bytes(path))
-    except UserError:
-        raise
-    except (FileNotFoundError, ValueError) as error:
-        raise UserError(f"{path}: cannot be read as JSON ({error})") from error
     if not isinstance(value, dict):
         raise UserError(f"{path}: holds no JSON object")
     return value

@@ -20,7 +20,7 @@ import torch
 from torch import Tensor
 
 from vd4rl_pomdp.core.errors import UserError, in_one_line
-from vd4rl_pomdp.core.reading import parse_json, read_bytes
+from vd4rl_pomdp.core.reading import damaged, parse_json, read_bytes
 from vd4rl_pomdp.runs import METRICS_FILE
 from vd4rl_pomdp.runs.files import appending, write_bytes
 from vd4rl_pomdp.runs.run import RunFolder, recipe
@@ -168,15 +168,13 @@ def read_metrics(path: Path) -> list[dict[str, float]]:
     """
     if not path.exists():
         return []
-    content, rows = read_bytes(path), []
-    try:
+    rows, content = list[dict[str, float]](), read_bytes(path)
+    with damaged(path, "a line is not JSON of numbers", "remove the line"):
         for line in content.decode().rpartition("\n")[0].splitlines():
             row = parse_json(line)
             if not (isinstance(row, dict) and "step" in row and all(isinstance(v, int | float) for v in row.values())):
                 raise ValueError("it holds no numbers with their step")
             rows.append(row)
-    except ValueError as error:
-        raise UserError(f"{path}: a line is not JSON of numbers ({error}); remove the line") from error
     return rows
 
 

@@ -14,8 +14,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
@@ -23,7 +22,7 @@ from typing import Any
 
 from vd4rl_pomdp.core.errors import UserError, disk_errors
 from vd4rl_pomdp.core.options import LABELS, settings_of
-from vd4rl_pomdp.core.reading import fits, parse_json, read_bytes
+from vd4rl_pomdp.core.reading import damaged, fits, parse_json, read_bytes
 from vd4rl_pomdp.core.tasks import TASKS
 from vd4rl_pomdp.runs import CONFIG_FILE, CRITIC_FILE, EPISODES_FILE, METRICS_FILE, RECORDS
 from vd4rl_pomdp.runs.critic import TOLD, VALUE
@@ -41,6 +40,8 @@ FILES = {Path(file).stem: file for file in RECORDS} | {"encoder": f"encoder/{CON
 CERTIFICATES = "certificates.json"
 NOT_CERTIFIED = "not certified"
 _HOLDS = {"data", "corruption", "name", "verdict", "why", "made"}
+DAMAGED = "its files are damaged", "take another copy, or leave it out"
+"""What is said of a run whose files hold something else than a run writes."""
 _ROUNDING = 1e-4
 """Of a score, which is kept to four digits, as its return is."""
 
@@ -179,7 +180,7 @@ def read_run(folder: Path | str) -> Result:
     found = read_episodes(path) if "timing" in files else episodes_until(path, sys.maxsize)
     rows = [{name: row[name] for name in COLUMNS} for row in found]
     step = max((int(row["step"]) for row in (*metrics, *rows)), default=0)
-    with whole_files(folder):
+    with damaged(folder, *DAMAGED):
         losses = [(int(row["step"]), row["action_loss"]) for row in metrics if "action_loss" in row]
         pretraining = files["config"]["stage"] == "pretrain"
         run = Result("", folder, files, step, losses if pretraining else [], rows, True)
@@ -228,17 +229,6 @@ def _check(run: Result) -> None:
         raise TypeError(f"its {CRITIC_FILE} is {critic}")
 
 
-@contextmanager
-def whole_files(where: Path | str) -> Iterator[None]:
-    """Whatever is wrong with a run's content becomes a sentence that says where."""
-    try:
-        yield
-    except UserError:
-        raise
-    except (KeyError, TypeError, ValueError, AttributeError) as error:
-        raise UserError(f"{where}: its files are damaged ({error}); take another copy, or leave it out") from error
-
-
 def read_results(folder: Path | str) -> list[Result]:
     """All runs of a results folder; raises UserError if it is none, or damaged."""
     folder = Path(folder)
@@ -259,7 +249,7 @@ def read_results(folder: Path | str) -> list[Result]:
         by_run.setdefault(row["id"], []).append(shared)
     runs: dict[str, Result] = {}
     for number, line in enumerate(lines, 1):
-        with whole_files(f"{path}: line {number}"):
+        with damaged(f"{path}: line {number}", *DAMAGED):
             told = parse_json(line)
             name, count = told["id"], int(told["episodes"])
             rows = by_run.get(name, [])
@@ -432,7 +422,7 @@ def verify_results(folder: Path | str) -> tuple[list[Result], list[str]]:
     """
     runs, told = read_results(folder), []
     for run in runs:
-        with whole_files(run.place):
+        with damaged(run.place, *DAMAGED):
             if (computed := _id(run)) != run.id:
                 told.append(f"run {run.id}: its record computes {computed}")
             config = run.record["config"]
