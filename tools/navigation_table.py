@@ -119,11 +119,10 @@ def state_lines(numbers: Numbers, ks: Sequence[int]) -> Iterator[str]:
 
 
 def texture_lines(numbers: Numbers) -> Iterator[str]:
-    """State errors at K = 15 with textures in the pictures, and without them."""
+    """State errors at K = 15 with textures in the pictures."""
     yield from _head(["seeds", *(f"`{name}`" for name in _ORDER)])
     for maze in _measured(numbers):
-        if with_them := list(_state_lines(numbers, "textures", Condition(maze, "", exogenous=True))):
-            yield from (*with_them, *_state_lines(numbers, "without", Condition(maze, "")))
+        yield from _state_lines(numbers, "textures", Condition(maze, "", exogenous=True))
 
 
 def budget_lines(usual: Numbers, longer: Numbers) -> Iterator[str]:
