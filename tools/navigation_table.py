@@ -32,9 +32,9 @@ MEASURES = (*PAPERS_WAY, *REFITTED, *REFITTED_RAW)
 """Of a maze's table: the paper's way and units, then both units by the refitted probe."""
 REFERENCES = {
     UNTRAINED: "untrained",
-    "supervised+a": "told the states: memory and actions",
-    "supervised": "told the states: memory",
-    "supervised_picture": "told the states: one picture",
+    "supervised+a": "`supervised+a`",
+    "supervised": "`supervised`",
+    "supervised_picture": "`supervised_picture`",
 }
 """Methods that no objective trains, as the pages call them."""
 HARD_SPREADS = {
