@@ -11,7 +11,6 @@ import numpy as np
 from vd4rl_pomdp.envs.mazes import PAPER_MAZES
 from vd4rl_pomdp.report.stats import mean_and_error
 from vd4rl_pomdp.runs.results import RUNS, read_results
-from vd4rl_pomdp.studies.navigation.claims import Numbers
 from vd4rl_pomdp.studies.navigation.measures import (
     OBJECTIVES,
     UNTRAINED,
@@ -21,6 +20,7 @@ from vd4rl_pomdp.studies.navigation.measures import (
     paper_number,
     refitted_error,
 )
+from vd4rl_pomdp.studies.navigation.report import Numbers
 from vd4rl_pomdp.studies.navigation.runs import NavigationRun, frame_of, load_runs, numbers_of
 
 RESULTS = Path(__file__).parents[1] / "results" / "navigation"
