@@ -32,8 +32,8 @@ class SideBySide(NamedTuple):
     """Two result sets side by side."""
 
     sides: list[Row]
-    """Of each its `path`, `finished` runs, `others` (unfinished and diverged, which are not compared), and the commits and
-    machines that they were `made` with."""
+    """Of each its `path`, how many runs `finished`, how many `others` are not compared, and what they were `made` with:
+    commits and machines."""
     rows: list[Row]
     """One a condition: scores with intervals and n of both, difference with interval, settings that differ, and what is
     certified of memory."""
