@@ -21,6 +21,7 @@ from vd4rl_pomdp.data.folder import PLAN, PROVENANCE, read_plan, shard_files, sh
 from vd4rl_pomdp.data.format import read_attributes, read_frame_size
 from vd4rl_pomdp.data.shards import differing
 from vd4rl_pomdp.data.store import open_store
+from vd4rl_pomdp.nn.encoder_folder import CONFIG, encoder_hash
 from vd4rl_pomdp.runs import CONFIG_FILE, TIMING_FILE
 from vd4rl_pomdp.runs.files import content_hash, files_below, groups, read_json
 from vd4rl_pomdp.runs.results import Result, read_records, read_results
@@ -219,6 +220,7 @@ class _Planner:
         """Names of the jobs that are the last of a cell."""
         self._of_other_code: Counter[str] = Counter()
         self._of_other_content: Counter[str] = Counter()
+        self._on_other_encoders = 0
 
     def add(self, cell: GridCell) -> None:
         """Want what a cell asks for."""
@@ -246,6 +248,9 @@ class _Planner:
         run = _found(self._here, own, data)
         if run is not None:
             self._of_other_code.update(of_other_code(run.record, values))
+            encoder = before[-1].folder / "encoder"
+            if section == "finetune" and (encoder / CONFIG).is_file():
+                self._on_other_encoders += run.record.get("inputs", {}).get("encoder") != encoder_hash(encoder)
             name, content = run.path.relative_to(self._out).as_posix(), run.data
         else:
             name, content = self._free(_run_folder(cell, section, data.name, values), own), ""
@@ -298,6 +303,8 @@ class _Planner:
             yield f"{name}: {line}: they do not count"
         for part, number in self._of_other_code.items():
             yield f"{part}: {number} sets or runs count, though its code has changed since they began"
+        if number := self._on_other_encoders:
+            yield f"{number} policies count that began with other encoders than their pretrainings' folders now hold"
 
 
 def _found(runs: Mapping[str, list[Result]], own: str, data: DataSet) -> Result | None:
