@@ -16,11 +16,11 @@ from safetensors import SafetensorError
 from safetensors.torch import save
 from torch.random import fork_rng
 
+from vd4rl_pomdp.core import __version__
 from vd4rl_pomdp.core.errors import UserError, disk_errors, first_line, in_one_line
 from vd4rl_pomdp.core.reading import build, parse_json, read_bytes, read_tensors
 from vd4rl_pomdp.core.registry import code_of
 from vd4rl_pomdp.core.text import code, code_block, one_line
-from vd4rl_pomdp.core.version import __version__
 from vd4rl_pomdp.corruptions import CorruptionConfig
 from vd4rl_pomdp.nn.encoder import Encoder, EncoderCard, EncoderConfig, EncoderRecord
 from vd4rl_pomdp.nn.frame import STATE
