@@ -102,8 +102,9 @@ class Result:
 
     @property
     def origin(self) -> dict[str, Any]:
-        """What its encoder says of the code that made it, and of its probe; empty where there is none yet."""
-        return self.files.get("encoder", {}).get("origin", {})
+        """What its encoder says of the code that made it, in earlier rows as a part of its own; empty without encoder."""
+        told = self.files.get("encoder", {})
+        return told.get("origin", told)
 
     @property
     def card(self) -> dict[str, Any]:
