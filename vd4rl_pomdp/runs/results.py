@@ -102,7 +102,7 @@ class Result:
 
     @property
     def origin(self) -> dict[str, Any]:
-        """What its encoder says of the code that made it, in earlier rows as a part of its own; empty without encoder."""
+        """What its encoder says of the code that made it, in earlier rows in a part of its own; empty without one."""
         told = self.files.get("encoder", {})
         return told.get("origin", told)
 
