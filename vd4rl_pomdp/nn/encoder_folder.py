@@ -171,6 +171,7 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
         frames = f", {record.frames:,} frames" if record.frames else ""
         budget = f"preset {code(card.preset)}, {card.steps:,} gradient steps{frames}"
     probe = ", ".join(f"{name.removeprefix('probe_')} {error:.1f}%" for name, error in record.probe.items())
+    commit = f", commit {code(record.commit)}" if record.commit else ""
     facts = {
         "method": code(card.method),
         "task, quality": f"{code(card.task)}, {code(card.quality)}",
@@ -180,8 +181,7 @@ def model_card(record: EncoderRecord, repository: str = "", license: str = LICEN
         "seed": str(card.seed),
         "encoder": f"{code(shape.frame_encoder)}, {shape.feature_dim} features, memory: {code(shape.history)}",
         "linear probe": f"error of {probe} of a standard deviation, on held-out episodes" if probe else "not measured",
-        "made by": f"vd4rl-pomdp {one_line(record.version)}"
-        + (f", commit {code(record.commit)}" * bool(record.commit)),
+        "made by": f"vd4rl-pomdp {one_line(record.version)}{commit}",
     } | ({"licence": code(license)} if license else {})
     tags = dict.fromkeys([*TAGS, card.method, card.task, card.corruption["corruption"]])
     values: dict[str, Any] = {"license": license} if license else {}
