@@ -296,21 +296,21 @@ def find_results(paths: Sequence[Path | str], but: Path | None = None) -> list[R
     """
     if not paths:
         raise UserError("name at least one run folder, or a folder that contains some")
-    paths = [Path(path) for path in paths]
-    if missing := [path for path in paths if not path.exists()]:
+    named = [Path(path) for path in paths]
+    if missing := [path for path in named if not path.exists()]:
         raise UserError(f"{missing[0]}: no such folder")
-    files = dict.fromkeys(file for path in paths for file in files_below(path, CONFIG_FILE))
+    files = dict.fromkeys(file for path in named for file in files_below(path, CONFIG_FILE))
     runs = [read_run(file.parent) for file in files if "stage" in read_json(file)]
     places: dict[Path, None] = {}
-    for path in paths:
+    for path in named:
         below = {file.parent for file in files_below(path, RUNS)}
         places |= dict.fromkeys(place for place in sorted(below) if below.isdisjoint(place.parents))
     for place in places:
-        if but is None or place in paths or place.resolve() != but.resolve():
+        if but is None or place in named or place.resolve() != but.resolve():
             runs += read_results(place)
     if not runs:
         raise UserError(
-            f"{paths[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl) and no results "
+            f"{named[0]}: contains no runs (a run is a folder with config.json and metrics.jsonl) and no results "
             f"folder (which holds {RUNS})"
         )
     found: dict[str, Result] = {}

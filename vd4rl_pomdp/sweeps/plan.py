@@ -74,16 +74,16 @@ class DataSet:
 
     def check(self) -> None:
         """Raise UserError unless its folder holds the set, or the set can be collected there."""
-        if self.foreign and self.section == "collect":  # shards that nothing here collected
+        if self.foreign:  # shards that nothing here collected
             shards = shard_paths(self.folder)
+            if self.section != "collect":
+                return
             task, _ = task_and_quality(self.folder, [read_attributes(shard) for shard in shards])
-            asked = self.wanted["task"], self.wanted.get("frame_size") or FRAME_SIZE
-            for has, wanted in zip((task, read_frame_size(shards)), asked, strict=True):
-                if has not in (None, wanted):
+            wanted = self.wanted["task"], self.wanted.get("frame_size") or FRAME_SIZE
+            for has, asked in zip((task, read_frame_size(shards)), wanted, strict=True):
+                if has not in (None, asked):
                     what = f"frames of {has}x{has} pixels" if isinstance(has, int) else f"a set of {has}"
-                    raise UserError(f"{self.folder}: holds {what}, the grid says {wanted}; choose another --data")
-        elif self.foreign:
-            shard_paths(self.folder)
+                    raise UserError(f"{self.folder}: holds {what}, the grid says {asked}; choose another --data")
         elif (self.folder / PLAN).exists():
             stored = read_json(self.folder / PLAN)
             for name in differing(stored, self.wanted)[:1]:

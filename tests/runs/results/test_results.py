@@ -155,7 +155,7 @@ def test_a_run_that_finished_after_all_takes_the_place_of_the_one_that_diverged(
     for paths in ([run, tmp_path / "out"], [tmp_path / "out", run]):
         assert [found.finished for found in find_results(paths)] == [True]
     write_report([run], tmp_path / "report")
-    assert add_results([run], tmp_path / "out") == (1, 0, 0, 0)
+    assert add_results([run], tmp_path / "out") == "1 run added"
     for out in ("out", "report"):
         assert [(found.finished, found.rows[-1]["score"]) for found in read_results(tmp_path / out)] == [(True, 2.0)]
     assert add_results([diverged], tmp_path / "out") == (0, 0, 1, 0), "and never the other way round"
@@ -195,7 +195,7 @@ def test_a_writing_that_is_killed_midway_leaves_what_was_there(tmp_path, monkeyp
             add_results([whole_run(tmp_path / "runs/1", seed=1)], tmp_path / "out")
     assert {row["seed"] for row in read_episodes(tmp_path / "out" / "episodes.csv")} == {0, 1}, "one file was written"
     assert [content(run) for run in read_results(tmp_path / "out")] == before
-    assert add_results([tmp_path / "runs"], tmp_path / "out") == (1, 1, 0, 0)
+    assert add_results([tmp_path / "runs"], tmp_path / "out") == "1 run added, 1 there already"
     assert [len(run.rows) for run in read_results(tmp_path / "out")] == [2, 2]
 
 
