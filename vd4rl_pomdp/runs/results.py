@@ -423,12 +423,12 @@ def _contradictions(run: Result) -> Iterator[str]:
             if wrong:
                 yield f"{wrong[0][1]} the {name} {wrong[0][0]}, its record {value} ({len(wrong)} such)"
         # steps: an earlier state of a longer training is an encoder, too
-        for name in trained.keys() & card.get("settings", {}).keys() - {"steps", "corruption"}:
+        for name in sorted(trained.keys() & card.get("settings", {}).keys() - {"steps", "corruption"}):
             if trained[name] != card["settings"][name]:
                 yield f"its encoder says {name} {trained[name]}, its settings {card['settings'][name]}"
         data, mean = run.files.get("critic", {}).get("data"), run.files.get("reference", {}).get("mean_reward")
-        gamma = config.get("gamma")
-        if None not in (data, mean, gamma) and abs(data - mean / (1 - gamma)) > _ROUNDING:
+        gamma = config.get("gamma", 1)
+        if None not in (data, mean) and gamma < 1 and abs(data - mean / (1 - gamma)) > _ROUNDING:
             yield f"its critic tells of data worth {data}, their mean reward {mean} makes {mean / (1 - gamma):.4f}"
         if run.rows:
             yield from _astray(run)
@@ -437,9 +437,11 @@ def _contradictions(run: Result) -> Iterator[str]:
 def _astray(run: Result) -> Iterator[str]:
     """What is wrong with a run's episodes: which of them are there, and what each says of itself."""
     config, own = run.record["config"], run.labels["corruption"]
-    places = [(row["step"], row["evaluated_under"], row["episode"]) for row in run.rows]
-    if len(set(places)) < len(places):
-        yield f"{len(places) - len(set(places))} episodes stand there twice"
+    played: dict[tuple[int, str], list[int]] = {}
+    for row in run.rows:
+        played.setdefault((row["step"], row["evaluated_under"]), []).append(row["episode"])
+    # at the end `evaluate --keep` adds episodes under others, as many as one likes
+    wanted = {place: len(numbers) for place, numbers in played.items()}
     if {"updates", "eval_every", "eval_episodes"} <= config.keys():  # which earlier runs do not tell
         last, count, every = config["updates"], config["eval_episodes"], config["eval_every"]
         ended = {run.step, run.files["timing"].get("updates")} if run.finished else {last}
@@ -447,18 +449,18 @@ def _astray(run: Result) -> Iterator[str]:
             yield f"it ends with update {(ended - {last}).pop()}, its record with {last}"
         # one that has no end may have been cut in its newest evaluation
         end = last if run.finished else (run.diverged or {"step": run.step})["step"] - 1
-        steps = {*range(every, end + 1, every), *[last] * run.finished}
-        wanted = {(step, own, number) for step in steps for number in range(count)}
+        wanted |= {
+            (step, under): 0
+            for step, under in played
+            if (run.finished or step <= end) and (step != last or under == own)
+        }
+        wanted |= {(step, own): count for step in {*range(every, end + 1, every), *[last] * run.finished}}
         if run.finished and config.get("eval_clean") and own != "none":
-            wanted |= {(last, "none", number) for number in range(config.get("eval_clean_episodes") or count)}
-        # `evaluate --keep` adds episodes under others, as many as one likes
-        wanted |= {(last, name, n) for step, name, top in places if step == last and name != own for n in range(top)}
-        here = {place for place in places if run.finished or place[0] <= end}
-        other = {place for place in here - wanted if place[0] != last or place[1] == own}
-        for what, those in (("missing", wanted - here), ("not those of its evaluations", other)):
-            if those:
-                step, name, number = min(those)
-                yield f"{len(those)} episodes are {what}, such as {number} under {name} at step {step}"
+            wanted[last, "none"] = config.get("eval_clean_episodes") or count
+    for (step, under), count in sorted(wanted.items()):
+        numbers = sorted(played.get((step, under), []))
+        if len(numbers) != count or numbers != list(range(len(numbers))):
+            yield f"at step {step} under {under} it has the episodes {numbers}, its record {count}, from 0 on"
     task, reference = TASKS.get(run.labels["task"]), run.files.get("reference", {})
     longest = min(config.get("eval_length", math.inf), task.decisions if task else math.inf)
     divisor = task.score_divisor if task else math.nan

@@ -69,20 +69,20 @@ def test_episodes_are_of_the_run_that_they_name_each_once_and_scored_by_their_re
     out, err = capsys.readouterr()
     assert out.splitlines() == [
         f"run {first.id}: an episode has the seed 7, its record 0 (1 such)",
-        f"run {first.id}: 1 episodes stand there twice",
+        f"run {first.id}: at step 10 under patch it has the episodes [0, 0], its record 2, from 0 on",
         f"run {first.id}: 1 scores are not their returns / 10",
         "2 runs, 3 contradictions between rows and records",
     ]
     assert err == f"error: {results}: 3 contradictions, see above; ask who made the rows\n"
 
 
+OWN = "patch+zero_frames"
 EDITED_ROWS = [
-    (0, {"episode": "5"}, "1 episodes are missing, such as 0 under patch+zero_frames at step 20"),
-    (0, {"episode": "5"}, "1 episodes are not those of its evaluations, such as 5 under patch+zero_frames at step 20"),
-    (1, {"step": "30"}, "1 episodes are missing, such as 1 under patch+zero_frames at step 20"),
-    (2, {"step": "60"}, "1 episodes are not those of its evaluations, such as 0 under patch+zero_frames at step 60"),
-    (3, {"evaluated_under": "none", "episode": "1"}, "1 episodes are missing, such as 1 under patch+zero_frames at step 40"),
-    (4, {"evaluated_under": "glitch"}, "1 episodes are missing, such as 0 under none at step 40"),
+    (0, {"episode": "5"}, f"at step 20 under {OWN} it has the episodes [1, 5], its record 2, from 0 on"),
+    (1, {"step": "30"}, f"at step 20 under {OWN} it has the episodes [0], its record 2, from 0 on"),
+    (2, {"step": "60"}, f"at step 60 under {OWN} it has the episodes [0], its record 0, from 0 on"),
+    (3, {"evaluated_under": "none"}, f"at step 40 under {OWN} it has the episodes [0], its record 2, from 0 on"),
+    (4, {"evaluated_under": "glitch"}, "at step 40 under none it has the episodes [], its record 1, from 0 on"),
     (0, {"episode_seed": "20007"}, "1 environment seeds are not those of their numbers"),
     (0, {"length": "5"}, "1 lengths are not within 1 and 4"),
     (0, {"quality": "medium"}, "an episode has the quality medium, its record expert (1 such)"),
@@ -94,7 +94,11 @@ EDITED_RECORDS = [
     (("labels", "quality"), "medium", "its labels have the quality medium, its record expert (1 such)"),
     (("step",), 39, "it ends with update 39, its record with 40"),
     (("timing", "updates"), 50, "it ends with update 50, its record with 40"),
-    (("config", "config", "eval_episodes"), 3, "2 episodes are missing, such as 2 under patch+zero_frames at step 20"),
+    (
+        ("config", "config", "eval_episodes"),
+        3,
+        f"at step 20 under {OWN} it has the episodes [0, 1], its record 3, from 0 on",
+    ),
     (("encoder", "pretrain", "corruption", "patch_size"), 24, "its encoder says patch_size 24, its settings 16"),
     (("critic", "data"), 1.0, "its critic tells of data worth 1.0, their mean reward"),
     (("reference", "mean_reward"), 1.0, "their mean reward 1.0 makes 100.0000"),
